@@ -1,0 +1,63 @@
+"""Honest comparison of model-order-reduction methods for real-time hyperelastic solids.
+
+>>> import mor_bench
+>>> scene = mor_bench.load_scene("beam-tiny")
+>>> scene.mesh.points.shape
+(63, 3)
+>>> method = mor_bench.load_method("linear-fem").fit(scene, None)
+>>> method.predict(scene.mesh.points * 0.0).shape
+(63, 3)
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mor_bench.errors import MorBenchError
+    from mor_bench.harness.results import Comparison
+    from mor_bench.harness.run import run
+    from mor_bench.scene.scene import Scene, load_scene
+    from mor_bench.snapshots.dataset import Snapshots, load_dataset
+    from mor_bench.surrogate import Surrogate, load_method, load_surrogate
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Comparison",
+    "MorBenchError",
+    "Scene",
+    "Snapshots",
+    "Surrogate",
+    "load_dataset",
+    "load_method",
+    "load_scene",
+    "load_surrogate",
+    "run",
+]
+
+_HOMES = {
+    "Comparison": "mor_bench.harness.results",
+    "MorBenchError": "mor_bench.errors",
+    "Scene": "mor_bench.scene.scene",
+    "Snapshots": "mor_bench.snapshots.dataset",
+    "Surrogate": "mor_bench.surrogate",
+    "load_dataset": "mor_bench.snapshots.dataset",
+    "load_method": "mor_bench.surrogate",
+    "load_scene": "mor_bench.scene.scene",
+    "load_surrogate": "mor_bench.surrogate",
+    "run": "mor_bench.harness.run",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used, so that `import mor_bench` and the command line start at once."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'mor_bench' has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,212 @@
+"""Newton's method for an equilibrium, full-order or reduced: a plain pass first, a safeguarded one where it fails.
+
+Plain full steps converge in six or seven iterations for nearly every load, although the residual first rises by orders
+of magnitude: a rising residual is not divergence. When they do not end in a stable, uninverted state, the load is
+applied in increments, each a descent on the potential energy with a line search, and cut back on failure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.errors import InvertedElementError, NoEquilibriumError
+from mor_bench.mechanics.assembly import State
+from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
+
+PLAIN_ITERATIONS = 25
+DAMPED_ITERATIONS = 60
+HOPELESS = 1e10
+"""A residual this many times the load ends the plain pass; near incompressibility it rises 3,000-fold and still converges."""
+ROUND_OFF = 1e-13
+"""A correction this small relative to the displacement is round-off: slender bodies never meet a force tolerance."""
+ARMIJO = 1e-4
+MAX_HALVINGS = 14
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """Stopping and stepping.
+
+    Parameters
+    ----------
+    tolerance : float
+        Norm of the residual relative to that of the load.
+    max_cuts : int
+        How often an increment may be halved before the solve gives up.
+    """
+
+    tolerance: float = 1e-8
+    max_cuts: int = 10
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A stable equilibrium with det F > 0 at every Gauss point."""
+
+    displacement: NDArray[np.float64]
+    min_det_f: float
+    iterations: int
+    cuts: int
+
+
+class Problem(Protocol):
+    """What Newton needs of a model with unknowns q."""
+
+    n_unknowns: int
+
+    def force(self, q: NDArray[np.float64]) -> State: ...
+    def linearise(self, q: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
+        """State and tangent at q."""
+        ...
+
+    def factor(self, tangent: NDArray[np.float64]) -> Factor:
+        """Factorise a tangent; raises `NotPositiveDefiniteError`."""
+        ...
+
+    @property
+    def rest_tangent(self) -> NDArray[np.float64]: ...
+    @property
+    def rest_factor(self) -> Factor: ...
+
+
+@dataclass
+class _Pass:
+    """The outcome of one Newton pass."""
+
+    q: NDArray[np.float64]
+    min_det_f: float
+    iterations: int
+    converged: bool
+
+    @property
+    def valid(self) -> bool:
+        return self.converged and self.min_det_f > 0
+
+
+def _met(residual: NDArray[np.float64], load_norm: float, tolerance: float) -> bool:
+    return float(np.linalg.norm(residual)) <= tolerance * load_norm
+
+
+def _is_round_off(step: NDArray[np.float64], q: NDArray[np.float64]) -> bool:
+    return float(np.abs(step).max()) <= ROUND_OFF * float(np.abs(q).max())
+
+
+def _plain(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float64] | None, tolerance: float) -> _Pass:
+    """Full Newton steps; from rest, the first one uses the rest-state factor that every solve shares."""
+    load_norm = float(np.linalg.norm(load))
+    q = problem.rest_factor.solve(load) if start is None else start.copy()
+    min_det = -np.inf
+    for iteration in range(1, PLAIN_ITERATIONS + 1):
+        state, tangent = problem.linearise(q)
+        residual, min_det = load - state.force, state.min_det_f
+        size = float(np.linalg.norm(residual))
+        if not size <= HOPELESS * load_norm:
+            break
+        try:
+            factor = problem.factor(tangent)
+        except NotPositiveDefiniteError:
+            break
+        if size <= tolerance * load_norm:
+            return _Pass(q, min_det, iteration, converged=True)
+        step = factor.solve(residual)
+        q = q + step
+        if _is_round_off(step, q):
+            return _Pass(q, min_det, iteration, converged=True)
+    return _Pass(q, min_det, PLAIN_ITERATIONS, converged=False)
+
+
+def _descent(problem: Problem, tangent: NDArray[np.float64], residual: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
+    """A descent direction of the potential, and whether the tangent itself was positive definite.
+
+    An indefinite tangent is shifted towards the rest-state stiffness until it is positive definite.
+    """
+    try:
+        return problem.factor(tangent).solve(residual), True
+    except NotPositiveDefiniteError:
+        pass
+    shift = 0.01
+    while True:
+        try:
+            return problem.factor(tangent + shift * problem.rest_tangent).solve(residual), False
+        except NotPositiveDefiniteError:
+            shift *= 4.0
+            if shift > 1e6:
+                return problem.rest_factor.solve(residual), False
+
+
+def _damped(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float64], tolerance: float) -> _Pass:
+    """Descent on the potential W(q) - f·q from a valid state, never leaving det F > 0."""
+    load_norm = float(np.linalg.norm(load))
+    q = start
+    for iteration in range(1, DAMPED_ITERATIONS + 1):
+        state, tangent = problem.linearise(q)
+        residual = load - state.force
+        step, stable = _descent(problem, tangent, residual)
+        if stable and (_met(residual, load_norm, tolerance) or _is_round_off(step, q)):
+            return _Pass(q, state.min_det_f, iteration, converged=True)
+        slope, work = float(residual @ step), float(load @ q)
+        potential, noise = state.energy_j - work, 1e-14 * (state.energy_j + abs(work))
+        for halving in range(MAX_HALVINGS):
+            length = 0.5**halving
+            trial_q = q + length * step
+            trial = problem.force(trial_q)
+            if trial.min_det_f > 0 and trial.energy_j - float(load @ trial_q) <= potential - ARMIJO * length * slope + noise:
+                break
+        else:
+            return _Pass(q, trial.min_det_f, iteration, converged=False)
+        q = trial_q
+    return _Pass(q, trial.min_det_f, DAMPED_ITERATIONS, converged=False)
+
+
+def solve_equilibrium(
+    problem: Problem, load: NDArray[np.float64], start: NDArray[np.float64] | None = None, options: NewtonOptions = NewtonOptions()
+) -> Solution:  # fmt: skip
+    """Find the stable equilibrium under a dead load.
+
+    Parameters
+    ----------
+    problem : Problem
+    load : (n_unknowns,) float64
+        External force, N (projected on the basis for a reduced problem).
+    start : (n_unknowns,) float64, optional
+        A guess; rest by default.
+    options : NewtonOptions
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    InvertedElementError
+        If the load can be followed only through det F <= 0.
+    NoEquilibriumError
+        If no stable equilibrium was found within the allowed cut-backs.
+    """
+    if not load.any():
+        return Solution(np.zeros(problem.n_unknowns), 1.0, 0, 0)
+    first = _plain(problem, load, start, options.tolerance)
+    if first.valid:
+        return Solution(first.q, first.min_det_f, first.iterations, 0)
+    iterations, cuts = first.iterations, 0
+    q, reached, increment = np.zeros(problem.n_unknowns), 0.0, 0.5
+    while True:
+        target = min(1.0, reached + increment)
+        attempt = _damped(problem, target * load, q, options.tolerance)
+        iterations += attempt.iterations
+        if attempt.valid:
+            if target == 1.0:
+                return Solution(attempt.q, attempt.min_det_f, iterations, cuts)
+            q, reached, increment = attempt.q, target, 2.0 * increment
+            continue
+        cuts += 1
+        increment *= 0.5
+        if cuts > options.max_cuts:
+            story = f"stopped at {reached:.4g} of the load after {iterations} iterations and {cuts} cut-backs"
+            if attempt.min_det_f <= 0 or (first.converged and first.min_det_f <= 0):
+                raise InvertedElementError(f"elements invert: {story}; the largest det F <= 0 tried was {min(attempt.min_det_f, first.min_det_f):.3g}.")
+            raise NoEquilibriumError(f"no stable equilibrium: {story}.")

@@ -1,0 +1,89 @@
+"""Load patches: a uniform traction over a part of the surface that has a fixed area, as consistent nodal weights.
+
+A force on a single node means a pressure that grows without bound as the mesh is refined, and inverts elements; a patch
+of fixed area means the same load on every mesh.
+"""
+
+from __future__ import annotations
+
+from math import ceil, sqrt
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from mor_bench.errors import SpecError
+from mor_bench.scene.mesh import Mesh
+
+POINTS_PER_PATCH = 256
+"""Surface quadrature points that a patch holds at least."""
+
+
+def _surface_points(mesh: Mesh, facets: NDArray[np.int64], spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64], sp.csr_array]:
+    """Positions (n, 3), areas (n,) and shape-function values (n, n_nodes) of midpoint-rule points on the facets."""
+    corners = mesh.points[facets]
+    longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
+    m = max(2, ceil(longest / spacing))
+    s = (np.arange(m) + 0.5) / m
+    x, y = (a.ravel() for a in np.meshgrid(s, s, indexing="ij"))
+    shape = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
+    d_x = np.stack([y - 1, 1 - y, y, -y], axis=1)
+    d_y = np.stack([x - 1, -x, x, 1 - x], axis=1)
+    positions = np.einsum("pa,fai->fpi", shape, corners)
+    normals = np.cross(np.einsum("pa,fai->fpi", d_x, corners), np.einsum("pa,fai->fpi", d_y, corners))
+    areas = np.linalg.norm(normals, axis=2) / m**2
+    n = len(facets) * m * m
+    rows = np.repeat(np.arange(n), 4)
+    columns = np.repeat(facets, m * m, axis=0).ravel()
+    values = sp.csr_array((np.tile(shape, (len(facets), 1)).ravel(), (rows, columns)), shape=(n, mesh.n_nodes))
+    return positions.reshape(-1, 3), areas.ravel(), values
+
+
+def patch_weights(mesh: Mesh, centres: NDArray[np.int64], facets: NDArray[np.int64], area_m2: float) -> sp.csr_array:
+    """Nodal weights of the patches around some nodes.
+
+    The patch around a node is the part of the facets that lies nearest to it and has the given area, so that a patch
+    at an edge is as large as one inside. A force F on the patch is the nodal forces ``weight * F`` (the consistent
+    load of a uniform traction F / area).
+
+    Parameters
+    ----------
+    mesh : Mesh
+    centres : (n_patches,) int
+        Node numbers.
+    facets : (n_facets, 4) int
+        The surface on which patches may lie.
+    area_m2 : float
+        Area of each patch, m².
+
+    Returns
+    -------
+    (n_patches, n_nodes) sparse float64
+        Each row sums to 1.
+
+    Raises
+    ------
+    SpecError
+        If there is no facet, or the facets are smaller than one patch.
+    """
+    if len(facets) == 0:
+        raise SpecError("the load region holds nodes but no facet of the surface, so no traction can act on it.")
+    positions, areas, values = _surface_points(mesh, facets, sqrt(area_m2 / POINTS_PER_PATCH))
+    if area_m2 > areas.sum() * (1 + 1e-12):
+        raise SpecError(f"`patch_area_m2` must be in (0, {areas.sum():.6g}], the area of the load region; got {area_m2}.")
+    nearness = sqrt(area_m2) * 1e-9
+    shares = sp.lil_array((len(centres), len(areas)))
+    for row, node in enumerate(centres):
+        distance = np.round(np.linalg.norm(positions - mesh.points[node], axis=1) / nearness)
+        order = np.argsort(distance, kind="stable")
+        # Points at the same distance enter together, each with the same fraction, so that a symmetric patch stays so.
+        ends = np.flatnonzero(np.append(np.diff(distance[order]) > 0, True))
+        filled = np.cumsum(areas[order])[ends]
+        last = min(int(np.searchsorted(filled, area_m2)), len(ends) - 1)
+        first_of_last = ends[last - 1] + 1 if last else 0
+        before = filled[last - 1] if last else 0.0
+        whole, partial = order[:first_of_last], order[first_of_last : ends[last] + 1]
+        shares[row, whole] = areas[whole]
+        shares[row, partial] = areas[partial] * (area_m2 - before) / (filled[last] - before)
+    weights = sp.csr_array(shares.tocsr() @ values)
+    return sp.csr_array(weights.multiply(1.0 / weights.sum(axis=1)[:, None]))

@@ -1,0 +1,77 @@
+"""A scene: mesh, material, supports, load patches and needs; what every method is given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from mor_bench.scene.loads import patch_weights
+from mor_bench.scene.materials import SaintVenantKirchhoff
+from mor_bench.scene.mesh import Mesh, box_mesh
+from mor_bench.scene.regions import region_facets, region_nodes
+from mor_bench.specs import DatasetSpec, load_dataset_spec
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is simulated.
+
+    Attributes
+    ----------
+    spec : DatasetSpec
+        The validated dataset file.
+    mesh : Mesh
+    material : SaintVenantKirchhoff
+    fixed_nodes : (n_fixed,) int64
+        Nodes with u = 0.
+    """
+
+    spec: DatasetSpec
+    mesh: Mesh
+    material: SaintVenantKirchhoff
+    fixed_nodes: NDArray[np.int64]
+
+    @property
+    def name(self) -> str:
+        return self.spec.name
+
+    @cached_property
+    def free_dofs(self) -> NDArray[np.int64]:
+        """(n_free,) dof = 3 * node + axis, without those of fixed nodes."""
+        fixed = (3 * self.fixed_nodes[:, None] + np.arange(3)).ravel()
+        return np.setdiff1d(np.arange(self.mesh.n_dofs), fixed)
+
+    @cached_property
+    def patch_nodes(self) -> NDArray[np.int64]:
+        """(n_patches,) the node at the centre of each load patch; the patch's number is the load-region id."""
+        return region_nodes(self.mesh, self.spec.loads.region)
+
+    @cached_property
+    def patch_weights(self) -> sp.csr_array:
+        """(n_patches, n_nodes) nodal weights of a force on each patch; rows sum to 1."""
+        facets = region_facets(self.mesh, self.patch_nodes)
+        return patch_weights(self.mesh, self.patch_nodes, facets, self.spec.loads.patch_area_m2)
+
+
+def load_scene(source: str | Path | Mapping[str, Any] | DatasetSpec) -> Scene:
+    """Build a scene from a dataset's name, the path of a TOML, a dict with the same keys, or a validated spec.
+
+    Raises
+    ------
+    SpecError
+        If the dataset is unknown or not valid, or a region of it is empty.
+    """
+    spec = source if isinstance(source, DatasetSpec) else load_dataset_spec(source)
+    mesh = box_mesh(spec.geometry.size_m, spec.geometry.cells)
+    material = SaintVenantKirchhoff(spec.material.young_pa, spec.material.poisson)
+    fixed = np.unique(np.concatenate([region_nodes(mesh, support.region) for support in spec.supports]))
+    scene = Scene(spec, mesh, material, fixed)
+    _ = scene.patch_weights  # an empty load region is an error of the dataset: raised here, not at the first solve
+    return scene

@@ -1,0 +1,155 @@
+"""Generation of a dataset by the full-order model, in parallel, stopped and resumed at any moment."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, as_completed
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+
+from mor_bench.errors import InvertedElementError, NoEquilibriumError, StoreError
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.scene.scene import load_scene
+from mor_bench.snapshots.sampling import draw_loads
+from mor_bench.snapshots.store import SCHEMA_VERSION, STATUSES, Shard, read_shard, write_atomically, write_shard
+from mor_bench.specs import DatasetSpec
+
+SHARD_SIZE = 100
+"""Samples per shard."""
+
+GENERATOR_VERSION = 1
+"""Raised when a change of the full-order model or of the sampling changes samples; part of a dataset's folder name."""
+
+Progress = Callable[[int, int], None]
+"""Called with the samples done and the samples wanted."""
+
+
+def default_cache() -> Path:
+    """The user's cache folder for datasets."""
+    return Path(platformdirs.user_cache_dir("mor-bench"))
+
+
+def dataset_folder(spec: DatasetSpec, cache: Path | None) -> Path:
+    """Where a dataset lies: its name, and a digest of all that decides its samples."""
+    return (cache or default_cache()) / "datasets" / f"{spec.name}-{spec.digest()}-v{SCHEMA_VERSION}.{GENERATOR_VERSION}"
+
+
+def shard_path(folder: Path, number: int) -> Path:
+    return folder / f"shard-{number:05d}.h5"
+
+
+def n_samples_of(spec: DatasetSpec, limit: int | None = None) -> int:
+    """How many samples a dataset has, or the limit if that is less."""
+    whole = len(load_scene(spec).patch_nodes) * spec.loads.samples_per_patch
+    return whole if limit is None else min(limit, whole)
+
+
+@lru_cache(maxsize=1)
+def _model(spec_json: str) -> FullOrderModel:
+    """A worker builds the model once and keeps it for its later shards."""
+    return FullOrderModel(load_scene(DatasetSpec.model_validate_json(spec_json)))
+
+
+def solve_shard(spec_json: str, number: int) -> Shard:
+    """Solve the samples of one shard; runs in a worker, on one thread."""
+    from threadpoolctl import threadpool_limits
+
+    model = _model(spec_json)
+    scene = model.scene
+    total = len(scene.patch_nodes) * scene.spec.loads.samples_per_patch
+    start = number * SHARD_SIZE
+    loads = draw_loads(scene.spec.loads, len(scene.patch_nodes), start, min(start + SHARD_SIZE, total))
+    forces = loads.nodal_forces(scene.patch_weights).reshape(len(loads), -1)[:, scene.free_dofs]
+    displacements = np.full((len(loads), model.n_unknowns), np.nan)
+    min_det_f, status = np.full(len(loads), np.nan), np.zeros(len(loads), dtype=np.uint8)
+    with threadpool_limits(1):
+        for row, force in enumerate(forces):
+            try:
+                solution = model.solve(force)
+            except InvertedElementError:
+                status[row] = STATUSES.index("inverted")
+            except NoEquilibriumError:
+                status[row] = STATUSES.index("no-equilibrium")
+            else:
+                displacements[row], min_det_f[row] = solution.displacement, solution.min_det_f
+    return Shard(start, loads.patches, loads.vectors, displacements, min_det_f, status)
+
+
+def _is_sound(path: Path) -> bool:
+    try:
+        read_shard(path)
+    except (StoreError, FileNotFoundError):
+        return False
+    return True
+
+
+@contextmanager
+def worker_pool(workers: int) -> Iterator[Executor]:
+    """Worker processes that need no `if __name__ == "__main__"` in the caller's script, and end with their parent."""
+    from loky import ProcessPoolExecutor
+
+    executor = ProcessPoolExecutor(max_workers=workers, timeout=60)
+    try:
+        yield executor
+    except BaseException:
+        executor.shutdown(kill_workers=True)
+        raise
+    executor.shutdown()
+
+
+def generate(
+    spec: DatasetSpec, limit: int | None = None, workers: int = 1, cache: Path | None = None, progress: Progress | None = None
+) -> Path:  # fmt: skip
+    """Make sure that the shards of a dataset exist; what is there and sound is kept, what is damaged is made again.
+
+    Parameters
+    ----------
+    spec : DatasetSpec
+    limit : int, optional
+        Only the first samples.
+    workers : int
+        Processes; 1 solves in this one.
+    cache : Path, optional
+        Cache folder; the user's by default.
+    progress : callable, optional
+        Called with (samples done, samples wanted) after each shard.
+
+    Returns
+    -------
+    Path
+        The dataset's folder.
+    """
+    folder = dataset_folder(spec, cache)
+    folder.mkdir(parents=True, exist_ok=True)
+    total = n_samples_of(spec, limit)
+    numbers = range(-(-total // SHARD_SIZE))
+    manifest = {"schema_version": SCHEMA_VERSION, "generator_version": GENERATOR_VERSION, "shard_size": SHARD_SIZE, "spec": spec.model_dump(mode="json")}
+    write_atomically(folder / "manifest.json", json.dumps(manifest, indent=1, sort_keys=True).encode())
+    missing = [number for number in numbers if not _is_sound(shard_path(folder, number))]
+    done = total - len(missing) * SHARD_SIZE
+
+    def commit(number: int, shard: Shard) -> None:
+        nonlocal done
+        write_shard(shard_path(folder, number), shard)
+        done += SHARD_SIZE
+        if progress:
+            progress(min(max(done, 0), total), total)
+
+    text = spec.model_dump_json()
+    if missing:
+        # Compiles the kernels, or reads them from numba's cache, here rather than in every worker at once.
+        commit(missing[0], solve_shard(text, missing[0]))
+    if len(missing) > 1 and workers > 1:
+        with worker_pool(workers) as executor:
+            futures: dict[Future[Shard], int] = {executor.submit(solve_shard, text, number): number for number in missing[1:]}
+            for future in as_completed(futures):
+                commit(futures[future], future.result())
+    else:
+        for number in missing[1:]:
+            commit(number, solve_shard(text, number))
+    return folder

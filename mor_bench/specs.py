@@ -1,0 +1,344 @@
+"""Dataset and method files: TOML read into validated, frozen specs, with one-line errors; and where the suite lies."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import inspect
+import itertools
+import json
+import tomllib
+import types
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, field_validator, model_validator
+
+from mor_bench.errors import MissingDependencyError, SpecError
+
+_M = TypeVar("_M", bound=BaseModel)
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Triple = Annotated[tuple[Finite, Finite, Finite], Field(strict=False)]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class BoxGeometry(_Model):
+    """A box of H8 cells with its lowest corner at the origin."""
+
+    shape: Literal["box"]
+    size_m: Annotated[tuple[Positive, Positive, Positive], Field(strict=False)]
+    cells: Annotated[tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], Field(strict=False)]
+
+
+class Material(_Model):
+    """Saint Venant-Kirchhoff parameters."""
+
+    law: Literal["saint-venant-kirchhoff"]
+    young_pa: Positive
+    poisson: Annotated[float, Field(gt=-1, lt=0.5)]
+
+
+class BoxRegion(_Model):
+    """The nodes inside an axis-aligned box, from its lowest to its highest corner, m."""
+
+    box_m: Annotated[tuple[Triple, Triple], Field(strict=False)]
+
+
+class SphereRegion(_Model):
+    """The nodes inside a sphere: centre and radius, m."""
+
+    sphere_m: Annotated[tuple[Triple, Positive], Field(strict=False)]
+
+
+NamedRegion = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max", "surface"]
+Region = NamedRegion | BoxRegion | SphereRegion
+
+
+class Support(_Model):
+    """A region whose nodes do not move."""
+
+    region: Region
+
+
+class Loads(_Model):
+    """Forces on patches of the surface, and how they are drawn."""
+
+    region: Region
+    kind: Literal["force"]
+    patch_area_m2: Positive
+    simultaneous: Literal[1] = 1
+    samples_per_patch: Annotated[int, Field(ge=1)]
+    magnitude_n: Annotated[
+        tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], Annotated[float, Field(gt=0, allow_inf_nan=False)]],
+        Field(strict=False),
+    ]
+    sampling: Literal["random"] = "random"
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @field_validator("magnitude_n")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[0] > value[1]:
+            raise ValueError("the lower bound must not exceed the upper one")
+        return value
+
+
+SplitBy = Literal["region", "sample"]
+
+
+class Split(_Model):
+    """Which samples are kept for the test."""
+
+    test_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    by: SplitBy = "region"
+
+
+class Needs(_Model):
+    """What the scene's user wants."""
+
+    outputs: Literal["all"] = "all"
+    error: Positive
+    latency_ms: Positive
+
+
+class DatasetSpec(_Model):
+    """A dataset file."""
+
+    name: str
+    title: str
+    source: str
+    geometry: BoxGeometry
+    material: Material
+    supports: Annotated[tuple[Support, ...], Field(strict=False)] = ()
+    loads: Loads
+    split: Split = Split()
+    needs: Needs
+
+    def physics(self) -> dict[str, Any]:
+        """All that decides the samples: two datasets with equal physics have equal snapshots."""
+        return self.model_dump(mode="json", include={"geometry", "material", "supports", "loads"})
+
+    def digest(self) -> str:
+        """Twelve hexadecimal digits of SHA-256 over `physics`."""
+        return hashlib.sha256(json.dumps(self.physics(), sort_keys=True).encode()).hexdigest()[:12]
+
+
+class Profile(_Model):
+    """What a profile changes: parameters replaced, swept values replaced."""
+
+    parameters: dict[str, Any] = {}
+    sweep: dict[str, list[Any]] = {}
+
+
+class MethodSpec(_Model):
+    """A method file. `limits` says in plain words where the method fails."""
+
+    name: str
+    title: str
+    surrogate: str
+    source: str
+    limits: str = ""
+    parameters: dict[str, Any] = {}
+    sweep: dict[str, list[Any]] = {}
+    profiles: dict[Literal["quick", "full"], Profile] = {}
+
+    @field_validator("surrogate")
+    @classmethod
+    def _importable(cls, value: str) -> str:
+        module, _, name = value.partition(":")
+        if not module or not name:
+            raise ValueError("it must read `package.module:Class`")
+        return value
+
+    @model_validator(mode="after")
+    def _no_empty_sweep(self) -> MethodSpec:
+        for sweep in (self.sweep, *(profile.sweep for profile in self.profiles.values())):
+            for key, values in sweep.items():
+                if not values:
+                    raise ValueError(f"the sweep of `{key}` is empty")
+        return self
+
+    def load_class(self) -> type[Any]:
+        """Import the surrogate's class."""
+        return load_class(self.surrogate)
+
+    def parameters_of(self, profile: str) -> dict[str, Any]:
+        """The file's parameters with the profile's on top, swept ones not included."""
+        chosen = self.profiles.get(profile, Profile())  # type: ignore[call-overload]
+        return {**self.parameters, **chosen.parameters}
+
+    def configurations(self, profile: str) -> list[dict[str, Any]]:
+        """The parameters of every swept configuration, first key slowest."""
+        chosen = self.profiles.get(profile, Profile())  # type: ignore[call-overload]
+        sweep = chosen.sweep or self.sweep
+        rows = itertools.product(*sweep.values())
+        return [{**self.parameters_of(profile), **dict(zip(sweep, row, strict=True))} for row in rows]
+
+
+def load_class(target: str) -> type[Any]:
+    """Import ``package.module:Class``.
+
+    Raises
+    ------
+    MissingDependencyError
+        If an optional dependency is not installed; the message names the extra.
+    SpecError
+        If the module or the class does not exist.
+    """
+    module, _, name = target.partition(":")
+    try:
+        loaded = import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name == "torch":
+            raise MissingDependencyError(f"{target} needs torch: pip install 'mor-bench[learn]'") from error
+        raise SpecError(f"surrogate {target!r} cannot be imported: {error}") from error
+    if not hasattr(loaded, name):
+        raise SpecError(f"surrogate {target!r}: module {module!r} has no class {name!r}{_nearest(name, dir(loaded))}.")
+    found = getattr(loaded, name)
+    if not isinstance(found, type):
+        raise SpecError(f"surrogate {target!r} is not a class.")
+    return found
+
+
+def _nearest(name: str, valid: Any) -> str:
+    close = difflib.get_close_matches(name, list(valid), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _models_within(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models that an annotation mentions, however nested."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    elif get_origin(annotation) in (Annotated, Union, types.UnionType, tuple, list, dict):
+        for part in get_args(annotation):
+            yield from _models_within(part)
+
+
+def _valid_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    """The keys that the table at a location may hold."""
+    models = [model]
+    for step in location:
+        fields = [m.model_fields[step].annotation for m in models if isinstance(step, str) and step in m.model_fields]
+        if fields:
+            models = [found for field in fields for found in _models_within(field)]
+    return sorted({key for m in models for key in m.model_fields if key != "name"})
+
+
+def _one_line(error: ValidationError, model: type[BaseModel], where: str) -> str:
+    """The first problem of a validation, as one line: file, key, what is allowed, what came."""
+    problems = error.errors(include_url=False)
+    unknown = [p for p in problems if p["type"] == "extra_forbidden"]
+    problem = (unknown or problems)[0]
+    shown = [s for s in problem["loc"] if isinstance(s, int) or not (s in ("BoxRegion", "SphereRegion") or s.startswith("literal["))]
+    key = "".join(f"[{s}]" if isinstance(s, int) else f".{s}" for s in shown).lstrip(".")
+    if problem["type"] == "extra_forbidden":
+        valid = _valid_keys(model, problem["loc"][:-1])
+        return f"{where}: unknown key `{key}`{_nearest(str(shown[-1]), valid)} Allowed here: {', '.join(valid)}.".replace("?.", "?")
+    if problem["type"] == "missing":
+        return f"{where}: key `{key}` is missing."
+    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    came = "" if problem["type"] == "value_error" and not key else f"; got {problem['input']!r}"
+    return f"{where}: `{key}` must be {message}{came}." if problem["msg"].startswith("Input should") else f"{where}: `{key}`: {message}{came}."
+
+
+def _validated(model: type[_M], content: Mapping[str, Any], where: str) -> _M:
+    try:
+        return model.model_validate(dict(content))
+    except ValidationError as error:
+        raise SpecError(_one_line(error, model, where)) from None
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise SpecError(f"{path}: no such file.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SpecError(f"{path}: not valid TOML: {error}") from None
+
+
+def find_suite(suite: Path | None = None) -> Path:
+    """The folder that holds ``datasets/`` and ``methods/``: the one given, the installed one, or the checkout's.
+
+    Raises
+    ------
+    SpecError
+        If the folder has neither.
+    """
+    package = Path(__file__).parent
+    places = [suite] if suite is not None else [package / "suite", package.parent]
+    for place in places:
+        if (place / "datasets").is_dir() or (place / "methods").is_dir():
+            return place
+    raise SpecError(f"{places[0]}: a suite must hold a folder `datasets` or `methods`.")
+
+
+def list_suite(kind: Literal["datasets", "methods"], suite: Path | None = None) -> dict[str, Path]:
+    """Names and files of the suite's datasets or methods, sorted by name."""
+    return {path.stem: path for path in sorted((find_suite(suite) / kind).glob("*.toml"))}
+
+
+def _resolve(kind: Literal["datasets", "methods"], source: str | Path, suite: Path | None) -> Path:
+    if isinstance(source, Path) or source.endswith(".toml"):
+        return Path(source)
+    known = list_suite(kind, suite)
+    if source not in known and suite is not None:
+        known = {**list_suite(kind), **known}
+    if source not in known:
+        raise SpecError(f"unknown {kind[:-1]} {source!r}{_nearest(source, known)} Known: {', '.join(known)}.".replace("?.", "?"))
+    return known[source]
+
+
+def load_dataset_spec(source: str | Path | Mapping[str, Any], suite: Path | None = None) -> DatasetSpec:
+    """Read and validate a dataset: a name in the suite, the path of a TOML, or a dict with the same keys."""
+    if isinstance(source, Mapping):
+        content = {"name": "scene", **source}
+        return _validated(DatasetSpec, {"title": content["name"], "source": "", **content}, "scene")
+    path = _resolve("datasets", source, suite)
+    return _validated(DatasetSpec, {**_read_toml(path), "name": path.stem}, str(path))
+
+
+def load_method_spec(source: str | Path, suite: Path | None = None) -> MethodSpec:
+    """Read and validate a method: a name in the suite or the path of a TOML."""
+    path = _resolve("methods", source, suite)
+    return _validated(MethodSpec, {**_read_toml(path), "name": path.stem}, str(path))
+
+
+def check_parameters(surrogate: type[Any], parameters: Mapping[str, Any], where: str | None = None) -> dict[str, Any]:
+    """Check knobs against the annotations of a surrogate's ``__init__`` and fill in its defaults.
+
+    The annotations may carry pydantic's `Field` constraints, e.g. ``Annotated[int, Field(ge=1)]``.
+
+    Raises
+    ------
+    SpecError
+        If a knob is unknown, of the wrong type, or out of range.
+    """
+    if surrogate.__init__ is object.__init__:
+        fields: dict[str, Any] = {}
+    else:
+        hints = get_type_hints(surrogate.__init__, include_extras=True)
+        knobs = list(inspect.signature(surrogate.__init__).parameters.values())[1:]
+        fields = {knob.name: (hints.get(knob.name, Any), ... if knob.default is knob.empty else knob.default) for knob in knobs}
+    model = create_model(surrogate.__name__, __config__=ConfigDict(extra="forbid", strict=True), **fields)
+    return _validated(model, parameters, where or surrogate.__name__).model_dump()
+
+
+def check_method(spec: MethodSpec) -> None:
+    """Check every configuration of a method, in both profiles, against its class.
+
+    Raises
+    ------
+    SpecError, MissingDependencyError
+    """
+    surrogate = spec.load_class()
+    for profile in ("quick", "full"):
+        for configuration in spec.configurations(profile):
+            check_parameters(surrogate, configuration, f"methods/{spec.name}.toml")

@@ -1,0 +1,203 @@
+"""The interface that every method implements, and how methods are made by name, saved and loaded."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mor_bench.errors import InvalidInputError, MorBenchError, NotFittedError, StoreError, UnsupportedSceneError
+from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.store import write_atomically
+from mor_bench.specs import check_parameters, list_suite, load_class, load_method_spec
+
+SCHEMA_VERSION = 1
+
+
+class Surrogate(ABC):
+    """A map from nodal forces to nodal displacements of one scene.
+
+    A subclass stores its knobs in ``__init__`` under their own names and nothing else, annotates them (pydantic `Field`
+    constraints give their range), begins `fit` with `_begin_fit`, and `predict` with `_checked_forces`. What it learns
+    ends in an underscore.
+    """
+
+    scene_: Scene
+
+    @abstractmethod
+    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
+        """Learn from snapshots, forgetting earlier fits.
+
+        Parameters
+        ----------
+        scene : Scene
+        snapshots : Snapshots or None
+            Training samples; None for methods that need none.
+
+        Returns
+        -------
+        self
+        """
+
+    @abstractmethod
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+        """Displacements under nodal forces.
+
+        Parameters
+        ----------
+        forces : (n_nodes, 3) or (n, n_nodes, 3)
+            Nodal forces, N.
+
+        Returns
+        -------
+        array of the same shape, float64
+            Nodal displacements, m, on the host.
+
+        Raises
+        ------
+        InvalidInputError
+            On a wrong shape or dtype, NaN or infinity.
+        NotFittedError
+            Before `fit`.
+        SolverError
+            If a method that solves equations finds no valid equilibrium.
+        """
+
+    def supports(self, scene: Scene) -> str | None:
+        """None, or the reason why the method cannot handle a scene."""
+        return None
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The knobs and their values."""
+        return {name: getattr(self, name) for name in list(inspect.signature(type(self).__init__).parameters)[1:]}
+
+    def save(self, path: str | Path) -> None:
+        """Write the fitted model to one safetensors file: arrays, and a JSON header with class, knobs and scene.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+        """
+        from safetensors.numpy import save as serialise
+
+        if not hasattr(self, "scene_"):
+            raise NotFittedError(f"{type(self).__name__} must be fitted before it is saved.")
+        header = {
+            "format": "mor-bench surrogate",
+            "schema_version": str(SCHEMA_VERSION),
+            "surrogate": f"{type(self).__module__}:{type(self).__qualname__}",
+            "parameters": json.dumps(self.parameters),
+            "scene": self.scene_.spec.model_dump_json(),
+        }
+        arrays = {name: np.ascontiguousarray(array) for name, array in self._state().items()}
+        write_atomically(Path(path), serialise(arrays, metadata=header))
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        """The arrays that make up a fitted model."""
+        raise MorBenchError(f"{type(self).__name__} does not support saving.")
+
+    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Become fitted from the arrays of `_state`; ``scene_`` is already set."""
+        raise MorBenchError(f"{type(self).__name__} does not support loading.")
+
+    def _begin_fit(self, scene: Scene) -> None:
+        """Check the knobs and the scene; the first line of every `fit`."""
+        check_parameters(type(self), self.parameters)
+        reason = self.supports(scene)
+        if reason is not None:
+            raise UnsupportedSceneError(f"{type(self).__name__} cannot handle {scene.name}: {reason}")
+        self.scene_ = scene
+
+    def _checked_snapshots(self, snapshots: Snapshots | None) -> Snapshots:
+        """The training samples, which this method cannot do without."""
+        if snapshots is None or len(snapshots) == 0:
+            raise InvalidInputError(f"{type(self).__name__} needs at least one training sample; got none.")
+        if not np.isfinite(snapshots.free_displacements).all() or not np.isfinite(snapshots.loads.vectors).all():
+            raise InvalidInputError("the training snapshots hold NaN or infinity.")
+        return snapshots
+
+    def _checked_forces(self, forces: ArrayLike) -> NDArray[np.float64]:
+        """Forces as (n, n_nodes, 3) float64; the first line of every `predict`."""
+        if not hasattr(self, "scene_"):
+            raise NotFittedError(f"{type(self).__name__} must be fitted before it predicts.")
+        array = np.asarray(forces)
+        n_nodes = self.scene_.mesh.n_nodes
+        if array.dtype.kind not in "fiu":
+            raise InvalidInputError(f"`forces` must hold real numbers; got dtype {array.dtype}.")
+        if array.ndim not in (2, 3) or array.shape[-2:] != (n_nodes, 3):
+            raise InvalidInputError(f"`forces` must have shape ({n_nodes}, 3) or (n, {n_nodes}, 3); got {array.shape}.")
+        if not np.isfinite(array).all():
+            raise InvalidInputError("`forces` must be finite; got NaN or infinity.")
+        return array.astype(np.float64, copy=False).reshape(-1, n_nodes, 3)
+
+
+def load_method(source: str | Path, **parameters: Any) -> Surrogate:
+    """Make an unfitted method.
+
+    Parameters
+    ----------
+    source : str or Path
+        A name in ``methods/``, or the path of a TOML.
+    **parameters
+        Replace the file's parameters.
+
+    Raises
+    ------
+    SpecError
+        If the method is unknown, or a parameter is unknown, of the wrong type or out of range.
+    MissingDependencyError
+        If the method needs an extra that is not installed.
+    """
+    spec = load_method_spec(source)
+    surrogate = spec.load_class()
+    return make_surrogate(surrogate, {**spec.parameters, **parameters})
+
+
+def make_surrogate(surrogate: type[Any], parameters: dict[str, Any]) -> Surrogate:
+    """Check the knobs and construct."""
+    if not issubclass(surrogate, Surrogate):
+        raise MorBenchError(f"{surrogate.__module__}:{surrogate.__name__} is not a subclass of mor_bench.Surrogate.")
+    return surrogate(**check_parameters(surrogate, parameters))
+
+
+def load_surrogate(path: str | Path) -> Surrogate:
+    """Read a fitted model written by `Surrogate.save`.
+
+    Only a class that a method of the suite names is ever imported: a file cannot make this run code of its own.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing, damaged, foreign or of a newer schema, or names a class that no method names.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(str(path), framework="numpy") as file:
+            header = file.metadata() or {}
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    except (SafetensorError, OSError, ValueError) as error:
+        raise StoreError(f"{path}: not a readable safetensors file: {error}") from None
+    if header.get("format") != "mor-bench surrogate":
+        raise StoreError(f"{path}: not a surrogate of mor-bench.")
+    if header.get("schema_version") != str(SCHEMA_VERSION):
+        raise StoreError(f"{path}: schema version {header.get('schema_version')}; this version of mor-bench reads version {SCHEMA_VERSION}.")
+    known = {load_method_spec(file).surrogate for file in list_suite("methods").values()}
+    if header.get("surrogate") not in known:
+        raise StoreError(f"{path}: class {header.get('surrogate')!r} is not named by any method of the suite.")
+    try:
+        method = make_surrogate(load_class(header["surrogate"]), json.loads(header["parameters"]))
+        scene_content = json.loads(header["scene"])
+        method.scene_ = load_scene(scene_content)
+        method._restore(state)
+    except (KeyError, ValueError, IndexError) as error:
+        raise StoreError(f"{path}: damaged: {error}") from None
+    return method
