@@ -174,12 +174,17 @@ class MethodSpec(_Model):
         chosen = self.profiles.get(profile, Profile())  # type: ignore[call-overload]
         return {**self.parameters, **chosen.parameters}
 
+    def _sweep_of(self, profile: str) -> dict[str, list[Any]]:
+        return self.profiles.get(profile, Profile()).sweep or self.sweep  # type: ignore[call-overload]
+
+    def swept_keys(self, profile: str) -> list[str]:
+        """The parameters that the profile's sweep, or else the file's, varies."""
+        return list(self._sweep_of(profile))
+
     def configurations(self, profile: str) -> list[dict[str, Any]]:
         """The parameters of every swept configuration, first key slowest."""
-        chosen = self.profiles.get(profile, Profile())  # type: ignore[call-overload]
-        sweep = chosen.sweep or self.sweep
-        rows = itertools.product(*sweep.values())
-        return [{**self.parameters_of(profile), **dict(zip(sweep, row, strict=True))} for row in rows]
+        sweep = self._sweep_of(profile)
+        return [{**self.parameters_of(profile), **dict(zip(sweep, row, strict=True))} for row in itertools.product(*sweep.values())]
 
 
 def load_class(target: str) -> type[Any]:
@@ -200,7 +205,7 @@ def load_class(target: str) -> type[Any]:
             raise MissingDependencyError(f"{target} needs torch: pip install 'mor-bench[learn]'") from error
         raise SpecError(f"surrogate {target!r} cannot be imported: {error}") from error
     if not hasattr(loaded, name):
-        raise SpecError(f"surrogate {target!r}: module {module!r} has no class {name!r}{_nearest(name, dir(loaded))}.")
+        raise SpecError(f"surrogate {target!r}: module {module!r} has no class {name!r}{_nearest(name, dir(loaded))}")
     found = getattr(loaded, name)
     if not isinstance(found, type):
         raise SpecError(f"surrogate {target!r} is not a class.")
@@ -209,7 +214,7 @@ def load_class(target: str) -> type[Any]:
 
 def _nearest(name: str, valid: Any) -> str:
     close = difflib.get_close_matches(name, list(valid), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    return f"; did you mean {close[0]!r}?" if close else "."
 
 
 def _models_within(annotation: Any) -> Iterator[type[BaseModel]]:
@@ -240,7 +245,7 @@ def _one_line(error: ValidationError, model: type[BaseModel], where: str) -> str
     key = "".join(f"[{s}]" if isinstance(s, int) else f".{s}" for s in shown).lstrip(".")
     if problem["type"] == "extra_forbidden":
         valid = _valid_keys(model, problem["loc"][:-1])
-        return f"{where}: unknown key `{key}`{_nearest(str(shown[-1]), valid)} Allowed here: {', '.join(valid)}.".replace("?.", "?")
+        return f"{where}: unknown key `{key}`{_nearest(str(shown[-1]), valid)} Allowed here: {', '.join(valid)}."
     if problem["type"] == "missing":
         return f"{where}: key `{key}` is missing."
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
@@ -292,7 +297,7 @@ def _resolve(kind: Literal["datasets", "methods"], source: str | Path, suite: Pa
     if source not in known and suite is not None:
         known = {**list_suite(kind), **known}
     if source not in known:
-        raise SpecError(f"unknown {kind[:-1]} {source!r}{_nearest(source, known)} Known: {', '.join(known)}.".replace("?.", "?"))
+        raise SpecError(f"unknown {kind[:-1]} {source!r}{_nearest(source, known)} Known: {', '.join(known)}.")
     return known[source]
 
 
@@ -303,6 +308,11 @@ def load_dataset_spec(source: str | Path | Mapping[str, Any], suite: Path | None
         return _validated(DatasetSpec, {"title": content["name"], "source": "", **content}, "scene")
     path = _resolve("datasets", source, suite)
     return _validated(DatasetSpec, {**_read_toml(path), "name": path.stem}, str(path))
+
+
+def is_method_file(path: Path) -> bool:
+    """Whether a TOML describes a method, which names a `surrogate`, rather than a dataset."""
+    return "surrogate" in _read_toml(path) or path.resolve().parent.name == "methods"
 
 
 def load_method_spec(source: str | Path, suite: Path | None = None) -> MethodSpec:
@@ -341,4 +351,4 @@ def check_method(spec: MethodSpec) -> None:
     surrogate = spec.load_class()
     for profile in ("quick", "full"):
         for configuration in spec.configurations(profile):
-            check_parameters(surrogate, configuration, f"methods/{spec.name}.toml")
+            check_parameters(surrogate, configuration, f"method {spec.name} ({profile})")

@@ -48,7 +48,9 @@ def shape_gradients(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tu
     weights = np.linalg.det(jacobian)
     if not np.all(weights > 0):
         cell, point = np.argwhere(~(weights > 0))[0]
-        raise InvalidInputError(f"cell {cell} is inverted or degenerate: det J must be > 0 m³; got {weights[cell, point]:.3g} at Gauss point {point}.")
+        raise InvalidInputError(
+            f"cell {cell} is inverted or degenerate: det J must be > 0 m³; got {weights[cell, point]:.3g} at Gauss point {point}."
+        )
     gradients = np.einsum("qai,cqik->cqak", d_reference, np.linalg.inv(jacobian))
     return gradients, weights
 

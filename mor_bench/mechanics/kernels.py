@@ -86,7 +86,11 @@ def _nodal_force(P, g, f_e):
     for a in range(8):
         for i in range(3):
             for l in range(LANES):
-                f_e[(3 * a + i) * LANES + l] += P[(3 * i) * LANES + l] * g[(3 * a) * LANES + l] + P[(3 * i + 1) * LANES + l] * g[(3 * a + 1) * LANES + l] + P[(3 * i + 2) * LANES + l] * g[(3 * a + 2) * LANES + l]
+                f_e[(3 * a + i) * LANES + l] += (
+                    P[(3 * i) * LANES + l] * g[(3 * a) * LANES + l]
+                    + P[(3 * i + 1) * LANES + l] * g[(3 * a + 1) * LANES + l]
+                    + P[(3 * i + 2) * LANES + l] * g[(3 * a + 2) * LANES + l]
+                )
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -129,7 +133,11 @@ def _add_blocks(g, h, h_lam, h_mu, t, M, k_e):
         for l in range(LANES):
             gg = g[x * LANES + l] * g[x * LANES + l] + g[y * LANES + l] * g[y * LANES + l] + g[z * LANES + l] * g[z * LANES + l]
             s = g[x * LANES + l] * t[x * LANES + l] + g[y * LANES + l] * t[y * LANES + l] + g[z * LANES + l] * t[z * LANES + l]
-            b0, b1, b2 = h_lam[x * LANES + l] + h_mu[x * LANES + l], h_lam[y * LANES + l] + h_mu[y * LANES + l], h_lam[z * LANES + l] + h_mu[z * LANES + l]
+            b0, b1, b2 = (
+                h_lam[x * LANES + l] + h_mu[x * LANES + l],
+                h_lam[y * LANES + l] + h_mu[y * LANES + l],
+                h_lam[z * LANES + l] + h_mu[z * LANES + l],
+            )
             block[l] += b0 * h[x * LANES + l] + gg * M[l] + s
             block[1 * LANES + l] += b0 * h[y * LANES + l] + gg * M[3 * LANES + l]
             block[2 * LANES + l] += b0 * h[z * LANES + l] + gg * M[4 * LANES + l]

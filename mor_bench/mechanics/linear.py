@@ -106,7 +106,7 @@ class SparseLU:
             raise NotPositiveDefiniteError from error
         if not np.all(lu.U.diagonal() > 0):
             raise NotPositiveDefiniteError
-        return lu  # type: ignore[no-any-return]
+        return lu
 
 
 def choose_solver(pattern: Pattern) -> LinearSolver:

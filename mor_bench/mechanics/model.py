@@ -43,13 +43,17 @@ class FullOrderModel:
     def __init__(self, scene: Scene) -> None:
         free = free_rigid_modes(scene)
         if free:
-            raise UnconstrainedBodyError(f"the supports of {scene.name} leave rigid motions free: {', '.join(free)}; fix at least three nodes not in line.")
+            raise UnconstrainedBodyError(
+                f"the supports of {scene.name} leave rigid motions free: {', '.join(free)}; fix at least three nodes not in line."
+            )
         mesh = scene.mesh
         self.scene = scene
         self.n_unknowns = len(scene.free_dofs)
-        dof_of_node = np.full(mesh.n_dofs, self.n_unknowns, dtype=np.int64)
-        dof_of_node[scene.free_dofs] = np.arange(self.n_unknowns)
-        self.assembler = Assembler(mesh.points, mesh.cells, dof_of_node.reshape(-1, 3), self.n_unknowns, scene.material)
+        number = np.full(mesh.n_dofs, self.n_unknowns, dtype=np.int64)
+        number[scene.free_dofs] = np.arange(self.n_unknowns)
+        dof_of_node = number.reshape(-1, 3)
+        self.cell_dofs = dof_of_node[mesh.cells].reshape(mesh.n_cells, 24)
+        self.assembler = Assembler(mesh.points, mesh.cells, dof_of_node, self.n_unknowns, scene.material)
         self._solver = choose_solver(self.assembler.pattern)
 
     @cached_property

@@ -208,5 +208,7 @@ def solve_equilibrium(
         if cuts > options.max_cuts:
             story = f"stopped at {reached:.4g} of the load after {iterations} iterations and {cuts} cut-backs"
             if attempt.min_det_f <= 0 or (first.converged and first.min_det_f <= 0):
-                raise InvertedElementError(f"elements invert: {story}; the largest det F <= 0 tried was {min(attempt.min_det_f, first.min_det_f):.3g}.")
+                raise InvertedElementError(
+                    f"elements invert: {story}; the largest det F <= 0 tried was {min(attempt.min_det_f, first.min_det_f):.3g}."
+                )
             raise NoEquilibriumError(f"no stable equilibrium: {story}.")

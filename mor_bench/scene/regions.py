@@ -36,7 +36,8 @@ def region_nodes(mesh: Mesh, region: Region) -> NDArray[np.int64]:
         bound = low if region.endswith("min") else high
         inside = np.abs(mesh.points[:, axis] - bound[axis]) <= near
     if not inside.any():
-        raise SpecError(f"region {region!r} holds no node of the mesh, whose bounds are {low.tolist()} to {high.tolist()} m.")
+        shown = region if isinstance(region, str) else region.model_dump()
+        raise SpecError(f"region {shown} holds no node of the mesh, whose bounds are {low.tolist()} to {high.tolist()} m.")
     return np.flatnonzero(inside)
 
 

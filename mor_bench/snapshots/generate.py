@@ -8,9 +8,11 @@ from concurrent.futures import Executor, Future, as_completed
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import platformdirs
+from threadpoolctl import threadpool_limits
 
 from mor_bench.errors import InvertedElementError, NoEquilibriumError, StoreError
 from mor_bench.mechanics.model import FullOrderModel
@@ -55,10 +57,8 @@ def _model(spec_json: str) -> FullOrderModel:
     return FullOrderModel(load_scene(DatasetSpec.model_validate_json(spec_json)))
 
 
-def solve_shard(spec_json: str, number: int) -> Shard:
-    """Solve the samples of one shard; runs in a worker, on one thread."""
-    from threadpoolctl import threadpool_limits
-
+def solve_shard(spec_json: str, number: int) -> tuple[Shard, float]:
+    """Solve the samples of one shard, on one thread; also the seconds that the solves took. Runs in a worker."""
     model = _model(spec_json)
     scene = model.scene
     total = len(scene.patch_nodes) * scene.spec.loads.samples_per_patch
@@ -68,6 +68,7 @@ def solve_shard(spec_json: str, number: int) -> Shard:
     displacements = np.full((len(loads), model.n_unknowns), np.nan)
     min_det_f, status = np.full(len(loads), np.nan), np.zeros(len(loads), dtype=np.uint8)
     with threadpool_limits(1):
+        begun = perf_counter()
         for row, force in enumerate(forces):
             try:
                 solution = model.solve(force)
@@ -77,7 +78,8 @@ def solve_shard(spec_json: str, number: int) -> Shard:
                 status[row] = STATUSES.index("no-equilibrium")
             else:
                 displacements[row], min_det_f[row] = solution.displacement, solution.min_det_f
-    return Shard(start, loads.patches, loads.vectors, displacements, min_det_f, status)
+        seconds = perf_counter() - begun
+    return Shard(start, loads.patches, loads.vectors, displacements, min_det_f, status), seconds
 
 
 def _is_sound(path: Path) -> bool:
@@ -128,14 +130,20 @@ def generate(
     folder.mkdir(parents=True, exist_ok=True)
     total = n_samples_of(spec, limit)
     numbers = range(-(-total // SHARD_SIZE))
-    manifest = {"schema_version": SCHEMA_VERSION, "generator_version": GENERATOR_VERSION, "shard_size": SHARD_SIZE, "spec": spec.model_dump(mode="json")}
+    manifest = {
+        "schema_version": SCHEMA_VERSION,
+        "generator_version": GENERATOR_VERSION,
+        "shard_size": SHARD_SIZE,
+        "spec": spec.model_dump(mode="json"),
+    }
     write_atomically(folder / "manifest.json", json.dumps(manifest, indent=1, sort_keys=True).encode())
     missing = [number for number in numbers if not _is_sound(shard_path(folder, number))]
     done = total - len(missing) * SHARD_SIZE
 
-    def commit(number: int, shard: Shard) -> None:
+    def commit(number: int, shard: Shard, seconds: float) -> None:
         nonlocal done
         write_shard(shard_path(folder, number), shard)
+        write_atomically(folder / f"seconds-{number:05d}.txt", f"{seconds:.6f}\n".encode())
         done += SHARD_SIZE
         if progress:
             progress(min(max(done, 0), total), total)
@@ -143,13 +151,22 @@ def generate(
     text = spec.model_dump_json()
     if missing:
         # Compiles the kernels, or reads them from numba's cache, here rather than in every worker at once.
-        commit(missing[0], solve_shard(text, missing[0]))
+        commit(missing[0], *solve_shard(text, missing[0]))
     if len(missing) > 1 and workers > 1:
         with worker_pool(workers) as executor:
-            futures: dict[Future[Shard], int] = {executor.submit(solve_shard, text, number): number for number in missing[1:]}
+            futures: dict[Future[tuple[Shard, float]], int] = {executor.submit(solve_shard, text, number): number for number in missing[1:]}
             for future in as_completed(futures):
-                commit(futures[future], future.result())
+                commit(futures[future], *future.result())
     else:
         for number in missing[1:]:
-            commit(number, solve_shard(text, number))
+            commit(number, *solve_shard(text, number))
     return folder
+
+
+def generation_seconds(spec: DatasetSpec, cache: Path | None, n_samples: int) -> float | None:
+    """Core-seconds that the full-order model took for a number of samples, from the shards solved; None if unknown.
+
+    Kept beside the shards and not in them: a dataset generated twice is bit-identical, its timings are not.
+    """
+    times = [float(path.read_text()) for path in sorted(dataset_folder(spec, cache).glob("seconds-*.txt"))]
+    return sum(times) * n_samples / n_samples_of(spec, len(times) * SHARD_SIZE) if times else None

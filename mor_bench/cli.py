@@ -1,0 +1,224 @@
+"""The command line: every command is one call of a public function. Nothing heavy is imported before it is used."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from mor_bench.harness.run import Listener
+
+app = typer.Typer(
+    help="Compare model-order-reduction methods for hyperelastic solids: error at equal time, time at equal error.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+class ProfileName(StrEnum):
+    """Budgets and sweeps of the method files."""
+
+    quick = "quick"
+    full = "full"
+
+
+class SplitName(StrEnum):
+    """How training and test are parted."""
+
+    region = "region"
+    sample = "sample"
+
+
+Suite = Annotated[Path | None, typer.Option(help="Folder with datasets/ and methods/ to look in first.")]
+Cache = Annotated[Path | None, typer.Option(help="Folder for generated datasets. [default: the user's cache folder]")]
+Limit = Annotated[int | None, typer.Option(min=1, help="Only the first samples; they cover the load regions evenly.")]
+Workers = Annotated[int | None, typer.Option(min=1, help="Processes for data generation. [default: all cores]")]
+
+
+@contextmanager
+def _clear_errors() -> Iterator[None]:
+    """One line on standard error and exit code 2 for every error that has a name; 130 after an interrupt."""
+    from mor_bench.errors import MorBenchError
+
+    try:
+        yield
+    except MorBenchError as error:
+        typer.secho(f"mor-bench: {error}", fg="red", err=True)
+        raise typer.Exit(2) from None
+    except KeyboardInterrupt:
+        typer.secho("mor-bench: stopped; what was finished is kept, and the same command goes on from there.", fg="yellow", err=True)
+        raise typer.Exit(130) from None
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Listener]:
+    """A bar for generation and for the configurations, and a line for each finished one."""
+    from rich.markup import escape
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    from mor_bench.harness.run import Listener
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bars:
+        tasks: dict[str, Any] = {}
+
+        def generating(dataset: str, done: int, total: int) -> None:
+            if dataset not in tasks:
+                tasks[dataset] = bars.add_task(f"samples of {escape(dataset)}", total=total)
+            bars.update(tasks[dataset], completed=done, total=total)
+
+        def starting(dataset: str, label: str, number: int, total: int) -> None:
+            if "run" not in tasks:
+                tasks["run"] = bars.add_task("", total=total)
+            bars.update(tasks["run"], description=escape(f"{dataset}: {label}"), completed=number - 1)
+
+        def finished(row: dict[str, Any]) -> None:
+            if row["status"] == "ok":
+                error, latency = row["error"], row["latency_ms"]
+                text = f"ē {error['mean_dof_m']:.2e} m   rel. l2 {error['rel_l2_median']:.3%}   {latency['median']:.3g} ms"
+                text += f"   fit {row['offline_s']['fit']:.3g} s"
+            else:
+                text = f"{row['status']}: {row['reason']}"
+            bars.console.print(f"[bold]{escape(row['label']):<46}[/bold] {escape(text)}", highlight=False)
+
+        yield Listener(generating, starting, finished)
+
+
+@app.command()
+def run(
+    datasets: Annotated[list[str] | None, typer.Argument(help="Names or TOML files. [default: beam-coarse]", show_default=False)] = None,
+    method: Annotated[
+        list[str] | None, typer.Option("--method", "-m", help="Name or TOML file; repeat for more. [default: the five core methods]")
+    ] = None,
+    profile: Annotated[ProfileName, typer.Option(help="Budgets and sweeps of the method files.")] = ProfileName.quick,
+    split: Annotated[SplitName | None, typer.Option(help="Test on unseen load regions or on unseen samples. [default: as the dataset says]")] = None,
+    limit: Limit = None,
+    out: Annotated[Path | None, typer.Option(help="Where to write. [default: reports/runs/TIME-DATASETS]")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads for fitting and predicting. [default: all cores]")] = None,
+    workers: Workers = None,
+    cache: Cache = None,
+    suite: Suite = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print results.json to standard output and the rest to standard error.")] = False,
+) -> None:
+    """Fit, score and time methods on datasets; end with tables, figures and a report."""
+    with _clear_errors():
+        from rich.console import Console
+
+        import mor_bench
+        from mor_bench.harness.run import CORE_METHODS
+        from mor_bench.report import print_tables, render
+
+        console = Console(stderr=as_json)
+        with _progress(console) as listener:
+            comparison = mor_bench.run(
+                datasets or ["beam-coarse"], method or CORE_METHODS, profile.value, out, limit=limit, split=split.value if split else None,
+                threads=threads, workers=workers, cache=cache, suite=suite, listener=listener,
+            )  # fmt: skip
+        print_tables(comparison, console)
+        for path in render(comparison):
+            console.print(str(path), highlight=False, soft_wrap=True)
+        if as_json:
+            print((comparison.out / "results.json").read_text(encoding="utf-8"))
+
+
+@app.command(name="list")
+def list_(suite: Suite = None, as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False) -> None:
+    """List the datasets and methods of the suite."""
+    with _clear_errors():
+        from mor_bench.specs import list_suite, load_dataset_spec, load_method_spec
+
+        datasets = [{"name": name, "title": load_dataset_spec(path).title} for name, path in list_suite("datasets", suite).items()]
+        methods = [{"name": name, "title": load_method_spec(path).title} for name, path in list_suite("methods", suite).items()]
+        if as_json:
+            print(json.dumps({"datasets": datasets, "methods": methods}, indent=1, ensure_ascii=False))
+            return
+        for heading, entries in (("Datasets", datasets), ("Methods", methods)):
+            print(heading)
+            for entry in entries:
+                print(f"  {entry['name']:<22} {entry['title']}")
+
+
+@app.command()
+def check(
+    files: Annotated[list[Path] | None, typer.Argument(help="Dataset or method files. [default: all of the suite]", show_default=False)] = None,
+    suite: Suite = None,
+) -> None:
+    """Validate dataset and method files, down to regions that must not be empty and parameters in range."""
+    with _clear_errors():
+        from mor_bench.errors import MissingDependencyError, MorBenchError
+        from mor_bench.harness.check import check_file
+        from mor_bench.specs import list_suite
+
+        paths = files or [*list_suite("datasets", suite).values(), *list_suite("methods", suite).values()]
+        problems = 0
+        for path in paths:
+            try:
+                print(f"{path}: {check_file(path)}")
+            except MissingDependencyError as error:
+                print(f"{path}: not checked in full: {error}")
+            except MorBenchError as error:
+                problems += 1
+                message = str(error)
+                typer.secho(message if message.startswith(str(path)) else f"{path}: {message}", fg="red", err=True)
+        if problems:
+            raise typer.Exit(2)
+
+
+@app.command()
+def generate(
+    dataset: Annotated[str, typer.Argument(help="Name or TOML file.")],
+    limit: Limit = None,
+    workers: Workers = None,
+    cache: Cache = None,
+    suite: Suite = None,
+) -> None:
+    """Generate a dataset's snapshots; stop and resume at any moment."""
+    with _clear_errors():
+        import os
+
+        from rich.console import Console
+
+        from mor_bench.snapshots.generate import generate as generate_shards
+        from mor_bench.specs import load_dataset_spec
+
+        spec = load_dataset_spec(dataset, suite)
+        with _progress(Console(stderr=True)) as listener:
+            folder = generate_shards(
+                spec, limit, workers or os.cpu_count() or 1, cache, lambda done, total: listener.generating(spec.name, done, total)
+            )
+        print(folder)
+
+
+@app.command()
+def report(out: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> None:
+    """Print the tables of a finished run and draw its figures and report again."""
+    with _clear_errors():
+        from rich.console import Console
+
+        import mor_bench
+        from mor_bench.report import print_tables, render
+
+        comparison = mor_bench.Comparison.read(out)
+        print_tables(comparison, Console())
+        for path in render(comparison):
+            print(path)
+
+
+@app.callback(invoke_without_command=True)
+def main(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
+    """Compare model-order-reduction methods for hyperelastic solids: error at equal time, time at equal error."""
+    if version:
+        from mor_bench import __version__
+
+        print(__version__)
+        sys.exit(0)

@@ -1,0 +1,31 @@
+"""Validation of one dataset or method file, without running it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mor_bench.scene.scene import load_scene
+from mor_bench.specs import check_method, is_method_file, load_dataset_spec, load_method_spec
+
+
+def check_file(path: Path) -> str:
+    """Validate a file and say what it describes.
+
+    A dataset's mesh, regions and patches are built; every configuration of a method is checked against its class.
+
+    Raises
+    ------
+    SpecError
+        The first problem, in one line.
+    MissingDependencyError
+        If the method's class needs an extra that is not installed.
+    """
+    if is_method_file(path):
+        method = load_method_spec(path)
+        check_method(method)
+        return f"method, {len(method.configurations('quick'))} quick and {len(method.configurations('full'))} full configurations"
+    spec = load_dataset_spec(path)
+    scene = load_scene(spec)
+    n_patches = len(scene.patch_nodes)
+    samples = n_patches * spec.loads.samples_per_patch
+    return f"dataset, {scene.mesh.n_cells} cells, {scene.mesh.n_nodes} nodes, {n_patches} load patches, {samples} samples"

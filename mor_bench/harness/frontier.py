@@ -1,0 +1,92 @@
+"""Time at error and error at time, from the swept configurations of each method.
+
+Between two adjacent non-dominated configurations the frontier is a straight line in log-log; beyond them it does not
+exist: nothing is extrapolated. Beside each interpolated figure stands the best real configuration that meets the target.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import exp, isfinite, log
+from typing import Any
+
+TARGET_ERRORS = (0.10, 0.03, 0.01, 0.003, 0.001)
+"""Relative l2, median over the test set."""
+
+TARGET_TIMES_MS = (0.1, 1.0, 3.0, 10.0, 33.0, 100.0)
+"""Latency of one query, median, ms."""
+
+EXACT = 1e-16
+"""An error of zero has no logarithm; it stands at the round-off of double precision."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """A configuration on the plane of latency and error."""
+
+    latency_ms: float
+    error: float
+    label: str
+
+
+def non_dominated(points: Sequence[Point]) -> list[Point]:
+    """The points that no other beats in one of latency and error without losing in the other, fastest first."""
+    front: list[Point] = []
+    for point in sorted(points, key=lambda p: (p.latency_ms, p.error)):
+        if isfinite(point.error) and (not front or point.error < front[-1].error):
+            front.append(point)
+    return front
+
+
+def _interpolate(x: float, x0: float, y0: float, x1: float, y1: float) -> float:
+    if x1 == x0:
+        return min(y0, y1)
+    share = (log(x) - log(x0)) / (log(x1) - log(x0))
+    return exp(log(y0) + share * (log(y1) - log(y0)))
+
+
+def time_at_error(points: Sequence[Point], target: float) -> dict[str, Any]:
+    """Latency at an error: interpolated, and that of the fastest real configuration that meets it.
+
+    When even the fastest configuration meets the target, its own latency stands for both; None means not reached.
+    """
+    front = non_dominated(points)
+    real = next((p for p in front if p.error <= target), None)
+    if real is None:
+        return {"latency_ms": None, "best": None}
+    before = front.index(real) - 1
+    latency = real.latency_ms
+    if before >= 0:
+        p = front[before]
+        latency = _interpolate(target, p.error, p.latency_ms, max(real.error, EXACT), real.latency_ms)
+    return {"latency_ms": latency, "best": {"label": real.label, "latency_ms": real.latency_ms, "error": real.error}}
+
+
+def error_at_time(points: Sequence[Point], target_ms: float) -> dict[str, Any]:
+    """Error at a latency: interpolated, and that of the most accurate real configuration that is fast enough."""
+    front = non_dominated(points)
+    within = [p for p in front if p.latency_ms <= target_ms]
+    if not within:
+        return {"error": None, "best": None}
+    real = within[-1]
+    error = real.error
+    if len(within) < len(front):
+        p = front[len(within)]
+        error = _interpolate(target_ms, real.latency_ms, max(real.error, EXACT), p.latency_ms, max(p.error, EXACT))
+    return {"error": error, "best": {"label": real.label, "latency_ms": real.latency_ms, "error": real.error}}
+
+
+def compare(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Both tables over all datasets and methods of results rows; a method without a usable row reaches nothing."""
+    at_error, at_time = [], []
+    for dataset, method in dict.fromkeys((row["dataset"], row["method"]) for row in rows):
+        points = [
+            Point(row["latency_ms"]["median"], row["error"]["rel_l2_median"], row["label"])
+            for row in rows
+            if (row["dataset"], row["method"]) == (dataset, method) and row["status"] == "ok"
+        ]
+        key = {"dataset": dataset, "method": method}
+        at_error += [{**key, "target_rel_l2_median": target, **time_at_error(points, target)} for target in TARGET_ERRORS]
+        at_time += [{**key, "target_latency_ms": target, **error_at_time(points, target)} for target in TARGET_TIMES_MS]
+    return {"time_at_error": at_error, "error_at_time": at_time}

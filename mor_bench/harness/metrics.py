@@ -1,0 +1,75 @@
+"""Errors of predictions against the reference, per sample, and their summary.
+
+A sample without a prediction (the method failed on it) has an infinite error: it counts as not reaching any target and
+is never dropped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class SampleErrors:
+    """Errors of each test sample, (n_test,) float64.
+
+    Attributes
+    ----------
+    mean_dof_m
+        The paper's e: mean over all degrees of freedom of the absolute error, m.
+    relative_l2
+        Norm of the error over norm of the reference, over the degrees of freedom of the sample.
+    max_nodal_m
+        Largest Euclidean nodal error, m.
+    amplitude_m
+        Largest nodal displacement of the reference, m.
+    """
+
+    mean_dof_m: NDArray[np.float64]
+    relative_l2: NDArray[np.float64]
+    max_nodal_m: NDArray[np.float64]
+    amplitude_m: NDArray[np.float64]
+
+
+def sample_errors(predicted: NDArray[np.float64], reference: NDArray[np.float64]) -> SampleErrors:
+    """Errors of predictions (n, n_nodes, 3) against references of the same shape, both in m.
+
+    NaN in a prediction means that there is none, and gives infinite errors.
+    """
+    difference = predicted - reference
+    norm = np.linalg.norm(reference, axis=(1, 2))
+    relative = np.linalg.norm(difference, axis=(1, 2)) / np.where(norm > 0, norm, 1.0)
+    mean = np.abs(difference).mean(axis=(1, 2))
+    largest = np.linalg.norm(difference, axis=2).max(axis=1)
+    finite = np.isfinite(mean)
+    return SampleErrors(
+        np.where(finite, mean, np.inf),
+        np.where(finite, relative, np.inf),
+        np.where(finite, largest, np.inf),
+        np.linalg.norm(reference, axis=2).max(axis=1),
+    )
+
+
+def summary(errors: SampleErrors) -> dict[str, float]:
+    """The figures of a results row.
+
+    `mean_dof_m` is the paper's ē, `std_dof_m` its σ(e) with M - 1, and `slope` that of the least-squares line through
+    the origin of e against the sample's largest displacement, as in the paper's figures.
+    """
+    e, relative = errors.mean_dof_m, errors.relative_l2
+    with np.errstate(invalid="ignore"):
+        spread = float(e.std(ddof=1)) if len(e) > 1 and np.isfinite(e).all() else float("nan" if len(e) < 2 else "inf")
+        slope = float(errors.amplitude_m @ e / (errors.amplitude_m @ errors.amplitude_m))
+    return {
+        "mean_dof_m": float(e.mean()),
+        "std_dof_m": spread,
+        "max_dof_m": float(e.max()),
+        "rel_l2_median": float(np.median(relative)),
+        "rel_l2_p95": float(np.percentile(relative, 95, method="higher")),
+        "rel_l2_max": float(relative.max()),
+        "max_nodal_m": float(errors.max_nodal_m.max()),
+        "slope": slope,
+    }

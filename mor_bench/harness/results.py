@@ -1,0 +1,169 @@
+"""What a run leaves on disk, and the `Comparison` that reads it.
+
+OUT/results.json       schema version, machine, rows
+OUT/results.csv        the same rows, flat
+OUT/comparison.json    time at error, error at time
+OUT/samples/*.h5       raw latencies and per-sample errors of each row, singular values of each dataset
+OUT/figures/*.png, OUT/report.html
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.errors import StoreError
+from mor_bench.harness.frontier import compare
+from mor_bench.snapshots.store import write_atomically
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SCHEMA_VERSION = 1
+
+
+def label_of(method: str, swept: Mapping[str, Any]) -> str:
+    """A configuration's name: the method, and the swept parameters in brackets."""
+    inside = ", ".join(f"{key}={value}" for key, value in swept.items())
+    return f"{method} [{inside}]" if inside else method
+
+
+def _plain(value: Any) -> Any:
+    """A copy without NaN or infinity, which JSON does not know: they become strings `nan`, `inf`."""
+    if isinstance(value, float) and not np.isfinite(value):
+        return str(value)
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+def _numbers(value: Any) -> Any:
+    """The inverse of `_plain`."""
+    if value in ("nan", "inf", "-inf"):
+        return float(value)
+    if isinstance(value, dict):
+        return {key: _numbers(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_numbers(item) for item in value]
+    return value
+
+
+def _write_json(path: Path, content: Any) -> None:
+    write_atomically(path, json.dumps(_plain(content), indent=1, allow_nan=False).encode())
+
+
+def _write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array, track_times=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, buffer.getvalue())
+
+
+@dataclass
+class Comparison:
+    """The results of a run.
+
+    Attributes
+    ----------
+    out : Path
+        The run's folder.
+    machine : dict
+        Processor, cores, versions.
+    rows : list of dict
+        One per fitted configuration, in the order in which they ran: `dataset`, `split`, `method`, `label`,
+        `parameters`, `status` (`ok`, `failed` or `skipped`), `reason`, `n_train`, `n_test`, `n_failed` (test samples
+        without a prediction), `threads`, `error`, `latency_ms`, `offline_s`, `model_bytes`, `discretisation_error_m`.
+    datasets : dict
+        For each dataset its spec, as in its file.
+    """
+
+    out: Path
+    machine: dict[str, Any]
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    datasets: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """A row per fitted configuration; nested figures in columns such as ``error.mean_dof_m``."""
+        import pandas as pd
+
+        flat = [{**row, "parameters": json.dumps(row["parameters"])} for row in self.rows]
+        return pd.json_normalize(flat)
+
+    @property
+    def frontier(self) -> dict[str, Any]:
+        """Time at error and error at time: the content of comparison.json."""
+        return compare(self.rows)
+
+    def _samples_path(self, name: str) -> Path:
+        return self.out / "samples" / (re.sub(r"[^\w.=-]+", "-", name).strip("-") + ".h5")
+
+    def add(self, row: dict[str, Any], samples: Mapping[str, NDArray[Any]] | None = None) -> None:
+        """Append a row and write everything; raw samples first, so that a row on disk has its samples."""
+        if samples:
+            _write_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"), samples)
+        self.rows.append(row)
+        self.write()
+
+    def add_dataset(self, name: str, spec: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Record a dataset: its spec and arrays such as `singular_values` (of the training snapshots)."""
+        self.datasets[name] = spec
+        _write_arrays(self._samples_path(name), arrays)
+
+    def samples(self, row: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """Raw samples of a row that ran.
+
+        `latency_ms` (n_queries,); `mean_dof_m`, `relative_l2`, `max_nodal_m`, `amplitude_m` (n_test,); and of the sample
+        with the largest e `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3).
+        """
+        return self._read_arrays(f"{row['dataset']}--{row['label']}")
+
+    def dataset_arrays(self, name: str) -> dict[str, NDArray[Any]]:
+        """Arrays of a dataset: `singular_values`, `points` (n_nodes, 3), `cells` (n_cells, 8)."""
+        return self._read_arrays(name)
+
+    def _read_arrays(self, name: str) -> dict[str, NDArray[Any]]:
+        with h5py.File(self._samples_path(name), "r") as file:
+            return {key: file[key][()] for key in file}
+
+    def write(self) -> None:
+        """Write results.json, results.csv and comparison.json, each atomically."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        content = {"schema_version": SCHEMA_VERSION, "machine": self.machine, "datasets": self.datasets, "rows": self.rows}
+        _write_json(self.out / "results.json", content)
+        _write_json(self.out / "comparison.json", self.frontier)
+        write_atomically(self.out / "results.csv", self.table.to_csv(index=False).encode())
+
+    @classmethod
+    def read(cls, out: str | Path) -> Comparison:
+        """Read a run's folder.
+
+        Raises
+        ------
+        StoreError
+            If there is no results.json, or it is not valid or of another schema version.
+        """
+        path = Path(out) / "results.json"
+        try:
+            content = _numbers(json.loads(path.read_text(encoding="utf-8")))
+            version = content["schema_version"]
+            if version != SCHEMA_VERSION:
+                raise StoreError(f"{path}: schema version {version}; this version of mor-bench reads version {SCHEMA_VERSION}.")
+            return cls(Path(out), content["machine"], content["rows"], content["datasets"])
+        except FileNotFoundError:
+            raise StoreError(f"{path}: no such file; is {out} the folder of a run?") from None
+        except (ValueError, KeyError, TypeError) as error:
+            raise StoreError(f"{path}: not a results file of mor-bench: {error}") from None

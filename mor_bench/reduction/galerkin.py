@@ -1,0 +1,80 @@
+"""Galerkin projection of an assembled model on a basis: u = Φq, Φᵀ f_int(Φq) = Φᵀ f."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dpotrs
+
+from mor_bench.mechanics.assembly import Assembler, State
+from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _symmetric_product(indptr: Any, indices: Any, values: Any, modes: Any, product: Any) -> None:
+    """product += K modes for the symmetric K whose upper triangle is given in CSR form."""
+    for i in range(len(indptr) - 1):
+        for k in range(indptr[i], indptr[i + 1]):
+            j, value = indices[k], values[k]
+            for m in range(modes.shape[1]):
+                product[i, m] += value * modes[j, m]
+            if i != j:
+                for m in range(modes.shape[1]):
+                    product[j, m] += value * modes[i, m]
+
+
+class _DenseFactor:
+    def __init__(self, cholesky: NDArray[np.float64]) -> None:
+        self._cholesky = cholesky
+
+    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(dpotrs(self._cholesky, rhs)[0]).reshape(rhs.shape)
+
+
+class GalerkinProblem:
+    """A reduced model over all cells (plain POD) or over weighted ones (ECSW).
+
+    The basis need only hold the rows of the dofs that the assembler sees, so that with few cells the cost of a Newton
+    step does not depend on the mesh.
+
+    Parameters
+    ----------
+    assembler : Assembler
+    modes : (assembler.n_dofs, r) float64
+        The rows of Φ that belong to the assembler's dofs.
+    """
+
+    def __init__(self, assembler: Assembler, modes: NDArray[np.float64]) -> None:
+        self.assembler = assembler
+        self.modes = np.ascontiguousarray(modes)
+        self.n_unknowns = modes.shape[1]
+
+    @cached_property
+    def rest_tangent(self) -> NDArray[np.float64]:
+        return self.linearise(np.zeros(self.n_unknowns))[1]
+
+    @cached_property
+    def rest_factor(self) -> Factor:
+        return self.factor(self.rest_tangent)
+
+    def _project(self, state: State) -> State:
+        return State(self.modes.T @ state.force, state.energy_j, state.min_det_f)
+
+    def force(self, q: NDArray[np.float64]) -> State:
+        return self._project(self.assembler.force(self.modes @ q))
+
+    def linearise(self, q: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
+        state, values = self.assembler.force_and_tangent(self.modes @ q)
+        pattern, product = self.assembler.pattern, np.zeros_like(self.modes)
+        _symmetric_product(pattern.indptr, pattern.indices, values, self.modes, product)
+        return self._project(state), self.modes.T @ product
+
+    def factor(self, tangent: NDArray[np.float64]) -> Factor:
+        cholesky, info = dpotrf(tangent)
+        if info != 0:
+            raise NotPositiveDefiniteError
+        return _DenseFactor(cholesky)

@@ -1,0 +1,49 @@
+"""The full-order model as a contestant."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.surrogate import Surrogate
+
+
+class FullFEM(Surrogate):
+    """Newton's method with a direct solver on the whole mesh.
+
+    Parameters
+    ----------
+    tolerance : float
+        Norm of the residual relative to that of the load at which Newton stops.
+    """
+
+    def __init__(self, tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8) -> None:
+        self.tolerance = tolerance
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
+        """Assemble and factorise the rest-state stiffness; snapshots are not used."""
+        self._begin_fit(scene)
+        self._restore({})
+        return self
+
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+        batch = self._checked_forces(forces)
+        out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
+        free = self.scene_.free_dofs
+        for row, load in zip(out, batch.reshape(len(batch), -1), strict=True):
+            row[free] = self.model_.solve(load[free], options=NewtonOptions(self.tolerance)).displacement
+        return out.reshape(np.shape(forces))
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        return {}
+
+    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
+        self.model_ = FullOrderModel(self.scene_)
+        _ = self.model_.rest_factor

@@ -1,0 +1,40 @@
+"""Linear elasticity: one back-solve with the rest-state stiffness."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.surrogate import Surrogate
+
+
+class LinearFEM(Surrogate):
+    """u = K₀⁻¹ f, with K₀ the stiffness at rest, factorised once. Wrong by the square of the rotations."""
+
+    def __init__(self) -> None:
+        pass
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
+        """Factorise the rest-state stiffness; snapshots are not used."""
+        self._begin_fit(scene)
+        self._restore({})
+        return self
+
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+        batch = self._checked_forces(forces)
+        out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
+        free = self.scene_.free_dofs
+        out[:, free] = self.model_.rest_factor.solve(batch.reshape(len(batch), -1)[:, free].T).T
+        return out.reshape(np.shape(forces))
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        return {}
+
+    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
+        self.model_ = FullOrderModel(self.scene_)
+        _ = self.model_.rest_factor

@@ -1,0 +1,139 @@
+"""PCA regression: a ridge regression from a few coordinates of the input to a few coordinates of the displacement."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.reduction.basis import pod
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.surrogate import Surrogate
+
+LINEAR_TAIL = 1e-8
+"""Singular values of the linear response below this fraction of the largest are dropped."""
+
+
+def monomial_indices(n_variables: int, degree: int) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """For each degree from 2 on: which monomial of the degree below, times which variable, gives each monomial."""
+    levels = []
+    last = np.arange(n_variables)
+    for _ in range(degree - 1):
+        parents = np.concatenate([np.flatnonzero(last <= v) for v in range(n_variables)])
+        variables = np.repeat(np.arange(n_variables), [int((last <= v).sum()) for v in range(n_variables)])
+        levels.append((parents, variables))
+        last = variables
+    return levels
+
+
+def monomials(z: NDArray[np.float64], levels: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> NDArray[np.float64]:
+    """All monomials of degree 1 and more of the variables z (n, n_variables), (n, n_monomials)."""
+    powers = [z]
+    for parents, variables in levels:
+        powers.append(powers[-1][:, parents] * z[:, variables])
+    return np.concatenate(powers, axis=1)
+
+
+class PCARegression(Surrogate):
+    """Polynomial ridge regression between principal coordinates, without means: no force gives no displacement.
+
+    With the linear response as input, u = K₀⁻¹f + Φ W p(z): z are coordinates of the linear response K₀⁻¹f, p their
+    monomials, and only the nonlinear rest is learned; the response to any force is at least that of linear elasticity.
+    With the force as input, u = Φ W p(z) with z the coordinates of the force itself: between load regions that share no
+    training sample this learns nothing.
+
+    Parameters
+    ----------
+    input : {"linear-response", "force"}
+        What the coordinates z are taken of.
+    n_input_modes : int
+        Length of z; capped at the rank of the input.
+    n_output_modes : int
+        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank.
+    degree : int
+        Highest degree of the monomials.
+    ridge : float
+        Tikhonov weight relative to the mean squared feature, with features scaled to unit root mean square.
+    """
+
+    def __init__(
+        self,
+        input: Literal["linear-response", "force"] = "linear-response",
+        n_input_modes: Annotated[int, Field(ge=1)] = 20,
+        n_output_modes: Annotated[int, Field(ge=1)] = 40,
+        degree: Annotated[int, Field(ge=1, le=4)] = 3,
+        ridge: Annotated[float, Field(ge=0)] = 1e-6,
+    ) -> None:
+        self.input = input
+        self.n_input_modes = n_input_modes
+        self.n_output_modes = n_output_modes
+        self.degree = degree
+        self.ridge = ridge
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
+        from sklearn.linear_model import Ridge
+
+        self._begin_fit(scene)
+        snapshots = self._checked_snapshots(snapshots)
+        loaded = self._loaded(scene)
+        forces, targets = snapshots.free_forces[:, loaded], snapshots.free_displacements
+        if self.input == "linear-response":
+            compliance = FullOrderModel(scene).rest_factor.solve(np.eye(len(scene.free_dofs))[:, loaded])
+            linear = pod(compliance.T)
+            response = linear.modes[:, linear.singular_values[: linear.modes.shape[1]] > LINEAR_TAIL * linear.singular_values[0]]
+            to_input = response.T @ compliance
+            targets = targets - forces @ compliance.T
+        else:
+            response, to_input = np.zeros((len(scene.free_dofs), 0)), np.eye(len(loaded))
+        inputs = forces @ to_input.T
+        axes = pod(inputs).modes[:, : self.n_input_modes]
+        axes = axes / np.sqrt(((inputs @ axes) ** 2).mean(axis=0))
+        features = monomials(inputs @ axes, monomial_indices(axes.shape[1], self.degree))
+        feature_scale = np.sqrt((features**2).mean(axis=0))
+        modes = pod(targets).modes[:, : self.n_output_modes]
+        regression = Ridge(alpha=self.ridge * len(features), fit_intercept=False, solver="cholesky")
+        regression.fit(features / feature_scale, targets @ modes)
+        weights = np.atleast_2d(regression.coef_) / feature_scale
+        self._restore({"response": response, "to_input": to_input, "axes": axes, "modes": modes, "weights": weights})
+        return self
+
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+        batch = self._checked_forces(forces).reshape(-1, self.scene_.mesh.n_dofs)
+        free = batch[:, self.scene_.free_dofs]
+        out = np.zeros_like(batch)
+        if self.input == "linear-response" and free[:, self._elsewhere].any():
+            # Forces where no load region is: their linear response was not tabulated, so it is solved for.
+            linear = self.model_.rest_factor.solve(free.T).T
+            coordinates = linear @ self.response_
+        else:
+            coordinates = free[:, self._loaded_dofs] @ self.to_input_.T
+            linear = coordinates @ self.response_.T if self.input == "linear-response" else np.zeros_like(free)
+        features = monomials(coordinates @ self.axes_, self._levels)
+        out[:, self.scene_.free_dofs] = linear + (features @ self.weights_.T) @ self.modes_.T
+        return out.reshape(np.shape(forces))
+
+    @staticmethod
+    def _loaded(scene: Scene) -> NDArray[np.int64]:
+        """Rows, among the free dofs, of those that some load patch acts on."""
+        nodes = np.unique(scene.patch_weights.indices)
+        return np.flatnonzero(np.isin(scene.free_dofs // 3, nodes))
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        return {"response": self.response_, "to_input": self.to_input_, "axes": self.axes_, "modes": self.modes_, "weights": self.weights_}
+
+    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
+        self.response_, self.to_input_, self.axes_ = state["response"], state["to_input"], state["axes"]
+        self.modes_, self.weights_ = state["modes"], state["weights"]
+        self._loaded_dofs = self._loaded(self.scene_)
+        self._elsewhere = np.setdiff1d(np.arange(len(self.scene_.free_dofs)), self._loaded_dofs)
+        self._levels = monomial_indices(self.axes_.shape[1], self.degree)
+
+    @cached_property
+    def model_(self) -> FullOrderModel:
+        """The full-order model, for the linear response to forces outside the load region."""
+        return FullOrderModel(self.scene_)
