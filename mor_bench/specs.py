@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, create_model, field_validator, model_validator
 
 from mor_bench.errors import MissingDependencyError, SpecError
 
@@ -58,7 +58,18 @@ class SphereRegion(_Model):
 
 
 NamedRegion = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max", "surface"]
-Region = NamedRegion | BoxRegion | SphereRegion
+
+
+def _kind_of_region(value: Any) -> str:
+    if isinstance(value, SphereRegion) or (isinstance(value, Mapping) and "sphere_m" in value):
+        return "sphere"
+    return "box" if isinstance(value, BoxRegion | Mapping) else "name"
+
+
+Region = Annotated[
+    Annotated[NamedRegion, Tag("name")] | Annotated[BoxRegion, Tag("box")] | Annotated[SphereRegion, Tag("sphere")], Discriminator(_kind_of_region)
+]
+_REGION_TAGS = ("name", "box", "sphere")
 
 
 class Support(_Model):
@@ -241,7 +252,8 @@ def _one_line(error: ValidationError, model: type[BaseModel], where: str) -> str
     problems = error.errors(include_url=False)
     unknown = [p for p in problems if p["type"] == "extra_forbidden"]
     problem = (unknown or problems)[0]
-    shown = [s for s in problem["loc"] if isinstance(s, int) or not (s in ("BoxRegion", "SphereRegion") or s.startswith("literal["))]
+    location = problem["loc"]
+    shown = [s for i, s in enumerate(location) if not (s in _REGION_TAGS and i and location[i - 1] == "region")]
     key = "".join(f"[{s}]" if isinstance(s, int) else f".{s}" for s in shown).lstrip(".")
     if problem["type"] == "extra_forbidden":
         valid = _valid_keys(model, problem["loc"][:-1])

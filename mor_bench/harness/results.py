@@ -48,15 +48,9 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _numbers(value: Any) -> Any:
-    """The inverse of `_plain`."""
-    if value in ("nan", "inf", "-inf"):
-        return float(value)
-    if isinstance(value, dict):
-        return {key: _numbers(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_numbers(item) for item in value]
-    return value
+def _with_numbers(row: dict[str, Any]) -> dict[str, Any]:
+    """A row read from JSON with the `nan` and `inf` of its errors as numbers again."""
+    return {**row, "error": row["error"] and {name: float(value) for name, value in row["error"].items()}}
 
 
 def _write_json(path: Path, content: Any) -> None:
@@ -158,11 +152,11 @@ class Comparison:
         """
         path = Path(out) / "results.json"
         try:
-            content = _numbers(json.loads(path.read_text(encoding="utf-8")))
+            content = json.loads(path.read_text(encoding="utf-8"))
             version = content["schema_version"]
             if version != SCHEMA_VERSION:
                 raise StoreError(f"{path}: schema version {version}; this version of mor-bench reads version {SCHEMA_VERSION}.")
-            return cls(Path(out), content["machine"], content["rows"], content["datasets"])
+            return cls(Path(out), content["machine"], [_with_numbers(row) for row in content["rows"]], content["datasets"])
         except FileNotFoundError:
             raise StoreError(f"{path}: no such file; is {out} the folder of a run?") from None
         except (ValueError, KeyError, TypeError) as error:

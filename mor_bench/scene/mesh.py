@@ -48,9 +48,9 @@ class Mesh:
     @cached_property
     def boundary_facets(self) -> NDArray[np.int64]:
         """(n_facets, 4) node numbers of the faces that belong to one cell only, turned outwards."""
-        faces: NDArray[np.int64] = self.cells[:, HEX_FACES].reshape(-1, 4)
+        faces = self.cells[:, HEX_FACES].reshape(-1, 4)
         _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-        return faces[np.sort(first[count == 1])]
+        return np.asarray(faces[np.sort(first[count == 1])])
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:

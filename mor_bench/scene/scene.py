@@ -71,7 +71,7 @@ def load_scene(source: str | Path | Mapping[str, Any] | DatasetSpec) -> Scene:
     spec = source if isinstance(source, DatasetSpec) else load_dataset_spec(source)
     mesh = box_mesh(spec.geometry.size_m, spec.geometry.cells)
     material = SaintVenantKirchhoff(spec.material.young_pa, spec.material.poisson)
-    fixed = np.unique(np.concatenate([region_nodes(mesh, support.region) for support in spec.supports]))
+    fixed = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(region_nodes(mesh, support.region) for support in spec.supports)]))
     scene = Scene(spec, mesh, material, fixed)
     _ = scene.patch_weights  # an empty load region is an error of the dataset: raised here, not at the first solve
     return scene

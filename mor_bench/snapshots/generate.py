@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, as_completed
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from time import perf_counter
+from threading import Thread
+from time import perf_counter, sleep
 
 import numpy as np
 import platformdirs
@@ -90,12 +92,23 @@ def _is_sound(path: Path) -> bool:
     return True
 
 
+def _end_with(parent: int) -> None:
+    """Let this worker end when its parent has died by a signal that no one can catch; otherwise it would wait for ever."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            sleep(1.0)
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
+
+
 @contextmanager
 def worker_pool(workers: int) -> Iterator[Executor]:
     """Worker processes that need no `if __name__ == "__main__"` in the caller's script, and end with their parent."""
     from loky import ProcessPoolExecutor
 
-    executor = ProcessPoolExecutor(max_workers=workers, timeout=60)
+    executor = ProcessPoolExecutor(max_workers=workers, initializer=_end_with, initargs=(os.getpid(),))
     try:
         yield executor
     except BaseException:

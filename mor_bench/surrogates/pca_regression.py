@@ -127,8 +127,11 @@ class PCARegression(Surrogate):
         return {"response": self.response_, "to_input": self.to_input_, "axes": self.axes_, "modes": self.modes_, "weights": self.weights_}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
+        # One memory order, fitted or loaded: BLAS rounds differently in another.
+        state = {name: np.ascontiguousarray(array) for name, array in state.items()}
         self.response_, self.to_input_, self.axes_ = state["response"], state["to_input"], state["axes"]
         self.modes_, self.weights_ = state["modes"], state["weights"]
+        self.__dict__.pop("model_", None)
         self._loaded_dofs = self._loaded(self.scene_)
         self._elsewhere = np.setdiff1d(np.arange(len(self.scene_.free_dofs)), self._loaded_dofs)
         self._levels = monomial_indices(self.axes_.shape[1], self.degree)

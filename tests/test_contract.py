@@ -1,0 +1,145 @@
+"""What every method of the suite must do; a new method file is picked up by itself."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mor_bench
+from mor_bench.errors import InvalidInputError, MissingDependencyError, NotFittedError, StoreError
+from mor_bench.harness.metrics import sample_errors
+from mor_bench.snapshots.dataset import Dataset
+from mor_bench.specs import list_suite
+from mor_bench.surrogate import Surrogate
+
+CHEAP = {"umesh": {"channels": 4, "steps": 1, "iterations": 60, "batch_size": 16}}
+"""Parameters that keep a costly method's battery short."""
+
+NEEDS_NO_SNAPSHOTS = ("fem", "linear-fem")
+
+
+def make(name: str) -> Surrogate:
+    try:
+        return mor_bench.load_method(name, **CHEAP.get(name, {}))
+    except MissingDependencyError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="module", params=sorted(list_suite("methods")))
+def fitted(request: pytest.FixtureRequest, tiny: Dataset) -> Surrogate:
+    return make(request.param).fit(tiny.scene, tiny.train)
+
+
+def test_one_query_and_a_batch_agree(fitted: Surrogate, tiny: Dataset) -> None:
+    forces = tiny.test.forces[:5]
+    batch = fitted.predict(forces)
+    assert batch.shape == forces.shape
+    assert batch.dtype == np.float64
+    single = np.stack([fitted.predict(force) for force in forces])
+    assert single.shape == forces.shape
+    np.testing.assert_allclose(single, batch, rtol=0, atol=2e-6 * np.abs(batch).max())
+
+
+def test_supports_do_not_move(fitted: Surrogate, tiny: Dataset) -> None:
+    assert (fitted.predict(tiny.test.forces[:5])[:, tiny.scene.fixed_nodes] == 0).all()
+
+
+def test_zero_force(fitted: Surrogate, tiny: Dataset) -> None:
+    if type(fitted).__name__ == "UMesh":
+        pytest.skip("the published U-Mesh has biases and answers no force with a small displacement")
+    rms = np.sqrt((tiny.train.displacements**2).mean())
+    assert np.linalg.norm(fitted.predict(np.zeros((tiny.scene.mesh.n_nodes, 3)))) <= 1e-3 * rms
+
+
+def test_prediction_is_far_better_than_none(fitted: Surrogate, tiny: Dataset) -> None:
+    if fitted.parameters.get("input") == "force":
+        pytest.skip("from the force alone nothing is known of unseen load regions; see the method's limits")
+    forces, reference = tiny.train.forces[:40], tiny.train.displacements[:40]
+    own = sample_errors(fitted.predict(forces), reference).mean_dof_m.mean()
+    none = sample_errors(np.zeros_like(reference), reference).mean_dof_m.mean()
+    assert own < (0.9 if type(fitted).__name__ == "UMesh" else 0.2) * none
+
+
+def test_inputs_are_left_alone(fitted: Surrogate, tiny: Dataset) -> None:
+    forces = tiny.test.forces[:3].copy()
+    before = forces.copy()
+    fitted.predict(forces)
+    np.testing.assert_array_equal(forces, before)
+
+
+def test_other_real_dtypes_and_lists_are_taken(fitted: Surrogate, tiny: Dataset) -> None:
+    force = np.round(tiny.test.forces[0], 3)
+    np.testing.assert_allclose(fitted.predict(force.tolist()), fitted.predict(force), atol=1e-15)
+    assert fitted.predict(force.astype(np.float32)).dtype == np.float64
+    assert np.isfinite(fitted.predict(np.ones(force.shape, dtype=int) * 0)).all()
+
+
+@pytest.mark.parametrize("bad", ["nan", "inf", "shape", "flat", "complex", "text"])
+def test_bad_forces_are_refused(fitted: Surrogate, tiny: Dataset, bad: str) -> None:
+    force: object = tiny.test.forces[0].copy()
+    assert isinstance(force, np.ndarray)
+    if bad in ("nan", "inf"):
+        force[3, 1] = float(bad)
+    force = {"shape": force[:-1], "flat": force.ravel(), "complex": force + 1j, "text": force.astype(str)}.get(bad, force)
+    with pytest.raises(InvalidInputError, match="forces"):
+        fitted.predict(force)
+
+
+def test_saved_and_loaded_predicts_the_same(fitted: Surrogate, tiny: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "model.safetensors"
+    fitted.save(path)
+    loaded = mor_bench.load_surrogate(path)
+    assert type(loaded) is type(fitted)
+    assert loaded.parameters == fitted.parameters
+    np.testing.assert_array_equal(loaded.predict(tiny.test.forces[:3]), fitted.predict(tiny.test.forces[:3]))
+
+
+@pytest.mark.parametrize("damage", ["truncated", "foreign", "class", "version"])
+def test_damaged_files_are_refused(fitted: Surrogate, tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "model.safetensors"
+    fitted.save(path)
+    content = path.read_bytes()
+    name = f"{type(fitted).__module__}:{type(fitted).__qualname__}".encode()
+    changed = {
+        "truncated": content[: len(content) // 3],
+        "foreign": b"something else entirely",
+        "class": content.replace(name, b"os:" + b"x" * (len(name) - 3)),
+        "version": content.replace(b'"schema_version":"1"', b'"schema_version":"9"'),
+    }[damage]
+    assert changed != content
+    path.write_bytes(changed)
+    with pytest.raises(StoreError, match="model.safetensors"):
+        mor_bench.load_surrogate(path)
+
+
+@pytest.mark.parametrize("name", sorted(list_suite("methods")))
+def test_unfitted_methods_say_so(name: str, tiny: Dataset, tmp_path: Path) -> None:
+    method = make(name)
+    with pytest.raises(NotFittedError):
+        method.predict(tiny.test.forces[0])
+    with pytest.raises(NotFittedError):
+        method.save(tmp_path / "model.safetensors")
+    assert not (tmp_path / "model.safetensors").exists()
+
+
+@pytest.mark.parametrize("name", sorted(list_suite("methods")))
+def test_fitting_again_forgets_the_first_fit_and_repeats_it(name: str, tiny: Dataset) -> None:
+    first = make(name).fit(tiny.scene, tiny.train).predict(tiny.test.forces[:3])
+    again = make(name).fit(tiny.scene, tiny.train[:40])
+    assert again.fit(tiny.scene, tiny.train) is again
+    np.testing.assert_array_equal(again.predict(tiny.test.forces[:3]), first)
+
+
+@pytest.mark.parametrize("name", sorted(list_suite("methods")))
+def test_snapshots_with_nan_or_none_at_all_are_refused(name: str, tiny: Dataset) -> None:
+    if name in NEEDS_NO_SNAPSHOTS:
+        assert np.isfinite(make(name).fit(tiny.scene, None).predict(tiny.test.forces[0])).all()
+        return
+    spoilt = copy.deepcopy(tiny.train[:20])
+    spoilt.free_displacements[3, 4] = np.nan
+    for snapshots in (None, tiny.train[:0], spoilt):
+        with pytest.raises(InvalidInputError):
+            make(name).fit(tiny.scene, snapshots)

@@ -1,0 +1,212 @@
+"""Metrics against hand-made numbers, the frontier's rules, and a whole comparison."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import mor_bench
+from mor_bench.errors import InvalidInputError, SpecError, StoreError
+from mor_bench.harness.frontier import Point, error_at_time, non_dominated, time_at_error
+from mor_bench.harness.metrics import sample_errors, summary
+from mor_bench.harness.results import Comparison
+from mor_bench.harness.run import Listener
+from mor_bench.harness.timing import N_QUERIES, latency_summary, measure_latency
+
+
+def test_metrics_by_hand() -> None:
+    reference = np.zeros((2, 2, 3))
+    reference[:, 1] = [[3.0, 0.0, 4.0], [0.0, 0.0, 10.0]]
+    predicted = reference.copy()
+    predicted[0, 1] += [0.0, 3.0, 4.0]
+    predicted[1, 0] += [0.0, 0.0, -1.0]
+    errors = sample_errors(predicted, reference)
+    np.testing.assert_allclose(errors.mean_dof_m, [7 / 6, 1 / 6])
+    np.testing.assert_allclose(errors.relative_l2, [1.0, 0.1])
+    np.testing.assert_allclose(errors.max_nodal_m, [5.0, 1.0])
+    np.testing.assert_allclose(errors.amplitude_m, [5.0, 10.0])
+    row = summary(errors)
+    assert row["mean_dof_m"] == pytest.approx(4 / 6)
+    assert row["std_dof_m"] == pytest.approx(math.sqrt(2 * 0.5**2))
+    assert row["max_dof_m"] == pytest.approx(7 / 6)
+    assert row["rel_l2_median"] == pytest.approx(0.55)
+    assert row["rel_l2_p95"] == row["rel_l2_max"] == pytest.approx(1.0)
+    assert row["slope"] == pytest.approx((5 * 7 / 6 + 10 / 6) / 125)
+
+
+def test_a_missing_prediction_is_an_infinite_error() -> None:
+    reference = np.ones((30, 4, 3))
+    predicted = reference.copy()
+    predicted[7, 2, 1] = np.nan
+    row = summary(sample_errors(predicted, reference))
+    assert row["mean_dof_m"] == row["max_dof_m"] == row["rel_l2_max"] == row["std_dof_m"] == math.inf
+    assert row["rel_l2_median"] == 0.0
+
+
+POINTS = [Point(1.0, 0.1, "a"), Point(10.0, 0.01, "b"), Point(5.0, 0.2, "dominated"), Point(100.0, 0.001, "c"), Point(0.5, math.inf, "failed")]
+
+
+def test_frontier_interpolates_in_log_log_and_never_extrapolates() -> None:
+    assert [p.label for p in non_dominated(POINTS)] == ["a", "b", "c"]
+    middle = time_at_error(POINTS, math.sqrt(0.1 * 0.01))
+    assert middle["latency_ms"] == pytest.approx(math.sqrt(10.0))
+    assert middle["best"] == {"label": "b", "latency_ms": 10.0, "error": 0.01}
+    assert time_at_error(POINTS, 0.5)["latency_ms"] == 1.0
+    assert time_at_error(POINTS, 0.0005) == {"latency_ms": None, "best": None}
+    assert error_at_time(POINTS, 0.7) == {"error": None, "best": None}
+    assert error_at_time(POINTS, math.sqrt(10.0))["error"] == pytest.approx(math.sqrt(0.1 * 0.01))
+    assert error_at_time(POINTS, math.sqrt(10.0))["best"]["label"] == "a"
+    assert error_at_time(POINTS, 1e6)["error"] == 0.001
+
+
+@given(st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-6, 1.0)), min_size=1, max_size=12), st.floats(1e-6, 1.0), st.floats(1e-3, 1e3))
+def test_frontier_stays_between_its_points(points: list[tuple[float, float]], error: float, time: float) -> None:
+    cloud = [Point(t, e, str(i)) for i, (t, e) in enumerate(points)]
+    front = non_dominated(cloud)
+    assert all(any(q.latency_ms <= p.latency_ms and q.error <= p.error for q in front) for p in cloud)
+    at_error = time_at_error(cloud, error)
+    if at_error["best"] is None:
+        assert min(p.error for p in cloud) > error
+    else:
+        assert front[0].latency_ms * (1 - 1e-9) <= at_error["latency_ms"] <= at_error["best"]["latency_ms"] * (1 + 1e-9)
+    at_time = error_at_time(cloud, time)
+    if at_time["best"] is None:
+        assert min(p.latency_ms for p in cloud) > time
+    else:
+        assert front[-1].error * (1 - 1e-9) <= at_time["error"] <= at_time["best"]["error"] * (1 + 1e-9)
+
+
+def test_latency_keeps_every_raw_sample_and_turns_the_collector_on_again() -> None:
+    import gc
+
+    seen: list[bytes] = []
+    samples = measure_latency(lambda query: seen.append(query.tobytes()), np.random.default_rng(0).normal(size=(50, 4, 3)))
+    assert len(samples) == N_QUERIES
+    assert (samples > 0).all()
+    assert len(set(seen[-N_QUERIES:])) == 50
+    assert gc.isenabled()
+    assert latency_summary(np.arange(101.0)) == {"median": 50.0, "p95": 95.0, "p99": 99.0}
+
+
+class Broken(mor_bench.Surrogate):
+    """A third party's class that fits and then crashes, or answers NaN now and then."""
+
+    def __init__(self, how: str = "crash") -> None:
+        self.how = how
+
+    def fit(self, scene, snapshots):  # type: ignore[no-untyped-def]
+        self._begin_fit(scene)
+        return self
+
+    def predict(self, forces):  # type: ignore[no-untyped-def]
+        batch = self._checked_forces(forces)
+        if self.how == "crash":
+            raise ZeroDivisionError("on purpose")
+        if self.how == "shape":
+            return batch[:, :-1]
+        out = np.full_like(batch, 1e-3)
+        out[batch[:, :, 0].sum(axis=1) > 0] = np.nan
+        return out.reshape(np.shape(forces))
+
+
+@pytest.fixture(scope="module")
+def comparison(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Comparison:
+    folder = tmp_path_factory.mktemp("methods")
+    methods: list[str | Path] = ["fem", "pod"]
+    for how in ("crash", "shape", "nan"):
+        path = folder / f"broken-{how}.toml"
+        path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "tests.test_harness:Broken"\n[parameters]\nhow = "{how}"')
+        methods.append(path)
+    return mor_bench.run(["beam-tiny"], methods, out=tmp_path_factory.mktemp("out") / "run", cache=cache, threads=1)
+
+
+def test_every_configuration_has_a_row(comparison: Comparison) -> None:
+    assert [row["label"] for row in comparison.rows] == [
+        *(f"fem [tolerance={t}]" for t in (0.1, 0.01, 0.0001, 1e-08)),
+        *(f"pod [n_modes={r}]" for r in (1, 3, 5, 10, 20, 40, 80)),
+        "broken-crash",
+        "broken-shape",
+        "broken-nan",
+    ]
+    crash, shape, nan = comparison.rows[-3:]
+    assert crash["status"] == shape["status"] == "failed"
+    assert crash["reason"] == "crashed with ZeroDivisionError: on purpose"
+    assert "must return floats of shape" in shape["reason"]
+    assert nan["status"] == "ok"
+    assert 0 < nan["n_failed"] < nan["n_test"]
+    assert nan["error"]["mean_dof_m"] == math.inf
+
+
+def test_rows_hold_what_the_schema_promises(comparison: Comparison) -> None:
+    row = comparison.rows[5]
+    assert row["status"] == "ok"
+    assert (row["dataset"], row["method"], row["parameters"]["n_modes"]) == ("beam-tiny", "pod", 3)
+    assert (row["n_train"], row["n_test"], row["threads"], row["split"]) == (170, 40, 1, "region")
+    assert set(row["error"]) == {"mean_dof_m", "std_dof_m", "max_dof_m", "rel_l2_median", "rel_l2_p95", "rel_l2_max", "max_nodal_m", "slope"}
+    assert set(row["latency_ms"]) == {"median", "p95", "p99"}
+    assert row["offline_s"]["fit"] > 0
+    assert row["offline_s"]["data"] > 0
+    assert row["model_bytes"] > 8 * 3 * 162
+    samples = comparison.samples(row)
+    assert len(samples["latency_ms"]) == N_QUERIES
+    assert samples["mean_dof_m"].mean() == pytest.approx(row["error"]["mean_dof_m"])
+    worst = np.abs(samples["worst_prediction"] - samples["worst_reference"]).mean()
+    assert worst == pytest.approx(row["error"]["max_dof_m"])
+    assert len(comparison.table) == len(comparison.rows)
+
+
+def test_more_modes_are_more_accurate(comparison: Comparison) -> None:
+    pods = [row["error"]["mean_dof_m"] for row in comparison.rows if row["method"] == "pod"]
+    assert pods == sorted(pods, reverse=True)
+
+
+def test_it_reads_back_as_it_was(comparison: Comparison) -> None:
+    again = Comparison.read(comparison.out)
+    assert again.rows == json.loads(json.dumps(comparison.rows))
+    assert again.frontier == comparison.frontier
+    text = (comparison.out / "results.json").read_text()
+    json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    reached = {(row["method"], row["target_rel_l2_median"]): row["best"] for row in comparison.frontier["time_at_error"]}
+    assert reached["fem", 0.001] is not None
+    assert reached["broken-crash", 0.1] is None
+
+
+def test_the_same_run_gives_the_same_errors_to_the_last_digit(comparison: Comparison, cache: Path, tmp_path: Path) -> None:
+    again = mor_bench.run(["beam-tiny"], ["fem", "pod"], out=tmp_path / "again", cache=cache, threads=1)
+    assert [row["error"] for row in again.rows] == [row["error"] for row in comparison.rows[:11]]
+
+
+def test_listener_hears_of_every_row(cache: Path, tmp_path: Path) -> None:
+    heard: list[str] = []
+    listener = Listener(
+        starting=lambda dataset, label, number, total: heard.append(f"{number}/{total} {label}"), finished=lambda row: heard.append(row["status"])
+    )
+    mor_bench.run(["beam-tiny"], ["linear-fem"], out=tmp_path / "out", cache=cache, listener=listener)
+    assert heard == ["1/1 linear-fem", "ok"]
+
+
+def test_bad_arguments_are_refused_before_anything_runs(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    for bad in ({"profile": "fast"}, {"threads": 0}, {"threads": 10_000}, {"methods": []}, {"datasets": []}):
+        with pytest.raises(InvalidInputError):
+            mor_bench.run(**{"datasets": ["beam-tiny"], "methods": ["fem"], "out": out, **bad})  # type: ignore[arg-type]
+    with pytest.raises(SpecError):
+        mor_bench.run(["beam-tiny"], ["fem", "pood"], out=out)
+    assert not out.exists()
+
+
+def test_reading_a_folder_that_is_no_run(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="no such file"):
+        Comparison.read(tmp_path)
+    (tmp_path / "results.json").write_text("{}")
+    with pytest.raises(StoreError, match="not a results file"):
+        Comparison.read(tmp_path)
+    (tmp_path / "results.json").write_text('{"schema_version": 99}')
+    with pytest.raises(StoreError, match="schema version 99"):
+        Comparison.read(tmp_path)

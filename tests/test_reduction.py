@@ -1,0 +1,177 @@
+"""Bases, cubature and Galerkin projection: their laws, and poor snapshots."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mor_bench
+from mor_bench.errors import InvalidInputError
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.reduction.basis import pod
+from mor_bench.reduction.cubature import CubatureError, ecsw_system, sparse_nnls
+from mor_bench.reduction.galerkin import GalerkinProblem
+from mor_bench.snapshots.dataset import Dataset
+from mor_bench.surrogates.hpod import HyperReducedPOD
+from mor_bench.surrogates.pca_regression import monomial_indices, monomials
+from mor_bench.surrogates.pod import PODGalerkin
+
+
+@pytest.fixture(scope="module")
+def coarse(cache: Path) -> Dataset:
+    return mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
+
+
+def test_the_basis_is_orthonormal_at_200_modes_of_fast_decay() -> None:
+    rng = np.random.default_rng(0)
+    left, right = (np.linalg.qr(rng.normal(size=(300, 250)))[0] for _ in range(2))
+    snapshots = left * 10.0 ** -np.linspace(0, 11, 250) @ right.T
+    modes = pod(snapshots, 200).modes
+    assert np.linalg.norm(modes.T @ modes - np.eye(200), 2) <= 1e-12
+
+
+def test_the_basis_is_optimal_and_its_error_is_the_tail(coarse: Dataset) -> None:
+    snapshots = coarse.train.free_displacements
+    basis = pod(snapshots, 10)
+    rest = snapshots - snapshots @ basis.modes @ basis.modes.T
+    assert np.linalg.norm(rest) == pytest.approx(np.linalg.norm(basis.singular_values[10:]), rel=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["duplicates", "one", "with zeros", "r above the rank"])
+def test_poor_snapshots_are_cut_to_their_rank_with_a_warning(kind: str, tiny: Dataset) -> None:
+    snapshots = tiny.train.free_displacements
+    chosen = {
+        "duplicates": np.repeat(snapshots[:4], 5, axis=0),
+        "one": snapshots[:1],
+        "with zeros": np.vstack([snapshots[:3], np.zeros((9, snapshots.shape[1]))]),
+        "r above the rank": snapshots[:6],
+    }[kind]
+    rank = {"duplicates": 4, "one": 1, "with zeros": 3, "r above the rank": 6}[kind]
+    with pytest.warns(UserWarning, match=f"rank {rank}"):
+        basis = pod(chosen, 20)
+    assert basis.modes.shape[1] == rank
+    assert np.linalg.norm(basis.modes.T @ basis.modes - np.eye(rank)) <= 1e-12
+
+
+def test_zero_snapshots_span_nothing() -> None:
+    with pytest.raises(InvalidInputError, match="all zero"):
+        pod(np.zeros((5, 8)))
+
+
+def test_projected_tangent_and_force(coarse: Dataset) -> None:
+    model = FullOrderModel(coarse.scene)
+    modes = pod(coarse.train.free_displacements, 12).modes
+    problem = GalerkinProblem(model.assembler, modes)
+    q = coarse.train.free_displacements[5] @ modes
+    state, tangent = problem.linearise(q)
+    np.testing.assert_allclose(state.force, modes.T @ model.force(modes @ q).force, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(tangent, tangent.T, atol=1e-12 * np.abs(tangent).max())
+    h = 1e-6 * np.random.default_rng(0).normal(size=12)
+    difference = problem.force(q + h).force - problem.force(q - h).force
+    np.testing.assert_allclose(2 * tangent @ h, difference, rtol=1e-6, atol=1e-8 * np.abs(difference).max())
+
+
+def test_galerkin_energy_never_lies_below_the_full_one_and_approaches_it(coarse: Dataset) -> None:
+    model = FullOrderModel(coarse.scene)
+    forces, exact = coarse.test.free_forces[:20], coarse.test.free_displacements[:20]
+    gaps = []
+    for r in (3, 10, 40):
+        method = PODGalerkin(r, tolerance=1e-10).fit(coarse.scene, coarse.train)
+        reduced = method.predict(coarse.test.forces[:20]).reshape(20, -1)[:, coarse.scene.free_dofs]
+        gap = [model.force(v).energy_j - f @ v - model.force(u).energy_j + f @ u for u, v, f in zip(exact, reduced, forces, strict=True)]
+        assert min(gap) >= -1e-12
+        gaps.append(np.mean(gap))
+    assert gaps[0] > gaps[1] > gaps[2]
+
+
+def test_ecsw_with_every_cell_is_plain_pod(coarse: Dataset) -> None:
+    plain = PODGalerkin(10).fit(coarse.scene, coarse.train).predict(coarse.test.forces[:10])
+    whole = HyperReducedPOD(10, cubature_tolerance=0.0).fit(coarse.scene, coarse.train)
+    assert len(whole.cells_) == coarse.scene.mesh.n_cells
+    assert np.abs(whole.predict(coarse.test.forces[:10]) - plain).max() <= 1e-10 * np.abs(plain).max()
+
+
+def test_ecsw_keeps_few_cells_and_stays_close_to_pod(coarse: Dataset) -> None:
+    reference = coarse.test.displacements
+    plain = PODGalerkin(10).fit(coarse.scene, coarse.train)
+    reduced = HyperReducedPOD(10).fit(coarse.scene, coarse.train)
+    errors = [np.abs(method.predict(coarse.test.forces) - reference).mean() for method in (plain, reduced)]
+    assert errors[1] <= 1.2 * errors[0]
+    assert len(reduced.cells_) < 0.6 * coarse.scene.mesh.n_cells
+    assert (reduced.weights_ > 0).all()
+    assert reduced.problem_.assembler.n_cells == len(reduced.cells_)
+    assert reduced.problem_.modes.shape[0] <= 24 * len(reduced.cells_)
+
+
+def test_the_compressed_training_system_is_the_whole_one(coarse: Dataset) -> None:
+    model = FullOrderModel(coarse.scene)
+    modes = pod(coarse.train.free_displacements, 4).modes
+    q = coarse.train.free_displacements[:50] @ modes
+    system = ecsw_system(model.assembler, model.cell_dofs, modes, q)
+    rows = np.array([modes.T @ model.force(modes @ coordinates).force for coordinates in q]).ravel()
+    assert np.linalg.norm(system.sum(axis=1)) == pytest.approx(np.linalg.norm(rows), rel=1e-10)
+    weights = np.random.default_rng(0).random(135)
+    padded = np.vstack([modes, np.zeros(4)])
+    whole = np.concatenate([np.einsum("eir,ei->re", padded[model.cell_dofs], model.assembler.cell_forces(modes @ c)) for c in q])
+    assert np.linalg.norm(system @ weights - system.sum(axis=1)) == pytest.approx(np.linalg.norm(whole @ weights - rows), rel=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nnls_reaches_its_tolerance_with_a_recomputed_residual(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    matrix = rng.normal(size=(60, 200)) + 0.5
+    matrix[:, 100:110] = matrix[:, :10]
+    matrix[:, 150:] *= 10.0 ** rng.uniform(-8, 8, 50)
+    matrix[:, 199] = 0.0
+    target = matrix[:, :150].sum(axis=1)
+    for tolerance in (1e-1, 1e-3, 1e-8):
+        found = sparse_nnls(matrix, target, tolerance)
+        assert (found.weights >= 0).all()
+        residual = target - matrix @ found.weights
+        assert np.linalg.norm(residual) <= tolerance * np.linalg.norm(target) * (1 + 1e-9)
+        assert found.relative_residual == pytest.approx(np.linalg.norm(residual) / np.linalg.norm(target))
+        assert found.passive_gradient <= 1e-10
+        assert (found.weights > 0).sum() <= 60
+
+
+def test_nnls_at_its_limit_meets_the_optimality_conditions() -> None:
+    """Run to the end on an unreachable target, the residual that the error reports is that of scipy's solution."""
+    from scipy.optimize import nnls
+
+    rng = np.random.default_rng(3)
+    matrix, target = rng.normal(size=(40, 15)), rng.normal(size=40)
+    best = nnls(matrix, target)[1] / np.linalg.norm(target)
+    with pytest.raises(CubatureError, match=f"relative residual of {best:.3g}"):
+        sparse_nnls(matrix, target, 1e-6)
+    assert sparse_nnls(matrix, target, best * (1 + 1e-9)).relative_residual == pytest.approx(best)
+
+
+def test_nnls_that_is_stopped_too_soon_fails_honestly() -> None:
+    rng = np.random.default_rng(0)
+    matrix = rng.random((30, 50))
+    with pytest.raises(CubatureError, match="`tolerance` asks for 1e-06"):
+        sparse_nnls(matrix, matrix.sum(axis=1), 1e-6, max_iterations=1)
+    with pytest.raises(InvalidInputError):
+        sparse_nnls(matrix * np.nan, matrix.sum(axis=1), 1e-6)
+
+
+def test_monomials_are_all_of_their_degree() -> None:
+    z = np.random.default_rng(0).normal(size=(3, 4))
+    values = monomials(z, monomial_indices(4, 3))
+    assert values.shape == (3, 4 + 10 + 20)
+    expected = {
+        *np.round(z[0], 12),
+        *(round(z[0, i] * z[0, j], 12) for i in range(4) for j in range(4)),
+        *(round(z[0, i] * z[0, j] * z[0, k], 12) for i in range(4) for j in range(4) for k in range(4)),
+    }
+    assert {*np.round(values[0], 12)} == expected
+
+
+def test_pca_regression_answers_forces_outside_the_load_region(tiny: Dataset) -> None:
+    method = mor_bench.load_method("pca-regression").fit(tiny.scene, tiny.train)
+    forces = np.zeros((tiny.scene.mesh.n_nodes, 3))
+    forces[tiny.scene.mesh.points[:, 2] == 0.0] = [0.0, 0.0, 1e-4]
+    linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None).predict(forces)
+    np.testing.assert_allclose(method.predict(forces), linear, atol=0.02 * np.abs(linear).max())

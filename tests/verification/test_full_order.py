@@ -1,0 +1,315 @@
+"""The full-order model against closed forms, laws of mechanics and an independent library."""
+
+from __future__ import annotations
+
+import itertools
+
+import felupe
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from felupe.constitution import tensortrax
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import mor_bench
+from mor_bench.errors import InvalidInputError, SolverError, UnconstrainedBodyError
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.linear import BandedCholesky, NotPositiveDefiniteError, SparseLU
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import solve_equilibrium
+from mor_bench.reduction.galerkin import GalerkinProblem
+from mor_bench.scene.materials import SaintVenantKirchhoff
+from mor_bench.scene.mesh import Mesh, box_mesh
+from mor_bench.scene.scene import Scene
+
+Array = NDArray[np.float64]
+LAW = SaintVenantKirchhoff(young_pa=500.0, poisson=0.4)
+
+
+def free_assembler(mesh: Mesh, law: SaintVenantKirchhoff = LAW) -> Assembler:
+    """All dofs free, numbered as in the mesh."""
+    return Assembler(mesh.points, mesh.cells, np.arange(mesh.n_dofs).reshape(-1, 3), mesh.n_dofs, law)
+
+
+def distorted(cells: tuple[int, int, int], seed: int = 0) -> Mesh:
+    """A unit box whose inner nodes are moved by up to 0.3 of a cell's edge."""
+    mesh = box_mesh((1.0, 1.0, 1.0), cells)
+    points = mesh.points.copy()
+    inner = np.all((points > 1e-9) & (points < 1 - 1e-9), axis=1)
+    points[inner] += np.random.default_rng(seed).uniform(-0.3, 0.3, (inner.sum(), 3)) / np.array(cells)
+    return Mesh(points, mesh.cells)
+
+
+def dense(assembler: Assembler, values: Array) -> Array:
+    """The whole tangent as a dense matrix."""
+    pattern = assembler.pattern
+    upper = sp.csr_array((values, pattern.indices, pattern.indptr), shape=(pattern.n, pattern.n)).toarray()
+    return np.asarray(upper + np.triu(upper, 1).T)
+
+
+def stress(gradient: Array, law: SaintVenantKirchhoff = LAW) -> Array:
+    """First Piola-Kirchhoff stress of one H8 cube under the homogeneous deformation gradient F, from its nodal forces."""
+    mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
+    u = mesh.points @ (gradient - np.eye(3)).T
+    forces = free_assembler(mesh, law).force(u.ravel()).force.reshape(-1, 3)
+    return np.stack([forces[mesh.points[:, axis] == 1.0].sum(axis=0) for axis in range(3)], axis=1)
+
+
+def test_patch_of_distorted_cells() -> None:
+    mesh = distorted((3, 3, 3))
+    gradient = np.eye(3) + np.array([[0.1, 0.05, -0.02], [0.03, -0.08, 0.04], [0.0, 0.06, 0.07]])
+    exact = mesh.points @ (gradient - np.eye(3)).T
+    outer = np.any((mesh.points < 1e-9) | (mesh.points > 1 - 1e-9), axis=1)
+    assembler = free_assembler(mesh)
+    inner = np.flatnonzero(np.repeat(~outer, 3))
+    u = np.where(outer[:, None], exact, 0.0).ravel()
+    for _ in range(12):
+        state, values = assembler.force_and_tangent(u)
+        u[inner] -= np.linalg.solve(dense(assembler, values)[np.ix_(inner, inner)], state.force[inner])
+    assert np.abs(u.reshape(-1, 3) - exact).max() <= 1e-12
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_taylor_energy_to_force_and_force_to_tangent(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    mesh = distorted((2, 2, 2), seed)
+    assembler = free_assembler(mesh)
+    u, direction = 0.05 * rng.normal(size=mesh.n_dofs), rng.normal(size=mesh.n_dofs)
+    state, values = assembler.force_and_tangent(u)
+    stiffness = dense(assembler, values)
+    steps = np.array([1e-1, 1e-2, 1e-3, 1e-4]) * 0.1
+    energy, force = [], []
+    for h in steps:
+        there = assembler.force(u + h * direction)
+        energy.append(abs(there.energy_j - state.energy_j - h * direction @ state.force))
+        force.append(np.linalg.norm(there.force - state.force - h * stiffness @ direction))
+    for remainder in (np.array(energy), np.array(force)):
+        order = np.log10(remainder[:-1] / remainder[1:])
+        assert order[-1] >= 1.95
+        assert order.mean() >= 1.95
+
+
+def test_force_alone_equals_force_with_tangent() -> None:
+    assembler = free_assembler(distorted((2, 3, 2)))
+    u = 0.05 * np.random.default_rng(0).normal(size=assembler.n_dofs)
+    alone, (state, _) = assembler.force(u), assembler.force_and_tangent(u)
+    np.testing.assert_allclose(alone.force, state.force, rtol=1e-13, atol=1e-13)
+    assert alone.energy_j == pytest.approx(state.energy_j, rel=1e-14)
+    assert alone.min_det_f == state.min_det_f
+
+
+def test_free_body_at_rest_has_exactly_six_zero_modes() -> None:
+    assembler = free_assembler(distorted((2, 2, 2)))
+    stiffness = dense(assembler, assembler.force_and_tangent(np.zeros(assembler.n_dofs))[1])
+    values = np.linalg.eigvalsh(stiffness)
+    assert (np.abs(values) <= 1e-12 * values[-1]).sum() == 6
+    assert values[6] > 1e-6 * values[-1]
+
+
+def test_rigid_rotations_cost_nothing() -> None:
+    mesh = distorted((2, 2, 2))
+    assembler = free_assembler(mesh)
+    stiffness = dense(assembler, assembler.force_and_tangent(np.zeros(mesh.n_dofs))[1])
+    for rotation in Rotation.random(100, random_state=0).as_matrix():
+        u = (mesh.points @ rotation.T - mesh.points).ravel()
+        state = assembler.force(u)
+        assert np.linalg.norm(state.force) <= 1e-12 * np.linalg.norm(stiffness, 2) * np.linalg.norm(u)
+        assert state.min_det_f == pytest.approx(1.0, abs=1e-12)
+
+
+def test_uniaxial_stress() -> None:
+    """ONSAS `uniaxialExtension`: Y = 1, ν = 0.3, P = 3 gives α = 2, β = √0.1."""
+    p = stress(np.diag([2.0, np.sqrt(0.1), np.sqrt(0.1)]), SaintVenantKirchhoff(1.0, 0.3))
+    np.testing.assert_allclose(p, np.diag([3.0, 0.0, 0.0]), atol=1e-13)
+
+
+@pytest.mark.parametrize("alpha", [0.7, 0.95, 1.3])
+def test_hydrostatic(alpha: float) -> None:
+    expected = (3 * LAW.lame_lambda + 2 * LAW.lame_mu) / 2 * (alpha**3 - alpha)
+    np.testing.assert_allclose(stress(alpha * np.eye(3)), expected * np.eye(3), rtol=1e-13, atol=1e-10)
+
+
+def test_simple_shear() -> None:
+    gradient = np.eye(3)
+    gradient[0, 1] = 0.5
+    p = stress(gradient)
+    assert p[0, 1] == pytest.approx(156.25)
+    assert p[1, 0] == pytest.approx(89.2857, abs=1e-4)
+    assert p[2, 2] == pytest.approx(89.2857, abs=1e-4)
+    assert p[0, 0] == pytest.approx(133.9286, abs=1e-4)
+    assert p[1, 1] == pytest.approx(133.9286, abs=1e-4)
+    mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
+    u = (mesh.points @ (gradient - np.eye(3)).T).ravel()
+    assert free_assembler(mesh).force(u).energy_j == pytest.approx(30.69196, abs=1e-5)
+
+
+def confined_column() -> GalerkinProblem:
+    """One cube between rigid lateral walls whose top moves along the axis as one: a single unknown."""
+    mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
+    dofs = np.full((8, 3), 4)
+    dofs[mesh.points[:, 0] == 1.0, 0] = np.arange(4)
+    return GalerkinProblem(Assembler(mesh.points, mesh.cells, dofs, 4, LAW), np.ones((4, 1)))
+
+
+LIMIT_PA = -206.19652
+
+
+def test_confined_compression_just_below_the_limit_point() -> None:
+    solution = solve_equilibrium(confined_column(), np.array([0.99 * LIMIT_PA]))
+    np.testing.assert_allclose(1 + solution.displacement, 0.6238701392, atol=1e-8)
+
+
+@pytest.mark.parametrize("factor", [1.01, 1.5, 3.0])
+def test_beyond_the_limit_point_there_is_no_solution(factor: float) -> None:
+    """Plain Newton 'converges' to a mirrored element here, with a residual of round-off."""
+    with pytest.raises(SolverError):
+        solve_equilibrium(confined_column(), np.array([factor * LIMIT_PA]))
+
+
+def felupe_solution(scene: Scene, forces: Array) -> Array:
+    """The same problem by felupe, whose stress and elasticity come from automatic differentiation of the energy."""
+    mesh = felupe.Mesh(scene.mesh.points, scene.mesh.cells, "hexahedron")
+    field = felupe.FieldContainer([felupe.Field(felupe.RegionHexahedron(mesh), dim=3)])
+    law = tensortrax.Hyperelastic(tensortrax.models.hyperelastic.saint_venant_kirchhoff, mu=scene.material.lame_mu, lmbda=scene.material.lame_lambda)
+    fixed = {"support": felupe.Boundary(field[0], mask=np.isin(np.arange(scene.mesh.n_nodes), scene.fixed_nodes))}
+    dof0, dof1 = felupe.dof.partition(field, fixed)
+    load = felupe.PointLoad(field, np.arange(scene.mesh.n_nodes), forces)
+    result = felupe.newtonraphson(items=[felupe.SolidBody(law, field), load], dof0=dof0, dof1=dof1, tol=1e-11, verbose=0)
+    return np.asarray(result.x[0].values)
+
+
+def test_agrees_with_felupe_on_random_loads() -> None:
+    scene = mor_bench.load_scene("beam-coarse")
+    model = FullOrderModel(scene)
+    rng = np.random.default_rng(7)
+    weights = scene.patch_weights.toarray()
+    for _ in range(20):
+        direction = rng.normal(size=3)
+        vector = direction / np.linalg.norm(direction) * rng.uniform(0.2, 1.0)
+        forces = weights[rng.integers(len(weights))][:, None] * vector
+        ours = np.zeros(scene.mesh.n_dofs)
+        ours[scene.free_dofs] = model.solve(forces.ravel()[scene.free_dofs]).displacement
+        theirs = felupe_solution(scene, forces).ravel()
+        assert np.linalg.norm(ours - theirs) <= 1e-8 * np.linalg.norm(theirs)
+
+
+def test_newton_converges_quadratically_near_the_solution() -> None:
+    scene = mor_bench.load_scene("beam-tiny")
+    model = FullOrderModel(scene)
+    load = np.zeros(model.n_unknowns)
+    load[-1] = 2.0
+    exact = model.solve(load).displacement
+    u, errors = exact + 1e-2 * np.random.default_rng(0).normal(size=len(exact)) * np.abs(exact).max(), []
+    for _ in range(4):
+        state, tangent = model.linearise(u)
+        u = u + model.factor(tangent).solve(load - state.force)
+        errors.append(np.linalg.norm(u - exact))
+    order = np.log(errors[2] / errors[1]) / np.log(errors[1] / errors[0])
+    assert order >= 1.8
+
+
+def test_work_of_loading_is_the_stored_energy_and_unloading_returns_to_rest() -> None:
+    model = FullOrderModel(mor_bench.load_scene("beam-tiny"))
+    load = np.zeros(model.n_unknowns)
+    load[-1] = 4.0
+    levels = np.linspace(0, 1, 41)
+    states = [np.zeros(model.n_unknowns)]
+    for level in levels[1:]:
+        states.append(model.solve(level * load, start=states[-1]).displacement)
+    work = sum(0.5 * (a + b) * load @ (v - u) for (a, b), (u, v) in zip(itertools.pairwise(levels), itertools.pairwise(states), strict=True))
+    assert work == pytest.approx(model.force(states[-1]).energy_j, rel=1e-3)
+    back = model.solve(1e-12 * load, start=states[-1]).displacement
+    assert np.abs(back).max() <= 1e-9 * np.abs(states[-1]).max()
+
+
+def test_mirrored_load_gives_the_mirrored_answer() -> None:
+    scene = mor_bench.load_scene("beam-coarse")
+    model = FullOrderModel(scene)
+    points = scene.mesh.points
+    mirror = np.array([int(np.linalg.norm(points - (p * [1, -1, 1] + [0, 1, 0]), axis=1).argmin()) for p in points])
+    forces = scene.patch_weights[[30]].toarray()[0][:, None] * np.array([0.3, 0.5, -0.4])
+    answers = []
+    for load in (forces, forces[mirror] * [1, -1, 1]):
+        u = np.zeros(scene.mesh.n_dofs)
+        u[scene.free_dofs] = model.solve(load.ravel()[scene.free_dofs]).displacement
+        answers.append(u.reshape(-1, 3))
+    assert np.abs(answers[1] - answers[0][mirror] * [1, -1, 1]).max() <= 1e-12 * np.abs(answers[0]).max() * 10
+
+
+@pytest.mark.parametrize("poisson", [0.48, 0.49, 0.499, 0.4999])
+def test_nearly_incompressible_converges(poisson: float) -> None:
+    spec = {
+        **mor_bench.load_scene("beam-coarse").spec.model_dump(mode="json"),
+        "material": {"law": "saint-venant-kirchhoff", "young_pa": 500.0, "poisson": poisson},
+    }
+    scene = mor_bench.load_scene(spec)
+    model = FullOrderModel(scene)
+    load = (scene.patch_weights[[62]].toarray()[0][:, None] * np.array([0.0, 0.5, 1.0])).ravel()[scene.free_dofs]
+    solution = model.solve(load)
+    assert np.linalg.norm(load - model.force(solution.displacement).force) <= 1e-8 * np.linalg.norm(load)
+    assert solution.min_det_f > 0
+
+
+def test_a_huge_load_ends_in_the_answer_or_in_a_typed_error() -> None:
+    scene = mor_bench.load_scene("beam-tiny")
+    model = FullOrderModel(scene)
+    for size in (10.0, 100.0, 1e4, 1e8):
+        for axis in range(3):
+            load = np.zeros((scene.mesh.n_nodes, 3))
+            load[-1, axis] = -size
+            try:
+                solution = model.solve(load.ravel()[scene.free_dofs])
+            except SolverError:
+                continue
+            assert solution.min_det_f > 0
+
+
+def test_both_direct_solvers_agree_and_notice_an_indefinite_matrix() -> None:
+    model = FullOrderModel(mor_bench.load_scene("beam-coarse"))
+    pattern, values = model.assembler.pattern, model.rest_tangent
+    rhs = np.random.default_rng(0).normal(size=(pattern.n, 2))
+    answers = [solver(pattern).factor(values).solve(rhs) for solver in (BandedCholesky, SparseLU)]
+    np.testing.assert_allclose(answers[0], answers[1], rtol=1e-9, atol=1e-12)
+    assert np.linalg.norm(dense(model.assembler, values) @ answers[0] - rhs) <= 1e-9 * np.linalg.norm(rhs)
+    spoilt = np.where(pattern.rows == pattern.indices, values - 0.5 * values.max(), values)
+    for solver in (BandedCholesky, SparseLU):
+        with pytest.raises(NotPositiveDefiniteError):
+            solver(pattern).factor(spoilt)
+
+
+def test_banded_solver_reorders_a_badly_numbered_mesh() -> None:
+    mesh = box_mesh((8.0, 1.0, 1.0), (20, 2, 2))
+    shuffle = np.random.default_rng(0).permutation(mesh.n_nodes)
+    points = np.empty_like(mesh.points)
+    points[shuffle] = mesh.points
+    fixed = points[:, 0] == 0
+    dofs = np.full((mesh.n_nodes, 3), 3 * int((~fixed).sum()))
+    dofs[~fixed] = np.arange(3 * int((~fixed).sum())).reshape(-1, 3)
+    assembler = Assembler(points, shuffle[mesh.cells], dofs, 3 * int((~fixed).sum()), LAW)
+    values = assembler.force_and_tangent(np.zeros(assembler.n_dofs))[1]
+    solver = BandedCholesky(assembler.pattern)
+    assert solver.bandwidth < assembler.n_dofs // 3
+    rhs = np.random.default_rng(1).normal(size=assembler.n_dofs)
+    np.testing.assert_allclose(dense(assembler, values) @ solver.factor(values).solve(rhs), rhs, rtol=0, atol=1e-9)
+
+
+def test_an_inverted_cell_is_refused() -> None:
+    mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
+    with pytest.raises(InvalidInputError, match=r"cell 0 is inverted or degenerate.*det J must be > 0"):
+        free_assembler(Mesh(mesh.points, mesh.cells[:, [4, 5, 6, 7, 0, 1, 2, 3]]))
+
+
+@pytest.mark.parametrize(
+    ("supports", "named"),
+    [
+        ([], "translation x, translation y, translation z, rotation about x, rotation about y, rotation about z"),
+        ([{"region": {"sphere_m": [[0.0, 0.0, 0.0], 0.01]}}], "rotation about x, rotation about y, rotation about z"),
+        ([{"region": {"box_m": [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]}}], "rotation about z"),
+    ],
+)
+def test_free_rigid_modes_are_named(supports: list[dict[str, object]], named: str) -> None:
+    spec = {**mor_bench.load_scene("beam-tiny").spec.model_dump(mode="json"), "supports": supports}
+    with pytest.raises(UnconstrainedBodyError) as caught:
+        FullOrderModel(mor_bench.load_scene(spec))
+    assert set(named.split(", ")) <= set(str(caught.value).split("free: ")[1].split("; ")[0].split(", "))
