@@ -60,6 +60,14 @@ def _clear_errors() -> Iterator[None]:
         raise typer.Exit(130) from None
 
 
+def _console(stderr: bool = False) -> Console:
+    """A console as wide as the terminal, or wide enough for every column where there is none."""
+    from rich.console import Console
+
+    stream = sys.stderr if stderr else sys.stdout
+    return Console(stderr=stderr, width=None if stream.isatty() else 120)
+
+
 @contextmanager
 def _progress(console: Console) -> Iterator[Listener]:
     """A bar for generation and for the configurations, and a line for each finished one."""
@@ -104,7 +112,7 @@ def run(
     split: Annotated[SplitName | None, typer.Option(help="Test on unseen load regions or on unseen samples. [default: as the dataset says]")] = None,
     limit: Limit = None,
     out: Annotated[Path | None, typer.Option(help="Where to write. [default: reports/runs/TIME-DATASETS]")] = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="Threads for fitting and predicting. [default: all cores]")] = None,
+    threads: Annotated[int, typer.Option(min=1, help="Threads of a prediction; fitting uses all cores.")] = 1,
     workers: Workers = None,
     cache: Cache = None,
     suite: Suite = None,
@@ -112,13 +120,11 @@ def run(
 ) -> None:
     """Fit, score and time methods on datasets; end with tables, figures and a report."""
     with _clear_errors():
-        from rich.console import Console
-
         import mor_bench
         from mor_bench.harness.run import CORE_METHODS
         from mor_bench.report import print_tables, render
 
-        console = Console(stderr=as_json)
+        console = _console(stderr=as_json)
         with _progress(console) as listener:
             comparison = mor_bench.run(
                 datasets or ["beam-coarse"], method or CORE_METHODS, profile.value, out, limit=limit, split=split.value if split else None,
@@ -186,13 +192,11 @@ def generate(
     with _clear_errors():
         import os
 
-        from rich.console import Console
-
         from mor_bench.snapshots.generate import generate as generate_shards
         from mor_bench.specs import load_dataset_spec
 
         spec = load_dataset_spec(dataset, suite)
-        with _progress(Console(stderr=True)) as listener:
+        with _progress(_console(stderr=True)) as listener:
             folder = generate_shards(
                 spec, limit, workers or os.cpu_count() or 1, cache, lambda done, total: listener.generating(spec.name, done, total)
             )
@@ -203,13 +207,11 @@ def generate(
 def report(out: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> None:
     """Print the tables of a finished run and draw its figures and report again."""
     with _clear_errors():
-        from rich.console import Console
-
         import mor_bench
         from mor_bench.report import print_tables, render
 
         comparison = mor_bench.Comparison.read(out)
-        print_tables(comparison, Console())
+        print_tables(comparison, _console())
         for path in render(comparison):
             print(path)
 

@@ -111,7 +111,7 @@ def test_damaged_files_are_refused(fitted: Surrogate, tmp_path: Path, damage: st
     }[damage]
     assert changed != content
     path.write_bytes(changed)
-    with pytest.raises(StoreError, match="model.safetensors"):
+    with pytest.raises(StoreError, match=r"model\.safetensors"):
         mor_bench.load_surrogate(path)
 
 

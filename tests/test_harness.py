@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -193,9 +194,10 @@ def test_listener_hears_of_every_row(cache: Path, tmp_path: Path) -> None:
 
 def test_bad_arguments_are_refused_before_anything_runs(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    for bad in ({"profile": "fast"}, {"threads": 0}, {"threads": 10_000}, {"methods": []}, {"datasets": []}):
+    arguments: list[dict[str, Any]] = [{"profile": "fast"}, {"threads": 0}, {"threads": 10_000}, {"methods": []}, {"datasets": []}]
+    for bad in arguments:
         with pytest.raises(InvalidInputError):
-            mor_bench.run(**{"datasets": ["beam-tiny"], "methods": ["fem"], "out": out, **bad})  # type: ignore[arg-type]
+            mor_bench.run(**{"datasets": ["beam-tiny"], "methods": ["fem"], "out": out, **bad})
     with pytest.raises(SpecError):
         mor_bench.run(["beam-tiny"], ["fem", "pood"], out=out)
     assert not out.exists()

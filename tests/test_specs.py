@@ -157,10 +157,8 @@ def test_load_method_takes_parameters_and_checks_them() -> None:
 
 def test_profile_replaces_parameters_and_sweep(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text(
-        METHOD
-        + "[parameters]\ntolerance = 1e-3\n[sweep]\nn_modes = [1, 2]\n[profiles.quick.sweep]\nn_modes = [5]\n[profiles.quick.parameters]\ntolerance = 0.1"
-    )
+    base = "[parameters]\ntolerance = 1e-3\n[sweep]\nn_modes = [1, 2]\n"
+    path.write_text(METHOD + base + "[profiles.quick.sweep]\nn_modes = [5]\n[profiles.quick.parameters]\ntolerance = 0.1")
     spec = load_method_spec(path)
     assert spec.configurations("quick") == [{"tolerance": 0.1, "n_modes": 5}]
     assert spec.configurations("full") == [{"tolerance": 1e-3, "n_modes": 1}, {"tolerance": 1e-3, "n_modes": 2}]

@@ -79,7 +79,8 @@ class Comparison:
     rows : list of dict
         One per fitted configuration, in the order in which they ran: `dataset`, `split`, `method`, `label`,
         `parameters`, `status` (`ok`, `failed` or `skipped`), `reason`, `n_train`, `n_test`, `n_failed` (test samples
-        without a prediction), `threads`, `error`, `latency_ms`, `offline_s`, `model_bytes`, `discretisation_error_m`.
+        without a prediction), `threads`, `error`, `latency_ms`, `offline_s`, `model_bytes`, `discretisation_error_m`,
+        `warnings`.
     datasets : dict
         For each dataset its spec, as in its file.
     """
@@ -121,7 +122,7 @@ class Comparison:
         """Raw samples of a row that ran.
 
         `latency_ms` (n_queries,); `mean_dof_m`, `relative_l2`, `max_nodal_m`, `amplitude_m` (n_test,); and of the sample
-        with the largest e `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3).
+        with the largest finite e `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3).
         """
         return self._read_arrays(f"{row['dataset']}--{row['label']}")
 

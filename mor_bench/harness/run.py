@@ -113,10 +113,11 @@ def _worst(errors: SampleErrors, predicted: NDArray[np.float64], data: Dataset) 
 def _evaluate(job: _Job, data: Dataset, data_seconds: float | None, threads: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Fit, predict the test set, time single queries; the parts of a row that this yields, and the raw samples."""
     method = make_surrogate(job.method.load_class(), job.parameters)
-    with pinned_threads(threads):
+    with pinned_threads(os.cpu_count() or 1):
         start = perf_counter()
         method.fit(data.scene, data.train)
         fit_seconds = perf_counter() - start
+    with pinned_threads(threads):
         predicted = _predict_all(method, data.test.forces)
         errors = sample_errors(predicted, data.test.displacements)
         answered = np.isfinite(errors.mean_dof_m)
@@ -170,7 +171,7 @@ def run(
     *,
     limit: int | None = None,
     split: SplitBy | None = None,
-    threads: int | None = None,
+    threads: int = 1,
     workers: int | None = None,
     cache: Path | None = None,
     suite: Path | None = None,
@@ -193,8 +194,8 @@ def run(
         Only the first samples of each dataset.
     split : {"region", "sample"}, optional
         Instead of the split in the dataset's file.
-    threads : int, optional
-        Threads for fitting and predicting; all cores by default.
+    threads : int
+        Threads of a prediction, one by default: steadiest and, on small scenes, fastest. Fitting uses all cores.
     workers : int, optional
         Processes for data generation; all cores by default.
     cache, suite : Path, optional
@@ -212,9 +213,8 @@ def run(
     cores = os.cpu_count() or 1
     if profile not in ("quick", "full"):
         raise InvalidInputError(f"`profile` must be 'quick' or 'full'; got {profile!r}.")
-    if threads is not None and not 1 <= threads <= cores:
+    if not 1 <= threads <= cores:
         raise InvalidInputError(f"`threads` must be an integer in [1, {cores}]; got {threads}.")
-    threads = threads or cores
     if not datasets or not methods:
         raise InvalidInputError("`datasets` and `methods` must name at least one each.")
     specs = [load_dataset_spec(dataset, suite) for dataset in datasets]

@@ -1,0 +1,200 @@
+"""The worst test sample of each method: the predicted mesh over the reference, seen in parallel projection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import ceil
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from mor_bench.harness.results import Comparison
+from mor_bench.report.canvas import GREY, INK, WIDTH_IN, Drawn, Style, new_figure, plain, save, shortened
+from mor_bench.report.summary import Entry, best_per_method, entries_of, metres, percent, short_swept
+from mor_bench.scene.mesh import Mesh
+
+REFERENCE, PREDICTION, FORCE = "#7fb2d6", "#D55E00", "#222222"
+
+AZIMUTH, ELEVATION = np.deg2rad(-68.0), np.deg2rad(20.0)
+"""Direction from which the mesh is seen: x runs to the right, z up, and the faces y-min and z-max show."""
+
+
+@dataclass(frozen=True)
+class WorstSample:
+    """The predicted test sample with the largest e of a configuration; arrays are (n_nodes, 3).
+
+    Attributes
+    ----------
+    entry : Entry
+    prediction, reference : array
+        Displacements, m; the prediction is NaN if there is none.
+    forces : array
+        N.
+    error_m, relative_l2 : float
+        Of this sample.
+    """
+
+    entry: Entry
+    prediction: NDArray[np.float64]
+    reference: NDArray[np.float64]
+    forces: NDArray[np.float64]
+    error_m: float
+    relative_l2: float
+
+
+def worst_samples(comparison: Comparison, dataset: str, styles: dict[str, Style]) -> Drawn | None:
+    """Predicted mesh over reference for the worst sample of each method's best configuration; None if there are none."""
+    try:
+        arrays = comparison.dataset_arrays(dataset)
+        mesh = Mesh(np.asarray(arrays["points"]), np.asarray(arrays["cells"]))
+    except (OSError, KeyError):
+        return None
+    samples = [sample for entry in best_per_method(entries_of(comparison, dataset)) if (sample := _read(comparison, entry)) is not None]
+    if not samples:
+        return None
+    columns = min(3 if len(samples) > 4 else 2, len(samples))
+    rows = ceil(len(samples) / columns)
+    arrows = [_arrow(mesh, sample) for sample in samples]
+    limits = _limits(mesh, samples, arrows)
+    tall = float(np.divide(*np.diff(limits, axis=0)[0, ::-1]))
+    figure = new_figure(0.9 + rows * (0.45 + WIDTH_IN / columns * min(tall, 1.0)))
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid.ravel():
+        axes.set_axis_off()
+    for axes, sample, arrow in zip(grid.ravel(), samples, arrows, strict=False):
+        _panel(axes, mesh, sample, arrow, limits)
+    handles = [
+        Line2D([], [], color=GREY, linewidth=0.8, label="at rest"),
+        Patch(facecolor=REFERENCE, edgecolor="#33607f", label="reference (full-order)"),
+        Line2D([], [], color=PREDICTION, linewidth=1.5, label="prediction"),
+        Line2D([], [], color=FORCE, linewidth=1.5, marker=">", label="total force"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+    figure.suptitle(plain(f"Worst test sample of each method – {dataset}"), x=0.01, ha="left", fontsize=13, color=INK)
+    path = save(figure, comparison, dataset, "worst-samples")
+    caption = (
+        "The test sample with the largest e of each method, in the configuration with the smallest ē: the average hides it. "
+        "Samples without a prediction cannot be drawn; the title gives their number. "
+        "Filled: the reference; lines: the prediction; grey: the body at rest. Deformations are not magnified, all panels have the same scale. "
+        "The arrow shows direction and place of the force, not its size."
+    )
+    return Drawn(dataset, path, "Worst test sample of each method", caption)
+
+
+def _read(comparison: Comparison, entry: Entry) -> WorstSample | None:
+    try:
+        arrays = comparison.samples(entry.row)
+        e = np.asarray(arrays["mean_dof_m"])
+        worst = int(np.argmax(np.where(np.isfinite(e), e, -1.0)))  # a sample without a prediction has nothing to draw
+        prediction, reference, forces = (np.asarray(arrays[f"worst_{name}"], dtype=float) for name in ("prediction", "reference", "forces"))
+        return WorstSample(entry, prediction, reference, forces, float(e[worst]), float(arrays["relative_l2"][worst]))
+    except (OSError, KeyError, ValueError):
+        return None
+
+
+def _project(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Screen coordinates (n, 2) in m and nearness (n,): a rotation, so all three axes have the same scale."""
+    ca, sa, ce, se = np.cos(AZIMUTH), np.sin(AZIMUTH), np.cos(ELEVATION), np.sin(ELEVATION)
+    towards = np.array([ce * ca, ce * sa, se])
+    right = np.array([-sa, ca, 0.0])
+    return points @ np.stack([right, np.cross(towards, right)]).T, points @ towards
+
+
+def _limits(mesh: Mesh, samples: list[WorstSample], arrows: list[NDArray[np.float64] | None]) -> NDArray[np.float64]:
+    """(2, 2) screen box that holds all shapes and arrows; of wild predictions only what lies within half a diagonal of the body."""
+    span = _diagonal(mesh)
+    shapes = [mesh.points, *(arrow for arrow in arrows if arrow is not None)]
+    for sample in samples:
+        shapes.append(mesh.points + sample.reference)
+        if np.isfinite(sample.prediction).all():
+            shapes.append(mesh.points + np.clip(sample.prediction, -0.5 * span, 0.5 * span))
+    screen = np.concatenate([_project(shape)[0] for shape in shapes])
+    margin = 0.06 * float(np.ptp(screen[:, 0]))
+    return np.array([screen.min(axis=0) - margin, screen.max(axis=0) + margin])
+
+
+def _diagonal(mesh: Mesh) -> float:
+    return float(np.linalg.norm(np.diff(mesh.bounds, axis=0)))
+
+
+def _arrow(mesh: Mesh, sample: WorstSample) -> NDArray[np.float64] | None:
+    """(2, 3) start and end of the total force: it ends on the surface where it pushes and starts there where it pulls."""
+    size, total = np.linalg.norm(sample.forces, axis=1), sample.forces.sum(axis=0)
+    if not size.sum() > 0 or not np.linalg.norm(total) > 0:
+        return None
+    points = mesh.points + sample.reference
+    place = size @ points / size.sum()
+    arrow = 0.16 * _diagonal(mesh) * total / np.linalg.norm(total)
+    loaded = mesh.boundary_facets[np.isin(mesh.boundary_facets, np.flatnonzero(size > 0)).any(axis=1)]
+    pushes = _normals(points, loaded).sum(axis=0) @ total < 0
+    return np.stack([place - arrow, place] if pushes else [place, place + arrow])
+
+
+def _panel(axes: Axes, mesh: Mesh, sample: WorstSample, arrow: NDArray[np.float64] | None, limits: NDArray[np.float64]) -> None:
+    axes.set_aspect("equal")
+    axes.set_xlim(limits[0, 0], limits[1, 0])
+    axes.set_ylim(limits[0, 1], limits[1, 1])
+    facets = mesh.boundary_facets
+    rest, _ = _project(mesh.points)
+    axes.add_collection(LineCollection(list(rest[_edges(facets)]), colors="#c4c4c4", linewidths=0.5, zorder=1))
+    reference = mesh.points + sample.reference
+    _draw_surface(axes, reference, facets)
+    if np.isfinite(sample.prediction).all():
+        screen, _ = _project(mesh.points + sample.prediction)
+        front = facets[_facing(mesh.points + sample.prediction, facets)]
+        axes.add_collection(LineCollection(list(screen[_edges(front)]), colors=PREDICTION, linewidths=0.9, zorder=4))
+        figures = f"e = {metres(sample.error_m)} m, relative L2 = {percent(sample.relative_l2)} %"
+        if sample.entry.n_failed:
+            figures += f"; {sample.entry.n_failed} failed"
+    else:
+        figures = "no prediction: the method failed on it"
+    if arrow is not None:
+        start, end = _project(arrow)[0]
+        _draw_force(axes, start, end, float(np.linalg.norm(sample.forces.sum(axis=0))))
+    name = shortened(f"{sample.entry.method}  {short_swept(sample.entry.swept)}".rstrip(), 44)
+    axes.set_title(plain(f"{name}\n{figures}"), fontsize=9.5, loc="left", color=INK)
+
+
+def _edges(facets: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n_edges, 2) edges of facets, each once."""
+    pairs = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
+    return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
+def _normals(points: NDArray[np.float64], facets: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(n_facets, 3) outward normals, as long as twice the facet's area."""
+    corners = points[facets]
+    return np.asarray(np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]))
+
+
+def _facing(points: NDArray[np.float64], facets: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """The facets whose outer side is seen."""
+    return np.asarray(_project(_normals(points, facets))[1] > 0)
+
+
+def _draw_surface(axes: Axes, points: NDArray[np.float64], facets: NDArray[np.int64]) -> None:
+    """Visible facets from far to near, the brighter the more they face upwards."""
+    seen = facets[_facing(points, facets)]
+    screen, nearness = _project(points)
+    order = np.argsort(nearness[seen].mean(axis=1))
+    normals = _normals(points, seen)
+    up = normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)
+    base = np.array([int(REFERENCE[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    shade = 1.0 - 0.75 * (0.35 + 0.3 * np.clip(up, -1, 1))[:, None]
+    colours = 1.0 - (1.0 - base) * np.clip(shade, 0.3, 1.0)
+    axes.add_collection(PolyCollection(list(screen[seen[order]]), facecolors=colours[order], edgecolors="#33607f", linewidths=0.4, zorder=3))
+
+
+def _draw_force(axes: Axes, start: NDArray[np.float64], end: NDArray[np.float64], newton: float) -> None:
+    shape = {"arrowstyle": "-|>", "color": FORCE, "linewidth": 1.6, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops=shape, zorder=6)
+    frame = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
+    beside, other = (end, start) if end[1] > start[1] else (start, end)
+    right = beside[0] >= other[0]
+    place: dict[str, Any] = {"xytext": (4 if right else -4, 4), "textcoords": "offset points", "ha": "left" if right else "right", "va": "center"}
+    axes.annotate(f"{newton:.2g} N", (beside[0], beside[1]), **place, fontsize=8.5, color=FORCE, bbox=frame, zorder=6)

@@ -1,0 +1,272 @@
+"""The report as one HTML page that needs nothing but itself."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from mor_bench.harness.results import Comparison
+from mor_bench.report.canvas import Drawn
+from mor_bench.report.figures import write_figures
+from mor_bench.report.summary import (
+    Entry,
+    dataset_names,
+    discretisation_error,
+    entries_of,
+    headline,
+    metres,
+    needs_of,
+    number,
+    percent,
+    short_names_used,
+    size_of,
+)
+from mor_bench.report.tables import target_cells
+from mor_bench.snapshots.store import write_atomically
+
+STYLE = """
+:root { color-scheme: light; }
+body { font: 15px/1.5 system-ui, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; color: #222; background: #fff;
+       max-width: 1160px; margin: 0 auto; padding: 24px 20px 60px; }
+h1 { font-size: 27px; margin: 0 0 4px; } h2 { font-size: 21px; margin: 42px 0 8px; border-bottom: 1px solid #ddd; padding-bottom: 4px; }
+h3 { font-size: 16px; margin: 26px 0 6px; } p { margin: 6px 0; }
+.headline { background: #f1f6fa; border-left: 4px solid #0072B2; padding: 12px 16px; font-size: 16px; margin: 14px 0; }
+.quiet { color: #666; font-size: 13px; } .wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; margin: 6px 0; }
+th, td { padding: 3px 7px; text-align: right; vertical-align: top; border-bottom: 1px solid #e8e8e8; white-space: nowrap; }
+thead th { background: #f5f5f5; border-bottom: 1px solid #bbb; font-weight: 600; vertical-align: bottom; }
+th.text, td.text { text-align: left; } td.reason { white-space: normal; min-width: 240px; text-align: left; }
+th.group { text-align: center; border-left: 1px solid #ddd; }
+tr.meets td, .pinned tr.meets td:first-child { background: #eef6ea; } tr.bad td, .pinned tr.bad td:first-child { color: #a33; background: #fdf3f1; }
+tr.front td:first-child { font-weight: 600; }
+.pinned td:first-child, .pinned tr:first-child th:first-child { position: sticky; left: 0; background: #fff; }
+.pinned tr:first-child th:first-child { background: #f5f5f5; }
+td small, td .quiet { color: #777; font-size: 11.5px; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: 3px 18px; margin: 6px 0; } dt { color: #666; }
+dd { margin: 0; overflow-wrap: anywhere; }
+dl.words dt { color: #222; font-weight: 600; }
+figure { margin: 18px 0 26px; } figure img { width: 100%; height: auto; border: 1px solid #eee; } figcaption { color: #555; font-size: 13px; }
+@media (max-width: 700px) { dl { grid-template-columns: 1fr; } dd { margin-bottom: 6px; } }
+"""
+
+GROUPS = (
+    ("relative L2 (%)", (("median", "rel_l2_median"), ("p95", "rel_l2_p95"), ("max", "rel_l2_max"))),
+    ("latency (ms)", (("median", "median"), ("p95", "p95"), ("p99", "p99"))),
+    ("per degree of freedom (m)", (("ē", "mean_dof_m"), ("σ(e)", "std_dof_m"), ("max e", "max_dof_m"))),
+    ("offline (s)", (("data", "data"), ("fit", "fit"))),
+    ("nodal (m)", (("max", "max_nodal_m"),)),
+    ("e over u", (("slope", "slope"),)),
+)
+"""Headings of the configuration table that stand over several figures: name, and the columns with their keys."""
+
+DEFINITIONS = (
+    ("e", "of a test sample: the mean absolute error over the degrees of freedom, m."),
+    ("ē, σ(e), max e", "mean, standard deviation (with M − 1) and maximum of e over the test set."),
+    (
+        "relative L2",
+        "of a test sample: the norm of the error over the norm of the reference displacement; median, 95th percentile, maximum over the test set.",
+    ),
+    ("largest nodal", "the largest Euclidean error of any node in any test sample."),
+    ("slope", "of the least-squares line through the origin of e over the largest nodal displacement of the sample."),
+    (
+        "latency",
+        "wall-clock time of one query at a time, from nodal forces to nodal displacements on the host, after warm-up; percentiles over the queries.",
+    ),
+    ("failures", "a test sample without a prediction counts as an infinite error; it is never dropped."),
+    ("meets the needs", "the median relative L2 error and the median latency are both within what the dataset's file asks for."),
+    ("Pareto", "no other configuration of the dataset has both a smaller median error and a smaller median latency."),
+    (
+        "time at error, error at time",
+        "log-log between adjacent non-dominated configurations of a method, beside the best real configuration that meets the target. "
+        "Interpolation never extrapolates: beyond the configurations measured, a target is “not reached”.",
+    ),
+    (
+        "discretisation error",
+        "of the scene's own mesh against a finer one. All errors above are against the full-order model on this mesh, and say nothing about it.",
+    ),
+)
+
+RAW_FILES = (
+    ("results.json", "all rows, machine and datasets"),
+    ("results.csv", "the same rows, flat"),
+    ("comparison.json", "time at error and error at time"),
+    ("samples/", "raw latencies and per-sample errors of every row (HDF5)"),
+    ("figures/", "the figures of this page (PNG)"),
+)
+
+
+def render(comparison: Comparison) -> list[Path]:
+    """Write all figures and the page.
+
+    Parameters
+    ----------
+    comparison : Comparison
+
+    Returns
+    -------
+    list of Path
+        The figures, and OUT/report.html last.
+    """
+    drawn = write_figures(comparison)
+    return [*(figure.path for figure in drawn), _write_page(comparison, drawn)]
+
+
+def write_report(comparison: Comparison) -> Path:
+    """Write all figures and OUT/report.html; return the page's path."""
+    return render(comparison)[-1]
+
+
+def _write_page(comparison: Comparison, drawn: Sequence[Drawn]) -> Path:
+    names = dataset_names(comparison)
+    sections = "\n".join(_dataset_section(comparison, name, [figure for figure in drawn if figure.dataset == name]) for name in names)
+    headlines = "".join(f'<p class="headline"><b>{escape(name)}</b>: {escape(headline(comparison, name))}</p>' for name in names)
+    raw = "".join(f'<dt><a href="{name}">{name}</a></dt><dd>{escape(what)}</dd>' for name, what in RAW_FILES)
+    words = "".join(f"<dt>{escape(word)}</dt><dd>{escape(meaning)}</dd>" for word, meaning in DEFINITIONS)
+    page = f"""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>mor-bench: {escape(", ".join(names))}</title><style>{STYLE}</style></head><body>
+<h1>mor-bench report</h1>
+<p class="quiet">Speed against error of model-order-reduction methods, on the same snapshots and the same machine.</p>
+{headlines or "<p>There is nothing to report: no dataset was run.</p>"}
+{sections}
+<h2>Machine</h2><dl>{"".join(_definition(key, value) for key, value in _flat(comparison.machine))}</dl>
+<h2>How the numbers are defined</h2><dl class="words">{words}</dl>
+<h2>Raw files</h2><p class="quiet">Beside this page:</p><dl>{raw}</dl>
+</body></html>
+"""
+    path = comparison.out / "report.html"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, page.encode())
+    return path
+
+
+def _flat(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
+    """Nested tables as rows such as ``("versions numpy", "2.4.6")``."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _flat(item, f"{prefix} {key}".strip())
+    elif isinstance(value, list | tuple) and any(isinstance(item, dict) for item in value):
+        for item in value:
+            yield from _flat(item, prefix)
+    else:
+        yield prefix, ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+def _definition(key: str, value: str) -> str:
+    return f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>"
+
+
+def _dataset_section(comparison: Comparison, dataset: str, drawn: Sequence[Drawn]) -> str:
+    entries, spec = entries_of(comparison, dataset), comparison.datasets.get(dataset, {})
+    names = short_names_used(entries)
+    targets = "".join(
+        f"<h3>{title}</h3>{_target_table(comparison, dataset, kind)}"
+        for kind, title in (
+            ("time_at_error", "Time at error: median latency at a median relative L2 error"),
+            ("error_at_time", "Error at time: median relative L2 error within a median latency"),
+        )
+    )
+    note = f"In brackets and below: the best real configuration. {escape(names)}{'.' if names else ''}"
+    return f"""<h2>{escape(dataset)}{f": {escape(str(spec['title']))}" if spec.get("title") else ""}</h2>
+<h3>What was run</h3><dl>{"".join(_definition(key, value) for key, value in _what_was_run(comparison, dataset, entries))}</dl>
+<h3>Configurations</h3><div class="wide">{_configuration_table(entries)}</div>
+<p class="quiet">Green: meets the needs. Bold: on the Pareto front. Red: failed, skipped, or test samples without a prediction.</p>
+{_troubles(entries)}
+{targets}<p class="quiet">{note}</p>
+{"".join(map(_figure, drawn)) or "<p>There are no figures: no configuration gave samples to draw.</p>"}"""
+
+
+def _what_was_run(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> list[tuple[str, str]]:
+    spec, needs = comparison.datasets.get(dataset, {}), needs_of(comparison, dataset)
+    scene = [
+        (key, "; ".join(f"{k}: {v}" if k else v for k, v in _flat(spec[key]))) for key in ("geometry", "material", "supports", "loads") if key in spec
+    ]
+
+    def values(name: str) -> str:
+        return ", ".join(dict.fromkeys(str(entry.row.get(name)) for entry in entries)) or "–"
+
+    return [
+        *([("source", str(spec["source"]))] if spec.get("source") else []),
+        *scene,
+        ("split", f"by {values('split')}; training samples: {values('n_train')}; test samples: {values('n_test')}"),
+        ("needs", f"median relative L2 error ≤ {percent(needs['error'])} %, median latency ≤ {number(needs['latency_ms'])} ms"),
+        ("discretisation error of the scene itself", discretisation_error(entries)),
+        ("threads", values("threads")),
+        (
+            "configurations",
+            f"{len(entries)}, of which {sum(e.ran for e in entries)} ran, {sum(e.row['status'] == 'failed' for e in entries)} failed, "
+            f"{sum(e.row['status'] == 'skipped' for e in entries)} were skipped",
+        ),
+    ]
+
+
+def _cell(group: str, key: str, entry: Entry) -> str:
+    if group.startswith("latency"):
+        return number(entry.figure("latency_ms", key))
+    if group.startswith("offline"):
+        return number(entry.figure("offline_s", key))
+    value = entry.figure("error", key)
+    return percent(value) if group.startswith("relative") else metres(value)
+
+
+def _count(value: object) -> str:
+    return "–" if value is None else str(value)
+
+
+def _configuration_table(entries: Sequence[Entry]) -> str:
+    over = "".join(f'<th class="group" colspan="{len(columns)}">{escape(group)}</th>' for group, columns in GROUPS)
+    under = "".join(f"<th>{escape(name)}</th>" for _, columns in GROUPS for name, _ in columns)
+    plain = ("size", "threads", "n train", "n test", "without<br>prediction", "discretisation<br>error (m)")
+    tail = "".join(f'<th rowspan="2">{name}</th>' for name in plain)
+    body = []
+    for entry in entries:
+        row = entry.row
+        cells = [escape(_cell(group, key, entry)) for group, columns in GROUPS for _, key in columns]
+        discretisation = row.get("discretisation_error_m")
+        cells += [escape(size_of(row.get("model_bytes"))), *(escape(_count(row.get(key))) for key in ("threads", "n_train", "n_test", "n_failed"))]
+        cells.append("not measured" if discretisation is None else metres(float(discretisation)))
+        kind = "meets" if entry.meets_needs else "bad" if entry.trouble else ""
+        marks = f"<td>{'yes' if entry.meets_needs else 'no'}</td><td>{'*' if entry.on_front else ''}</td>"
+        status = f'<td class="text">{escape(str(row["status"]))}</td>'
+        body.append(
+            f'<tr class="{kind}{" front" if entry.on_front else ""}"><td class="text">{escape(entry.label)}</td>{status}{marks}'
+            + "".join(f"<td>{cell}</td>" for cell in cells)
+            + "</tr>"
+        )
+    first = "".join(f'<th rowspan="2" class="text">{name}</th>' for name in ("configuration", "status", "needs<br>met", "Pareto"))
+    head = f"<thead><tr>{first}{over}{tail}</tr><tr>{under}</tr></thead>"
+    return f'<table class="pinned">{head}<tbody>{"".join(body)}</tbody></table>'
+
+
+def _troubles(entries: Sequence[Entry]) -> str:
+    """Failed and skipped configurations, those with failed samples, each with its reason, and all warnings."""
+    said = [("bad", e.label, e.trouble) for e in entries if e.trouble]
+    said += [("", e.label, f"warning: {warning}") for e in entries for warning in e.warnings]
+    rows = "".join(
+        f'<tr class="{kind}"><td class="text">{escape(label)}</td><td class="reason">{escape(text)}</td></tr>' for kind, label, text in said
+    )
+    if not rows:
+        return "<p>Every configuration ran without a warning and predicted every test sample.</p>"
+    head = '<thead><tr><th class="text">configuration</th><th class="text">what happened</th></tr></thead>'
+    return f'<h3>Failures, skips and warnings</h3><div class="wide"><table>{head}<tbody>{rows}</tbody></table></div>'
+
+
+def _target_table(comparison: Comparison, dataset: str, kind: str) -> str:
+    headings, rows = target_cells(comparison, dataset, kind)
+    head = "".join(f"<th>{escape(heading)}</th>" for heading in headings)
+    body = []
+    for method, cells in rows.items():
+        lines = (cell.partition("\n") for cell in cells)
+        tds = "".join(f"<td>{escape(first)}<br><small>{escape(second)}</small></td>" for first, _, second in lines)
+        body.append(f'<tr><td class="text">{escape(method)}</td>{tds}</tr>')
+    return f'<div class="wide"><table><thead><tr><th class="text">method</th>{head}</tr></thead><tbody>{"".join(body)}</tbody></table></div>'
+
+
+def _figure(drawn: Drawn) -> str:
+    data = base64.b64encode(drawn.path.read_bytes()).decode()
+    alt = escape(f"{drawn.title}, {drawn.dataset}", quote=True)
+    caption = f"<b>{escape(drawn.title)}.</b> {escape(drawn.caption)}"
+    return f'<figure><img alt="{alt}" src="data:image/png;base64,{data}"><figcaption>{caption}</figcaption></figure>\n'

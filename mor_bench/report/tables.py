@@ -1,0 +1,215 @@
+"""Console tables of a comparison: a row per configuration, time at error, error at time."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from mor_bench.harness.results import Comparison
+from mor_bench.report.summary import (
+    Entry,
+    dataset_names,
+    discretisation_error,
+    entries_of,
+    headline,
+    metres,
+    needs_of,
+    number,
+    percent,
+    short_names_used,
+    short_swept,
+)
+
+NOT_REACHED = "not reached"
+
+LABEL_WIDTH = 25
+"""Characters that the label keeps before columns of less weight are left out."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the configuration table.
+
+    Attributes
+    ----------
+    heading : str
+        At most two lines.
+    cell : callable
+        An `Entry` to its text.
+    weight : int
+        Where the terminal is narrow, columns of small weight are left out first.
+    """
+
+    heading: str
+    cell: Callable[[Entry], str]
+    weight: int
+
+
+def _bounded(value: float | None) -> str:
+    """Percent; below 0.01 % as a bound, since the CSV file and the page have the digits."""
+    return "<0.01" if value is not None and 0 < value < 1e-4 else percent(value)
+
+
+def _kilobytes(value: float | None) -> str:
+    return number(None if value is None else value / 1000)
+
+
+def _mark(entry: Entry) -> str:
+    return "yes" if entry.meets_needs else "no" if entry.ran else entry.row["status"]
+
+
+COLUMNS = (
+    Column("ē\nm", lambda e: metres(e.figure("error", "mean_dof_m")), 9),
+    Column("σ(e)\nm", lambda e: metres(e.figure("error", "std_dof_m")), 3),
+    Column("max e\nm", lambda e: metres(e.figure("error", "max_dof_m")), 6),
+    Column("rel L2\nmed %", lambda e: percent(e.figure("error", "rel_l2_median")), 9),
+    Column("\np95 %", lambda e: _bounded(e.figure("error", "rel_l2_p95")), 8),
+    Column("\nmax %", lambda e: _bounded(e.figure("error", "rel_l2_max")), 8),
+    Column("latency\nmed ms", lambda e: number(e.figure("latency_ms", "median")), 9),
+    Column("\np95", lambda e: number(e.figure("latency_ms", "p95")), 8),
+    Column("\np99", lambda e: number(e.figure("latency_ms", "p99")), 5),
+    Column("fit\ns", lambda e: number(e.figure("offline_s", "fit")), 6),
+    Column("size\nkB", lambda e: _kilobytes(e.row.get("model_bytes")), 4),
+    Column("\nthr", lambda e: str(e.row.get("threads") or "–"), 4),
+    Column("Pa-\nreto", lambda e: "*" if e.on_front else "", 9),
+    Column("meets\nneeds", _mark, 9),
+)
+
+
+def _columns_for(entries: Sequence[Entry], width: int) -> tuple[list[Column], int]:
+    """The columns that leave the label its room, in their order, and the characters left for the label."""
+
+    def needed(column: Column) -> int:
+        return 1 + max(len(line) for line in [*column.heading.split("\n"), *map(column.cell, entries)])
+
+    chosen = list(COLUMNS)
+    while len(chosen) > 5 and LABEL_WIDTH + sum(map(needed, chosen)) > width:
+        chosen.remove(min(chosen, key=lambda column: column.weight))
+    return chosen, max(width - sum(map(needed, chosen)), 8)
+
+
+def configuration_table(comparison: Comparison, dataset: str, width: int = 120) -> Table:
+    """A row per configuration of a dataset.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    dataset : str
+        Its name.
+    width : int
+        Characters of a line; columns of little weight are left out where it is small.
+    """
+    entries = entries_of(comparison, dataset)
+    columns, room = _columns_for(entries, width)
+    table = Table(box=SIMPLE_HEAD, padding=0, show_edge=False)
+    table.add_column("configuration", overflow="fold", max_width=room)
+    for column in columns:
+        table.add_column(column.heading, justify="right", no_wrap=True)
+    for entry in entries:
+        style = "green" if entry.meets_needs else "" if entry.ran else "red"
+        said = f" ({entry.n_failed} failed)" if entry.ran and entry.n_failed else ""
+        label = Text.assemble((entry.label, "bold" if entry.on_front else ""), (said, "red"))
+        table.add_row(label, *(Text(column.cell(entry)) for column in columns), style=style)
+    return table
+
+
+def _target_table(headings: Sequence[str], rows: dict[str, list[str]], width: int) -> Table:
+    table = Table(box=SIMPLE_HEAD, padding=0, show_edge=False)
+    table.add_column("method", overflow="fold", min_width=8)
+    for heading in headings:
+        table.add_column(heading, justify="right", overflow="fold", min_width=len(NOT_REACHED) if width >= 100 else 8)
+    for method, cells in rows.items():
+        table.add_row(Text(method), *(Text(cell, style="dim" if cell == NOT_REACHED else "") for cell in cells))
+    return table
+
+
+def target_cells(comparison: Comparison, dataset: str, kind: str) -> tuple[list[str], dict[str, list[str]]]:
+    """Headings and, for each method, a cell per target: the interpolated value, and the best real configuration.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    dataset : str
+        Its name.
+    kind : {"time_at_error", "error_at_time"}
+        Which table.
+    """
+    wanted: list[dict[str, Any]] = [record for record in comparison.frontier[kind] if record["dataset"] == dataset]
+    swept = {entry.label: short_swept(entry.swept) for entry in entries_of(comparison, dataset)}
+    headings: dict[str, None] = {}
+    rows: dict[str, list[str]] = {}
+    for record in wanted:
+        if kind == "time_at_error":
+            heading, value, unit = f"{percent(record['target_rel_l2_median'])} %", number(record["latency_ms"]), "ms"
+        else:
+            heading, value, unit = f"{number(record['target_latency_ms'])} ms", percent(record["error"]), "%"
+        best = record["best"]
+        cell = NOT_REACHED
+        if best is not None:
+            real = number(best["latency_ms"]) if unit == "ms" else percent(best["error"])
+            cell = f"{value} {unit} ({real})\n{swept[best['label']]}".rstrip()
+        headings[heading] = None
+        rows.setdefault(record["method"], []).append(cell)
+    return list(headings), rows
+
+
+def tables(comparison: Comparison, width: int = 120) -> list[RenderableType]:
+    """All console tables, a group for each dataset.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    width : int
+        Characters of a line.
+    """
+    return [_dataset_group(comparison, name, width) for name in dataset_names(comparison)]
+
+
+def _dataset_group(comparison: Comparison, dataset: str, width: int) -> Group:
+    entries, needs = entries_of(comparison, dataset), needs_of(comparison, dataset)
+    title = str(comparison.datasets.get(dataset, {}).get("title", ""))
+    notes = [Text(f"{entry.label}: {entry.trouble}", style="red") for entry in entries if entry.trouble]
+    notes += [Text(f"{entry.label}: warning: {warning}", style="yellow") for entry in entries for warning in entry.warnings]
+    parts: list[RenderableType] = [
+        Text(f"{dataset}{f' – {title}' if title else ''}", style="bold"),
+        Text(f"needs: relative L2 (median) ≤ {percent(needs['error'])} %, latency (median) ≤ {number(needs['latency_ms'])} ms"),
+        Text(f"discretisation error of the scene itself: {discretisation_error(entries)}"),
+        Text(""),
+        configuration_table(comparison, dataset, width),
+        Text("Pareto *: no other configuration is both faster and more accurate (medians).", style="dim"),
+        *notes,
+    ]
+    for kind, heading in (
+        ("time_at_error", "Time at error: median latency at a median relative L2 error (in brackets: the fastest real configuration)"),
+        ("error_at_time", "Error at time: median relative L2 error within a median latency (in brackets: the best real configuration)"),
+    ):
+        headings, rows = target_cells(comparison, dataset, kind)
+        parts += [Text(""), Text(heading, style="bold"), _target_table(headings, rows, width)]
+    parts.append(Text("  ".join(filter(None, [short_names_used(entries), "Nothing is extrapolated."])), style="dim"))
+    parts += [Text(""), Text(headline(comparison, dataset), style="bold"), Text("")]
+    return Group(*parts)
+
+
+def print_tables(comparison: Comparison, console: Console | None = None) -> None:
+    """Print all tables.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    console : rich.console.Console, optional
+        Standard output by default, 120 characters wide where that is no terminal.
+    """
+    console = console or Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+    with console.capture() as captured:
+        for part in tables(comparison, console.width):
+            console.print(part, highlight=False)
+    encoding = console.encoding or "utf-8"  # a redirected stream of a legacy code page must not end a long run with an error
+    console.file.write(captured.get().encode(encoding, "replace").decode(encoding))
+    console.file.flush()
