@@ -5,6 +5,8 @@ from __future__ import annotations
 import inspect
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,8 +26,8 @@ class Surrogate(ABC):
     """A map from nodal forces to nodal displacements of one scene.
 
     A subclass stores its knobs in ``__init__`` under their own names and nothing else, annotates them (pydantic `Field`
-    constraints give their range), begins `fit` with `_begin_fit`, and `predict` with `_checked_forces`. What it learns
-    ends in an underscore.
+    constraints give their range), fits inside ``with self._fitting(scene)``, and begins `predict` with `_checked_forces`.
+    What it learns ends in an underscore.
     """
 
     scene_: Scene
@@ -108,13 +110,21 @@ class Surrogate(ABC):
         """Become fitted from the arrays of `_state`; ``scene_`` is already set."""
         raise MorBenchError(f"{type(self).__name__} does not support loading.")
 
-    def _begin_fit(self, scene: Scene) -> None:
-        """Check the knobs and the scene; the first line of every `fit`."""
+    @contextmanager
+    def _fitting(self, scene: Scene) -> Iterator[None]:
+        """Check the knobs and the scene, forget an earlier fit, and stay unfitted if the body fails."""
         check_parameters(type(self), self.parameters)
         reason = self.supports(scene)
         if reason is not None:
             raise UnsupportedSceneError(f"{type(self).__name__} cannot handle {scene.name}: {reason}")
+        for name in [name for name in vars(self) if name.endswith("_")]:
+            delattr(self, name)
         self.scene_ = scene
+        try:
+            yield
+        except BaseException:
+            del self.scene_
+            raise
 
     def _checked_snapshots(self, snapshots: Snapshots | None) -> Snapshots:
         """The training samples, which this method cannot do without."""

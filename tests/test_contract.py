@@ -15,7 +15,7 @@ from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import list_suite
 from mor_bench.surrogate import Surrogate
 
-CHEAP = {"umesh": {"channels": 4, "steps": 1, "iterations": 60, "batch_size": 16}}
+CHEAP = {"umesh": {"channels": 8, "steps": 1, "iterations": 150, "batch_size": 16, "learning_rate": 3e-3}}
 """Parameters that keep a costly method's battery short."""
 
 NEEDS_NO_SNAPSHOTS = ("fem", "linear-fem")
@@ -140,6 +140,9 @@ def test_snapshots_with_nan_or_none_at_all_are_refused(name: str, tiny: Dataset)
         return
     spoilt = copy.deepcopy(tiny.train[:20])
     spoilt.free_displacements[3, 4] = np.nan
+    method = make(name).fit(tiny.scene, tiny.train)
     for snapshots in (None, tiny.train[:0], spoilt):
         with pytest.raises(InvalidInputError):
-            make(name).fit(tiny.scene, snapshots)
+            method.fit(tiny.scene, snapshots)
+        with pytest.raises(NotFittedError):
+            method.predict(tiny.test.forces[0])

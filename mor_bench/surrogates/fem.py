@@ -29,8 +29,8 @@ class FullFEM(Surrogate):
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
         """Assemble and factorise the rest-state stiffness; snapshots are not used."""
-        self._begin_fit(scene)
-        self._restore({})
+        with self._fitting(scene):
+            self._restore({})
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:

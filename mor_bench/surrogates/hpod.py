@@ -50,18 +50,18 @@ class HyperReducedPOD(Surrogate):
         self.tolerance = tolerance
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
-        self._begin_fit(scene)
-        displacements = self._checked_snapshots(snapshots).free_displacements
-        modes = pod(displacements, self.n_modes).modes
-        model = FullOrderModel(scene)
-        if self.cubature_tolerance == 0:
-            weights = np.ones(scene.mesh.n_cells)
-        else:
-            chosen = np.unique(np.linspace(0, len(displacements) - 1, self.n_cubature_snapshots).astype(int))
-            system = ecsw_system(model.assembler, model.cell_dofs, modes, displacements[chosen] @ modes)
-            weights = sparse_nnls(system, system.sum(axis=1), self.cubature_tolerance).weights
-        cells = np.flatnonzero(weights)
-        self._restore({"modes": modes, "cells": cells, "weights": weights[cells]})
+        with self._fitting(scene):
+            displacements = self._checked_snapshots(snapshots).free_displacements
+            modes = pod(displacements, self.n_modes).modes
+            model = FullOrderModel(scene)
+            if self.cubature_tolerance == 0:
+                weights = np.ones(scene.mesh.n_cells)
+            else:
+                chosen = np.unique(np.linspace(0, len(displacements) - 1, self.n_cubature_snapshots).astype(int))
+                system = ecsw_system(model.assembler, model.cell_dofs, modes, displacements[chosen] @ modes)
+                weights = sparse_nnls(system, system.sum(axis=1), self.cubature_tolerance).weights
+            cells = np.flatnonzero(weights)
+            self._restore({"modes": modes, "cells": cells, "weights": weights[cells]})
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:

@@ -21,8 +21,8 @@ class LinearFEM(Surrogate):
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
         """Factorise the rest-state stiffness; snapshots are not used."""
-        self._begin_fit(scene)
-        self._restore({})
+        with self._fitting(scene):
+            self._restore({})
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:

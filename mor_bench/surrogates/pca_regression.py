@@ -78,28 +78,28 @@ class PCARegression(Surrogate):
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         from sklearn.linear_model import Ridge
 
-        self._begin_fit(scene)
-        snapshots = self._checked_snapshots(snapshots)
-        loaded = self._loaded(scene)
-        forces, targets = snapshots.free_forces[:, loaded], snapshots.free_displacements
-        if self.input == "linear-response":
-            compliance = FullOrderModel(scene).rest_factor.solve(np.eye(len(scene.free_dofs))[:, loaded])
-            linear = pod(compliance.T)
-            response = linear.modes[:, linear.singular_values[: linear.modes.shape[1]] > LINEAR_TAIL * linear.singular_values[0]]
-            to_input = response.T @ compliance
-            targets = targets - forces @ compliance.T
-        else:
-            response, to_input = np.zeros((len(scene.free_dofs), 0)), np.eye(len(loaded))
-        inputs = forces @ to_input.T
-        axes = pod(inputs).modes[:, : self.n_input_modes]
-        axes = axes / np.sqrt(((inputs @ axes) ** 2).mean(axis=0))
-        features = monomials(inputs @ axes, monomial_indices(axes.shape[1], self.degree))
-        feature_scale = np.sqrt((features**2).mean(axis=0))
-        modes = pod(targets).modes[:, : self.n_output_modes]
-        regression = Ridge(alpha=self.ridge * len(features), fit_intercept=False, solver="cholesky")
-        regression.fit(features / feature_scale, targets @ modes)
-        weights = np.atleast_2d(regression.coef_) / feature_scale
-        self._restore({"response": response, "to_input": to_input, "axes": axes, "modes": modes, "weights": weights})
+        with self._fitting(scene):
+            snapshots = self._checked_snapshots(snapshots)
+            loaded = self._loaded(scene)
+            forces, targets = snapshots.free_forces[:, loaded], snapshots.free_displacements
+            if self.input == "linear-response":
+                compliance = FullOrderModel(scene).rest_factor.solve(np.eye(len(scene.free_dofs))[:, loaded])
+                linear = pod(compliance.T)
+                response = linear.modes[:, linear.singular_values[: linear.modes.shape[1]] > LINEAR_TAIL * linear.singular_values[0]]
+                to_input = response.T @ compliance
+                targets = targets - forces @ compliance.T
+            else:
+                response, to_input = np.zeros((len(scene.free_dofs), 0)), np.eye(len(loaded))
+            inputs = forces @ to_input.T
+            axes = pod(inputs).modes[:, : self.n_input_modes]
+            axes = axes / np.sqrt(((inputs @ axes) ** 2).mean(axis=0))
+            features = monomials(inputs @ axes, monomial_indices(axes.shape[1], self.degree))
+            feature_scale = np.sqrt((features**2).mean(axis=0))
+            modes = pod(targets).modes[:, : self.n_output_modes]
+            regression = Ridge(alpha=self.ridge * len(features), fit_intercept=False, solver="cholesky")
+            regression.fit(features / feature_scale, targets @ modes)
+            weights = np.atleast_2d(regression.coef_) / feature_scale
+            self._restore({"response": response, "to_input": to_input, "axes": axes, "modes": modes, "weights": weights})
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
@@ -131,7 +131,6 @@ class PCARegression(Surrogate):
         state = {name: np.ascontiguousarray(array) for name, array in state.items()}
         self.response_, self.to_input_, self.axes_ = state["response"], state["to_input"], state["axes"]
         self.modes_, self.weights_ = state["modes"], state["weights"]
-        self.__dict__.pop("model_", None)
         self._loaded_dofs = self._loaded(self.scene_)
         self._elsewhere = np.setdiff1d(np.arange(len(self.scene_.free_dofs)), self._loaded_dofs)
         self._levels = monomial_indices(self.axes_.shape[1], self.degree)

@@ -44,9 +44,9 @@ class PODGalerkin(Surrogate):
         self.tolerance = tolerance
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
-        self._begin_fit(scene)
-        basis = pod(self._checked_snapshots(snapshots).free_displacements, self.n_modes)
-        self._restore({"modes": basis.modes})
+        with self._fitting(scene):
+            basis = pod(self._checked_snapshots(snapshots).free_displacements, self.n_modes)
+            self._restore({"modes": basis.modes})
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:

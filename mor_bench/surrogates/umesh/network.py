@@ -1,0 +1,81 @@
+"""The 3D U-Net of U-Mesh: convolutions, ReLU, max-pooling and skips; no normalisation layer, as in the paper."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+
+class DoubleConvolution(nn.Sequential):
+    """Two padded 3×3×3 convolutions, each followed by ReLU: (n, c_in, x, y, z) → (n, c_out, x, y, z)."""
+
+    def __init__(self, c_in: int, c_out: int) -> None:
+        super().__init__(
+            nn.Conv3d(c_in, c_out, 3, padding=1),
+            nn.ReLU(inplace=True),
+            nn.Conv3d(c_out, c_out, 3, padding=1),
+            nn.ReLU(inplace=True),
+        )
+
+
+class UNet(nn.Module):
+    """3D U-Net from 3 force components to 3 displacement components per grid point.
+
+    Mendizabal, Márquez-Neila, Cotin, "Simulation of hyperelastic materials in real-time using Deep Learning", section
+    "U-Net architecture". It has c·2^k channels at the bottom, which the paper calls the feature space size.
+
+    Parameters
+    ----------
+    channels : int
+        c, channels of the first level; each level down has twice as many.
+    steps : int
+        k, how often the grid is halved. Every side of the grid must be a multiple of 2^k.
+    """
+
+    def __init__(self, channels: int, steps: int) -> None:
+        super().__init__()
+        widths = [channels * 2**level for level in range(steps + 1)]
+        levels = list(pairwise(widths))
+        self.encoder = nn.ModuleList(DoubleConvolution(c_in, c_out) for c_in, c_out in zip([3, *widths[:-2]], widths[:-1], strict=True))
+        self.pool = nn.MaxPool3d(2)
+        self.bottom = DoubleConvolution(widths[-2], widths[-1])
+        self.up = nn.ModuleList(nn.ConvTranspose3d(below, here, 2, stride=2) for here, below in reversed(levels))
+        self.decoder = nn.ModuleList(DoubleConvolution(2 * here, here) for here, _ in reversed(levels))
+        self.head = nn.Conv3d(channels, 3, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(n, 3, x, y, z) → (n, 3, x, y, z)."""
+        skips = []
+        for encode in self.encoder:
+            x = encode(x)  # (n, c 2^i, x / 2^i, y / 2^i, z / 2^i)
+            skips.append(x)
+            x = self.pool(x)
+        x = self.bottom(x)
+        for up, decode, skip in zip(self.up, self.decoder, reversed(skips), strict=True):
+            x = decode(torch.cat([skip, up(x)], dim=1))
+        output: Tensor = self.head(x)
+        return output
+
+
+def empty_network(channels: int, steps: int) -> UNet:
+    """A U-Net without values, on torch's "meta" device, so that no random number is drawn."""
+    with torch.device("meta"):
+        return UNet(channels, steps)
+
+
+def new_network(channels: int, steps: int, generator: torch.Generator) -> UNet:
+    """A U-Net with He-normal weights and zero biases, drawn from the given generator only.
+
+    The paper names no initialisation. torch's default shrinks the signal by sqrt(6) in each of the eleven layers: the coarse
+    beam's error after 2,800 iterations was 1.48e-3 m with it and 1.19e-3 m with He's.
+    """
+    network = empty_network(channels, steps)
+    network.to_empty(device="cpu")
+    for layer in network.modules():
+        if isinstance(layer, nn.Conv3d | nn.ConvTranspose3d):
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="linear" if layer is network.head else "relu", generator=generator)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+    return network

@@ -1,0 +1,98 @@
+"""Training of the U-Net: mean squared error over the body, Adam, a fixed number of iterations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import cos, isfinite, pi
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mor_bench.errors import MorBenchError
+from mor_bench.surrogates.umesh.network import UNet
+
+Schedule = Literal["constant", "one-cycle"]
+
+LOSS_INTERVAL = 50
+"""Iterations per point of the loss curve; reading the loss more often would cost a little and show mostly noise."""
+
+WARM_UP = 0.1
+"""Part of a one-cycle schedule during which the learning rate rises."""
+
+
+@dataclass(frozen=True)
+class TrainingPlan:
+    """How a network is trained; `UMesh` says what each means."""
+
+    iterations: int
+    batch_size: int
+    learning_rate: float
+    schedule: Schedule
+    second_moment_decay: float
+
+
+def rate_factor(schedule: Schedule, iteration: int, iterations: int) -> float:
+    """The learning rate of an iteration, counted from 0, as a fraction of the peak.
+
+    Constant: 1. One-cycle: linearly up during the first tenth, then half a cosine down to zero.
+    """
+    if schedule == "constant":
+        return 1.0
+    progress = (iteration + 1) / (iterations + 1)
+    if progress < WARM_UP:
+        return progress / WARM_UP
+    return 0.5 * (1.0 + cos(pi * (progress - WARM_UP) / (1.0 - WARM_UP)))
+
+
+def train(network: UNet, inputs: Tensor, targets: Tensor, body: Tensor, plan: TrainingPlan, generator: torch.Generator) -> NDArray[np.float64]:
+    """Change the network's weights to lower the mean squared error.
+
+    Every epoch is a new permutation; a last, smaller batch is left out.
+
+    Parameters
+    ----------
+    network : UNet
+    inputs, targets : (n_samples, 3, x, y, z) float32
+        Scaled forces and displacements on the padded grid.
+    body : (1, 1, x, y, z) float32
+        1 where the error counts, 0 at padding.
+    plan : TrainingPlan
+    generator : torch.Generator
+        Draws the permutations; no global random state is read or changed.
+
+    Returns
+    -------
+    (n_intervals,) float64
+        The loss, averaged over the components of all nodes of the batch and over `LOSS_INTERVAL` iterations.
+
+    Raises
+    ------
+    MorBenchError
+        If the loss is not finite.
+    """
+    batch_size = min(plan.batch_size, len(inputs))
+    per_batch = 1.0 / (batch_size * 3 * float(body.sum()))
+    optimiser = torch.optim.Adam(network.parameters(), lr=plan.learning_rate, betas=(0.9, plan.second_moment_decay), fused=True)
+    order = torch.empty(0, dtype=torch.int64)
+    curve: list[float] = []
+    total, n_summed = torch.zeros(()), 0
+    for iteration in range(plan.iterations):
+        if len(order) < batch_size:
+            order = torch.randperm(len(inputs), generator=generator)
+        rows, order = order[:batch_size], order[batch_size:]
+        for group in optimiser.param_groups:
+            group["lr"] = plan.learning_rate * rate_factor(plan.schedule, iteration, plan.iterations)
+        loss = ((network(inputs[rows]) - targets[rows]) * body).square().sum() * per_batch
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        total, n_summed = total + loss.detach(), n_summed + 1
+        if n_summed == LOSS_INTERVAL or iteration == plan.iterations - 1:
+            curve.append(float(total) / n_summed)
+            if not isfinite(curve[-1]):
+                raise MorBenchError(f"training diverged before iteration {iteration + 1}: `learning_rate` {plan.learning_rate} is too high.")
+            total, n_summed = torch.zeros(()), 0
+    return np.array(curve)
