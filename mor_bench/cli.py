@@ -55,8 +55,11 @@ def _clear_errors() -> Iterator[None]:
     except MorBenchError as error:
         typer.secho(f"mor-bench: {error}", fg="red", err=True)
         raise typer.Exit(2) from None
+    except OSError as error:
+        typer.secho(f"mor-bench: {error.filename or ''}: {error.strerror or error}", fg="red", err=True)
+        raise typer.Exit(2) from None
     except KeyboardInterrupt:
-        typer.secho("mor-bench: stopped; what was finished is kept, and the same command goes on from there.", fg="yellow", err=True)
+        typer.secho("mor-bench: stopped; finished samples and rows are kept. A run goes on when it is given the same --out.", fg="yellow", err=True)
         raise typer.Exit(130) from None
 
 
@@ -135,6 +138,8 @@ def run(
             console.print(str(path), highlight=False, soft_wrap=True)
         if as_json:
             print((comparison.out / "results.json").read_text(encoding="utf-8"))
+        if not any(row["status"] == "ok" for row in comparison.rows):
+            raise typer.Exit(1)
 
 
 @app.command(name="list")

@@ -25,6 +25,10 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Triple = Annotated[tuple[Finite, Finite, Finite], Field(strict=False)]
 
 
+MAX_CELLS = 10_000_000
+"""Cells of a mesh; more is a slip of the keyboard on the machines that this is for."""
+
+
 class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -35,6 +39,13 @@ class BoxGeometry(_Model):
     shape: Literal["box"]
     size_m: Annotated[tuple[Positive, Positive, Positive], Field(strict=False)]
     cells: Annotated[tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], Field(strict=False)]
+
+    @field_validator("cells")
+    @classmethod
+    def _fits_in_memory(cls, value: tuple[int, int, int]) -> tuple[int, int, int]:
+        if value[0] * value[1] * value[2] > MAX_CELLS:
+            raise ValueError(f"there must be at most {MAX_CELLS:,} cells in all")
+        return value
 
 
 class Material(_Model):
@@ -87,7 +98,7 @@ class Loads(_Model):
     simultaneous: Literal[1] = 1
     samples_per_patch: Annotated[int, Field(ge=1)]
     magnitude_n: Annotated[
-        tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], Annotated[float, Field(gt=0, allow_inf_nan=False)]],
+        tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], Annotated[float, Field(ge=1e-12, le=1e12)]],
         Field(strict=False),
     ]
     sampling: Literal["random"] = "random"
@@ -277,6 +288,8 @@ def _read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise SpecError(f"{path}: no such file.") from None
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read: {error.strerror}.") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SpecError(f"{path}: not valid TOML: {error}") from None
 
@@ -315,6 +328,8 @@ def _resolve(kind: Literal["datasets", "methods"], source: str | Path, suite: Pa
 
 def load_dataset_spec(source: str | Path | Mapping[str, Any], suite: Path | None = None) -> DatasetSpec:
     """Read and validate a dataset: a name in the suite, the path of a TOML, or a dict with the same keys."""
+    if not isinstance(source, str | Path | Mapping):
+        raise SpecError(f"a dataset must be a name, the path of a TOML or a dict; got {type(source).__name__}.")
     if isinstance(source, Mapping):
         content = {"name": "scene", **source}
         return _validated(DatasetSpec, {"title": content["name"], "source": "", **content}, "scene")

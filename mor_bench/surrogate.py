@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +22,9 @@ from mor_bench.specs import check_parameters, list_suite, load_class, load_metho
 
 SCHEMA_VERSION = 1
 
+MAX_FORCE_N = 1e30
+"""Largest nodal force component; its cube must not overflow."""
+
 
 class Surrogate(ABC):
     """A map from nodal forces to nodal displacements of one scene.
@@ -31,6 +35,9 @@ class Surrogate(ABC):
     """
 
     scene_: Scene
+
+    needs_snapshots: ClassVar[bool] = True
+    """Whether `fit` learns from snapshots; their cost is charged only to methods that do."""
 
     @abstractmethod
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
@@ -100,6 +107,7 @@ class Surrogate(ABC):
             "scene": self.scene_.spec.model_dump_json(),
         }
         arrays = {name: np.ascontiguousarray(array) for name, array in self._state().items()}
+        header["sha256"] = _digest(header, arrays)
         write_atomically(Path(path), serialise(arrays, metadata=header))
 
     def _state(self) -> dict[str, NDArray[Any]]:
@@ -144,9 +152,18 @@ class Surrogate(ABC):
             raise InvalidInputError(f"`forces` must hold real numbers; got dtype {array.dtype}.")
         if array.ndim not in (2, 3) or array.shape[-2:] != (n_nodes, 3):
             raise InvalidInputError(f"`forces` must have shape ({n_nodes}, 3) or (n, {n_nodes}, 3); got {array.shape}.")
-        if not np.isfinite(array).all():
-            raise InvalidInputError("`forces` must be finite; got NaN or infinity.")
+        if not (np.abs(array) <= MAX_FORCE_N).all():
+            raise InvalidInputError(f"`forces` must be finite and at most {MAX_FORCE_N:g} N; got {np.abs(array).max():g}.")
         return array.astype(np.float64, copy=False).reshape(-1, n_nodes, 3)
+
+
+def _digest(header: dict[str, str], arrays: dict[str, NDArray[Any]]) -> str:
+    """SHA-256 of all that a surrogate's file holds."""
+    digest = hashlib.sha256(json.dumps({key: header[key] for key in sorted(header) if key != "sha256"}).encode())
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
+        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
+    return digest.hexdigest()
 
 
 def load_method(source: str | Path, **parameters: Any) -> Surrogate:
@@ -200,6 +217,8 @@ def load_surrogate(path: str | Path) -> Surrogate:
         raise StoreError(f"{path}: not a surrogate of mor-bench.")
     if header.get("schema_version") != str(SCHEMA_VERSION):
         raise StoreError(f"{path}: schema version {header.get('schema_version')}; this version of mor-bench reads version {SCHEMA_VERSION}.")
+    if header.get("sha256") != _digest(header, state):
+        raise StoreError(f"{path}: damaged: the checksum does not match.")
     known = {load_method_spec(file).surrogate for file in list_suite("methods").values()}
     if header.get("surrogate") not in known:
         raise StoreError(f"{path}: class {header.get('surrogate')!r} is not named by any method of the suite.")
@@ -208,6 +227,6 @@ def load_surrogate(path: str | Path) -> Surrogate:
         scene_content = json.loads(header["scene"])
         method.scene_ = load_scene(scene_content)
         method._restore(state)
-    except (KeyError, ValueError, IndexError) as error:
-        raise StoreError(f"{path}: damaged: {error}") from None
+    except (MorBenchError, KeyError, ValueError, IndexError, TypeError, AttributeError) as error:
+        raise StoreError(f"{path}: its content does not make a {header['surrogate'].partition(':')[2]}: {error}") from None
     return method

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import save as serialise
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, MissingDependencyError, NotFittedError, StoreError
@@ -14,6 +16,7 @@ from mor_bench.harness.metrics import sample_errors
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import list_suite
 from mor_bench.surrogate import Surrogate
+from mor_bench.surrogate import _digest as file_digest
 
 CHEAP = {"umesh": {"channels": 8, "steps": 1, "iterations": 150, "batch_size": 16, "learning_rate": 3e-3}}
 """Parameters that keep a costly method's battery short."""
@@ -77,11 +80,15 @@ def test_other_real_dtypes_and_lists_are_taken(fitted: Surrogate, tiny: Dataset)
     assert np.isfinite(fitted.predict(np.ones(force.shape, dtype=int) * 0)).all()
 
 
-@pytest.mark.parametrize("bad", ["nan", "inf", "shape", "flat", "complex", "text"])
+def test_an_empty_batch_is_answered_with_one(fitted: Surrogate, tiny: Dataset) -> None:
+    assert fitted.predict(tiny.test.forces[:0]).shape == (0, tiny.scene.mesh.n_nodes, 3)
+
+
+@pytest.mark.parametrize("bad", ["nan", "inf", "1e155", "shape", "flat", "complex", "text"])
 def test_bad_forces_are_refused(fitted: Surrogate, tiny: Dataset, bad: str) -> None:
     force: object = tiny.test.forces[0].copy()
     assert isinstance(force, np.ndarray)
-    if bad in ("nan", "inf"):
+    if bad in ("nan", "inf", "1e155"):
         force[3, 1] = float(bad)
     force = {"shape": force[:-1], "flat": force.ravel(), "complex": force + 1j, "text": force.astype(str)}.get(bad, force)
     with pytest.raises(InvalidInputError, match="forces"):
@@ -97,7 +104,7 @@ def test_saved_and_loaded_predicts_the_same(fitted: Surrogate, tiny: Dataset, tm
     np.testing.assert_array_equal(loaded.predict(tiny.test.forces[:3]), fitted.predict(tiny.test.forces[:3]))
 
 
-@pytest.mark.parametrize("damage", ["truncated", "foreign", "class", "version"])
+@pytest.mark.parametrize("damage", ["truncated", "foreign", "class", "version", "bit"])
 def test_damaged_files_are_refused(fitted: Surrogate, tmp_path: Path, damage: str) -> None:
     path = tmp_path / "model.safetensors"
     fitted.save(path)
@@ -107,10 +114,36 @@ def test_damaged_files_are_refused(fitted: Surrogate, tmp_path: Path, damage: st
         "truncated": content[: len(content) // 3],
         "foreign": b"something else entirely",
         "class": content.replace(name, b"os:" + b"x" * (len(name) - 3)),
+        "bit": content[:-3] + bytes([content[-3] ^ 4]) + content[-2:],
         "version": content.replace(b'"schema_version":"1"', b'"schema_version":"9"'),
     }[damage]
     assert changed != content
     path.write_bytes(changed)
+    with pytest.raises(StoreError, match=r"model\.safetensors"):
+        mor_bench.load_surrogate(path)
+
+
+@pytest.mark.parametrize("forgery", ["fewer rows", "nan", "knobs", "scene", "missing"])
+def test_forged_files_with_a_valid_checksum_are_refused(fitted: Surrogate, tmp_path: Path, forgery: str) -> None:
+    """Nothing reaches a kernel, which checks no bounds, before its shape is checked."""
+    path = tmp_path / "model.safetensors"
+    fitted.save(path)
+    with safe_open(str(path), framework="numpy") as file:
+        header, arrays = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    if not arrays and forgery in ("fewer rows", "nan", "missing"):
+        assert fitted.needs_snapshots is False
+        return
+    first = sorted(name for name, array in arrays.items() if array.dtype.kind == "f")[0] if arrays else ""
+    if forgery == "fewer rows":
+        arrays = {name: np.ascontiguousarray(array[: len(array) // 2]) for name, array in arrays.items()}
+    elif forgery == "nan":
+        arrays[first] = np.full_like(arrays[first], np.nan)
+    elif forgery == "missing":
+        del arrays[first]
+    else:
+        header[{"knobs": "parameters", "scene": "scene"}[forgery]] = "[1]"
+    header["sha256"] = file_digest(header, arrays)
+    path.write_bytes(serialise(arrays, metadata=header))
     with pytest.raises(StoreError, match=r"model\.safetensors"):
         mor_bench.load_surrogate(path)
 

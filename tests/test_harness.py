@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -18,7 +18,9 @@ from mor_bench.harness.frontier import Point, error_at_time, non_dominated, time
 from mor_bench.harness.metrics import sample_errors, summary
 from mor_bench.harness.results import Comparison
 from mor_bench.harness.run import Listener
-from mor_bench.harness.timing import N_QUERIES, latency_summary, measure_latency
+from mor_bench.harness.timing import N_QUERIES, N_WARM_UP, latency_summary, measure_latency, pinned_threads
+from mor_bench.snapshots.generate import generation_seconds
+from mor_bench.specs import load_dataset_spec
 
 
 def test_metrics_by_hand() -> None:
@@ -93,6 +95,104 @@ def test_latency_keeps_every_raw_sample_and_turns_the_collector_on_again() -> No
     assert len(set(seen[-N_QUERIES:])) == 50
     assert gc.isenabled()
     assert latency_summary(np.arange(101.0)) == {"median": 50.0, "p95": 95.0, "p99": 99.0}
+
+
+def test_warm_up_comes_first_and_is_not_timed() -> None:
+    calls: list[int] = []
+    assert len(measure_latency(lambda query: calls.append(1), np.zeros((3, 4, 3)))) == N_QUERIES
+    assert len(calls) == N_QUERIES + N_WARM_UP
+
+
+def test_threads_are_pinned_and_given_back() -> None:
+    from threadpoolctl import threadpool_info
+
+    before = [pool["num_threads"] for pool in threadpool_info()]
+    with pinned_threads(1):
+        assert {pool["num_threads"] for pool in threadpool_info()} == {1}
+    assert [pool["num_threads"] for pool in threadpool_info()] == before
+
+
+class Recorder(mor_bench.Surrogate):
+    """A third party's class that keeps what it is given and then spoils it."""
+
+    seen: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self, spoil: str = "test") -> None:
+        self.spoil = spoil
+
+    def fit(self, scene, snapshots):  # type: ignore[no-untyped-def]
+        with self._fitting(scene):
+            Recorder.seen["regions"] = set(snapshots.regions)
+            Recorder.seen["vectors"] = snapshots.loads.vectors.copy()
+            if self.spoil == "train":
+                snapshots.free_displacements[:] *= 0.5
+            if self.spoil == "exit":
+                raise SystemExit(3)
+        return self
+
+    def predict(self, forces):  # type: ignore[no-untyped-def]
+        out = np.zeros(np.shape(forces))
+        forces *= 0.0
+        return out
+
+
+@pytest.mark.parametrize("spoil", ["test", "train", "exit"])
+def test_a_method_trains_on_the_training_set_and_spoils_only_its_own_row(spoil: str, cache: Path, tmp_path: Path) -> None:
+    path = tmp_path / "recorder.toml"
+    path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "tests.test_harness:Recorder"\n[parameters]\nspoil = "{spoil}"')
+    comparison = mor_bench.run(["beam-tiny"], [path, "linear-fem"], out=tmp_path / "out", cache=cache)
+    alone = mor_bench.run(["beam-tiny"], ["linear-fem"], out=tmp_path / "alone", cache=cache)
+    assert comparison.rows[0]["status"] == ("ok" if spoil == "test" else "failed")
+    assert comparison.rows[1]["error"] == alone.rows[0]["error"]
+    data = mor_bench.load_dataset("beam-tiny", cache=cache)
+    np.testing.assert_array_equal(Recorder.seen["vectors"], data.train.loads.vectors)
+    assert not Recorder.seen["regions"] & set(data.test.regions)
+
+
+def test_data_costs_what_its_generation_took_and_only_those_who_learn_from_it(cache: Path, tmp_path: Path) -> None:
+    comparison = mor_bench.run(["beam-tiny"], ["linear-fem", "pca-regression"], out=tmp_path / "out", cache=cache)
+    seconds = generation_seconds(load_dataset_spec("beam-tiny"), cache, 170)
+    assert seconds is not None
+    assert [row["offline_s"]["data"] for row in comparison.rows] == [0.0, seconds, seconds, seconds]
+
+
+def test_a_stopped_run_goes_on_and_another_run_is_refused(cache: Path, tmp_path: Path) -> None:
+    class StopError(Exception):
+        pass
+
+    def stop(row: dict[str, Any]) -> None:
+        if row["label"] == "pod [n_modes=3]":
+            raise StopError
+
+    out = tmp_path / "out"
+    arguments: dict[str, Any] = {"datasets": ["beam-tiny"], "methods": ["linear-fem", "pod"], "out": out, "cache": cache}
+    with pytest.raises(StopError):
+        mor_bench.run(**arguments, listener=Listener(finished=stop))
+    begun = Comparison.read(out).rows
+    assert [row["label"] for row in begun] == ["linear-fem", "pod [n_modes=1]", "pod [n_modes=3]"]
+    finished: list[str] = []
+    whole = mor_bench.run(**arguments, listener=Listener(finished=lambda row: finished.append(row["label"])))
+    assert finished == [f"pod [n_modes={r}]" for r in (5, 10, 20, 40, 80)]
+    assert whole.rows[:3] == begun
+    with pytest.raises(InvalidInputError, match="holds a run with other settings"):
+        mor_bench.run(**{**arguments, "split": "sample"})
+    assert Comparison.read(out).rows == whole.rows
+
+
+def test_everything_is_checked_before_anything_runs(cache: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "pod.toml"
+    mine.write_text('title = "t"\nsource = "s"\nsurrogate = "mor_bench.surrogates.pod:PODGalerkin"\n[parameters]\nn_mode = 3')
+    out = tmp_path / "out"
+    with pytest.raises(SpecError, match="unknown key `n_mode`"):
+        mor_bench.run(["beam-tiny"], ["fem", mine], out=out, cache=cache)
+    with pytest.raises(InvalidInputError, match="two methods are called 'pod'"):
+        mor_bench.run(["beam-tiny"], ["pod", mine], out=out, cache=cache)
+    with pytest.raises(InvalidInputError, match="two datasets are called 'beam-tiny'"):
+        mor_bench.run(["beam-tiny", "beam-tiny"], ["fem"], out=out, cache=cache)
+    assert not out.exists()
+    out.write_text("a file")
+    with pytest.raises(InvalidInputError, match=r"`out`: .* cannot be written"):
+        mor_bench.run(["beam-tiny"], ["fem"], out=out, cache=cache)
 
 
 class Broken(mor_bench.Surrogate):

@@ -81,6 +81,9 @@ BAD = [
     (set_("split", "by", value="patch"), r"`split.by` must be 'region' or 'sample'; got 'patch'"),
     (set_("split", "test_fraction", value=1.0), r"`split.test_fraction` must be less than 1; got 1"),
     (set_("needs", "error", value=True), r"`needs.error` must be a valid number; got True"),
+    (set_("geometry", "cells", value=[2_000_000, 2_000, 2_000]), r"there must be at most 10,000,000 cells in all"),
+    (set_("loads", "magnitude_n", value=[0.0, 1e-300]), r"`loads.magnitude_n\[1\]` must be greater than or equal to 0.000000000001"),
+    (set_("supports", 0, "region", value={"box_m": [[0.0, 0.0, 0.0], [2.0, 1.0, 1.0]]}), r"the supports fix every node"),
     (lambda spec: spec.pop("material"), r"key `material` is missing"),
     (lambda spec: spec["geometry"].pop("cells"), r"key `geometry.cells` is missing"),
 ]

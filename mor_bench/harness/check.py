@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mor_bench.mechanics.model import check_supports
 from mor_bench.scene.scene import load_scene
 from mor_bench.specs import check_method, is_method_file, load_dataset_spec, load_method_spec
 
@@ -15,7 +16,7 @@ def check_file(path: Path) -> str:
 
     Raises
     ------
-    SpecError
+    SpecError, UnconstrainedBodyError
         The first problem, in one line.
     MissingDependencyError
         If the method's class needs an extra that is not installed.
@@ -26,6 +27,7 @@ def check_file(path: Path) -> str:
         return f"method, {len(method.configurations('quick'))} quick and {len(method.configurations('full'))} full configurations"
     spec = load_dataset_spec(path)
     scene = load_scene(spec)
+    check_supports(scene)
     n_patches = len(scene.patch_nodes)
     samples = n_patches * spec.loads.samples_per_patch
     return f"dataset, {scene.mesh.n_cells} cells, {scene.mesh.n_nodes} nodes, {n_patches} load patches, {samples} samples"

@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SCHEMA_VERSION = 1
+_WHAT_RAN = ("dataset", "split", "method", "label", "parameters", "n_train", "n_test", "threads")
+_WHAT_CAME_OUT = ("status", "reason", "n_failed", "error", "latency_ms", "offline_s", "model_bytes", "discretisation_error_m")
+ROW_KEYS = frozenset([*_WHAT_RAN, *_WHAT_CAME_OUT])
+"""What every row of results.json has."""
 
 
 def label_of(method: str, swept: Mapping[str, Any]) -> str:
@@ -83,12 +87,15 @@ class Comparison:
         `warnings`.
     datasets : dict
         For each dataset its spec, as in its file.
+    settings : dict
+        Profile, split, limit, threads and version of the run.
     """
 
     out: Path
     machine: dict[str, Any]
     rows: list[dict[str, Any]] = field(default_factory=list)
     datasets: dict[str, dict[str, Any]] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
 
     @property
     def table(self) -> pd.DataFrame:
@@ -105,6 +112,13 @@ class Comparison:
 
     def _samples_path(self, name: str) -> Path:
         return self.out / "samples" / (re.sub(r"[^\w.=-]+", "-", name).strip("-") + ".h5")
+
+    def has(self, dataset: str, label: str, parameters: Mapping[str, Any]) -> bool:
+        """Whether a configuration has run; a row that did not succeed is forgotten, so that it is tried again."""
+        key = (dataset, label, parameters)
+        mine = [row for row in self.rows if (row["dataset"], row["label"], row["parameters"]) == key]
+        self.rows = [row for row in self.rows if row not in mine or row["status"] == "ok"]
+        return any(row["status"] == "ok" for row in mine)
 
     def add(self, row: dict[str, Any], samples: Mapping[str, NDArray[Any]] | None = None) -> None:
         """Append a row and write everything; raw samples first, so that a row on disk has its samples."""
@@ -137,7 +151,7 @@ class Comparison:
     def write(self) -> None:
         """Write results.json, results.csv and comparison.json, each atomically."""
         self.out.mkdir(parents=True, exist_ok=True)
-        content = {"schema_version": SCHEMA_VERSION, "machine": self.machine, "datasets": self.datasets, "rows": self.rows}
+        content = {"schema_version": SCHEMA_VERSION, "machine": self.machine, "settings": self.settings, "datasets": self.datasets, "rows": self.rows}
         _write_json(self.out / "results.json", content)
         _write_json(self.out / "comparison.json", self.frontier)
         write_atomically(self.out / "results.csv", self.table.to_csv(index=False).encode())
@@ -157,8 +171,13 @@ class Comparison:
             version = content["schema_version"]
             if version != SCHEMA_VERSION:
                 raise StoreError(f"{path}: schema version {version}; this version of mor-bench reads version {SCHEMA_VERSION}.")
-            return cls(Path(out), content["machine"], [_with_numbers(row) for row in content["rows"]], content["datasets"])
+            rows = [_with_numbers(row) for row in content["rows"]]
+            for row in rows:
+                absent = ROW_KEYS - row.keys()
+                if absent:
+                    raise StoreError(f"{path}: a row lacks {', '.join(sorted(absent))}.")
+            return cls(Path(out), content["machine"], rows, content["datasets"], content["settings"])
         except FileNotFoundError:
             raise StoreError(f"{path}: no such file; is {out} the folder of a run?") from None
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise StoreError(f"{path}: not a results file of mor-bench: {error}") from None

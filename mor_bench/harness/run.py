@@ -6,6 +6,7 @@ import os
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,14 +16,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench import __version__
 from mor_bench.errors import InvalidInputError, MissingDependencyError, MorBenchError, SolverError
 from mor_bench.harness.metrics import SampleErrors, sample_errors, summary
 from mor_bench.harness.results import Comparison, label_of
 from mor_bench.harness.timing import describe_machine, latency_summary, measure_latency, pinned_threads
+from mor_bench.mechanics.model import check_supports
 from mor_bench.reduction.basis import pod
+from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.generate import generation_seconds
-from mor_bench.specs import DatasetSpec, MethodSpec, SplitBy, load_dataset_spec, load_method_spec
+from mor_bench.specs import DatasetSpec, MethodSpec, SplitBy, check_method, load_dataset_spec, load_method_spec
 from mor_bench.surrogate import Surrogate, make_surrogate
 
 CORE_METHODS = ("fem", "pod", "hpod", "pca-regression", "umesh")
@@ -75,11 +79,12 @@ def _predict_all(method: Surrogate, forces: NDArray[np.float64]) -> NDArray[np.f
     for start in range(0, len(forces), PREDICTION_BATCH):
         batch = forces[start : start + PREDICTION_BATCH]
         try:
-            predicted = np.asarray(method.predict(batch))
+            # A copy: what a method does to its input must not reach the rows after it.
+            predicted = np.asarray(method.predict(batch.copy()))
         except SolverError:
             for row, force in enumerate(batch):
                 try:
-                    out[start + row] = method.predict(force)
+                    out[start + row] = method.predict(force.copy())
                 except SolverError:
                     continue
             continue
@@ -115,7 +120,7 @@ def _evaluate(job: _Job, data: Dataset, data_seconds: float | None, threads: int
     method = make_surrogate(job.method.load_class(), job.parameters)
     with pinned_threads(os.cpu_count() or 1):
         start = perf_counter()
-        method.fit(data.scene, data.train)
+        method.fit(data.scene, data.train if method.needs_snapshots else None)
         fit_seconds = perf_counter() - start
     with pinned_threads(threads):
         predicted = _predict_all(method, data.test.forces)
@@ -123,13 +128,13 @@ def _evaluate(job: _Job, data: Dataset, data_seconds: float | None, threads: int
         answered = np.isfinite(errors.mean_dof_m)
         if not answered.any():
             raise SolverError(f"no valid prediction on any of {len(data.test)} test samples")
-        latency = measure_latency(method.predict, data.test.forces[answered])
+        latency = measure_latency(method.predict, data.test.forces[answered].copy())
     row = {
         "status": "ok",
         "n_failed": int((~answered).sum()),
         "error": summary(errors),
         "latency_ms": latency_summary(latency),
-        "offline_s": {"data": data_seconds, "fit": fit_seconds},
+        "offline_s": {"data": data_seconds if method.needs_snapshots else 0.0, "fit": fit_seconds},
         "model_bytes": _model_bytes(method),
     }
     samples = {
@@ -153,7 +158,7 @@ def _run_job(job: _Job, data: Dataset, data_seconds: float | None, threads: int)
             outcome, samples = {"status": "skipped", "reason": str(error)}, {}
         except MorBenchError as error:
             outcome, samples = {"status": "failed", "reason": f"{type(error).__name__}: {error}"}, {}
-        except Exception as error:  # third parties' code runs here
+        except (Exception, SystemExit) as error:  # third parties' code runs here
             outcome, samples = {"status": "failed", "reason": f"crashed with {type(error).__name__}: {error}"}, {}
     notes = list(dict.fromkeys(str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)))
     return {**outcome, "warnings": notes}, samples
@@ -179,8 +184,8 @@ def run(
 ) -> Comparison:
     """Compare methods on datasets.
 
-    Every specification is checked before anything runs. Rows are written as they finish, so that a stopped run keeps
-    what it has.
+    Every specification is checked before anything runs. Rows are written as they finish; the same run into the same
+    folder keeps the rows that are there and goes on.
 
     Parameters
     ----------
@@ -208,7 +213,7 @@ def run(
     SpecError
         If a dataset, a method or a parameter is not valid.
     InvalidInputError
-        If an argument is out of range.
+        If an argument is out of range, or ``out`` cannot be written or holds another run.
     """
     cores = os.cpu_count() or 1
     if profile not in ("quick", "full"):
@@ -218,13 +223,26 @@ def run(
     if not datasets or not methods:
         raise InvalidInputError("`datasets` and `methods` must name at least one each.")
     specs = [load_dataset_spec(dataset, suite) for dataset in datasets]
-    jobs = _jobs([load_method_spec(method, suite) for method in methods], profile)
-    comparison = Comparison(Path(out) if out else _default_out([spec.name for spec in specs]), describe_machine())
+    method_specs = [load_method_spec(method, suite) for method in methods]
+    for kind, names in (("dataset", [spec.name for spec in specs]), ("method", [spec.name for spec in method_specs])):
+        for name in names:
+            if names.count(name) > 1:
+                raise InvalidInputError(f"two {kind}s are called {name!r}; rename one of the files.")
+    for spec in specs:
+        check_supports(load_scene(spec))
+    for method_spec in method_specs:
+        with suppress(MissingDependencyError):  # that becomes a row with its reason
+            check_method(method_spec)
+    jobs = _jobs(method_specs, profile)
+    settings = {"profile": profile, "split": split, "limit": limit, "threads": threads, "version": __version__}
+    comparison = _open_run(Path(out) if out else _default_out([spec.name for spec in specs]), specs, settings)
     for number, (spec, job) in enumerate((spec, job) for spec in specs for job in jobs):
         if number % len(jobs) == 0:
             data = _open(spec, comparison, listener, limit=limit, split=split, workers=workers, cache=cache)
             data_seconds = generation_seconds(spec, cache, len(data.train))
         listener.starting(spec.name, job.label, number + 1, len(specs) * len(jobs))
+        if comparison.has(spec.name, job.label, job.parameters):
+            continue
         outcome, samples = _run_job(job, data, data_seconds, threads)
         row: dict[str, Any] = {
             "dataset": spec.name,
@@ -247,6 +265,22 @@ def run(
         }
         comparison.add(row, samples)
         listener.finished(row)
+    return comparison
+
+
+def _open_run(out: Path, specs: Sequence[DatasetSpec], settings: dict[str, Any]) -> Comparison:
+    """The comparison in a folder: a new one, or the one that was begun there with the same settings and datasets."""
+    datasets = {spec.name: spec.model_dump(mode="json") for spec in specs}
+    if (out / "results.json").exists():
+        begun = Comparison.read(out)
+        if begun.settings != settings or any(datasets.get(name) != spec for name, spec in begun.datasets.items()):
+            raise InvalidInputError(f"{out} holds a run with other settings or datasets; choose another folder or remove it.")
+        return begun
+    comparison = Comparison(out, describe_machine(), settings=settings)
+    try:
+        comparison.write()
+    except OSError as error:
+        raise InvalidInputError(f"`out`: {out} cannot be written: {error.strerror}.") from None
     return comparison
 
 

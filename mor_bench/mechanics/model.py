@@ -31,6 +31,15 @@ def free_rigid_modes(scene: Scene) -> list[str]:
     return [RIGID_MODES[int(np.abs(mode).argmax())] for mode in free]
 
 
+def check_supports(scene: Scene) -> None:
+    """Raise `UnconstrainedBodyError`, naming the rigid modes that the supports leave free."""
+    free = free_rigid_modes(scene)
+    if free:
+        raise UnconstrainedBodyError(
+            f"the supports of {scene.name} leave rigid motions free: {', '.join(free)}; fix at least three nodes not in line."
+        )
+
+
 class FullOrderModel:
     """H8, Saint Venant-Kirchhoff, dead loads, over the free dofs of a scene.
 
@@ -41,11 +50,7 @@ class FullOrderModel:
     """
 
     def __init__(self, scene: Scene) -> None:
-        free = free_rigid_modes(scene)
-        if free:
-            raise UnconstrainedBodyError(
-                f"the supports of {scene.name} leave rigid motions free: {', '.join(free)}; fix at least three nodes not in line."
-            )
+        check_supports(scene)
         mesh = scene.mesh
         self.scene = scene
         self.n_unknowns = len(scene.free_dofs)

@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs
 
+from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
 
@@ -46,9 +47,16 @@ class GalerkinProblem:
     assembler : Assembler
     modes : (assembler.n_dofs, r) float64
         The rows of Φ that belong to the assembler's dofs.
+
+    Raises
+    ------
+    InvalidInputError
+        If the basis has another number of rows, NaN or infinity: the kernels behind check no bounds.
     """
 
     def __init__(self, assembler: Assembler, modes: NDArray[np.float64]) -> None:
+        if modes.ndim != 2 or len(modes) != assembler.n_dofs or not np.isfinite(modes).all():
+            raise InvalidInputError(f"`modes` must be a finite array of shape ({assembler.n_dofs}, r); got shape {modes.shape}.")
         self.assembler = assembler
         self.modes = np.ascontiguousarray(modes)
         self.n_unknowns = modes.shape[1]

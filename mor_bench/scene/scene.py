@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from mor_bench.errors import SpecError
 from mor_bench.scene.loads import patch_weights
 from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.mesh import Mesh, box_mesh
@@ -69,9 +70,18 @@ def load_scene(source: str | Path | Mapping[str, Any] | DatasetSpec) -> Scene:
         If the dataset is unknown or not valid, or a region of it is empty.
     """
     spec = source if isinstance(source, DatasetSpec) else load_dataset_spec(source)
+    try:
+        return _build(spec)
+    except SpecError as error:
+        raise SpecError(f"{spec.name}: {error}") from None
+
+
+def _build(spec: DatasetSpec) -> Scene:
     mesh = box_mesh(spec.geometry.size_m, spec.geometry.cells)
     material = SaintVenantKirchhoff(spec.material.young_pa, spec.material.poisson)
     fixed = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(region_nodes(mesh, support.region) for support in spec.supports)]))
+    if len(fixed) == mesh.n_nodes:
+        raise SpecError("the supports fix every node of the mesh: nothing can move.")
     scene = Scene(spec, mesh, material, fixed)
     _ = scene.patch_weights  # an empty load region is an error of the dataset: raised here, not at the first solve
     return scene

@@ -20,9 +20,15 @@ from mor_bench.snapshots.store import read_shard
 from mor_bench.specs import DatasetSpec, Split, SplitBy, load_dataset_spec
 
 
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """The array, locked: what all methods share, none may change."""
+    array.setflags(write=False)
+    return array
+
+
 @dataclass(frozen=True)
 class Snapshots:
-    """Pairs of nodal forces and displacements.
+    """Pairs of nodal forces and displacements; a dataset's are read-only.
 
     Attributes
     ----------
@@ -43,12 +49,15 @@ class Snapshots:
         return len(self.loads)
 
     def __getitem__(self, index: NDArray[np.int64] | slice) -> Snapshots:
-        return Snapshots(self.scene, self.loads[index], self.free_displacements[index], self.min_det_f[index])
+        loads = self.loads[index]
+        for array in (loads.patches, loads.vectors):
+            read_only(array)
+        return Snapshots(self.scene, loads, read_only(self.free_displacements[index]), read_only(self.min_det_f[index]))
 
     @cached_property
     def forces(self) -> NDArray[np.float64]:
         """(n_samples, n_nodes, 3) nodal forces, N."""
-        return self.loads.nodal_forces(self.scene.patch_weights)
+        return read_only(self.loads.nodal_forces(self.scene.patch_weights))
 
     @property
     def free_forces(self) -> NDArray[np.float64]:
@@ -60,7 +69,7 @@ class Snapshots:
         """(n_samples, n_nodes, 3) nodal displacements, m."""
         full = np.zeros((len(self), self.scene.mesh.n_dofs))
         full[:, self.scene.free_dofs] = self.free_displacements
-        return full.reshape(len(self), -1, 3)
+        return read_only(full.reshape(len(self), -1, 3))
 
     @property
     def regions(self) -> NDArray[np.int64]:
@@ -143,6 +152,8 @@ def load_dataset(
     for name, value in (("limit", limit), ("workers", workers)):
         if value is not None and value < 1:
             raise InvalidInputError(f"`{name}` must be an integer >= 1; got {value}.")
+    if split not in (None, "region", "sample"):
+        raise InvalidInputError(f"`split` must be 'region' or 'sample'; got {split!r}.")
     spec = source if isinstance(source, DatasetSpec) else load_dataset_spec(source)
     scene = load_scene(spec)
     folder = generate(spec, limit, workers or os.cpu_count() or 1, cache, progress)

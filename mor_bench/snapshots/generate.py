@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from threading import Thread
@@ -181,5 +181,8 @@ def generation_seconds(spec: DatasetSpec, cache: Path | None, n_samples: int) ->
 
     Kept beside the shards and not in them: a dataset generated twice is bit-identical, its timings are not.
     """
-    times = [float(path.read_text()) for path in sorted(dataset_folder(spec, cache).glob("seconds-*.txt"))]
+    times = []
+    for path in sorted(dataset_folder(spec, cache).glob("seconds-*.txt")):
+        with suppress(ValueError, OSError):  # a timing that was lost costs nothing but itself
+            times.append(float(path.read_text()))
     return sum(times) * n_samples / n_samples_of(spec, len(times) * SHARD_SIZE) if times else None

@@ -24,6 +24,8 @@ class FullFEM(Surrogate):
         Norm of the residual relative to that of the load at which Newton stops.
     """
 
+    needs_snapshots = False
+
     def __init__(self, tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8) -> None:
         self.tolerance = tolerance
 
@@ -37,7 +39,7 @@ class FullFEM(Surrogate):
         batch = self._checked_forces(forces)
         out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
         free = self.scene_.free_dofs
-        for row, load in zip(out, batch.reshape(len(batch), -1), strict=True):
+        for row, load in zip(out, batch.reshape(-1, self.scene_.mesh.n_dofs), strict=True):
             row[free] = self.model_.solve(load[free], options=NewtonOptions(self.tolerance)).displacement
         return out.reshape(np.shape(forces))
 

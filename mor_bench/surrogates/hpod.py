@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.basis import pod
@@ -74,6 +75,11 @@ class HyperReducedPOD(Surrogate):
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         self.modes_, self.cells_, self.weights_ = state["modes"], state["cells"], state["weights"]
         scene = self.scene_
+        numbers, n_cells = self.cells_, scene.mesh.n_cells
+        if numbers.dtype.kind != "i" or numbers.shape != self.weights_.shape or not ((numbers >= 0) & (numbers < n_cells)).all():
+            raise InvalidInputError(f"`cells` must be integers in [0, {n_cells - 1}], as many as there are weights.")
+        if self.modes_.shape[0] != len(scene.free_dofs):
+            raise InvalidInputError(f"`modes` must have {len(scene.free_dofs)} rows; got {self.modes_.shape[0]}.")
         cells = scene.mesh.cells[self.cells_]
         touched = np.zeros((scene.mesh.n_nodes, 3), dtype=bool)
         touched[cells] = True

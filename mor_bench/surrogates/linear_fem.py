@@ -16,6 +16,8 @@ from mor_bench.surrogate import Surrogate
 class LinearFEM(Surrogate):
     """u = K₀⁻¹ f, with K₀ the stiffness at rest, factorised once. Wrong by the square of the rotations."""
 
+    needs_snapshots = False
+
     def __init__(self) -> None:
         pass
 
@@ -29,7 +31,7 @@ class LinearFEM(Surrogate):
         batch = self._checked_forces(forces)
         out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
         free = self.scene_.free_dofs
-        out[:, free] = self.model_.rest_factor.solve(batch.reshape(len(batch), -1)[:, free].T).T
+        out[:, free] = self.model_.rest_factor.solve(batch.reshape(-1, self.scene_.mesh.n_dofs)[:, free].T).T
         return out.reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from functools import cached_property
+from math import comb
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import Scene
@@ -129,6 +131,19 @@ class PCARegression(Surrogate):
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         # One memory order, fitted or loaded: BLAS rounds differently in another.
         state = {name: np.ascontiguousarray(array) for name, array in state.items()}
+        n_free, n_loaded = len(self.scene_.free_dofs), len(self._loaded(self.scene_))
+        n_inputs, n_modes = state["to_input"].shape[0], state["modes"].shape[1]
+        n_features = sum(comb(state["axes"].shape[1] + d - 1, d) for d in range(1, self.degree + 1))
+        shapes = {
+            "response": (n_free, n_inputs if self.input == "linear-response" else 0),
+            "to_input": (n_inputs, n_loaded),
+            "axes": (n_inputs, state["axes"].shape[1]),
+            "modes": (n_free, n_modes),
+            "weights": (n_modes, n_features),
+        }
+        for name, shape in shapes.items():
+            if state[name].shape != shape or not np.isfinite(state[name]).all():
+                raise InvalidInputError(f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}.")
         self.response_, self.to_input_, self.axes_ = state["response"], state["to_input"], state["axes"]
         self.modes_, self.weights_ = state["modes"], state["weights"]
         self._loaded_dofs = self._loaded(self.scene_)

@@ -22,7 +22,7 @@ def predict_reduced(
 ) -> NDArray[np.float64]:  # fmt: skip
     """Solve the reduced equilibrium for each load (n, n_nodes, 3), N, and expand to all nodes, m."""
     out = np.zeros((len(batch), scene.mesh.n_dofs))
-    for row, load in zip(out, batch.reshape(len(batch), -1), strict=True):
+    for row, load in zip(out, batch.reshape(-1, scene.mesh.n_dofs), strict=True):
         solution = solve_equilibrium(problem, modes.T @ load[scene.free_dofs], options=NewtonOptions(tolerance))
         row[scene.free_dofs] = modes @ solution.displacement
     return out.reshape(batch.shape)

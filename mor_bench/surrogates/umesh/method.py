@@ -9,6 +9,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
@@ -143,6 +144,9 @@ class UMesh(Surrogate):
         return {**weights, "scales": scales, "loss_curve": self.loss_curve_}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
+        for name, array in state.items():
+            if not np.isfinite(array).all():
+                raise InvalidInputError(f"`{name}` must be finite; got NaN or infinity.")
         self.grid_ = padded_grid(self.scene_.mesh, self.steps)
         self.force_scale_, self.displacement_scale_ = (float(scale) for scale in state["scales"])
         self.loss_curve_ = state["loss_curve"]
