@@ -234,7 +234,7 @@ def error_against_amplitude(comparison: Comparison, dataset: str, styles: dict[s
     for axes, (entry, amplitude, e) in zip(grid.ravel(), panels, strict=False):
         _amplitude_panel(axes, entry, amplitude, e, styles[entry.method])
     figure.supxlabel("largest nodal displacement of the reference (m)", fontsize=10)
-    figure.supylabel("e: mean absolute error per degree of freedom (m)", fontsize=10)
+    figure.supylabel("mean error per dof, e (m)", fontsize=10)
     figure.suptitle(plain(f"Error against deformation – {dataset}"), x=0.01, ha="left", fontsize=13, color=INK)
     path = save(figure, comparison, dataset, "error-against-deformation")
     caption = (
