@@ -48,12 +48,54 @@ class BoxGeometry(_Model):
         return value
 
 
-class Material(_Model):
-    """Saint Venant-Kirchhoff parameters."""
+class Discretisation(_Model):
+    """The elements. Selective integration takes the volumetric part of the energy from each hexahedron's mean gradient."""
 
-    law: Literal["saint-venant-kirchhoff"]
+    element: Literal["hexahedron", "tetrahedron"] = "hexahedron"
+    integration: Literal["full", "selective"] = "full"
+
+    @model_validator(mode="after")
+    def _has_points_to_spare(self) -> Discretisation:
+        if self.element == "tetrahedron" and self.integration == "selective":
+            raise ValueError("`integration` of tetrahedra must be 'full', since they have one quadrature point; got 'selective'")
+        return self
+
+
+class TwoLameMaterial(_Model):
+    """Saint Venant-Kirchhoff or compressible neo-Hookean, from Young's modulus and Poisson's ratio."""
+
+    law: Literal["saint-venant-kirchhoff", "neo-hookean"]
     young_pa: Positive
     poisson: Annotated[float, Field(gt=-1, lt=0.5)]
+
+
+class MooneyRivlinMaterial(_Model):
+    """Mooney-Rivlin with a quadratic volumetric energy."""
+
+    law: Literal["mooney-rivlin"]
+    c10_pa: Positive
+    c01_pa: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    bulk_pa: Positive
+
+
+class OgdenMaterial(_Model):
+    """Ogden with a quadratic volumetric energy; every term needs mu_p alpha_p > 0."""
+
+    law: Literal["ogden"]
+    mu_pa: Annotated[tuple[Finite, ...], Field(strict=False, min_length=1)]
+    alpha: Annotated[tuple[Finite, ...], Field(strict=False, min_length=1)]
+    bulk_pa: Positive
+
+    @model_validator(mode="after")
+    def _stable_terms(self) -> OgdenMaterial:
+        if len(self.mu_pa) != len(self.alpha):
+            raise ValueError(f"`mu_pa` and `alpha` must have equal lengths; got {len(self.mu_pa)} and {len(self.alpha)}")
+        if not all(mu * alpha > 0 for mu, alpha in zip(self.mu_pa, self.alpha, strict=True)):
+            raise ValueError(f"every product of `mu_pa` and `alpha` must be > 0; got {self.mu_pa} and {self.alpha}")
+        return self
+
+
+MaterialSpec = Annotated[TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial, Field(discriminator="law")]
 
 
 class BoxRegion(_Model):
@@ -80,7 +122,11 @@ def _kind_of_region(value: Any) -> str:
 Region = Annotated[
     Annotated[NamedRegion, Tag("name")] | Annotated[BoxRegion, Tag("box")] | Annotated[SphereRegion, Tag("sphere")], Discriminator(_kind_of_region)
 ]
-_REGION_TAGS = ("name", "box", "sphere")
+_BRANCHES = {
+    "region": ("name", "box", "sphere"),
+    "material": ("saint-venant-kirchhoff", "neo-hookean", "mooney-rivlin", "ogden"),
+}
+"""Steps that pydantic puts into an error's location to say which alternative of a key it took."""
 
 
 class Support(_Model):
@@ -137,7 +183,8 @@ class DatasetSpec(_Model):
     title: str
     source: str
     geometry: BoxGeometry
-    material: Material
+    discretisation: Discretisation = Discretisation()
+    material: MaterialSpec
     supports: Annotated[tuple[Support, ...], Field(strict=False)] = ()
     loads: Loads
     split: Split = Split()
@@ -145,7 +192,7 @@ class DatasetSpec(_Model):
 
     def physics(self) -> dict[str, Any]:
         """All that decides the samples: two datasets with equal physics have equal snapshots."""
-        return self.model_dump(mode="json", include={"geometry", "material", "supports", "loads"})
+        return self.model_dump(mode="json", include={"geometry", "discretisation", "material", "supports", "loads"})
 
     def digest(self) -> str:
         """Twelve hexadecimal digits of SHA-256 over `physics`."""
@@ -264,11 +311,17 @@ def _one_line(error: ValidationError, model: type[BaseModel], where: str) -> str
     unknown = [p for p in problems if p["type"] == "extra_forbidden"]
     problem = (unknown or problems)[0]
     location = problem["loc"]
-    shown = [s for i, s in enumerate(location) if not (s in _REGION_TAGS and i and location[i - 1] == "region")]
+    shown = [s for i, s in enumerate(location) if not (i and s in _BRANCHES.get(str(location[i - 1]), ()))]
     key = "".join(f"[{s}]" if isinstance(s, int) else f".{s}" for s in shown).lstrip(".")
     if problem["type"] == "extra_forbidden":
         valid = _valid_keys(model, problem["loc"][:-1])
         return f"{where}: unknown key `{key}`{_nearest(str(shown[-1]), valid)} Allowed here: {', '.join(valid)}."
+    if problem["type"] == "union_tag_invalid":
+        context = problem["ctx"]
+        *others, last = context["expected_tags"].split(", ")
+        return f"{where}: `{key}.{context['discriminator'].strip(chr(39))}` must be {', '.join(others)} or {last}; got {context['tag']!r}."
+    if problem["type"] == "union_tag_not_found":
+        return f"{where}: key `{key}.{problem['ctx']['discriminator'].strip(chr(39))}` is missing."
     if problem["type"] == "missing":
         return f"{where}: key `{key}` is missing."
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input should be ")

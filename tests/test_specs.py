@@ -13,7 +13,7 @@ from mor_bench.errors import MissingDependencyError, MorBenchError, SpecError
 from mor_bench.harness.check import check_file
 from mor_bench.specs import list_suite, load_dataset_spec, load_method_spec
 
-SHIPPED = {"beam-coarse": (135, 256, 64, 6400), "beam-tiny": (24, 63, 21, 210)}
+SHIPPED = {"beam-coarse": (135, 256, 64, 6400), "beam-fine": (3267, 4032, 336, 33600), "beam-tiny": (24, 63, 21, 210)}
 
 
 def test_every_shipped_dataset_is_pinned_to_its_counts() -> None:
@@ -59,7 +59,17 @@ BAD = [
     (set_("material", "young_pa", value=-5.0), r"`material.young_pa` must be greater than 0; got -5"),
     (set_("material", "young_pa", value=float("nan")), r"`material.young_pa` must be"),
     (set_("material", "young_pa", value=float("inf")), r"`material.young_pa` must be a finite number; got inf"),
-    (set_("material", "law", value="neo"), r"`material.law` must be 'saint-venant-kirchhoff'; got 'neo'"),
+    (set_("material", "law", value="neo"), r"`material.law` must be 'saint-venant-kirchhoff', 'neo-hookean', 'mooney-rivlin' or 'ogden'; got 'neo'"),
+    (lambda spec: spec["material"].pop("law"), r"key `material.law` is missing"),
+    (set_("material", value={"law": "mooney-rivlin", "c10_pa": 1.0, "c01_pa": 0.1}), r"key `material.bulk_pa` is missing"),
+    (
+        set_("material", value={"law": "mooney-rivlin", "c10_pa": -1.0, "c01_pa": 0.1, "bulk_pa": 9.0}),
+        r"`material.c10_pa` must be greater than 0; got -1",
+    ),
+    (set_("material", value={"law": "ogden", "mu_pa": [1.0], "alpha": [2.0, 3.0], "bulk_pa": 9.0}), r"`mu_pa` and `alpha` must have equal lengths"),
+    (set_("material", value={"law": "ogden", "mu_pa": [1.0], "alpha": [-2.0], "bulk_pa": 9.0}), r"every product of `mu_pa` and `alpha` must be > 0"),
+    (set_("discretisation", value={"element": "wedge"}), r"`discretisation.element` must be 'hexahedron' or 'tetrahedron'; got 'wedge'"),
+    (set_("discretisation", value={"element": "tetrahedron", "integration": "selective"}), r"`integration` of tetrahedra must be 'full'"),
     (set_("geometry", "shape", value="sphere"), r"`geometry.shape` must be 'box'; got 'sphere'"),
     (set_("geometry", "cells", value=[6, 2]), r"`geometry.cells\[2\]` is missing"),
     (set_("geometry", "cells", value=[6, 2, 0]), r"`geometry.cells\[2\]` must be greater than or equal to 1; got 0"),

@@ -3,56 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import InvalidInputError
+from mor_bench.mechanics.elements import H8, element_of, shape_gradients
+from mor_bench.mechanics.general import general_force
 from mor_bench.mechanics.kernels import LANES, internal_force, internal_force_and_tangent
-from mor_bench.scene.materials import SaintVenantKirchhoff
+from mor_bench.scene.materials import Material, SaintVenantKirchhoff
 
-_CORNERS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], dtype=float)
-_GAUSS = _CORNERS / np.sqrt(3.0)
+Array = NDArray[np.float64]
 
 
-def _upper_entries() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row and column of the 300 upper entries of an element matrix, in the order in which the kernel stores them."""
+def _upper_entries(n_nodes: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Row and column of the upper entries of an element matrix, in the order in which the kernels store them."""
     rows, columns = [], []
-    for a in range(8):
-        for b in range(a, 8):
+    for a in range(n_nodes):
+        for b in range(a, n_nodes):
             for i in range(3):
                 for j in range(i if a == b else 0, 3):
                     rows.append(3 * a + i)
                     columns.append(3 * b + j)
     return np.array(rows), np.array(columns)
-
-
-def shape_gradients(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gradients of the trilinear shape functions at the 2x2x2 Gauss points.
-
-    Returns
-    -------
-    gradients : (n_cells, 8, 8, 3) float64
-        dN_a/dX at each Gauss point, 1/m; axes cell, point, node, direction.
-    weights : (n_cells, 8) float64
-        det J (the Gauss weights are 1), m³.
-
-    Raises
-    ------
-    InvalidInputError
-        If det J is not positive at some Gauss point: the cell is inverted or degenerate.
-    """
-    terms = 1 + _GAUSS[:, None, :] * _CORNERS[None, :, :]
-    d_reference = 0.125 * np.stack([_CORNERS[:, i] * np.prod(np.delete(terms, i, axis=2), axis=2) for i in range(3)], axis=2)
-    jacobian = np.einsum("qai,cak->cqki", d_reference, points[cells])
-    weights = np.linalg.det(jacobian)
-    if not np.all(weights > 0):
-        cell, point = np.argwhere(~(weights > 0))[0]
-        raise InvalidInputError(
-            f"cell {cell} is inverted or degenerate: det J must be > 0 m³; got {weights[cell, point]:.3g} at Gauss point {point}."
-        )
-    gradients = np.einsum("qai,cqik->cqak", d_reference, np.linalg.inv(jacobian))
-    return gradients, weights
 
 
 @dataclass(frozen=True)
@@ -78,12 +51,46 @@ class State:
     min_det_f: float
 
 
-def _batched(values: NDArray[np.generic], fill: float) -> NDArray[np.generic]:
+def _batched(values: NDArray[Any], fill: float) -> NDArray[Any]:
     """(n_cells, ...) → (n_batches, ..., LANES), padded with ``fill``."""
     n_batches = -(-len(values) // LANES)
     padded = np.full((n_batches * LANES, *values.shape[1:]), fill, dtype=values.dtype)
     padded[: len(values)] = values
     return np.ascontiguousarray(np.moveaxis(padded.reshape(n_batches, LANES, *values.shape[1:]), 1, -1))
+
+
+@dataclass(frozen=True)
+class _Quadrature:
+    """Gradients, weights and law parameters at the quadrature points of every cell.
+
+    Attributes
+    ----------
+    gradients : (n_cells, n_points, n_nodes, 3) float64
+    weights : (n_cells, n_points) float64
+    parameters : (n_points, n_parameters) float64
+    """
+
+    gradients: Array
+    weights: Array
+    parameters: Array
+
+
+def _quadrature(points: Array, cells: NDArray[np.int64], material: Material, selective: bool) -> _Quadrature:
+    """Full integration, or selective: the volumetric part from each cell's mean gradient only, the rest at every point.
+
+    Selective integration with mean gradients (Hughes, IJNME 15, 1980: B-bar) of an energy that is a sum of both parts
+    keeps a potential and hence a symmetric tangent. The pressure is constant in a cell and may oscillate between cells.
+    """
+    element = element_of(cells)
+    gradients, det_j = shape_gradients(points, cells, element.derivatives)
+    weights = det_j * element.weights
+    if not selective:
+        return _Quadrature(gradients, weights, np.array([material.parameters] * len(element.weights)))
+    # The cell's mean gradient, not that at its centre, which fails the patch test on warped cells.
+    volume = weights.sum(axis=1)
+    mean = np.einsum("cq,cqaj->caj", weights, gradients) / volume[:, None, None]
+    parameters = [material.shape_parameters] * len(element.weights) + [material.volume_parameters]
+    return _Quadrature(np.concatenate([gradients, mean[:, None]], axis=1), np.hstack([weights, volume[:, None]]), np.array(parameters))
 
 
 class Assembler:
@@ -93,79 +100,82 @@ class Assembler:
     ----------
     points : (n_nodes, 3) float64
         Reference positions, m.
-    cells : (n_cells, 8) int
-        The cells to sum over.
+    cells : (n_cells, 8) or (n_cells, 4) int
+        The cells to sum over: H8 or T4.
     dof_of_node : (n_nodes, 3) int
         Row of each nodal displacement component in the vectors; ``n_dofs`` for one that is zero (a support).
     n_dofs : int
         Length of the vectors.
-    material : SaintVenantKirchhoff
+    material : Material
     cell_weights : (n_cells,) float64, optional
         Cubature weights that multiply each cell's energy; 1 by default.
+    selective : bool
+        Take the volumetric part of the energy from the cells' mean gradients, which cures volumetric locking of H8.
 
     Raises
     ------
     InvalidInputError
-        If a cell is inverted or degenerate.
+        If a cell is inverted or degenerate, or no element has as many nodes.
     """
 
     def __init__(
         self,
-        points: NDArray[np.float64],
+        points: Array,
         cells: NDArray[np.int64],
         dof_of_node: NDArray[np.int64],
         n_dofs: int,
-        material: SaintVenantKirchhoff,
-        cell_weights: NDArray[np.float64] | None = None,
+        material: Material,
+        cell_weights: Array | None = None,
+        selective: bool = False,
     ) -> None:
-        gradients, weights = shape_gradients(points, cells)
-        if cell_weights is not None:
-            weights = weights * cell_weights[:, None]
-        dofs = dof_of_node[cells].reshape(len(cells), 24)
-        rows, columns = _upper_entries()
+        quadrature = _quadrature(points, cells, material, selective)
+        weights = quadrature.weights if cell_weights is None else quadrature.weights * cell_weights[:, None]
+        n_cells, n_points, n_nodes, _ = quadrature.gradients.shape
+        dofs = dof_of_node[cells].reshape(n_cells, 3 * n_nodes)
+        rows, columns = _upper_entries(n_nodes)
         low, high = np.minimum(dofs[:, rows], dofs[:, columns]), np.maximum(dofs[:, rows], dofs[:, columns])
         key = np.where(high < n_dofs, low * n_dofs + high, n_dofs * n_dofs)
         entries, slots = np.unique(key, return_inverse=True)
         entries = entries[entries < n_dofs * n_dofs]
-        indptr = np.searchsorted(entries // n_dofs, np.arange(n_dofs + 1))
         self.n_dofs = n_dofs
-        self.n_cells = len(cells)
+        self.n_cells = n_cells
         self.material = material
-        self.pattern = Pattern(n_dofs, indptr, entries % n_dofs)
+        self.pattern = Pattern(n_dofs, np.searchsorted(entries // n_dofs, np.arange(n_dofs + 1)), entries % n_dofs)
         self._n_values = len(entries) + 1
-        n_batches = -(-len(cells) // LANES)
-        self._gradients = _batched(gradients.reshape(len(cells), 8, 24), 0.0).reshape(n_batches, 8, 24 * LANES)
-        self._weights = _batched(weights, 0.0)
-        self._dofs = _batched(dofs.astype(np.int32), n_dofs)
-        self._slots = _batched(slots.reshape(len(cells), -1).astype(np.int32), len(entries))
+        self._vectorised = isinstance(material, SaintVenantKirchhoff) and n_nodes == H8.n_nodes
+        if self._vectorised:
+            self._gradients = _batched(quadrature.gradients.reshape(n_cells, n_points, 24), 0.0).reshape(-1, n_points, 24 * LANES)
+            self._w_lam = _batched(weights * quadrature.parameters[:, 0], 0.0)
+            self._w_mu = _batched(weights * quadrature.parameters[:, 1], 0.0)
+            self._dofs = _batched(dofs.astype(np.int32), n_dofs)
+            self._slots = _batched(slots.reshape(n_cells, -1).astype(np.int32), len(entries))
+        else:
+            self._gradients, self._weights, self._parameters = quadrature.gradients, weights, quadrature.parameters
+            self._dofs, self._slots = dofs.astype(np.int32), slots.reshape(n_cells, -1).astype(np.int32)
 
-    def force(self, u: NDArray[np.float64]) -> State:
+    def _sum(self, u: Array, dofs: NDArray[np.int32], force: Array, values: Array) -> tuple[float, float]:
+        """Add the cells' forces and, where ``values`` is not empty, tangents; returns energy and min det F."""
+        if not self._vectorised:
+            law, parameters = self.material.law, self._parameters
+            return general_force(u, dofs, self._gradients, self._weights, law, parameters, self._slots, force, values)  # type: ignore[no-any-return]
+        if len(values) == 0:
+            return internal_force(u, dofs, self._gradients, self._w_lam, self._w_mu, force)  # type: ignore[no-any-return]
+        return internal_force_and_tangent(u, dofs, self._gradients, self._w_lam, self._w_mu, self._slots, force, values)  # type: ignore[no-any-return]
+
+    def force(self, u: Array) -> State:
         """Internal force, N, stored energy, J, and min det F at displacements ``u`` (n_dofs,), m."""
         force = np.zeros(self.n_dofs + 1)
-        law = self.material
-        energy, min_det = internal_force(
-            np.append(u, 0.0), self._dofs, self._gradients, self._weights, law.lame_lambda, law.lame_mu, force
-        )  # fmt: skip
-        return State(force[:-1], energy, min_det)
+        return State(force[:-1], *self._sum(np.append(u, 0.0), self._dofs, force, np.zeros(0)))
 
-    def force_and_tangent(self, u: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
+    def force_and_tangent(self, u: Array) -> tuple[State, Array]:
         """`force`, and the values of the tangent stiffness, N/m, in ``pattern``."""
         force, values = np.zeros(self.n_dofs + 1), np.zeros(self._n_values)
-        law = self.material
-        energy, min_det = internal_force_and_tangent(
-            np.append(u, 0.0), self._dofs, self._gradients, self._weights, law.lame_lambda, law.lame_mu, self._slots, force, values
-        )  # fmt: skip
-        return State(force[:-1], energy, min_det), values[:-1]
+        return State(force[:-1], *self._sum(np.append(u, 0.0), self._dofs, force, values)), values[:-1]
 
-    def cell_forces(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Internal force of each cell on its own, (n_cells, 24), N: what cubature is trained on."""
-        out = np.zeros((len(self._dofs) * LANES, 24))
-        local = np.arange(24 * LANES, dtype=np.int32).reshape(1, 24, LANES)
-        law = self.material
-        padded = np.append(u, 0.0)
-        for b in range(len(self._dofs)):
-            force = np.zeros(24 * LANES + 1)
-            displacements = np.append(padded[self._dofs[b]].ravel(), 0.0)
-            internal_force(displacements, local, self._gradients[b : b + 1], self._weights[b : b + 1], law.lame_lambda, law.lame_mu, force)
-            out[b * LANES : (b + 1) * LANES] = force[:-1].reshape(24, LANES).T
-        return out[: self.n_cells]
+    def cell_forces(self, u: Array) -> Array:
+        """Internal force of each cell on its own, (n_cells, 3 n_nodes), N: what cubature is trained on."""
+        local = np.arange(self._dofs.size, dtype=np.int32).reshape(self._dofs.shape)
+        force = np.zeros(local.size + 1)
+        self._sum(np.append(np.append(u, 0.0)[self._dofs].ravel(), 0.0), local, force, np.zeros(0))
+        own = force[:-1].reshape(self._dofs.shape)
+        return np.moveaxis(own, 2, 1).reshape(-1, 24)[: self.n_cells] if self._vectorised else own

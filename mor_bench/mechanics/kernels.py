@@ -1,4 +1,4 @@
-"""Element kernels for H8 and Saint Venant-Kirchhoff, vectorised over batches of elements.
+"""Element kernels for Saint Venant-Kirchhoff on H8, vectorised over batches of elements.
 
 Layout: every array ends in ``LANES`` elements, so that each innermost loop does the same arithmetic on neighbouring
 elements and LLVM turns it into vector instructions. Per-element quantities are flat arrays, component ``i`` of lane
@@ -21,13 +21,17 @@ from numba import njit
 LANES = 32
 """Elements per batch; on the fine beam 8, 16, 32 and 64 gave tangents in 8.2, 4.2, 3.3 and 3.7 ms (one thread)."""
 
+
 N_UPPER = 300
 """Entries in the upper triangle of a 24x24 element matrix."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _deformation(u_e, g, H):
-    """H (9) = Σ_a u_a ⊗ g_a at one Gauss point; u_e and g are (24)."""
+    """H (9) = Σ_a u_a ⊗ g_a at one Gauss point; u_e and g are (24).
+
+    One expression per component: a loop over the nodes stores and loads H once per node.
+    """
     for i in range(3):
         for j in range(3):
             for l in range(LANES):
@@ -44,7 +48,7 @@ def _deformation(u_e, g, H):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _stress(H, w, lam, mu, S, P, energy, min_det):
+def _stress(H, w_lam, w_mu, S, P, energy, min_det):
     """Weighted S (6: 00 11 22 01 02 12) and P (9) at one Gauss point; adds to the energy, lowers min det F.
 
     E is formed from H, not from FᵀF - I, which would lose the digits of a small strain.
@@ -60,8 +64,8 @@ def _stress(H, w, lam, mu, S, P, energy, min_det):
         e02 = 0.5 * (h02 + h20 + h00 * h02 + h10 * h12 + h20 * h22)
         e12 = 0.5 * (h12 + h21 + h01 * h02 + h11 * h12 + h21 * h22)
         trace = e00 + e11 + e22
-        wl = w[l] * lam * trace
-        wm = w[l] * 2.0 * mu
+        wl = w_lam[l] * trace
+        wm = 2.0 * w_mu[l]
         s00, s11, s22 = wl + wm * e00, wl + wm * e11, wl + wm * e22
         s01, s02, s12 = wm * e01, wm * e02, wm * e12
         S[l], S[1 * LANES + l], S[2 * LANES + l], S[3 * LANES + l], S[4 * LANES + l], S[5 * LANES + l] = s00, s11, s22, s01, s02, s12
@@ -82,7 +86,7 @@ def _stress(H, w, lam, mu, S, P, energy, min_det):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _nodal_force(P, g, f_e):
-    """f_a += P g_a for the 8 nodes."""
+    """f_a += P g_a for every node."""
     for a in range(8):
         for i in range(3):
             for l in range(LANES):
@@ -94,13 +98,13 @@ def _nodal_force(P, g, f_e):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _push_forward(H, S, g, w, lam, mu, h, h_lam, h_mu, t, M):
+def _push_forward(H, S, g, w_lam, w_mu, h, h_lam, h_mu, t, M):
     """Per node h = F g, w λ h, w μ h and t = w S g; M (6) = w μ F Fᵀ."""
     for l in range(LANES):
         f00, f01, f02 = 1.0 + H[l], H[1 * LANES + l], H[2 * LANES + l]
         f10, f11, f12 = H[3 * LANES + l], 1.0 + H[4 * LANES + l], H[5 * LANES + l]
         f20, f21, f22 = H[6 * LANES + l], H[7 * LANES + l], 1.0 + H[8 * LANES + l]
-        wm = w[l] * mu
+        wm = w_mu[l]
         M[l] = wm * (f00 * f00 + f01 * f01 + f02 * f02)
         M[1 * LANES + l] = wm * (f10 * f10 + f11 * f11 + f12 * f12)
         M[2 * LANES + l] = wm * (f20 * f20 + f21 * f21 + f22 * f22)
@@ -114,7 +118,7 @@ def _push_forward(H, S, g, w, lam, mu, h, h_lam, h_mu, t, M):
             h0 = g0 + H[l] * g0 + H[1 * LANES + l] * g1 + H[2 * LANES + l] * g2
             h1 = g1 + H[3 * LANES + l] * g0 + H[4 * LANES + l] * g1 + H[5 * LANES + l] * g2
             h2 = g2 + H[6 * LANES + l] * g0 + H[7 * LANES + l] * g1 + H[8 * LANES + l] * g2
-            wl, wm = w[l] * lam, w[l] * mu
+            wl, wm = w_lam[l], w_mu[l]
             h[x * LANES + l], h[y * LANES + l], h[z * LANES + l] = h0, h1, h2
             h_lam[x * LANES + l], h_lam[y * LANES + l], h_lam[z * LANES + l] = wl * h0, wl * h1, wl * h2
             h_mu[x * LANES + l], h_mu[y * LANES + l], h_mu[z * LANES + l] = wm * h0, wm * h1, wm * h2
@@ -125,7 +129,7 @@ def _push_forward(H, S, g, w, lam, mu, h, h_lam, h_mu, t, M):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _add_blocks(g, h, h_lam, h_mu, t, M, k_e):
-    """Add one Gauss point to the 300 upper entries k_e of the element matrices."""
+    """Add one Gauss point to the upper entries k_e of the element matrices."""
     p = 0
     for a in range(8):
         x, y, z = 3 * a, 3 * a + 1, 3 * a + 2
@@ -169,7 +173,7 @@ def _add_blocks(g, h, h_lam, h_mu, t, M, k_e):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def internal_force(u, dofs, gradients, weights, lam, mu, force):
+def internal_force(u, dofs, gradients, w_lam, w_mu, force):
     """Internal force of a batch of elements, added into ``force``.
 
     Parameters
@@ -177,19 +181,18 @@ def internal_force(u, dofs, gradients, weights, lam, mu, force):
     u : (n_dofs + 1,) float64
         Displacements, m; the last entry, of the dummy dof, is zero.
     dofs : (n_batches, 24, LANES) int32
-    gradients : (n_batches, 8, 24 * LANES) float64
+    gradients : (n_batches, n_points, 24 * LANES) float64
         dN_a/dX_j at the Gauss points, entry (3a + j) * LANES + lane, 1/m.
-    weights : (n_batches, 8, LANES) float64
-        Gauss weight times det J (times a cubature weight), m³.
-    lam, mu : float
-        Lamé parameters, Pa.
+    w_lam, w_mu : (n_batches, n_points, LANES) float64
+        Gauss weight times det J times λ and times μ (and a cubature weight), J. A point may carry only one of the two:
+        that is selective integration.
     force : (n_dofs + 1,) float64
         Receives the sum, N; the dummy entry receives the padding's.
 
     Returns
     -------
     (float, float)
-        Stored energy, J, and the smallest det F over all Gauss points of non-zero weight or padding.
+        Stored energy, J, and the smallest det F over all Gauss points.
     """
     u_e, f_e = np.empty(24 * LANES), np.empty(24 * LANES)
     H, P, S = np.empty(9 * LANES), np.empty(9 * LANES), np.empty(6 * LANES)
@@ -201,7 +204,7 @@ def internal_force(u, dofs, gradients, weights, lam, mu, force):
         f_e[:] = 0.0
         for q in range(gradients.shape[1]):
             _deformation(u_e, gradients[b, q], H)
-            _stress(H, weights[b, q], lam, mu, S, P, energy, min_det)
+            _stress(H, w_lam[b, q], w_mu[b, q], S, P, energy, min_det)
             _nodal_force(P, gradients[b, q], f_e)
         for i in range(24):
             for l in range(LANES):
@@ -210,7 +213,7 @@ def internal_force(u, dofs, gradients, weights, lam, mu, force):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def internal_force_and_tangent(u, dofs, gradients, weights, lam, mu, slots, force, values):
+def internal_force_and_tangent(u, dofs, gradients, w_lam, w_mu, slots, force, values):
     """Internal force and tangent stiffness; as `internal_force`, and the upper triangle of K added into ``values``.
 
     Parameters
@@ -232,11 +235,11 @@ def internal_force_and_tangent(u, dofs, gradients, weights, lam, mu, slots, forc
         f_e[:] = 0.0
         k_e[:] = 0.0
         for q in range(gradients.shape[1]):
-            g, w = gradients[b, q], weights[b, q]
+            g = gradients[b, q]
             _deformation(u_e, g, H)
-            _stress(H, w, lam, mu, S, P, energy, min_det)
+            _stress(H, w_lam[b, q], w_mu[b, q], S, P, energy, min_det)
             _nodal_force(P, g, f_e)
-            _push_forward(H, S, g, w, lam, mu, h, h_lam, h_mu, t, M)
+            _push_forward(H, S, g, w_lam[b, q], w_mu[b, q], h, h_lam, h_mu, t, M)
             _add_blocks(g, h, h_lam, h_mu, t, M, k_e)
         for i in range(24):
             for l in range(LANES):

@@ -41,7 +41,9 @@ class LinearSolver(Protocol):
         ...
 
 
-class _BandedFactor:
+class BandedFactor:
+    """A banded Cholesky factor, in LAPACK's upper storage."""
+
     def __init__(self, band: NDArray[np.float64], order: NDArray[np.int64] | None) -> None:
         self._band, self._order = band, order
 
@@ -51,6 +53,18 @@ class _BandedFactor:
         solution = np.empty_like(rhs)
         solution[self._order] = np.asarray(dpbtrs(self._band, rhs[self._order])[0]).reshape(rhs.shape)
         return solution
+
+    def single_precision(self) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Columns of L (n, bandwidth + 1) float32, with inverted diagonals, and the place in them of each row."""
+        width, n = self._band.shape
+        columns = np.zeros((n, width), dtype=np.float32)
+        for k in range(width):
+            columns[: n - k, k] = self._band[width - 1 - k, k:]
+        columns[:, 0] = 1.0 / self._band[width - 1]
+        place = np.arange(n)
+        if self._order is not None:
+            place[self._order] = np.arange(n)
+        return columns, place
 
 
 class BandedCholesky:
@@ -76,13 +90,13 @@ class BandedCholesky:
         """n times bandwidth squared: the multiply-adds of a factorisation."""
         return float(self._n) * self.bandwidth**2
 
-    def factor(self, values: NDArray[np.float64]) -> Factor:
+    def factor(self, values: NDArray[np.float64]) -> BandedFactor:
         flat = np.zeros(self._n * (self.bandwidth + 1))
         flat[self._places] = values
         band, info = dpbtrf(flat.reshape(self._n, self.bandwidth + 1).T, overwrite_ab=1)
         if info != 0:
             raise NotPositiveDefiniteError
-        return _BandedFactor(band, self._order)
+        return BandedFactor(band, self._order)
 
 
 class SparseLU:

@@ -9,9 +9,14 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import UnconstrainedBodyError
 from mor_bench.mechanics.assembly import Assembler, State
-from mor_bench.mechanics.linear import Factor, choose_solver
+from mor_bench.mechanics.elements import element_of, shape_gradients
+from mor_bench.mechanics.linear import BandedFactor, Factor, choose_solver
 from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibrium
+from mor_bench.mechanics.pcg import RotatedPCG
 from mor_bench.scene.scene import Scene
+
+PCG_FROM = 3000
+"""Unknowns from which conjugate gradients beat a fresh banded factor for each Newton step."""
 
 RIGID_MODES = ("translation x", "translation y", "translation z", "rotation about x", "rotation about y", "rotation about z")
 
@@ -41,7 +46,7 @@ def check_supports(scene: Scene) -> None:
 
 
 class FullOrderModel:
-    """H8, Saint Venant-Kirchhoff, dead loads, over the free dofs of a scene.
+    """Finite elements under dead loads, over the free dofs of a scene.
 
     Raises
     ------
@@ -57,9 +62,9 @@ class FullOrderModel:
         number = np.full(mesh.n_dofs, self.n_unknowns, dtype=np.int64)
         number[scene.free_dofs] = np.arange(self.n_unknowns)
         dof_of_node = number.reshape(-1, 3)
-        self.cell_dofs = dof_of_node[mesh.cells].reshape(mesh.n_cells, 24)
-        self.assembler = Assembler(mesh.points, mesh.cells, dof_of_node, self.n_unknowns, scene.material)
-        self._solver = choose_solver(self.assembler.pattern)
+        self.cell_dofs = dof_of_node[mesh.cells].reshape(mesh.n_cells, -1)
+        self.assembler = Assembler(mesh.points, mesh.cells, dof_of_node, self.n_unknowns, scene.material, selective=scene.selective)
+        self._direct = choose_solver(self.assembler.pattern)
 
     @cached_property
     def rest_tangent(self) -> NDArray[np.float64]:
@@ -78,7 +83,26 @@ class FullOrderModel:
         return self.assembler.force_and_tangent(q)
 
     def factor(self, tangent: NDArray[np.float64]) -> Factor:
-        return self._solver.factor(tangent)
+        """Factorise a tangent; raises `NotPositiveDefiniteError`."""
+        return self._direct.factor(tangent)
+
+    @cached_property
+    def pcg(self) -> RotatedPCG | None:
+        """The iterative solver, where it is faster than a fresh factor for each step."""
+        if self.n_unknowns < PCG_FROM or not isinstance(self.rest_factor, BandedFactor):
+            return None
+        mesh = self.scene.mesh
+        element = element_of(mesh.cells)
+        gradients, det_j = shape_gradients(mesh.points, mesh.cells, element.centre[None])
+        cell_nodes = (self.cell_dofs[:, ::3] // 3).astype(np.int32)
+        return RotatedPCG(self.assembler.pattern, self.rest_factor, cell_nodes, gradients[:, 0], det_j[:, 0] * element.weights.sum())
+
+    def step(
+        self, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64], tolerance: float
+    ) -> NDArray[np.float64]:  # fmt: skip
+        if self.pcg is None:
+            return self.factor(tangent).solve(residual)
+        return self.pcg.solve(q, tangent, residual, tolerance)
 
     def solve(self, load: NDArray[np.float64], start: NDArray[np.float64] | None = None, options: NewtonOptions = NewtonOptions()) -> Solution:
         """Equilibrium under forces on the free dofs, (n_free,) N; see `solve_equilibrium`."""

@@ -81,7 +81,13 @@ class GalerkinProblem:
         _symmetric_product(pattern.indptr, pattern.indices, values, self.modes, product)
         return self._project(state), self.modes.T @ product
 
+    def step(
+        self, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64], tolerance: float
+    ) -> NDArray[np.float64]:  # fmt: skip
+        return self.factor(tangent).solve(residual)
+
     def factor(self, tangent: NDArray[np.float64]) -> Factor:
+        """Dense Cholesky; raises `NotPositiveDefiniteError`."""
         cholesky, info = dpotrf(tangent)
         if info != 0:
             raise NotPositiveDefiniteError

@@ -19,23 +19,36 @@ POINTS_PER_PATCH = 256
 """Surface quadrature points that a patch holds at least."""
 
 
+def _midpoints(n_corners: int, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Shape functions (n, n_corners) at the midpoints of the parts of a facet, and their derivatives (n, n_corners, 2).
+
+    A quadrilateral is cut into m², a triangle into m² equal parts.
+    """
+    if n_corners == 4:
+        s = (np.arange(m) + 0.5) / m
+        x, y = (a.ravel() for a in np.meshgrid(s, s, indexing="ij"))
+        shape = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
+        return shape, np.stack([np.stack([y - 1, 1 - y, y, -y], axis=1), np.stack([x - 1, -x, x, 1 - x], axis=1)], axis=2)
+    i, j = (a.ravel() for a in np.meshgrid(np.arange(m), np.arange(m), indexing="ij"))
+    up = [(i + 1 / 3)[i + j < m] / m, (j + 1 / 3)[i + j < m] / m]
+    down = [(i + 2 / 3)[i + j < m - 1] / m, (j + 2 / 3)[i + j < m - 1] / m]
+    x, y = np.append(up[0], down[0]), np.append(up[1], down[1])
+    return np.stack([1 - x - y, x, y], axis=1), np.tile(np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]]), (len(x), 1, 1))
+
+
 def _surface_points(mesh: Mesh, facets: NDArray[np.int64], spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64], sp.csr_array]:
     """Positions (n, 3), areas (n,) and shape-function values (n, n_nodes) of midpoint-rule points on the facets."""
-    corners = mesh.points[facets]
+    corners, n_corners = mesh.points[facets], facets.shape[1]
     longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
     m = max(2, ceil(longest / spacing))
-    s = (np.arange(m) + 0.5) / m
-    x, y = (a.ravel() for a in np.meshgrid(s, s, indexing="ij"))
-    shape = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
-    d_x = np.stack([y - 1, 1 - y, y, -y], axis=1)
-    d_y = np.stack([x - 1, -x, x, 1 - x], axis=1)
+    shape, derivatives = _midpoints(n_corners, m)
     positions = np.einsum("pa,fai->fpi", shape, corners)
-    normals = np.cross(np.einsum("pa,fai->fpi", d_x, corners), np.einsum("pa,fai->fpi", d_y, corners))
-    areas = np.linalg.norm(normals, axis=2) / m**2
-    n = len(facets) * m * m
-    rows = np.repeat(np.arange(n), 4)
-    columns = np.repeat(facets, m * m, axis=0).ravel()
-    values = sp.csr_array((np.tile(shape, (len(facets), 1)).ravel(), (rows, columns)), shape=(n, mesh.n_nodes))
+    tangents = np.einsum("pad,fai->fpdi", derivatives, corners)
+    areas = np.linalg.norm(np.cross(tangents[:, :, 0], tangents[:, :, 1]), axis=2) / m**2
+    areas = areas if n_corners == 4 else 0.5 * areas
+    rows = np.repeat(np.arange(areas.size), n_corners)
+    columns = np.repeat(facets, len(shape), axis=0).ravel()
+    values = sp.csr_array((np.tile(shape, (len(facets), 1)).ravel(), (rows, columns)), shape=(areas.size, mesh.n_nodes))
     return positions.reshape(-1, 3), areas.ravel(), values
 
 
@@ -51,7 +64,7 @@ def patch_weights(mesh: Mesh, centres: NDArray[np.int64], facets: NDArray[np.int
     mesh : Mesh
     centres : (n_patches,) int
         Node numbers.
-    facets : (n_facets, 4) int
+    facets : (n_facets, 4 or 3) int
         The surface on which patches may lie.
     area_m2 : float
         Area of each patch, m².

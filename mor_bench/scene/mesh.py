@@ -8,19 +8,25 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-HEX_FACES = np.array([[0, 4, 7, 3], [1, 2, 6, 5], [0, 1, 5, 4], [3, 7, 6, 2], [0, 3, 2, 1], [4, 5, 6, 7]])
-"""The faces of a hexahedron in VTK node order, each turned outwards."""
+FACES = {
+    8: np.array([[0, 4, 7, 3], [1, 2, 6, 5], [0, 1, 5, 4], [3, 7, 6, 2], [0, 3, 2, 1], [4, 5, 6, 7]]),
+    4: np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]),
+}
+"""The faces of a hexahedron and of a tetrahedron in VTK node order, each turned outwards."""
+
+KUHN = np.array([[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]])
+"""Six tetrahedra around a hexahedron's diagonal 0-6; those of neighbouring cells fit together."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh of H8 cells.
+    """A mesh of H8 or of T4 cells.
 
     Attributes
     ----------
     points : (n_nodes, 3) float64
         Reference positions, m.
-    cells : (n_cells, 8) int64
+    cells : (n_cells, 8) or (n_cells, 4) int64
         Node numbers in VTK order.
     grid_shape : (int, int, int) or None
         Nodes per axis of the regular grid in which the mesh lies.
@@ -47,8 +53,9 @@ class Mesh:
 
     @cached_property
     def boundary_facets(self) -> NDArray[np.int64]:
-        """(n_facets, 4) node numbers of the faces that belong to one cell only, turned outwards."""
-        faces = self.cells[:, HEX_FACES].reshape(-1, 4)
+        """(n_facets, 4 or 3) node numbers of the faces that belong to one cell only, turned outwards."""
+        faces = FACES[self.cells.shape[1]]
+        faces = self.cells[:, faces].reshape(-1, faces.shape[1])
         _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
         return np.asarray(faces[np.sort(first[count == 1])])
 
@@ -58,8 +65,8 @@ class Mesh:
         return np.array([self.points.min(axis=0), self.points.max(axis=0)])
 
 
-def box_mesh(size_m: tuple[float, float, float], cells: tuple[int, int, int]) -> Mesh:
-    """A box of equal H8 cells with its lowest corner at the origin.
+def box_mesh(size_m: tuple[float, float, float], cells: tuple[int, int, int], tetrahedra: bool = False) -> Mesh:
+    """A box of equal H8 cells, or of six T4 in the place of each, with its lowest corner at the origin.
 
     Nodes are numbered with z fastest and x slowest, which keeps the bandwidth of a beam along x small.
 
@@ -69,6 +76,7 @@ def box_mesh(size_m: tuple[float, float, float], cells: tuple[int, int, int]) ->
         Edge lengths, m.
     cells : three ints
         Cells per axis.
+    tetrahedra : bool
     """
     nx, ny, nz = (n + 1 for n in cells)
     axes = [np.linspace(0.0, length, n + 1) for length, n in zip(size_m, cells, strict=True)]
@@ -80,4 +88,5 @@ def box_mesh(size_m: tuple[float, float, float], cells: tuple[int, int, int]) ->
         (low, low, high), (high, low, high), (high, high, high), (low, high, high),
     ]  # fmt: skip
     hexes = np.stack([node[corner].ravel() for corner in corners], axis=1)
-    return Mesh(points, hexes, (nx, ny, nz), np.arange(len(points)))
+    cell_nodes = hexes[:, KUHN].reshape(-1, 4) if tetrahedra else hexes
+    return Mesh(points, cell_nodes, (nx, ny, nz), np.arange(len(points)))

@@ -42,7 +42,7 @@ def region_nodes(mesh: Mesh, region: Region) -> NDArray[np.int64]:
 
 
 def region_facets(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n_facets, 4) boundary facets all of whose nodes are among ``nodes``."""
+    """(n_facets, 4 or 3) boundary facets all of whose nodes are among ``nodes``."""
     inside = np.zeros(mesh.n_nodes, dtype=bool)
     inside[nodes] = True
     facets = mesh.boundary_facets

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.loads import patch_weights
-from mor_bench.scene.materials import SaintVenantKirchhoff
+from mor_bench.scene.materials import Material, make_material
 from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.regions import region_facets, region_nodes
 from mor_bench.specs import DatasetSpec, load_dataset_spec
@@ -29,19 +29,24 @@ class Scene:
     spec : DatasetSpec
         The validated dataset file.
     mesh : Mesh
-    material : SaintVenantKirchhoff
+    material : Material
     fixed_nodes : (n_fixed,) int64
         Nodes with u = 0.
     """
 
     spec: DatasetSpec
     mesh: Mesh
-    material: SaintVenantKirchhoff
+    material: Material
     fixed_nodes: NDArray[np.int64]
 
     @property
     def name(self) -> str:
         return self.spec.name
+
+    @property
+    def selective(self) -> bool:
+        """Whether the volumetric part of the energy is taken from the cells' mean gradients."""
+        return self.spec.discretisation.integration == "selective"
 
     @cached_property
     def free_dofs(self) -> NDArray[np.int64]:
@@ -77,8 +82,8 @@ def load_scene(source: str | Path | Mapping[str, Any] | DatasetSpec) -> Scene:
 
 
 def _build(spec: DatasetSpec) -> Scene:
-    mesh = box_mesh(spec.geometry.size_m, spec.geometry.cells)
-    material = SaintVenantKirchhoff(spec.material.young_pa, spec.material.poisson)
+    mesh = box_mesh(spec.geometry.size_m, spec.geometry.cells, spec.discretisation.element == "tetrahedron")
+    material = make_material(spec.material)
     fixed = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(region_nodes(mesh, support.region) for support in spec.supports)]))
     if len(fixed) == mesh.n_nodes:
         raise SpecError("the supports fix every node of the mesh: nothing can move.")

@@ -86,6 +86,6 @@ class HyperReducedPOD(Surrogate):
         rows = np.flatnonzero(touched.reshape(-1)[scene.free_dofs])
         dof_of_node = np.full(scene.mesh.n_dofs, len(rows), dtype=np.int64)
         dof_of_node[scene.free_dofs[rows]] = np.arange(len(rows))
-        assembler = Assembler(scene.mesh.points, cells, dof_of_node.reshape(-1, 3), len(rows), scene.material, self.weights_)
+        assembler = Assembler(scene.mesh.points, cells, dof_of_node.reshape(-1, 3), len(rows), scene.material, self.weights_, scene.selective)
         self.problem_ = GalerkinProblem(assembler, self.modes_[rows])
         _ = self.problem_.rest_factor

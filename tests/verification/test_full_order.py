@@ -16,7 +16,7 @@ import mor_bench
 from mor_bench.errors import InvalidInputError, SolverError, UnconstrainedBodyError
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.linear import BandedCholesky, NotPositiveDefiniteError, SparseLU
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.model import PCG_FROM, FullOrderModel
 from mor_bench.mechanics.newton import solve_equilibrium
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.scene.materials import SaintVenantKirchhoff
@@ -171,7 +171,8 @@ def felupe_solution(scene: Scene, forces: Array) -> Array:
     """The same problem by felupe, whose stress and elasticity come from automatic differentiation of the energy."""
     mesh = felupe.Mesh(scene.mesh.points, scene.mesh.cells, "hexahedron")
     field = felupe.FieldContainer([felupe.Field(felupe.RegionHexahedron(mesh), dim=3)])
-    law = tensortrax.Hyperelastic(tensortrax.models.hyperelastic.saint_venant_kirchhoff, mu=scene.material.lame_mu, lmbda=scene.material.lame_lambda)
+    lmbda, mu = scene.material.parameters
+    law = tensortrax.Hyperelastic(tensortrax.models.hyperelastic.saint_venant_kirchhoff, mu=mu, lmbda=lmbda)
     fixed = {"support": felupe.Boundary(field[0], mask=np.isin(np.arange(scene.mesh.n_nodes), scene.fixed_nodes))}
     dof0, dof1 = felupe.dof.partition(field, fixed)
     load = felupe.PointLoad(field, np.arange(scene.mesh.n_nodes), forces)
@@ -313,3 +314,51 @@ def test_free_rigid_modes_are_named(supports: list[dict[str, object]], named: st
     with pytest.raises(UnconstrainedBodyError) as caught:
         FullOrderModel(mor_bench.load_scene(spec))
     assert set(named.split(", ")) <= set(str(caught.value).split("free: ")[1].split("; ")[0].split(", "))
+
+
+@pytest.fixture(scope="module")
+def large() -> FullOrderModel:
+    """A beam large enough for conjugate gradients."""
+    spec = mor_bench.load_scene("beam-coarse").spec.model_dump(mode="json")
+    return FullOrderModel(mor_bench.load_scene({**spec, "geometry": {"shape": "box", "size_m": [4.0, 1.0, 1.0], "cells": [18, 7, 7]}}))
+
+
+def test_conjugate_gradients_end_where_fresh_factors_do(large: FullOrderModel) -> None:
+    assert large.n_unknowns >= PCG_FROM
+    rng = np.random.default_rng(0)
+    for patch in rng.integers(0, len(large.scene.patch_nodes), 10):
+        direction = rng.normal(size=3)
+        force = large.scene.patch_weights.toarray()[patch][:, None] * direction / np.linalg.norm(direction)
+        load = force.ravel()[large.scene.free_dofs]
+        solution = large.solve(load)
+        u = solution.displacement
+        assert np.linalg.norm(load - large.force(u).force) <= 1e-8 * np.linalg.norm(load)
+        assert solution.iterations <= 12
+        _, tangent = large.linearise(u)
+        step = large.factor(tangent).solve(load - large.force(u).force)
+        assert np.linalg.norm(step) <= 1e-6 * np.linalg.norm(u)
+
+
+def test_the_turned_factor_needs_few_iterations_far_from_rest(large: FullOrderModel) -> None:
+    """With the tip turned by more than half a radian, the factor as it is needs several times as many."""
+    scene = large.scene
+    tip = int(np.linalg.norm(scene.mesh.points[scene.patch_nodes] - [4.0, 0.5, 1.0], axis=1).argmin())
+    force = scene.patch_weights.toarray()[tip][:, None] * np.array([0.0, 0.0, -6.0])
+    u = large.solve(force.ravel()[scene.free_dofs]).displacement
+    tangent = large.linearise(u)[1]
+    rhs = np.random.default_rng(0).normal(size=large.n_unknowns)
+    assert large.pcg is not None
+    x = large.pcg.solve(u, tangent, rhs, 1e-8)
+    turned = large.pcg.iterations
+    assert np.linalg.norm(dense(large.assembler, tangent) @ x - rhs) <= 2e-8 * np.linalg.norm(rhs)
+    large.pcg.solve(0.0 * u, tangent, rhs, 1e-8)
+    assert turned <= 30
+    assert large.pcg.iterations >= 2 * turned
+
+
+def test_conjugate_gradients_notice_an_indefinite_tangent(large: FullOrderModel) -> None:
+    pattern, values = large.assembler.pattern, large.rest_tangent
+    spoilt = np.where(pattern.rows == pattern.indices, values - 0.5 * values.max(), values)
+    assert large.pcg is not None
+    with pytest.raises(NotPositiveDefiniteError):
+        large.pcg.solve(np.zeros(large.n_unknowns), spoilt, np.ones(large.n_unknowns), 1e-6)

@@ -1,0 +1,97 @@
+"""Reference elements: H8 with 2x2x2 Gauss points and T4 with one; gradients of their shape functions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.errors import InvalidInputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Element:
+    """Derivatives of the shape functions at quadrature points of the reference cell.
+
+    Attributes
+    ----------
+    name : str
+    derivatives : (n_points, n_nodes, 3) float64
+    weights : (n_points,) float64
+        They sum to the reference cell's volume.
+    centre : (n_nodes, 3) float64
+        Derivatives at the centroid.
+    """
+
+    name: str
+    derivatives: Array
+    weights: Array
+    centre: Array
+
+    @property
+    def n_nodes(self) -> int:
+        return int(self.derivatives.shape[1])
+
+
+_CORNERS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], dtype=float)
+
+
+def _trilinear(points: Array) -> Array:
+    terms = 1 + points[:, None, :] * _CORNERS[None, :, :]
+    return 0.125 * np.stack([_CORNERS[:, i] * np.prod(np.delete(terms, i, axis=2), axis=2) for i in range(3)], axis=2)
+
+
+_LINEAR = np.array([[-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+H8 = Element("H8", _trilinear(_CORNERS / np.sqrt(3.0)), np.ones(8), _trilinear(np.zeros((1, 3)))[0])
+T4 = Element("T4", _LINEAR[None], np.array([1.0 / 6.0]), _LINEAR)
+
+
+def element_of(cells: NDArray[np.int64]) -> Element:
+    """The element whose number of nodes the cells have.
+
+    Raises
+    ------
+    InvalidInputError
+        If no element has.
+    """
+    for element in (H8, T4):
+        if cells.ndim == 2 and cells.shape[1] == element.n_nodes:
+            return element
+    raise InvalidInputError(f"cells must have shape (n_cells, 8) for H8 or (n_cells, 4) for T4; got {cells.shape}.")
+
+
+def shape_gradients(points: Array, cells: NDArray[np.int64], derivatives: Array) -> tuple[Array, Array]:
+    """Gradients of the shape functions in the reference configuration, and det J.
+
+    Parameters
+    ----------
+    points : (n_nodes, 3) float64
+    cells : (n_cells, n_cell_nodes) int
+    derivatives : (n_points, n_cell_nodes, 3) float64
+
+    Returns
+    -------
+    gradients : (n_cells, n_points, n_cell_nodes, 3) float64
+        dN_a/dX, 1/m.
+    det_j : (n_cells, n_points) float64
+        m³.
+
+    Raises
+    ------
+    InvalidInputError
+        If det J is not positive at some point: the cell is inverted or degenerate.
+    """
+    jacobian = np.einsum("qai,cak->cqki", derivatives, points[cells])
+    det_j = np.linalg.det(jacobian)
+    # A flat cell has a det J of round-off size rather than zero.
+    least = 1e-12 * np.linalg.norm(jacobian, axis=(2, 3)) ** 3
+    if not np.all(det_j > least):
+        cell, point = np.argwhere(~(det_j > least))[0]
+        raise InvalidInputError(
+            f"cell {cell} is inverted or degenerate: det J must be > 0 m³; got {det_j[cell, point]:.3g} at quadrature point {point}."
+        )
+    return np.einsum("qai,cqik->cqak", derivatives, np.linalg.inv(jacobian)), det_j

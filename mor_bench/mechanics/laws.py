@@ -1,0 +1,181 @@
+"""Hyperelastic laws at a quadrature point: energy, second Piola-Kirchhoff stress and its derivative.
+
+A law is one function ``law(C, parameters, S, D) -> W``: from the right Cauchy-Green tensor C (3, 3) and the law's
+parameters it writes S = 2 dW/dC (3, 3) and D = dS/dE (6, 6), both zero on entry, Voigt order 00 11 22 01 02 12 with
+engineering shear strains, and returns the energy density W. To add one, write the function, give it a number in
+`evaluate`, and a parameter class in `mor_bench.scene.materials`.
+"""
+
+from __future__ import annotations
+
+from math import log, sqrt
+
+import numpy as np
+from numba import njit
+
+SAINT_VENANT_KIRCHHOFF, NEO_HOOKEAN, MOONEY_RIVLIN, OGDEN = range(4)
+
+_I = np.array([0, 1, 2, 0, 0, 1])
+_J = np.array([0, 1, 2, 1, 2, 2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _inverse(C, out):
+    """Inverse of a symmetric (3, 3) matrix; returns the determinant."""
+    out[0, 0] = C[1, 1] * C[2, 2] - C[1, 2] * C[1, 2]
+    out[0, 1] = out[1, 0] = C[0, 2] * C[1, 2] - C[0, 1] * C[2, 2]
+    out[0, 2] = out[2, 0] = C[0, 1] * C[1, 2] - C[0, 2] * C[1, 1]
+    out[1, 1] = C[0, 0] * C[2, 2] - C[0, 2] * C[0, 2]
+    out[1, 2] = out[2, 1] = C[0, 1] * C[0, 2] - C[0, 0] * C[1, 2]
+    out[2, 2] = C[0, 0] * C[1, 1] - C[0, 1] * C[0, 1]
+    det = C[0, 0] * out[0, 0] + C[0, 1] * out[0, 1] + C[0, 2] * out[0, 2]
+    out /= det
+    return det
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_dyad(D, factor, A, B):
+    """D += factor (A ⊗ B + B ⊗ A) / 2 for symmetric A, B."""
+    for m in range(6):
+        for n in range(6):
+            D[m, n] += 0.5 * factor * (A[_I[m], _J[m]] * B[_I[n], _J[n]] + B[_I[m], _J[m]] * A[_I[n], _J[n]])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_product(D, factor, A):
+    """D += factor A ⊙ A, (A ⊙ A)_ijkl = (A_ik A_jl + A_il A_jk) / 2: minus the derivative of C⁻¹ by C for A = C⁻¹."""
+    for m in range(6):
+        i, j = _I[m], _J[m]
+        for n in range(6):
+            k, q = _I[n], _J[n]
+            D[m, n] += 0.5 * factor * (A[i, k] * A[j, q] + A[i, q] * A[j, k])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _saint_venant_kirchhoff(C, p, S, D):
+    """W = λ/2 tr(E)² + μ tr(E²); p = (λ, μ)."""
+    lam, mu = p[0], p[1]
+    trace = 0.5 * (C[0, 0] + C[1, 1] + C[2, 2] - 3.0)
+    W = 0.5 * lam * trace * trace
+    for i in range(3):
+        for j in range(3):
+            e = 0.5 * (C[i, j] - (1.0 if i == j else 0.0))
+            W += mu * e * e
+            S[i, j] = 2.0 * mu * e
+        S[i, i] += lam * trace
+        for j in range(3):
+            D[i, j] = lam
+        D[i, i] += 2.0 * mu
+        D[3 + i, 3 + i] = mu
+    return W
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _neo_hookean(C, p, S, D):
+    """W = μ/2 (tr C - 3) - μ ln J + λ/2 (ln J)²; p = (λ, μ). Bonet & Wood, section 6.4.3."""
+    lam, mu = p[0], p[1]
+    inverse = np.empty((3, 3))
+    log_j = 0.5 * log(_inverse(C, inverse))
+    for i in range(3):
+        for j in range(3):
+            S[i, j] = (lam * log_j - mu) * inverse[i, j]
+        S[i, i] += mu
+    _add_dyad(D, lam, inverse, inverse)
+    _add_product(D, 2.0 * (mu - lam * log_j), inverse)
+    return 0.5 * mu * (C[0, 0] + C[1, 1] + C[2, 2] - 3.0) - mu * log_j + 0.5 * lam * log_j * log_j
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_volumetric(J, inverse, bulk, S, D):
+    """U = κ/2 (J - 1)²: adds its stress and tangent, returns its energy."""
+    d_u = bulk * (J - 1.0)
+    S += (J * d_u) * inverse
+    _add_dyad(D, J * (d_u + J * bulk), inverse, inverse)
+    _add_product(D, -2.0 * J * d_u, inverse)
+    return 0.5 * bulk * (J - 1.0) ** 2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mooney_rivlin(C, p, S, D):
+    """W = c10 (J^(-2/3) I₁ - 3) + c01 (J^(-4/3) I₂ - 3) + κ/2 (J - 1)²; p = (c10, c01, κ). Holzapfel, section 6.5."""
+    c10, c01, bulk = p[0], p[1], p[2]
+    inverse, identity = np.empty((3, 3)), np.eye(3)
+    J = sqrt(_inverse(C, inverse))
+    first = C[0, 0] + C[1, 1] + C[2, 2]
+    second = 0.5 * (first * first - (C * C).sum())
+    a, b = c10 * J ** (-2.0 / 3.0), c01 * J ** (-4.0 / 3.0)
+    d_second = first * identity - C
+    S += 2.0 * a * (identity - first / 3.0 * inverse) + 2.0 * b * (d_second - 2.0 / 3.0 * second * inverse)
+    # dS/dE = 2 dS/dC, term by term.
+    _add_dyad(D, -8.0 / 3.0 * a, identity, inverse)
+    _add_dyad(D, 4.0 / 9.0 * a * first, inverse, inverse)
+    _add_product(D, 4.0 / 3.0 * a * first, inverse)
+    _add_dyad(D, -16.0 / 3.0 * b, d_second, inverse)
+    _add_dyad(D, 16.0 / 9.0 * b * second, inverse, inverse)
+    _add_product(D, 8.0 / 3.0 * b * second, inverse)
+    _add_dyad(D, 4.0 * b, identity, identity)
+    _add_product(D, -4.0 * b, identity)
+    return a * first - 3.0 * c10 + b * second - 3.0 * c01 + _add_volumetric(J, inverse, bulk, S, D)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ogden(C, p, S, D):
+    """W = Σ μ_p/α_p (λ̄₁^α_p + λ̄₂^α_p + λ̄₃^α_p - 3) + κ/2 (J - 1)²; p = (κ, μ₁, α₁, μ₂, α₂, …).
+
+    λ̄ = J^(-1/3) λ. Principal form with the limit of equal stretches: Holzapfel, sections 6.5 and 6.6.
+    """
+    values, vectors = np.linalg.eigh(C)
+    inverse = np.empty((3, 3))
+    J = sqrt(_inverse(C, inverse))
+    stretch = np.sqrt(values)
+    energy = 0.0
+    beta, gamma = np.zeros(3), np.zeros((3, 3))
+    for term in range(1, len(p), 2):
+        mu, alpha = p[term], p[term + 1]
+        powers = (stretch * J ** (-1.0 / 3.0)) ** alpha
+        mean = powers.sum() / 3.0
+        energy += mu / alpha * (3.0 * mean - 3.0)
+        for a in range(3):
+            beta[a] += mu * (powers[a] - mean)
+            for b in range(3):
+                gamma[a, b] += mu * alpha / 3.0 * ((powers[a] * 3.0 if a == b else 0.0) - powers[a] - powers[b] + mean)
+    # S_a = β_a / λ_a²; dS_a/dlnλ_b gives the normal block, differences of S the shear block.
+    principal = beta / values
+    for a in range(3):
+        Na = np.outer(vectors[:, a], vectors[:, a])
+        S += principal[a] * Na
+        for b in range(3):
+            Nb = np.outer(vectors[:, b], vectors[:, b])
+            normal = (gamma[a, b] - (2.0 * beta[a] if a == b else 0.0)) / (values[a] * values[b])
+            _add_dyad(D, normal, Na, Nb)
+            if b != a:
+                if abs(values[a] - values[b]) > 1e-6 * values[a]:
+                    shear = (principal[a] - principal[b]) / (values[a] - values[b])
+                else:
+                    middle = 0.5 * (values[a] + values[b])
+                    shear = 0.5 * (gamma[a, a] - gamma[a, b] - 2.0 * beta[a]) / (middle * middle)
+                for m in range(6):
+                    i, j = _I[m], _J[m]
+                    for n in range(6):
+                        k, q = _I[n], _J[n]
+                        D[m, n] += (
+                            shear
+                            * 0.5
+                            * (vectors[i, a] * vectors[j, b] + vectors[j, a] * vectors[i, b])
+                            * (vectors[k, a] * vectors[q, b] + vectors[q, a] * vectors[k, b])
+                        )
+    return energy + _add_volumetric(J, inverse, p[0], S, D)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def evaluate(law, C, parameters, S, D):
+    """Dispatch by the law's number; S and D are overwritten."""
+    S[:] = 0.0
+    D[:] = 0.0
+    if law == SAINT_VENANT_KIRCHHOFF:
+        return _saint_venant_kirchhoff(C, parameters, S, D)
+    if law == NEO_HOOKEAN:
+        return _neo_hookean(C, parameters, S, D)
+    if law == MOONEY_RIVLIN:
+        return _mooney_rivlin(C, parameters, S, D)
+    return _ogden(C, parameters, S, D)
