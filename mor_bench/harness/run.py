@@ -222,17 +222,7 @@ def run(
         raise InvalidInputError(f"`threads` must be an integer in [1, {cores}]; got {threads}.")
     if not datasets or not methods:
         raise InvalidInputError("`datasets` and `methods` must name at least one each.")
-    specs = [load_dataset_spec(dataset, suite) for dataset in datasets]
-    method_specs = [load_method_spec(method, suite) for method in methods]
-    for kind, names in (("dataset", [spec.name for spec in specs]), ("method", [spec.name for spec in method_specs])):
-        for name in names:
-            if names.count(name) > 1:
-                raise InvalidInputError(f"two {kind}s are called {name!r}; rename one of the files.")
-    for spec in specs:
-        check_supports(load_scene(spec))
-    for method_spec in method_specs:
-        with suppress(MissingDependencyError):  # that becomes a row with its reason
-            check_method(method_spec)
+    specs, method_specs = _checked_specs(datasets, methods, suite)
     jobs = _jobs(method_specs, profile)
     settings = {"profile": profile, "split": split, "limit": limit, "threads": threads, "version": __version__}
     comparison = _open_run(Path(out) if out else _default_out([spec.name for spec in specs]), specs, settings)
@@ -266,6 +256,24 @@ def run(
         comparison.add(row, samples)
         listener.finished(row)
     return comparison
+
+
+def _checked_specs(
+    datasets: Sequence[str | Path | Mapping[str, Any]], methods: Sequence[str | Path], suite: Path | None
+) -> tuple[list[DatasetSpec], list[MethodSpec]]:
+    """Read all specifications and check them as far as they can be without running, so that no run fails half-way on one."""
+    specs = [load_dataset_spec(dataset, suite) for dataset in datasets]
+    method_specs = [load_method_spec(method, suite) for method in methods]
+    for kind, names in (("dataset", [spec.name for spec in specs]), ("method", [spec.name for spec in method_specs])):
+        for name in names:
+            if names.count(name) > 1:
+                raise InvalidInputError(f"two {kind}s are called {name!r}; rename one of the files.")
+    for spec in specs:
+        check_supports(load_scene(spec))
+    for method_spec in method_specs:
+        with suppress(MissingDependencyError):  # that becomes a row with its reason
+            check_method(method_spec)
+    return specs, method_specs
 
 
 def _open_run(out: Path, specs: Sequence[DatasetSpec], settings: dict[str, Any]) -> Comparison:
