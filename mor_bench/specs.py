@@ -61,6 +61,10 @@ class Discretisation(_Model):
         return self
 
 
+SolverName = Literal["auto", "rotated-pcg", "jacobi-pcg", "cholesky", "superlu", "pardiso"]
+"""How equilibria are solved, see `mor_bench.mechanics.model`."""
+
+
 class TwoLameMaterial(_Model):
     """Saint Venant-Kirchhoff or compressible neo-Hookean, from Young's modulus and Poisson's ratio."""
 
@@ -184,6 +188,7 @@ class DatasetSpec(_Model):
     source: str
     geometry: BoxGeometry
     discretisation: Discretisation = Discretisation()
+    solver: SolverName = "auto"
     material: MaterialSpec
     supports: Annotated[tuple[Support, ...], Field(strict=False)] = ()
     loads: Loads
@@ -192,7 +197,7 @@ class DatasetSpec(_Model):
 
     def physics(self) -> dict[str, Any]:
         """All that decides the samples: two datasets with equal physics have equal snapshots."""
-        return self.model_dump(mode="json", include={"geometry", "discretisation", "material", "supports", "loads"})
+        return self.model_dump(mode="json", include={"geometry", "discretisation", "solver", "material", "supports", "loads"})
 
     def digest(self) -> str:
         """Twelve hexadecimal digits of SHA-256 over `physics`."""

@@ -22,7 +22,17 @@ def test_every_shipped_dataset_is_pinned_to_its_counts() -> None:
         assert check_file(list_suite("datasets")[name]) == f"dataset, {cells} cells, {nodes} nodes, {patches} load patches, {samples} samples"
 
 
-CONFIGURATIONS = {"fem": 4, "hpod": 12, "linear-fem": 1, "pca-regression": 3, "pca-regression-force": 1, "pod": 7, "umesh": 1}
+CONFIGURATIONS = {
+    "fem": 4,
+    "fem-jacobi-pcg": 1,
+    "fem-pardiso": 1,
+    "hpod": 12,
+    "linear-fem": 1,
+    "pca-regression": 3,
+    "pca-regression-force": 1,
+    "pod": 7,
+    "umesh": 1,
+}
 
 
 @pytest.mark.parametrize("name", sorted(list_suite("methods")))

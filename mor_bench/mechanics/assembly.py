@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.mechanics.elements import H8, element_of, shape_gradients
@@ -16,30 +17,29 @@ from mor_bench.scene.materials import Material, SaintVenantKirchhoff
 Array = NDArray[np.float64]
 
 
-def _upper_entries(n_nodes: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row and column of the upper entries of an element matrix, in the order in which the kernels store them."""
-    rows, columns = [], []
-    for a in range(n_nodes):
-        for b in range(a, n_nodes):
-            for i in range(3):
-                for j in range(i if a == b else 0, 3):
-                    rows.append(3 * a + i)
-                    columns.append(3 * b + j)
-    return np.array(rows), np.array(columns)
-
-
 @dataclass(frozen=True)
 class Pattern:
     """Upper triangle (diagonal included) of a symmetric sparse matrix in CSR form, without values."""
 
     n: int
     indptr: NDArray[np.int64]
-    indices: NDArray[np.int64]
+    indices: NDArray[np.int32]
 
     @property
     def rows(self) -> NDArray[np.int64]:
         """(n_nonzeros,) row of each entry."""
         return np.repeat(np.arange(self.n), np.diff(self.indptr))
+
+    @property
+    def node_graph(self) -> sp.csr_matrix:
+        """(n / 3, n / 3) whether two nodes share a cell; the three dofs of a node are neighbours in the pattern."""
+        starts, stops = self.indptr[:-1:3], self.indptr[1::3]
+        counts = (stops - starts) // 3
+        rows = np.repeat(np.arange(self.n // 3), counts)
+        first = np.repeat(starts - 3 * np.append(0, np.cumsum(counts)[:-1]), counts)
+        columns = self.indices[first + 3 * np.arange(counts.sum())] // 3
+        upper = sp.csr_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(self.n // 3, self.n // 3))
+        return sp.csr_matrix(upper + upper.T)
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,50 @@ def _quadrature(points: Array, cells: NDArray[np.int64], material: Material, sel
     return _Quadrature(np.concatenate([gradients, mean[:, None]], axis=1), np.hstack([weights, volume[:, None]]), np.array(parameters))
 
 
+def _pattern(dof_of_node: NDArray[np.int64], cells: NDArray[np.int64], n_dofs: int) -> tuple[Pattern, NDArray[np.int32]]:
+    """The pattern, and where each upper entry of each element matrix lies in it, (n_cells, n_upper).
+
+    Pairs of nodes are sorted, not pairs of dofs: a ninth of the memory. Nodes with no free dof take no part; those with
+    one or two are treated as free first.
+    """
+    active = np.flatnonzero((dof_of_node < n_dofs).any(axis=1))
+    active = active[np.argsort(dof_of_node[active].min(axis=1))]
+    n_nodes = len(active)
+    number = np.full(len(dof_of_node), n_nodes)
+    number[active] = np.arange(n_nodes)
+    nodes = number[cells]
+    a, b = np.triu_indices(cells.shape[1])
+    low, high = np.minimum(nodes[:, a], nodes[:, b]), np.maximum(nodes[:, a], nodes[:, b])
+    pairs, pair_of = np.unique(np.where(high < n_nodes, low * n_nodes + high, n_nodes * n_nodes), return_inverse=True)
+    pairs, pair_of = pairs[pairs < n_nodes * n_nodes], pair_of.reshape(low.shape)
+    rows, columns = pairs // n_nodes, pairs % n_nodes
+    # Row 3A holds 3 entries per pair (A, B); rows 3A + 1 and 3A + 2 lack the 1 and 2 entries left of the diagonal.
+    counts = 3 * np.bincount(rows, minlength=n_nodes)
+    indptr = np.append(0, np.cumsum(np.stack([counts, counts - 1, counts - 2], axis=1)))
+    rank = np.arange(len(pairs)) - np.searchsorted(rows, rows)
+    indices, starts = np.empty(indptr[-1], dtype=np.int32), np.full((len(pairs) + 1, 3), indptr[-1])
+    for i in range(3):
+        starts[:-1, i] = indptr[3 * rows + i] + 3 * rank - i
+        for j in range(3):
+            right = (rank > 0) | (j >= i)
+            indices[(starts[:-1, i] + j)[right]] = (3 * columns + j)[right]
+    slots = np.empty((len(cells), 9 * len(a) - 3 * cells.shape[1]), dtype=np.int32)
+    p = 0
+    for pair, (m, n) in enumerate(zip(a, b, strict=True)):
+        swapped, start = nodes[:, m] > nodes[:, n], starts[pair_of[:, pair]]
+        for i in range(3):
+            for j in range(i if m == n else 0, 3):
+                slots[:, p] = np.where(start[:, 0] == indptr[-1], indptr[-1], np.where(swapped, start[:, j] + i, start[:, i] + j))
+                p += 1
+    dofs = dof_of_node[active].ravel()
+    if len(dofs) == n_dofs:
+        return Pattern(n_dofs, indptr, indices), slots
+    kept = (dofs < n_dofs)[indices] & np.repeat(dofs < n_dofs, np.diff(indptr))
+    place = np.append(np.where(kept, np.cumsum(kept) - 1, kept.sum()), kept.sum()).astype(np.int32)
+    ends = np.append(0, np.cumsum(kept))[indptr]
+    return Pattern(n_dofs, np.append(0, ends[1:][dofs < n_dofs]), dofs[indices[kept]].astype(np.int32)), place[slots]
+
+
 class Assembler:
     """Internal force and tangent of a set of cells over the dofs that matter.
 
@@ -132,26 +176,21 @@ class Assembler:
         weights = quadrature.weights if cell_weights is None else quadrature.weights * cell_weights[:, None]
         n_cells, n_points, n_nodes, _ = quadrature.gradients.shape
         dofs = dof_of_node[cells].reshape(n_cells, 3 * n_nodes)
-        rows, columns = _upper_entries(n_nodes)
-        low, high = np.minimum(dofs[:, rows], dofs[:, columns]), np.maximum(dofs[:, rows], dofs[:, columns])
-        key = np.where(high < n_dofs, low * n_dofs + high, n_dofs * n_dofs)
-        entries, slots = np.unique(key, return_inverse=True)
-        entries = entries[entries < n_dofs * n_dofs]
+        self.pattern, slots = _pattern(dof_of_node, cells, n_dofs)
         self.n_dofs = n_dofs
         self.n_cells = n_cells
         self.material = material
-        self.pattern = Pattern(n_dofs, np.searchsorted(entries // n_dofs, np.arange(n_dofs + 1)), entries % n_dofs)
-        self._n_values = len(entries) + 1
+        self._n_values = len(self.pattern.indices) + 1
         self._vectorised = isinstance(material, SaintVenantKirchhoff) and n_nodes == H8.n_nodes
         if self._vectorised:
             self._gradients = _batched(quadrature.gradients.reshape(n_cells, n_points, 24), 0.0).reshape(-1, n_points, 24 * LANES)
             self._w_lam = _batched(weights * quadrature.parameters[:, 0], 0.0)
             self._w_mu = _batched(weights * quadrature.parameters[:, 1], 0.0)
             self._dofs = _batched(dofs.astype(np.int32), n_dofs)
-            self._slots = _batched(slots.reshape(n_cells, -1).astype(np.int32), len(entries))
+            self._slots = _batched(slots, len(self.pattern.indices))
         else:
             self._gradients, self._weights, self._parameters = quadrature.gradients, weights, quadrature.parameters
-            self._dofs, self._slots = dofs.astype(np.int32), slots.reshape(n_cells, -1).astype(np.int32)
+            self._dofs, self._slots = dofs.astype(np.int32), slots
 
     def _sum(self, u: Array, dofs: NDArray[np.int32], force: Array, values: Array) -> tuple[float, float]:
         """Add the cells' forces and, where ``values`` is not empty, tangents; returns energy and min det F."""

@@ -1,24 +1,27 @@
-"""Direct solvers for the tangent: they factorise a symmetric matrix whose pattern never changes.
+"""Solvers for symmetric positive definite matrices of one pattern: direct ones, and multigrid for large meshes.
 
-A failed Cholesky factorisation is news about the mechanics (the equilibrium is not stable), so each solver says whether
-the matrix was positive definite instead of going on with a meaningless direction.
+A failed Cholesky factorisation is news about the mechanics (the equilibrium is not stable), so each direct solver says
+whether the matrix was positive definite instead of going on with a meaningless direction.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse as sp
+from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbtrf, dpbtrs
+from scipy.sparse import linalg as sp_linalg
 from scipy.sparse.csgraph import reverse_cuthill_mckee
-from scipy.sparse.linalg import splu
 
 from mor_bench.mechanics.assembly import Pattern
 
-MAX_BANDED_WORK = 1e10
-"""n times bandwidth squared up to which the banded factorisation beats SuperLU (fine beam: 2.6e9, 114 against 433 ms)."""
+MAX_BAND_ENTRIES = 4e7
+"""Entries of a band (0.3 GB) up to which a banded factor of the rest state is kept; multigrid serves larger meshes."""
+CYCLE_TOLERANCE = 1e-12
+"""Relative residual of a solve by multigrid."""
 
 
 class NotPositiveDefiniteError(ArithmeticError):
@@ -41,6 +44,69 @@ class LinearSolver(Protocol):
         ...
 
 
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def banded_solve(band, x):
+    """Solve L Lᵀ x = x in place; band (n, bandwidth + 1) float32 holds the columns of L, diagonals inverted.
+
+    Four columns at once, so that x is loaded and stored once for four multiply-adds.
+    """
+    n, width = band.shape
+    zero = np.float32(0.0)
+    whole = n - n % 4
+    for j in range(0, whole, 4):
+        a, b, c, d = band[j], band[j + 1], band[j + 2], band[j + 3]
+        x0 = x[j] * a[0]
+        x1 = (x[j + 1] - a[1] * x0) * b[0]
+        x2 = (x[j + 2] - a[2] * x0 - b[1] * x1) * c[0]
+        x3 = (x[j + 3] - a[3] * x0 - b[2] * x1 - c[1] * x2) * d[0]
+        x[j], x[j + 1], x[j + 2], x[j + 3] = x0, x1, x2, x3
+        last = min(width - 4, n - j - 4)
+        tail = x[j + 4 : j + 4 + last]
+        a4, b4, c4, d4 = a[4 : 4 + last], b[3 : 3 + last], c[2 : 2 + last], d[1 : 1 + last]
+        for k in range(last):
+            tail[k] -= a4[k] * x0 + b4[k] * x1 + c4[k] * x2 + d4[k] * x3
+        for k in range(last, min(width - 1, n - j - 4)):  # the ends of b, c, d reach beyond that of a
+            at = x[j + 4 + k]
+            if k + 3 < width:
+                at -= b[k + 3] * x1
+            if k + 2 < width:
+                at -= c[k + 2] * x2
+            at -= d[k + 1] * x3
+            x[j + 4 + k] = at
+    for j in range(whole, n):
+        x[j] *= band[j, 0]
+        for k in range(1, n - j):
+            x[j + k] -= band[j, k] * x[j]
+    for j in range(n - 1, whole - 1, -1):
+        s = x[j]
+        for k in range(1, n - j):
+            s -= band[j, k] * x[j + k]
+        x[j] = s * band[j, 0]
+    for j in range(whole - 4, -1, -4):
+        a, b, c, d = band[j], band[j + 1], band[j + 2], band[j + 3]
+        last = min(width - 4, n - j - 4)
+        tail = x[j + 4 : j + 4 + last]
+        a4, b4, c4, d4 = a[4 : 4 + last], b[3 : 3 + last], c[2 : 2 + last], d[1 : 1 + last]
+        s0, s1, s2, s3 = zero, zero, zero, zero
+        for k in range(last):
+            s0 += a4[k] * tail[k]
+            s1 += b4[k] * tail[k]
+            s2 += c4[k] * tail[k]
+            s3 += d4[k] * tail[k]
+        for k in range(last, min(width - 1, n - j - 4)):
+            at = x[j + 4 + k]
+            if k + 3 < width:
+                s1 += b[k + 3] * at
+            if k + 2 < width:
+                s2 += c[k + 2] * at
+            s3 += d[k + 1] * at
+        x3 = (x[j + 3] - s3) * d[0]
+        x2 = (x[j + 2] - s2 - c[1] * x3) * c[0]
+        x1 = (x[j + 1] - s1 - b[1] * x2 - b[2] * x3) * b[0]
+        x[j] = (x[j] - s0 - a[1] * x1 - a[2] * x2 - a[3] * x3) * a[0]
+        x[j + 1], x[j + 2], x[j + 3] = x1, x2, x3
+
+
 class BandedFactor:
     """A banded Cholesky factor, in LAPACK's upper storage."""
 
@@ -54,8 +120,8 @@ class BandedFactor:
         solution[self._order] = np.asarray(dpbtrs(self._band, rhs[self._order])[0]).reshape(rhs.shape)
         return solution
 
-    def single_precision(self) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Columns of L (n, bandwidth + 1) float32, with inverted diagonals, and the place in them of each row."""
+    def single_precision(self) -> SingleBandedFactor:
+        """A copy in float32, which is solved with twice as fast."""
         width, n = self._band.shape
         columns = np.zeros((n, width), dtype=np.float32)
         for k in range(width):
@@ -64,36 +130,48 @@ class BandedFactor:
         place = np.arange(n)
         if self._order is not None:
             place[self._order] = np.arange(n)
-        return columns, place
+        return SingleBandedFactor(columns, place)
+
+
+class SingleBandedFactor:
+    """Columns of L (n, bandwidth + 1) float32, diagonals inverted, and the place (n,) of each unknown in them."""
+
+    def __init__(self, columns: NDArray[np.float32], place: NDArray[np.int64]) -> None:
+        self._columns, self.place = columns, place
+
+    def solve_in_place(self, x: NDArray[np.float32]) -> None:
+        """Overwrite the right-hand side x (n,), in the factor's order, by the solution."""
+        banded_solve(self._columns, x)
 
 
 class BandedCholesky:
     """LAPACK's banded Cholesky, in natural order or after reverse Cuthill-McKee, whichever has the smaller band."""
 
     def __init__(self, pattern: Pattern) -> None:
-        rows, columns = pattern.rows, pattern.indices
-        matrix = sp.csr_array((np.ones(len(rows)), (rows, columns)), shape=(pattern.n, pattern.n))
-        order = reverse_cuthill_mckee(sp.csr_matrix(matrix + matrix.T), symmetric_mode=True)
-        place = np.empty(pattern.n, dtype=np.int64)
-        place[order] = np.arange(pattern.n)
-        natural, reordered = int(np.abs(columns - rows).max()), int(np.abs(place[columns] - place[rows]).max())
-        self.bandwidth = min(natural, reordered)
-        self._order = order.astype(np.int64) if reordered < natural else None
-        if self._order is not None:
-            rows, columns = place[rows], place[columns]
-        low, high = np.minimum(rows, columns), np.maximum(rows, columns)
-        self._n = pattern.n
-        self._places = high * (self.bandwidth + 1) + self.bandwidth + low - high
+        graph = pattern.node_graph
+        order = reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
+        place = np.empty(len(order), dtype=np.int64)
+        place[order] = np.arange(len(order))
+        a, b = graph.nonzero()
+        natural, reordered = int(np.abs(a - b).max()), int(np.abs(place[a] - place[b]).max())
+        self.bandwidth = 3 * min(natural, reordered) + 2
+        self._order = (3 * order[:, None] + np.arange(3)).ravel() if reordered < natural else None
+        self._place = (3 * place[:, None] + np.arange(3)).ravel() if reordered < natural else None
+        self._pattern = pattern
 
     @property
-    def work(self) -> float:
-        """n times bandwidth squared: the multiply-adds of a factorisation."""
-        return float(self._n) * self.bandwidth**2
+    def entries(self) -> int:
+        """Stored entries of the band."""
+        return self._pattern.n * (self.bandwidth + 1)
 
     def factor(self, values: NDArray[np.float64]) -> BandedFactor:
-        flat = np.zeros(self._n * (self.bandwidth + 1))
-        flat[self._places] = values
-        band, info = dpbtrf(flat.reshape(self._n, self.bandwidth + 1).T, overwrite_ab=1)
+        rows, columns = self._pattern.rows, self._pattern.indices
+        if self._place is not None:
+            rows, columns = self._place[rows], self._place[columns]
+        low, high = np.minimum(rows, columns), np.maximum(rows, columns)
+        flat = np.zeros(self.entries)
+        flat[high * np.int64(self.bandwidth) + self.bandwidth + low] = values
+        band, info = dpbtrf(flat.reshape(self._pattern.n, self.bandwidth + 1).T, overwrite_ab=1)
         if info != 0:
             raise NotPositiveDefiniteError
         return BandedFactor(band, self._order)
@@ -115,7 +193,7 @@ class SparseLU:
         t = self._template
         matrix = sp.csc_matrix((values[self._gather], t.indices, t.indptr), shape=t.shape)
         try:
-            lu = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+            lu = sp_linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         except RuntimeError as error:
             raise NotPositiveDefiniteError from error
         if not np.all(lu.U.diagonal() > 0):
@@ -123,7 +201,94 @@ class SparseLU:
         return lu
 
 
-def choose_solver(pattern: Pattern) -> LinearSolver:
-    """The faster of the two direct solvers for a pattern."""
+class Pardiso:
+    """MKL's parallel sparse Cholesky; the symbolic factorisation is done once. Needs the extra `mkl`."""
+
+    def __init__(self, pattern: Pattern) -> None:
+        from pypardiso import PyPardisoSolver
+        from pypardiso.pardiso_wrapper import PyPardisoError
+
+        self._error: type[Exception] = PyPardisoError
+        self._solver = PyPardisoSolver(mtype=2)
+        indices, indptr = pattern.indices.astype(np.int32), pattern.indptr.astype(np.int32)
+        self._matrix = sp.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(pattern.n, pattern.n))
+        self._phase(11, np.zeros(pattern.n))
+
+    def _phase(self, phase: int, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        # The wrapper's own `factorize` repeats the symbolic phase and copies the matrix, its `solve` compares it.
+        self._solver.set_phase(phase)
+        return np.asarray(self._solver._call_pardiso(self._matrix, np.asfortranarray(rhs)))
+
+    def factor(self, values: NDArray[np.float64]) -> Pardiso:
+        """Factorise; the factor before is lost."""
+        self._matrix.data = np.ascontiguousarray(values)
+        try:
+            self._phase(22, np.zeros(len(self._matrix.indptr) - 1))
+        except self._error as error:
+            raise NotPositiveDefiniteError from error
+        return self
+
+    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self._phase(33, rhs)
+
+
+class Multigrid:
+    """Smoothed aggregation with the rigid motions as near null space (Vaněk, Mandel & Brezina, Computing 56, 1996), by PyAMG.
+
+    Parameters
+    ----------
+    pattern : Pattern
+    points : (n / 3, 3) float64
+        Reference positions of the free nodes, m.
+    """
+
+    def __init__(self, pattern: Pattern, points: NDArray[np.float64]) -> None:
+        self._pattern, self._points = pattern, points
+
+    def factor(self, values: NDArray[np.float64]) -> MultigridFactor:
+        """Build the hierarchy; that the matrix is positive definite is not noticed."""
+        return MultigridFactor(self._pattern, values, self._points)
+
+
+class MultigridFactor:
+    """A multigrid hierarchy; one V-cycle in float32 is a preconditioner, conjugate gradients with it solve."""
+
+    def __init__(self, pattern: Pattern, values: NDArray[np.float64], points: NDArray[np.float64]) -> None:
+        from pyamg import smoothed_aggregation_solver
+
+        upper = sp.csr_matrix((values, pattern.indices, pattern.indptr), shape=(pattern.n, pattern.n))
+        self._matrix = (upper + sp.triu(upper, 1).T).tobsr(blocksize=(3, 3))
+        x = points - points.mean(axis=0)
+        motions = np.zeros((len(points), 3, 6))
+        motions[:, :, :3] = np.eye(3)
+        for axis in range(3):
+            motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], x / np.abs(x).max())
+        smoother = "block_gauss_seidel"
+        self._levels: Any = smoothed_aggregation_solver(
+            self._matrix.astype(np.float32), B=motions.reshape(-1, 6).astype(np.float32), strength=None, improve_candidates=None, max_coarse=500,
+            presmoother=(smoother, {"sweep": "forward"}), postsmoother=(smoother, {"sweep": "backward"}), coarse_solver="cholesky",
+        )  # fmt: skip
+        self._cycle = self._levels.aspreconditioner()
+        self.place = np.arange(pattern.n)
+
+    def single_precision(self) -> MultigridFactor:
+        return self
+
+    def solve_in_place(self, x: NDArray[np.float32]) -> None:
+        x[:] = self._cycle @ x
+
+    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        if rhs.ndim == 2:
+            return np.stack([self.solve(column) for column in rhs.T], axis=1)
+        scale = float(np.abs(rhs).max()) or 1.0
+        cycle = sp_linalg.LinearOperator(self._matrix.shape, lambda r: self._cycle @ r.astype(np.float32), dtype=np.float64)
+        solution, failed = sp_linalg.cg(self._matrix, rhs / scale, rtol=CYCLE_TOLERANCE, maxiter=500, M=cycle)
+        if failed:
+            raise NotPositiveDefiniteError
+        return np.asarray(solution * scale)
+
+
+def choose_solver(pattern: Pattern, points: NDArray[np.float64]) -> BandedCholesky | Multigrid:
+    """What factorises the stiffness at rest: a banded Cholesky up to `MAX_BAND_ENTRIES`, else multigrid."""
     banded = BandedCholesky(pattern)
-    return banded if banded.work <= MAX_BANDED_WORK else SparseLU(pattern)
+    return banded if banded.entries <= MAX_BAND_ENTRIES else Multigrid(pattern, points)

@@ -3,22 +3,59 @@
 from __future__ import annotations
 
 from functools import cached_property
+from importlib.util import find_spec
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import UnconstrainedBodyError
+from mor_bench.errors import MissingDependencyError, UnconstrainedBodyError
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.elements import element_of, shape_gradients
-from mor_bench.mechanics.linear import BandedFactor, Factor, choose_solver
+from mor_bench.mechanics.linear import (
+    BandedCholesky,
+    BandedFactor,
+    Factor,
+    LinearSolver,
+    Multigrid,
+    MultigridFactor,
+    Pardiso,
+    SparseLU,
+    choose_solver,
+)
 from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibrium
-from mor_bench.mechanics.pcg import RotatedPCG
+from mor_bench.mechanics.rotated import BlockJacobi, RotatedRest, conjugate_gradients
 from mor_bench.scene.scene import Scene
+from mor_bench.specs import SolverName
+
+SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
+"""How equilibria are solved.
+
+auto
+    Anderson-accelerated iteration with the stiffness at rest, factorised once in single precision and turned with the
+    nodes; where that fails, Newton's method as by `cholesky` on small meshes and `rotated-pcg` on others.
+rotated-pcg
+    Newton's method, each step by conjugate gradients preconditioned by the turned rest-state factor.
+jacobi-pcg
+    Newton's method, each step by conjugate gradients preconditioned by the tangent's own 3x3 diagonal blocks.
+cholesky, superlu, pardiso
+    Newton's method, each step by a fresh direct factor: banded Cholesky, SuperLU, or MKL's (extra `mkl`).
+
+Meshes whose band has more than `MAX_BAND_ENTRIES` entries use multigrid in place of a rest-state factor.
+"""
 
 PCG_FROM = 3000
 """Unknowns from which conjugate gradients beat a fresh banded factor for each Newton step."""
+JACOBI_ITERATIONS = 20_000
 
 RIGID_MODES = ("translation x", "translation y", "translation z", "rotation about x", "rotation about y", "rotation about z")
+
+
+def missing_library(solver: SolverName) -> str | None:
+    """What to install before a solver can be used; None if nothing."""
+    if solver == "pardiso" and find_spec("pypardiso") is None:
+        return "the solver `pardiso` needs pypardiso: pip install 'mor-bench[mkl]'"
+    return None
 
 
 def free_rigid_modes(scene: Scene) -> list[str]:
@@ -48,14 +85,26 @@ def check_supports(scene: Scene) -> None:
 class FullOrderModel:
     """Finite elements under dead loads, over the free dofs of a scene.
 
+    Parameters
+    ----------
+    scene : Scene
+    solver : str, optional
+        One of `SOLVERS`; by default as the scene says.
+
     Raises
     ------
     UnconstrainedBodyError
         If the supports leave rigid motions free; the message names them.
+    MissingDependencyError
+        If the solver's library is not installed.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, solver: SolverName | None = None) -> None:
         check_supports(scene)
+        self.solver = solver or scene.spec.solver
+        missing = missing_library(self.solver)
+        if missing:
+            raise MissingDependencyError(f"{missing}.")
         mesh = scene.mesh
         self.scene = scene
         self.n_unknowns = len(scene.free_dofs)
@@ -64,7 +113,17 @@ class FullOrderModel:
         dof_of_node = number.reshape(-1, 3)
         self.cell_dofs = dof_of_node[mesh.cells].reshape(mesh.n_cells, -1)
         self.assembler = Assembler(mesh.points, mesh.cells, dof_of_node, self.n_unknowns, scene.material, selective=scene.selective)
-        self._direct = choose_solver(self.assembler.pattern)
+        self._direct = self._direct_solver()
+
+    def _direct_solver(self) -> LinearSolver:
+        pattern = self.assembler.pattern
+        if self.solver == "cholesky":
+            return BandedCholesky(pattern)
+        if self.solver == "superlu":
+            return SparseLU(pattern)
+        if self.solver == "pardiso":
+            return Pardiso(pattern)
+        return choose_solver(pattern, self.scene.mesh.points[self.scene.free_dofs[::3] // 3])
 
     @cached_property
     def rest_tangent(self) -> NDArray[np.float64]:
@@ -74,7 +133,8 @@ class FullOrderModel:
     @cached_property
     def rest_factor(self) -> Factor:
         """The stiffness at rest, factorised: the linear response is one back-solve."""
-        return self.factor(self.rest_tangent)
+        # With Pardiso a solver of its own, since it holds one factor at a time.
+        return (self._direct_solver() if self.solver == "pardiso" else self._direct).factor(self.rest_tangent)
 
     def force(self, q: NDArray[np.float64]) -> State:
         return self.assembler.force(q)
@@ -87,22 +147,33 @@ class FullOrderModel:
         return self._direct.factor(tangent)
 
     @cached_property
-    def pcg(self) -> RotatedPCG | None:
-        """The iterative solver, where it is faster than a fresh factor for each step."""
-        if self.n_unknowns < PCG_FROM or not isinstance(self.rest_factor, BandedFactor):
-            return None
-        mesh = self.scene.mesh
+    def _rotated(self) -> RotatedRest:
+        mesh, factor = self.scene.mesh, self.rest_factor
+        assert isinstance(factor, BandedFactor | MultigridFactor)
         element = element_of(mesh.cells)
         gradients, det_j = shape_gradients(mesh.points, mesh.cells, element.centre[None])
         cell_nodes = (self.cell_dofs[:, ::3] // 3).astype(np.int32)
-        return RotatedPCG(self.assembler.pattern, self.rest_factor, cell_nodes, gradients[:, 0], det_j[:, 0] * element.weights.sum())
+        return RotatedRest(factor.single_precision(), cell_nodes, gradients[:, 0], det_j[:, 0] * element.weights.sum())
+
+    @cached_property
+    def _jacobi(self) -> BlockJacobi:
+        return BlockJacobi(self.assembler.pattern)
+
+    @property
+    def accelerator(self) -> RotatedRest | None:
+        return self._rotated if self.solver == "auto" else None
 
     def step(
         self, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64], tolerance: float
     ) -> NDArray[np.float64]:  # fmt: skip
-        if self.pcg is None:
-            return self.factor(tangent).solve(residual)
-        return self.pcg.solve(q, tangent, residual, tolerance)
+        pattern = self.assembler.pattern
+        if self.solver == "jacobi-pcg":
+            self._jacobi.take(tangent)
+            return conjugate_gradients(pattern, tangent, self._jacobi, residual, tolerance, JACOBI_ITERATIONS)[0]
+        if self.solver == "rotated-pcg" or (self.solver == "auto" and (self.n_unknowns >= PCG_FROM or isinstance(self._direct, Multigrid))):
+            self._rotated.turn(q)
+            return conjugate_gradients(pattern, tangent, self._rotated, residual, tolerance)[0]
+        return self.factor(tangent).solve(residual)
 
     def solve(self, load: NDArray[np.float64], start: NDArray[np.float64] | None = None, options: NewtonOptions = NewtonOptions()) -> Solution:
         """Equilibrium under forces on the free dofs, (n_free,) N; see `solve_equilibrium`."""

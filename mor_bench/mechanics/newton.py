@@ -1,8 +1,9 @@
-"""Newton's method for an equilibrium, full-order or reduced: a plain pass first, a safeguarded one where it fails.
+"""The nonlinear solve of an equilibrium, full-order or reduced: the fast way first, a safeguarded one where it fails.
 
-Plain full steps converge in six or seven iterations for nearly every load, although the residual first rises by orders
-of magnitude: a rising residual is not divergence. When they do not end in a stable, uninverted state, the load is
-applied in increments, each a descent on the potential energy with a line search, and cut back on failure.
+Where there is an approximate inverse of all tangents, an accelerated iteration with it goes first; it fails on the
+largest deformations only. Newton's plain full steps follow: the residual first rises by orders of magnitude, which is
+not divergence. When neither ends in a stable, uninverted state, the load is applied in increments, each a descent on the
+potential energy with a line search, and cut back on failure.
 """
 
 from __future__ import annotations
@@ -14,9 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvertedElementError, NoEquilibriumError
+from mor_bench.mechanics.anderson import Anderson
 from mor_bench.mechanics.assembly import State
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
 
+ACCELERATED_ITERATIONS = 40
+DIVERGED = 1e4
+"""A residual this many times the load ends the accelerated pass, which does not come back from there."""
+TURNING = 1e-2
+"""Nodal rotations are taken anew while corrections are larger than this, relative to the displacement."""
 PLAIN_ITERATIONS = 25
 DAMPED_ITERATIONS = 60
 HOPELESS = 1e10
@@ -57,10 +64,25 @@ class Solution:
     cuts: int
 
 
+class Turning(Protocol):
+    """An approximate inverse of all tangents, which turns with the body."""
+
+    def turn(self, q: NDArray[np.float64] | None) -> None:
+        """Turn it as the body at q has turned; as at rest for None."""
+        ...
+
+    def solve(self, residual: NDArray[np.float64]) -> NDArray[np.float64]: ...
+
+
 class Problem(Protocol):
-    """What Newton needs of a model with unknowns q."""
+    """What the solve needs of a model with unknowns q."""
 
     n_unknowns: int
+
+    @property
+    def accelerator(self) -> Turning | None:
+        """What the accelerated pass iterates with; without it there is none."""
+        ...
 
     def force(self, q: NDArray[np.float64]) -> State: ...
     def linearise(self, q: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
@@ -112,25 +134,54 @@ def _forcing(size: float, before: float, target: float) -> float:
     return 0.1 if size <= target else min(0.1, max(0.9 * (size / before) ** 2, 0.3 * target / size))
 
 
+def _accelerated(
+    problem: Problem, inverse: Turning, load: NDArray[np.float64], start: NDArray[np.float64] | None, tolerance: float
+) -> _Pass:  # fmt: skip
+    """Anderson's acceleration of the iteration with an approximate inverse; converged only where no curvature was negative."""
+    load_norm = float(np.linalg.norm(load))
+    memory = Anderson(problem.n_unknowns)
+    inverse.turn(start)
+    q = inverse.solve(load) if start is None else start.copy()
+    turning, min_det = True, -np.inf
+    for iteration in range(1, ACCELERATED_ITERATIONS + 1):
+        state = problem.force(q)
+        residual, min_det = load - state.force, state.min_det_f
+        size = float(np.linalg.norm(residual))
+        if size <= tolerance * load_norm:
+            return _Pass(q, min_det, iteration, converged=memory.convex)
+        if not size <= DIVERGED * load_norm:
+            return _Pass(q, min_det, iteration, converged=False)
+        if turning:
+            inverse.turn(q)
+        correction = inverse.solve(residual)
+        turning = float(np.abs(correction).max()) > TURNING * float(np.abs(q).max())
+        q = q + memory.advance(q, correction, residual)
+    return _Pass(q, min_det, ACCELERATED_ITERATIONS, converged=False)
+
+
 def _plain(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float64] | None, tolerance: float) -> _Pass:
     """Full Newton steps; from rest, the first one uses the rest-state factor that every solve shares."""
     load_norm = float(np.linalg.norm(load))
     q = problem.rest_factor.solve(load) if start is None else start.copy()
-    min_det, before = -np.inf, np.inf
+    min_det, before, near = -np.inf, np.inf, False
     for iteration in range(1, PLAIN_ITERATIONS + 1):
+        if near:  # one more residual is cheap, and usually no further tangent is needed
+            state = problem.force(q)
+            if _met(load - state.force, load_norm, tolerance):
+                return _Pass(q, state.min_det_f, iteration, converged=True)
         state, tangent = problem.linearise(q)
         residual, min_det = load - state.force, state.min_det_f
         size = float(np.linalg.norm(residual))
         if not (size <= HOPELESS * load_norm and np.isfinite(state.energy_j)):
             break
         try:
-            # Also at the solution, where the step is not needed: that the tangent is positive definite there is.
+            # Also at a solution that was not come to from near by: that the tangent is positive definite there is seen.
             step = problem.step(q, tangent, residual, _forcing(size, before, tolerance * load_norm))
         except NotPositiveDefiniteError:
             break
         if size <= tolerance * load_norm:
             return _Pass(q, min_det, iteration, converged=True)
-        before = size
+        near, before = size <= np.sqrt(tolerance) * load_norm, size
         q = q + step
         if _is_round_off(step, q):
             return _Pass(q, min_det, iteration, converged=True)
@@ -209,10 +260,16 @@ def solve_equilibrium(
     """
     if not load.any():
         return Solution(np.zeros(problem.n_unknowns), 1.0, 0, 0)
+    iterations, cuts = 0, 0
+    if problem.accelerator is not None:
+        first = _accelerated(problem, problem.accelerator, load, start, options.tolerance)
+        if first.valid:
+            return Solution(first.q, first.min_det_f, first.iterations, 0)
+        iterations = first.iterations
     first = _plain(problem, load, start, options.tolerance)
+    iterations += first.iterations
     if first.valid:
-        return Solution(first.q, first.min_det_f, first.iterations, 0)
-    iterations, cuts = first.iterations, 0
+        return Solution(first.q, first.min_det_f, iterations, 0)
     q, reached, increment = np.zeros(problem.n_unknowns), 0.0, 0.5
     while True:
         target = min(1.0, reached + increment)

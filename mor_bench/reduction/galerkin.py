@@ -60,6 +60,7 @@ class GalerkinProblem:
         self.assembler = assembler
         self.modes = np.ascontiguousarray(modes)
         self.n_unknowns = modes.shape[1]
+        self.accelerator = None
 
     @cached_property
     def rest_tangent(self) -> NDArray[np.float64]:

@@ -26,7 +26,7 @@ from mor_bench.specs import DatasetSpec
 SHARD_SIZE = 100
 """Samples per shard."""
 
-GENERATOR_VERSION = 2
+GENERATOR_VERSION = 3
 """Raised when a change of the full-order model or of the sampling changes samples; part of a dataset's folder name."""
 
 Progress = Callable[[int, int], None]

@@ -8,26 +8,33 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.model import FullOrderModel, missing_library
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.specs import SolverName
 from mor_bench.surrogate import Surrogate
 
 
 class FullFEM(Surrogate):
-    """Newton's method with a direct solver on the whole mesh.
+    """The nonlinear solve on the whole mesh.
 
     Parameters
     ----------
     tolerance : float
-        Norm of the residual relative to that of the load at which Newton stops.
+        Norm of the residual relative to that of the load at which the solve stops.
+    solver : str, optional
+        One of `mor_bench.mechanics.model.SOLVERS`; by default as the scene says.
     """
 
     needs_snapshots = False
 
-    def __init__(self, tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8) -> None:
+    def __init__(self, tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8, solver: SolverName | None = None) -> None:
         self.tolerance = tolerance
+        self.solver = solver
+
+    def supports(self, scene: Scene) -> str | None:
+        return missing_library(self.solver or scene.spec.solver)
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
         """Assemble and factorise the rest-state stiffness; snapshots are not used."""
@@ -47,5 +54,5 @@ class FullFEM(Surrogate):
         return {}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        self.model_ = FullOrderModel(self.scene_)
+        self.model_ = FullOrderModel(self.scene_, self.solver)
         _ = self.model_.rest_factor

@@ -15,13 +15,15 @@ from scipy.spatial.transform import Rotation
 import mor_bench
 from mor_bench.errors import InvalidInputError, SolverError, UnconstrainedBodyError
 from mor_bench.mechanics.assembly import Assembler
-from mor_bench.mechanics.linear import BandedCholesky, NotPositiveDefiniteError, SparseLU
-from mor_bench.mechanics.model import PCG_FROM, FullOrderModel
+from mor_bench.mechanics.linear import BandedCholesky, MultigridFactor, NotPositiveDefiniteError, SparseLU
+from mor_bench.mechanics.model import SOLVERS, FullOrderModel
 from mor_bench.mechanics.newton import solve_equilibrium
+from mor_bench.mechanics.rotated import BlockJacobi, conjugate_gradients
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import Scene
+from mor_bench.specs import SolverName
 
 Array = NDArray[np.float64]
 LAW = SaintVenantKirchhoff(young_pa=500.0, poisson=0.4)
@@ -323,42 +325,74 @@ def large() -> FullOrderModel:
     return FullOrderModel(mor_bench.load_scene({**spec, "geometry": {"shape": "box", "size_m": [4.0, 1.0, 1.0], "cells": [18, 7, 7]}}))
 
 
-def test_conjugate_gradients_end_where_fresh_factors_do(large: FullOrderModel) -> None:
-    assert large.n_unknowns >= PCG_FROM
-    rng = np.random.default_rng(0)
-    for patch in rng.integers(0, len(large.scene.patch_nodes), 10):
+def tip_load(scene: Scene, newton: float) -> Array:
+    tip = int(np.linalg.norm(scene.mesh.points[scene.patch_nodes] - [4.0, 0.5, 1.0], axis=1).argmin())
+    force = scene.patch_weights.toarray()[tip][:, None] * np.array([0.0, 0.0, -newton])
+    return np.asarray(force.ravel()[scene.free_dofs])
+
+
+@pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "auto"])
+def test_every_solver_ends_at_the_same_equilibrium(large: FullOrderModel, solver: SolverName) -> None:
+    if solver == "pardiso":
+        pytest.importorskip("pypardiso", reason="MKL is an extra")
+    other, rng = FullOrderModel(large.scene, solver), np.random.default_rng(0)
+    for patch in rng.integers(0, len(large.scene.patch_nodes), 3):
         direction = rng.normal(size=3)
         force = large.scene.patch_weights.toarray()[patch][:, None] * direction / np.linalg.norm(direction)
         load = force.ravel()[large.scene.free_dofs]
-        solution = large.solve(load)
-        u = solution.displacement
-        assert np.linalg.norm(load - large.force(u).force) <= 1e-8 * np.linalg.norm(load)
-        assert solution.iterations <= 12
-        _, tangent = large.linearise(u)
-        step = large.factor(tangent).solve(load - large.force(u).force)
-        assert np.linalg.norm(step) <= 1e-6 * np.linalg.norm(u)
+        ours, theirs = large.solve(load), other.solve(load)
+        assert ours.iterations <= 20
+        assert theirs.iterations <= 8
+        for solution in (ours, theirs):
+            assert np.linalg.norm(load - large.force(solution.displacement).force) <= 1e-8 * np.linalg.norm(load)
+        np.testing.assert_allclose(ours.displacement, theirs.displacement, rtol=0, atol=1e-6 * np.abs(ours.displacement).max())
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_every_solver_notices_inversion_and_cuts_back(solver: SolverName) -> None:
+    """Three times the load that crushes the tip of the coarse beam."""
+    if solver == "pardiso":
+        pytest.importorskip("pypardiso", reason="MKL is an extra")
+    scene = mor_bench.load_scene("beam-tiny")
+    with pytest.raises(SolverError, match=r"stopped at .* of the load after"):
+        FullOrderModel(scene, solver).solve(tip_load(scene, 2000.0))
 
 
 def test_the_turned_factor_needs_few_iterations_far_from_rest(large: FullOrderModel) -> None:
     """With the tip turned by more than half a radian, the factor as it is needs several times as many."""
-    scene = large.scene
-    tip = int(np.linalg.norm(scene.mesh.points[scene.patch_nodes] - [4.0, 0.5, 1.0], axis=1).argmin())
-    force = scene.patch_weights.toarray()[tip][:, None] * np.array([0.0, 0.0, -6.0])
-    u = large.solve(force.ravel()[scene.free_dofs]).displacement
+    u = large.solve(tip_load(large.scene, 6.0)).displacement
     tangent = large.linearise(u)[1]
     rhs = np.random.default_rng(0).normal(size=large.n_unknowns)
-    assert large.pcg is not None
-    x = large.pcg.solve(u, tangent, rhs, 1e-8)
-    turned = large.pcg.iterations
+    rotated = large.accelerator
+    assert rotated is not None
+    rotated.turn(u)
+    x, turned = conjugate_gradients(large.assembler.pattern, tangent, rotated, rhs, 1e-8)
     assert np.linalg.norm(dense(large.assembler, tangent) @ x - rhs) <= 2e-8 * np.linalg.norm(rhs)
-    large.pcg.solve(0.0 * u, tangent, rhs, 1e-8)
+    rotated.turn(None)
     assert turned <= 30
-    assert large.pcg.iterations >= 2 * turned
+    assert conjugate_gradients(large.assembler.pattern, tangent, rotated, rhs, 1e-8)[1] >= 2 * turned
 
 
-def test_conjugate_gradients_notice_an_indefinite_tangent(large: FullOrderModel) -> None:
+@pytest.mark.parametrize("plain", [False, True])
+def test_conjugate_gradients_notice_an_indefinite_tangent(large: FullOrderModel, plain: bool) -> None:
     pattern, values = large.assembler.pattern, large.rest_tangent
     spoilt = np.where(pattern.rows == pattern.indices, values - 0.5 * values.max(), values)
-    assert large.pcg is not None
+    preconditioner = BlockJacobi(pattern) if plain else large.accelerator
+    if isinstance(preconditioner, BlockJacobi):
+        preconditioner.take(values)
+    assert preconditioner is not None
     with pytest.raises(NotPositiveDefiniteError):
-        large.pcg.solve(np.zeros(large.n_unknowns), spoilt, np.ones(large.n_unknowns), 1e-6)
+        conjugate_gradients(pattern, spoilt, preconditioner, np.ones(large.n_unknowns), 1e-6)
+
+
+def test_multigrid_solves_as_the_banded_factor_does_and_accelerates(large: FullOrderModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mor_bench.mechanics.linear.MAX_BAND_ENTRIES", 0)
+    model = FullOrderModel(large.scene)
+    rhs = np.random.default_rng(0).normal(size=(large.n_unknowns, 2))
+    assert isinstance(model.rest_factor, MultigridFactor)
+    expected = large.rest_factor.solve(rhs)
+    np.testing.assert_allclose(model.rest_factor.solve(rhs), expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    load = tip_load(large.scene, 1.0)
+    solution = model.solve(load)
+    assert solution.iterations <= 40
+    np.testing.assert_allclose(solution.displacement, large.solve(load).displacement, rtol=0, atol=1e-6 * np.abs(solution.displacement).max())

@@ -1,0 +1,248 @@
+"""The rest-state stiffness, turned with the body, as an approximate inverse of any tangent.
+
+A tangent far from rest is, to first order, the rest-state stiffness seen by an observer who turns with each node:
+K ≈ R K₀ Rᵀ with R the block-diagonal matrix of nodal rotations, the polar factors of the nodal mean deformation
+gradient. One single-precision factor of K₀ hence serves every iteration of every load (corotational warping: Müller et
+al., "Stable real-time deformations", SCA 2002; here it only directs the iteration, so that the answer stays exact).
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mor_bench.mechanics.assembly import Pattern
+from mor_bench.mechanics.linear import NotPositiveDefiniteError
+
+Array = NDArray[np.float64]
+
+MAX_ITERATIONS = 400
+"""Of conjugate gradients with the turned factor; 11-15 are usual, so that a tangent which needs more is nearly singular."""
+
+
+class SingleFactor(Protocol):
+    """A factor in single precision, or what comes near one, with its unknowns in an order of its own.
+
+    Attributes
+    ----------
+    place : (n,) int64
+        Place of each unknown.
+    """
+
+    place: NDArray[np.int64]
+
+    def solve_in_place(self, x: NDArray[np.float32]) -> None:
+        """Overwrite the right-hand side x (n,) by the solution."""
+        ...
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def nodal_rotations(u, cell_nodes, centre_gradients, volumes, rotations):
+    """Rotation of the volume-weighted mean deformation gradient of the cells around each free node.
+
+    Parameters
+    ----------
+    u : (n_free_nodes + 1, 3) float64
+        Displacements, m; the last row, of fixed nodes, is zero.
+    cell_nodes : (n_cells, n_cell_nodes) int32
+    centre_gradients : (n_cells, n_cell_nodes, 3) float64
+    volumes : (n_cells,) float64
+    rotations : (n_free_nodes + 1, 3, 3) float64
+        Overwritten.
+    """
+    rotations[:] = 0.0
+    n = cell_nodes.shape[1]
+    H, X, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for c in range(len(cell_nodes)):
+        for i in range(3):
+            for j in range(3):
+                h = 1.0 if i == j else 0.0
+                for a in range(n):
+                    h += u[cell_nodes[c, a], i] * centre_gradients[c, a, j]
+                H[i, j] = volumes[c] * h
+        for a in range(n):
+            node = cell_nodes[c, a]
+            for i in range(3):
+                for j in range(3):
+                    rotations[node, i, j] += H[i, j]
+    for node in range(len(rotations) - 1):
+        size = 0.0
+        for i in range(3):
+            for j in range(3):
+                X[i, j] = rotations[node, i, j]
+                size += X[i, j] * X[i, j]
+        X *= np.sqrt(3.0 / size)
+        for _ in range(8):  # Newton's iteration for the polar factor (Higham): quadratic, from within the basin
+            Y[0, 0] = X[1, 1] * X[2, 2] - X[1, 2] * X[2, 1]
+            Y[0, 1] = X[1, 2] * X[2, 0] - X[1, 0] * X[2, 2]
+            Y[0, 2] = X[1, 0] * X[2, 1] - X[1, 1] * X[2, 0]
+            Y[1, 0] = X[0, 2] * X[2, 1] - X[0, 1] * X[2, 2]
+            Y[1, 1] = X[0, 0] * X[2, 2] - X[0, 2] * X[2, 0]
+            Y[1, 2] = X[0, 1] * X[2, 0] - X[0, 0] * X[2, 1]
+            Y[2, 0] = X[0, 1] * X[1, 2] - X[0, 2] * X[1, 1]
+            Y[2, 1] = X[0, 2] * X[1, 0] - X[0, 0] * X[1, 2]
+            Y[2, 2] = X[0, 0] * X[1, 1] - X[0, 1] * X[1, 0]
+            det = X[0, 0] * Y[0, 0] + X[0, 1] * Y[0, 1] + X[0, 2] * Y[0, 2]
+            if not det > 1e-6:  # a collapsed or mirrored neighbourhood: no rotation to speak of
+                X[:] = np.eye(3)
+                break
+            change = 0.0
+            for i in range(3):
+                for j in range(3):
+                    new = 0.5 * (X[i, j] + Y[i, j] / det)
+                    change += abs(new - X[i, j])
+                    X[i, j] = new
+            if change < 1e-7:
+                break
+        rotations[node] = X
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def multiply(indptr, indices, values, x, y):
+    """y = K x for the symmetric K whose upper triangle is given; all three dofs of a node are neighbours in the pattern."""
+    y[:] = 0.0
+    for a in range(len(x) // 3):
+        i = 3 * a
+        r0, r1, r2 = indptr[i], indptr[i + 1], indptr[i + 2]
+        x0, x1, x2 = x[i], x[i + 1], x[i + 2]
+        y0 = values[r0] * x0 + values[r0 + 1] * x1 + values[r0 + 2] * x2
+        y1 = values[r0 + 1] * x0 + values[r1] * x1 + values[r1 + 1] * x2
+        y2 = values[r0 + 2] * x0 + values[r1 + 1] * x1 + values[r2] * x2
+        n_blocks = (r1 - r0 - 3) // 3
+        r0, r1, r2 = r0 + 3, r1 + 2, r2 + 1
+        for k in range(n_blocks):
+            o = 3 * k
+            j = indices[r0 + o]
+            k00, k01, k02 = values[r0 + o], values[r0 + o + 1], values[r0 + o + 2]
+            k10, k11, k12 = values[r1 + o], values[r1 + o + 1], values[r1 + o + 2]
+            k20, k21, k22 = values[r2 + o], values[r2 + o + 1], values[r2 + o + 2]
+            z0, z1, z2 = x[j], x[j + 1], x[j + 2]
+            y0 += k00 * z0 + k01 * z1 + k02 * z2
+            y1 += k10 * z0 + k11 * z1 + k12 * z2
+            y2 += k20 * z0 + k21 * z1 + k22 * z2
+            y[j] += k00 * x0 + k10 * x1 + k20 * x2
+            y[j + 1] += k01 * x0 + k11 * x1 + k21 * x2
+            y[j + 2] += k02 * x0 + k12 * x1 + k22 * x2
+        y[i] += y0
+        y[i + 1] += y1
+        y[i + 2] += y2
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _turn_back(place, rotations, scale, r, work):
+    """work = scale Rᵀ r, in the factor's order."""
+    for a in range(len(place)):
+        Q, i, p = rotations[a], 3 * a, 3 * place[a]
+        r0, r1, r2 = scale * r[i], scale * r[i + 1], scale * r[i + 2]
+        work[p] = Q[0, 0] * r0 + Q[1, 0] * r1 + Q[2, 0] * r2
+        work[p + 1] = Q[0, 1] * r0 + Q[1, 1] * r1 + Q[2, 1] * r2
+        work[p + 2] = Q[0, 2] * r0 + Q[1, 2] * r1 + Q[2, 2] * r2
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _turn(place, rotations, scale, work, z):
+    """z = R work / scale."""
+    for a in range(len(place)):
+        Q, i, p = rotations[a], 3 * a, 3 * place[a]
+        w0, w1, w2 = work[p] / scale, work[p + 1] / scale, work[p + 2] / scale
+        z[i] = Q[0, 0] * w0 + Q[0, 1] * w1 + Q[0, 2] * w2
+        z[i + 1] = Q[1, 0] * w0 + Q[1, 1] * w1 + Q[1, 2] * w2
+        z[i + 2] = Q[2, 0] * w0 + Q[2, 1] * w1 + Q[2, 2] * w2
+
+
+class RotatedRest:
+    """z = R K₀⁻¹ Rᵀ r, the solve in single precision.
+
+    Parameters
+    ----------
+    factor : SingleFactor
+        Of the stiffness at rest, with the three dofs of a node as neighbours.
+    cell_nodes : (n_cells, n_cell_nodes) int32
+        Number of each cell's nodes among the free ones; the number of free nodes for a fixed one.
+    centre_gradients : (n_cells, n_cell_nodes, 3) float64
+        dN_a/dX at the cells' centres, 1/m.
+    volumes : (n_cells,) float64
+        m³.
+    """
+
+    def __init__(self, factor: SingleFactor, cell_nodes: NDArray[np.int32], centre_gradients: Array, volumes: Array) -> None:
+        self._factor = factor
+        self._place = np.ascontiguousarray(factor.place[::3] // 3)
+        self._cells = cell_nodes, centre_gradients, volumes
+        self._rotations = np.tile(np.eye(3), (len(self._place) + 1, 1, 1))
+        self._work = np.empty(3 * len(self._place), dtype=np.float32)
+
+    def turn(self, q: Array | None) -> None:
+        """Take the nodal rotations from displacements q (n,), m; from rest for None."""
+        if q is None:
+            self._rotations[:] = np.eye(3)
+        else:
+            nodal_rotations(np.append(q, np.zeros(3)).reshape(-1, 3), *self._cells, self._rotations)
+
+    def solve(self, residual: Array) -> Array:
+        """Approximate displacement, m, under forces (n,), N."""
+        size = float(np.abs(residual).max())
+        z = np.empty_like(residual)
+        if size == 0.0:
+            z[:] = 0.0
+            return z
+        # Scaled to one, so that single precision neither underflows nor overflows.
+        _turn_back(self._place, self._rotations, 1.0 / size, residual, self._work)
+        self._factor.solve_in_place(self._work)
+        _turn(self._place, self._rotations, 1.0 / size, self._work, z)
+        return z
+
+
+class BlockJacobi:
+    """The plain preconditioner: the inverse of each node's 3x3 block of the tangent itself."""
+
+    def __init__(self, pattern: Pattern) -> None:
+        first = pattern.indptr[:-1:3]
+        second, third = pattern.indptr[1::3], pattern.indptr[2::3]
+        self._places = np.stack([first, first + 1, first + 2, first + 1, second, second + 1, first + 2, second + 1, third], axis=1)
+
+    def take(self, values: Array) -> None:
+        """Invert the diagonal blocks of a tangent."""
+        try:
+            self._inverse = np.linalg.inv(values[self._places].reshape(-1, 3, 3))
+        except np.linalg.LinAlgError as error:
+            raise NotPositiveDefiniteError from error
+
+    def solve(self, residual: Array) -> Array:
+        return np.asarray((self._inverse @ residual.reshape(-1, 3, 1)).ravel())
+
+
+class Preconditioner(Protocol):
+    """An approximate inverse."""
+
+    def solve(self, residual: Array) -> Array: ...
+
+
+def conjugate_gradients(
+    pattern: Pattern, values: Array, preconditioner: Preconditioner, rhs: Array, tolerance: float, max_iterations: int = MAX_ITERATIONS
+) -> tuple[Array, int]:  # fmt: skip
+    """Solve K x = rhs to a relative tolerance; returns x and the number of iterations.
+
+    Raises
+    ------
+    NotPositiveDefiniteError
+        Where a direction of negative curvature is met, or the iterations do not suffice.
+    """
+    x, r, p, q = np.zeros_like(rhs), rhs.copy(), np.zeros_like(rhs), np.empty_like(rhs)
+    target, rz = tolerance * float(np.linalg.norm(rhs)), 1.0
+    for iteration in range(max_iterations):
+        if float(np.linalg.norm(r)) <= target:
+            return x, iteration
+        z = preconditioner.solve(r)
+        rz, before = float(r @ z), rz
+        p = z + (rz / before) * p
+        multiply(pattern.indptr, pattern.indices, values, p, q)
+        curvature = float(p @ q)
+        if not curvature > 0.0:
+            raise NotPositiveDefiniteError
+        x += (rz / curvature) * p
+        r -= (rz / curvature) * q
+    raise NotPositiveDefiniteError
