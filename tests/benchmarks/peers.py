@@ -1,0 +1,481 @@
+"""The whole nonlinear solve beside other finite-element codes: from rest to a relative residual of 1e-8 under one dead load.
+
+    python -m tests.benchmarks.peers --dataset beam-coarse --loads 5 --rounds 3
+
+Every contender gets the same nodes, 8-node hexahedra with 2 x 2 x 2 Gauss points, supports and nodal forces, the Saint
+Venant-Kirchhoff law, plain Newton from zero displacement, and the same threads. It stops when the residual on the free dofs
+is at most 1e-8 of the load on them. Meshes, patterns and whatever else does not depend on the load are set up before the
+clock starts, by an untimed solve. For each load every contender runs once a round, in an order that rotates. Afterwards our
+residual and a reference solved to 1e-10 check each answer, and nothing is printed if one is wrong.
+
+mor-bench
+    `FullOrderModel.solve` as it is. Its first step takes the factor of the tangent at rest, which all solves share.
+felupe
+    Its `newtonraphson` with `tol` related to the load instead of the reactions, which only changes when it stops. felupe has
+    no Saint Venant-Kirchhoff law in closed form: its strain-based and its differentiated ones (`MaterialStrain`,
+    `Hyperelastic`) give the same iterations, but a solve takes about 1.5 times as long on beam-coarse. So it gets the closed
+    form below as a `Material`. Linear solvers: SciPy's `spsolve` (felupe's default), `pypardiso.spsolve`, and "tuned
+    Pardiso": Cholesky of the upper triangle (mtype 2), analysed once per pattern.
+Kratos
+    Release build of the package index. `TotalLagrangianElement3D8N` with `LinearElastic3DLaw`, linear between second
+    Piola-Kirchhoff stress and Green-Lagrange strain; `ResidualCriteria`, whose ratio is to the load for a start at rest;
+    reactions off, printing off. Linear solvers: amgcl with Kratos' defaults (GMRES, aggregation, ILU(0), 1e-6), and tuned:
+    conjugate gradients, smoothed aggregation, ILU(0), 1e-3. Its sparse LU is left out: several times slower on beam-fine.
+
+Steps are the linear systems solved for a correction, with the one at rest. Ours solves one more at the answer, to see that it is stable.
+"""
+
+from __future__ import annotations
+
+import gc
+import inspect
+import json
+import os
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any
+
+import numpy as np
+import scipy.sparse as sp
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+from scipy.sparse.linalg import spsolve
+
+import mor_bench
+from mor_bench.harness.timing import describe_machine
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.scene.materials import SaintVenantKirchhoff
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.sampling import draw_loads
+
+Array = NDArray[np.float64]
+LinearSolve = Callable[[Any, Array], Array]
+
+TOLERANCE = 1e-8
+REFERENCE_TOLERANCE = 1e-10
+MAX_RESIDUAL = 1.01 * TOLERANCE
+"""The residuals of two codes differ by round-off."""
+MAX_DIFFERENCE = 1e-6
+MAX_STEPS = 30
+OWN_SOLVERS = ("auto", "pardiso") if "solver" in inspect.signature(FullOrderModel).parameters else ("auto",)
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class DisagreementError(RuntimeError):
+    """A contender did not solve the problem that the others solved."""
+
+
+class Contender(ABC):
+    """A code that solves one scene under one load at a time. Only `solve` is timed."""
+
+    name: str
+
+    @abstractmethod
+    def prepare(self, forces: Array) -> None:
+        """Take (n_nodes, 3) nodal forces, N, and go back to rest."""
+
+    @abstractmethod
+    def solve(self) -> int:
+        """Solve, and return the number of Newton steps."""
+
+    @abstractmethod
+    def displacement(self) -> Array:
+        """(n_nodes, 3) of the last solve, m."""
+
+
+class Ours(Contender):
+    """The full-order model with one of its linear solvers."""
+
+    def __init__(self, scene: Scene, solver: str) -> None:
+        make: Any = FullOrderModel
+        self.name = f"mor-bench, {solver}"
+        self._model: FullOrderModel = make(scene) if solver == "auto" else make(scene, solver=solver)
+        self._free, self._u = scene.free_dofs, np.zeros(scene.mesh.n_dofs)
+
+    def prepare(self, forces: Array) -> None:
+        self._load = forces.ravel()[self._free]
+
+    def solve(self) -> int:
+        solution = self._model.solve(self._load, options=NewtonOptions(TOLERANCE))
+        self._u[self._free] = solution.displacement
+        return solution.iterations
+
+    def displacement(self) -> Array:
+        return self._u.reshape(-1, 3).copy()
+
+
+def common_material(scene: Scene) -> SaintVenantKirchhoff:
+    """The law of a scene that all sides can solve."""
+    if not isinstance(scene.material, SaintVenantKirchhoff) or scene.selective or scene.mesh.cells.shape[1] != 8:
+        raise ValueError(f"{scene.name}: the peers are set up for Saint Venant-Kirchhoff in fully integrated 8-node hexahedra only.")
+    return scene.material
+
+
+def stress(mu: float, lmbda: float, x: list[Array]) -> list[Array]:
+    """First Piola-Kirchhoff stress P = F S, (3, 3, n_points, n_cells), and the state variables, of which there are none."""
+    return [np.einsum("iM...,MJ...->iJ...", x[0], second_stress(mu, lmbda, x[0])), x[1]]
+
+
+def second_stress(mu: float, lmbda: float, F: Array) -> Array:
+    """S = λ tr(E) I + 2 μ E."""
+    S = mu * np.einsum("mI...,mJ...->IJ...", F, F)
+    trace = 0.5 * lmbda * (np.einsum("II...->...", S) / mu - 3)
+    for i in range(3):
+        S[i, i] += trace - mu
+    return np.asarray(S)
+
+
+def elasticity(mu: float, lmbda: float, x: list[Array]) -> list[Array]:
+    """dP/dF = λ F_iJ F_kL + μ (F_iL F_kJ + (F Fᵀ)_ik δ_JL) + δ_ik S_JL."""
+    F = x[0]
+    A = lmbda * np.einsum("iJ...,kL...->iJkL...", F, F)
+    A += mu * np.einsum("iL...,kJ...->iJkL...", F, F)
+    B, S = mu * np.einsum("iM...,kM...->ik...", F, F), second_stress(mu, lmbda, F)
+    for i in range(3):
+        A[:, i, :, i] += B
+        A[i, :, i] += S
+    return [A]
+
+
+class TunedPardiso:
+    """Pardiso's Cholesky factorisation of the upper triangle, analysed once per pattern: felupe's has fewer entries at rest."""
+
+    def __init__(self) -> None:
+        self._analysed: list[tuple[Any, tuple[Any, Any]]] = []
+
+    def __call__(self, matrix: sp.csr_matrix, rhs: Array) -> Array:
+        from pypardiso import PyPardisoSolver
+
+        upper = sp.triu(matrix, format="csr")
+        upper.sort_indices()
+        for pardiso, pattern in self._analysed:
+            if all(map(np.array_equal, pattern, (upper.indptr, upper.indices))):
+                pardiso.set_phase(23)
+                break
+        else:
+            pardiso = PyPardisoSolver(mtype=2, phase=13)
+            self._analysed.append((pardiso, (upper.indptr, upper.indices)))
+        return np.asarray(pardiso._call_pardiso(upper, rhs))
+
+
+def default_pardiso() -> LinearSolve:
+    """pypardiso's `spsolve` with its defaults."""
+    from pypardiso import spsolve as solve
+
+    return partial(solve)
+
+
+class Felupe(Contender):
+    """felupe's Newton with one of several linear solvers."""
+
+    def __init__(self, scene: Scene, name: str, make_solver: Callable[[], LinearSolve]) -> None:
+        import felupe
+
+        self.name = f"felupe, {name}"
+        self._felupe, self._solver, self._free = felupe, make_solver(), scene.free_dofs
+        material = common_material(scene)
+        mesh = felupe.Mesh(scene.mesh.points, scene.mesh.cells, "hexahedron")
+        self._field = felupe.FieldContainer([felupe.Field(felupe.RegionHexahedron(mesh), dim=3)])
+        fixed = np.isin(np.arange(scene.mesh.n_nodes), scene.fixed_nodes)
+        self._dof0, self._dof1 = felupe.dof.partition(self._field, {"fixed": felupe.Boundary(self._field[0], mask=fixed)})
+        law = felupe.Material(*(partial(function, material.lame_mu, material.lame_lambda) for function in (stress, elasticity)))
+        self._body = felupe.SolidBody(law, self._field)
+        self._load = felupe.PointLoad(self._field, np.arange(scene.mesh.n_nodes))
+
+    def prepare(self, forces: Array) -> None:
+        self._field[0].values = np.zeros_like(forces)
+        self._load.update(forces)
+        self._size = float(np.linalg.norm(forces.ravel()[self._free]))
+
+    def _check(self, dx: Array, x: Any, f: Array, xtol: float, ftol: float, dof1: Any, dof0: Any, items: Any) -> tuple[float, float, bool]:
+        residual = float(np.linalg.norm(f[dof1])) / self._size
+        return float(np.linalg.norm(dx)), residual, residual <= ftol
+
+    def solve(self) -> int:
+        result = self._felupe.newtonraphson(
+            x0=self._field,
+            items=[self._body, self._load],
+            dof0=self._dof0,
+            dof1=self._dof1,
+            solver=self._solver,
+            check=self._check,
+            tol=TOLERANCE,
+            maxiter=MAX_STEPS,
+            verbose=0,
+        )
+        self._u = result.x[0].values
+        return int(result.iterations)
+
+    def displacement(self) -> Array:
+        return np.array(self._u)
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """Send to nowhere what is printed, from compiled code too: a package's banner."""
+    sys.stdout.flush()
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
+
+
+class Kratos(Contender):
+    """Kratos' Newton with one of its linear solvers."""
+
+    def __init__(self, scene: Scene, name: str, linear_solver: dict[str, Any]) -> None:
+        with silent():
+            km, sma = map(import_module, ("KratosMultiphysics", "KratosMultiphysics.StructuralMechanicsApplication"))
+        km.Logger.GetDefaultOutput().SetSeverity(km.Logger.Severity.WARNING)
+
+        self.name = f"Kratos, {name}"
+        material = common_material(scene)
+        self._km, self._load_variable, self._utilities = km, sma.POINT_LOAD, km.VariableUtils()
+        self._model = km.Model()
+        self._part = part = self._model.CreateModelPart("solid")
+        part.ProcessInfo[km.DOMAIN_SIZE] = 3
+        for variable in (km.DISPLACEMENT, km.REACTION, km.VOLUME_ACCELERATION, sma.POINT_LOAD):
+            part.AddNodalSolutionStepVariable(variable)
+        for i, point in enumerate(scene.mesh.points.tolist(), 1):
+            part.CreateNewNode(i, *point)
+        properties = part.CreateNewProperties(1)
+        properties[km.YOUNG_MODULUS], properties[km.POISSON_RATIO] = material.young_pa, material.poisson
+        properties[km.CONSTITUTIVE_LAW] = sma.LinearElastic3DLaw()
+        for i, cell in enumerate((scene.mesh.cells + 1).tolist(), 1):
+            part.CreateNewElement("TotalLagrangianElement3D8N", i, cell, properties)
+        for i in range(1, scene.mesh.n_nodes + 1):
+            part.CreateNewCondition("PointLoadCondition3D1N", i, [i], properties)
+        for axis in "XYZ":
+            displacement = getattr(km, f"DISPLACEMENT_{axis}")
+            self._utilities.AddDof(displacement, getattr(km, f"REACTION_{axis}"), part)
+            for node in scene.fixed_nodes.tolist():
+                part.GetNode(node + 1).Fix(displacement)
+        solver = km.LinearSolverFactory().Create(km.Parameters(json.dumps(linear_solver)))
+        scheme, criterion = km.ResidualBasedIncrementalUpdateStaticScheme(), km.ResidualCriteria(TOLERANCE, 0.0)
+        builder = km.ResidualBasedBlockBuilderAndSolver(solver)
+        reactions, new_dofs, move_mesh = False, False, True  # this element takes F from the moved mesh
+        self._strategy = km.ResidualBasedNewtonRaphsonStrategy(part, scheme, criterion, builder, MAX_STEPS, reactions, new_dofs, move_mesh)
+        for part_of_solver in (criterion, builder, self._strategy):
+            part_of_solver.SetEchoLevel(0)
+        self._strategy.Initialize()
+        self._strategy.Check()
+
+    def prepare(self, forces: Array) -> None:
+        for node, force in zip(self._part.Nodes, forces.tolist(), strict=True):
+            node.SetSolutionStepValue(self._load_variable, force)
+        self._utilities.SetHistoricalVariableToZero(self._km.DISPLACEMENT, self._part.Nodes)
+        self._utilities.UpdateCurrentToInitialConfiguration(self._part.Nodes)
+
+    def solve(self) -> int:
+        self._strategy.InitializeSolutionStep()
+        self._strategy.Predict()
+        converged = self._strategy.SolveSolutionStep()
+        self._strategy.FinalizeSolutionStep()
+        if not converged:
+            raise DisagreementError(f"{self.name} does not converge in {MAX_STEPS} steps.")
+        return int(self._part.ProcessInfo[self._km.NL_ITERATION_NUMBER])
+
+    def displacement(self) -> Array:
+        return np.array(self._utilities.GetSolutionStepValuesVector(self._part.Nodes, self._km.DISPLACEMENT, 0, 3)).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A contender that may run: what it needs, and how it is made."""
+
+    label: str
+    needs: tuple[str, ...]
+    make: Callable[[Scene], Contender]
+
+    @property
+    def missing(self) -> list[str]:
+        """Distributions that are not installed."""
+        return [name for name in self.needs if not _installed(name)]
+
+
+def _installed(distribution: str) -> bool:
+    try:
+        version(distribution)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+KRATOS = ("KratosMultiphysics", "KratosStructuralMechanicsApplication")
+TUNED_AMGCL = {
+    "solver_type": "amgcl",
+    "verbosity": 0,
+    "krylov_type": "cg",
+    "coarsening_type": "smoothed_aggregation",
+    "smoother_type": "ilu0",
+    "tolerance": 1e-3,
+}
+PEERS = (
+    Entry("felupe, SuperLU", ("felupe",), lambda scene: Felupe(scene, "SuperLU", lambda: spsolve)),
+    Entry("felupe, Pardiso", ("felupe", "pypardiso"), lambda scene: Felupe(scene, "Pardiso", default_pardiso)),
+    Entry("felupe, tuned Pardiso", ("felupe", "pypardiso"), lambda scene: Felupe(scene, "tuned Pardiso", TunedPardiso)),
+    Entry("Kratos, amgcl", KRATOS, lambda scene: Kratos(scene, "amgcl", {"solver_type": "amgcl", "verbosity": 0})),
+    Entry("Kratos, tuned amgcl", KRATOS, lambda scene: Kratos(scene, "tuned amgcl", TUNED_AMGCL)),
+)
+
+
+def own_entry(solver: str) -> Entry:
+    return Entry(f"mor-bench, {solver}", ("pypardiso",) if solver == "pardiso" else (), lambda scene: Ours(scene, solver))
+
+
+def pick_loads(scene: Scene, n: int) -> tuple[list[int], Array]:
+    """Sample numbers and (n, n_nodes, 3) forces, N, of n loads whose magnitudes are spread evenly over those of a whole turn.
+
+    A turn loads each patch once. Patches at supports are left out, where most of the force goes into the support.
+    """
+    drawn = draw_loads(scene.spec.loads, len(scene.patch_nodes), 0, len(scene.patch_nodes))
+    usable = np.flatnonzero(~np.isin(scene.patch_nodes, scene.fixed_nodes))
+    by_size = usable[np.linalg.norm(drawn.vectors[usable], axis=1).argsort()]
+    chosen = by_size[((np.arange(n) + 0.5) / n * len(by_size)).astype(int)]
+    return chosen.tolist(), drawn[chosen].nodal_forces(scene.patch_weights)
+
+
+@dataclass
+class Row:
+    """What one contender did, for each load."""
+
+    name: str
+    times_ms: list[list[float]] = field(default_factory=list)
+    steps: list[int] = field(default_factory=list)
+    residuals: list[float] = field(default_factory=list)
+    differences: list[float] = field(default_factory=list)
+
+    @property
+    def medians_ms(self) -> Array:
+        return np.median(self.times_ms, axis=1)
+
+
+def _timed(contender: Contender, forces: Array) -> tuple[float, int]:
+    contender.prepare(forces)
+    gc.disable()
+    try:
+        start = perf_counter()
+        steps = contender.solve()
+        return 1e3 * (perf_counter() - start), steps
+    finally:
+        gc.enable()
+
+
+def compare(scene: Scene, forces: Array, contenders: Sequence[Contender], rounds: int) -> list[Row]:
+    """Time the contenders and check what they answer.
+
+    Parameters
+    ----------
+    scene : Scene
+    forces : (n_loads, n_nodes, 3) float64
+        N.
+    contenders : sequence of Contender
+    rounds : int
+        Solves of each load by each contender.
+
+    Returns
+    -------
+    list of Row
+        In the order of the contenders.
+
+    Raises
+    ------
+    DisagreementError
+        If the residual of an answer is above the tolerance, or its displacement is not that of the reference.
+    """
+    model, free = FullOrderModel(scene), scene.free_dofs
+    rows = [Row(contender.name) for contender in contenders]
+    for contender in contenders:
+        _timed(contender, forces[0])
+    for load in forces:
+        target = load.ravel()[free]
+        reference = model.solve(target, options=NewtonOptions(REFERENCE_TOLERANCE)).displacement
+        for row in rows:
+            row.times_ms.append([])
+        for turn in range(rounds):
+            for i in np.roll(np.arange(len(rows)), -turn).tolist():
+                contender, row = contenders[i], rows[i]
+                time_ms, steps = _timed(contender, load)
+                row.times_ms[-1].append(time_ms)
+                if turn == 0:
+                    row.steps.append(steps)
+                    u = contender.displacement().ravel()[free]
+                    row.residuals.append(float(np.linalg.norm(target - model.force(u).force) / np.linalg.norm(target)))
+                    row.differences.append(float(np.linalg.norm(u - reference) / np.linalg.norm(reference)))
+                    if not (row.residuals[-1] <= MAX_RESIDUAL and row.differences[-1] <= MAX_DIFFERENCE):
+                        raise DisagreementError(
+                            f"{row.name} solves another problem: its relative residual is {row.residuals[-1]:.2g} (at most {TOLERANCE:g} is "
+                            f"asked for), its displacement differs by {row.differences[-1]:.2g} (at most {MAX_DIFFERENCE:g})."
+                        )
+    return rows
+
+
+def print_rows(console: Console, rows: Sequence[Row]) -> None:
+    """Times with their checks, and how many times as long as the first contender each takes."""
+    times = Table(title="One solve, from rest")
+    ratios = Table(title=f"Times as long as {rows[0].name}, per load")
+    for table, columns in ((times, ("median ms", "min ms", "steps", "residual", "difference")), (ratios, ("median", "min", "max"))):
+        table.add_column("contender")
+        for column in columns:
+            table.add_column(column, justify="right")
+    for row in rows:
+        steps = "-".join(map(str, sorted({min(row.steps), max(row.steps)})))
+        checks = (f"{max(row.residuals):.1e}", f"{max(row.differences):.1e}")
+        times.add_row(row.name, f"{np.median(row.medians_ms):.2f}", f"{np.min(row.times_ms):.2f}", steps, *checks)
+        ratio = row.medians_ms / rows[0].medians_ms
+        ratios.add_row(row.name, *(f"{value:.2f}" for value in (np.median(ratio), ratio.min(), ratio.max())))
+    console.print(times, ratios)
+
+
+def main(
+    dataset: Annotated[list[str] | None, typer.Option(help="Repeat for more; by default beam-coarse and beam-fine.", show_default=False)] = None,
+    loads: Annotated[int, typer.Option(min=1, help="Loads of each dataset.")] = 5,
+    rounds: Annotated[int, typer.Option(min=1, help="Solves of each load.")] = 3,
+    threads: Annotated[int, typer.Option(min=1, help="Threads of every contender.")] = 1,
+    solver: Annotated[list[str] | None, typer.Option(help=f"Our linear solvers; by default {' and '.join(OWN_SOLVERS)}.", show_default=False)] = None,
+    as_json: Annotated[Path | None, typer.Option("--json", help="Also write everything to this file.")] = None,
+) -> None:
+    """Time the full-order model beside other finite-element codes."""
+    pinned = dict.fromkeys(THREAD_VARIABLES, str(threads))
+    if any(os.environ.get(name) != value for name, value in pinned.items()):  # libraries read them when they are loaded
+        os.execve(sys.executable, [sys.executable, "-m", "tests.benchmarks.peers", *sys.argv[1:]], {**os.environ, **pinned})
+    console = Console()
+    entries = [*(own_entry(name) for name in solver or OWN_SOLVERS), *PEERS]
+    for entry in entries:
+        if entry.missing:
+            console.print(f"{entry.label}: skipped, not installed: pip install {' '.join(entry.missing)}", markup=False)
+    report: dict[str, Any] = {"machine": describe_machine(), "threads": threads, "datasets": {}}
+    for name in dataset or ("beam-coarse", "beam-fine"):
+        scene = mor_bench.load_scene(name)
+        samples, forces = pick_loads(scene, loads)
+        norms = [float(np.linalg.norm(load.ravel()[scene.free_dofs])) for load in forces]
+        console.rule(f"{name}: {scene.mesh.n_cells} cells, {len(scene.free_dofs)} unknowns, {threads} thread(s)")
+        console.print("Loads: " + ", ".join(f"sample {i} |f| = {norm:.3g} N" for i, norm in zip(samples, norms, strict=True)), highlight=False)
+        try:
+            rows = compare(scene, forces, [entry.make(scene) for entry in entries if not entry.missing], rounds)
+        except DisagreementError as error:
+            console.print(f"no comparison: {error}", style="red", markup=False)
+            raise typer.Exit(1) from None
+        print_rows(console, rows)
+        report["datasets"][name] = {"samples": samples, "load_norms_n": norms, "contenders": [vars(row) for row in rows]}
+    if as_json:
+        as_json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    typer.run(main)
