@@ -26,37 +26,45 @@ N_UPPER = 300
 """Entries in the upper triangle of a 24x24 element matrix."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _deformation(u_e, g, H):
-    """H (9) = Σ_a u_a ⊗ g_a at one Gauss point; u_e and g are (24).
-
-    One expression per component: a loop over the nodes stores and loads H once per node.
-    """
-    for i in range(3):
-        for j in range(3):
-            for l in range(LANES):
-                H[(3 * i + j) * LANES + l] = (
-                    u_e[i * LANES + l] * g[j * LANES + l]
-                    + u_e[(3 + i) * LANES + l] * g[(3 + j) * LANES + l]
-                    + u_e[(6 + i) * LANES + l] * g[(6 + j) * LANES + l]
-                    + u_e[(9 + i) * LANES + l] * g[(9 + j) * LANES + l]
-                    + u_e[(12 + i) * LANES + l] * g[(12 + j) * LANES + l]
-                    + u_e[(15 + i) * LANES + l] * g[(15 + j) * LANES + l]
-                    + u_e[(18 + i) * LANES + l] * g[(18 + j) * LANES + l]
-                    + u_e[(21 + i) * LANES + l] * g[(21 + j) * LANES + l]
-                )
+@njit(inline="always")
+def _component(u_e, g, i, j, l):
+    """H_ij = Σ_a u_a,i g_a,j."""
+    return (
+        u_e[i * LANES + l] * g[j * LANES + l]
+        + u_e[(3 + i) * LANES + l] * g[(3 + j) * LANES + l]
+        + u_e[(6 + i) * LANES + l] * g[(6 + j) * LANES + l]
+        + u_e[(9 + i) * LANES + l] * g[(9 + j) * LANES + l]
+        + u_e[(12 + i) * LANES + l] * g[(12 + j) * LANES + l]
+        + u_e[(15 + i) * LANES + l] * g[(15 + j) * LANES + l]
+        + u_e[(18 + i) * LANES + l] * g[(18 + j) * LANES + l]
+        + u_e[(21 + i) * LANES + l] * g[(21 + j) * LANES + l]
+    )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _stress(H, w_lam, w_mu, S, P, energy, min_det):
-    """Weighted S (6: 00 11 22 01 02 12) and P (9) at one Gauss point; adds to the energy, lowers min det F.
+@njit(inline="always")
+def _add_row(f_e, g, i, l, p0, p1, p2):
+    """f_a,i += P_i · g_a for every node."""
+    f_e[i * LANES + l] += p0 * g[l] + p1 * g[LANES + l] + p2 * g[2 * LANES + l]
+    f_e[(3 + i) * LANES + l] += p0 * g[3 * LANES + l] + p1 * g[4 * LANES + l] + p2 * g[5 * LANES + l]
+    f_e[(6 + i) * LANES + l] += p0 * g[6 * LANES + l] + p1 * g[7 * LANES + l] + p2 * g[8 * LANES + l]
+    f_e[(9 + i) * LANES + l] += p0 * g[9 * LANES + l] + p1 * g[10 * LANES + l] + p2 * g[11 * LANES + l]
+    f_e[(12 + i) * LANES + l] += p0 * g[12 * LANES + l] + p1 * g[13 * LANES + l] + p2 * g[14 * LANES + l]
+    f_e[(15 + i) * LANES + l] += p0 * g[15 * LANES + l] + p1 * g[16 * LANES + l] + p2 * g[17 * LANES + l]
+    f_e[(18 + i) * LANES + l] += p0 * g[18 * LANES + l] + p1 * g[19 * LANES + l] + p2 * g[20 * LANES + l]
+    f_e[(21 + i) * LANES + l] += p0 * g[21 * LANES + l] + p1 * g[22 * LANES + l] + p2 * g[23 * LANES + l]
 
-    E is formed from H, not from FᵀF - I, which would lose the digits of a small strain.
+
+@njit(inline="always")
+def _point(u_e, g, w_lam, w_mu, H, S, f_e, energy, min_det):
+    """One Gauss point: H (9) and the weighted S (6: 00 11 22 01 02 12) for the tangent; nodal forces and energy added.
+
+    One loop over the lanes does it all, so that F, S and P stay in registers: with a loop for each the fine beam took 0.61 ms
+    instead of 0.36. E is formed from H, not from FᵀF - I, which would lose the digits of a small strain.
     """
     for l in range(LANES):
-        h00, h01, h02 = H[l], H[1 * LANES + l], H[2 * LANES + l]
-        h10, h11, h12 = H[3 * LANES + l], H[4 * LANES + l], H[5 * LANES + l]
-        h20, h21, h22 = H[6 * LANES + l], H[7 * LANES + l], H[8 * LANES + l]
+        h00, h01, h02 = _component(u_e, g, 0, 0, l), _component(u_e, g, 0, 1, l), _component(u_e, g, 0, 2, l)
+        h10, h11, h12 = _component(u_e, g, 1, 0, l), _component(u_e, g, 1, 1, l), _component(u_e, g, 1, 2, l)
+        h20, h21, h22 = _component(u_e, g, 2, 0, l), _component(u_e, g, 2, 1, l), _component(u_e, g, 2, 2, l)
         e00 = h00 + 0.5 * (h00 * h00 + h10 * h10 + h20 * h20)
         e11 = h11 + 0.5 * (h01 * h01 + h11 * h11 + h21 * h21)
         e22 = h22 + 0.5 * (h02 * h02 + h12 * h12 + h22 * h22)
@@ -68,33 +76,17 @@ def _stress(H, w_lam, w_mu, S, P, energy, min_det):
         wm = 2.0 * w_mu[l]
         s00, s11, s22 = wl + wm * e00, wl + wm * e11, wl + wm * e22
         s01, s02, s12 = wm * e01, wm * e02, wm * e12
-        S[l], S[1 * LANES + l], S[2 * LANES + l], S[3 * LANES + l], S[4 * LANES + l], S[5 * LANES + l] = s00, s11, s22, s01, s02, s12
         energy[l] += 0.5 * (s00 * e00 + s11 * e11 + s22 * e22) + s01 * e01 + s02 * e02 + s12 * e12
         f00, f11, f22 = 1.0 + h00, 1.0 + h11, 1.0 + h22
-        P[l] = f00 * s00 + h01 * s01 + h02 * s02
-        P[1 * LANES + l] = f00 * s01 + h01 * s11 + h02 * s12
-        P[2 * LANES + l] = f00 * s02 + h01 * s12 + h02 * s22
-        P[3 * LANES + l] = h10 * s00 + f11 * s01 + h12 * s02
-        P[4 * LANES + l] = h10 * s01 + f11 * s11 + h12 * s12
-        P[5 * LANES + l] = h10 * s02 + f11 * s12 + h12 * s22
-        P[6 * LANES + l] = h20 * s00 + h21 * s01 + f22 * s02
-        P[7 * LANES + l] = h20 * s01 + h21 * s11 + f22 * s12
-        P[8 * LANES + l] = h20 * s02 + h21 * s12 + f22 * s22
         det = f00 * (f11 * f22 - h12 * h21) - h01 * (h10 * f22 - h12 * h20) + h02 * (h10 * h21 - f11 * h20)
         min_det[l] = min(min_det[l], det)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _nodal_force(P, g, f_e):
-    """f_a += P g_a for every node."""
-    for a in range(8):
-        for i in range(3):
-            for l in range(LANES):
-                f_e[(3 * a + i) * LANES + l] += (
-                    P[(3 * i) * LANES + l] * g[(3 * a) * LANES + l]
-                    + P[(3 * i + 1) * LANES + l] * g[(3 * a + 1) * LANES + l]
-                    + P[(3 * i + 2) * LANES + l] * g[(3 * a + 2) * LANES + l]
-                )
+        H[l], H[1 * LANES + l], H[2 * LANES + l] = h00, h01, h02
+        H[3 * LANES + l], H[4 * LANES + l], H[5 * LANES + l] = h10, h11, h12
+        H[6 * LANES + l], H[7 * LANES + l], H[8 * LANES + l] = h20, h21, h22
+        S[l], S[1 * LANES + l], S[2 * LANES + l], S[3 * LANES + l], S[4 * LANES + l], S[5 * LANES + l] = s00, s11, s22, s01, s02, s12
+        _add_row(f_e, g, 0, l, f00 * s00 + h01 * s01 + h02 * s02, f00 * s01 + h01 * s11 + h02 * s12, f00 * s02 + h01 * s12 + h02 * s22)
+        _add_row(f_e, g, 1, l, h10 * s00 + f11 * s01 + h12 * s02, h10 * s01 + f11 * s11 + h12 * s12, h10 * s02 + f11 * s12 + h12 * s22)
+        _add_row(f_e, g, 2, l, h20 * s00 + h21 * s01 + f22 * s02, h20 * s01 + h21 * s11 + f22 * s12, h20 * s02 + h21 * s12 + f22 * s22)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -172,7 +164,7 @@ def _add_blocks(g, h, h_lam, h_mu, t, M, k_e):
             p += 9
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def internal_force(u, dofs, gradients, w_lam, w_mu, force):
     """Internal force of a batch of elements, added into ``force``.
 
@@ -195,7 +187,7 @@ def internal_force(u, dofs, gradients, w_lam, w_mu, force):
         Stored energy, J, and the smallest det F over all Gauss points.
     """
     u_e, f_e = np.empty(24 * LANES), np.empty(24 * LANES)
-    H, P, S = np.empty(9 * LANES), np.empty(9 * LANES), np.empty(6 * LANES)
+    H, S = np.empty(9 * LANES), np.empty(6 * LANES)
     energy, min_det = np.zeros(LANES), np.full(LANES, np.inf)
     for b in range(dofs.shape[0]):
         for i in range(24):
@@ -203,16 +195,14 @@ def internal_force(u, dofs, gradients, w_lam, w_mu, force):
                 u_e[i * LANES + l] = u[dofs[b, i, l]]
         f_e[:] = 0.0
         for q in range(gradients.shape[1]):
-            _deformation(u_e, gradients[b, q], H)
-            _stress(H, w_lam[b, q], w_mu[b, q], S, P, energy, min_det)
-            _nodal_force(P, gradients[b, q], f_e)
+            _point(u_e, gradients[b, q], w_lam[b, q], w_mu[b, q], H, S, f_e, energy, min_det)
         for i in range(24):
             for l in range(LANES):
                 force[dofs[b, i, l]] += f_e[i * LANES + l]
     return energy.sum(), min_det.min()
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def internal_force_and_tangent(u, dofs, gradients, w_lam, w_mu, slots, force, values):
     """Internal force and tangent stiffness; as `internal_force`, and the upper triangle of K added into ``values``.
 
@@ -225,7 +215,7 @@ def internal_force_and_tangent(u, dofs, gradients, w_lam, w_mu, slots, force, va
         Receives the sum, N/m.
     """
     u_e, f_e, k_e = np.empty(24 * LANES), np.empty(24 * LANES), np.empty(N_UPPER * LANES)
-    H, P, S, M = np.empty(9 * LANES), np.empty(9 * LANES), np.empty(6 * LANES), np.empty(6 * LANES)
+    H, S, M = np.empty(9 * LANES), np.empty(6 * LANES), np.empty(6 * LANES)
     h, h_lam, h_mu, t = np.empty(24 * LANES), np.empty(24 * LANES), np.empty(24 * LANES), np.empty(24 * LANES)
     energy, min_det = np.zeros(LANES), np.full(LANES, np.inf)
     for b in range(dofs.shape[0]):
@@ -236,9 +226,7 @@ def internal_force_and_tangent(u, dofs, gradients, w_lam, w_mu, slots, force, va
         k_e[:] = 0.0
         for q in range(gradients.shape[1]):
             g = gradients[b, q]
-            _deformation(u_e, g, H)
-            _stress(H, w_lam[b, q], w_mu[b, q], S, P, energy, min_det)
-            _nodal_force(P, g, f_e)
+            _point(u_e, g, w_lam[b, q], w_mu[b, q], H, S, f_e, energy, min_det)
             _push_forward(H, S, g, w_lam[b, q], w_mu[b, q], h, h_lam, h_mu, t, M)
             _add_blocks(g, h, h_lam, h_mu, t, M, k_e)
         for i in range(24):

@@ -18,8 +18,8 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from mor_bench.mechanics.assembly import Pattern
 
-MAX_BAND_ENTRIES = 4e7
-"""Entries of a band (0.3 GB) up to which a banded factor of the rest state is kept; multigrid serves larger meshes."""
+MAX_BAND_ENTRIES = 1e8
+"""Entries of a band (0.8 GB) up to which a banded factor of the rest state is kept; multigrid serves larger meshes."""
 CYCLE_TOLERANCE = 1e-12
 """Relative residual of a solve by multigrid."""
 

@@ -55,49 +55,47 @@ def nodal_rotations(u, cell_nodes, centre_gradients, volumes, rotations):
     """
     rotations[:] = 0.0
     n = cell_nodes.shape[1]
-    H, X, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for c in range(len(cell_nodes)):
-        for i in range(3):
-            for j in range(3):
-                h = 1.0 if i == j else 0.0
-                for a in range(n):
-                    h += u[cell_nodes[c, a], i] * centre_gradients[c, a, j]
-                H[i, j] = volumes[c] * h
+        nodes, g, v = cell_nodes[c], centre_gradients[c], volumes[c]
+        h00, h01, h02, h10, h11, h12, h20, h21, h22 = v, 0.0, 0.0, 0.0, v, 0.0, 0.0, 0.0, v
         for a in range(n):
-            node = cell_nodes[c, a]
-            for i in range(3):
-                for j in range(3):
-                    rotations[node, i, j] += H[i, j]
+            x, y, z = u[nodes[a], 0], u[nodes[a], 1], u[nodes[a], 2]
+            g0, g1, g2 = v * g[a, 0], v * g[a, 1], v * g[a, 2]
+            h00, h01, h02 = h00 + x * g0, h01 + x * g1, h02 + x * g2
+            h10, h11, h12 = h10 + y * g0, h11 + y * g1, h12 + y * g2
+            h20, h21, h22 = h20 + z * g0, h21 + z * g1, h22 + z * g2
+        for a in range(n):
+            Q = rotations[nodes[a]]
+            Q[0, 0], Q[0, 1], Q[0, 2] = Q[0, 0] + h00, Q[0, 1] + h01, Q[0, 2] + h02
+            Q[1, 0], Q[1, 1], Q[1, 2] = Q[1, 0] + h10, Q[1, 1] + h11, Q[1, 2] + h12
+            Q[2, 0], Q[2, 1], Q[2, 2] = Q[2, 0] + h20, Q[2, 1] + h21, Q[2, 2] + h22
     for node in range(len(rotations) - 1):
+        Q = rotations[node]
         size = 0.0
         for i in range(3):
             for j in range(3):
-                X[i, j] = rotations[node, i, j]
-                size += X[i, j] * X[i, j]
-        X *= np.sqrt(3.0 / size)
+                size += Q[i, j] * Q[i, j]
+        scale = np.sqrt(3.0 / size)
+        a, b, c = scale * Q[0, 0], scale * Q[0, 1], scale * Q[0, 2]
+        d, e, f = scale * Q[1, 0], scale * Q[1, 1], scale * Q[1, 2]
+        g0, h, i0 = scale * Q[2, 0], scale * Q[2, 1], scale * Q[2, 2]
         for _ in range(8):  # Newton's iteration for the polar factor (Higham): quadratic, from within the basin
-            Y[0, 0] = X[1, 1] * X[2, 2] - X[1, 2] * X[2, 1]
-            Y[0, 1] = X[1, 2] * X[2, 0] - X[1, 0] * X[2, 2]
-            Y[0, 2] = X[1, 0] * X[2, 1] - X[1, 1] * X[2, 0]
-            Y[1, 0] = X[0, 2] * X[2, 1] - X[0, 1] * X[2, 2]
-            Y[1, 1] = X[0, 0] * X[2, 2] - X[0, 2] * X[2, 0]
-            Y[1, 2] = X[0, 1] * X[2, 0] - X[0, 0] * X[2, 1]
-            Y[2, 0] = X[0, 1] * X[1, 2] - X[0, 2] * X[1, 1]
-            Y[2, 1] = X[0, 2] * X[1, 0] - X[0, 0] * X[1, 2]
-            Y[2, 2] = X[0, 0] * X[1, 1] - X[0, 1] * X[1, 0]
-            det = X[0, 0] * Y[0, 0] + X[0, 1] * Y[0, 1] + X[0, 2] * Y[0, 2]
+            ca, cb, cc = e * i0 - f * h, f * g0 - d * i0, d * h - e * g0
+            det = a * ca + b * cb + c * cc
             if not det > 1e-6:  # a collapsed or mirrored neighbourhood: no rotation to speak of
-                X[:] = np.eye(3)
+                a, b, c, d, e, f, g0, h, i0 = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
                 break
-            change = 0.0
-            for i in range(3):
-                for j in range(3):
-                    new = 0.5 * (X[i, j] + Y[i, j] / det)
-                    change += abs(new - X[i, j])
-                    X[i, j] = new
-            if change < 1e-7:
+            r = 0.5 / det
+            cd, ce, cf = c * h - b * i0, a * i0 - c * g0, b * g0 - a * h
+            cg, ch, ci = b * f - c * e, c * d - a * f, a * e - b * d
+            change = abs(r * ca - 0.5 * a) + abs(r * ce - 0.5 * e) + abs(r * ci - 0.5 * i0) + abs(r * cb - 0.5 * b) + abs(r * cf - 0.5 * f)
+            change += abs(r * cc - 0.5 * c) + abs(r * cd - 0.5 * d) + abs(r * cg - 0.5 * g0) + abs(r * ch - 0.5 * h)
+            a, b, c = 0.5 * a + r * ca, 0.5 * b + r * cb, 0.5 * c + r * cc
+            d, e, f = 0.5 * d + r * cd, 0.5 * e + r * ce, 0.5 * f + r * cf
+            g0, h, i0 = 0.5 * g0 + r * cg, 0.5 * h + r * ch, 0.5 * i0 + r * ci
+            if change < 1e-4:  # the next one would change by its square
                 break
-        rotations[node] = X
+        Q[0, 0], Q[0, 1], Q[0, 2], Q[1, 0], Q[1, 1], Q[1, 2], Q[2, 0], Q[2, 1], Q[2, 2] = a, b, c, d, e, f, g0, h, i0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
