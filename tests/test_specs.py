@@ -22,7 +22,10 @@ def test_every_shipped_dataset_is_pinned_to_its_counts() -> None:
         assert check_file(list_suite("datasets")[name]) == f"dataset, {cells} cells, {nodes} nodes, {patches} load patches, {samples} samples"
 
 
-CONFIGURATIONS = {"fem": 4, "hpod": 12, "linear-fem": 1, "pca-regression": 3, "pca-regression-force": 1, "pod": 7, "umesh": 1}
+CONFIGURATIONS = {
+    "fem": 4, "fem-coarse": 4, "fem-warm": 8, "hpod": 12, "linear-fem": 1,
+    "pca-regression": 3, "pca-regression-force": 1, "pod": 7, "umesh": 1,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sorted(list_suite("methods")))
