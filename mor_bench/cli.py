@@ -209,6 +209,35 @@ def generate(
 
 
 @app.command()
+def refine(
+    dataset: Annotated[str, typer.Argument(help="Name or TOML file.")],
+    loads: Annotated[int, typer.Option(help="Samples that are solved, spread over the load patches.")] = 5,
+    levels: Annotated[int, typer.Option(help="Refinements, each with twice the cells per axis of the one before.")] = 2,
+    max_dofs: Annotated[int, typer.Option(help="Meshes with more unknowns are left out.")] = 150_000,
+    cache: Cache = None,
+    suite: Suite = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the record to standard output and the rest to standard error.")] = False,
+) -> None:
+    """Measure the error of a dataset's own mesh on refined ones; later runs show it beside the methods' errors."""
+    with _clear_errors():
+        from mor_bench.harness.discretisation import refine as refine_dataset
+        from mor_bench.specs import load_dataset_spec
+
+        spec = load_dataset_spec(dataset, suite)
+        with _progress(_console(stderr=True)) as listener:
+            record = refine_dataset(
+                spec, loads, levels, max_dofs=max_dofs, cache=cache, suite=suite,
+                progress=lambda done, total: listener.generating(f"{spec.name} on refined meshes", done, total),
+            )  # fmt: skip
+        if as_json:
+            print(json.dumps(record, indent=1, allow_nan=False))
+            return
+        from mor_bench.report.tables import print_discretisation
+
+        print_discretisation(record, _console())
+
+
+@app.command()
 def report(out: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> None:
     """Print the tables of a finished run and draw its figures and report again."""
     with _clear_errors():

@@ -15,6 +15,10 @@ class InvalidInputError(MorBenchError, ValueError):
     """An array has a wrong shape, a wrong dtype, or holds NaN or infinity."""
 
 
+class OutsideMeshError(MorBenchError, ValueError):
+    """A point lies in no cell of a mesh; the message names the point and the mesh's bounds."""
+
+
 class NotFittedError(MorBenchError, RuntimeError):
     """`predict` or `save` was called before `fit`."""
 

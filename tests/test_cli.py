@@ -67,6 +67,16 @@ def test_list_and_check(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
+def test_refine_prints_and_keeps_its_record(tmp_path: Path) -> None:
+    done = mor_bench("refine", "beam-tiny", "--loads", "2", "--levels", "1", "--cache", "c", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (path,) = tmp_path.rglob("discretisation.json")
+    assert json.loads(done.stdout) == json.loads(path.read_text())
+    again = mor_bench("refine", "beam-tiny", "--loads", "2", "--levels", "2", "--max-dofs", "1000", "--cache", "c", cwd=tmp_path)
+    assert "left out for their size: 24 x 8 x 8 cells (6,075 dofs)" in again.stdout
+    assert "discretisation error of beam-tiny: mean e " in again.stdout
+
+
 def test_generate_says_where(tmp_path: Path) -> None:
     done = mor_bench("generate", "beam-tiny", "--limit", "100", "--workers", "1", "--cache", "c", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -80,6 +90,9 @@ def test_generate_says_where(tmp_path: Path) -> None:
         (["run", "beam-tiny", "-m", "pood"], "unknown method 'pood'; did you mean 'pod'?"),
         (["run", "--suite", "nowhere"], "nowhere: a suite must hold a folder"),
         (["report", "nowhere"], "no such file"),
+        (["refine", "beam-tini"], "unknown dataset 'beam-tini'; did you mean 'beam-tiny'?"),
+        (["refine", "beam-tiny", "--levels", "0", "--cache", "."], "`levels` must be an integer in [1, 10]; got 0."),
+        (["refine", "beam-tiny", "--max-dofs", "900", "--cache", "."], "`max_dofs` must be at least 975"),
         (["run", "beam-tiny", "--threads", "100000"], "`threads` must be an integer in [1, "),
     ],
 )

@@ -227,7 +227,9 @@ def test_one_row(tmp_path: Path) -> None:
     made = Comparison(tmp_path, {})
     add_tiny(made)
     add_row(made, "pod", {"n_modes": 5}, 0.005, 1.0, discretisation_error_m=0.0123)
-    assert discretisation_error(entries_of(made, "beam-tiny")) == "1.2e-02 m"
+    assert discretisation_error(entries_of(made, "beam-tiny")).startswith("1.2e-02 m; methods' errors below it")
+    made.rows[0]["discretisation_rel_l2"] = 0.205
+    assert discretisation_error(entries_of(made, "beam-tiny")).startswith("1.2e-02 m, relative L2 (median) 20.5 %; ")
     assert "1.2e-02 m" in console_text(made)
     assert len(render(made)) == 5
 

@@ -83,8 +83,9 @@ class Comparison:
     rows : list of dict
         One per fitted configuration, in the order in which they ran: `dataset`, `split`, `method`, `label`,
         `parameters`, `status` (`ok`, `failed` or `skipped`), `reason`, `n_train`, `n_test`, `n_failed` (test samples
-        without a prediction), `threads`, `error`, `latency_ms`, `offline_s`, `model_bytes`, `discretisation_error_m`,
-        `warnings`.
+        without a prediction), `threads`, `error`, `latency_ms`, `offline_s`, `model_bytes`, `warnings`; and of the
+        dataset's own mesh against the limit of fine ones `discretisation_error_m` (mean e) and `discretisation_rel_l2`
+        (median), None where not measured.
     datasets : dict
         For each dataset its spec, as in its file.
     settings : dict

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mor_bench import __version__
 from mor_bench.errors import InvalidInputError, MissingDependencyError, MorBenchError, SolverError
+from mor_bench.harness.discretisation import measured
 from mor_bench.harness.metrics import SampleErrors, sample_errors, summary
 from mor_bench.harness.results import Comparison, label_of
 from mor_bench.harness.timing import describe_machine, latency_summary, measure_latency, pinned_threads
@@ -185,7 +186,8 @@ def run(
     """Compare methods on datasets.
 
     Every specification is checked before anything runs. Rows are written as they finish; the same run into the same
-    folder keeps the rows that are there and goes on.
+    folder keeps the rows that are there and goes on. The discretisation error of a dataset's mesh is read from the record
+    that `mor_bench.harness.discretisation.refine` left, and is not measured here.
 
     Parameters
     ----------
@@ -214,6 +216,8 @@ def run(
         If a dataset, a method or a parameter is not valid.
     InvalidInputError
         If an argument is out of range, or ``out`` cannot be written or holds another run.
+    StoreError
+        If the record of a discretisation error is damaged.
     """
     cores = os.cpu_count() or 1
     if profile not in ("quick", "full"):
@@ -223,9 +227,12 @@ def run(
     if not datasets or not methods:
         raise InvalidInputError("`datasets` and `methods` must name at least one each.")
     specs, method_specs = _checked_specs(datasets, methods, suite)
+    discretisation = {spec.name: _discretisation(spec, cache, suite) for spec in specs}
     jobs = _jobs(method_specs, profile)
     settings = {"profile": profile, "split": split, "limit": limit, "threads": threads, "version": __version__}
     comparison = _open_run(Path(out) if out else _default_out([spec.name for spec in specs]), specs, settings)
+    comparison.rows = [{**row, **discretisation[row["dataset"]]} for row in comparison.rows]
+    comparison.write()
     for number, (spec, job) in enumerate((spec, job) for spec in specs for job in jobs):
         if number % len(jobs) == 0:
             data = _open(spec, comparison, listener, limit=limit, split=split, workers=workers, cache=cache)
@@ -250,12 +257,18 @@ def run(
             "latency_ms": None,
             "offline_s": None,
             "model_bytes": None,
-            "discretisation_error_m": None,
+            **discretisation[spec.name],
             **outcome,
         }
         comparison.add(row, samples)
         listener.finished(row)
     return comparison
+
+
+def _discretisation(spec: DatasetSpec, cache: Path | None, suite: Path | None) -> dict[str, float | None]:
+    """The part of every row that says how far the dataset's mesh is from the body; None where it was not measured."""
+    record = measured(spec, cache, suite) or {}
+    return {"discretisation_error_m": record.get("error_m"), "discretisation_rel_l2": record.get("relative_l2_median")}
 
 
 def _checked_specs(

@@ -15,6 +15,9 @@ SHORT_NAMES = {"n_modes": "r", "tolerance": "tol", "cubature_tolerance": "ctol",
 """How a swept parameter is called where space is short; others go by the initials of their words."""
 
 
+OF_THE_MESH = "methods' errors below it are errors against this mesh, not against the body"
+
+
 @dataclass(frozen=True)
 class Entry:
     """A row of the results, with what was concluded about it.
@@ -127,10 +130,13 @@ def best_per_method(entries: Sequence[Entry]) -> list[Entry]:
 
 
 def discretisation_error(entries: Sequence[Entry]) -> str:
-    """The scene's own discretisation error, as text."""
-    measured = [entry.row.get("discretisation_error_m") for entry in entries]
-    found = next((value for value in measured if value is not None), None)
-    return "not measured" if found is None else f"{metres(float(found))} m"
+    """The scene's own discretisation error, as text, and what it means for the errors beside it."""
+    found = next((entry.row for entry in entries if entry.row.get("discretisation_error_m") is not None), None)
+    if found is None:
+        return "not measured"
+    relative = found.get("discretisation_rel_l2")
+    beside = "" if relative is None else f", relative L2 (median) {percent(float(relative))} %"
+    return f"{metres(float(found['discretisation_error_m']))} m{beside}; {OF_THE_MESH}"
 
 
 def headline(comparison: Comparison, dataset: str) -> str:

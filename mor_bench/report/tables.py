@@ -213,3 +213,32 @@ def print_tables(comparison: Comparison, console: Console | None = None) -> None
     encoding = console.encoding or "utf-8"  # a redirected stream of a legacy code page must not end a long run with an error
     console.file.write(captured.get().encode(encoding, "replace").decode(encoding))
     console.file.flush()
+
+
+def print_discretisation(record: dict[str, Any], console: Console | None = None) -> None:
+    """Print the record of `mor_bench.harness.discretisation.refine`: a row per load, the means, the meshes.
+
+    Parameters
+    ----------
+    record : dict
+    console : rich.console.Console, optional
+        Standard output by default.
+    """
+    console = console or Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+    table = Table(box=SIMPLE_HEAD, padding=0, show_edge=False)
+    for heading in ("sample", "patch", "force\nN", "e\nm", "rel L2\n%", "order", "limit"):
+        table.add_column(heading, justify="right")
+    for load in record["loads"]:
+        force = number(sum(component**2 for component in load["vector_n"]) ** 0.5)
+        figures = (metres(load["error_m"]), percent(load["relative_l2"]), number(load["order"]), load["limit"])
+        table.add_row(str(load["sample"]), str(load["patch"]), force, *figures)
+    console.print(table, highlight=False)
+    for load in record["loads"]:
+        if load["error_m"] is None:
+            console.print(Text(f"sample {load['sample']} is in no mean: {load['reason']}", style="red"))
+    for kind, meshes in (("meshes", record["meshes"]), ("left out for their size", record["left_out"])):
+        if meshes:
+            shown = ", ".join(f"{' x '.join(map(str, mesh['cells']))} cells ({mesh['n_dofs']:,} dofs)" for mesh in meshes)
+            console.print(Text(f"{kind}: {shown}"))
+    mean = f"mean e {metres(record['error_m'])} m, relative L2 {percent(record['relative_l2'])} % (median {percent(record['relative_l2_median'])} %)"
+    console.print(Text(f"discretisation error of {record['dataset']}: {mean}", style="bold"))

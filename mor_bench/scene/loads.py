@@ -52,6 +52,47 @@ def _surface_points(mesh: Mesh, facets: NDArray[np.int64], spacing: float) -> tu
     return positions.reshape(-1, 3), areas.ravel(), values
 
 
+def patch_shares(
+    mesh: Mesh, centres: NDArray[np.int64], facets: NDArray[np.int64], area_m2: float
+) -> tuple[sp.csr_array, NDArray[np.float64], sp.csr_array]:  # fmt: skip
+    """Points on the surface, and the area of each that belongs to the patches around some nodes; see `patch_weights`.
+
+    Returns
+    -------
+    areas : (n_patches, n_points) sparse float64
+        m²; rows sum to the patch's area up to round-off.
+    points : (n_points, 3) float64
+        Positions, m.
+    values : (n_points, n_nodes) sparse float64
+        Shape functions of the mesh at the points.
+
+    Raises
+    ------
+    SpecError
+        If there is no facet, or the facets are smaller than one patch.
+    """
+    if len(facets) == 0:
+        raise SpecError("the load region holds nodes but no facet of the surface, so no traction can act on it.")
+    positions, areas, values = _surface_points(mesh, facets, sqrt(area_m2 / POINTS_PER_PATCH))
+    if area_m2 > areas.sum() * (1 + 1e-12):
+        raise SpecError(f"`patch_area_m2` must be in (0, {areas.sum():.6g}], the area of the load region; got {area_m2}.")
+    nearness = sqrt(area_m2) * 1e-9
+    shares = sp.lil_array((len(centres), len(areas)))
+    for row, node in enumerate(centres):
+        distance = np.round(np.linalg.norm(positions - mesh.points[node], axis=1) / nearness)
+        order = np.argsort(distance, kind="stable")
+        # Points at the same distance enter together, each with the same fraction, so that a symmetric patch stays so.
+        ends = np.flatnonzero(np.append(np.diff(distance[order]) > 0, True))
+        filled = np.cumsum(areas[order])[ends]
+        last = min(int(np.searchsorted(filled, area_m2)), len(ends) - 1)
+        first_of_last = ends[last - 1] + 1 if last else 0
+        before = filled[last - 1] if last else 0.0
+        whole, partial = order[:first_of_last], order[first_of_last : ends[last] + 1]
+        shares[row, whole] = areas[whole]
+        shares[row, partial] = areas[partial] * (area_m2 - before) / (filled[last] - before)
+    return shares.tocsr(), positions, values
+
+
 def patch_weights(mesh: Mesh, centres: NDArray[np.int64], facets: NDArray[np.int64], area_m2: float) -> sp.csr_array:
     """Nodal weights of the patches around some nodes.
 
@@ -79,24 +120,6 @@ def patch_weights(mesh: Mesh, centres: NDArray[np.int64], facets: NDArray[np.int
     SpecError
         If there is no facet, or the facets are smaller than one patch.
     """
-    if len(facets) == 0:
-        raise SpecError("the load region holds nodes but no facet of the surface, so no traction can act on it.")
-    positions, areas, values = _surface_points(mesh, facets, sqrt(area_m2 / POINTS_PER_PATCH))
-    if area_m2 > areas.sum() * (1 + 1e-12):
-        raise SpecError(f"`patch_area_m2` must be in (0, {areas.sum():.6g}], the area of the load region; got {area_m2}.")
-    nearness = sqrt(area_m2) * 1e-9
-    shares = sp.lil_array((len(centres), len(areas)))
-    for row, node in enumerate(centres):
-        distance = np.round(np.linalg.norm(positions - mesh.points[node], axis=1) / nearness)
-        order = np.argsort(distance, kind="stable")
-        # Points at the same distance enter together, each with the same fraction, so that a symmetric patch stays so.
-        ends = np.flatnonzero(np.append(np.diff(distance[order]) > 0, True))
-        filled = np.cumsum(areas[order])[ends]
-        last = min(int(np.searchsorted(filled, area_m2)), len(ends) - 1)
-        first_of_last = ends[last - 1] + 1 if last else 0
-        before = filled[last - 1] if last else 0.0
-        whole, partial = order[:first_of_last], order[first_of_last : ends[last] + 1]
-        shares[row, whole] = areas[whole]
-        shares[row, partial] = areas[partial] * (area_m2 - before) / (filled[last] - before)
-    weights = sp.csr_array(shares.tocsr() @ values)
+    areas, _, values = patch_shares(mesh, centres, facets, area_m2)
+    weights = sp.csr_array(areas @ values)
     return sp.csr_array(weights.multiply(1.0 / weights.sum(axis=1)[:, None]))

@@ -12,8 +12,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mor_bench.errors import SpecError
-from mor_bench.scene.loads import patch_weights
+from mor_bench.errors import SpecError, UnsupportedSceneError
+from mor_bench.scene.loads import patch_shares, patch_weights
 from mor_bench.scene.materials import Material, make_material
 from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.regions import region_facets, region_nodes
@@ -59,6 +59,27 @@ class Scene:
         """(n_patches,) the node at the centre of each load patch; the patch's number is the load-region id."""
         return region_nodes(self.mesh, self.spec.loads.region)
 
+    def patch_points(self, patches: NDArray[np.int64]) -> tuple[NDArray[np.float64], sp.csr_array]:
+        """The traction of some load patches as forces at points of the surface, which is the same on every mesh of the body.
+
+        Parameters
+        ----------
+        patches : (n,) int
+            Numbers of patches.
+
+        Returns
+        -------
+        points : (n_points, 3) float64
+            Positions, m.
+        shares : (n, n_points) sparse float64
+            Share of the patch's force at each point; rows sum to 1.
+        """
+        facets = region_facets(self.mesh, self.patch_nodes)
+        areas, points, _ = patch_shares(self.mesh, self.patch_nodes[patches], facets, self.spec.loads.patch_area_m2)
+        used = np.unique(areas.indices)
+        shares = areas[:, used]
+        return points[used], sp.csr_array(shares.multiply(1.0 / shares.sum(axis=1)[:, None]))
+
     @cached_property
     def patch_weights(self) -> sp.csr_array:
         """(n_patches, n_nodes) nodal weights of a force on each patch; rows sum to 1."""
@@ -81,12 +102,40 @@ def load_scene(source: str | Path | Mapping[str, Any] | DatasetSpec) -> Scene:
         raise SpecError(f"{spec.name}: {error}") from None
 
 
-def _build(spec: DatasetSpec) -> Scene:
+def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
+    """The same body and supports on another mesh; its load patches are not looked at, and may not exist.
+
+    Parameters
+    ----------
+    scene : Scene
+        Of a box.
+    cells : three ints
+        Cells per axis.
+
+    Raises
+    ------
+    UnsupportedSceneError
+        If the scene is not a box, or has no such mesh.
+    """
+    geometry = scene.spec.geometry
+    if geometry.shape != "box":
+        raise UnsupportedSceneError(f"{scene.name}: only the mesh of a box can be made finer or coarser; got `geometry.shape` {geometry.shape!r}.")
+    try:
+        return _without_patches(scene.spec.model_copy(update={"geometry": geometry.model_copy(update={"cells": cells})}))
+    except SpecError as error:
+        raise UnsupportedSceneError(f"{scene.name} with {' x '.join(map(str, cells))} cells: {error}") from None
+
+
+def _without_patches(spec: DatasetSpec) -> Scene:
     mesh = box_mesh(spec.geometry.size_m, spec.geometry.cells, spec.discretisation.element == "tetrahedron")
     material = make_material(spec.material)
     fixed = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(region_nodes(mesh, support.region) for support in spec.supports)]))
     if len(fixed) == mesh.n_nodes:
         raise SpecError("the supports fix every node of the mesh: nothing can move.")
-    scene = Scene(spec, mesh, material, fixed)
+    return Scene(spec, mesh, material, fixed)
+
+
+def _build(spec: DatasetSpec) -> Scene:
+    scene = _without_patches(spec)
     _ = scene.patch_weights  # an empty load region is an error of the dataset: raised here, not at the first solve
     return scene

@@ -1,0 +1,290 @@
+"""Other meshes of the same body: interpolation between them, coarse and warm-started FEM, the discretisation error."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mor_bench
+from mor_bench.errors import InvalidInputError, OutsideMeshError, SpecError, StoreError, UnsupportedSceneError
+from mor_bench.harness.discretisation import chosen_samples, limit_of, measured, refine
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.report.html import render
+from mor_bench.scene.interpolation import interpolation_matrix
+from mor_bench.scene.mesh import Mesh, box_mesh
+from mor_bench.scene.scene import Scene, load_scene, with_cells
+from mor_bench.snapshots.dataset import Dataset
+from mor_bench.specs import DatasetSpec, load_dataset_spec
+
+SHIPPED = ("beam-coarse", "beam-tiny")
+
+
+def distorted(tetrahedra: bool) -> Mesh:
+    """A graded, sheared and bent box: no cell is a parallelepiped."""
+    mesh = box_mesh((2.0, 1.0, 1.0), (7, 3, 4), tetrahedra)
+    x, y, z = mesh.points.T
+    return replace(mesh, points=np.stack([x**2 + 0.2 * y * z, y + 0.1 * x * z, z + 0.15 * x * y], axis=1))
+
+
+@pytest.mark.parametrize("tetrahedra", [False, True])
+def test_interpolation_reproduces_linear_fields_and_the_nodes(tetrahedra: bool) -> None:
+    mesh = distorted(tetrahedra)
+    generator = np.random.default_rng(0)
+    shares = generator.dirichlet(np.ones(mesh.cells.shape[1]), size=500)
+    corners = mesh.points[mesh.cells[generator.integers(mesh.n_cells, size=500)]]
+    if not tetrahedra:  # a convex combination of a bent hexahedron's corners may lie outside it
+        corners = corners.mean(axis=1, keepdims=True) + 0.5 * (corners - corners.mean(axis=1, keepdims=True))
+    points = np.einsum("na,nai->ni", shares, corners)
+    matrix = interpolation_matrix(mesh, points)
+    np.testing.assert_allclose(matrix.sum(axis=1), 1, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(matrix @ mesh.points, points, rtol=0, atol=1e-12)
+    assert matrix.toarray().min() > -1e-9
+    np.testing.assert_allclose(interpolation_matrix(mesh, mesh.points).toarray(), np.eye(mesh.n_nodes), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("tetrahedra", [False, True])
+def test_points_outside_are_refused_and_those_outside_by_round_off_are_not(tetrahedra: bool) -> None:
+    mesh = box_mesh((2.0, 1.0, 1.0), (4, 2, 2), tetrahedra)
+    surface = mesh.points[np.unique(mesh.boundary_facets)]
+    outwards = np.sign(surface - np.array([1.0, 0.5, 0.5]))
+    interpolation_matrix(mesh, surface + 1e-13 * outwards)
+    with pytest.raises(OutsideMeshError, match=r"a point lies outside the mesh, .* the first is \[2.0, 0.5, 1.01\] m"):
+        interpolation_matrix(mesh, np.array([[1.0, 0.5, 0.5], [2.0, 0.5, 1.01]]))
+    with pytest.raises(OutsideMeshError, match="63 points lie outside"):
+        interpolation_matrix(mesh, box_mesh((2.0, 1.0, 1.0), (6, 2, 2)).points + 10.0)
+
+
+def with_element(name: str, element: str) -> Scene:
+    spec = load_dataset_spec(name)
+    return load_scene(spec.model_copy(update={"discretisation": spec.discretisation.model_copy(update={"element": element})}))
+
+
+@pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
+def test_forces_keep_their_sum_and_moment_on_the_coarse_mesh(element: str) -> None:
+    scene = with_element("beam-coarse", element)
+    method = mor_bench.load_method("fem-coarse", coarsening=2).fit(scene, None)
+    coarse = method.model_.scene.mesh  # type: ignore[attr-defined]
+    assert coarse.grid_shape == (9, 3, 3)
+    forces = np.random.default_rng(1).normal(size=(scene.mesh.n_nodes, 3))
+    carried = method.interpolation_.T @ forces  # type: ignore[attr-defined]
+    np.testing.assert_allclose(carried.sum(axis=0), forces.sum(axis=0), rtol=0, atol=1e-12 * np.abs(forces).sum())
+    moments = np.cross(scene.mesh.points, forces).sum(axis=0), np.cross(coarse.points, carried).sum(axis=0)
+    np.testing.assert_allclose(*moments, rtol=0, atol=1e-12 * np.abs(np.cross(scene.mesh.points, forces)).sum())
+
+
+def test_coarse_fem_is_the_coarse_model_where_the_meshes_share_nodes(tiny: Dataset) -> None:
+    method = mor_bench.load_method("fem-coarse", coarsening=2, tolerance=1e-10).fit(tiny.scene, None)
+    mesh = with_cells(tiny.scene, (3, 1, 1))
+    force = np.zeros((mesh.mesh.n_nodes, 3))
+    force[-1] = [0.0, 0.1, -0.5]
+    at = np.array([int(np.linalg.norm(tiny.scene.mesh.points - x, axis=1).argmin()) for x in mesh.mesh.points])
+    fine = np.zeros((tiny.scene.mesh.n_nodes, 3))
+    fine[at] = force
+    expected = np.zeros(mesh.mesh.n_dofs)
+    expected[mesh.free_dofs] = FullOrderModel(mesh).solve(force.ravel()[mesh.free_dofs]).displacement
+    np.testing.assert_allclose(method.predict(fine)[at], expected.reshape(-1, 3), rtol=0, atol=1e-9)
+
+
+def box(**changes: Any) -> Scene:
+    content = {**load_dataset_spec("beam-tiny").model_dump(mode="json"), **changes}
+    return load_scene(content)
+
+
+def test_scenes_without_a_coarser_mesh_are_refused_with_the_reason() -> None:
+    one = box(geometry={"shape": "box", "size_m": [2.0, 1.0, 1.0], "cells": [1, 1, 1]})
+    held = box(supports=[{"region": {"box_m": [[0.3, 0.0, 0.0], [0.4, 1.0, 1.0]]}}])
+    method = mor_bench.load_method("fem-coarse")
+    for scene, reason in ((one, "one cell cannot be made coarser"), (held, "holds no node"), (not_a_box(held), "only the mesh of a box")):
+        assert reason in (method.supports(scene) or "")
+        with pytest.raises(UnsupportedSceneError, match=reason):
+            method.fit(scene, None)
+
+
+def not_a_box(scene: Scene) -> Scene:
+    return replace(scene, spec=scene.spec.model_copy(update={"geometry": scene.spec.geometry.model_copy(update={"shape": "shell"})}))
+
+
+@pytest.mark.parametrize("start", ["nearest", "previous"])
+def test_warm_starts_end_at_the_equilibrium_of_the_full_order_model(tiny: Dataset, start: str) -> None:
+    method = mor_bench.load_method("fem-warm", start=start, tolerance=1e-8).fit(tiny.scene, tiny.train)
+    predicted = method.predict(tiny.test.forces)
+    backwards = method.predict(tiny.test.forces[::-1])[::-1]
+    for found in (predicted, backwards):
+        scale = np.linalg.norm(tiny.test.displacements, axis=(1, 2))
+        assert (np.linalg.norm(found - tiny.test.displacements, axis=(1, 2)) <= 1e-6 * scale).all()
+    if start == "nearest":
+        np.testing.assert_array_equal(predicted, backwards)
+
+
+@pytest.mark.parametrize(("start", "needed"), [("nearest", True), ("previous", False)])
+def test_a_known_solution_is_found_again_without_a_step(tiny: Dataset, start: str, needed: bool) -> None:
+    method = mor_bench.load_method("fem-warm", start=start, tolerance=1e-6)
+    assert method.needs_snapshots is needed
+    method.fit(tiny.scene, tiny.train if needed else None)
+    iterations = []
+    solve = method.model_.solve  # type: ignore[attr-defined]
+
+    def counted(*arguments: Any) -> Any:
+        solution = solve(*arguments)
+        iterations.append(solution.iterations)
+        return solution
+
+    method.model_.solve = counted  # type: ignore[attr-defined]
+    for _ in range(2):
+        method.predict(tiny.train.forces[5])
+    assert iterations[1] == 1
+    assert (iterations[0] == 1) == needed
+
+
+def test_the_limit_of_a_series_with_a_known_order() -> None:
+    exact, error = np.random.default_rng(2).normal(size=(2, 5, 3))
+    for order in (1.0, 1.6, 2.0):
+        found, seen, kind = limit_of([exact + error * 2.0 ** (-order * level) for level in range(3)])
+        np.testing.assert_allclose(found, exact, rtol=0, atol=1e-12)
+        assert seen == pytest.approx(order)
+        assert kind == "extrapolated"
+    for insane in (0.1, 5.0, -1.0):
+        series = [exact + error * 2.0 ** (-insane * level) for level in range(3)]
+        assert limit_of(series)[2] == "finest"
+        np.testing.assert_array_equal(limit_of(series)[0], series[-1])
+    assert limit_of([exact, exact + error])[1:] == (None, "finest")
+    assert limit_of([exact, exact, exact])[1:] == (None, "finest")
+
+
+def tip_deflection(scene: Scene, cells: tuple[int, int, int]) -> np.ndarray[Any, Any]:
+    """Mean deflection of the tip face, m, as an array of one, under 1 N spread evenly over it."""
+    mesh = with_cells(scene, cells)
+    points = mesh.mesh.points
+    tip = np.flatnonzero(points[:, 0] == points[:, 0].max())
+    inner = (points[tip, 1:] > 1e-9) & (points[tip, 1:] < 1 - 1e-9)
+    weights = np.where(inner, 1.0, 0.5).prod(axis=1)
+    load = np.zeros((mesh.mesh.n_nodes, 3))
+    load[tip, 2] = -weights / weights.sum()
+    displacement = np.zeros(mesh.mesh.n_dofs)
+    displacement[mesh.free_dofs] = FullOrderModel(mesh).solve(load.ravel()[mesh.free_dofs]).displacement
+    return np.array([-weights @ displacement.reshape(-1, 3)[tip, 2] / weights.sum()])
+
+
+def test_the_tip_of_the_coarse_beam_tends_to_its_independent_limit() -> None:
+    """An independent study gives 0.417 m on 8 x 2 x 2 cells and 0.518 m in the limit."""
+    scene = load_scene("beam-coarse")
+    assert tip_deflection(scene, (8, 2, 2))[0] == pytest.approx(0.417, rel=2e-3)
+    limit, order, kind = limit_of([tip_deflection(scene, (15 * k, 3 * k, 3 * k)) for k in (1, 2, 4)])
+    assert kind == "extrapolated"
+    assert order is not None
+    assert limit[0] == pytest.approx(0.518, rel=0.02)
+
+
+@pytest.mark.parametrize("changes", [{}, {"element": "tetrahedron"}, {"integration": "selective"}])
+def test_every_mesh_carries_the_same_force_and_moment(changes: dict[str, str]) -> None:
+    scene = box(discretisation=changes)
+    patches = np.array([0, 10, 20])
+    points, shares = scene.patch_points(patches)
+    for factor in (1, 2, 3):
+        mesh = with_cells(scene, (6 * factor, 2 * factor, 2 * factor)).mesh
+        weights = shares @ interpolation_matrix(mesh, points)
+        np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(weights @ mesh.points, shares @ points, rtol=0, atol=1e-12)
+        if factor == 1:
+            np.testing.assert_allclose(weights.toarray(), scene.patch_weights[patches].toarray(), rtol=0, atol=1e-12)
+
+
+def test_samples_are_those_of_the_dataset_and_spread_over_its_patches(tiny: Dataset) -> None:
+    samples = chosen_samples(tiny.scene.spec, 21, 7)
+    assert (samples % 21 // 3 == np.arange(7)).all()
+    assert samples.max() < 210
+    np.testing.assert_array_equal(samples, chosen_samples(tiny.scene.spec, 21, 7))
+
+
+@pytest.fixture(scope="module")
+def changed() -> DatasetSpec:
+    """beam-tiny with another stiffness: its physics has no shipped record."""
+    spec = load_dataset_spec("beam-tiny")
+    return spec.model_copy(update={"material": spec.material.model_copy(update={"young_pa": 600.0})})
+
+
+@pytest.mark.parametrize("discretisation", [{}, {"element": "tetrahedron"}, {"integration": "selective"}])
+def test_refinement_of_every_element(discretisation: dict[str, str], tmp_path: Path) -> None:
+    record = refine(box(discretisation=discretisation).spec, 2, 1, cache=tmp_path)
+    assert [mesh["cells"] for mesh in record["meshes"]] == [[6, 2, 2], [12, 4, 4]]
+    assert {load["limit"] for load in record["loads"]} == {"finest"}
+    assert 0.02 < record["relative_l2"] < 0.7
+
+
+def test_a_record_holds_what_it_is_made_of_and_serves_only_its_physics(changed: DatasetSpec, tmp_path: Path) -> None:
+    assert measured(changed, tmp_path) is None
+    record = refine(changed, 3, 3, max_dofs=7000, cache=tmp_path)
+    assert [mesh["n_dofs"] for mesh in record["meshes"]] == [189, 975, 6075]
+    assert [mesh["n_dofs"] for mesh in record["left_out"]] == [42483]
+    assert record["error_m"] == pytest.approx(np.mean([load["error_m"] for load in record["loads"]]))
+    assert record["relative_l2_median"] == pytest.approx(np.median([load["relative_l2"] for load in record["loads"]]))
+    assert record["command"].endswith("beam-tiny --loads 3 --levels 3 --max-dofs 7000")
+    assert measured(changed, tmp_path) == json.loads(json.dumps(record))
+    stiffer = changed.model_copy(update={"material": changed.material.model_copy(update={"young_pa": 601.0})})
+    assert measured(stiffer, tmp_path) is None
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_records_belong_to_the_shipped_datasets(name: str, tmp_path: Path) -> None:
+    spec = load_dataset_spec(name)
+    record = measured(spec, tmp_path)
+    assert record is not None
+    assert record["digest"] == spec.digest()
+    assert record["command"].startswith(f"mor-bench refine {name} ")
+
+
+def test_the_measured_error_arrives_in_every_row_and_page(cache: Path, tmp_path: Path) -> None:
+    spec = load_dataset_spec("beam-tiny")
+    record = measured(spec, tmp_path)
+    assert record is not None
+    run = mor_bench.run(["beam-tiny"], ["linear-fem", "fem-coarse"], out=tmp_path / "out", cache=cache)
+    assert {row["discretisation_error_m"] for row in run.rows} == {record["error_m"]}
+    assert {row["discretisation_rel_l2"] for row in run.rows} == {record["relative_l2_median"]}
+    stored = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
+    assert {row["discretisation_error_m"] for row in stored} == {record["error_m"]}
+    assert (run.table["discretisation_error_m"] == record["error_m"]).all()
+    assert str(record["error_m"]) in (tmp_path / "out" / "results.csv").read_text()
+    page = render(run)[-1].read_text(encoding="utf-8")
+    assert page.count(f"<td>{record['error_m']:.1e}</td>") >= len(run.rows)
+    assert "not against the body" in page
+
+
+def test_a_changed_dataset_shows_none_until_it_is_measured(changed: DatasetSpec, tmp_path: Path) -> None:
+    content = changed.model_dump(mode="json")
+    arguments: dict[str, Any] = {"methods": ["linear-fem"], "cache": tmp_path / "cache", "workers": 1, "out": tmp_path / "out"}
+    assert mor_bench.run([content], **arguments).rows[0]["discretisation_error_m"] is None
+    record = refine(content, 2, 1, cache=tmp_path / "cache")
+    assert [row["discretisation_error_m"] for row in mor_bench.run([content], **arguments).rows] == [record["error_m"]]
+    assert [row["discretisation_error_m"] for row in mor_bench.Comparison.read(tmp_path / "out").rows] == [record["error_m"]]
+
+
+@pytest.mark.parametrize("damage", ["", "{}", '{"format": "mor-bench discretisation error", "schema_version": 1, "digest": "x", "error_m": "nan"}'])
+def test_a_damaged_record_is_named(changed: DatasetSpec, tmp_path: Path, damage: str) -> None:
+    refine(changed, 1, 1, cache=tmp_path)
+    path = next(tmp_path.rglob("discretisation.json"))
+    path.write_text(damage)
+    with pytest.raises(StoreError, match=r"discretisation\.json: damaged"):
+        measured(changed, tmp_path)
+
+
+def test_bad_arguments_are_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for arguments, message in (
+        ({"levels": 0}, r"`levels` must be an integer in \[1, 10\]; got 0\."),
+        ({"n_loads": 0}, r"`loads` must be an integer in \[1, 21\], the load patches of beam-tiny; got 0\."),
+        ({"n_loads": 22}, r"got 22\."),
+        ({"max_dofs": 974}, r"`max_dofs` must be at least 975, the unknowns of the first refinement of beam-tiny; got 974\."),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            refine("beam-tiny", cache=tmp_path, **arguments)  # type: ignore[arg-type]
+    with pytest.raises(SpecError, match="unknown dataset 'beam-tini'; did you mean 'beam-tiny'"):
+        refine("beam-tini", cache=tmp_path)
+    scene = not_a_box(load_scene("beam-tiny"))
+    monkeypatch.setattr("mor_bench.harness.discretisation.load_scene", lambda spec: scene)
+    with pytest.raises(UnsupportedSceneError, match=r"only the mesh of a box can be made finer or coarser; got `geometry.shape` 'shell'"):
+        refine("beam-tiny", cache=tmp_path)
+    assert not list(tmp_path.iterdir())
