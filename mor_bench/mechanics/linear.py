@@ -45,66 +45,73 @@ class LinearSolver(Protocol):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
-def banded_solve(band, x):
-    """Solve L Lᵀ x = x in place; band (n, bandwidth + 1) float32 holds the columns of L, diagonals inverted.
+def banded_solve(band, right_hand_sides):
+    """Solve L Lᵀ x = x in place for every row x of (m, n); band (n, bandwidth + 1) holds the columns of L, diagonals inverted.
 
-    Four columns at once, so that x is loaded and stored once for four multiply-adds.
+    Four columns at once, so that x is loaded and stored once for four multiply-adds; they serve every right-hand side
+    before the next four are fetched.
     """
     n, width = band.shape
     zero = np.float32(0.0)
     whole = n - n % 4
     for j in range(0, whole, 4):
         a, b, c, d = band[j], band[j + 1], band[j + 2], band[j + 3]
-        x0 = x[j] * a[0]
-        x1 = (x[j + 1] - a[1] * x0) * b[0]
-        x2 = (x[j + 2] - a[2] * x0 - b[1] * x1) * c[0]
-        x3 = (x[j + 3] - a[3] * x0 - b[2] * x1 - c[1] * x2) * d[0]
-        x[j], x[j + 1], x[j + 2], x[j + 3] = x0, x1, x2, x3
         last = min(width - 4, n - j - 4)
-        tail = x[j + 4 : j + 4 + last]
         a4, b4, c4, d4 = a[4 : 4 + last], b[3 : 3 + last], c[2 : 2 + last], d[1 : 1 + last]
-        for k in range(last):
-            tail[k] -= a4[k] * x0 + b4[k] * x1 + c4[k] * x2 + d4[k] * x3
-        for k in range(last, min(width - 1, n - j - 4)):  # the ends of b, c, d reach beyond that of a
-            at = x[j + 4 + k]
-            if k + 3 < width:
-                at -= b[k + 3] * x1
-            if k + 2 < width:
-                at -= c[k + 2] * x2
-            at -= d[k + 1] * x3
-            x[j + 4 + k] = at
-    for j in range(whole, n):
-        x[j] *= band[j, 0]
-        for k in range(1, n - j):
-            x[j + k] -= band[j, k] * x[j]
-    for j in range(n - 1, whole - 1, -1):
-        s = x[j]
-        for k in range(1, n - j):
-            s -= band[j, k] * x[j + k]
-        x[j] = s * band[j, 0]
+        for r in range(len(right_hand_sides)):
+            x = right_hand_sides[r]
+            x0 = x[j] * a[0]
+            x1 = (x[j + 1] - a[1] * x0) * b[0]
+            x2 = (x[j + 2] - a[2] * x0 - b[1] * x1) * c[0]
+            x3 = (x[j + 3] - a[3] * x0 - b[2] * x1 - c[1] * x2) * d[0]
+            x[j], x[j + 1], x[j + 2], x[j + 3] = x0, x1, x2, x3
+            tail = x[j + 4 : j + 4 + last]
+            for k in range(last):
+                tail[k] -= a4[k] * x0 + b4[k] * x1 + c4[k] * x2 + d4[k] * x3
+            for k in range(last, min(width - 1, n - j - 4)):  # the ends of b, c, d reach beyond that of a
+                at = x[j + 4 + k]
+                if k + 3 < width:
+                    at -= b[k + 3] * x1
+                if k + 2 < width:
+                    at -= c[k + 2] * x2
+                at -= d[k + 1] * x3
+                x[j + 4 + k] = at
+    for r in range(len(right_hand_sides)):
+        x = right_hand_sides[r]
+        for j in range(whole, n):
+            x[j] *= band[j, 0]
+            for k in range(1, n - j):
+                x[j + k] -= band[j, k] * x[j]
+        for j in range(n - 1, whole - 1, -1):
+            s = x[j]
+            for k in range(1, n - j):
+                s -= band[j, k] * x[j + k]
+            x[j] = s * band[j, 0]
     for j in range(whole - 4, -1, -4):
         a, b, c, d = band[j], band[j + 1], band[j + 2], band[j + 3]
         last = min(width - 4, n - j - 4)
-        tail = x[j + 4 : j + 4 + last]
         a4, b4, c4, d4 = a[4 : 4 + last], b[3 : 3 + last], c[2 : 2 + last], d[1 : 1 + last]
-        s0, s1, s2, s3 = zero, zero, zero, zero
-        for k in range(last):
-            s0 += a4[k] * tail[k]
-            s1 += b4[k] * tail[k]
-            s2 += c4[k] * tail[k]
-            s3 += d4[k] * tail[k]
-        for k in range(last, min(width - 1, n - j - 4)):
-            at = x[j + 4 + k]
-            if k + 3 < width:
-                s1 += b[k + 3] * at
-            if k + 2 < width:
-                s2 += c[k + 2] * at
-            s3 += d[k + 1] * at
-        x3 = (x[j + 3] - s3) * d[0]
-        x2 = (x[j + 2] - s2 - c[1] * x3) * c[0]
-        x1 = (x[j + 1] - s1 - b[1] * x2 - b[2] * x3) * b[0]
-        x[j] = (x[j] - s0 - a[1] * x1 - a[2] * x2 - a[3] * x3) * a[0]
-        x[j + 1], x[j + 2], x[j + 3] = x1, x2, x3
+        for r in range(len(right_hand_sides)):
+            x = right_hand_sides[r]
+            tail = x[j + 4 : j + 4 + last]
+            s0, s1, s2, s3 = zero, zero, zero, zero
+            for k in range(last):
+                s0 += a4[k] * tail[k]
+                s1 += b4[k] * tail[k]
+                s2 += c4[k] * tail[k]
+                s3 += d4[k] * tail[k]
+            for k in range(last, min(width - 1, n - j - 4)):
+                at = x[j + 4 + k]
+                if k + 3 < width:
+                    s1 += b[k + 3] * at
+                if k + 2 < width:
+                    s2 += c[k + 2] * at
+                s3 += d[k + 1] * at
+            x3 = (x[j + 3] - s3) * d[0]
+            x2 = (x[j + 2] - s2 - c[1] * x3) * c[0]
+            x1 = (x[j + 1] - s1 - b[1] * x2 - b[2] * x3) * b[0]
+            x[j] = (x[j] - s0 - a[1] * x1 - a[2] * x2 - a[3] * x3) * a[0]
+            x[j + 1], x[j + 2], x[j + 3] = x1, x2, x3
 
 
 class BandedFactor:
@@ -140,7 +147,7 @@ class SingleBandedFactor:
         self._columns, self.place = columns, place
 
     def solve_in_place(self, x: NDArray[np.float32]) -> None:
-        """Overwrite the right-hand side x (n,), in the factor's order, by the solution."""
+        """Overwrite the right-hand sides x (m, n), in the factor's order, by the solutions."""
         banded_solve(self._columns, x)
 
 
@@ -275,7 +282,8 @@ class MultigridFactor:
         return self
 
     def solve_in_place(self, x: NDArray[np.float32]) -> None:
-        x[:] = self._cycle @ x
+        for row in x:
+            row[:] = self._cycle @ row
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         if rhs.ndim == 2:

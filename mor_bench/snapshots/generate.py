@@ -16,8 +16,9 @@ import numpy as np
 import platformdirs
 from threadpoolctl import threadpool_limits
 
-from mor_bench.errors import InvertedElementError, NoEquilibriumError, StoreError
+from mor_bench.errors import InvertedElementError, StoreError
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import Solution
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.snapshots.store import SCHEMA_VERSION, STATUSES, Shard, read_shard, write_atomically, write_shard
@@ -71,15 +72,11 @@ def solve_shard(spec_json: str, number: int) -> tuple[Shard, float]:
     min_det_f, status = np.full(len(loads), np.nan), np.zeros(len(loads), dtype=np.uint8)
     with threadpool_limits(1):
         begun = perf_counter()
-        for row, force in enumerate(forces):
-            try:
-                solution = model.solve(force)
-            except InvertedElementError:
-                status[row] = STATUSES.index("inverted")
-            except NoEquilibriumError:
-                status[row] = STATUSES.index("no-equilibrium")
+        for row, found in enumerate(model.solve_many(forces)):
+            if isinstance(found, Solution):
+                displacements[row], min_det_f[row] = found.displacement, found.min_det_f
             else:
-                displacements[row], min_det_f[row] = solution.displacement, solution.min_det_f
+                status[row] = STATUSES.index("inverted" if isinstance(found, InvertedElementError) else "no-equilibrium")
         seconds = perf_counter() - begun
     return Shard(start, loads.patches, loads.vectors, displacements, min_det_f, status), seconds
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from mor_bench.errors import SolverError
 from mor_bench.mechanics.model import FullOrderModel, missing_library
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.scene import Scene
@@ -46,8 +47,11 @@ class FullFEM(Surrogate):
         batch = self._checked_forces(forces)
         out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
         free = self.scene_.free_dofs
-        for row, load in zip(out, batch.reshape(-1, self.scene_.mesh.n_dofs), strict=True):
-            row[free] = self.model_.solve(load[free], options=NewtonOptions(self.tolerance)).displacement
+        loads = batch.reshape(-1, self.scene_.mesh.n_dofs)[:, free]
+        for row, found in zip(out, self.model_.solve_many(loads, NewtonOptions(self.tolerance)), strict=True):
+            if isinstance(found, SolverError):
+                raise found
+            row[free] = found.displacement
         return out.reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:

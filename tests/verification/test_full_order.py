@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 
 import felupe
 import numpy as np
@@ -365,22 +366,20 @@ def test_the_turned_factor_needs_few_iterations_far_from_rest(large: FullOrderMo
     rhs = np.random.default_rng(0).normal(size=large.n_unknowns)
     rotated = large.accelerator
     assert rotated is not None
-    rotated.turn(u)
-    x, turned = conjugate_gradients(large.assembler.pattern, tangent, rotated, rhs, 1e-8)
+    x, turned = conjugate_gradients(large.assembler.pattern, tangent, rotated.at(u), rhs, 1e-8)
     assert np.linalg.norm(dense(large.assembler, tangent) @ x - rhs) <= 2e-8 * np.linalg.norm(rhs)
-    rotated.turn(None)
     assert turned <= 30
-    assert conjugate_gradients(large.assembler.pattern, tangent, rotated, rhs, 1e-8)[1] >= 2 * turned
+    assert conjugate_gradients(large.assembler.pattern, tangent, rotated.at(None), rhs, 1e-8)[1] >= 2 * turned
 
 
 @pytest.mark.parametrize("plain", [False, True])
 def test_conjugate_gradients_notice_an_indefinite_tangent(large: FullOrderModel, plain: bool) -> None:
     pattern, values = large.assembler.pattern, large.rest_tangent
     spoilt = np.where(pattern.rows == pattern.indices, values - 0.5 * values.max(), values)
-    preconditioner = BlockJacobi(pattern) if plain else large.accelerator
-    if isinstance(preconditioner, BlockJacobi):
-        preconditioner.take(values)
-    assert preconditioner is not None
+    rotated, jacobi = large.accelerator, BlockJacobi(pattern)
+    assert rotated is not None
+    jacobi.take(values)
+    preconditioner = jacobi if plain else rotated.at(None)
     with pytest.raises(NotPositiveDefiniteError):
         conjugate_gradients(pattern, spoilt, preconditioner, np.ones(large.n_unknowns), 1e-6)
 
@@ -396,3 +395,19 @@ def test_multigrid_solves_as_the_banded_factor_does_and_accelerates(large: FullO
     solution = model.solve(load)
     assert solution.iterations <= 40
     np.testing.assert_allclose(solution.displacement, large.solve(load).displacement, rtol=0, atol=1e-6 * np.abs(solution.displacement).max())
+
+
+def test_a_load_has_the_same_answer_alone_and_among_others(large: FullOrderModel) -> None:
+    rng = np.random.default_rng(0)
+    loads = np.stack([tip_load(large.scene, newton) for newton in (0.1, 0.0, 1.0, 3.0, 200.0, *rng.uniform(0.0, 2.0, 20))])
+    refused = 0
+    for load, among in zip(loads, large.solve_many(loads), strict=True):
+        if isinstance(among, SolverError):
+            refused += 1
+            with pytest.raises(type(among), match=re.escape(str(among))):
+                large.solve(load)
+            continue
+        alone = large.solve(load)
+        assert (alone.displacement == among.displacement).all()
+        assert (alone.min_det_f, alone.iterations, alone.cuts) == (among.min_det_f, among.iterations, among.cuts)
+    assert refused == 1
