@@ -9,7 +9,8 @@ clock starts, by an untimed solve. For each load every contender runs once a rou
 residual and a reference solved to 1e-10 check each answer, and nothing is printed if one is wrong.
 
 mor-bench
-    `FullOrderModel.solve` as it is. Its first step takes the factor of the tangent at rest, which all solves share.
+    `FullOrderModel.solve` as it is, with several of its solvers. `auto` is the default: an accelerated iteration with the
+    rest-state factor, which all solves share, and no tangent. The others are Newton's method, its first step with that factor.
 felupe
     Its `newtonraphson` with `tol` related to the load instead of the reactions, which only changes when it stops. felupe has
     no Saint Venant-Kirchhoff law in closed form: its strain-based and its differentiated ones (`MaterialStrain`,
@@ -22,13 +23,12 @@ Kratos
     reactions off, printing off. Linear solvers: amgcl with Kratos' defaults (GMRES, aggregation, ILU(0), 1e-6), and tuned:
     conjugate gradients, smoothed aggregation, ILU(0), 1e-3. Its sparse LU is left out: several times slower on beam-fine.
 
-Steps are the linear systems solved for a correction, with the one at rest. Ours solves one more at the answer, to see that it is stable.
+Steps are Newton iterations, and back-solves with the rest-state factor for `auto`.
 """
 
 from __future__ import annotations
 
 import gc
-import inspect
 import json
 import os
 import sys
@@ -53,11 +53,12 @@ from scipy.sparse.linalg import spsolve
 
 import mor_bench
 from mor_bench.harness.timing import describe_machine
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.model import SOLVERS, FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.sampling import draw_loads
+from mor_bench.specs import SolverName
 
 Array = NDArray[np.float64]
 LinearSolve = Callable[[Any, Array], Array]
@@ -68,7 +69,7 @@ MAX_RESIDUAL = 1.01 * TOLERANCE
 """The residuals of two codes differ by round-off."""
 MAX_DIFFERENCE = 1e-6
 MAX_STEPS = 30
-OWN_SOLVERS = ("auto", "pardiso") if "solver" in inspect.signature(FullOrderModel).parameters else ("auto",)
+OWN_SOLVERS: tuple[SolverName, ...] = ("auto", "rotated-pcg", "cholesky", "pardiso")
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -95,12 +96,11 @@ class Contender(ABC):
 
 
 class Ours(Contender):
-    """The full-order model with one of its linear solvers."""
+    """The full-order model with one of its solvers."""
 
-    def __init__(self, scene: Scene, solver: str) -> None:
-        make: Any = FullOrderModel
+    def __init__(self, scene: Scene, solver: SolverName) -> None:
         self.name = f"mor-bench, {solver}"
-        self._model: FullOrderModel = make(scene) if solver == "auto" else make(scene, solver=solver)
+        self._model = FullOrderModel(scene, solver)
         self._free, self._u = scene.free_dofs, np.zeros(scene.mesh.n_dofs)
 
     def prepare(self, forces: Array) -> None:
@@ -334,7 +334,7 @@ PEERS = (
 )
 
 
-def own_entry(solver: str) -> Entry:
+def own_entry(solver: SolverName) -> Entry:
     return Entry(f"mor-bench, {solver}", ("pypardiso",) if solver == "pardiso" else (), lambda scene: Ours(scene, solver))
 
 
@@ -447,7 +447,7 @@ def main(
     loads: Annotated[int, typer.Option(min=1, help="Loads of each dataset.")] = 5,
     rounds: Annotated[int, typer.Option(min=1, help="Solves of each load.")] = 3,
     threads: Annotated[int, typer.Option(min=1, help="Threads of every contender.")] = 1,
-    solver: Annotated[list[str] | None, typer.Option(help=f"Our linear solvers; by default {' and '.join(OWN_SOLVERS)}.", show_default=False)] = None,
+    solver: Annotated[list[str] | None, typer.Option(help=f"Our solvers; by default {', '.join(OWN_SOLVERS)}.", show_default=False)] = None,
     as_json: Annotated[Path | None, typer.Option("--json", help="Also write everything to this file.")] = None,
 ) -> None:
     """Time the full-order model beside other finite-element codes."""
@@ -455,7 +455,10 @@ def main(
     if any(os.environ.get(name) != value for name, value in pinned.items()):  # libraries read them when they are loaded
         os.execve(sys.executable, [sys.executable, "-m", "tests.benchmarks.peers", *sys.argv[1:]], {**os.environ, **pinned})
     console = Console()
-    entries = [*(own_entry(name) for name in solver or OWN_SOLVERS), *PEERS]
+    unknown = set(solver or ()) - set(SOLVERS)
+    if unknown:
+        raise typer.BadParameter(f"--solver must be one of {', '.join(SOLVERS)}; got {', '.join(sorted(unknown))}.")
+    entries = [*(own_entry(name) for name in SOLVERS if name in (solver or OWN_SOLVERS)), *PEERS]
     for entry in entries:
         if entry.missing:
             console.print(f"{entry.label}: skipped, not installed: pip install {' '.join(entry.missing)}", markup=False)

@@ -1,0 +1,93 @@
+"""Cost of the full-order solve against the size of the mesh: seconds and memory from 1e3 to 3e5 unknowns, and the slopes.
+
+    python -m tests.benchmarks.scaling
+
+Each size is a cantilever of the beams' proportions, material and loads, in a process of its own on one thread. Set-up is
+the mesh, the pattern and the rest-state factor, from the import on; a solve is the median over the loads.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+from time import perf_counter
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+SIZES = (4, 6, 8, 11, 14, 18, 23, 29)
+"""Cells across; four times as many along."""
+N_LOADS = 5
+
+
+def measure(across: int) -> dict[str, Any]:
+    """Set-up, solve and peak memory of one size, in this process."""
+    import mor_bench
+    from mor_bench.mechanics.model import FullOrderModel
+    from mor_bench.snapshots.sampling import draw_loads
+
+    begun = perf_counter()
+    spec = mor_bench.load_scene("beam-fine").spec.model_dump(mode="json")
+    spec["geometry"]["cells"] = [4 * across, across, across]
+    scene = mor_bench.load_scene(spec)
+    model = FullOrderModel(scene)
+    n_patches = len(scene.patch_nodes)
+    # Away from the support, spread along the beam.
+    numbers = np.linspace(0.3, 0.95, N_LOADS) * n_patches
+    loads = [(int(i), draw_loads(scene.spec.loads, n_patches, int(i), int(i) + 1).vectors[0]) for i in numbers]
+    forces = [(scene.patch_weights[[patch]].toarray().T * vector).ravel()[scene.free_dofs] for patch, vector in loads]
+    _ = model.accelerator
+    set_up = perf_counter() - begun
+    model.solve(1e-3 * forces[0])
+    seconds, iterations = [], []
+    for force in forces:
+        begun = perf_counter()
+        iterations.append(model.solve(force).iterations)
+        seconds.append(perf_counter() - begun)
+    return {
+        "across": across,
+        "unknowns": model.n_unknowns,
+        "rest_state": type(model.rest_factor).__name__,
+        "set_up_s": set_up,
+        "solve_s": float(np.median(seconds)),
+        "iterations": float(np.median(iterations)),
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+
+
+def main(
+    size: Annotated[list[int] | None, typer.Option(min=2, help=f"Cells across; repeat for more. By default {SIZES}.", show_default=False)] = None,
+    one: Annotated[bool, typer.Option(hidden=True)] = False,
+) -> None:
+    """Measure seconds and memory of the full-order solve against the number of unknowns."""
+    if one:
+        print(json.dumps(measure((size or SIZES)[0])))
+        return
+    pinned = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    table = Table("cells", "unknowns", "rest state", "set-up s", "solve ms", "iterations", "peak MB")
+    rows = []
+    for across in size or SIZES:
+        command = [sys.executable, "-m", "tests.benchmarks.scaling", "--one", "--size", str(across)]
+        row = json.loads(subprocess.run(command, check=True, capture_output=True, text=True, env=pinned).stdout)
+        rows.append(row)
+        table.add_row(
+            f"{4 * across} x {across} x {across}", f"{row['unknowns']:,}", row["rest_state"], f"{row['set_up_s']:.2f}",
+            f"{1e3 * row['solve_s']:.2f}", f"{row['iterations']:.0f}", f"{row['peak_mb']:.0f}",
+        )  # fmt: skip
+    console = Console()
+    console.print(table)
+    if len(rows) > 1:
+        unknowns = np.log([row["unknowns"] for row in rows])
+        for key in ("solve_s", "set_up_s", "peak_mb"):
+            slope = np.polyfit(unknowns, np.log([row[key] for row in rows]), 1)[0]
+            console.print(f"{key} grows as unknowns to the power {slope:.2f}", highlight=False)
+
+
+if __name__ == "__main__":
+    typer.run(main)
