@@ -11,6 +11,7 @@ from mor_bench.errors import UnconstrainedBodyError
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.linear import BandedFactor, Factor, choose_solver
+from mor_bench.mechanics.locking import warn_of_locking
 from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibrium
 from mor_bench.mechanics.pcg import RotatedPCG
 from mor_bench.scene.scene import Scene
@@ -56,6 +57,7 @@ class FullOrderModel:
 
     def __init__(self, scene: Scene) -> None:
         check_supports(scene)
+        warn_of_locking(scene)
         mesh = scene.mesh
         self.scene = scene
         self.n_unknowns = len(scene.free_dofs)
