@@ -220,11 +220,13 @@ def refine(
 ) -> None:
     """Measure the error of a dataset's own mesh on refined ones; later runs show it beside the methods' errors."""
     with _clear_errors():
+        from threadpoolctl import threadpool_limits
+
         from mor_bench.harness.discretisation import refine as refine_dataset
         from mor_bench.specs import load_dataset_spec
 
         spec = load_dataset_spec(dataset, suite)
-        with _progress(_console(stderr=True)) as listener:
+        with _progress(_console(stderr=True)) as listener, threadpool_limits(1):
             record = refine_dataset(
                 spec, loads, levels, max_dofs=max_dofs, cache=cache, suite=suite,
                 progress=lambda done, total: listener.generating(f"{spec.name} on refined meshes", done, total),

@@ -1,4 +1,4 @@
-"""Every error that this package raises on purpose, under one base class."""
+"""Every error that this package raises on purpose, under one base class, and its warning."""
 
 from __future__ import annotations
 
@@ -49,3 +49,7 @@ class StoreError(MorBenchError):
 
 class MissingDependencyError(MorBenchError, ImportError):
     """A method needs an extra that is not installed; the message names it."""
+
+
+class LockingWarning(UserWarning):
+    """A discretisation is too stiff for a nearly incompressible material: its displacements are too small."""

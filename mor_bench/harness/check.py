@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mor_bench.mechanics.locking import locking_risk
 from mor_bench.mechanics.model import check_supports
 from mor_bench.scene.scene import load_scene
 from mor_bench.specs import check_method, is_method_file, load_dataset_spec, load_method_spec
@@ -30,4 +31,6 @@ def check_file(path: Path) -> str:
     check_supports(scene)
     n_patches = len(scene.patch_nodes)
     samples = n_patches * spec.loads.samples_per_patch
-    return f"dataset, {scene.mesh.n_cells} cells, {scene.mesh.n_nodes} nodes, {n_patches} load patches, {samples} samples"
+    said = f"dataset, {scene.mesh.n_cells} cells, {scene.mesh.n_nodes} nodes, {n_patches} load patches, {samples} samples"
+    risk = locking_risk(scene)
+    return f"{said}; warning: {risk}" if risk else said

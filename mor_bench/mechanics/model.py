@@ -23,6 +23,7 @@ from mor_bench.mechanics.linear import (
     SparseLU,
     choose_solver,
 )
+from mor_bench.mechanics.locking import warn_of_locking
 from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibria, solve_equilibrium
 from mor_bench.mechanics.rotated import BlockJacobi, RotatedRest, conjugate_gradients
 from mor_bench.scene.scene import Scene
@@ -101,6 +102,7 @@ class FullOrderModel:
 
     def __init__(self, scene: Scene, solver: SolverName | None = None) -> None:
         check_supports(scene)
+        warn_of_locking(scene)
         self.solver = solver or scene.spec.solver
         missing = missing_library(self.solver)
         if missing:

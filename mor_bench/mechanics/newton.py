@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import InvertedElementError, NoEquilibriumError, SolverError
+from mor_bench.errors import InvalidInputError, InvertedElementError, NoEquilibriumError, SolverError
 from mor_bench.mechanics.anderson import Anderson
 from mor_bench.mechanics.assembly import State
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
@@ -157,7 +157,8 @@ def _accelerated(
         residual, min_det = load - state.force, state.min_det_f
         size = float(np.linalg.norm(residual))
         if size <= tolerance * load_norm:
-            return _Pass(q, min_det, iteration, converged=memory.convex)
+            # Of a start that is a solution nothing is known yet; Newton's pass looks at the tangent there.
+            return _Pass(q, min_det, iteration, converged=memory.convex and (start is None or iteration > 1))
         if not size <= DIVERGED * load_norm:
             return _Pass(q, min_det, iteration, converged=False)
         if turning:
@@ -288,6 +289,8 @@ def solve_equilibrium(
         If the load can be followed only through det F <= 0.
     NoEquilibriumError
         If no stable equilibrium was found within the allowed cut-backs.
+    InvalidInputError
+        If the load has another shape, NaN or infinity.
     """
     found = next(solve_equilibria(problem, [load], [start], options))[1]
     if isinstance(found, SolverError):
@@ -310,6 +313,9 @@ def solve_equilibria(
     Yields the number of a load and its solution, or the error that it would raise, in the order in which they are found. A
     solution is the same to the last digit whatever the other loads are.
     """
+    for number, load in enumerate(loads):
+        if load.shape != (problem.n_unknowns,) or not np.isfinite(load).all():
+            raise InvalidInputError(f"load {number} must be finite and of shape ({problem.n_unknowns},); got shape {load.shape}.")
     starts = starts or [None] * len(loads)
     pending = [i for i, load in enumerate(loads) if load.any()]
     for i in sorted(set(range(len(loads))) - set(pending)):

@@ -16,6 +16,7 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.progress import track
+from threadpoolctl import threadpool_limits
 
 import mor_bench
 from mor_bench.mechanics.linear import BandedCholesky, NotPositiveDefiniteError
@@ -33,6 +34,7 @@ def main(
     times: Annotated[float, typer.Option(min=0, help="Factor on every load.")] = 1.0,
 ) -> None:
     """Solve random loads and check every answer."""
+    threadpool_limits(1)
     scene = mor_bench.load_scene(dataset)
     model, cholesky = FullOrderModel(scene), BandedCholesky(FullOrderModel(scene).assembler.pattern)
     free, n_patches = scene.free_dofs, len(scene.patch_nodes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,12 @@ LAWS: dict[str, Material] = {
     "neo-hookean": NeoHookean(500.0, 0.4),
     "mooney-rivlin": MooneyRivlin(70.0, 20.0, 800.0),
     "ogden": Ogden((100.0, -20.0), (2.1, -1.7), 800.0),
+}
+COMPRESSIBLE: dict[str, Material] = {
+    "saint-venant-kirchhoff": SaintVenantKirchhoff(1.0, 0.3),
+    "neo-hookean": NeoHookean(1.0, 0.3),
+    "mooney-rivlin": MooneyRivlin(0.15, 0.04, 0.8),
+    "ogden": Ogden((0.3, -0.08), (2.1, -1.7), 0.8),
 }
 ELEMENTS = [("hexahedron", False), ("hexahedron", True), ("tetrahedron", False)]
 EVERY = list(itertools.product(LAWS, ELEMENTS))
@@ -112,25 +119,105 @@ def test_homogeneous_states_of_saint_venant_kirchhoff(kind: tuple[str, bool]) ->
     np.testing.assert_allclose(p, np.diag([3.0, 0.0, 0.0]), atol=1e-13)
 
 
+def piola(law: Material, gradient: Array) -> Array:
+    """First Piola-Kirchhoff stress (..., 3, 3) of each law in spatial form, P = τ F⁻ᵀ with Kirchhoff's τ; SVK by P = F S."""
+    eye, inverse = np.eye(3), np.swapaxes(np.linalg.inv(gradient), -1, -2)
+    left = gradient @ np.swapaxes(gradient, -1, -2)
+    j = np.linalg.det(gradient)[..., None, None]
+
+    def deviator(tensor: Array) -> Array:
+        return np.asarray(tensor - np.trace(tensor, axis1=-2, axis2=-1)[..., None, None] / 3 * eye)
+
+    if isinstance(law, SaintVenantKirchhoff):
+        strain = 0.5 * (np.swapaxes(gradient, -1, -2) @ gradient - eye)
+        return np.asarray(gradient @ (law.lame_lambda * np.trace(strain, axis1=-2, axis2=-1)[..., None, None] * eye + 2 * law.lame_mu * strain))
+    if isinstance(law, NeoHookean):
+        return np.asarray((law.lame_mu * (left - eye) + law.lame_lambda * np.log(j) * eye) @ inverse)
+    if isinstance(law, MooneyRivlin):
+        bar = j ** (-2 / 3) * left
+        first = np.trace(bar, axis1=-2, axis2=-1)[..., None, None]
+        tau = deviator(2 * law.c10_pa * bar + 2 * law.c01_pa * (first * bar - bar @ bar))
+    else:
+        assert isinstance(law, Ogden)
+        values, vectors = np.linalg.eigh(left)
+        bar = j[..., 0] ** (-1 / 3) * np.sqrt(values)
+        powers = sum(mu * bar**alpha for mu, alpha in zip(law.mu_pa, law.alpha, strict=True))
+        tau = deviator(np.einsum("...ia,...a,...ja->...ij", vectors, powers, vectors))
+    return np.asarray((tau + law.bulk_pa * (j - 1) * j * eye) @ inverse)
+
+
+STATES = {
+    "general": np.array([[1.1, 0.2, 0.0], [0.05, 0.9, 0.1], [0.0, -0.1, 1.05]]),
+    "shear": np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+    "stretch": np.diag([1.5, 0.9, 0.8]),
+    "hydrostatic": 0.8 * np.eye(3),
+    "almost hydrostatic": np.diag([0.8, 0.8 + 1e-9, 0.8]),
+}
+
+
+@pytest.mark.parametrize("state", list(STATES))
+@pytest.mark.parametrize(("law", "kind"), EVERY)
+def test_stress_of_homogeneous_states(law: str, kind: tuple[str, bool], state: str) -> None:
+    p, energy = homogeneous(STATES[state], LAWS[law], *kind)
+    np.testing.assert_allclose(p, piola(LAWS[law], STATES[state]), rtol=1e-10, atol=1e-9)
+    # The energy is the stress's work on the straight way from rest.
+    places, weights = np.polynomial.legendre.leggauss(12)
+    way = np.eye(3) + (0.5 + 0.5 * places[:, None, None]) * (STATES[state] - np.eye(3))
+    work = 0.5 * weights @ np.einsum("nij,ij->n", piola(LAWS[law], way), STATES[state] - np.eye(3))
+    assert energy == pytest.approx(work, rel=1e-9)
+
+
+@pytest.mark.parametrize("law", list(LAWS))
+def test_tangent_where_two_stretches_are_equal(law: str) -> None:
+    """There the derivative of the principal stresses is a limit."""
+    model = assembler(box_mesh((1.0, 1.0, 1.0), (2, 2, 2)), LAWS[law])
+    points = box_mesh((1.0, 1.0, 1.0), (2, 2, 2)).points
+    u, direction = (points * [0.3, -0.1, -0.1]).ravel(), np.random.default_rng(0).normal(size=model.n_dofs)
+    here = dense(model, model.force_and_tangent(u)[1]) @ direction
+    ahead, behind = (model.force(u + h * direction).force for h in (1e-5, -1e-5))
+    np.testing.assert_allclose(here, (ahead - behind) / 2e-5, atol=1e-6 * np.abs(here).max())
+
+
 @pytest.mark.parametrize("kind", ELEMENTS)
-def test_homogeneous_states_of_the_other_laws(kind: tuple[str, bool]) -> None:
-    """P = F S by hand: neo-Hookean in any F; isochoric shear of Mooney-Rivlin; principal stretches of Ogden."""
-    gradient = np.array([[1.1, 0.2, 0.0], [0.05, 0.9, 0.1], [0.0, -0.1, 1.05]])
-    neo = NeoHookean(500.0, 0.4)
-    inverse, log_j = np.linalg.inv(gradient).T, np.log(np.linalg.det(gradient))
-    expected = neo.lame_mu * (gradient - inverse) + neo.lame_lambda * log_j * inverse
-    np.testing.assert_allclose(homogeneous(gradient, neo, *kind)[0], expected, rtol=1e-11, atol=1e-10)
+def test_hydrostatic_stress_of_saint_venant_kirchhoff(kind: tuple[str, bool]) -> None:
+    law = SaintVenantKirchhoff(500.0, 0.4)
+    for alpha in (0.7, 0.95, 1.3):
+        expected = (3 * law.lame_lambda + 2 * law.lame_mu) / 2 * (alpha**3 - alpha)
+        np.testing.assert_allclose(homogeneous(alpha * np.eye(3), law, *kind)[0], expected * np.eye(3), rtol=1e-12, atol=1e-10)
 
-    mooney, k = MooneyRivlin(70.0, 20.0, 800.0), 0.5
-    p, energy = homogeneous(np.array([[1.0, k, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), mooney, *kind)
-    assert p[0, 1] == pytest.approx(2 * (70.0 + 20.0) * k, rel=1e-12)
-    assert energy == pytest.approx((70.0 + 20.0) * k**2, rel=1e-12)
 
-    ogden, stretch = Ogden((100.0, -20.0), (2.1, -1.7), 800.0), np.array([1.3, 0.9, 1.05])
-    volume = stretch.prod()
-    bar = stretch * volume ** (-1 / 3)
-    own = sum(mu * (bar**alpha - (bar**alpha).mean()) for mu, alpha in zip(ogden.mu_pa, ogden.alpha, strict=True))
-    np.testing.assert_allclose(np.diag(homogeneous(np.diag(stretch), ogden, *kind)[0]), (own + 800.0 * (volume - 1) * volume) / stretch, rtol=1e-11)
+@pytest.mark.parametrize("kind", ELEMENTS)
+def test_stress_of_saint_venant_kirchhoff_is_least_at_one_over_root_three(kind: tuple[str, bool]) -> None:
+    """In confined compression, uniaxial stress and hydrostatic compression alike."""
+    law, h = SaintVenantKirchhoff(500.0, 0.4), 1e-4
+
+    def side(alpha: float) -> float:
+        return float(np.sqrt(1 - law.poisson * (alpha**2 - 1)))
+
+    ways: tuple[Callable[[float], list[float]], ...] = (lambda a: [a, 1, 1], lambda a: [a, side(a), side(a)], lambda a: [a, a, a])
+    for way in ways:
+        below, at, above = (homogeneous(np.diag(way(1 / np.sqrt(3) + s)), law, *kind)[0][0, 0] for s in (-h, 0.0, h))
+        assert (above - below) / (2 * h) == pytest.approx(0.0, abs=1e-5 * abs(at))
+        assert above > at < below
+    assert homogeneous(np.diag([1 / np.sqrt(3), 1, 1]), law, *kind)[0][0, 0] == pytest.approx(-206.19652, abs=1e-5)
+
+
+@pytest.mark.parametrize(("law", "kind"), EVERY)
+def test_the_derivative_of_the_force_is_symmetric(law: str, kind: tuple[str, bool]) -> None:
+    """Reciprocity from forces alone, and the tangent's own matrix, whose lower triangle is its upper one."""
+    model = assembler(warped(kind[0]), LAWS[law], kind[1])
+    rng = np.random.default_rng(0)
+    u, one, other = 0.02 * rng.normal(size=model.n_dofs), rng.normal(size=model.n_dofs), rng.normal(size=model.n_dofs)
+
+    def slope(direction: Array, h: float = 5e-4) -> Array:
+        force = [model.force(u + k * h * direction).force for k in (-2, -1, 1, 2)]
+        return np.asarray((force[0] - 8 * force[1] + 8 * force[2] - force[3]) / (12 * h))
+
+    stiffness = dense(model, model.force_and_tangent(u)[1])
+    size = np.linalg.norm(stiffness, 2) * np.linalg.norm(one) * np.linalg.norm(other)
+    assert abs(one @ slope(other) - other @ slope(one)) <= 1e-9 * size
+    assert abs(one @ slope(other) - one @ stiffness @ other) <= 1e-9 * size
+    assert np.abs(stiffness - stiffness.T).max() <= 1e-14 * np.abs(stiffness).max()
 
 
 @pytest.mark.parametrize("law", list(LAWS))
@@ -162,9 +249,9 @@ def test_the_vectorised_kernel_is_the_general_one() -> None:
         assert fast.min_det_f == pytest.approx(slow.min_det_f, rel=1e-13)
 
 
-def manufactured_error(n: int, element: str) -> tuple[float, float]:
+def manufactured_error(n: int, element: str, selective: bool, law: Material) -> tuple[float, float]:
     """L2 and H1 error on n³ cells for u = 0.05 sin(πx) sin(πy) sin(πz) (1, -1, 0.5), whose body force is integrated."""
-    law, direction = SaintVenantKirchhoff(1.0, 0.3), 0.05 * np.array([1.0, -1.0, 0.5])
+    direction = 0.05 * np.array([1.0, -1.0, 0.5])
 
     def field(x: Array) -> Array:
         return np.asarray(np.sin(np.pi * x).prod(axis=-1)[..., None] * direction)
@@ -174,17 +261,14 @@ def manufactured_error(n: int, element: str) -> tuple[float, float]:
         d = np.pi * np.stack([c[..., 0] * s[..., 1] * s[..., 2], s[..., 0] * c[..., 1] * s[..., 2], s[..., 0] * s[..., 1] * c[..., 2]], axis=-1)
         return np.asarray(direction[:, None] * d[..., None, :])
 
-    def piola(x: Array) -> Array:
-        deformation = np.eye(3) + gradient(x)
-        strain = 0.5 * (np.swapaxes(deformation, -1, -2) @ deformation - np.eye(3))
-        trace = np.trace(strain, axis1=-2, axis2=-1)[..., None, None]
-        return np.asarray(deformation @ (law.lame_lambda * trace * np.eye(3) + 2 * law.lame_mu * strain))
+    def stress(x: Array) -> Array:
+        return piola(law, np.eye(3) + gradient(x))
 
     def body_force(x: Array) -> Array:
         h, total = 1e-3, np.zeros(x.shape)
         for j in range(3):
             e = h * np.eye(3)[j]
-            total -= ((8 * (piola(x + e) - piola(x - e)) - piola(x + 2 * e) + piola(x - 2 * e)) / (12 * h))[..., j]
+            total -= ((8 * (stress(x + e) - stress(x - e)) - stress(x + 2 * e) + stress(x - 2 * e)) / (12 * h))[..., j]
         return total
 
     mesh = box_mesh((1.0, 1.0, 1.0), (n, n, n), element == "tetrahedron")
@@ -208,9 +292,9 @@ def manufactured_error(n: int, element: str) -> tuple[float, float]:
     dofs[~outer] = np.arange(3 * free).reshape(-1, 3)
     load = np.zeros(3 * free + 1)
     np.add.at(load, dofs[mesh.cells], np.einsum("qa,cq,cqi->cai", shape, volume, body_force(x)))
-    model = Assembler(mesh.points, mesh.cells, dofs, 3 * free, law)
+    model = Assembler(mesh.points, mesh.cells, dofs, 3 * free, law, selective=selective)
     solver, u = BandedCholesky(model.pattern), np.zeros(3 * free)
-    for _ in range(6):
+    for _ in range(5):
         state, values = model.force_and_tangent(u)
         u += solver.factor(values).solve(load[:-1] - state.force)
     nodal = np.append(u, 0.0)[dofs][mesh.cells]
@@ -219,19 +303,32 @@ def manufactured_error(n: int, element: str) -> tuple[float, float]:
     return float(np.sqrt((volume[..., None] * difference**2).sum())), float(np.sqrt((volume[..., None, None] * slope**2).sum()))
 
 
-@pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
-def test_manufactured_solution_converges_at_the_right_order(element: str) -> None:
-    """On these meshes T4 is not yet in its asymptotic range: L2 order 1.88."""
-    coarse, fine = manufactured_error(7, element), manufactured_error(14, element)
-    assert np.log2(coarse[0] / fine[0]) >= (1.95 if element == "hexahedron" else 1.85)
-    assert np.log2(coarse[1] / fine[1]) >= 0.95
+@pytest.mark.parametrize(("law", "kind"), [pair for pair in EVERY if pair[1][0] == "hexahedron" or pair[0] == "saint-venant-kirchhoff"])
+def test_manufactured_solution_converges_at_the_right_order(law: str, kind: tuple[str, bool]) -> None:
+    """T4 needs finer meshes: its L2 order is 1.84, 1.91, 1.95 and 1.97 from 7, 10, 14 and 20 cells to the next (24)."""
+    material = COMPRESSIBLE[law]
+    n = (7, 14) if kind[0] == "hexahedron" else (16, 20)
+    coarse, fine = (manufactured_error(cells, *kind, material) for cells in n)
+    order = np.log(np.divide(coarse, fine)) / np.log(n[1] / n[0])
+    assert order[0] >= 1.95
+    assert order[1] >= 0.95
 
 
-def cantilever(size: list[float], cells: list[int], poisson: float, integration: str = "full") -> FullOrderModel:
+def material_spec(law: str, young: float, poisson: float) -> dict[str, Any]:
+    """The material table of a law with Young's modulus, Pa, and Poisson's ratio at rest."""
+    shear, bulk = young / (2 * (1 + poisson)), young / (3 * (1 - 2 * poisson))
+    if law == "mooney-rivlin":
+        return {"law": law, "c10_pa": 0.4 * shear, "c01_pa": 0.1 * shear, "bulk_pa": bulk}
+    if law == "ogden":
+        return {"law": law, "mu_pa": [1.6 * shear / 2.1, -0.4 * shear / 1.7], "alpha": [2.1, -1.7], "bulk_pa": bulk}
+    return {"law": law, "young_pa": young, "poisson": poisson}
+
+
+def cantilever(size: list[float], cells: list[int], poisson: float, integration: str = "full", law: str = "saint-venant-kirchhoff") -> FullOrderModel:
     spec: dict[str, Any] = {
         "geometry": {"shape": "box", "size_m": size, "cells": cells},
         "discretisation": {"integration": integration},
-        "material": {"law": "saint-venant-kirchhoff", "young_pa": 12e3, "poisson": poisson},
+        "material": material_spec(law, 12e3, poisson),
         "supports": [{"region": "x-min"}],
         "loads": {"region": "x-max", "kind": "force", "patch_area_m2": size[1] * size[2], "samples_per_patch": 1, "magnitude_n": [0.0, 1.0]},
         "needs": {"error": 0.01, "latency_ms": 1.0},
@@ -268,41 +365,36 @@ def test_elastica(slender: FullOrderModel, load: float) -> None:
     assert -deflection[0] == pytest.approx(back, rel=0.02)
 
 
+@pytest.mark.parametrize(("law", "kind"), [pair for pair in EVERY if pair[1][0] == "hexahedron"])
+def test_elastica_of_every_law(law: str, kind: tuple[str, bool]) -> None:
+    """Strains of a slender beam are small, so that PL²/EI = 1 bends every law alike."""
+    model = cantilever([20.0, 1.0, 1.0], [160, 1, 6], 0.0, "selective" if kind[1] else "full", law)
+    deflection = tip(model, -1000.0 / 20.0**2) / 20.0
+    assert -deflection[2] == pytest.approx(ELASTICA[1.0][0], rel=0.02)
+    assert -deflection[0] == pytest.approx(ELASTICA[1.0][1], rel=0.02)
+
+
+@pytest.mark.filterwarnings("ignore::mor_bench.errors.LockingWarning")
+@pytest.mark.parametrize("law", list(LAWS))
 @pytest.mark.parametrize("poisson", [0.48, 0.49, 0.499, 0.4999])
-def test_selective_integration_cures_volumetric_locking(poisson: float) -> None:
+def test_selective_integration_cures_volumetric_locking(poisson: float, law: str) -> None:
     """A short cantilever stiffens without bound as ν → 1/2 with full integration, and hardly at all with selective."""
-    reference = tip(cantilever([4.0, 1.0, 1.0], [16, 4, 4], 0.3), -50.0)[2]
-    full = tip(cantilever([4.0, 1.0, 1.0], [16, 4, 4], poisson), -50.0)[2]
-    selective = tip(cantilever([4.0, 1.0, 1.0], [16, 4, 4], poisson, "selective"), -50.0)[2]
-    assert selective / reference == pytest.approx(1.0, abs=0.06)
+    size, cells = [4.0, 1.0, 1.0], [12, 3, 3]
+    reference = tip(cantilever(size, cells, 0.3, law=law), -50.0)[2]
+    full = tip(cantilever(size, cells, poisson, law=law), -50.0)[2]
+    selective = tip(cantilever(size, cells, poisson, "selective", law), -50.0)[2]
+    assert selective / reference == pytest.approx(1.0, abs=0.08)
     if poisson >= 0.499:
         assert full / reference < 0.75
 
 
 def test_slender_beam_of_hundred_to_one_terminates() -> None:
-    """PL²/EI = 0.6, exact w/L = 0.19235; with one cell over the height it locks in shear, but it ends."""
+    """PL²/EI = 0.6, exact w/L = 0.19235; with cells half as long as the beam is high it locks in shear; four times shorter, no more."""
     length = 100.0
     deflection = -tip(cantilever([length, 1.0, 1.0], [200, 1, 2], 0.0), -0.6 * 1000.0 / length**2)[2] / length
     assert 0.5 * 0.19235 < deflection < 0.19235
-
-
-def test_stiffness_contrast_of_a_million_passes_the_patch_test_in_tension() -> None:
-    """Two bars in series, the second a million times softer: all of the stretch is in it."""
-    mesh = box_mesh((2.0, 1.0, 1.0), (2, 1, 1))
-    law = SaintVenantKirchhoff(1.0, 0.0)
-    fixed = mesh.points[:, 0] == 0
-    dofs = np.full((mesh.n_nodes, 3), 3 * int((~fixed).sum()))
-    dofs[~fixed] = np.arange(3 * int((~fixed).sum())).reshape(-1, 3)
-    model = Assembler(mesh.points, mesh.cells, dofs, 3 * int((~fixed).sum()), law, np.array([1e6, 1.0]))
-    alpha = 1.2
-    load = np.zeros((mesh.n_nodes, 3))
-    load[mesh.points[:, 0] == 2.0, 0] = 0.5 * (alpha**3 - alpha) / 4
-    u = np.zeros(model.n_dofs)
-    for _ in range(12):
-        state, values = model.force_and_tangent(u)
-        u += BandedCholesky(model.pattern).factor(values).solve(load[~fixed].ravel() - state.force)
-    end = u.reshape(-1, 3)[mesh.points[~fixed][:, 0] == 2.0, 0]
-    np.testing.assert_allclose(end, alpha - 1, rtol=2e-6)
+    cured = -tip(cantilever([length, 1.0, 1.0], [800, 1, 2], 0.0), -0.6 * 1000.0 / length**2)[2] / length
+    assert cured == pytest.approx(0.19235, rel=0.03)
 
 
 @pytest.mark.parametrize("law", list(LAWS))

@@ -1,0 +1,31 @@
+"""The warning that a discretisation is too stiff for a nearly incompressible material."""
+
+from __future__ import annotations
+
+import warnings
+
+from mor_bench.errors import LockingWarning
+from mor_bench.scene.scene import Scene
+
+LOCKING_FROM = 0.45
+"""Poisson's ratio above which H8 with full integration and T4 lock in volume."""
+
+
+def locking_risk(scene: Scene) -> str | None:
+    """Why the scene's answers will be too stiff, and the remedy; None where they will not."""
+    poisson = scene.material.poisson_at_rest
+    if poisson <= LOCKING_FROM or scene.selective:
+        return None
+    tetrahedra = scene.mesh.cells.shape[1] == 4
+    remedy = 'element = "hexahedron" and integration = "selective"' if tetrahedra else 'integration = "selective"'
+    return (
+        f"{scene.name}: with Poisson's ratio {poisson:.6g} at rest, above {LOCKING_FROM}, {'T4' if tetrahedra else 'fully integrated H8'} "
+        f"cells lock: displacements are too small; set {remedy} under [discretisation]."
+    )
+
+
+def warn_of_locking(scene: Scene) -> None:
+    """Give a `LockingWarning` for a scene that locks; called where a model is built."""
+    risk = locking_risk(scene)
+    if risk:
+        warnings.warn(risk, LockingWarning, stacklevel=3)

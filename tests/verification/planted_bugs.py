@@ -1,0 +1,282 @@
+"""Plant known bugs in a copy of the package, one at a time, and record which verification tests notice.
+
+Run as ``python -m tests.verification.planted_bugs`` (``--workers 2`` for two at once); it writes `PLANTED_BUGS.md` beside
+this file and fails if a bug goes unnoticed or a test function has never failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+RECORD = Path(__file__).with_name("PLANTED_BUGS.md")
+COPIED = ("mor_bench", "tests", "datasets", "methods")
+LIMIT_S = 300
+"""A bug may also make the suite hang; what has failed until then counts."""
+
+# Which tests run, as an expression of pytest's -k. Compiling and the slow tests are most of the time.
+SLOW = "manufactured or elastica or cures or slender or felupe or arch or huge or nearly or conjugate or turned"
+CORE = f"not ({SLOW} or refused or warned or check)"
+STATES = (
+    "taylor or rest or patch or homogeneous or hydrostatic or uniaxial or shear or least or symmetric or small or kernel or equal or free or rigid"
+)
+STATES += " or without"
+ALL = "not (manufactured and tetrahedron or 4999 or 0.49)"
+
+
+@dataclass(frozen=True)
+class Bug:
+    """A text of a source file, found in it exactly once, and what to put in its place."""
+
+    name: str
+    file: str
+    text: str
+    wrong: str
+    tests: str = CORE
+
+
+KERNELS, GENERAL, LAWS, ELEMENTS, ASSEMBLY = (f"mor_bench/mechanics/{name}.py" for name in ("kernels", "general", "laws", "elements", "assembly"))
+LINEAR, MODEL, NEWTON, PCG, STABILITY = (f"mor_bench/mechanics/{name}.py" for name in ("linear", "model", "newton", "pcg", "stability"))
+LOCKING, GALERKIN, SURROGATE = "mor_bench/mechanics/locking.py", "mor_bench/reduction/galerkin.py", "mor_bench/surrogate.py"
+CHECK, LOADS = "mor_bench/harness/check.py", "mor_bench/scene/loads.py"
+
+BUGS = (
+    # Saint Venant-Kirchhoff on H8
+    Bug("H8 kernel: sign of a shear stress", KERNELS, "s01, s02, s12 = wm * e01,", "s01, s02, s12 = -wm * e01,"),
+    Bug("H8 kernel: μ for λ in the pressure", KERNELS, "wl = w_lam[l] * trace", "wl = w_mu[l] * trace", STATES),
+    Bug("H8 kernel: λ for μ in the shear", KERNELS, "wm = 2.0 * w_mu[l]", "wm = 2.0 * w_lam[l]", STATES),
+    Bug(
+        "H8 kernel: geometric stiffness dropped", KERNELS, "m00, m11, m22 = gg * M[l] + s,", "s = 0.0\n                m00, m11, m22 = gg * M[l] + s,"
+    ),
+    Bug("H8 kernel: F transposed in P", KERNELS, "= f00 * s01 + h01 * s11 + h02 * s12", "= f00 * s01 + h10 * s11 + h20 * s12", STATES),
+    Bug("H8 kernel: strain not quadratic", KERNELS, "e00 = h00 + 0.5 *", "e00 = h00 + 0.25 *", STATES),
+    Bug("H8 kernel: energy halved", KERNELS, "energy[l] += 0.5 * (s00", "energy[l] += 0.25 * (s00", f"{STATES} or work or huge"),
+    Bug("H8 kernel: λ and μ swapped in a tangent block", KERNELS, "+= l0 * h1 + n1 * h0 + m01", "+= l1 * h0 + n0 * h1 + m01"),
+    Bug(
+        "H8 kernel: force alone takes the first Gauss point's gradients",
+        KERNELS,
+        "_nodal_force(P, gradients[b, q], f_e)",
+        "_nodal_force(P, gradients[b, 0], f_e)",
+        STATES + " or alone",
+    ),
+    Bug("H8 kernel: det F of the wrong sign", KERNELS, "- h01 * (h10 * f22 - h12 * h20)", "+ h01 * (h10 * f22 - h12 * h20)"),
+    # any law on any element
+    Bug("general kernel: sign of the force", GENERAL, "f_e[a, i] += F[i, 0] * Sg[a, 0]", "f_e[a, i] -= F[i, 0] * Sg[a, 0]", STATES),
+    Bug("general kernel: F transposed", GENERAL, "+= u_e[a, i] * g[a, j]", "+= u_e[a, j] * g[a, i]", STATES),
+    Bug("general kernel: geometric stiffness dropped", GENERAL, "k_ab = geometric if i == j else 0.0", "k_ab = 0.0"),
+    Bug("general kernel: det F <= 0 accepted", GENERAL, "if not det > 0.0:", "if False:", "huge or confined or without"),
+    Bug(
+        "general kernel: min det F not kept", GENERAL, "min_det = min(min_det, det)", "min_det = det", "kernel or confined or alone or huge or rigid"
+    ),
+    # laws
+    Bug("Saint Venant-Kirchhoff: λ and μ swapped", LAWS, "lam, mu = p[0], p[1]\n    trace", "lam, mu = p[1], p[0]\n    trace", STATES),
+    Bug("Saint Venant-Kirchhoff: sign of the stress", LAWS, "S[i, j] = 2.0 * mu * e", "S[i, j] = -2.0 * mu * e", STATES),
+    Bug("Saint Venant-Kirchhoff: tangent in shear", LAWS, "D[3 + i, 3 + i] = mu", "D[3 + i, 3 + i] = 2.0 * mu", STATES),
+    Bug("neo-Hooke: λ and μ swapped", LAWS, "lam, mu = p[0], p[1]\n    inverse", "lam, mu = p[1], p[0]\n    inverse", STATES),
+    Bug("neo-Hooke: sign of the stress", LAWS, "(lam * log_j - mu) * inverse[i, j]", "(mu - lam * log_j) * inverse[i, j]", STATES),
+    Bug("neo-Hooke: tangent", LAWS, "2.0 * (mu - lam * log_j)", "2.0 * (mu + lam * log_j)", f"{STATES} or quadratically"),
+    Bug("Mooney-Rivlin: c10 and c01 swapped", LAWS, "c10, c01, bulk = p[0], p[1], p[2]", "c01, c10, bulk = p[0], p[1], p[2]", f"{STATES} or felupe"),
+    Bug("Mooney-Rivlin: sign of the second stress", LAWS, "+ 2.0 * b * (d_second", "- 2.0 * b * (d_second", STATES),
+    Bug("Mooney-Rivlin: tangent", LAWS, "_add_product(D, -4.0 * b, identity)", "_add_product(D, 4.0 * b, identity)", STATES),
+    Bug("Ogden: sign of the stress", LAWS, "S += principal[a] * Na", "S -= principal[a] * Na", STATES),
+    Bug("Ogden: tangent in shear", LAWS, "shear = (principal[a] - principal[b])", "shear = 0.5 * (principal[a] - principal[b])", STATES),
+    Bug("Ogden: tangent of equal stretches", LAWS, "gamma[a, b] - 2.0 * beta[a])", "gamma[a, b] + 2.0 * beta[a])", "equal"),
+    Bug("volumetric energy: tangent", LAWS, "_add_product(D, -2.0 * J * d_u, inverse)", "_add_product(D, 2.0 * J * d_u, inverse)", STATES),
+    # elements and assembly
+    Bug("H8: one Gauss weight wrong", ELEMENTS, "np.ones(8)", "np.array([1.0] * 7 + [1.2])", f"({ALL}) and not (tetrahedron or turned)"),
+    Bug(
+        "H8: Gauss points at the wrong place",
+        ELEMENTS,
+        "_CORNERS / np.sqrt(3.0)",
+        "_CORNERS / np.sqrt(1.5)",
+        "elastica or slender or manufactured and not tetrahedron",
+    ),
+    Bug("T4: two nodes exchanged", ELEMENTS, "[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]", "[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]", STATES),
+    Bug("T4: weight of the pyramid", ELEMENTS, "np.array([1.0 / 6.0])", "np.array([1.0 / 3.0])", f"{STATES} or contrast or felupe"),
+    Bug("inverted cells accepted", ELEMENTS, "if not np.all(det_j > least):", "if False:", "refused"),
+    Bug("NaN in det J accepted", ELEMENTS, "if not np.all(det_j > least):", "if np.any(det_j <= least):", "refused"),
+    Bug(
+        "selective: gradient at the centre, not the mean",
+        ASSEMBLY,
+        'mean = np.einsum("cq,cqaj->caj", weights, gradients) / volume[:, None, None]',
+        "mean = shape_gradients(points, cells, element.centre[None])[0][:, 0]",
+        f"{STATES} or cures",
+    ),
+    Bug("selective integration ignored", ASSEMBLY, "if not selective:", "if True:", "cures"),
+    Bug("weights of cells ignored", ASSEMBLY, "else quadrature.weights * cell_weights[:, None]", "else quadrature.weights", "contrast"),
+    Bug(
+        "lower triangle stored at fixed dofs",
+        ASSEMBLY,
+        "np.where(high < n_dofs, low",
+        "np.where(low < n_dofs, low",
+        "contrast or direct or quadratically",
+    ),
+    # Newton
+    Bug(
+        "Newton's tolerance ignored",
+        NEWTON,
+        "if size <= tolerance * load_norm:\n            return",
+        "if size <= 1e-1 * load_norm:\n            return",
+        f"{CORE} or nearly or conjugate or (felupe and not every)",
+    ),
+    Bug("det F not checked", NEWTON, "return self.converged and self.min_det_f > 0", "return self.converged", "confined or huge or limit or arch"),
+    Bug("line search leaves det F > 0", NEWTON, "if trial.min_det_f > 0 and trial.energy_j", "if trial.energy_j", "confined or huge or arch"),
+    Bug(
+        "the last state returned where there is no equilibrium",
+        NEWTON,
+        'raise NoEquilibriumError(f"no stable equilibrium: {story}.")',
+        "return Solution(q, 1.0, iterations, cuts)",
+        "itself or confined or huge or arch or limit",
+    ),
+    Bug("cut-backs not limited", NEWTON, "if cuts > options.max_cuts or", "if cuts > 2 * options.max_cuts or", "cut_back"),
+    Bug("safeguarded pass takes half a load for the whole", NEWTON, "if target == 1.0:", "if target >= 0.5:", "cut_back or huge"),
+    Bug(
+        "start perturbed at random",
+        NEWTON,
+        "else start.copy()",
+        "else start + 1e-9 * np.random.normal(size=len(start))\n    q = q * (1 + 1e-9 * np.random.random())",
+        "identical or mirrored",
+    ),
+    # solvers
+    Bug("banded Cholesky: indefinite accepted", LINEAR, "if info != 0:", "if info < 0:", "direct or huge or conjugate"),
+    Bug("SuperLU: indefinite accepted", LINEAR, "if not np.all(lu.U.diagonal() > 0):", "if False:", "direct"),
+    Bug("band not reordered", LINEAR, "min(natural, reordered)", "natural", "reorders"),
+    Bug("banded Cholesky: solution not put back in order", LINEAR, "solution[self._order] = ", "solution[:] = ", "reorders"),
+    Bug("dense Cholesky: indefinite accepted", GALERKIN, "if info != 0:", "if info < 0:", "confined or limit or arch"),
+    Bug("conjugate gradients: indefinite accepted", PCG, "if not curvature > 0.0:", "if curvature == 0.0:", "conjugate or turned"),
+    Bug("conjugate gradients: rotations dropped", PCG, "rotations[node] = X", "rotations[node] = np.eye(3)", "conjugate or turned"),
+    Bug(
+        "conjugate gradients: product with K",
+        PCG,
+        "y2 += k20 * z0 + k21 * z1 + k22 * z2",
+        "y2 += k20 * z0 + k12 * z1 + k22 * z2",
+        "conjugate or turned",
+    ),
+    # stability
+    Bug("highest eigenvalue for the lowest", STABILITY, 'which="SA"', 'which="LA"', "lowest"),
+    Bug("eigenvalue not relative to rest", STABILITY, "scipy.linalg.eigvalsh(here, there,", "scipy.linalg.eigvalsh(here, np.eye(n),", "limit"),
+    Bug("limit: leaps not noticed", STABILITY, "LEAP = 0.25", "LEAP = 1e9", "arch or limit"),
+    Bug("limit: stops at a coarse factor", STABILITY, "tolerance: float = 1e-8", "tolerance: float = 1e-2", "limit or arch"),
+    Bug("limit: inverse factor named", STABILITY, "{limit.factor:.6g}", "{1 / limit.factor:.6g}", "limit or arch"),
+    # checks
+    Bug("supports not checked", MODEL, "    if free:\n", "    if False:\n", "named"),
+    Bug("locking warned of too late", LOCKING, "LOCKING_FROM = 0.45", "LOCKING_FROM = 0.47", "warned or check"),
+    Bug("locking warned of too early", LOCKING, "LOCKING_FROM = 0.45", "LOCKING_FROM = 0.4", "warned or check"),
+    Bug("locking not said by check", CHECK, "if risk else said", "if False else said", "warned or check"),
+    Bug("complex forces accepted", SURROGATE, 'not in "fiu"', 'not in "fiuc"', "refused"),
+    Bug("forces of any size accepted", SURROGATE, "(np.abs(array) <= MAX_FORCE_N).all()", "True", "refused"),
+)
+
+
+def sources(bug: Bug, root: Path = ROOT) -> tuple[str, str]:
+    """The file's text without and with the bug.
+
+    Raises
+    ------
+    ValueError
+        If the text to replace is not found exactly once.
+    """
+    text = (root / bug.file).read_text(encoding="utf-8")
+    if text.count(bug.text) != 1:
+        raise ValueError(f"{bug.name}: {bug.text!r} must be found once in {bug.file}; found {text.count(bug.text)} times.")
+    return text, text.replace(bug.text, bug.wrong)
+
+
+def test_functions() -> list[str]:
+    """`file::function` of every test of this folder but the one about this program."""
+    found = []
+    for path in sorted(Path(__file__).parent.glob("test_*.py")):
+        if path.name != "test_planted_bugs.py":
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            found += [f"{path.name}::{node.name}" for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]
+    return found
+
+
+def run(tree: Path, tests: str) -> tuple[set[str], bool]:
+    """Red test functions of a copy, and whether the suite ran at all."""
+    environment = os.environ | {
+        "NUMBA_CACHE_DIR": str(tree / ".numba"),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "PYTHONPATH": str(tree),
+        "OMP_NUM_THREADS": "1",
+    }
+    command = [sys.executable, "-m", "pytest", "tests/verification", "-v", "--tb=no", "-p", "no:cacheprovider", "-k", tests]
+    command += ["--ignore", "tests/verification/test_planted_bugs.py"]
+    try:
+        output = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=LIMIT_S).stdout
+    except subprocess.TimeoutExpired as error:
+        output = (error.stdout or b"").decode()
+    red = re.findall(r"^tests/verification/(\w+\.py::\w+).* (?:FAILED|ERROR)", output, re.MULTILINE)
+    return set(red), " PASSED" in output or bool(red)
+
+
+def plant(bug: Bug, base: Path) -> set[str]:
+    """Red test functions with one bug, in a copy of the copy whose kernels are compiled."""
+    with tempfile.TemporaryDirectory(prefix="planted-") as folder:
+        tree = Path(folder) / "tree"
+        shutil.copytree(base, tree)
+        (tree / bug.file).write_text(sources(bug, tree)[1], encoding="utf-8")
+        if bug.file == LAWS:  # numba does not see that a function called from another file has changed
+            os.utime(tree / GENERAL)
+        red, _ = run(tree, bug.tests)
+    print(f"{bug.name}: {len(red)} red", flush=True)
+    return red
+
+
+def write_record(caught: dict[str, set[str]], tests: list[str]) -> None:
+    """Both tables: bug → tests, test → bugs."""
+    lines = ["# Planted bugs", "", "Written by `python -m tests.verification.planted_bugs`: each bug is planted alone in a copy of the package.", ""]
+    lines += ["Of each bug only the tests run that its line in the program selects.", "", "| bug | tests that turn red |", "|---|---|"]
+    for name, red in caught.items():
+        named = ", ".join(f"`{test.split('::')[1]}`" for test in sorted(red))
+        lines.append(f"| {name} | {named or '**none**'} |")
+    lines += ["", "| test | bugs that it has caught |", "|---|---|"]
+    for test in tests:
+        bugs = [name for name, red in caught.items() if test in red]
+        lines.append(f"| `{test}` | {'; '.join(bugs) or '**none**'} |")
+    RECORD.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--only", default="", help="Only bugs whose name holds this text; writes no record.")
+    arguments = parser.parse_args()
+    bugs = [bug for bug in BUGS if arguments.only in bug.name]
+    for bug in bugs:
+        sources(bug)
+    with tempfile.TemporaryDirectory(prefix="planted-base-") as folder:
+        base = Path(folder)
+        for name in COPIED:
+            shutil.copytree(ROOT / name, base / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copy(ROOT / "pyproject.toml", base)
+        red, ran = run(base, ALL)
+        if red or not ran:
+            print(f"without a bug these are red or nothing ran: {sorted(red)}")
+            return 1
+        with ThreadPoolExecutor(arguments.workers) as pool:
+            caught = dict(zip([bug.name for bug in bugs], pool.map(lambda bug: plant(bug, base), bugs), strict=True))
+    tests = test_functions()
+    unnoticed = [name for name, red in caught.items() if not red]
+    never = [] if arguments.only else [test for test in tests if not any(test in red for red in caught.values())]
+    if not arguments.only:
+        write_record(caught, tests)
+    for name in unnoticed:
+        print(f"unnoticed: {name}")
+    for test in never:
+        print(f"never red: {test}")
+    return int(bool(unnoticed or never))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,228 @@
+"""Equilibria of every law on every element: convergence, reversibility, symmetry, and loads that have none."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mor_bench
+from mor_bench.errors import InvalidInputError, LockingWarning, SolverError
+from mor_bench.harness.check import check_file
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.linear import BandedCholesky
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
+from mor_bench.scene.materials import SaintVenantKirchhoff
+from mor_bench.scene.mesh import Mesh, box_mesh
+from mor_bench.scene.scene import Scene, load_scene
+
+from .test_elements_and_laws import ELEMENTS, EVERY, LAWS, material_spec, piola
+from .test_full_order import LAW, LIMIT_PA, confined_column, free_assembler
+
+Array = NDArray[np.float64]
+
+
+def scene_of(law: str, kind: tuple[str, bool], poisson: float = 0.4, base: str = "beam-tiny") -> Scene:
+    """A shipped scene with another law, element and Poisson's ratio."""
+    spec = mor_bench.load_scene(base).spec.model_dump(mode="json")
+    discretisation = {"element": kind[0], "integration": "selective" if kind[1] else "full"}
+    return load_scene({**spec, "discretisation": discretisation, "material": material_spec(law, 500.0, poisson)})
+
+
+def patch_load(scene: Scene, patch: int, force: list[float]) -> Array:
+    """A force, N, on a patch, over the free dofs."""
+    return np.asarray((scene.patch_weights[[patch]].toarray()[0][:, None] * np.array(force)).ravel()[scene.free_dofs])
+
+
+@pytest.mark.parametrize("kind", ELEMENTS)
+@pytest.mark.parametrize("steps", [1, 10])
+@pytest.mark.parametrize("factor", [0.99, 1.01, 1.5, 3.0])
+def test_confined_compression_ends_at_the_limit_point(kind: tuple[str, bool], steps: int, factor: float) -> None:
+    """Beyond it plain Newton 'converges' to a mirrored element, with a residual of round-off."""
+    column, q = confined_column(LAW, kind[0] == "tetrahedron", kind[1]), None
+    for step in range(1, steps + 1):
+        level = factor * step / steps
+        if level > 1:
+            with pytest.raises(SolverError):
+                solve_equilibrium(column, np.array([level * LIMIT_PA]), q)
+            return
+        solution = solve_equilibrium(column, np.array([level * LIMIT_PA]), q)
+        q = solution.displacement
+        assert solution.min_det_f == pytest.approx(1 + q[0], rel=1e-12)
+        assert q[0] > 1 / np.sqrt(3) - 1
+    assert q is not None
+    assert 1 + q[0] == pytest.approx(0.6238701392, abs=1e-7)
+
+
+@pytest.mark.parametrize(("law", "kind"), [pair for pair in EVERY if pair[0] != "saint-venant-kirchhoff"])
+def test_laws_without_a_limit_point_carry_more(law: str, kind: tuple[str, bool]) -> None:
+    for factor in (1.01, 3.0):
+        solution = solve_equilibrium(confined_column(LAWS[law], kind[0] == "tetrahedron", kind[1]), np.array([factor * LIMIT_PA]))
+        alpha = 1 + solution.displacement[0]
+        assert piola(LAWS[law], np.diag([alpha, 1.0, 1.0]))[0, 0] == pytest.approx(factor * LIMIT_PA, rel=1e-7)
+        assert solution.min_det_f == pytest.approx(alpha, rel=1e-12)
+
+
+@pytest.mark.parametrize(("law", "kind"), EVERY)
+def test_newton_converges_quadratically_near_the_solution(law: str, kind: tuple[str, bool]) -> None:
+    model = FullOrderModel(scene_of(law, kind))
+    load = np.zeros(model.n_unknowns)
+    load[-1] = 2.0
+    exact = model.solve(load, options=NewtonOptions(tolerance=1e-12)).displacement
+    u, errors = exact + 1e-2 * np.random.default_rng(0).normal(size=len(exact)) * np.abs(exact).max(), []
+    for _ in range(4):
+        errors.append(float(np.linalg.norm(u - exact)))
+        state, tangent = model.linearise(u)
+        u = u + model.factor(tangent).solve(load - state.force)
+    orders = [np.log(c / b) / np.log(b / a) for a, b, c in zip(errors, errors[1:], errors[2:], strict=False) if c > 1e-12 * np.linalg.norm(exact)]
+    assert max(orders) >= 1.8
+
+
+@pytest.mark.parametrize(("law", "kind"), EVERY)
+def test_work_of_loading_is_the_stored_energy_and_unloading_returns_to_rest(law: str, kind: tuple[str, bool]) -> None:
+    model = FullOrderModel(scene_of(law, kind))
+    load = patch_load(model.scene, -1, [0.2, -1.0, 2.0])
+    levels = np.linspace(0, 1, 41)
+    states = [np.zeros(model.n_unknowns)]
+    for level in levels[1:]:
+        states.append(model.solve(level * load, start=states[-1]).displacement)
+    work = sum(0.5 * (a + b) * load @ (v - u) for (a, b), (u, v) in zip(itertools.pairwise(levels), itertools.pairwise(states), strict=True))
+    assert work == pytest.approx(model.force(states[-1]).energy_j, rel=1e-3)
+    u = model.solve(levels[1] * load, start=states[-1]).displacement
+    np.testing.assert_allclose(u, states[1], atol=1e-6 * np.abs(states[1]).max())
+    for _ in range(6):
+        state, tangent = model.linearise(u)
+        u = u - model.factor(tangent).solve(state.force)
+    assert np.abs(u).max() <= 1e-9 * np.abs(states[-1]).max()
+
+
+@pytest.mark.parametrize(("law", "selective"), list(itertools.product(LAWS, (False, True))))
+def test_mirrored_load_gives_the_mirrored_answer(law: str, selective: bool) -> None:
+    """H8 only: the split into T4 is not symmetric."""
+    scene = scene_of(law, ("hexahedron", selective), base="beam-coarse")
+    model, points = FullOrderModel(scene), scene.mesh.points
+    mirror = np.array([int(np.linalg.norm(points - (p * [1, -1, 1] + [0, 1, 0]), axis=1).argmin()) for p in points])
+    forces = scene.patch_weights[[30]].toarray()[0][:, None] * np.array([0.3, 0.5, -0.4])
+    answers = []
+    for load in (forces, forces[mirror] * [1, -1, 1]):
+        u = np.zeros(scene.mesh.n_dofs)
+        u[scene.free_dofs] = model.solve(load.ravel()[scene.free_dofs], options=NewtonOptions(tolerance=1e-13)).displacement
+        answers.append(u.reshape(-1, 3))
+    assert np.linalg.norm(answers[1] - answers[0][mirror] * [1, -1, 1]) <= 1e-12 * np.linalg.norm(answers[0])
+    assert np.abs(answers[1] - answers[0]).max() > 0.1 * np.abs(answers[0]).max()
+
+
+@pytest.mark.parametrize(("law", "kind"), EVERY)
+def test_two_runs_are_identical(law: str, kind: tuple[str, bool]) -> None:
+    first, second = (FullOrderModel(scene_of(law, kind)) for _ in range(2))
+    loads = [patch_load(first.scene, patch, [0.3, -1.0, 1.5]) for patch in (-1, 3)]
+    once, again = [first.solve(load) for load in loads], [second.solve(load) for load in reversed(loads)]
+    for one, other in zip(once, reversed(again), strict=True):
+        np.testing.assert_array_equal(one.displacement, other.displacement)
+        assert (one.min_det_f, one.iterations, one.cuts) == (other.min_det_f, other.iterations, other.cuts)
+
+
+@pytest.mark.filterwarnings("ignore::mor_bench.errors.LockingWarning")
+@pytest.mark.parametrize("poisson", [0.48, 0.49, 0.499, 0.4999])
+@pytest.mark.parametrize(("law", "kind"), EVERY)
+def test_nearly_incompressible_converges(law: str, kind: tuple[str, bool], poisson: float) -> None:
+    scene = scene_of(law, kind, poisson)
+    model, load = FullOrderModel(scene), patch_load(scene, -1, [0.0, 0.5, 1.0])
+    assert scene.material.poisson_at_rest == pytest.approx(poisson, rel=1e-9)
+    solution = model.solve(load)
+    assert np.linalg.norm(load - model.force(solution.displacement).force) <= 1e-8 * np.linalg.norm(load)
+    assert solution.min_det_f > 0
+
+
+@pytest.mark.parametrize("kind", [kind for kind in ELEMENTS if not kind[1]])
+@pytest.mark.parametrize("law", list(LAWS))
+def test_a_scene_that_locks_is_warned_of(law: str, kind: tuple[str, bool]) -> None:
+    with pytest.warns(LockingWarning, match=r"beam-tiny: with Poisson's ratio 0\.46 at rest.*integration = \"selective\"") as caught:
+        FullOrderModel(scene_of(law, kind, 0.46))
+    assert len(caught) == 1
+    assert ('element = "hexahedron"' in str(caught[0].message)) == (kind[0] == "tetrahedron")
+
+
+@pytest.mark.filterwarnings("error::mor_bench.errors.LockingWarning")
+@pytest.mark.parametrize("law", list(LAWS))
+def test_a_scene_that_does_not_lock_is_not_warned_of(law: str) -> None:
+    for kind, poisson in ((("hexahedron", True), 0.4999), (("hexahedron", False), 0.449), (("tetrahedron", False), 0.449)):
+        FullOrderModel(scene_of(law, kind, poisson))
+
+
+def test_check_says_that_a_dataset_locks(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "datasets" / "beam-tiny.toml").read_text(encoding="utf-8")
+    path = tmp_path / "soft.toml"
+    path.write_text(text.replace("poisson  = 0.4", "poisson  = 0.48"), encoding="utf-8")
+    assert "warning: soft: with Poisson's ratio 0.48" in check_file(path)
+    path.write_text(text, encoding="utf-8")
+    assert "warning" not in check_file(path)
+
+
+def test_one_huge_step_is_cut_back_and_ends_where_small_steps_do() -> None:
+    scene = scene_of("neo-hookean", ("hexahedron", False))
+    model, load = FullOrderModel(scene), patch_load(scene, -1, [-20.0, 0.0, -20.0])
+    solution = model.solve(load)
+    q = None
+    for level in np.linspace(0.05, 1.0, 20):
+        q = model.solve(level * load, start=q).displacement
+    assert q is not None
+    assert solution.iterations > 10
+    np.testing.assert_allclose(solution.displacement, q, atol=1e-6 * np.abs(q).max())
+    few = NewtonOptions(max_cuts=3)
+    with pytest.raises(SolverError, match="4 cut-backs"):
+        solve_equilibrium(confined_column(), np.array([3 * LIMIT_PA]), options=few)
+
+
+@pytest.mark.parametrize("bad", ["nan", "inf"])
+def test_points_that_are_not_finite_are_refused(bad: str) -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    points[2, 1] = float(bad)
+    with np.errstate(invalid="ignore"), pytest.raises(InvalidInputError, match="cell 0"):
+        free_assembler(Mesh(points, np.array([[0, 1, 2, 3]])))
+
+
+@pytest.mark.parametrize("bad", ["nan", "inf", "shape", "complex", "text"])
+def test_forces_that_are_not_real_numbers_of_the_right_shape_are_refused(bad: str) -> None:
+    scene = mor_bench.load_scene("beam-tiny")
+    method = mor_bench.load_method("fem").fit(scene, None)
+    force: NDArray[Any] = np.zeros((scene.mesh.n_nodes, 3))
+    if bad in ("nan", "inf"):
+        force[3, 1] = float(bad)
+    force = {"shape": force[:-1], "complex": force + 1j, "text": force.astype(str)}.get(bad, force)
+    with pytest.raises(InvalidInputError, match="forces"):
+        method.predict(force)
+
+
+@pytest.mark.parametrize("bad", ["nan", "inf"])
+def test_the_solver_itself_refuses_a_load_that_is_not_finite(bad: str) -> None:
+    model = FullOrderModel(mor_bench.load_scene("beam-tiny"))
+    load = np.zeros(model.n_unknowns)
+    load[3] = float(bad)
+    with pytest.raises(InvalidInputError, match="load 0 must be finite"):
+        model.solve(load)
+
+
+@pytest.mark.parametrize("kind", ELEMENTS)
+def test_stiffness_contrast_of_a_million(kind: tuple[str, bool]) -> None:
+    """Two bars in series, the second a million times softer: all of the stretch is in it."""
+    mesh = box_mesh((2.0, 1.0, 1.0), (2, 1, 1), kind[0] == "tetrahedron")
+    fixed = mesh.points[:, 0] == 0
+    n = 3 * int((~fixed).sum())
+    dofs = np.full((mesh.n_nodes, 3), n)
+    dofs[~fixed] = np.arange(n).reshape(-1, 3)
+    stiff = mesh.points[mesh.cells].mean(axis=1)[:, 0] < 1
+    model = Assembler(mesh.points, mesh.cells, dofs, n, SaintVenantKirchhoff(1.0, 0.0), np.where(stiff, 1e6, 1.0), kind[1])
+    alpha, load = 1.2, np.zeros((mesh.n_nodes, 3))
+    for facet in mesh.boundary_facets[(mesh.points[mesh.boundary_facets][:, :, 0] == 2.0).all(axis=1)]:
+        load[facet, 0] += 0.5 * (alpha**3 - alpha) / (4 if len(facet) == 4 else 6)
+    u = np.zeros(n)
+    for _ in range(12):
+        state, values = model.force_and_tangent(u)
+        u += BandedCholesky(model.pattern).factor(values).solve(load[~fixed].ravel() - state.force)
+    np.testing.assert_allclose(u.reshape(-1, 3)[mesh.points[~fixed][:, 0] == 2.0, 0], alpha - 1, rtol=2e-6)

@@ -1,0 +1,81 @@
+"""The full-order model against felupe, whose stress and elasticity come from automatic differentiation of the energy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import felupe
+import numpy as np
+import pytest
+from felupe.constitution import tensortrax
+from numpy.typing import NDArray
+from tensortrax.math import log, sqrt, trace
+from tensortrax.math.linalg import det
+
+import mor_bench
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.scene.scene import Scene
+
+from .test_elements_and_laws import LAWS, material_spec
+
+Array = NDArray[np.float64]
+
+
+def felupe_law(scene: Scene) -> Any:
+    """The scene's law, its energy written in C."""
+    models, p = tensortrax.models.hyperelastic, scene.material.parameters
+    name = scene.spec.material.law
+    if name == "saint-venant-kirchhoff":
+        return tensortrax.Hyperelastic(models.saint_venant_kirchhoff, mu=p[1], lmbda=p[0])
+
+    def energy(c: Any) -> Any:
+        j = sqrt(det(c))
+        if name == "neo-hookean":
+            return p[1] / 2 * (trace(c) - 3) - p[1] * log(j) + p[0] / 2 * log(j) ** 2
+        if name == "mooney-rivlin":
+            return models.mooney_rivlin(c, C10=p[0], C01=p[1]) + p[2] / 2 * (j - 1) ** 2
+        # Ogden with exponents 2 and -2, whose sums of stretches are the invariants: automatic eigenvalues lose digits.
+        return models.mooney_rivlin(c, C10=p[1] / p[2], C01=p[3] / p[4]) + p[0] / 2 * (j - 1) ** 2
+
+    return tensortrax.Hyperelastic(energy)
+
+
+def felupe_solution(scene: Scene, forces: Array) -> Array:
+    """Displacements, (n_nodes, 3) m."""
+    tetrahedra = scene.mesh.cells.shape[1] == 4
+    mesh = felupe.Mesh(scene.mesh.points, scene.mesh.cells, "tetra" if tetrahedra else "hexahedron")
+    field = felupe.FieldContainer([felupe.Field((felupe.RegionTetra if tetrahedra else felupe.RegionHexahedron)(mesh), dim=3)])
+    fixed = {"support": felupe.Boundary(field[0], mask=np.isin(np.arange(scene.mesh.n_nodes), scene.fixed_nodes))}
+    dof0, dof1 = felupe.dof.partition(field, fixed)
+    load = felupe.PointLoad(field, np.arange(scene.mesh.n_nodes), forces)
+    result = felupe.newtonraphson(items=[felupe.SolidBody(felupe_law(scene), field), load], dof0=dof0, dof1=dof1, tol=1e-11, verbose=0)
+    return np.asarray(result.x[0].values)
+
+
+def compare(scene: Scene, n_loads: int) -> None:
+    """Solve random loads on random patches by both; 1e-8 is the largest relative difference allowed."""
+    model, rng, weights = FullOrderModel(scene), np.random.default_rng(7), scene.patch_weights.toarray()
+    for _ in range(n_loads):
+        direction = rng.normal(size=3)
+        vector = direction / np.linalg.norm(direction) * rng.uniform(0.2, 1.0)
+        forces = weights[rng.integers(len(weights))][:, None] * vector
+        ours = np.zeros(scene.mesh.n_dofs)
+        load = forces.ravel()[scene.free_dofs]
+        ours[scene.free_dofs] = model.solve(load, options=NewtonOptions(tolerance=1e-10)).displacement
+        theirs = felupe_solution(scene, forces).ravel()
+        assert np.linalg.norm(ours - theirs) <= 1e-8 * np.linalg.norm(theirs)
+
+
+def test_agrees_with_felupe_on_fifty_random_loads() -> None:
+    compare(mor_bench.load_scene("beam-coarse"), 50)
+
+
+@pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
+@pytest.mark.parametrize("law", list(LAWS))
+def test_agrees_with_felupe_on_every_law_and_element(law: str, element: str) -> None:
+    spec = mor_bench.load_scene("beam-tiny").spec.model_dump(mode="json")
+    material = material_spec(law, 500.0, 0.4)
+    if law == "ogden":
+        material |= {"alpha": [2.0, -2.0], "mu_pa": [140.0, -35.0]}
+    compare(mor_bench.load_scene({**spec, "discretisation": {"element": element}, "material": material}), 5)

@@ -1,0 +1,125 @@
+"""Limit points: a closed form, and a snapping truss-like arch against its path under a prescribed displacement."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mor_bench
+from mor_bench.errors import NoEquilibriumError, SolverError
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import solve_equilibrium
+from mor_bench.mechanics.stability import LimitPoint, limit_load, lowest_tangent_eigenvalue, solve_on_path
+from mor_bench.reduction.galerkin import GalerkinProblem
+from mor_bench.scene.mesh import Mesh, box_mesh
+
+from .test_full_order import LAW, LIMIT_PA, confined_column, dense
+
+Array = NDArray[np.float64]
+
+
+def test_limit_of_confined_compression() -> None:
+    """At stretch α the tangent is (3α² - 1)/2 of that at rest: it vanishes at α = 1/√3."""
+    problem = confined_column()
+    for alpha in (0.7, 0.9, 1.2):
+        assert lowest_tangent_eigenvalue(problem, np.array([alpha - 1])) == pytest.approx((3 * alpha**2 - 1) / 2, rel=1e-12)
+    limit = limit_load(problem, np.array([3 * LIMIT_PA]))
+    assert limit is not None
+    assert limit.factor == pytest.approx(1 / 3, rel=1e-7)
+    assert 1 + limit.displacement[0] == pytest.approx(1 / np.sqrt(3), abs=1e-4)
+    assert 0 < limit.lowest_eigenvalue < 1e-3
+
+
+def named(error: NoEquilibriumError) -> tuple[float, float]:
+    """The limit's factor and the eigenvalue that the message names."""
+    found = re.search(r"ends at (\S+) of the load, where the lowest tangent eigenvalue is (\S+) of", str(error))
+    assert found is not None
+    return float(found[1]), float(found[2])
+
+
+def test_asked_for_more_the_path_ends_in_an_error_that_names_the_limit() -> None:
+    with pytest.raises(NoEquilibriumError, match="lowest tangent eigenvalue") as caught:
+        solve_on_path(confined_column(), np.array([1.5 * LIMIT_PA]))
+    factor, eigenvalue = named(caught.value)
+    assert factor == pytest.approx(1 / 1.5, abs=1e-6)
+    assert 0 < eigenvalue < 1e-3
+    assert limit_load(confined_column(), np.array([0.99 * LIMIT_PA])) is None
+    np.testing.assert_allclose(1 + solve_on_path(confined_column(), np.array([0.99 * LIMIT_PA])), 0.6238701392, atol=1e-8)
+
+
+def test_lowest_eigenvalue_of_a_large_tangent_is_that_of_the_dense_matrices() -> None:
+    scene = mor_bench.load_scene("beam-coarse")
+    model = FullOrderModel(scene)
+    load = (scene.patch_weights[[62]].toarray()[0][:, None] * np.array([-2.0, 0.5, 1.0])).ravel()[scene.free_dofs]
+    u = model.solve(load).displacement
+    tangent, rest = (dense(model.assembler, values) for values in (model.linearise(u)[1], model.rest_tangent))
+    expected = np.linalg.eigvals(np.linalg.solve(rest, tangent)).real.min()
+    assert lowest_tangent_eigenvalue(model, u) == pytest.approx(expected, rel=1e-6)
+    assert lowest_tangent_eigenvalue(model, 0 * u) == pytest.approx(1.0, rel=1e-10)
+
+
+@dataclass(frozen=True)
+class Arch:
+    """Two straight bars between hinges 4 m apart, the crown 0.4 m above them; the load is 2 N downwards on the crown's edge."""
+
+    problem: GalerkinProblem
+    load: Array
+    crown: NDArray[np.int64]
+    limit: LimitPoint
+
+
+@pytest.fixture(scope="module")
+def arch() -> Arch:
+    mesh = box_mesh((4.0, 1.0, 0.2), (8, 1, 2))
+    x, _, z = mesh.points.T
+    fixed = ((x == 0) | (x == 4.0)) & np.isclose(z, 0.1)
+    crown_nodes = np.flatnonzero((x == 2.0) & (z == 0.2))
+    lifted = Mesh(mesh.points + np.outer(0.4 * (1 - np.abs(x / 2 - 1)), [0, 0, 1]), mesh.cells)
+    n = 3 * int((~fixed).sum())
+    dofs = np.full((mesh.n_nodes, 3), n)
+    dofs[~fixed] = np.arange(n).reshape(-1, 3)
+    problem = GalerkinProblem(Assembler(lifted.points, lifted.cells, dofs, n, LAW), np.eye(n))
+    crown = dofs[crown_nodes, 2]
+    load = np.zeros(n)
+    load[crown] = -1.0
+    limit = limit_load(problem, load)
+    assert limit is not None
+    return Arch(problem, load, crown, limit)
+
+
+def test_limit_of_the_arch_is_the_greatest_reaction_to_a_prescribed_displacement(arch: Arch) -> None:
+    others = np.setdiff1d(np.arange(len(arch.load)), arch.crown)
+    q, reactions = np.zeros(len(arch.load)), []
+    for depth in np.linspace(0.0, 0.4, 81):
+        q[arch.crown] = -depth
+        for _ in range(8):
+            state, tangent = arch.problem.linearise(q)
+            q[others] -= np.linalg.solve(tangent[np.ix_(others, others)], state.force[others])
+        reactions.append(-arch.problem.force(q).force[arch.crown].mean())
+    most = int(np.argmax(reactions))
+    top = np.polynomial.Polynomial.fit(np.arange(most - 2, most + 3), reactions[most - 2 : most + 3], 4)
+    assert arch.limit.factor == pytest.approx(top(np.linspace(most - 1, most + 1, 2001)).max(), rel=1e-6)
+    assert 0 < arch.limit.lowest_eigenvalue < 1e-3
+    assert reactions[-1] < reactions[most]
+
+
+@pytest.mark.parametrize("factor", [1.01, 1.5, 3.0])
+def test_beyond_its_limit_the_arch_snaps_to_a_stable_state_or_says_why_not(arch: Arch, factor: float) -> None:
+    load = factor * arch.limit.factor * arch.load
+    with pytest.raises(NoEquilibriumError) as caught:
+        solve_on_path(arch.problem, load)
+    assert named(caught.value)[0] == pytest.approx(1 / factor, abs=1e-6)
+    try:
+        solution = solve_equilibrium(arch.problem, load)
+    except SolverError:
+        return
+    assert solution.min_det_f > 0
+    assert lowest_tangent_eigenvalue(arch.problem, solution.displacement) > 0
+    assert solution.displacement[arch.crown].max() < -0.4
+    residual = load - arch.problem.force(solution.displacement).force
+    assert np.linalg.norm(residual) <= 1e-8 * np.linalg.norm(load)
