@@ -17,11 +17,12 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from queue import SimpleQueue
 
 ROOT = Path(__file__).parents[2]
 RECORD = Path(__file__).with_name("PLANTED_BUGS.md")
 COPIED = ("mor_bench", "tests", "datasets", "methods")
-LIMIT_S = 300
+LIMIT_S = 120
 """A bug may also make the suite hang; what has failed until then counts."""
 
 # Which tests run, as an expression of pytest's -k. Compiling and the slow tests are most of the time.
@@ -74,7 +75,6 @@ BUGS = (
     Bug("general kernel: sign of the force", GENERAL, "f_e[a, i] += F[i, 0] * Sg[a, 0]", "f_e[a, i] -= F[i, 0] * Sg[a, 0]", STATES),
     Bug("general kernel: F transposed", GENERAL, "+= u_e[a, i] * g[a, j]", "+= u_e[a, j] * g[a, i]", STATES),
     Bug("general kernel: geometric stiffness dropped", GENERAL, "k_ab = geometric if i == j else 0.0", "k_ab = 0.0"),
-    Bug("general kernel: det F <= 0 accepted", GENERAL, "if not det > 0.0:", "if False:", "huge or confined or without"),
     Bug(
         "general kernel: min det F not kept", GENERAL, "min_det = min(min_det, det)", "min_det = det", "kernel or confined or alone or huge or rigid"
     ),
@@ -130,7 +130,6 @@ BUGS = (
         f"{CORE} or nearly or conjugate or (felupe and not every)",
     ),
     Bug("det F not checked", NEWTON, "return self.converged and self.min_det_f > 0", "return self.converged", "confined or huge or limit or arch"),
-    Bug("line search leaves det F > 0", NEWTON, "if trial.min_det_f > 0 and trial.energy_j", "if trial.energy_j", "confined or huge or arch"),
     Bug(
         "the last state returned where there is no equilibrium",
         NEWTON,
@@ -152,7 +151,7 @@ BUGS = (
     Bug("SuperLU: indefinite accepted", LINEAR, "if not np.all(lu.U.diagonal() > 0):", "if False:", "direct"),
     Bug("band not reordered", LINEAR, "min(natural, reordered)", "natural", "reorders"),
     Bug("banded Cholesky: solution not put back in order", LINEAR, "solution[self._order] = ", "solution[:] = ", "reorders"),
-    Bug("dense Cholesky: indefinite accepted", GALERKIN, "if info != 0:", "if info < 0:", "confined or limit or arch"),
+    Bug("dense Cholesky: indefinite accepted", GALERKIN, "if info != 0:", "if info < 0:", "unstable or confined or limit or arch"),
     Bug("conjugate gradients: indefinite accepted", PCG, "if not curvature > 0.0:", "if curvature == 0.0:", "conjugate or turned"),
     Bug("conjugate gradients: rotations dropped", PCG, "rotations[node] = X", "rotations[node] = np.eye(3)", "conjugate or turned"),
     Bug(
@@ -202,35 +201,52 @@ def test_functions() -> list[str]:
     return found
 
 
-def run(tree: Path, tests: str) -> tuple[set[str], bool]:
+def run(tree: Path, tests: str, limit_s: float = LIMIT_S) -> tuple[set[str], bool]:
     """Red test functions of a copy, and whether the suite ran at all."""
     environment = os.environ | {
         "NUMBA_CACHE_DIR": str(tree / ".numba"),
         "PYTHONDONTWRITEBYTECODE": "1",
+        "PYTHONUNBUFFERED": "1",
         "PYTHONPATH": str(tree),
         "OMP_NUM_THREADS": "1",
     }
     command = [sys.executable, "-m", "pytest", "tests/verification", "-v", "--tb=no", "-p", "no:cacheprovider", "-k", tests]
     command += ["--ignore", "tests/verification/test_planted_bugs.py"]
     try:
-        output = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=LIMIT_S).stdout
+        output = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=limit_s).stdout
     except subprocess.TimeoutExpired as error:
         output = (error.stdout or b"").decode()
     red = re.findall(r"^tests/verification/(\w+\.py::\w+).* (?:FAILED|ERROR)", output, re.MULTILINE)
     return set(red), " PASSED" in output or bool(red)
 
 
-def plant(bug: Bug, base: Path) -> set[str]:
-    """Red test functions with one bug, in a copy of the copy whose kernels are compiled."""
-    with tempfile.TemporaryDirectory(prefix="planted-") as folder:
-        tree = Path(folder) / "tree"
-        shutil.copytree(base, tree)
-        (tree / bug.file).write_text(sources(bug, tree)[1], encoding="utf-8")
-        if bug.file == LAWS:  # numba does not see that a function called from another file has changed
-            os.utime(tree / GENERAL)
-        red, _ = run(tree, bug.tests)
+def plant(bug: Bug, tree: Path) -> set[str]:
+    """Red test functions with one bug in a copy, which is put back in order afterwards.
+
+    Numba keeps compiled kernels by the source's path and content, so that copies must last; and it does not see that a
+    function called from another file has changed.
+    """
+    before = {path: path.read_text(encoding="utf-8") for path in (tree / bug.file, tree / GENERAL)}
+    if bug.file == LAWS:
+        (tree / GENERAL).write_text(before[tree / GENERAL] + "# compiled anew\n", encoding="utf-8")
+    (tree / bug.file).write_text(sources(bug, tree)[1], encoding="utf-8")
+    red, _ = run(tree, bug.tests)
+    for path, text in before.items():
+        path.write_text(text, encoding="utf-8")
+    shutil.rmtree(tree / ".numba")
+    shutil.copytree(tree / ".numba-clean", tree / ".numba")
     print(f"{bug.name}: {len(red)} red", flush=True)
     return red
+
+
+def prepare(tree: Path) -> set[str]:
+    """Copy the package and compile its kernels by a run of the suite; red test functions, or the word that nothing ran."""
+    for name in COPIED:
+        shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", tree)
+    red, ran = run(tree, ALL, 10 * LIMIT_S)
+    shutil.copytree(tree / ".numba", tree / ".numba-clean")
+    return red if ran else {"nothing ran"}
 
 
 def write_record(caught: dict[str, set[str]], tests: list[str]) -> None:
@@ -255,17 +271,24 @@ def main() -> int:
     bugs = [bug for bug in BUGS if arguments.only in bug.name]
     for bug in bugs:
         sources(bug)
-    with tempfile.TemporaryDirectory(prefix="planted-base-") as folder:
-        base = Path(folder)
-        for name in COPIED:
-            shutil.copytree(ROOT / name, base / name, ignore=shutil.ignore_patterns("__pycache__"))
-        shutil.copy(ROOT / "pyproject.toml", base)
-        red, ran = run(base, ALL)
-        if red or not ran:
-            print(f"without a bug these are red or nothing ran: {sorted(red)}")
+    with tempfile.TemporaryDirectory(prefix="planted-") as folder, ThreadPoolExecutor(arguments.workers) as pool:
+        trees = [Path(folder) / str(number) for number in range(arguments.workers)]
+        red = set().union(*pool.map(prepare, trees))
+        if red:
+            print(f"red without a bug: {sorted(red)}")
             return 1
-        with ThreadPoolExecutor(arguments.workers) as pool:
-            caught = dict(zip([bug.name for bug in bugs], pool.map(lambda bug: plant(bug, base), bugs), strict=True))
+        free: SimpleQueue[Path] = SimpleQueue()
+        for tree in trees:
+            free.put(tree)
+
+        def plant_somewhere(bug: Bug) -> set[str]:
+            tree = free.get()
+            try:
+                return plant(bug, tree)
+            finally:
+                free.put(tree)
+
+        caught = dict(zip([bug.name for bug in bugs], pool.map(plant_somewhere, bugs), strict=True))
     tests = test_functions()
     unnoticed = [name for name, red in caught.items() if not red]
     never = [] if arguments.only else [test for test in tests if not any(test in red for red in caught.values())]
