@@ -59,6 +59,17 @@ def test_confined_compression_ends_at_the_limit_point(kind: tuple[str, bool], st
     assert 1 + q[0] == pytest.approx(0.6238701392, abs=1e-7)
 
 
+@pytest.mark.parametrize("kind", ELEMENTS)
+def test_an_unstable_equilibrium_is_never_returned(kind: tuple[str, bool]) -> None:
+    """Under 0.9 of the limit load the residual vanishes at two stretches; started at the unstable one, the other is found."""
+    column, ratio = confined_column(LAW, kind[0] == "tetrahedron", kind[1]), 0.9 * 2 / (3 * np.sqrt(3))
+    unstable, stable = sorted(root.real for root in np.roots([1.0, 0.0, -1.0, ratio]) if root.real > 0)
+    load = column.force(np.array([unstable - 1])).force
+    assert load == pytest.approx([0.9 * LIMIT_PA], rel=1e-7)
+    solution = solve_equilibrium(column, load, np.array([unstable - 1]))
+    assert 1 + solution.displacement[0] == pytest.approx(stable, abs=1e-6)
+
+
 @pytest.mark.parametrize(("law", "kind"), [pair for pair in EVERY if pair[0] != "saint-venant-kirchhoff"])
 def test_laws_without_a_limit_point_carry_more(law: str, kind: tuple[str, bool]) -> None:
     for factor in (1.01, 3.0):
