@@ -136,9 +136,8 @@ BUGS = (
         "if _met(load - state.force, load_norm, 1e-1):",
         f"{CORE} or solver",
     ),
-    Bug(
-        "a start that is an unstable solution is accepted", NEWTON, "memory.convex and (start is None or iteration > 1)", "memory.convex", "unstable"
-    ),
+    Bug("a start that is an unstable solution is accepted", NEWTON, "and (start is None or iteration > 1)", "", "unstable"),
+    Bug("accelerated pass: negative curvature accepted", NEWTON, "converged=memory.convex and", "converged=True and", "unstable"),
     Bug("det F not checked", NEWTON, "return self.converged and self.min_det_f > 0", "return self.converged", "confined or huge or limit or arch"),
     Bug(
         "the last state returned where there is no equilibrium",

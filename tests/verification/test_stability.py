@@ -17,6 +17,7 @@ from mor_bench.mechanics.newton import solve_equilibrium
 from mor_bench.mechanics.stability import LimitPoint, limit_load, lowest_tangent_eigenvalue, solve_on_path
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.scene.mesh import Mesh, box_mesh
+from mor_bench.scene.scene import Scene
 
 from .test_full_order import LAW, LIMIT_PA, confined_column, dense
 
@@ -123,3 +124,27 @@ def test_beyond_its_limit_the_arch_snaps_to_a_stable_state_or_says_why_not(arch:
     assert solution.displacement[arch.crown].max() < -0.4
     residual = load - arch.problem.force(solution.displacement).force
     assert np.linalg.norm(residual) <= 1e-8 * np.linalg.norm(load)
+
+
+def test_an_unstable_equilibrium_is_never_returned_by_the_accelerated_pass() -> None:
+    """The arch as a whole model, held on the falling part of its path: the residual vanishes, the tangent is indefinite."""
+    mesh = box_mesh((4.0, 1.0, 0.2), (8, 1, 2))
+    x, _, z = mesh.points.T
+    lifted = Mesh(mesh.points + np.outer(0.4 * (1 - np.abs(x / 2 - 1)), [0, 0, 1]), mesh.cells)
+    fixed = np.flatnonzero(((x == 0) | (x == 4.0)) & np.isclose(z, 0.1))
+    model = FullOrderModel(Scene(mor_bench.load_scene("beam-tiny").spec, lifted, LAW, fixed))
+    free = np.full(mesh.n_dofs, -1)
+    free[model.scene.free_dofs] = np.arange(model.n_unknowns)
+    crown = free.reshape(-1, 3)[(x == 2.0) & (z == 0.2), 2]
+    others, q = np.setdiff1d(np.arange(model.n_unknowns), crown), np.zeros(model.n_unknowns)
+    for depth in np.linspace(0.0, 0.35, 71):
+        q[crown] = -depth
+        for _ in range(8):
+            state, values = model.linearise(q)
+            q[others] -= np.linalg.solve(dense(model.assembler, values)[np.ix_(others, others)], state.force[others])
+    assert lowest_tangent_eigenvalue(model, q) < 0
+    load = model.force(q).force
+    for start in (None, q, q * (1 + 1e-6)):
+        solution = model.solve(load, start)
+        assert lowest_tangent_eigenvalue(model, solution.displacement) > 0
+        assert np.linalg.norm(load - model.force(solution.displacement).force) <= 1e-8 * np.linalg.norm(load)
