@@ -51,5 +51,9 @@ class MissingDependencyError(MorBenchError, ImportError):
     """A method needs an extra that is not installed; the message names it."""
 
 
+class IllConditionedWarning(UserWarning):
+    """The stiffness at rest has so large a condition number that answers lose most of their digits."""
+
+
 class LockingWarning(UserWarning):
     """A discretisation is too stiff for a nearly incompressible material: its displacements are too small."""

@@ -10,8 +10,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.mechanics.elements import H8, element_of, shape_gradients
-from mor_bench.mechanics.general import general_force
 from mor_bench.mechanics.kernels import LANES, internal_force, internal_force_and_tangent
+from mor_bench.mechanics.laws import general_force
 from mor_bench.scene.materials import Material, SaintVenantKirchhoff
 
 Array = NDArray[np.float64]
@@ -179,6 +179,7 @@ class Assembler:
         self.pattern, slots = _pattern(dof_of_node, cells, n_dofs)
         self.n_dofs = n_dofs
         self.n_cells = n_cells
+        self.extent_m = float(np.ptp(points, axis=0).max())
         self.material = material
         self._n_values = len(self.pattern.indices) + 1
         self._vectorised = isinstance(material, SaintVenantKirchhoff) and n_nodes == H8.n_nodes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import cached_property
 from importlib.util import find_spec
 from typing import get_args
@@ -9,7 +10,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import MissingDependencyError, SolverError, UnconstrainedBodyError
+from mor_bench.errors import IllConditionedWarning, MissingDependencyError, SolverError, UnconstrainedBodyError
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.linear import (
@@ -25,7 +26,7 @@ from mor_bench.mechanics.linear import (
 )
 from mor_bench.mechanics.locking import warn_of_locking
 from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibria, solve_equilibrium
-from mor_bench.mechanics.rotated import BlockJacobi, RotatedRest, conjugate_gradients
+from mor_bench.mechanics.rotated import BlockJacobi, RotatedRest, condition_number, conjugate_gradients
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import SolverName
 
@@ -48,6 +49,8 @@ Meshes whose band has more than `MAX_BAND_ENTRIES` entries use multigrid in plac
 PCG_FROM = 3000
 """Unknowns from which conjugate gradients beat a fresh banded factor for each Newton step."""
 JACOBI_ITERATIONS = 20_000
+ILL_CONDITIONED = 1e10
+"""Condition number of the stiffness at rest from which answers cannot be trusted to the default tolerance."""
 
 RIGID_MODES = ("translation x", "translation y", "translation z", "rotation about x", "rotation about y", "rotation about z")
 
@@ -115,6 +118,7 @@ class FullOrderModel:
         dof_of_node = number.reshape(-1, 3)
         self.cell_dofs = dof_of_node[mesh.cells].reshape(mesh.n_cells, -1)
         self.assembler = Assembler(mesh.points, mesh.cells, dof_of_node, self.n_unknowns, scene.material, selective=scene.selective)
+        self.extent = self.assembler.extent_m
         self._direct = self._direct_solver()
 
     def _direct_solver(self) -> LinearSolver:
@@ -136,7 +140,16 @@ class FullOrderModel:
     def rest_factor(self) -> Factor:
         """The stiffness at rest, factorised: the linear response is one back-solve."""
         # With Pardiso a solver of its own, since it holds one factor at a time.
-        return (self._direct_solver() if self.solver == "pardiso" else self._direct).factor(self.rest_tangent)
+        factor = (self._direct_solver() if self.solver == "pardiso" else self._direct).factor(self.rest_tangent)
+        condition = condition_number(self.assembler.pattern, self.rest_tangent, factor) if isinstance(factor, BandedFactor) else 1.0
+        if condition > ILL_CONDITIONED:
+            warnings.warn(
+                f"{self.scene.name}: the condition number of the stiffness at rest is about {condition:.0e}, above {ILL_CONDITIONED:.0e}: "
+                f"displacements have some {max(0, int(15.9 - np.log10(condition)))} correct digits.",
+                IllConditionedWarning,
+                stacklevel=2,
+            )
+        return factor
 
     def force(self, q: NDArray[np.float64]) -> State:
         return self.assembler.force(q)

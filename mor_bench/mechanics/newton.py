@@ -30,7 +30,10 @@ DAMPED_ITERATIONS = 60
 HOPELESS = 1e10
 """A residual this many times the load ends the plain pass; near incompressibility it rises 3,000-fold and still converges."""
 ROUND_OFF = 1e-13
-"""A correction this small relative to the displacement is round-off: slender bodies never meet a force tolerance."""
+"""A correction this small relative to the displacement is round-off: slender bodies never meet a force tolerance.
+
+So is one this small relative to the body, once the residual falls no further: strains lose their digits to the 1 in F.
+"""
 ARMIJO = 1e-4
 DAMPED_FORCING = 1e-3
 """Relative tolerance of an iterative solve in the safeguarded pass."""
@@ -80,9 +83,17 @@ class Turning(Protocol):
 
 
 class Problem(Protocol):
-    """What the solve needs of a model with unknowns q."""
+    """What the solve needs of a model with unknowns q.
+
+    Attributes
+    ----------
+    n_unknowns : int
+    extent : float
+        Unknowns of this size are displacements of the size of the body.
+    """
 
     n_unknowns: int
+    extent: float
 
     @property
     def accelerator(self) -> Turning | None:
@@ -127,8 +138,8 @@ def _met(residual: NDArray[np.float64], load_norm: float, tolerance: float) -> b
     return float(np.linalg.norm(residual)) <= tolerance * load_norm
 
 
-def _is_round_off(step: NDArray[np.float64], q: NDArray[np.float64]) -> bool:
-    return float(np.abs(step).max()) <= ROUND_OFF * float(np.abs(q).max())
+def _is_round_off(step: NDArray[np.float64], q: NDArray[np.float64], extent: float = 0.0) -> bool:
+    return float(np.abs(step).max()) <= ROUND_OFF * max(float(np.abs(q).max()), extent)
 
 
 def _forcing(size: float, before: float, target: float) -> float:
@@ -151,7 +162,7 @@ def _accelerated(
     memory = Anderson(problem.n_unknowns)
     rotations = inverse.turned(start)
     q = (yield load, rotations) if start is None else start.copy()
-    turning, min_det = True, -np.inf
+    turning, min_det, before = True, -np.inf, np.inf
     for iteration in range(1, ACCELERATED_ITERATIONS + 1):
         state = problem.force(q)
         residual, min_det = load - state.force, state.min_det_f
@@ -164,6 +175,9 @@ def _accelerated(
         if turning:
             rotations = inverse.turned(q)
         correction = yield residual, rotations
+        if size > 0.5 * before and _is_round_off(correction, q, problem.extent):
+            return _Pass(q, min_det, iteration, converged=memory.convex)
+        before = size
         turning = float(np.abs(correction).max()) > TURNING * float(np.abs(q).max())
         q = q + memory.advance(q, correction, residual)
     return _Pass(q, min_det, ACCELERATED_ITERATIONS, converged=False)
@@ -213,9 +227,10 @@ def _plain(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float6
             break
         if size <= tolerance * load_norm:
             return _Pass(q, min_det, iteration, converged=True)
+        floor = problem.extent if size > 0.5 * before else 0.0
         near, before = size <= np.sqrt(tolerance) * load_norm, size
         q = q + step
-        if _is_round_off(step, q):
+        if _is_round_off(step, q, floor):
             return _Pass(q, min_det, iteration, converged=True)
     return _Pass(q, min_det, PLAIN_ITERATIONS, converged=False)
 
@@ -244,12 +259,14 @@ def _descent(
 def _damped(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float64], tolerance: float) -> _Pass:
     """Descent on the potential W(q) - f·q from a valid state, never leaving det F > 0."""
     load_norm = float(np.linalg.norm(load))
-    q = start
+    q, before = start, np.inf
     for iteration in range(1, DAMPED_ITERATIONS + 1):
         state, tangent = problem.linearise(q)
         residual = load - state.force
         step, stable = _descent(problem, q, tangent, residual)
-        if stable and (_met(residual, load_norm, tolerance) or _is_round_off(step, q)):
+        size = float(np.linalg.norm(residual))
+        floor, before = problem.extent if size > 0.5 * before else 0.0, size
+        if stable and (size <= tolerance * load_norm or _is_round_off(step, q, floor)):
             return _Pass(q, state.min_det_f, iteration, converged=True)
         slope, work = float(residual @ step), float(load @ q)
         potential, noise = state.energy_j - work, 1e-14 * (state.energy_j + abs(work))
@@ -363,4 +380,4 @@ def _by_newton(
                 raise InvertedElementError(
                     f"elements invert: {story}; the largest det F <= 0 tried was {min(attempt.min_det_f, first.min_det_f):.3g}."
                 )
-            raise NoEquilibriumError(f"no stable equilibrium: {story}.")
+            raise NoEquilibriumError(f"no stable equilibrium: {story}; `mor_bench.mechanics.stability.limit_load` tells where its path ends.")

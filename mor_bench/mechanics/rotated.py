@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mor_bench.mechanics.assembly import Pattern
-from mor_bench.mechanics.linear import NotPositiveDefiniteError
+from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
 
 Array = NDArray[np.float64]
 
@@ -237,6 +237,20 @@ class Preconditioner(Protocol):
     """An approximate inverse."""
 
     def solve(self, residual: Array) -> Array: ...
+
+
+def condition_number(pattern: Pattern, values: Array, factor: Factor, iterations: int = 4) -> float:
+    """The ratio of the extreme eigenvalues of a symmetric positive definite matrix, from below, by power iteration both ways."""
+    x = np.random.default_rng(0).normal(size=pattern.n)
+    y, z = x / np.linalg.norm(x), np.empty(pattern.n)
+    largest = smallest = 1.0
+    for _ in range(iterations):
+        multiply(pattern.indptr, pattern.indices, values, x / np.linalg.norm(x), z)
+        x, largest = z.copy(), float(np.linalg.norm(z))
+        y = factor.solve(y)
+        smallest = 1.0 / float(np.linalg.norm(y))
+        y = y * smallest
+    return largest / smallest
 
 
 def conjugate_gradients(

@@ -61,6 +61,7 @@ class GalerkinProblem:
         self.modes = np.ascontiguousarray(modes)
         self.n_unknowns = modes.shape[1]
         self.accelerator = None
+        self.extent = assembler.extent_m * float(np.sqrt(len(modes)))
 
     @cached_property
     def rest_tangent(self) -> NDArray[np.float64]:

@@ -18,6 +18,9 @@ from mor_bench.scene.mesh import Mesh
 POINTS_PER_PATCH = 256
 """Surface quadrature points that a patch holds at least."""
 
+MAX_SURFACE_POINTS = 5_000_000
+"""More than these are a patch that is lost on its facet."""
+
 
 def _midpoints(n_corners: int, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Shape functions (n, n_corners) at the midpoints of the parts of a facet, and their derivatives (n, n_corners, 2).
@@ -69,10 +72,15 @@ def patch_shares(
     Raises
     ------
     SpecError
-        If there is no facet, or the facets are smaller than one patch.
+        If there is no facet, the facets are smaller than one patch, or so large that a patch is lost on one.
     """
     if len(facets) == 0:
         raise SpecError("the load region holds nodes but no facet of the surface, so no traction can act on it.")
+    corners = mesh.points[facets]
+    longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
+    least = POINTS_PER_PATCH * len(facets) * longest**2 / MAX_SURFACE_POINTS
+    if area_m2 < least:
+        raise SpecError(f"`patch_area_m2` must be at least {least:.3g}, for facets with edges of up to {longest:.3g} m; got {area_m2}.")
     positions, areas, values = _surface_points(mesh, facets, sqrt(area_m2 / POINTS_PER_PATCH))
     if area_m2 > areas.sum() * (1 + 1e-12):
         raise SpecError(f"`patch_area_m2` must be in (0, {areas.sum():.6g}], the area of the load region; got {area_m2}.")
@@ -118,7 +126,7 @@ def patch_weights(mesh: Mesh, centres: NDArray[np.int64], facets: NDArray[np.int
     Raises
     ------
     SpecError
-        If there is no facet, or the facets are smaller than one patch.
+        If there is no facet, the facets are smaller than one patch, or so large that a patch is lost on one.
     """
     areas, _, values = patch_shares(mesh, centres, facets, area_m2)
     weights = sp.csr_array(areas @ values)

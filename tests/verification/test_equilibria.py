@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import mor_bench
-from mor_bench.errors import InvalidInputError, LockingWarning, SolverError
+from mor_bench.errors import IllConditionedWarning, InvalidInputError, LockingWarning, SolverError
 from mor_bench.harness.check import check_file
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.linear import BandedCholesky
@@ -237,3 +238,25 @@ def test_stiffness_contrast_of_a_million(kind: tuple[str, bool]) -> None:
         state, values = model.force_and_tangent(u)
         u += BandedCholesky(model.pattern).factor(values).solve(load[~fixed].ravel() - state.force)
     np.testing.assert_allclose(u.reshape(-1, 3)[mesh.points[~fixed][:, 0] == 2.0, 0], alpha - 1, rtol=2e-6)
+
+
+@pytest.mark.parametrize(("law", "kind"), EVERY)
+def test_tiny_loads_have_proportional_answers(law: str, kind: tuple[str, bool]) -> None:
+    """Down to displacements of 1e-13 of the body, where laws that see F and not F - 1 have lost their digits."""
+    model = FullOrderModel(scene_of(law, kind))
+    load = patch_load(model.scene, -1, [0.2, -1.0, 2.0])
+    unit = model.solve(1e-3 * load).displacement / 1e-3
+    for size in (1e-6, 1e-9, 1e-12):
+        u = model.solve(size * load).displacement
+        assert np.linalg.norm(u / size - unit) <= (0.01 + 3e-13 / size) * np.linalg.norm(unit)
+
+
+def test_an_ill_conditioned_stiffness_is_reported() -> None:
+    spec = mor_bench.load_scene("beam-tiny").spec.model_dump(mode="json")
+    spec["loads"]["patch_area_m2"] = 1.0
+    for length, ill in ((20.0, False), (1000.0, True)):
+        spec["geometry"] = {"shape": "box", "size_m": [length, 1.0, 1.0], "cells": [160, 1, 1]}
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            _ = FullOrderModel(mor_bench.load_scene(spec)).rest_factor
+        assert any(issubclass(warning.category, IllConditionedWarning) for warning in caught) == ill
