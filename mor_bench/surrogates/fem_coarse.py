@@ -28,7 +28,7 @@ class CoarseFEM(Surrogate):
     coarsening : int
         The scene's cells per axis are divided by it and rounded up.
     tolerance : float
-        Norm of the residual relative to that of the load at which Newton stops.
+        Norm of the residual relative to that of the load at which the solve stops.
     """
 
     needs_snapshots = False

@@ -25,11 +25,11 @@ NEAR = 0.5
 
 
 class WarmFEM(Surrogate):
-    """Newton's method on the whole mesh, started at u* + K₀⁻¹(f - f*), with u* the known solution under a load f*.
+    """The full-order solve, started at u* + K₀⁻¹(f - f*), with u* the known solution under a load f*.
 
     A solution is used only if its linear response lies within `NEAR` of the query's; else the start is rest. A bad start
-    costs time and never the answer: the tolerance and the checks are those of full-order FEM, and where Newton fails from
-    the start the safeguarded pass begins at rest.
+    costs time and never the answer: the tolerance and the checks are those of full-order FEM, and where the start leads
+    nowhere the safeguarded pass begins at rest.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class WarmFEM(Surrogate):
         of this object, as in an interactive simulation; then the answers depend on the order of the queries, within the
         tolerance, and a loaded model begins at rest.
     tolerance : float
-        Norm of the residual relative to that of the load at which Newton stops.
+        Norm of the residual relative to that of the load at which the solve stops.
     n_starts : int
         Training samples kept for `nearest`.
     """
