@@ -16,7 +16,7 @@ from mor_bench.snapshots.dataset import Dataset
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> Iterator[None]:
     """On a busy machine the threads of a small factorisation wait for each other: up to a hundred times slower."""
-    with threadpool_limits(1):
+    with threadpool_limits(1, user_api="blas"):
         yield
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench import __version__
-from mor_bench.errors import InvalidInputError, MissingDependencyError, MorBenchError, SolverError
+from mor_bench.errors import InvalidInputError, MissingDependencyError, MorBenchError, SolverError, UnsupportedSceneError
 from mor_bench.harness.discretisation import measured
 from mor_bench.harness.metrics import SampleErrors, sample_errors, summary
 from mor_bench.harness.results import Comparison, label_of
@@ -155,7 +155,7 @@ def _run_job(job: _Job, data: Dataset, data_seconds: float | None, threads: int)
         warnings.simplefilter("always", UserWarning)
         try:
             outcome, samples = _evaluate(job, data, data_seconds, threads)
-        except MissingDependencyError as error:
+        except (MissingDependencyError, UnsupportedSceneError) as error:
             outcome, samples = {"status": "skipped", "reason": str(error)}, {}
         except MorBenchError as error:
             outcome, samples = {"status": "failed", "reason": f"{type(error).__name__}: {error}"}, {}
