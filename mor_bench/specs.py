@@ -33,12 +33,16 @@ class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
+Cells = Annotated[tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], Field(strict=False)]
+Size = Annotated[tuple[Positive, Positive, Positive], Field(strict=False)]
+
+
 class BoxGeometry(_Model):
     """A box of H8 cells with its lowest corner at the origin."""
 
     shape: Literal["box"]
-    size_m: Annotated[tuple[Positive, Positive, Positive], Field(strict=False)]
-    cells: Annotated[tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], Field(strict=False)]
+    size_m: Size
+    cells: Cells
 
     @field_validator("cells")
     @classmethod
@@ -46,6 +50,22 @@ class BoxGeometry(_Model):
         if value[0] * value[1] * value[2] > MAX_CELLS:
             raise ValueError(f"there must be at most {MAX_CELLS:,} cells in all")
         return value
+
+
+class LShapeGeometry(BoxGeometry):
+    """A box without the cells in its corner of highest x and highest z: an arm along x, and a column on its end."""
+
+    shape: Literal["l-shape"]  # type: ignore[assignment]
+    cut_cells: Annotated[tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], Field(strict=False)]
+
+    @model_validator(mode="after")
+    def _leaves_an_l(self) -> LShapeGeometry:
+        if self.cut_cells[0] >= self.cells[0] or self.cut_cells[1] >= self.cells[2]:
+            raise ValueError(f"`cut_cells` must be less than the {self.cells[0]} cells along x and the {self.cells[2]} along z; got {self.cut_cells}")
+        return self
+
+
+Geometry = Annotated[BoxGeometry | LShapeGeometry, Field(discriminator="shape")]
 
 
 class Discretisation(_Model):
@@ -127,6 +147,7 @@ Region = Annotated[
     Annotated[NamedRegion, Tag("name")] | Annotated[BoxRegion, Tag("box")] | Annotated[SphereRegion, Tag("sphere")], Discriminator(_kind_of_region)
 ]
 _BRANCHES = {
+    "geometry": ("box", "l-shape"),
     "region": ("name", "box", "sphere"),
     "material": ("saint-venant-kirchhoff", "neo-hookean", "mooney-rivlin", "ogden"),
 }
@@ -186,7 +207,7 @@ class DatasetSpec(_Model):
     name: str
     title: str
     source: str
-    geometry: BoxGeometry
+    geometry: Geometry
     discretisation: Discretisation = Discretisation()
     solver: SolverName = "auto"
     material: MaterialSpec

@@ -99,7 +99,7 @@ def test_scenes_without_a_coarser_mesh_are_refused_with_the_reason() -> None:
     one = box(geometry={"shape": "box", "size_m": [2.0, 1.0, 1.0], "cells": [1, 1, 1]})
     held = box(supports=[{"region": {"box_m": [[0.3, 0.0, 0.0], [0.4, 1.0, 1.0]]}}])
     method = mor_bench.load_method("fem-coarse")
-    for scene, reason in ((one, "one cell cannot be made coarser"), (held, "holds no node"), (not_a_box(held), "only the mesh of a box")):
+    for scene, reason in ((one, "one cell cannot be made coarser"), (held, "holds no node"), (not_a_box(held), "only the mesh of a box or an L")):
         assert reason in (method.supports(scene) or "")
         with pytest.raises(UnsupportedSceneError, match=reason):
             method.fit(scene, None)
@@ -285,6 +285,6 @@ def test_bad_arguments_are_one_clear_line(tmp_path: Path, monkeypatch: pytest.Mo
         refine("beam-tini", cache=tmp_path)
     scene = not_a_box(load_scene("beam-tiny"))
     monkeypatch.setattr("mor_bench.harness.discretisation.load_scene", lambda spec: scene)
-    with pytest.raises(UnsupportedSceneError, match=r"only the mesh of a box can be made finer or coarser; got `geometry.shape` 'shell'"):
+    with pytest.raises(UnsupportedSceneError, match=r"only the mesh of a box or an L can be made finer or coarser; got `geometry.shape` 'shell'"):
         refine("beam-tiny", cache=tmp_path)
     assert not list(tmp_path.iterdir())

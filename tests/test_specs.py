@@ -13,7 +13,12 @@ from mor_bench.errors import MissingDependencyError, MorBenchError, SpecError
 from mor_bench.harness.check import check_file
 from mor_bench.specs import list_suite, load_dataset_spec, load_method_spec
 
-SHIPPED = {"beam-coarse": (135, 256, 64, 6400), "beam-fine": (3267, 4032, 336, 33600), "beam-tiny": (24, 63, 21, 210)}
+SHIPPED = {
+    "l-shape": (335, 540, 60, 6000),
+    "beam-coarse": (135, 256, 64, 6400),
+    "beam-fine": (3267, 4032, 336, 33600),
+    "beam-tiny": (24, 63, 21, 210),
+}
 
 
 def test_every_shipped_dataset_is_pinned_to_its_counts() -> None:
@@ -74,7 +79,7 @@ BAD = [
     (set_("loads", "patch_area_m2", value=1e-9), r"`patch_area_m2` must be at least 0\.\d+, for facets with edges of up to 0\.5 m; got 1e-09"),
     (set_("discretisation", value={"element": "wedge"}), r"`discretisation.element` must be 'hexahedron' or 'tetrahedron'; got 'wedge'"),
     (set_("discretisation", value={"element": "tetrahedron", "integration": "selective"}), r"`integration` of tetrahedra must be 'full'"),
-    (set_("geometry", "shape", value="sphere"), r"`geometry.shape` must be 'box'; got 'sphere'"),
+    (set_("geometry", "shape", value="sphere"), r"`geometry.shape` must be 'box' or 'l-shape'; got 'sphere'"),
     (set_("geometry", "cells", value=[6, 2]), r"`geometry.cells\[2\]` is missing"),
     (set_("geometry", "cells", value=[6, 2, 0]), r"`geometry.cells\[2\]` must be greater than or equal to 1; got 0"),
     (set_("geometry", "cells", value=[6, 2, 2.5]), r"`geometry.cells\[2\]` must be a valid integer; got 2.5"),

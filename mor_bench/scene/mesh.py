@@ -90,3 +90,25 @@ def box_mesh(size_m: tuple[float, float, float], cells: tuple[int, int, int], te
     hexes = np.stack([node[corner].ravel() for corner in corners], axis=1)
     cell_nodes = hexes[:, KUHN].reshape(-1, 4) if tetrahedra else hexes
     return Mesh(points, cell_nodes, (nx, ny, nz), np.arange(len(points)))
+
+
+def l_mesh(size_m: tuple[float, float, float], cells: tuple[int, int, int], cut_cells: tuple[int, int], tetrahedra: bool = False) -> Mesh:
+    """A box without the cells in its corner of highest x and highest z, in the box's regular grid.
+
+    Parameters
+    ----------
+    size_m, cells, tetrahedra
+        Of the box; see `box_mesh`.
+    cut_cells : two ints
+        Cells that are missing along x and along z.
+    """
+    box = box_mesh(size_m, cells, tetrahedra)
+    x, _, z = np.unravel_index(np.arange(box.n_cells) // (len(KUHN) if tetrahedra else 1), cells)
+    return part_of(box, (x < cells[0] - cut_cells[0]) | (z < cells[2] - cut_cells[1]))
+
+
+def part_of(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
+    """The cells (n_cells,) that are kept, with their nodes, in the order and the grid that they had."""
+    nodes, cells = np.unique(mesh.cells[kept], return_inverse=True)
+    index = None if mesh.grid_index is None else mesh.grid_index[nodes]
+    return Mesh(mesh.points[nodes], cells.reshape(-1, mesh.cells.shape[1]), mesh.grid_shape, index)

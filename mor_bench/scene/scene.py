@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,9 @@ from numpy.typing import NDArray
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.scene.loads import patch_shares, patch_weights
 from mor_bench.scene.materials import Material, make_material
-from mor_bench.scene.mesh import Mesh, box_mesh
+from mor_bench.scene.mesh import Mesh, box_mesh, l_mesh
 from mor_bench.scene.regions import region_facets, region_nodes
-from mor_bench.specs import DatasetSpec, load_dataset_spec
+from mor_bench.specs import DatasetSpec, LShapeGeometry, load_dataset_spec
 
 
 @dataclass(frozen=True)
@@ -108,26 +109,42 @@ def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
     Parameters
     ----------
     scene : Scene
-        Of a box.
+        Of a box or an L.
     cells : three ints
         Cells per axis.
 
     Raises
     ------
     UnsupportedSceneError
-        If the scene is not a box, or has no such mesh.
+        If the scene is neither, or has no such mesh.
     """
     geometry = scene.spec.geometry
-    if geometry.shape != "box":
-        raise UnsupportedSceneError(f"{scene.name}: only the mesh of a box can be made finer or coarser; got `geometry.shape` {geometry.shape!r}.")
+    name = f"{scene.name} with {' x '.join(map(str, cells))} cells"
+    changed: dict[str, Any] = {"cells": cells}
+    if isinstance(geometry, LShapeGeometry):
+        cut = [Fraction(n * new, old) for n, new, old in zip(geometry.cut_cells, cells[::2], geometry.cells[::2], strict=True)]
+        if any(n.denominator > 1 for n in cut):
+            raise UnsupportedSceneError(f"{name}: the corner of an L that is cut away must consist of whole cells.")
+        changed["cut_cells"] = tuple(int(n) for n in cut)
+    elif geometry.shape != "box":
+        raise UnsupportedSceneError(
+            f"{scene.name}: only the mesh of a box or an L can be made finer or coarser; got `geometry.shape` {geometry.shape!r}."
+        )
     try:
-        return _without_patches(scene.spec.model_copy(update={"geometry": geometry.model_copy(update={"cells": cells})}))
+        return _without_patches(scene.spec.model_copy(update={"geometry": geometry.model_copy(update=changed)}))
     except SpecError as error:
-        raise UnsupportedSceneError(f"{scene.name} with {' x '.join(map(str, cells))} cells: {error}") from None
+        raise UnsupportedSceneError(f"{name}: {error}") from None
+
+
+def _mesh(spec: DatasetSpec) -> Mesh:
+    geometry, tetrahedra = spec.geometry, spec.discretisation.element == "tetrahedron"
+    if isinstance(geometry, LShapeGeometry):
+        return l_mesh(geometry.size_m, geometry.cells, geometry.cut_cells, tetrahedra)
+    return box_mesh(geometry.size_m, geometry.cells, tetrahedra)
 
 
 def _without_patches(spec: DatasetSpec) -> Scene:
-    mesh = box_mesh(spec.geometry.size_m, spec.geometry.cells, spec.discretisation.element == "tetrahedron")
+    mesh = _mesh(spec)
     material = make_material(spec.material)
     fixed = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(region_nodes(mesh, support.region) for support in spec.supports)]))
     if len(fixed) == mesh.n_nodes:
