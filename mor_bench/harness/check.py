@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mor_bench.errors import MissingDependencyError
 from mor_bench.mechanics.locking import locking_risk
-from mor_bench.mechanics.model import check_supports
+from mor_bench.mechanics.model import check_supports, missing_library
 from mor_bench.scene.scene import load_scene
 from mor_bench.specs import check_method, is_method_file, load_dataset_spec, load_method_spec
 
@@ -20,7 +21,7 @@ def check_file(path: Path) -> str:
     SpecError, UnconstrainedBodyError
         The first problem, in one line.
     MissingDependencyError
-        If the method's class needs an extra that is not installed.
+        If the method's class or the dataset's solver needs an extra that is not installed.
     """
     if is_method_file(path):
         method = load_method_spec(path)
@@ -29,6 +30,9 @@ def check_file(path: Path) -> str:
     spec = load_dataset_spec(path)
     scene = load_scene(spec)
     check_supports(scene)
+    missing = missing_library(spec.solver)
+    if missing:
+        raise MissingDependencyError(f"{missing}.")
     n_patches = len(scene.patch_nodes)
     samples = n_patches * spec.loads.samples_per_patch
     said = f"dataset, {scene.mesh.n_cells} cells, {scene.mesh.n_nodes} nodes, {n_patches} load patches, {samples} samples"

@@ -10,7 +10,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import IllConditionedWarning, MissingDependencyError, SolverError, UnconstrainedBodyError
+from mor_bench.errors import IllConditionedWarning, MissingDependencyError, SolverError, SpecError, UnconstrainedBodyError
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.linear import (
@@ -20,13 +20,14 @@ from mor_bench.mechanics.linear import (
     LinearSolver,
     Multigrid,
     MultigridFactor,
+    NotPositiveDefiniteError,
     Pardiso,
     SparseLU,
     choose_solver,
 )
 from mor_bench.mechanics.locking import warn_of_locking
 from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibria, solve_equilibrium
-from mor_bench.mechanics.rotated import BlockJacobi, RotatedRest, condition_number, conjugate_gradients
+from mor_bench.mechanics.rotated import BlockJacobi, JacobiFactor, RotatedRest, condition_number, conjugate_gradients
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import SolverName
 
@@ -49,6 +50,7 @@ Meshes whose band has more than `MAX_BAND_ENTRIES` entries use multigrid in plac
 PCG_FROM = 3000
 """Unknowns from which conjugate gradients beat a fresh banded factor for each Newton step."""
 JACOBI_ITERATIONS = 20_000
+CERTIFY_TOLERANCE = 1e-2
 ILL_CONDITIONED = 1e10
 """Condition number of the stiffness at rest from which answers cannot be trusted to the default tolerance."""
 
@@ -107,6 +109,8 @@ class FullOrderModel:
         check_supports(scene)
         warn_of_locking(scene)
         self.solver = solver or scene.spec.solver
+        if self.solver not in SOLVERS:
+            raise SpecError(f"`solver` must be one of {', '.join(SOLVERS)}; got {self.solver!r}.")
         missing = missing_library(self.solver)
         if missing:
             raise MissingDependencyError(f"{missing}.")
@@ -140,7 +144,15 @@ class FullOrderModel:
     def rest_factor(self) -> Factor:
         """The stiffness at rest, factorised: the linear response is one back-solve."""
         # With Pardiso a solver of its own, since it holds one factor at a time.
-        factor = (self._direct_solver() if self.solver == "pardiso" else self._direct).factor(self.rest_tangent)
+        if self.solver == "jacobi-pcg":
+            return JacobiFactor(self.assembler.pattern, self.rest_tangent)
+        try:
+            factor = (self._direct_solver() if self.solver == "pardiso" else self._direct).factor(self.rest_tangent)
+        except NotPositiveDefiniteError:
+            raise SolverError(
+                f"{self.scene.name}: the stiffness at rest is not positive definite in double precision; is the material too nearly "
+                "incompressible, or the body too slender?"
+            ) from None
         condition = condition_number(self.assembler.pattern, self.rest_tangent, factor) if isinstance(factor, BandedFactor) else 1.0
         if condition > ILL_CONDITIONED:
             warnings.warn(
@@ -175,6 +187,17 @@ class FullOrderModel:
         return BlockJacobi(self.assembler.pattern)
 
     @property
+    def _iterative(self) -> bool:
+        by_size = self.n_unknowns >= PCG_FROM or isinstance(self._direct, Multigrid)
+        return self.solver in ("rotated-pcg", "jacobi-pcg") or (self.solver == "auto" and by_size)
+
+    def certify(self, q: NDArray[np.float64]) -> None:
+        """With an iterative solver, look for negative curvature by conjugate gradients under a random force."""
+        if self._iterative:
+            force = np.random.default_rng(0).normal(size=self.n_unknowns)
+            self.step(q, self.linearise(q)[1], force, CERTIFY_TOLERANCE)
+
+    @property
     def accelerator(self) -> RotatedRest | None:
         return self._rotated if self.solver == "auto" else None
 
@@ -185,7 +208,7 @@ class FullOrderModel:
         if self.solver == "jacobi-pcg":
             self._jacobi.take(tangent)
             return conjugate_gradients(pattern, tangent, self._jacobi, residual, tolerance, JACOBI_ITERATIONS)[0]
-        if self.solver == "rotated-pcg" or (self.solver == "auto" and (self.n_unknowns >= PCG_FROM or isinstance(self._direct, Multigrid))):
+        if self._iterative:
             return conjugate_gradients(pattern, tangent, self._rotated.at(q), residual, tolerance)[0]
         return self.factor(tangent).solve(residual)
 

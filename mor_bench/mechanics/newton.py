@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mor_bench.errors import InvalidInputError, InvertedElementError, NoEquilibriumError, SolverError
 from mor_bench.mechanics.anderson import Anderson
@@ -38,6 +38,15 @@ ARMIJO = 1e-4
 DAMPED_FORCING = 1e-3
 """Relative tolerance of an iterative solve in the safeguarded pass."""
 MAX_HALVINGS = 14
+PROBE_FROM = 0.1
+"""Probing begins when the residual has fallen to this share of the load: the tangent then hardly changes any more."""
+PROBES = 4
+"""Directions in which the accelerated pass looks for negative curvature; soft ones first."""
+PROBE_LENGTH = 1e-6
+"""Length of the difference that gives the tangent's product with a probe, relative to the body."""
+LINEAR = 1e-11
+"""Displacements this small relative to the body are those of the stiffness at rest, to more digits than a law in F keeps."""
+MAX_LOAD_N = 1e30
 MAX_ITERATIONS = 300
 """Newton iterations over all increments before the solve gives up."""
 
@@ -56,6 +65,10 @@ class NewtonOptions:
 
     tolerance: float = 1e-8
     max_cuts: int = 10
+
+    def __post_init__(self) -> None:
+        if not 0 < self.tolerance <= 1:
+            raise InvalidInputError(f"`tolerance` must be in (0, 1]; got {self.tolerance}.")
 
 
 @dataclass(frozen=True)
@@ -114,6 +127,13 @@ class Problem(Protocol):
         """
         ...
 
+    def certify(self, q: NDArray[np.float64]) -> None:
+        """Look for negative curvature at a solution q, if the solves of the steps that led there do not prove that there is none.
+
+        Raises `NotPositiveDefiniteError` where there is some.
+        """
+        ...
+
     @property
     def rest_tangent(self) -> NDArray[np.float64]: ...
     @property
@@ -142,6 +162,10 @@ def _is_round_off(step: NDArray[np.float64], q: NDArray[np.float64], extent: flo
     return float(np.abs(step).max()) <= ROUND_OFF * max(float(np.abs(q).max()), extent)
 
 
+def _is_linear(problem: Problem, q: NDArray[np.float64]) -> bool:
+    return float(np.abs(q).max()) <= LINEAR * problem.extent
+
+
 def _forcing(size: float, before: float, target: float) -> float:
     """How exactly to solve for a step: Eisenstat and Walker's second choice, and no further than the target needs.
 
@@ -150,8 +174,46 @@ def _forcing(size: float, before: float, target: float) -> float:
     return 0.1 if size <= target else min(0.1, max(0.9 * (size / before) ** 2, 0.3 * target / size))
 
 
-_Correcting = Generator[tuple[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64], _Pass]
-"""Asks for the correction under a residual and rotations, again and again."""
+_Asked = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
+_Correcting = Generator[_Asked, list[NDArray[np.float64]], _Pass]
+"""Asks for the corrections under some residuals and rotations, again and again."""
+
+
+class _Probes:
+    """A search for negative curvature that goes along with the iteration, at one more residual for each of its steps.
+
+    The first probe is the response to a random force, which soft modes dominate; each next one is P⁻¹ K of the one before,
+    as in Lanczos' method. The probes' products with K are differences of the internal force.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        self.wanted = np.random.default_rng(0).normal(size=problem.n_unknowns)
+        self._probes: list[NDArray[np.float64]] = []
+        self._products: list[NDArray[np.float64]] = []
+
+    @property
+    def complete(self) -> bool:
+        return len(self._probes) == PROBES
+
+    def add(self, answer: NDArray[np.float64], q: NDArray[np.float64], force: NDArray[np.float64]) -> None:
+        """Take P⁻¹ of ``wanted`` as the next probe, at q with its internal force."""
+        for probe in self._probes:
+            answer = answer - float(probe @ answer) / float(probe @ probe) * probe
+        length = PROBE_LENGTH * self._problem.extent / (float(np.abs(answer).max()) or 1.0)
+        probe = length * answer
+        self._probes.append(probe)
+        self._products.append(self._problem.force(q + probe).force - force)
+        self.wanted = self._products[-1]
+
+    @property
+    def convex(self) -> bool:
+        """Whether no combination of the probes has negative curvature."""
+        probes, products = np.array(self._probes), np.array(self._products)
+        matrix = probes @ products.T
+        scale = np.sqrt(np.abs(np.diag(matrix)))
+        matrix = 0.5 * (matrix + matrix.T) / np.outer(scale, scale)
+        return bool(np.isfinite(matrix).all()) and float(np.linalg.eigvalsh(matrix)[0]) > 0
 
 
 def _accelerated(
@@ -159,33 +221,46 @@ def _accelerated(
 ) -> _Correcting:  # fmt: skip
     """Anderson's acceleration of the iteration with an approximate inverse; converged only where no curvature was negative."""
     load_norm = float(np.linalg.norm(load))
-    memory = Anderson(problem.n_unknowns)
+    memory, probes = Anderson(problem.n_unknowns), _Probes(problem)
     rotations = inverse.turned(start)
-    q = (yield load, rotations) if start is None else start.copy()
+    q = (yield [(load, rotations)])[0] if start is None else start.copy()
+    if start is None and _is_linear(problem, q):
+        return _Pass(problem.rest_factor.solve(load), 1.0, 1, converged=True)
     turning, min_det, before = True, -np.inf, np.inf
     for iteration in range(1, ACCELERATED_ITERATIONS + 1):
         state = problem.force(q)
         residual, min_det = load - state.force, state.min_det_f
         size = float(np.linalg.norm(residual))
         if size <= tolerance * load_norm:
-            # Of a start that is a solution nothing is known yet; Newton's pass looks at the tangent there.
-            return _Pass(q, min_det, iteration, converged=memory.convex and (start is None or iteration > 1))
+            break
         if not size <= DIVERGED * load_norm:
             return _Pass(q, min_det, iteration, converged=False)
         if turning:
             rotations = inverse.turned(q)
-        correction = yield residual, rotations
+        asked = [(residual, rotations)]
+        probing = size <= PROBE_FROM * load_norm and not probes.complete
+        if probing:
+            asked.append((probes.wanted, rotations))
+        correction, *answers = yield asked
+        for answer in answers:
+            probes.add(answer, q, state.force)
         if size > 0.5 * before and _is_round_off(correction, q, problem.extent):
-            return _Pass(q, min_det, iteration, converged=memory.convex)
+            break
         before = size
         turning = float(np.abs(correction).max()) > TURNING * float(np.abs(q).max())
         q = q + memory.advance(q, correction, residual)
-    return _Pass(q, min_det, ACCELERATED_ITERATIONS, converged=False)
+    else:
+        return _Pass(q, min_det, ACCELERATED_ITERATIONS, converged=False)
+    if not (min_det > 0 and memory.convex):
+        return _Pass(q, min_det, iteration, converged=False)
+    while not probes.complete:
+        probes.add((yield [(probes.wanted, rotations)])[0], q, state.force)
+    return _Pass(q, min_det, iteration, converged=probes.convex)
 
 
 def _in_step(inverse: Turning, passes: Iterator[_Correcting], together: int) -> Iterator[tuple[int, _Pass]]:
     """Run passes, several at a time, so that they share each sweep over the factor; yields number and outcome as they end."""
-    waiting: list[tuple[int, _Correcting, tuple[NDArray[np.float64], NDArray[np.float64]]]] = []
+    waiting: list[tuple[int, _Correcting, _Asked]] = []
     numbered = enumerate(passes)
     while True:
         while len(waiting) < together and (item := next(numbered, None)) is not None:
@@ -195,26 +270,37 @@ def _in_step(inverse: Turning, passes: Iterator[_Correcting], together: int) -> 
                 yield item[0], ended.value
         if not waiting:
             return
-        corrections = inverse.solve_many([asked[0] for _, _, asked in waiting], [asked[1] for _, _, asked in waiting])
+        together_asked = [pair for _, _, asked in waiting for pair in asked]
+        answers = iter(inverse.solve_many([residual for residual, _ in together_asked], [rotations for _, rotations in together_asked]))
         still = []
-        for (number, running, _), correction in zip(waiting, corrections, strict=True):
+        for number, running, asked in waiting:
             try:
-                still.append((number, running, running.send(correction)))
+                still.append((number, running, running.send([next(answers) for _ in asked])))
             except StopIteration as ended:
                 yield number, ended.value
         waiting = still
+
+
+def _is_certified(problem: Problem, q: NDArray[np.float64]) -> bool:
+    try:
+        problem.certify(q)
+    except NotPositiveDefiniteError:
+        return False
+    return True
 
 
 def _plain(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float64] | None, tolerance: float) -> _Pass:
     """Full Newton steps; from rest, the first one uses the rest-state factor that every solve shares."""
     load_norm = float(np.linalg.norm(load))
     q = problem.rest_factor.solve(load) if start is None else start.copy()
+    if start is None and _is_linear(problem, q):
+        return _Pass(q, 1.0, 1, converged=True)
     min_det, before, near = -np.inf, np.inf, False
     for iteration in range(1, PLAIN_ITERATIONS + 1):
         if near:  # one more residual is cheap, and usually no further tangent is needed
             state = problem.force(q)
             if _met(load - state.force, load_norm, tolerance):
-                return _Pass(q, state.min_det_f, iteration, converged=True)
+                return _Pass(q, state.min_det_f, iteration, converged=_is_certified(problem, q))
         state, tangent = problem.linearise(q)
         residual, min_det = load - state.force, state.min_det_f
         size = float(np.linalg.norm(residual))
@@ -226,12 +312,12 @@ def _plain(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float6
         except NotPositiveDefiniteError:
             break
         if size <= tolerance * load_norm:
-            return _Pass(q, min_det, iteration, converged=True)
+            return _Pass(q, min_det, iteration, converged=_is_certified(problem, q))
         floor = problem.extent if size > 0.5 * before else 0.0
         near, before = size <= np.sqrt(tolerance) * load_norm, size
         q = q + step
         if _is_round_off(step, q, floor):
-            return _Pass(q, min_det, iteration, converged=True)
+            return _Pass(q, min_det, iteration, converged=_is_certified(problem, q))
     return _Pass(q, min_det, PLAIN_ITERATIONS, converged=False)
 
 
@@ -267,7 +353,7 @@ def _damped(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float
         size = float(np.linalg.norm(residual))
         floor, before = problem.extent if size > 0.5 * before else 0.0, size
         if stable and (size <= tolerance * load_norm or _is_round_off(step, q, floor)):
-            return _Pass(q, state.min_det_f, iteration, converged=True)
+            return _Pass(q, state.min_det_f, iteration, converged=_is_certified(problem, q))
         slope, work = float(residual @ step), float(load @ q)
         potential, noise = state.energy_j - work, 1e-14 * (state.energy_j + abs(work))
         for halving in range(MAX_HALVINGS):
@@ -307,12 +393,20 @@ def solve_equilibrium(
     NoEquilibriumError
         If no stable equilibrium was found within the allowed cut-backs.
     InvalidInputError
-        If the load has another shape, NaN or infinity.
+        If the load or the start has another shape, NaN or infinity, or the load more than `MAX_LOAD_N`.
     """
     found = next(solve_equilibria(problem, [load], [start], options))[1]
     if isinstance(found, SolverError):
         raise found
     return found
+
+
+def _checked(values: ArrayLike, name: str, problem: Problem) -> NDArray[np.float64]:
+    """A float64 vector of the problem's unknowns; the kernels behind check no bounds."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu" or array.shape != (problem.n_unknowns,) or not np.isfinite(array).all():
+        raise InvalidInputError(f"{name} must be finite real numbers of shape ({problem.n_unknowns},); got shape {array.shape}, dtype {array.dtype}.")
+    return np.ascontiguousarray(array, dtype=np.float64)
 
 
 TOGETHER = 16
@@ -330,10 +424,11 @@ def solve_equilibria(
     Yields the number of a load and its solution, or the error that it would raise, in the order in which they are found. A
     solution is the same to the last digit whatever the other loads are.
     """
+    loads = [_checked(load, f"load {number}", problem) for number, load in enumerate(loads)]
     for number, load in enumerate(loads):
-        if load.shape != (problem.n_unknowns,) or not np.isfinite(load).all():
-            raise InvalidInputError(f"load {number} must be finite and of shape ({problem.n_unknowns},); got shape {load.shape}.")
-    starts = starts or [None] * len(loads)
+        if np.abs(load).max() > MAX_LOAD_N:
+            raise InvalidInputError(f"load {number} must be within ±{MAX_LOAD_N:g} N; got {load[np.abs(load).argmax()]:g}.")
+    starts = [None if start is None else _checked(start, "`start`", problem) for start in starts or [None] * len(loads)]
     pending = [i for i, load in enumerate(loads) if load.any()]
     for i in sorted(set(range(len(loads))) - set(pending)):
         yield i, Solution(np.zeros(problem.n_unknowns), 1.0, 0, 0)
@@ -362,6 +457,11 @@ def _by_newton(
     iterations, cuts = iterations + first.iterations, 0
     if first.valid:
         return Solution(first.q, first.min_det_f, iterations, 0)
+    if start is not None:  # which may lie on a branch that cannot be reached from rest
+        attempt = _damped(problem, load, start, options.tolerance)
+        iterations += attempt.iterations
+        if attempt.valid:
+            return Solution(attempt.q, attempt.min_det_f, iterations, 0)
     q, reached, increment = np.zeros(problem.n_unknowns), 0.0, 0.5
     while True:
         target = min(1.0, reached + increment)
@@ -380,4 +480,4 @@ def _by_newton(
                 raise InvertedElementError(
                     f"elements invert: {story}; the largest det F <= 0 tried was {min(attempt.min_det_f, first.min_det_f):.3g}."
                 )
-            raise NoEquilibriumError(f"no stable equilibrium: {story}; `mor_bench.mechanics.stability.limit_load` tells where its path ends.")
+            raise NoEquilibriumError(f"no stable equilibrium found: {story}; `mor_bench.mechanics.stability.limit_load` tells where its path ends.")

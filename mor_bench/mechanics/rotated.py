@@ -278,3 +278,16 @@ def conjugate_gradients(
         x += (rz / curvature) * p
         r -= (rz / curvature) * q
     raise NotPositiveDefiniteError
+
+
+class JacobiFactor:
+    """What stands for a factor where there is none: conjugate gradients with a matrix's diagonal blocks."""
+
+    def __init__(self, pattern: Pattern, values: Array) -> None:
+        self._pattern, self._values, self._jacobi = pattern, values, BlockJacobi(pattern)
+        self._jacobi.take(values)
+
+    def solve(self, rhs: Array) -> Array:
+        if rhs.ndim == 2:
+            return np.stack([self.solve(column) for column in rhs.T], axis=1)
+        return conjugate_gradients(self._pattern, self._values, self._jacobi, rhs, 1e-10, 20_000)[0]

@@ -88,6 +88,9 @@ class GalerkinProblem:
     ) -> NDArray[np.float64]:  # fmt: skip
         return self.factor(tangent).solve(residual)
 
+    def certify(self, q: NDArray[np.float64]) -> None:
+        """Nothing to do: every step has a Cholesky factor."""
+
     def factor(self, tangent: NDArray[np.float64]) -> Factor:
         """Dense Cholesky; raises `NotPositiveDefiniteError`."""
         cholesky, info = dpotrf(tangent)

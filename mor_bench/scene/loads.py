@@ -18,7 +18,7 @@ from mor_bench.scene.mesh import Mesh
 POINTS_PER_PATCH = 256
 """Surface quadrature points that a patch holds at least."""
 
-MAX_SURFACE_POINTS = 5_000_000
+MAX_SURFACE_POINTS = 200_000
 """More than these are a patch that is lost on its facet."""
 
 

@@ -123,8 +123,8 @@ BUGS = (
     Bug(
         "tolerance ignored by the accelerated pass",
         NEWTON,
-        "if size <= tolerance * load_norm:\n            # Of",
-        "if size <= 1e-1 * load_norm:\n            # Of",
+        "if size <= tolerance * load_norm:\n            break",
+        "if size <= 1e-1 * load_norm:\n            break",
         f"{CORE} or nearly or turned or (felupe and not every)",
     ),
     Bug(
@@ -134,8 +134,8 @@ BUGS = (
         "if _met(load - state.force, load_norm, 1e-1):",
         f"{CORE} or solver",
     ),
-    Bug("a start that is an unstable solution is accepted", NEWTON, "and (start is None or iteration > 1)", "", "unstable"),
-    Bug("accelerated pass: negative curvature accepted", NEWTON, "converged=memory.convex and", "converged=True and", "unstable"),
+    Bug("accelerated pass: negative curvature of probes accepted", NEWTON, "converged=probes.convex", "converged=True", "unstable or column"),
+    Bug("iterative solvers: solutions not certified", MODEL, "if self._iterative:\n            force", "if False:\n            force", "column"),
     Bug("det F not checked", NEWTON, "return self.converged and self.min_det_f > 0", "return self.converged", "confined or huge or limit or arch"),
     Bug(
         "the last state returned where there is no equilibrium",
@@ -149,8 +149,8 @@ BUGS = (
     Bug(
         "start perturbed at random",
         NEWTON,
-        "(yield load, rotations) if",
-        "(yield load, rotations) * (1 + 1e-9 * np.random.random(len(load))) if",
+        "q = (yield [(load, rotations)])[0] if",
+        "q = (yield [(load, rotations)])[0] * (1 + 1e-9 * np.random.random(len(load))) if",
         "identical or mirrored or among",
     ),
     Bug(
@@ -162,7 +162,10 @@ BUGS = (
     ),
     Bug("round-off floor of a small load not recognised", NEWTON, "max(float(np.abs(q).max()), extent)", "float(np.abs(q).max())", "tiny"),
     Bug("ill-conditioning not reported", MODEL, "if condition > ILL_CONDITIONED:", "if False:", "ill_conditioned"),
-    Bug("loads that are not finite solved", NEWTON, "or not np.isfinite(load).all():", "or False:", "refuses"),
+    Bug("loads that are not finite solved", NEWTON, "or not np.isfinite(array).all():", "or False:", "refuses"),
+    Bug("loads beyond all bounds solved", NEWTON, "if np.abs(load).max() > MAX_LOAD_N:", "if False:", "refuses"),
+    Bug("starts of another shape taken", NEWTON, "or array.shape != (problem.n_unknowns,)", "", "refuses"),
+    Bug("round-off for an answer to a tiny load", NEWTON, "<= LINEAR * problem.extent", "<= 0.0 * problem.extent", "tiny"),
     Bug(
         "scale of one load taken for all",
         ROTATED,

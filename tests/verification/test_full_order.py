@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import mor_bench
-from mor_bench.errors import InvalidInputError, SolverError, UnconstrainedBodyError
+from mor_bench.errors import IllConditionedWarning, InvalidInputError, SolverError, UnconstrainedBodyError
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.linear import BandedCholesky, MultigridFactor, NotPositiveDefiniteError, SparseLU
 from mor_bench.mechanics.model import SOLVERS, FullOrderModel
@@ -293,6 +294,26 @@ def test_multigrid_solves_as_the_banded_factor_does_and_accelerates(large: FullO
     solution = model.solve(load)
     assert solution.iterations <= 40
     np.testing.assert_allclose(solution.displacement, large.solve(load).displacement, rtol=0, atol=1e-6 * np.abs(solution.displacement).max())
+
+
+@pytest.mark.parametrize(("thickness", "may_fail"), [(0.1, False), (0.01, True)])
+def test_multigrid_bears_plates_or_says_why_not(thickness: float, may_fail: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The coarsest matrix of the thinner one is not definite in single precision."""
+    spec = mor_bench.load_scene("beam-coarse").spec.model_dump(mode="json")
+    spec["loads"]["patch_area_m2"] = 1.0
+    scene = mor_bench.load_scene({**spec, "geometry": {"shape": "box", "size_m": [4.0, 1.0, thickness], "cells": [40, 20, 2]}})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", IllConditionedWarning)
+        expected = FullOrderModel(scene).rest_factor.solve(np.ones(len(scene.free_dofs)))
+    monkeypatch.setattr("mor_bench.mechanics.linear.MAX_BAND_ENTRIES", 0)
+    try:
+        found = FullOrderModel(scene).rest_factor.solve(np.ones(len(scene.free_dofs)))
+    except SolverError as error:
+        if not may_fail:
+            raise
+        assert "multigrid does not solve" in str(error)  # noqa: PT017
+    else:
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4 * np.abs(expected).max())
 
 
 def test_a_load_has_the_same_answer_alone_and_among_others(large: FullOrderModel) -> None:
