@@ -40,7 +40,7 @@ DAMPED_FORCING = 1e-3
 MAX_HALVINGS = 14
 PROBE_FROM = 0.1
 """Probing begins when the residual has fallen to this share of the load: the tangent then hardly changes any more."""
-PROBES = 4
+PROBES = 3
 """Directions in which the accelerated pass looks for negative curvature; soft ones first."""
 PROBE_LENGTH = 1e-6
 """Length of the difference that gives the tangent's product with a probe, relative to the body."""
@@ -86,6 +86,10 @@ class Turning(Protocol):
 
     def turned(self, q: NDArray[np.float64] | None) -> NDArray[np.float64]:
         """Nodal rotations of the body at q; the identity for None."""
+        ...
+
+    def soft(self, rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The response at rest to a random force, turned: soft modes dominate it."""
         ...
 
     def solve_many(
@@ -182,29 +186,36 @@ _Correcting = Generator[_Asked, list[NDArray[np.float64]], _Pass]
 class _Probes:
     """A search for negative curvature that goes along with the iteration, at one more residual for each of its steps.
 
-    The first probe is the response to a random force, which soft modes dominate; each next one is P⁻¹ K of the one before,
-    as in Lanczos' method. The probes' products with K are differences of the internal force.
+    The first probe is the turned response to a random force, which soft modes dominate; each next one is P⁻¹ K of the one
+    before, as in Lanczos' method. The probes' products with K are differences of the internal force.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
-        self.wanted = np.random.default_rng(0).normal(size=problem.n_unknowns)
         self._probes: list[NDArray[np.float64]] = []
         self._products: list[NDArray[np.float64]] = []
+
+    @property
+    def begun(self) -> bool:
+        return bool(self._probes)
 
     @property
     def complete(self) -> bool:
         return len(self._probes) == PROBES
 
+    @property
+    def wanted(self) -> NDArray[np.float64]:
+        """The residual whose correction is the next probe."""
+        return self._products[-1]
+
     def add(self, answer: NDArray[np.float64], q: NDArray[np.float64], force: NDArray[np.float64]) -> None:
-        """Take P⁻¹ of ``wanted`` as the next probe, at q with its internal force."""
+        """Take the next probe, at q with its internal force."""
         for probe in self._probes:
             answer = answer - float(probe @ answer) / float(probe @ probe) * probe
         length = PROBE_LENGTH * self._problem.extent / (float(np.abs(answer).max()) or 1.0)
         probe = length * answer
         self._probes.append(probe)
         self._products.append(self._problem.force(q + probe).force - force)
-        self.wanted = self._products[-1]
 
     @property
     def convex(self) -> bool:
@@ -238,8 +249,9 @@ def _accelerated(
         if turning:
             rotations = inverse.turned(q)
         asked = [(residual, rotations)]
-        probing = size <= PROBE_FROM * load_norm and not probes.complete
-        if probing:
+        if size <= PROBE_FROM * load_norm and not probes.complete:
+            if not probes.begun:
+                probes.add(inverse.soft(rotations), q, state.force)
             asked.append((probes.wanted, rotations))
         correction, *answers = yield asked
         for answer in answers:
@@ -253,6 +265,8 @@ def _accelerated(
         return _Pass(q, min_det, ACCELERATED_ITERATIONS, converged=False)
     if not (min_det > 0 and memory.convex):
         return _Pass(q, min_det, iteration, converged=False)
+    if not probes.begun:
+        probes.add(inverse.soft(rotations), q, state.force)
     while not probes.complete:
         probes.add((yield [(probes.wanted, rotations)])[0], q, state.force)
     return _Pass(q, min_det, iteration, converged=probes.convex)

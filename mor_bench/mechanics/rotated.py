@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -196,6 +197,18 @@ class RotatedRest:
         z = np.empty(work.shape)
         for out, row, Q, scale in zip(z, work, rotations, scales, strict=True):
             _turn(self._place, Q, scale, row, out)
+        return z
+
+    @cached_property
+    def _soft(self) -> NDArray[np.float32]:
+        response = np.random.default_rng(0).normal(size=(1, 3 * len(self._place))).astype(np.float32)
+        self._factor.solve_in_place(response)
+        return np.asarray(response[0] / np.abs(response).max())
+
+    def soft(self, rotations: Array) -> Array:
+        """The response at rest to a random force, of size one, turned."""
+        z = np.empty(len(self._soft))
+        _turn(self._place, rotations, 1.0, self._soft, z)
         return z
 
     def at(self, q: Array | None) -> Turned:

@@ -256,6 +256,7 @@ def test_a_column_beyond_its_buckling_load_is_never_called_stable_when_straight(
             solution = model.solve(load)
         except SolverError:
             continue
+        assert np.linalg.norm(load - model.force(solution.displacement).force) <= 1e-8 * np.linalg.norm(load)
         BandedCholesky(model.assembler.pattern).factor(model.linearise(solution.displacement)[1])
 
 
