@@ -201,7 +201,7 @@ class _Probes:
 
     @property
     def complete(self) -> bool:
-        return len(self._probes) == PROBES
+        return len(self._probes) >= PROBES
 
     @property
     def wanted(self) -> NDArray[np.float64]:
