@@ -37,6 +37,7 @@ class SplitName(StrEnum):
 
     region = "region"
     sample = "sample"
+    direction = "direction"
 
 
 Suite = Annotated[Path | None, typer.Option(help="Folder with datasets/ and methods/ to look in first.")]
@@ -112,7 +113,7 @@ def run(
         list[str] | None, typer.Option("--method", "-m", help="Name or TOML file; repeat for more. [default: the five core methods]")
     ] = None,
     profile: Annotated[ProfileName, typer.Option(help="Budgets and sweeps of the method files.")] = ProfileName.quick,
-    split: Annotated[SplitName | None, typer.Option(help="Test on unseen load regions or on unseen samples. [default: as the dataset says]")] = None,
+    split: Annotated[SplitName | None, typer.Option(help="What the test part has that training has not. [default: as the dataset says]")] = None,
     limit: Limit = None,
     out: Annotated[Path | None, typer.Option(help="Where to write. [default: reports/runs/TIME-DATASETS]")] = None,
     threads: Annotated[int, typer.Option(min=1, help="Threads of a prediction; fitting uses all cores.")] = 1,

@@ -14,7 +14,19 @@ from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, create_model, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    ValidationInfo,
+    create_model,
+    field_validator,
+    model_validator,
+)
 
 from mor_bench.errors import MissingDependencyError, SpecError
 
@@ -65,7 +77,101 @@ class LShapeGeometry(BoxGeometry):
         return self
 
 
-Geometry = Annotated[BoxGeometry | LShapeGeometry, Field(discriminator="shape")]
+class SourceFile(_Model):
+    """A file that a dataset is made from, bound to its content; in a TOML it is written as its path alone.
+
+    Attributes
+    ----------
+    path : str
+        Absolute; it does not enter a dataset's digest.
+    sha256 : str
+        Of the content.
+    """
+
+    path: str
+    sha256: str
+
+    def checked(self) -> Path:
+        """The path of the file, after a look whether its content is what it was.
+
+        Raises
+        ------
+        SpecError
+            If the file is missing or has changed.
+        """
+        if _sha256(Path(self.path)) != self.sha256:
+            raise SpecError(f"{self.path}: the file has changed since the dataset was read.")
+        return Path(self.path)
+
+
+def _sha256(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except FileNotFoundError:
+        raise SpecError(f"{path}: no such file.") from None
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read: {error.strerror}.") from None
+
+
+def _source_file(value: Any, info: ValidationInfo) -> Any:
+    """A path, relative to the folder of the TOML, as a `SourceFile`."""
+    if not isinstance(value, str):
+        return value
+    path = (Path(info.context or ".") / value).resolve()
+    return {"path": str(path), "sha256": _sha256(path)}
+
+
+File = Annotated[SourceFile, BeforeValidator(_source_file)]
+
+
+def _surface(value: Any, info: ValidationInfo) -> Any:
+    return value if value == "liver" else _source_file(value, info)
+
+
+class VoxelsGeometry(_Model):
+    """A closed surface filled with a sparse grid of H8: the cells of its bounding box's regular grid that overlap it.
+
+    Attributes
+    ----------
+    surface : "liver" or SourceFile
+        The two-lobed liver that comes with the package, or an STL or OBJ file.
+    cells : three ints
+        Of the whole grid, per axis.
+    unit_m : float
+        Length of the file's unit, m.
+    """
+
+    shape: Literal["voxels"]
+    surface: Annotated[Literal["liver"] | SourceFile, BeforeValidator(_surface)]
+    cells: Cells
+    unit_m: Positive = 1.0
+
+    _fits_in_memory = field_validator("cells")(BoxGeometry._fits_in_memory.__func__)  # type: ignore[attr-defined]
+
+
+class TetrahedraGeometry(_Model):
+    """The two-lobed liver that comes with the package, meshed with T4 of about one size."""
+
+    shape: Literal["tetrahedra"]
+    surface: Literal["liver"]
+
+
+class FileGeometry(_Model):
+    """The H8 or T4 cells of a mesh file that meshio reads: Gmsh, VTK, VTU, Abaqus and others.
+
+    Attributes
+    ----------
+    file : SourceFile
+    unit_m : float
+        Length of the file's unit, m.
+    """
+
+    shape: Literal["file"]
+    file: File
+    unit_m: Positive = 1.0
+
+
+Geometry = Annotated[BoxGeometry | LShapeGeometry | VoxelsGeometry | TetrahedraGeometry | FileGeometry, Field(discriminator="shape")]
 
 
 class Discretisation(_Model):
@@ -134,21 +240,53 @@ class SphereRegion(_Model):
     sphere_m: Annotated[tuple[Triple, Positive], Field(strict=False)]
 
 
+class NearestRegion(_Model):
+    """The nodes of the surface nearest to a point: its position, m, and their number."""
+
+    nearest_m: Annotated[tuple[Triple, Annotated[int, Field(ge=1)]], Field(strict=False)]
+
+
+class PointSetRegion(_Model):
+    """A named set of nodes of the mesh file."""
+
+    point_set: str
+
+
+class NearSurfaceRegion(_Model):
+    """The nodes of the surface that lie near another surface, open or closed, of an STL or OBJ file."""
+
+    near_surface: File
+    within_m: Positive
+    unit_m: Positive = 1.0
+
+
 NamedRegion = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max", "surface"]
+
+_REGIONS: dict[str, type[BaseModel]] = {
+    "box_m": BoxRegion, "sphere_m": SphereRegion, "nearest_m": NearestRegion, "point_set": PointSetRegion, "near_surface": NearSurfaceRegion,
+}  # fmt: skip
 
 
 def _kind_of_region(value: Any) -> str:
-    if isinstance(value, SphereRegion) or (isinstance(value, Mapping) and "sphere_m" in value):
-        return "sphere"
-    return "box" if isinstance(value, BoxRegion | Mapping) else "name"
+    for key, kind in _REGIONS.items():
+        if isinstance(value, kind) or (isinstance(value, Mapping) and key in value):
+            return f"by {key}"
+    return "by box_m" if isinstance(value, Mapping) else "name"
 
 
 Region = Annotated[
-    Annotated[NamedRegion, Tag("name")] | Annotated[BoxRegion, Tag("box")] | Annotated[SphereRegion, Tag("sphere")], Discriminator(_kind_of_region)
+    Annotated[NamedRegion, Tag("name")]
+    | Annotated[BoxRegion, Tag("by box_m")]
+    | Annotated[SphereRegion, Tag("by sphere_m")]
+    | Annotated[NearestRegion, Tag("by nearest_m")]
+    | Annotated[PointSetRegion, Tag("by point_set")]
+    | Annotated[NearSurfaceRegion, Tag("by near_surface")],
+    Discriminator(_kind_of_region),
 ]
 _BRANCHES = {
-    "geometry": ("box", "l-shape"),
-    "region": ("name", "box", "sphere"),
+    "geometry": ("box", "l-shape", "voxels", "tetrahedra", "file"),
+    "region": ("name", *(f"by {key}" for key in _REGIONS)),
+    "unseen_region": ("name", *(f"by {key}" for key in _REGIONS)),
     "material": ("saint-venant-kirchhoff", "neo-hookean", "mooney-rivlin", "ogden"),
 }
 """Steps that pydantic puts into an error's location to say which alternative of a key it took."""
@@ -160,19 +298,51 @@ class Support(_Model):
     region: Region
 
 
+LoadKind = Literal["force", "normal", "tangential"]
+
+Sampling = Literal["random", "latin-hypercube", "sobol"]
+
+
 class Loads(_Model):
-    """Forces on patches of the surface, and how they are drawn."""
+    """Forces on patches of the surface, and how they are drawn; see `mor_bench.snapshots.sampling`.
+
+    Attributes
+    ----------
+    region : Region
+        Where patches may lie.
+    kind : str
+        `force`: directions uniform on the sphere. `normal`: along the surface's normal, inwards or outwards.
+        `tangential`: across it.
+    patch_area_m2 : float
+        Of each patch, m².
+    n_patches : int, optional
+        So many patches, spread evenly over the region away from the supports; by default one around each node of the region.
+    simultaneous : int
+        Patches that are loaded at once.
+    min_distance_m : float, optional
+        Between the centres of patches that are loaded at once; needed with more than one.
+    samples_per_patch, samples : int, optional
+        Exactly one of them. With `samples` patches, or combinations of them, come in random order, each as often as the others.
+    magnitude_n : two floats
+        Range of each force, N.
+    sampling : str
+        Plan for directions and magnitudes.
+    seed : int
+    """
 
     region: Region
-    kind: Literal["force"]
+    kind: LoadKind
     patch_area_m2: Positive
-    simultaneous: Literal[1] = 1
-    samples_per_patch: Annotated[int, Field(ge=1)]
+    n_patches: Annotated[int, Field(ge=1)] | None = None
+    simultaneous: Annotated[int, Field(ge=1, le=8)] = 1
+    min_distance_m: Positive | None = None
+    samples_per_patch: Annotated[int, Field(ge=1)] | None = None
+    samples: Annotated[int, Field(ge=1)] | None = None
     magnitude_n: Annotated[
         tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], Annotated[float, Field(ge=1e-12, le=1e12)]],
         Field(strict=False),
     ]
-    sampling: Literal["random"] = "random"
+    sampling: Sampling = "random"
     seed: Annotated[int, Field(ge=0)] = 0
 
     @field_validator("magnitude_n")
@@ -182,15 +352,42 @@ class Loads(_Model):
             raise ValueError("the lower bound must not exceed the upper one")
         return value
 
+    @model_validator(mode="after")
+    def _consistent(self) -> Loads:
+        if (self.samples_per_patch is None) == (self.samples is None):
+            raise ValueError("exactly one of `samples_per_patch` and `samples` must be given")
+        if self.simultaneous > 1 and self.samples is None:
+            raise ValueError("with `simultaneous` > 1 `samples` must be given, not `samples_per_patch`")
+        if (self.simultaneous > 1) != (self.min_distance_m is not None):
+            raise ValueError(f"`min_distance_m` must be given with `simultaneous` > 1 and only then; got `simultaneous` {self.simultaneous}")
+        if self.kind == "normal" and self.magnitude_n[0] == self.magnitude_n[1]:
+            raise ValueError(f"`magnitude_n` of normal forces must be a range, or samples would repeat; got {self.magnitude_n}")
+        return self
 
-SplitBy = Literal["region", "sample"]
+
+SplitBy = Literal["region", "sample", "direction"]
 
 
 class Split(_Model):
-    """Which samples are kept for the test."""
+    """Which samples are kept for the test; see `mor_bench.snapshots.dataset.split_samples`."""
 
     test_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
     by: SplitBy = "region"
+
+
+class ExtraTests(_Model):
+    """The named test sets beside the main one; see `mor_bench.snapshots.test_sets`.
+
+    Attributes
+    ----------
+    samples : int
+        In each.
+    unseen_region : Region, optional
+        A part of the surface where no load of the main set acts.
+    """
+
+    samples: Annotated[int, Field(ge=1)] = 200
+    unseen_region: Region | None = None
 
 
 class Needs(_Model):
@@ -201,8 +398,21 @@ class Needs(_Model):
     latency_ms: Positive
 
 
+Side = Annotated[int, Field(ge=2, le=1024)]
+
+
+def _without_paths(value: Any) -> Any:
+    """A copy in which a file is known by its content, wherever it lies."""
+    if isinstance(value, dict):
+        return {key: _without_paths(item) for key, item in value.items() if not (key == "path" and "sha256" in value)}
+    return [_without_paths(item) for item in value] if isinstance(value, list) else value
+
+
 class DatasetSpec(_Model):
-    """A dataset file."""
+    """A dataset file.
+
+    `grid_nodes` are the nodes per axis of the regular grid for methods that need one, where the mesh lies in none.
+    """
 
     name: str
     title: str
@@ -214,11 +424,14 @@ class DatasetSpec(_Model):
     supports: Annotated[tuple[Support, ...], Field(strict=False)] = ()
     loads: Loads
     split: Split = Split()
+    tests: ExtraTests = ExtraTests()
     needs: Needs
+    grid_nodes: Annotated[tuple[Side, Side, Side], Field(strict=False)] | None = None
 
     def physics(self) -> dict[str, Any]:
         """All that decides the samples: two datasets with equal physics have equal snapshots."""
-        physics = self.model_dump(mode="json", include={"geometry", "discretisation", "material", "supports", "loads"})
+        dumped = self.model_dump(mode="json", include={"geometry", "discretisation", "material", "supports", "loads"}, exclude_none=True)
+        physics: dict[str, Any] = _without_paths(dumped)
         # Solvers agree to the tolerance only; the default one leaves no trace.
         return physics if self.solver == "auto" else {**physics, "solver": self.solver}
 
@@ -357,9 +570,9 @@ def _one_line(error: ValidationError, model: type[BaseModel], where: str) -> str
     return f"{where}: `{key}` must be {message}{came}." if problem["msg"].startswith("Input should") else f"{where}: `{key}`: {message}{came}."
 
 
-def _validated(model: type[_M], content: Mapping[str, Any], where: str) -> _M:
+def _validated(model: type[_M], content: Mapping[str, Any], where: str, folder: Path | None = None) -> _M:
     try:
-        return model.model_validate(dict(content))
+        return model.model_validate(dict(content), context=folder)
     except ValidationError as error:
         raise SpecError(_one_line(error, model, where)) from None
 
@@ -415,7 +628,7 @@ def load_dataset_spec(source: str | Path | Mapping[str, Any], suite: Path | None
         content = {"name": "scene", **source}
         return _validated(DatasetSpec, {"title": content["name"], "source": "", **content}, "scene")
     path = _resolve("datasets", source, suite)
-    return _validated(DatasetSpec, {**_read_toml(path), "name": path.stem}, str(path))
+    return _validated(DatasetSpec, {**_read_toml(path), "name": path.stem}, str(path), path.parent)
 
 
 def is_method_file(path: Path) -> bool:

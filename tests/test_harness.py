@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 import mor_bench
@@ -68,6 +68,7 @@ def test_frontier_interpolates_in_log_log_and_never_extrapolates() -> None:
     assert error_at_time(POINTS, 1e6)["error"] == 0.001
 
 
+@example([(1.0, 1.0000000000000002e-06), (2.0, 1e-06)], 1e-06, 1.0)
 @given(st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-6, 1.0)), min_size=1, max_size=12), st.floats(1e-6, 1.0), st.floats(1e-3, 1e3))
 def test_frontier_stays_between_its_points(points: list[tuple[float, float]], error: float, time: float) -> None:
     cloud = [Point(t, e, str(i)) for i, (t, e) in enumerate(points)]

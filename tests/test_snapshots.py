@@ -15,10 +15,10 @@ import pytest
 import mor_bench
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.scene.scene import Scene
+from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Dataset, split_samples
 from mor_bench.snapshots.generate import dataset_folder, generate, generation_seconds
-from mor_bench.snapshots.sampling import draw_loads
+from mor_bench.snapshots.sampling import PatchLoads, draw_loads
 from mor_bench.snapshots.store import Shard, read_shard, write_shard
 from mor_bench.specs import DatasetSpec, Split, load_dataset_spec
 
@@ -50,26 +50,27 @@ def test_the_centroid_of_an_inner_patch_is_its_node(tiny_scene: Scene) -> None:
 
 
 def test_directions_are_uniform_and_magnitudes_in_range() -> None:
-    loads = load_dataset_spec("beam-coarse").loads
-    drawn = draw_loads(loads, 64, 0, 6400)
-    size = np.linalg.norm(drawn.vectors, axis=1)
+    drawn = draw_loads(mor_bench.load_scene("beam-coarse"), 0, 6400)
+    vectors = drawn.vectors[:, 0]
+    size = np.linalg.norm(vectors, axis=1)
     assert size.min() >= 0
     assert size.max() <= 1
     assert np.histogram(size, bins=4, range=(0, 1))[0].min() > 1450
-    directions = drawn.vectors / size[:, None]
+    directions = vectors / size[:, None]
     assert np.abs(directions.mean(axis=0)).max() < 0.03
     np.testing.assert_allclose(directions.T @ directions / 6400, np.eye(3) / 3, atol=0.02)
-    np.testing.assert_array_equal(np.bincount(drawn.patches), 100)
-    assert len(np.unique(drawn.vectors, axis=0)) == 6400
+    np.testing.assert_array_equal(np.bincount(drawn.patches[:, 0]), 100)
+    assert len(np.unique(vectors, axis=0)) == 6400
 
 
 def test_a_sample_depends_on_seed_and_index_only() -> None:
-    loads = load_dataset_spec("beam-tiny").loads
-    whole = draw_loads(loads, 21, 0, 50)
-    part = draw_loads(loads, 21, 17, 23)
+    scene = mor_bench.load_scene("beam-tiny")
+    whole = draw_loads(scene, 0, 50)
+    part = draw_loads(scene, 17, 23)
     np.testing.assert_array_equal(whole.vectors[17:23], part.vectors)
     np.testing.assert_array_equal(whole.patches[17:23], part.patches)
-    other = draw_loads(loads.model_copy(update={"seed": 1}), 21, 0, 50)
+    loads = scene.spec.loads.model_copy(update={"seed": 1})
+    other = draw_loads(load_scene(scene.spec.model_copy(update={"loads": loads})), 0, 50)
     assert not np.isclose(other.vectors, whole.vectors).any()
 
 
@@ -97,7 +98,8 @@ def test_sample_split_shares_no_sample(cache: Path) -> None:
 
 def test_test_regions_do_not_depend_on_the_limit() -> None:
     regions = np.arange(640) % 64
-    test = [set(regions[:n][split_samples(regions[:n], 64, Split(), 0)[1]]) for n in (128, 640)]
+    loads = PatchLoads(regions[:, None], np.zeros((640, 1, 3)))
+    test = [set(regions[split_samples(loads[:n], 64, Split(), 0)[1]]) for n in (128, 640)]
     assert test[0] == test[1]
 
 
@@ -151,7 +153,7 @@ def test_damaged_files_say_what_they_are_and_are_made_again(tmp_path: Path, name
             "truncated": content[:-9],
             "foreign": b"PK" + content,
             "empty": b"",
-            "newer": content.replace(b'"schema_version": 1', b'"schema_version": 7'),
+            "newer": content.replace(b'"schema_version": 2', b'"schema_version": 7'),
         }[name]
     )
     with pytest.raises(StoreError, match=message):
@@ -163,7 +165,7 @@ def test_damaged_files_say_what_they_are_and_are_made_again(tmp_path: Path, name
 
 
 def test_a_failed_write_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shard = Shard(0, np.zeros(1, dtype=np.int64), np.zeros((1, 3)), np.zeros((1, 6)), np.ones(1), np.zeros(1, dtype=np.uint8))
+    shard = Shard(0, np.zeros((1, 1), dtype=np.int64), np.zeros((1, 1, 3)), np.zeros((1, 6)), np.ones(1), np.zeros(1, dtype=np.uint8))
     write_shard(tmp_path / "shard.h5", shard)
     before = (tmp_path / "shard.h5").read_bytes()
 

@@ -8,6 +8,7 @@ from mor_bench.errors import MissingDependencyError
 from mor_bench.mechanics.locking import locking_risk
 from mor_bench.mechanics.model import check_supports, missing_library
 from mor_bench.scene.scene import load_scene
+from mor_bench.snapshots.sampling import n_samples_of
 from mor_bench.specs import check_method, is_method_file, load_dataset_spec, load_method_spec
 
 
@@ -34,7 +35,7 @@ def check_file(path: Path) -> str:
     if missing:
         raise MissingDependencyError(f"{missing}.")
     n_patches = len(scene.patch_nodes)
-    samples = n_patches * spec.loads.samples_per_patch
+    samples = n_samples_of(scene)
     said = f"dataset, {scene.mesh.n_cells} cells, {scene.mesh.n_nodes} nodes, {n_patches} load patches, {samples} samples"
     risk = locking_risk(scene)
     return f"{said}; warning: {risk}" if risk else said

@@ -7,13 +7,14 @@ The limit of vanishing cell size is Richardson's from the last three meshes wher
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from math import inf, log2
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench import __version__
@@ -21,9 +22,9 @@ from mor_bench.errors import InvalidInputError, SolverError, SpecError, StoreErr
 from mor_bench.harness.metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.interpolation import interpolation_matrix
-from mor_bench.scene.scene import Scene, load_scene, with_cells
+from mor_bench.scene.scene import Scene, load_scene, refined
 from mor_bench.snapshots.generate import dataset_folder
-from mor_bench.snapshots.sampling import draw_loads
+from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import DatasetSpec, find_suite, load_dataset_spec
 
@@ -36,12 +37,18 @@ Progress = Callable[[int, int], None]
 """Called with the solves done and the solves wanted."""
 
 
-def chosen_samples(spec: DatasetSpec, n_patches: int, n_loads: int) -> NDArray[np.int64]:
-    """Numbers of samples of a dataset, one from each of equal stretches of its load patches, seeded by the dataset."""
-    generator = np.random.default_rng([spec.loads.seed, 0xD15C])
+def chosen_samples(scene: Scene, n_loads: int) -> NDArray[np.int64]:
+    """Numbers of samples of a dataset, one from each of equal stretches of its load patches, seeded by the dataset.
+
+    Where patches come in random order, the first samples.
+    """
+    loads, n_patches = scene.spec.loads, len(scene.patch_nodes)
+    if loads.samples_per_patch is None:
+        return np.arange(min(n_loads, n_samples_of(scene)))
+    generator = np.random.default_rng([loads.seed, 0xD15C])
     bounds = np.arange(n_loads + 1) * n_patches // n_loads
     patches = generator.integers(bounds[:-1], bounds[1:])
-    return np.asarray(generator.integers(spec.loads.samples_per_patch, size=n_loads) * n_patches + patches)
+    return np.asarray(generator.integers(loads.samples_per_patch, size=n_loads) * n_patches + patches)
 
 
 def limit_of(displacements: list[NDArray[np.float64]]) -> tuple[NDArray[np.float64], float | None, str]:
@@ -72,39 +79,40 @@ def limit_of(displacements: list[NDArray[np.float64]]) -> tuple[NDArray[np.float
 
 def _meshes(scene: Scene, levels: int, max_dofs: int) -> tuple[list[Scene], list[dict[str, Any]]]:
     """The scene on its own and on the refined meshes that are within the limit, and a record of those that are not."""
-    cells = getattr(scene.spec.geometry, "cells", (1, 1, 1))
-    meshes, left_out = [scene], []
-    for level in range(1, levels + 1):
-        finer = tuple(n * 2**level for n in cells)
-        n_dofs = 3 * int(np.prod([n + 1 for n in finer]))
-        if n_dofs > max_dofs:
-            left_out.append({"cells": list(finer), "n_dofs": n_dofs})
-        else:
-            meshes.append(with_cells(scene, finer))
-    if len(meshes) == 1:
-        with_cells(scene, finer)  # says why not, if the geometry has no cells per axis
-        raise InvalidInputError(
-            f"`max_dofs` must be at least {left_out[0]['n_dofs']}, the unknowns of the first refinement of {scene.name}; got {max_dofs}."
-        )
-    return meshes, left_out
+    meshes = [scene]
+    for _ in range(levels):
+        finer = refined(meshes[-1])
+        if finer.mesh.n_dofs > max_dofs:
+            if len(meshes) == 1:
+                raise InvalidInputError(
+                    f"`max_dofs` must be at least {finer.mesh.n_dofs}, the unknowns of the first refinement of {scene.name}; got {max_dofs}."
+                )
+            return meshes, [_size(finer)]
+        meshes.append(finer)
+    return meshes, []
+
+
+def _size(scene: Scene) -> dict[str, int]:
+    return {"n_cells": scene.mesh.n_cells, "n_dofs": scene.mesh.n_dofs}
 
 
 class _OnMesh:
-    """Some load patches of a scene on another mesh of its body, and answers at the scene's own nodes."""
+    """Some loads of a scene on another mesh of its body, and answers at the scene's own nodes."""
 
-    def __init__(self, scene: Scene, mesh: Scene, patches: NDArray[np.int64]) -> None:
-        points, shares = scene.patch_points(patches)
+    def __init__(self, scene: Scene, mesh: Scene, loads: Sequence[PatchLoads]) -> None:
+        points, shares = scene.patch_points(np.concatenate([load.patches[0] for load in loads]))
+        weights = sp.csr_array(shares @ interpolation_matrix(mesh.mesh, points))
+        rows = np.split(np.arange(weights.shape[0])[:, None], np.cumsum([load.patches.size for load in loads])[:-1])
         self.scene = mesh
-        self.weights = (shares @ interpolation_matrix(mesh.mesh, points)).toarray()
+        self.forces = [PatchLoads(row.T, load.vectors).nodal_forces(weights)[0] for row, load in zip(rows, loads, strict=True)]
         self.at_nodes = interpolation_matrix(mesh.mesh, scene.mesh.points)
         self.model = FullOrderModel(mesh)
 
-    def solve(self, row: int, force: NDArray[np.float64], start: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    def solve(self, row: int, start: NDArray[np.float64] | None) -> NDArray[np.float64]:
         """(n_nodes of this mesh, 3) displacements, m, from a start of that shape."""
         free = self.scene.free_dofs
         out = np.zeros(self.scene.mesh.n_dofs)
-        load = (self.weights[row][:, None] * force).ravel()[free]
-        out[free] = self.model.solve(load, None if start is None else start.ravel()[free]).displacement
+        out[free] = self.model.solve(self.forces[row].ravel()[free], None if start is None else start.ravel()[free]).displacement
         return out.reshape(-1, 3)
 
 
@@ -127,7 +135,7 @@ def refine(
     n_loads : int
         Samples of the dataset that are solved, spread over its load patches.
     levels : int
-        Refinements, each with twice the cells per axis of the one before.
+        Refinements, each of eight cells in the place of one.
     max_dofs : int
         Meshes with more unknowns are left out.
     cache, suite : Path, optional
@@ -150,8 +158,6 @@ def refine(
         If the dataset is not valid.
     InvalidInputError
         If a number is out of range, or not even the first refinement is within ``max_dofs``.
-    UnsupportedSceneError
-        If the scene cannot be refined.
     SolverError
         If no load has an equilibrium on every mesh.
     """
@@ -163,24 +169,23 @@ def refine(
     if not 1 <= levels <= 10:
         raise InvalidInputError(f"`levels` must be an integer in [1, 10]; got {levels}.")
     scenes, left_out = _meshes(scene, levels, max_dofs)
-    samples = chosen_samples(spec, n_patches, n_loads)
-    loads = [draw_loads(spec.loads, n_patches, int(i), int(i) + 1) for i in samples]
-    patches = samples % n_patches
+    samples = chosen_samples(scene, n_loads)
+    loads = [draw_loads(scene, int(i), int(i) + 1) for i in samples]
     answers: list[list[NDArray[np.float64]]] = [[] for _ in samples]
     starts: list[NDArray[np.float64] | None] = [None] * n_loads
     reasons: list[str | None] = [None] * n_loads
     previous: Scene | None = None
     for number, mesh in enumerate(scenes):
-        on_mesh = _OnMesh(scene, mesh, patches)
+        on_mesh = _OnMesh(scene, mesh, loads)
         carried = None if previous is None else interpolation_matrix(previous.mesh, mesh.mesh.points)
-        for row, load in enumerate(loads):
+        for row in range(n_loads):
             if reasons[row] is None:
                 known = starts[row]
                 start = None if carried is None or known is None else carried @ known
                 try:
-                    found = on_mesh.solve(row, load.vectors[0], start)
+                    found = on_mesh.solve(row, start)
                 except SolverError as error:
-                    reasons[row] = f"{' x '.join(map(str, _cells(mesh)))} cells: {error}"
+                    reasons[row] = f"{mesh.mesh.n_cells} cells: {error}"
                 else:
                     starts[row] = found
                     answers[row].append(on_mesh.at_nodes @ found)
@@ -188,8 +193,8 @@ def refine(
                 progress(number * n_loads + row + 1, len(scenes) * n_loads)
         previous = mesh
     records = [
-        {"sample": int(i), "patch": int(patch), "vector_n": load.vectors[0].tolist(), **_errors(answer, reason)}
-        for i, patch, load, answer, reason in zip(samples, patches, loads, answers, reasons, strict=True)
+        {"sample": int(i), "patches": load.patches[0].tolist(), "vectors_n": load.vectors[0].tolist(), **_errors(answer, reason)}
+        for i, load, answer, reason in zip(samples, loads, answers, reasons, strict=True)
     ]
     solved = [record for record in records if record["error_m"] is not None]
     if not solved:
@@ -204,7 +209,7 @@ def refine(
         "error_m": float(np.mean([record["error_m"] for record in solved])),
         "relative_l2": float(np.mean([record["relative_l2"] for record in solved])),
         "relative_l2_median": float(np.median([record["relative_l2"] for record in solved])),
-        "meshes": [{"cells": list(_cells(mesh)), "n_dofs": mesh.mesh.n_dofs} for mesh in scenes],
+        "meshes": [_size(mesh) for mesh in scenes],
         "left_out": left_out,
         "loads": records,
     }
@@ -212,10 +217,6 @@ def refine(
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
     return result
-
-
-def _cells(scene: Scene) -> tuple[int, int, int]:
-    return scene.spec.geometry.cells
 
 
 def _errors(answers: list[NDArray[np.float64]], reason: str | None) -> dict[str, Any]:

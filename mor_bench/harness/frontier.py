@@ -40,9 +40,10 @@ def non_dominated(points: Sequence[Point]) -> list[Point]:
 
 
 def _interpolate(x: float, x0: float, y0: float, x1: float, y1: float) -> float:
-    if x1 == x0:
+    span = log(x1) - log(x0)
+    if span == 0:  # neighbouring floats may have one logarithm
         return min(y0, y1)
-    share = (log(x) - log(x0)) / (log(x1) - log(x0))
+    share = (log(x) - log(x0)) / span
     return exp(log(y0) + share * (log(y1) - log(y0)))
 
 

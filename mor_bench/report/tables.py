@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import hypot
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -229,16 +230,16 @@ def print_discretisation(record: dict[str, Any], console: Console | None = None)
     for heading in ("sample", "patch", "force\nN", "e\nm", "rel L2\n%", "order", "limit"):
         table.add_column(heading, justify="right")
     for load in record["loads"]:
-        force = number(sum(component**2 for component in load["vector_n"]) ** 0.5)
+        force = ", ".join(number(hypot(*vector)) for vector in load["vectors_n"])
         figures = (metres(load["error_m"]), percent(load["relative_l2"]), number(load["order"]), load["limit"])
-        table.add_row(str(load["sample"]), str(load["patch"]), force, *figures)
+        table.add_row(str(load["sample"]), ", ".join(map(str, load["patches"])), force, *figures)
     console.print(table, highlight=False)
     for load in record["loads"]:
         if load["error_m"] is None:
             console.print(Text(f"sample {load['sample']} is in no mean: {load['reason']}", style="red"))
     for kind, meshes in (("meshes", record["meshes"]), ("left out for their size", record["left_out"])):
         if meshes:
-            shown = ", ".join(f"{' x '.join(map(str, mesh['cells']))} cells ({mesh['n_dofs']:,} dofs)" for mesh in meshes)
+            shown = ", ".join(f"{mesh['n_cells']:,} cells ({mesh['n_dofs']:,} dofs)" for mesh in meshes)
             console.print(Text(f"{kind}: {shown}"))
     mean = f"mean e {metres(record['error_m'])} m, relative L2 {percent(record['relative_l2'])} % (median {percent(record['relative_l2_median'])} %)"
     console.print(Text(f"discretisation error of {record['dataset']}: {mean}", style="bold"))

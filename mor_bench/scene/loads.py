@@ -6,6 +6,7 @@ of fixed area means the same load on every mesh.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import ceil, sqrt
 
 import numpy as np
@@ -13,7 +14,6 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.errors import SpecError
-from mor_bench.scene.mesh import Mesh
 
 POINTS_PER_PATCH = 256
 """Surface quadrature points that a patch holds at least."""
@@ -39,35 +39,87 @@ def _midpoints(n_corners: int, m: int) -> tuple[NDArray[np.float64], NDArray[np.
     return np.stack([1 - x - y, x, y], axis=1), np.tile(np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]]), (len(x), 1, 1))
 
 
-def _surface_points(mesh: Mesh, facets: NDArray[np.int64], spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64], sp.csr_array]:
-    """Positions (n, 3), areas (n,) and shape-function values (n, n_nodes) of midpoint-rule points on the facets."""
-    corners, n_corners = mesh.points[facets], facets.shape[1]
+@dataclass(frozen=True)
+class Facets:
+    """The surface that loads act on: a mesh's own, or the smooth one that is embedded in a mesh.
+
+    Attributes
+    ----------
+    points : (n_points, 3) float64
+        m.
+    facets : (n_facets, 4 or 3) int64
+        Numbers of points, turned outwards.
+    """
+
+    points: NDArray[np.float64]
+    facets: NDArray[np.int64]
+
+    def within(self, points: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(n, 4 or 3) the facets all of whose corners are among some points."""
+        inside = np.zeros(len(self.points), dtype=bool)
+        inside[points] = True
+        return self.facets[inside[self.facets].all(axis=1)]
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Load patches, cut out of the surface by the points of a midpoint rule.
+
+    Attributes
+    ----------
+    areas : (n_patches, n_points) sparse float64
+        Area of each point that belongs to a patch, m²; rows sum to the patch's area up to round-off.
+    points : (n_points, 3) float64
+        m.
+    values : (n_points, n_surface_points) sparse float64
+        The facets' shape functions at the points.
+    normals : (n_points, 3) float64
+        Outward, of unit length.
+    """
+
+    areas: sp.csr_array
+    points: NDArray[np.float64]
+    values: sp.csr_array
+    normals: NDArray[np.float64]
+
+    def mean_normals(self) -> NDArray[np.float64]:
+        """(n_patches, 3) outward unit normals, each the mean over its patch."""
+        sums = self.areas @ self.normals
+        return np.asarray(sums / np.linalg.norm(sums, axis=1, keepdims=True))
+
+
+def _midpoint_rule(surface: Facets, facets: NDArray[np.int64], spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64], sp.csr_array]:
+    """Positions (n, 3), area vectors (n, 3) and shape-function values (n, n_surface_points) of points on the facets."""
+    corners, n_corners = surface.points[facets], facets.shape[1]
     longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
     m = max(2, ceil(longest / spacing))
     shape, derivatives = _midpoints(n_corners, m)
     positions = np.einsum("pa,fai->fpi", shape, corners)
     tangents = np.einsum("pad,fai->fpdi", derivatives, corners)
-    areas = np.linalg.norm(np.cross(tangents[:, :, 0], tangents[:, :, 1]), axis=2) / m**2
+    areas = np.cross(tangents[:, :, 0], tangents[:, :, 1]) / m**2
     areas = areas if n_corners == 4 else 0.5 * areas
-    rows = np.repeat(np.arange(areas.size), n_corners)
+    n_points = len(facets) * len(shape)
+    rows = np.repeat(np.arange(n_points), n_corners)
     columns = np.repeat(facets, len(shape), axis=0).ravel()
-    values = sp.csr_array((np.tile(shape, (len(facets), 1)).ravel(), (rows, columns)), shape=(areas.size, mesh.n_nodes))
-    return positions.reshape(-1, 3), areas.ravel(), values
+    values = sp.csr_array((np.tile(shape, (len(facets), 1)).ravel(), (rows, columns)), shape=(n_points, len(surface.points)))
+    return positions.reshape(-1, 3), areas.reshape(-1, 3), values
 
 
-def patch_shares(
-    mesh: Mesh, centres: NDArray[np.int64], facets: NDArray[np.int64], area_m2: float
-) -> tuple[sp.csr_array, NDArray[np.float64], sp.csr_array]:  # fmt: skip
-    """Points on the surface, and the area of each that belongs to the patches around some nodes; see `patch_weights`.
+def cut_patches(surface: Facets, facets: NDArray[np.int64], centres: NDArray[np.int64], area_m2: float) -> Patches:
+    """The patches around some points of a surface.
 
-    Returns
-    -------
-    areas : (n_patches, n_points) sparse float64
-        m²; rows sum to the patch's area up to round-off.
-    points : (n_points, 3) float64
-        Positions, m.
-    values : (n_points, n_nodes) sparse float64
-        Shape functions of the mesh at the points.
+    The patch around a point is the part of the facets that lies nearest to it and has the given area, so that a patch
+    at an edge is as large as one inside. A force F on it is a uniform traction F / area.
+
+    Parameters
+    ----------
+    surface : Facets
+    facets : (n_facets, 4 or 3) int
+        The part of the surface on which patches may lie.
+    centres : (n_patches,) int
+        Numbers of points of the surface.
+    area_m2 : float
+        Area of each patch, m².
 
     Raises
     ------
@@ -76,18 +128,19 @@ def patch_shares(
     """
     if len(facets) == 0:
         raise SpecError("the load region holds nodes but no facet of the surface, so no traction can act on it.")
-    corners = mesh.points[facets]
+    corners = surface.points[facets]
     longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
     least = POINTS_PER_PATCH * len(facets) * longest**2 / MAX_SURFACE_POINTS
     if area_m2 < least:
         raise SpecError(f"`patch_area_m2` must be at least {least:.3g}, for facets with edges of up to {longest:.3g} m; got {area_m2}.")
-    positions, areas, values = _surface_points(mesh, facets, sqrt(area_m2 / POINTS_PER_PATCH))
+    positions, vectors, values = _midpoint_rule(surface, facets, sqrt(area_m2 / POINTS_PER_PATCH))
+    areas = np.linalg.norm(vectors, axis=1)
     if area_m2 > areas.sum() * (1 + 1e-12):
         raise SpecError(f"`patch_area_m2` must be in (0, {areas.sum():.6g}], the area of the load region; got {area_m2}.")
     nearness = sqrt(area_m2) * 1e-9
-    shares = sp.lil_array((len(centres), len(areas)))
-    for row, node in enumerate(centres):
-        distance = np.round(np.linalg.norm(positions - mesh.points[node], axis=1) / nearness)
+    rows, columns, shares = [], [], []
+    for row, centre in enumerate(surface.points[centres]):
+        distance = np.round(np.linalg.norm(positions - centre, axis=1) / nearness)
         order = np.argsort(distance, kind="stable")
         # Points at the same distance enter together, each with the same fraction, so that a symmetric patch stays so.
         ends = np.flatnonzero(np.append(np.diff(distance[order]) > 0, True))
@@ -95,39 +148,21 @@ def patch_shares(
         last = min(int(np.searchsorted(filled, area_m2)), len(ends) - 1)
         first_of_last = ends[last - 1] + 1 if last else 0
         before = filled[last - 1] if last else 0.0
-        whole, partial = order[:first_of_last], order[first_of_last : ends[last] + 1]
-        shares[row, whole] = areas[whole]
-        shares[row, partial] = areas[partial] * (area_m2 - before) / (filled[last] - before)
-    return shares.tocsr(), positions, values
+        own = areas[order[: ends[last] + 1]]
+        own[first_of_last:] *= (area_m2 - before) / (filled[last] - before)
+        rows.append(np.full(len(own), row))
+        columns.append(order[: len(own)])
+        shares.append(own)
+    at = np.concatenate(rows), np.concatenate(columns)
+    cut = sp.csr_array((np.concatenate(shares), at), shape=(len(centres), len(areas)))
+    return Patches(cut, positions, values, vectors / areas[:, None])
 
 
-def patch_weights(mesh: Mesh, centres: NDArray[np.int64], facets: NDArray[np.int64], area_m2: float) -> sp.csr_array:
-    """Nodal weights of the patches around some nodes.
-
-    The patch around a node is the part of the facets that lies nearest to it and has the given area, so that a patch
-    at an edge is as large as one inside. A force F on the patch is the nodal forces ``weight * F`` (the consistent
-    load of a uniform traction F / area).
-
-    Parameters
-    ----------
-    mesh : Mesh
-    centres : (n_patches,) int
-        Node numbers.
-    facets : (n_facets, 4 or 3) int
-        The surface on which patches may lie.
-    area_m2 : float
-        Area of each patch, m².
-
-    Returns
-    -------
-    (n_patches, n_nodes) sparse float64
-        Each row sums to 1.
-
-    Raises
-    ------
-    SpecError
-        If there is no facet, the facets are smaller than one patch, or so large that a patch is lost on one.
-    """
-    areas, _, values = patch_shares(mesh, centres, facets, area_m2)
-    weights = sp.csr_array(areas @ values)
-    return sp.csr_array(weights.multiply(1.0 / weights.sum(axis=1)[:, None]))
+def spread_out(points: NDArray[np.float64], n: int) -> NDArray[np.int64]:
+    """Numbers of n points that lie evenly among all, by farthest-point sampling from the one nearest to their mean; sorted."""
+    chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmin())]
+    distance = np.full(len(points), np.inf)
+    while len(chosen) < n:
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        chosen.append(int(distance.argmax()))
+    return np.sort(chosen)

@@ -3,22 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
+from math import pi, sqrt
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
-from mor_bench.scene.loads import patch_shares, patch_weights
+from mor_bench.scene.interpolation import interpolation_matrix
+from mor_bench.scene.loads import Facets, Patches, cut_patches, spread_out
 from mor_bench.scene.materials import Material, make_material
 from mor_bench.scene.mesh import Mesh, box_mesh, l_mesh
-from mor_bench.scene.regions import region_facets, region_nodes
-from mor_bench.specs import DatasetSpec, LShapeGeometry, load_dataset_spec
+from mor_bench.scene.regions import Cloud, region_points
+from mor_bench.scene.subdivision import subdivide
+from mor_bench.specs import (
+    BoxGeometry,
+    DatasetSpec,
+    FileGeometry,
+    LShapeGeometry,
+    TetrahedraGeometry,
+    VoxelsGeometry,
+    load_dataset_spec,
+)
 
 
 @dataclass(frozen=True)
@@ -33,12 +45,18 @@ class Scene:
     material : Material
     fixed_nodes : (n_fixed,) int64
         Nodes with u = 0.
+    embedded_surface : Facets or None
+        The smooth surface that a mesh of voxels is filled from, and that loads act on.
+    point_sets : mapping of str to (n,) int64
+        Named sets of nodes, of a mesh file.
     """
 
     spec: DatasetSpec
     mesh: Mesh
     material: Material
     fixed_nodes: NDArray[np.int64]
+    embedded_surface: Facets | None = field(default=None, repr=False)
+    point_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict, repr=False)
 
     @property
     def name(self) -> str:
@@ -56,9 +74,53 @@ class Scene:
         return np.setdiff1d(np.arange(self.mesh.n_dofs), fixed)
 
     @cached_property
+    def surface(self) -> Facets:
+        """What loads act on: the mesh's own boundary, or the embedded surface."""
+        return self.embedded_surface or Facets(self.mesh.points, self.mesh.boundary_facets)
+
+    @cached_property
+    def _loaded_points(self) -> NDArray[np.int64]:
+        """Numbers of the surface's points in the load region."""
+        sets = {} if self.embedded_surface else self.point_sets
+        return region_points(Cloud(self.surface.points, np.unique(self.surface.facets), sets), self.spec.loads.region)
+
+    @cached_property
     def patch_nodes(self) -> NDArray[np.int64]:
-        """(n_patches,) the node at the centre of each load patch; the patch's number is the load-region id."""
-        return region_nodes(self.mesh, self.spec.loads.region)
+        """(n_patches,) the point of the surface at the centre of each load patch; the patch's number is the load-region id.
+
+        On a mesh's own boundary these are numbers of nodes.
+        """
+        region, loads = self._loaded_points, self.spec.loads
+        if loads.n_patches is None:
+            return region
+        points = self.surface.points[region]
+        if len(self.fixed_nodes):
+            distance = cKDTree(self.mesh.points[self.fixed_nodes]).query(points)[0]
+            region = region[distance > sqrt(loads.patch_area_m2 / pi)]
+        if loads.n_patches > len(region):
+            raise SpecError(
+                f"`n_patches` must be in [1, {len(region)}], the points of the load region that are away from the supports; got {loads.n_patches}."
+            )
+        return region[spread_out(self.surface.points[region], loads.n_patches)]
+
+    @property
+    def patch_centres(self) -> NDArray[np.float64]:
+        """(n_patches, 3) m."""
+        return self.surface.points[self.patch_nodes]
+
+    @cached_property
+    def loaded_facets(self) -> NDArray[np.int64]:
+        """(n_facets, 4 or 3) the part of the surface on which patches lie."""
+        return self.surface.within(self._loaded_points)
+
+    @cached_property
+    def _patches(self) -> Patches:
+        return cut_patches(self.surface, self.loaded_facets, self.patch_nodes, self.spec.loads.patch_area_m2)
+
+    @cached_property
+    def patch_normals(self) -> NDArray[np.float64]:
+        """(n_patches, 3) outward unit normals, each the mean over its patch."""
+        return self._patches.mean_normals()
 
     def patch_points(self, patches: NDArray[np.int64]) -> tuple[NDArray[np.float64], sp.csr_array]:
         """The traction of some load patches as forces at points of the surface, which is the same on every mesh of the body.
@@ -75,17 +137,24 @@ class Scene:
         shares : (n, n_points) sparse float64
             Share of the patch's force at each point; rows sum to 1.
         """
-        facets = region_facets(self.mesh, self.patch_nodes)
-        areas, points, _ = patch_shares(self.mesh, self.patch_nodes[patches], facets, self.spec.loads.patch_area_m2)
+        areas = self._patches.areas[patches]
         used = np.unique(areas.indices)
-        shares = areas[:, used]
-        return points[used], sp.csr_array(shares.multiply(1.0 / shares.sum(axis=1)[:, None]))
+        return self._patches.points[used], _rows_to_one(areas[:, used])
 
     @cached_property
     def patch_weights(self) -> sp.csr_array:
-        """(n_patches, n_nodes) nodal weights of a force on each patch; rows sum to 1."""
-        facets = region_facets(self.mesh, self.patch_nodes)
-        return patch_weights(self.mesh, self.patch_nodes, facets, self.spec.loads.patch_area_m2)
+        """(n_patches, n_nodes) nodal weights of a force on each patch; rows sum to 1.
+
+        The consistent load of a uniform traction; from an embedded surface it goes to the nodes of the cells around it.
+        """
+        if self.embedded_surface:
+            points, shares = self.patch_points(np.arange(len(self.patch_nodes)))
+            return _rows_to_one(sp.csr_array(shares @ interpolation_matrix(self.mesh, points)))
+        return _rows_to_one(sp.csr_array(self._patches.areas @ self._patches.values))
+
+
+def _rows_to_one(matrix: sp.csr_array) -> sp.csr_array:
+    return sp.csr_array(matrix.multiply(1.0 / matrix.sum(axis=1)[:, None]))
 
 
 def load_scene(source: str | Path | Mapping[str, Any] | DatasetSpec) -> Scene:
@@ -126,7 +195,7 @@ def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
         if any(n.denominator > 1 for n in cut):
             raise UnsupportedSceneError(f"{name}: the corner of an L that is cut away must consist of whole cells.")
         changed["cut_cells"] = tuple(int(n) for n in cut)
-    elif geometry.shape != "box":
+    elif not isinstance(geometry, BoxGeometry):
         raise UnsupportedSceneError(
             f"{scene.name}: only the mesh of a box or an L can be made finer or coarser; got `geometry.shape` {geometry.shape!r}."
         )
@@ -136,20 +205,76 @@ def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
         raise UnsupportedSceneError(f"{name}: {error}") from None
 
 
-def _mesh(spec: DatasetSpec) -> Mesh:
+def refined(scene: Scene) -> Scene:
+    """The same body and supports on a mesh of eight cells in the place of one; its load patches are not looked at.
+
+    Of an embedded surface's voxels the steps stay as they are.
+    """
+    geometry = scene.spec.geometry
+    if isinstance(geometry, BoxGeometry) and scene.mesh.grid_shape is not None:
+        nx, ny, nz = (2 * n for n in geometry.cells)
+        return with_cells(scene, (nx, ny, nz))
+    mesh, parents = subdivide(scene.mesh)
+    fixed = np.isin(parents, scene.fixed_nodes).all(axis=1)
+    return replace(scene, mesh=mesh, fixed_nodes=np.flatnonzero(fixed), point_sets={})
+
+
+@dataclass(frozen=True)
+class _Body:
+    """What a geometry yields."""
+
+    mesh: Mesh
+    surface: Facets | None = None
+    point_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+
+
+def _body(spec: DatasetSpec) -> _Body:
     geometry, tetrahedra = spec.geometry, spec.discretisation.element == "tetrahedron"
     if isinstance(geometry, LShapeGeometry):
-        return l_mesh(geometry.size_m, geometry.cells, geometry.cut_cells, tetrahedra)
-    return box_mesh(geometry.size_m, geometry.cells, tetrahedra)
+        return _Body(l_mesh(geometry.size_m, geometry.cells, geometry.cut_cells, tetrahedra))
+    if isinstance(geometry, BoxGeometry):
+        return _Body(box_mesh(geometry.size_m, geometry.cells, tetrahedra))
+    if isinstance(geometry, VoxelsGeometry):
+        return _voxels(geometry)
+    if isinstance(geometry, TetrahedraGeometry):
+        from mor_bench.scene.liver import liver_tetrahedra
+
+        return _Body(liver_tetrahedra())
+    return _from_file(geometry)
+
+
+def _voxels(geometry: VoxelsGeometry) -> _Body:
+    from mor_bench.scene.liver import liver_surface
+    from mor_bench.scene.surfaces import read_surface
+    from mor_bench.scene.voxels import voxel_mesh
+
+    surface = liver_surface() if geometry.surface == "liver" else read_surface(geometry.surface.checked(), geometry.unit_m)
+    return _Body(voxel_mesh(surface, geometry.cells), Facets(surface.points, surface.triangles))
+
+
+def _from_file(geometry: FileGeometry) -> _Body:
+    from mor_bench.scene.files import read_mesh
+
+    mesh, point_sets = read_mesh(geometry.file.checked(), geometry.unit_m)
+    return _Body(mesh, point_sets=point_sets)
 
 
 def _without_patches(spec: DatasetSpec) -> Scene:
-    mesh = _mesh(spec)
-    material = make_material(spec.material)
-    fixed = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(region_nodes(mesh, support.region) for support in spec.supports)]))
+    body = _body(spec)
+    mesh = body.mesh
+    _check_element(spec, mesh)
+    cloud = Cloud(mesh.points, np.unique(mesh.boundary_facets), body.point_sets)
+    fixed = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(region_points(cloud, support.region) for support in spec.supports)]))
     if len(fixed) == mesh.n_nodes:
         raise SpecError("the supports fix every node of the mesh: nothing can move.")
-    return Scene(spec, mesh, material, fixed)
+    return Scene(spec, mesh, make_material(spec.material), fixed, body.surface, body.point_sets)
+
+
+def _check_element(spec: DatasetSpec, mesh: Mesh) -> None:
+    """The element of a body that is not made here must be that of the file."""
+    found = "tetrahedron" if mesh.cells.shape[1] == 4 else "hexahedron"
+    if found != spec.discretisation.element:
+        raise SpecError(f"`discretisation.element` must be {found!r}, as in the mesh; got {spec.discretisation.element!r}.")
 
 
 def _build(spec: DatasetSpec) -> Scene:

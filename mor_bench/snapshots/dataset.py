@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.snapshots.generate import SHARD_SIZE, Progress, generate, n_samples_of, shard_path
-from mor_bench.snapshots.sampling import PatchLoads
-from mor_bench.snapshots.store import read_shard
+from mor_bench.snapshots.generate import Progress, generate, n_samples_to_generate, read_shards
+from mor_bench.snapshots.sampling import PatchLoads, repeated
+from mor_bench.snapshots.test_sets import SetName, check_regions, spec_of_set
 from mor_bench.specs import DatasetSpec, Split, SplitBy, load_dataset_spec
 
 
@@ -73,8 +73,9 @@ class Snapshots:
 
     @property
     def regions(self) -> NDArray[np.int64]:
-        """(n_samples,) load-region id."""
-        return self.loads.patches
+        """(n_samples,) load-region id; (n_samples, k) with k forces at once."""
+        patches = self.loads.patches
+        return patches[:, 0] if patches.shape[1] == 1 else patches
 
 
 @dataclass(frozen=True)
@@ -84,19 +85,27 @@ class Dataset:
     Attributes
     ----------
     n_refused : int
-        Samples without a valid equilibrium; they are stored with their reason and in neither part.
+        Samples without a valid equilibrium; they are stored with their reason and in no part.
+    n_unused : int
+        Valid samples in neither part: those of several forces of which some belong to one part and some to the other.
+    tests : dict of str to Snapshots
+        The named test sets that were asked for, see `mor_bench.snapshots.test_sets`.
     """
 
     scene: Scene = field(repr=False)
     train: Snapshots
     test: Snapshots
     n_refused: int
+    n_unused: int = 0
+    tests: dict[SetName, Snapshots] = field(default_factory=dict)
 
 
-def split_samples(regions: NDArray[np.int64], n_regions: int, split: Split, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def split_samples(loads: PatchLoads, n_regions: int, split: Split, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Row numbers of the training and of the test samples, each sorted.
 
-    By region, whole load regions go to the test, chosen independently of how many samples there are; by sample, any.
+    By sample, any go to the test. By region, whole load regions do, chosen independently of how many samples there are;
+    by direction, forces in a cone around a random axis. A sample of several forces is for the test if all of them are and
+    for training if none is; the part of the regions, or of the sphere, is such that the test has its fraction of those.
 
     Raises
     ------
@@ -104,16 +113,25 @@ def split_samples(regions: NDArray[np.int64], n_regions: int, split: Split, seed
         If a part would be empty.
     """
     generator = np.random.default_rng([seed, 0x5917])
-    if split.by == "region":
-        n_test = min(max(1, round(split.test_fraction * n_regions)), n_regions - 1)
-        in_test = np.isin(regions, generator.permutation(n_regions)[:n_test])
+    n, k = loads.patches.shape
+    if split.by == "sample":
+        held = np.zeros((n, 1), dtype=bool)
+        held[generator.permutation(n)[: round(split.test_fraction * n)]] = True
     else:
-        n_test = round(split.test_fraction * len(regions))
-        in_test = np.zeros(len(regions), dtype=bool)
-        in_test[generator.permutation(len(regions))[:n_test]] = True
-    if in_test.all() or not in_test.any():
-        raise InvalidInputError(f"{len(regions)} samples cannot be split by {split.by}: the training or the test part would be empty.")
-    return np.flatnonzero(~in_test), np.flatnonzero(in_test)
+        # With p of the regions held out, p^k of the samples have all in them and (1 - p)^k none.
+        odds = (split.test_fraction / (1 - split.test_fraction)) ** (1 / k)
+        part = odds / (1 + odds)
+        if split.by == "region":
+            n_test = min(max(1, round(part * n_regions)), n_regions - 1)
+            held = np.isin(loads.patches, generator.permutation(n_regions)[:n_test])
+        else:
+            axis = generator.normal(size=3)
+            along = loads.vectors @ axis / (np.linalg.norm(axis) * np.maximum(np.linalg.norm(loads.vectors, axis=2), np.finfo(float).tiny))
+            held = along > 1 - 2 * part
+    test, train = held.all(axis=1), ~held.any(axis=1)
+    if not train.any() or not test.any():
+        raise InvalidInputError(f"{n} samples cannot be split by {split.by}: the training or the test part would be empty.")
+    return np.flatnonzero(train), np.flatnonzero(test)
 
 
 def load_dataset(
@@ -121,6 +139,7 @@ def load_dataset(
     limit: int | None = None,
     *,
     split: SplitBy | None = None,
+    tests: Sequence[SetName] = (),
     workers: int | None = None,
     cache: Path | None = None,
     progress: Progress | None = None,
@@ -133,8 +152,10 @@ def load_dataset(
         A name in the suite, the path of a TOML, or a dict with the same keys.
     limit : int, optional
         Only the first samples; they cover the load regions evenly.
-    split : {"region", "sample"}, optional
+    split : {"region", "sample", "direction"}, optional
         Instead of the split in the file.
+    tests : sequence of str
+        Named test sets to read beside the main one, see `mor_bench.snapshots.test_sets`.
     workers : int, optional
         Processes for generation; all cores by default.
     cache : Path, optional
@@ -152,19 +173,50 @@ def load_dataset(
     for name, value in (("limit", limit), ("workers", workers)):
         if value is not None and value < 1:
             raise InvalidInputError(f"`{name}` must be an integer >= 1; got {value}.")
-    if split not in (None, "region", "sample"):
-        raise InvalidInputError(f"`split` must be 'region' or 'sample'; got {split!r}.")
+    if split not in (None, *get_args(SplitBy)):
+        raise InvalidInputError(f"`split` must be one of {', '.join(get_args(SplitBy))}; got {split!r}.")
+    spec = source if isinstance(source, DatasetSpec) else load_dataset_spec(source)
+    others = {name: spec_of_set(spec, name) for name in tests}
+    if "unseen-regions" in others:
+        check_regions(spec)
+    by = Split(test_fraction=spec.split.test_fraction, by=split or spec.split.by)
+    stores = [_Store(item, generate(item, limit, workers or os.cpu_count() or 1, cache, progress), limit) for item in (spec, *others.values())]
+    if n_repeated := repeated([store.loads for store in stores]):
+        raise InvalidInputError(f"{spec.name}: {n_repeated} samples repeat others; are `seed` and `magnitude_n` as they should be?")
+    main = stores[0]
+    valid = np.flatnonzero(main.status == 0)
+    parts = split_samples(main.loads[valid], len(main.scene.patch_nodes), by, spec.loads.seed)
+    train, test = main.snapshots([valid[part] for part in parts])
+    sets = {name: store.snapshots([np.flatnonzero(store.status == 0)])[0] for name, store in zip(others, stores[1:], strict=True)}
+    return Dataset(main.scene, train, test, len(main.status) - len(valid), len(valid) - len(train) - len(test), sets)
+
+
+class _Store:
+    """The shards of a dataset, read one at a time."""
+
+    def __init__(self, spec: DatasetSpec, folder: Path, limit: int | None) -> None:
+        self.scene = load_scene(spec)
+        self._folder, self._total = folder, n_samples_to_generate(spec, limit)
+        shards = [replace(shard, displacements=shard.displacements[:, :0]) for shard in read_shards(folder, self._total)]
+        self.loads = PatchLoads(*(np.concatenate([getattr(shard, name) for shard in shards]) for name in ("patches", "vectors")))
+        self.status, self._min_det_f = (np.concatenate([getattr(shard, name) for shard in shards]) for name in ("status", "min_det_f"))
+
+    def snapshots(self, parts: Sequence[NDArray[np.int64]]) -> list[Snapshots]:
+        """The samples of some parts, each given by rising numbers; beside them no more than one shard is in memory."""
+        out = [np.empty((len(part), len(self.scene.free_dofs))) for part in parts]
+        for shard in read_shards(self._folder, self._total):
+            for part, displacements in zip(parts, out, strict=True):
+                first, last = np.searchsorted(part, [shard.start, shard.start + len(shard.status)])
+                displacements[first:last] = shard.displacements[part[first:last] - shard.start]
+        return [Snapshots(self.scene, self.loads[part], u, self._min_det_f[part])[:] for part, u in zip(parts, out, strict=True)]
+
+
+def stream(
+    source: str | Path | Mapping[str, Any] | DatasetSpec, limit: int | None = None, *, workers: int | None = None, cache: Path | None = None
+) -> Iterator[Snapshots]:  # fmt: skip
+    """The valid samples of a dataset, train and test together, a hundred at a time; parameters as of `load_dataset`."""
     spec = source if isinstance(source, DatasetSpec) else load_dataset_spec(source)
     scene = load_scene(spec)
-    folder = generate(spec, limit, workers or os.cpu_count() or 1, cache, progress)
-    total = n_samples_of(spec, limit)
-    shards = [read_shard(shard_path(folder, number)) for number in range(-(-total // SHARD_SIZE))]
-
-    def joined(name: str) -> Any:
-        return np.concatenate([getattr(shard, name) for shard in shards])[:total]
-
-    chosen = spec.split if split is None else Split(test_fraction=spec.split.test_fraction, by=split)
-    ok = joined("status") == 0
-    snapshots = Snapshots(scene, PatchLoads(joined("patches"), joined("vectors")), joined("displacements"), joined("min_det_f"))[np.flatnonzero(ok)]
-    train, test = split_samples(snapshots.regions, len(scene.patch_nodes), chosen, spec.loads.seed)
-    return Dataset(scene, snapshots[train], snapshots[test], int((~ok).sum()))
+    folder = generate(spec, limit, workers or os.cpu_count() or 1, cache)
+    for shard in read_shards(folder, n_samples_to_generate(spec, limit)):
+        yield Snapshots(scene, PatchLoads(shard.patches, shard.vectors), shard.displacements, shard.min_det_f)[np.flatnonzero(shard.status == 0)]

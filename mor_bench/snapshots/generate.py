@@ -20,7 +20,7 @@ from mor_bench.errors import InvertedElementError, StoreError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import Solution
 from mor_bench.scene.scene import load_scene
-from mor_bench.snapshots.sampling import draw_loads
+from mor_bench.snapshots.sampling import draw_loads, n_samples_of
 from mor_bench.snapshots.store import SCHEMA_VERSION, STATUSES, Shard, read_shard, write_atomically, write_shard
 from mor_bench.specs import DatasetSpec
 
@@ -48,10 +48,16 @@ def shard_path(folder: Path, number: int) -> Path:
     return folder / f"shard-{number:05d}.h5"
 
 
-def n_samples_of(spec: DatasetSpec, limit: int | None = None) -> int:
+def n_samples_to_generate(spec: DatasetSpec, limit: int | None = None) -> int:
     """How many samples a dataset has, or the limit if that is less."""
-    whole = len(load_scene(spec).patch_nodes) * spec.loads.samples_per_patch
+    whole = n_samples_of(load_scene(spec))
     return whole if limit is None else min(limit, whole)
+
+
+def read_shards(folder: Path, n_samples: int) -> Iterator[Shard]:
+    """The first samples of a dataset, a shard at a time; raises `StoreError`."""
+    for start in range(0, n_samples, SHARD_SIZE):
+        yield read_shard(shard_path(folder, start // SHARD_SIZE)).first(n_samples - start)
 
 
 @lru_cache(maxsize=1)
@@ -64,9 +70,8 @@ def solve_shard(spec_json: str, number: int) -> tuple[Shard, float]:
     """Solve the samples of one shard, on one thread; also the seconds that the solves took. Runs in a worker."""
     model = _model(spec_json)
     scene = model.scene
-    total = len(scene.patch_nodes) * scene.spec.loads.samples_per_patch
     start = number * SHARD_SIZE
-    loads = draw_loads(scene.spec.loads, len(scene.patch_nodes), start, min(start + SHARD_SIZE, total))
+    loads = draw_loads(scene, start, min(start + SHARD_SIZE, n_samples_of(scene)))
     forces = loads.nodal_forces(scene.patch_weights).reshape(len(loads), -1)[:, scene.free_dofs]
     displacements = np.full((len(loads), model.n_unknowns), np.nan)
     min_det_f, status = np.full(len(loads), np.nan), np.zeros(len(loads), dtype=np.uint8)
@@ -138,7 +143,7 @@ def generate(
     """
     folder = dataset_folder(spec, cache)
     folder.mkdir(parents=True, exist_ok=True)
-    total = n_samples_of(spec, limit)
+    total = n_samples_to_generate(spec, limit)
     numbers = range(-(-total // SHARD_SIZE))
     manifest = {
         "schema_version": SCHEMA_VERSION,
@@ -182,4 +187,4 @@ def generation_seconds(spec: DatasetSpec, cache: Path | None, n_samples: int) ->
     for path in sorted(dataset_folder(spec, cache).glob("seconds-*.txt")):
         with suppress(ValueError, OSError):  # a timing that was lost costs nothing but itself
             times.append(float(path.read_text()))
-    return sum(times) * n_samples / n_samples_of(spec, len(times) * SHARD_SIZE) if times else None
+    return sum(times) * n_samples / n_samples_to_generate(spec, len(times) * SHARD_SIZE) if times else None

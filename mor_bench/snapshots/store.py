@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import StoreError
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 FORMAT = "mor-bench snapshots"
 HEADER_BYTES = 512
 STATUSES = ("ok", "inverted", "no-equilibrium")
@@ -33,9 +33,9 @@ class Shard:
     ----------
     start : int
         Number of the first sample.
-    patches : (n,) int64
-    vectors : (n, 3) float64
-        Force on the patch, N.
+    patches : (n, k) int64
+    vectors : (n, k, 3) float64
+        Forces on the patches, N.
     displacements : (n, n_free) float64
         At the free dofs, m; NaN where the status is not `ok`.
     min_det_f : (n,) float64
@@ -49,6 +49,10 @@ class Shard:
     displacements: NDArray[np.float64]
     min_det_f: NDArray[np.float64]
     status: NDArray[np.uint8]
+
+    def first(self, n: int) -> Shard:
+        """The first n samples, or all if there are no more."""
+        return Shard(self.start, **{name: getattr(self, name)[:n] for name in _FIELDS})
 
 
 _FIELDS = {"patches": "<i8", "vectors": "<f8", "displacements": "<f8", "min_det_f": "<f8", "status": "|u1"}

@@ -25,8 +25,8 @@ class FullOrder:
         self.pinned = ExitStack()
         self.pinned.enter_context(pinned_threads(1))
         scene = mor_bench.load_scene(dataset)
-        drawn = draw_loads(scene.spec.loads, len(scene.patch_nodes), 0, N_DRAWN)
-        median = int(np.linalg.norm(drawn.vectors, axis=1).argsort()[N_DRAWN // 2])
+        drawn = draw_loads(scene, 0, N_DRAWN)
+        median = int(np.linalg.norm(drawn.vectors, axis=(1, 2)).argsort()[N_DRAWN // 2])
         self.load = drawn.nodal_forces(scene.patch_weights)[median].ravel()[scene.free_dofs]
         self.model = FullOrderModel(scene)
         self.state = self.model.solve(self.load).displacement

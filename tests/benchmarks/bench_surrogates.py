@@ -67,7 +67,7 @@ class _Fitted:
             raise NotImplementedError(f"{method} is not there, or needs an extra that is not installed.")
         self.test = load_limited(dataset).test
         self.surrogate = mor_bench.load_surrogate(path)
-        sizes = np.linalg.norm(self.test.loads.vectors, axis=1)
+        sizes = np.linalg.norm(self.test.loads.vectors, axis=(1, 2))
         self.force = self.test.forces[int(sizes.argsort()[len(sizes) // 2])]
         self.pinned.enter_context(pinned_threads(1))
         self.surrogate.predict(self.force)

@@ -343,9 +343,9 @@ def pick_loads(scene: Scene, n: int) -> tuple[list[int], Array]:
 
     A turn loads each patch once. Patches at supports are left out, where most of the force goes into the support.
     """
-    drawn = draw_loads(scene.spec.loads, len(scene.patch_nodes), 0, len(scene.patch_nodes))
+    drawn = draw_loads(scene, 0, len(scene.patch_nodes))
     usable = np.flatnonzero(~np.isin(scene.patch_nodes, scene.fixed_nodes))
-    by_size = usable[np.linalg.norm(drawn.vectors[usable], axis=1).argsort()]
+    by_size = usable[np.linalg.norm(drawn.vectors[usable], axis=(1, 2)).argsort()]
     chosen = by_size[((np.arange(n) + 0.5) / n * len(by_size)).astype(int)]
     return chosen.tolist(), drawn[chosen].nodal_forces(scene.patch_weights)
 

@@ -40,8 +40,8 @@ def measure(across: int) -> dict[str, Any]:
     n_patches = len(scene.patch_nodes)
     # Away from the support, spread along the beam.
     numbers = np.linspace(0.3, 0.95, N_LOADS) * n_patches
-    loads = [(int(i), draw_loads(scene.spec.loads, n_patches, int(i), int(i) + 1).vectors[0]) for i in numbers]
-    forces = [(scene.patch_weights[[patch]].toarray().T * vector).ravel()[scene.free_dofs] for patch, vector in loads]
+    drawn = draw_loads(scene, 0, n_patches)[numbers.astype(int)]
+    forces = drawn.nodal_forces(scene.patch_weights).reshape(N_LOADS, -1)[:, scene.free_dofs]
     _ = model.accelerator
     set_up = perf_counter() - begun
     model.solve(1e-3 * forces[0])

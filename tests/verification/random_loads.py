@@ -37,11 +37,11 @@ def main(
     threadpool_limits(1)
     scene = mor_bench.load_scene(dataset)
     model, cholesky = FullOrderModel(scene), BandedCholesky(FullOrderModel(scene).assembler.pattern)
-    free, n_patches = scene.free_dofs, len(scene.patch_nodes)
+    free = scene.free_dofs
     outcomes: Counter[str] = Counter()
     least, worst, iterations, cuts = np.inf, 0.0, [], 0
     for start in track(range(0, n_loads, CHUNK), description=dataset):
-        drawn = draw_loads(scene.spec.loads, n_patches, start, min(start + CHUNK, n_loads))
+        drawn = draw_loads(scene, start, min(start + CHUNK, n_loads))
         loads = times * drawn.nodal_forces(scene.patch_weights).reshape(len(drawn), -1)[:, free]
         for load, found in zip(loads, model.solve_many(loads), strict=True):
             if not isinstance(found, Solution):
