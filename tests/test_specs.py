@@ -18,6 +18,9 @@ SHIPPED = {
     "beam-coarse": (135, 256, 64, 6400),
     "beam-fine": (3267, 4032, 336, 33600),
     "beam-tiny": (24, 63, 21, 210),
+    "beam-coarse-3-forces": (135, 256, 64, 12360),
+    "beam-nearly-incompressible": (135, 256, 64, 3200),
+    "block-compression": (216, 343, 49, 1960),
 }
 
 

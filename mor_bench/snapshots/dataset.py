@@ -97,7 +97,7 @@ class Dataset:
     test: Snapshots
     n_refused: int
     n_unused: int = 0
-    tests: dict[SetName, Snapshots] = field(default_factory=dict)
+    tests: dict[str, Snapshots] = field(default_factory=dict)
 
 
 def split_samples(loads: PatchLoads, n_regions: int, split: Split, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -181,13 +181,15 @@ def load_dataset(
         check_regions(spec)
     by = Split(test_fraction=spec.split.test_fraction, by=split or spec.split.by)
     stores = [_Store(item, generate(item, limit, workers or os.cpu_count() or 1, cache, progress), limit) for item in (spec, *others.values())]
-    if n_repeated := repeated([store.loads for store in stores]):
+    if n_repeated := repeated([(store.scene, store.loads) for store in stores]):
         raise InvalidInputError(f"{spec.name}: {n_repeated} samples repeat others; are `seed` and `magnitude_n` as they should be?")
     main = stores[0]
     valid = np.flatnonzero(main.status == 0)
     parts = split_samples(main.loads[valid], len(main.scene.patch_nodes), by, spec.loads.seed)
     train, test = main.snapshots([valid[part] for part in parts])
-    sets = {name: store.snapshots([np.flatnonzero(store.status == 0)])[0] for name, store in zip(others, stores[1:], strict=True)}
+    sets: dict[str, Snapshots] = {
+        name: store.snapshots([np.flatnonzero(store.status == 0)])[0] for name, store in zip(others, stores[1:], strict=True)
+    }
     return Dataset(main.scene, train, test, len(main.status) - len(valid), len(valid) - len(train) - len(test), sets)
 
 
