@@ -59,7 +59,7 @@ class _ToNodes(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, padded: PaddedGrid) -> Tensor:
         ctx.padded = padded
-        flat = values.detach().permute(0, 2, 3, 4, 1).reshape(len(values), -1, 3)
+        flat = values.detach().permute(0, 2, 3, 4, 1).reshape(len(values), padded.grid.weights.shape[1], 3)
         if padded.places is None:
             return torch.from_numpy(padded.grid.displacements_to_nodes(flat.numpy()))
         return flat.index_select(1, padded.places)
