@@ -128,7 +128,7 @@ def test_the_default_grid_of_half_a_bounding_box_counts_the_body_only() -> None:
     assert prod(default_shape(ell)) == pytest.approx(ell.n_nodes * 4 / 3, rel=0.1)
 
 
-@pytest.mark.parametrize("shape", [(1, 4, 4), (4, 0, 4), (4, 4, -3), (1000, 1000, 1000), (2, 2, MAX_POINTS // 4 + 1)])
+@pytest.mark.parametrize("shape", [(1, 4, 4), (4, 0, 4), (4, 4, -3), (101, 100, 100), (2, 2, MAX_POINTS // 4 + 1)])
 def test_shapes_out_of_range_are_refused(shape: tuple[int, int, int]) -> None:
     with pytest.raises(SpecError, match=f"at least 2 points per axis and at most 1,000,000 .* got {' x '.join(map(str, shape))}"):
         grid_map(irregular_box((1.0, 1.0, 1.0), (2, 2, 2), tetrahedra=True), shape)

@@ -112,6 +112,13 @@ def default_shape(mesh: Mesh) -> tuple[int, int, int]:
     ----------
     mesh : Mesh
 
+    Notes
+    -----
+    256 nodes of a beam of irregular T4 (4 × 1 × 1 m) get 16 × 4 × 4 points, on which every displacement can be met. On 0.8 and
+    0.6 times as many per axis the best fit misses 0.3 % and 0.7 % (relative l²), and yet U-Mesh (c = 16, k = 2, 900 iterations,
+    one training each) erred less: 7.9 % and 6.2 % against 8.7 %. 1.3 and 1.6 times as many gave 9.6 % and 12.4 %, at several
+    times the cost. A grid finer than the nodes gains nothing; a coarser one may pay where training is short.
+
     Raises
     ------
     InvalidInputError
