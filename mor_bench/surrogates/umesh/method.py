@@ -139,7 +139,7 @@ class UMesh(Surrogate):
 
     def _padded_grid(self) -> PaddedGrid:
         """The scene's grid, of the shape that its file asks for."""
-        return padded_grid(grid_map(self.scene_.mesh, getattr(self.scene_.spec, "grid_nodes", None)), self.steps)
+        return padded_grid(grid_map(self.scene_.mesh, self.scene_.spec.grid_nodes), self.steps)
 
     def _state(self) -> dict[str, NDArray[Any]]:
         weights = {f"network.{name}": value.numpy() for name, value in self.network_.state_dict().items()}
