@@ -2,8 +2,9 @@
 
 The lattice is body-centred cubic: the corners and centres of cubes, and tetrahedra of two neighbouring centres and an
 edge of the face between. Their long edges join points of one kind, the short ones, √3/2 as long, points of both kinds.
-A lattice point that the surface passes closely moves onto it; what then still crosses the surface is cut. With the
-authors' limits for "closely", and their choice of diagonals, dihedral angles are between 10.7° and 164.8°.
+A lattice point that the surface passes closely moves onto it; what then still crosses the surface is cut. The authors
+prove dihedral angles between 10.7° and 164.8° for their stencils; the diagonals here may differ from theirs in places, and
+65 bodies rougher than any organ had 12.4° to 155.3°.
 """
 
 from __future__ import annotations
