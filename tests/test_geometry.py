@@ -197,7 +197,7 @@ def clipped(polygon: NDArray[np.float64], low: NDArray[np.float64]) -> NDArray[n
 
 def test_a_triangle_meets_the_cells_in_which_clipping_leaves_something_of_it() -> None:
     rng = np.random.default_rng(0)
-    corners = rng.uniform(-0.5, 3.5, size=(60, 1, 3)) + rng.uniform(-1.5, 1.5, size=(60, 3, 3)) * rng.choice([0.1, 1.0], size=(60, 1, 3))
+    corners = rng.uniform(-0.5, 3.5, size=(60, 1, 3)) + rng.uniform(-1.5, 1.5, size=(60, 3, 3)) * rng.choice([0.1, 1.0, 5.0], size=(60, 1, 1))
     for triangle in corners:
         expected = [len(clipped(triangle, np.array(low, dtype=float))) > 0 for low in np.ndindex(3, 3, 3)]
         np.testing.assert_array_equal(met_cells(triangle[None], (3, 3, 3), 0.5).ravel(), expected)
@@ -231,6 +231,13 @@ def test_a_body_thinner_than_a_cell_is_in_the_cells_that_it_passes() -> None:
     mesh = voxel_mesh(needle, (5, 4, 3))
     assert mesh.n_cells < 60
     interpolation_matrix(mesh, on_surface(needle, np.random.default_rng(0)))
+
+
+@pytest.mark.parametrize(("depth", "n_cells"), [(-1e-6, 3), (0.0, 3), (1e-12, 3), (1e-6, 4)])
+def test_a_cell_that_a_body_enters_however_little_is_kept_and_one_that_it_touches_is_not(depth: float, n_cells: int) -> None:
+    surface = boundary(l_mesh((2.0, 1.0, 2.0), (2, 1, 2), (1, 1)))
+    points = surface.points + depth * (surface.points == 1) * [1, 0, 0]
+    assert voxel_mesh(Surface(points, surface.triangles), (2, 1, 2)).n_cells == n_cells
 
 
 def test_cells_that_only_an_edge_joins_are_refused() -> None:
