@@ -238,7 +238,7 @@ def irregular() -> tuple[Snapshots, Snapshots]:
     scene = load_scene({**spec, "discretisation": {"element": "tetrahedron"}})
     mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
     scene = replace(scene, mesh=mesh, fixed_nodes=np.flatnonzero(mesh.points[:, 0] == 0))
-    loads = draw_loads(scene.spec.loads, len(scene.patch_nodes), 0, 140)
+    loads = draw_loads(scene, 0, 140)
     displacements = mor_bench.load_method("fem").fit(scene, None).predict(loads.nodal_forces(scene.patch_weights))
     samples = Snapshots(scene, loads, displacements.reshape(140, -1)[:, scene.free_dofs], np.ones(140))
     return samples[:100], samples[100:]
