@@ -79,6 +79,11 @@ class Scene:
         return self.embedded_surface or Facets(self.mesh.points, self.mesh.boundary_facets)
 
     @cached_property
+    def to_surface(self) -> sp.csr_array:
+        """(n_surface_points, n_nodes) takes nodal displacements to the surface's points; its transpose takes forces back."""
+        return interpolation_matrix(self.mesh, self.surface.points)
+
+    @cached_property
     def _loaded_points(self) -> NDArray[np.int64]:
         """Numbers of the surface's points in the load region."""
         sets = {} if self.embedded_surface else self.point_sets
