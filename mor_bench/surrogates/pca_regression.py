@@ -16,6 +16,7 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
 
+
 def monomial_indices(n_variables: int, degree: int) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """For each degree from 2 on: which monomial of the degree below, times which variable, gives each monomial."""
     levels = []
