@@ -18,7 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-PIECES = 16
+PIECES = 8
 PAUSE_S = 0.002
 
 

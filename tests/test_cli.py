@@ -83,6 +83,15 @@ def test_generate_says_where(tmp_path: Path) -> None:
     assert len(list((tmp_path / done.stdout.strip()).glob("shard-*.h5"))) == 1
 
 
+def test_generate_makes_the_test_sets_if_asked(tmp_path: Path) -> None:
+    done = mor_bench("generate", "beam-tiny", "--tests", "--limit", "5", "--workers", "1", "--cache", "c", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    folders = [Path(line) for line in done.stdout.splitlines()]
+    names = ["beam-tiny", *(f"beam-tiny--{name}" for name in ("in-range", "2x", "4x", "several-forces"))]
+    assert [folder.name.rsplit("-", 2)[0] for folder in folders] == names
+    assert all((tmp_path / folder / "shard-00000.h5").is_file() for folder in folders)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -93,6 +102,8 @@ def test_generate_says_where(tmp_path: Path) -> None:
         (["refine", "beam-tini"], "unknown dataset 'beam-tini'; did you mean 'beam-tiny'?"),
         (["refine", "beam-tiny", "--levels", "0", "--cache", "."], "`levels` must be an integer in [1, 10]; got 0."),
         (["refine", "beam-tiny", "--max-dofs", "900", "--cache", "."], "`max_dofs` must be at least 975"),
+        (["generate", "beam-tiny", "--workers", "2", "--cluster", "tcp://127.0.0.1:1", "--cache", "."], "`workers` and `cluster` exclude each other"),
+        (["generate", "beam-tiny", "--cluster", "host", "--cache", "."], "must be the address of a Dask scheduler, tcp://host:port; got 'host'"),
         (["run", "beam-tiny", "--threads", "100000"], "`threads` must be an integer in [1, "),
     ],
 )

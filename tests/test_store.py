@@ -148,7 +148,7 @@ def test_damaged_files_say_what_they_are_and_are_made_again(tmp_path: Path, cach
     assert (folder / "shard-00000.h5").stat().st_mtime_ns == untouched
 
 
-@pytest.mark.parametrize("other", ["number", "seed", "material", "forces", "fewer", "unknowns", "not solved", "dataset"])
+@pytest.mark.parametrize("other", ["number", "seed", "material", "start", "forces", "fewer", "unknowns", "not solved", "dataset"])
 def test_a_sound_shard_that_does_not_belong_there_is_made_again(tmp_path: Path, other: str) -> None:
     spec = tiny_spec()
     folder = generate(spec, limit=200, workers=1, cache=tmp_path)
@@ -164,6 +164,7 @@ def test_a_sound_shard_that_does_not_belong_there_is_made_again(tmp_path: Path, 
         write_shard(path, shard.first(99))
     else:
         changes: dict[str, dict[str, Any]] = {
+            "start": {"start": 0},
             "forces": {"vectors": shard.vectors * (1 + 1e-6)},
             "unknowns": {"displacements": shard.displacements[:, :-1]},
             "not solved": {"displacements": np.full_like(shard.displacements, np.nan)},
@@ -413,6 +414,7 @@ def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(tmp_p
         f".b.h5.{host}.{living}.00.tmp": True,
         f".c.h5.elsewhere.{dead.pid}.00.tmp": True,
         f".d.h5.{host}.{living}.01.tmp": False,
+        ".of-someone-else.tmp": True,
         "shard-00000.h5": True,
     }
     for name in names:
@@ -449,7 +451,7 @@ def test_killed_fifty_times_and_resumed_is_bit_identical(
         folder = dataset_folder(LONG, cache)
         pool = kills % 10 == 9
         process = generators.start(cache, workers=2 if pool else 1)
-        time.sleep(rng.uniform(1.0, 3.5) if pool else rng.uniform(0.0, 0.7))
+        time.sleep(rng.uniform(1.0, 2.5) if pool else rng.uniform(0.0, 0.7))
         os.kill(process, signal.SIGKILL)
         status = generators.wait(process)
         there = files(folder)

@@ -134,7 +134,8 @@ def generate(
     """Make sure that the shards of a dataset exist; what is there and sound is kept, what is damaged is made again.
 
     Several processes may generate the same dataset into the same folder at once. No more than a few shards per worker are
-    in memory, however many there are.
+    in memory, however many there are. Neither what is stopped nor where it is solved changes a bit; processors of another
+    kind, with other instructions, agree to the solver's tolerance.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ class Task:
     dataset : str
         See `Shard`.
     problem : bytes
-        From `pack`; 0.4 MB for the 12,096 dofs of beam-fine, whose shards are 9 MB.
+        From `pack`; 0.5 MB for the 12,096 dofs of beam-fine, whose shards are 9 MB.
     start : int
         Number of the first sample.
     loads : PatchLoads

@@ -98,11 +98,11 @@ def remove_leftovers(folder: Path) -> None:
 
 def _writer_is_dead(temporary: Path) -> bool:
     """Whether a file was written by a process of this machine that is no more; False if that cannot be known."""
-    *_, host, pid, _, _ = temporary.name.split(".")
-    if host != _host() or not pid.isdigit() or sys.platform == "win32":  # there, a signal 0 is none that does nothing
+    named = re.fullmatch(r"\..*\.(?P<host>[^.]*)\.(?P<pid>\d+)\.[0-9a-f]+\.tmp", temporary.name)
+    if named is None or named["host"] != _host() or sys.platform == "win32":  # there, signal 0 is not one that does nothing
         return False
     try:
-        os.kill(int(pid), 0)
+        os.kill(int(named["pid"]), 0)
     except ProcessLookupError:
         return True
     except OSError:
