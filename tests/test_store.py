@@ -7,6 +7,7 @@ import hashlib
 import io
 import json
 import os
+import pickle
 import shutil
 import signal
 import subprocess
@@ -15,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -230,11 +231,13 @@ def test_no_more_is_in_memory_than_the_window() -> None:
 
 def test_a_task_is_modest_and_repeats_nothing_that_can_be_worked_out() -> None:
     scene = mor_bench.load_scene("beam-fine")
-    fresh = len(pack(scene))
-    assert fresh < 1e6
     assert np.isfinite(scene.patch_normals).all()
-    assert len(scene.mesh.boundary_facets) > 0
-    assert len(pack(scene)) == fresh
+    packed = pack(scene)
+    assert len(packed) < 1e6
+    there, weights = pickle.loads(packed)
+    for item in (there, there.mesh):
+        assert set(vars(item)) == {field.name for field in fields(item)}
+    np.testing.assert_array_equal(weights.toarray(), scene.patch_weights.toarray())
 
 
 @needs_signals
@@ -577,14 +580,21 @@ def test_a_cluster_that_loses_a_worker_half_way(tmp_path: Path, many: dict[str, 
 
 
 @needs_signals
-def test_a_cluster_that_loses_its_scheduler(tmp_path: Path, many: dict[str, bytes]) -> None:
+@pytest.mark.parametrize(
+    ("lost", "message"),
+    [("scheduler", r"connection to the Dask scheduler .* was lost\. Finished shards are kept"), ("only", r"died one after the other.* memory\?")],
+)
+def test_a_cluster_that_loses_what_it_cannot_do_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, many: dict[str, bytes], lost: str, message: str
+) -> None:
+    monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
     with Cluster(tmp_path / "cluster", ("only",)) as cluster:
 
         def kill(done: int, total: int) -> None:
             if done >= total // 2:
-                cluster.processes["scheduler"].kill()
+                cluster.processes[lost].kill()
 
-        with pytest.raises(WorkerError, match=r"connection to the Dask scheduler .* was lost\. Finished shards are kept"):
+        with pytest.raises(WorkerError, match=message):
             generate(tiny_spec(200), cache=tmp_path, progress=kill, cluster=cluster.address)
     folder = dataset_folder(tiny_spec(200), tmp_path)
     assert many.items() >= files(folder).items()

@@ -4,7 +4,7 @@
     python -m tests.benchmarks.generation --samples 100 --samples 1000 --samples 33600
 
 Each size is generated in a process of its own, by so many workers of one thread. Seconds are the whole call's, with the
-scene and the start of the workers; the rate beyond the first shard, which the parent solves alone, is that of a long run.
+scene and the start of the workers; "long run/s" is the rate beyond the first shard, which the parent solves alone.
 Peak memory is the largest resident set of the parent, which also solves the first shard, and of any one worker.
 """
 
@@ -64,7 +64,7 @@ def main(
         print(json.dumps(measure(dataset, (samples or SIZES)[0], workers)))
         return
     pinned = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    table = Table("samples", "seconds", "samples/s", "beyond the first shard", "ms per sample", "disk MB", "parent MB", "worker MB")
+    table = Table("samples", "seconds", "samples/s", "long run/s", "ms/sample", "disk MB", "parent MB", "worker MB")
     for size in samples or SIZES:
         options = ["--one", "--samples", str(size), "--dataset", dataset, "--workers", str(workers)]
         command = [sys.executable, "-m", "tests.benchmarks.generation", *options]
