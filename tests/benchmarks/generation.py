@@ -73,7 +73,7 @@ def main(
             f"{row['samples']:,}", f"{row['seconds']:.1f}", f"{row['rate']:.1f}", _number(row["rate_beyond"], ".1f"),
             f"{1e3 / row['rate']:.1f}", f"{row['disk_mb']:.0f}", f"{row['parent_mb']:.0f}", _number(row["worker_mb"], ".0f"),
         )  # fmt: skip
-    console = Console()
+    console = Console(width=100)
     console.print(f"{dataset}, {workers} workers of one thread", highlight=False)
     console.print(table)
 
