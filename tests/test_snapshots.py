@@ -16,11 +16,12 @@ import mor_bench
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.snapshots.dataset import Dataset, split_samples
+from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.generate import dataset_folder, generate, generation_seconds
 from mor_bench.snapshots.sampling import PatchLoads, draw_loads
+from mor_bench.snapshots.split import split_samples
 from mor_bench.snapshots.store import Shard, read_shard, write_shard
-from mor_bench.specs import DatasetSpec, Split, load_dataset_spec
+from mor_bench.specs import DatasetSpec, Split, load_generated_spec
 
 
 def shards(folder: Path) -> dict[str, bytes]:
@@ -69,7 +70,7 @@ def test_a_sample_depends_on_seed_and_index_only() -> None:
     part = draw_loads(scene, 17, 23)
     np.testing.assert_array_equal(whole.vectors[17:23], part.vectors)
     np.testing.assert_array_equal(whole.patches[17:23], part.patches)
-    loads = scene.spec.loads.model_copy(update={"seed": 1})
+    loads = scene.generated.loads.model_copy(update={"seed": 1})
     other = draw_loads(load_scene(scene.spec.model_copy(update={"loads": loads})), 0, 50)
     assert not np.isclose(other.vectors, whole.vectors).any()
 
@@ -111,7 +112,7 @@ def test_too_few_samples_to_split(cache: Path) -> None:
 
 
 def test_worker_count_changes_no_bit(tmp_path: Path, cache: Path, tiny: Dataset) -> None:
-    spec = load_dataset_spec("beam-tiny")
+    spec = load_generated_spec("beam-tiny")
     parallel = generate(spec, workers=2, cache=tmp_path)
     assert shards(parallel) == shards(dataset_folder(spec, cache))
     assert len(shards(parallel)) == 3
@@ -119,7 +120,7 @@ def test_worker_count_changes_no_bit(tmp_path: Path, cache: Path, tiny: Dataset)
 
 
 def test_a_limit_is_a_prefix(tmp_path: Path, cache: Path, tiny: Dataset) -> None:
-    spec = load_dataset_spec("beam-tiny")
+    spec = load_generated_spec("beam-tiny")
     first = generate(spec, limit=100, cache=tmp_path)
     assert list(shards(first)) == ["shard-00000.h5"]
     again = generate(spec, cache=tmp_path)
@@ -127,7 +128,7 @@ def test_a_limit_is_a_prefix(tmp_path: Path, cache: Path, tiny: Dataset) -> None
 
 
 def test_any_flipped_byte_is_noticed(tmp_path: Path, cache: Path, tiny: Dataset) -> None:
-    source = dataset_folder(load_dataset_spec("beam-tiny"), cache) / "shard-00002.h5"
+    source = dataset_folder(load_generated_spec("beam-tiny"), cache) / "shard-00002.h5"
     content = source.read_bytes()
     rng = np.random.default_rng(0)
     path = tmp_path / source.name
@@ -143,7 +144,7 @@ def test_any_flipped_byte_is_noticed(tmp_path: Path, cache: Path, tiny: Dataset)
     ("name", "message"), [("truncated", "checksum"), ("foreign", "not a shard"), ("empty", "not a shard"), ("newer", "schema version 7")]
 )
 def test_damaged_files_say_what_they_are_and_are_made_again(tmp_path: Path, name: str, message: str) -> None:
-    spec = load_dataset_spec("beam-tiny")
+    spec = load_generated_spec("beam-tiny")
     folder = generate(spec, cache=tmp_path)
     before = shards(folder)
     path = folder / "shard-00001.h5"
@@ -191,7 +192,7 @@ generate(DatasetSpec.model_validate_json(sys.argv[1]), workers=2, cache=Path(sys
 @pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKILL")
 def test_killed_ten_times_and_resumed_is_bit_identical(tmp_path: Path) -> None:
     """The script has no main guard, as a student's would not."""
-    spec = load_dataset_spec("beam-tiny")
+    spec = load_generated_spec("beam-tiny")
     longer = DatasetSpec.model_validate({**spec.model_dump(), "loads": {**spec.loads.model_dump(), "samples_per_patch": 100}})
     undisturbed = shards(generate(longer, workers=2, cache=tmp_path / "undisturbed"))
     rng = np.random.default_rng(int(time.time()))

@@ -92,10 +92,8 @@ def outwards(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[n
 
 def _extreme_volumes(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Least and greatest det J / |J|³ (n_cells,) at the quadrature points of cells with corners (n_cells, 4 or 8, 3)."""
-    if corners.shape[1] == 4:
-        jacobian = (corners[:, 1:] - corners[:, :1])[:, None]
-    else:
-        jacobian = np.einsum("cai,qad->cqdi", corners, _trilinear(_GAUSS)[1])
+    edges = corners[:, None, 1:] - corners[:, None, :1]
+    jacobian = edges if corners.shape[1] == 4 else np.einsum("cai,qad->cqdi", corners, _trilinear(_GAUSS)[1])
     size = np.maximum(np.linalg.norm(jacobian, axis=(2, 3)) ** 3, np.finfo(float).tiny)
     volumes = np.linalg.det(jacobian) / size
     return volumes.min(axis=1), volumes.max(axis=1)

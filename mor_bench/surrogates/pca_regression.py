@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -77,6 +77,9 @@ class PCARegression(Surrogate):
         self.degree = degree
         self.ridge = ridge
 
+    def supports(self, scene: Scene) -> str | None:
+        return unknown_equations(scene) if self.input == "linear-response" else None
+
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         from sklearn.linear_model import Ridge
 
@@ -121,9 +124,8 @@ class PCARegression(Surrogate):
 
     @staticmethod
     def _loaded(scene: Scene) -> NDArray[np.int64]:
-        """Rows, among the free dofs, of those that some load patch acts on."""
-        nodes = np.unique(scene.patch_weights.indices)
-        return np.flatnonzero(np.isin(scene.free_dofs // 3, nodes))
+        """Rows, among the free dofs, of those that loads act on."""
+        return np.flatnonzero(np.isin(scene.free_dofs // 3, scene.loaded_nodes))
 
     def _state(self) -> dict[str, NDArray[Any]]:
         return {"response": self.response_, "to_input": self.to_input_, "axes": self.axes_, "modes": self.modes_, "weights": self.weights_}
