@@ -615,7 +615,7 @@ def _one_line(error: ValidationError, model: type[BaseModel], where: str) -> str
         return f"{where}: key `{key}.{problem['ctx']['discriminator'].strip(chr(39))}` is missing."
     if problem["type"] == "missing":
         return f"{where}: key `{key}` is missing."
-    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input should be ").rstrip(".")
     came = "" if problem["type"] == "value_error" and not key else f"; got {problem['input']!r}"
     return f"{where}: `{key}` must be {message}{came}." if problem["msg"].startswith("Input should") else f"{where}: `{key}`: {message}{came}."
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.mesh import Mesh
-from mor_bench.scene.soundness import check_numbers, outwards
+from mor_bench.scene.soundness import check_numbers, in_grid, outwards
 from mor_bench.specs import SourceFile
 
 STILL = 1e-9
@@ -112,6 +112,24 @@ def _check_names(names: list[str]) -> None:
 
 
 def _checked(arrays: Mapping[str, NDArray[Any]]) -> ImportedArrays:
+    _check_shapes(arrays)
+    points, cells = arrays["points"].astype(np.float64), _integers(arrays["cells"])
+    fixed = np.unique(_integers(arrays.get("fixed_nodes", np.zeros(0))))
+    forces, displacements = (np.ascontiguousarray(arrays[name], dtype=np.float64) for name in ("forces", "displacements"))
+    n, n_nodes = forces.shape[:2]
+    if n == 0:
+        raise SpecError("there must be samples; got none.")
+    regions = _integers(arrays["regions"]).reshape(n, -1) if "regions" in arrays else None
+    check_numbers(points, cells)
+    if (unused := n_nodes - len(np.unique(cells))) > 0:
+        raise SpecError(f"every node must belong to a cell; {unused} of {n_nodes} do not.")
+    cells = outwards(points, cells)
+    _check_samples(forces, displacements, fixed, regions)
+    return ImportedArrays(in_grid(Mesh(points, cells)), forces, displacements, fixed, regions, arrays.get("test"))
+
+
+def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Raise `SpecError` for the first array of a wrong type or shape, or with an entry that is not finite."""
     n, n_nodes = len(np.atleast_1d(arrays["forces"])), len(np.atleast_1d(arrays["points"]))
     shapes: dict[str, tuple[tuple[int | None, ...], ...]] = {
         "points": ((None, 3),), "cells": ((None, 8), (None, 4)), "forces": ((n, n_nodes, 3),), "displacements": ((n, n_nodes, 3),),
@@ -122,22 +140,11 @@ def _checked(arrays: Mapping[str, NDArray[Any]]) -> ImportedArrays:
         if array.dtype.kind not in kinds:
             raise SpecError(f"`{name}` must hold {_WORDS[kinds]}; got dtype {array.dtype}.")
         if not any(_has_shape(array, shape) for shape in shapes[name]):
-            allowed = " or ".join(f"({', '.join('n' if size is None else str(size) for size in shape)})" for shape in shapes[name])
+            allowed = " or ".join(str(shape).replace("None", "any") for shape in shapes[name])
             raise SpecError(f"`{name}` must have shape {allowed}; got {array.shape}.")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             first = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
             raise SpecError(f"`{name}` must be finite; entry {first} is not.")
-    points = arrays["points"].astype(np.float64)
-    cells = _integers(arrays["cells"])
-    fixed = np.unique(_integers(arrays.get("fixed_nodes", np.zeros(0, dtype=np.int64))))
-    forces, displacements = (np.ascontiguousarray(arrays[name], dtype=np.float64) for name in ("forces", "displacements"))
-    regions = _integers(arrays["regions"]).reshape(n, -1) if "regions" in arrays else None
-    check_numbers(points, cells)
-    if (unused := n_nodes - len(np.unique(cells))) > 0:
-        raise SpecError(f"every node must belong to a cell; {unused} of {n_nodes} do not.")
-    cells = outwards(points, cells)
-    _check_samples(forces, displacements, fixed, regions)
-    return ImportedArrays(Mesh(points, cells), forces, displacements, fixed, regions, arrays.get("test"))
 
 
 def _has_shape(array: NDArray[Any], shape: tuple[int | None, ...]) -> bool:
@@ -152,8 +159,6 @@ def _check_samples(
     forces: NDArray[np.float64], displacements: NDArray[np.float64], fixed: NDArray[np.int64], regions: NDArray[np.int64] | None
 ) -> None:  # fmt: skip
     n, n_nodes = forces.shape[:2]
-    if n == 0:
-        raise SpecError("there must be samples; got none.")
     if len(fixed) and (fixed[0] < 0 or fixed[-1] >= n_nodes):
         raise SpecError(f"`fixed_nodes` must be in [0, {n_nodes - 1}]; got {fixed[0]} to {fixed[-1]}.")
     if len(fixed) == n_nodes:

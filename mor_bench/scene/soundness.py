@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
@@ -14,6 +16,9 @@ from mor_bench.scene.mesh import FACES, Mesh
 
 SAME_PLACE = 1e-9
 """Distance, as a fraction of the bounding box's diagonal, within which two nodes lie in one place."""
+
+IN_GRID = 1e-6
+"""Distance, as a fraction of the bounding box's diagonal, within which a node lies at a point of a grid; files are in single precision."""
 
 FLAT = 1e-12
 """det J of a flat cell as a fraction of |J|³: round-off, where an exact result would be zero."""
@@ -57,7 +62,24 @@ def tidied(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[Mesh,
     number = np.empty_like(order)
     number[order] = np.arange(len(order))
     place[used] = number
-    return Mesh(points[order], number[cells]), place
+    return in_grid(Mesh(points[order], number[cells])), place
+
+
+def in_grid(mesh: Mesh) -> Mesh:
+    """The mesh with the regular grid, along the axes, that it lies in; as it is if there is none.
+
+    It lies in one if the nodes are equally spaced points of it and no cell is larger than the spacing.
+    """
+    low, size = mesh.points.min(axis=0), np.ptp(mesh.points, axis=0)
+    near = IN_GRID * float(np.linalg.norm(size))
+    gaps = [np.diff(np.sort(x)) for x in mesh.points.T]
+    steps = np.array([gap[gap > near].mean() for gap in gaps])
+    index = np.rint((mesh.points - low) / steps).astype(np.int64)
+    off = np.abs(mesh.points - low - index * steps).max()
+    if off > near or np.ptp(index[mesh.cells], axis=1).max() > 1:
+        return mesh
+    nx, ny, nz = (int(n) + 1 for n in index.max(axis=0))
+    return replace(mesh, grid_shape=(nx, ny, nz), grid_index=np.ravel_multi_index(tuple(index.T), (nx, ny, nz)))
 
 
 def check_numbers(points: NDArray[np.float64], cells: NDArray[np.int64]) -> None:
@@ -103,7 +125,7 @@ def _check_doubled(points: NDArray[np.float64]) -> None:
     near = SAME_PLACE * float(np.linalg.norm(np.ptp(points, axis=0)))
     pairs = cKDTree(points).query_pairs(near, output_type="ndarray")
     if len(pairs):
-        raise SpecError(f"{len(np.unique(pairs[:, 1]))} nodes lie in the place of others, as at {points[pairs[0, 0]].tolist()} m; merge them.")
+        raise SpecError(f"{len(np.unique(pairs[:, 1]))} nodes lie in the place of others, as at {points[pairs[:, 0].min()].tolist()} m; merge them.")
 
 
 def _check_overlap(cells: NDArray[np.int64]) -> None:
