@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.files import read_mesh, read_triangles
 from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import Scene
+from mor_bench.scene.soundness import in_grid
 from mor_bench.scene.triangle_distance import distances
 
 SIZE, CELLS = (1.2, 0.4, 0.4), (6, 2, 2)
@@ -63,10 +65,11 @@ def masks(raw: meshio.Mesh) -> dict[str, NDArray[np.int64]]:
 
 
 def write_gmsh(raw: meshio.Mesh, path: Path, version: str, binary: bool) -> None:
-    numbers = [np.full(len(block), tag) for block, tag in zip(raw.cells, (7, 1, 2), strict=True)]
-    fields = {"body": np.array([7, 3]), "left": np.array([1, 2]), "top": np.array([2, 2])}
+    # A body and one of its faces may have the same number.
+    numbers = [np.full(len(block), tag) for block, tag in zip(raw.cells, (1, 1, 2), strict=True)]
+    fields = {"body": np.array([1, 3]), "left": np.array([1, 2]), "top": np.array([2, 2])}
     data = {"gmsh:physical": numbers, "gmsh:geometrical": [n.copy() for n in numbers]}
-    tags = np.tile([3, 7], (len(raw.points), 1))
+    tags = np.tile([3, 1], (len(raw.points), 1))
     for entity, block in zip((1, 2), raw.cells[1:], strict=True):
         tags[block.data] = 2, entity
     point_data = {"gmsh:dim_tags": tags} if version == "4.1" else {}
@@ -150,9 +153,18 @@ def test_nodes_are_numbered_for_a_small_band_and_the_grid_is_seen(beam: tuple[st
     assert np.ptp(read.cells, axis=1).max() == np.ptp(mesh.cells, axis=1).max() < np.ptp(raw.cells[0].data, axis=1).max()
     assert read.grid_shape == mesh.grid_shape
     np.testing.assert_array_equal(read.grid_index, mesh.grid_index)
-    bent = meshio.Mesh(raw.points + 0.05 * np.sin(raw.points[:, [1, 2, 0]]), raw.cells)
-    bent.write(tmp_path / "bent.vtu")
-    assert read_mesh(tmp_path / "bent.vtu", 1.0)[0].grid_shape is None
+
+
+def test_what_is_no_regular_grid_is_not_taken_for_one() -> None:
+    mesh = replace(box_mesh(SIZE, CELLS), grid_shape=None, grid_index=None)
+    assert in_grid(mesh).grid_shape == (7, 3, 3)
+    uneven = mesh.points + 0.02 * np.sin(2 * np.pi / 1.2 * mesh.points * [1, 0, 0])
+    assert in_grid(replace(mesh, points=uneven)).grid_shape is None
+    coarse = box_mesh(SIZE, (6, 1, 1))
+    both = Mesh(np.vstack([mesh.points, coarse.points + np.array([1.4, 0.0, 0.0])]), np.vstack([mesh.cells, coarse.cells + mesh.n_nodes]))
+    assert in_grid(both).grid_shape is None
+    doubled = Mesh(np.vstack([mesh.points, mesh.points]), np.vstack([mesh.cells, mesh.cells + mesh.n_nodes]))
+    assert in_grid(doubled).grid_shape is None
 
 
 def test_inverted_cells_are_turned_over(beam: tuple[str, Mesh, meshio.Mesh], tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def tidied(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[Mesh,
 def in_grid(mesh: Mesh) -> Mesh:
     """The mesh with the regular grid, along the axes, that it lies in; as it is if there is none.
 
-    It lies in one if the nodes are equally spaced points of it and no cell is larger than the spacing.
+    It lies in one if each node is at a point of it, all are at different ones, and no cell is larger than the spacing.
     """
     low, size = mesh.points.min(axis=0), np.ptp(mesh.points, axis=0)
     near = IN_GRID * float(np.linalg.norm(size))
@@ -76,7 +76,7 @@ def in_grid(mesh: Mesh) -> Mesh:
     steps = np.array([gap[gap > near].mean() for gap in gaps])
     index = np.rint((mesh.points - low) / steps).astype(np.int64)
     off = np.abs(mesh.points - low - index * steps).max()
-    if off > near or np.ptp(index[mesh.cells], axis=1).max() > 1:
+    if off > near or np.ptp(index[mesh.cells], axis=1).max() > 1 or len(np.unique(index, axis=0)) < mesh.n_nodes:
         return mesh
     nx, ny, nz = (int(n) + 1 for n in index.max(axis=0))
     return replace(mesh, grid_shape=(nx, ny, nz), grid_index=np.ravel_multi_index(tuple(index.T), (nx, ny, nz)))
