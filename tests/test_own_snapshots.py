@@ -83,12 +83,15 @@ def test_splits(arrays: Arrays, tmp_path: Path) -> None:
     axis = test.mean(axis=0)
     assert (test @ axis).min() > (train @ axis).max() - 0.2 * np.linalg.norm(axis)
     assert len(mor_bench.load_dataset(path, 50).train) < 50
+    test = mor_bench.load_dataset(path).test.forces
+    far = written(tmp_path, {**arrays, "regions": 10**15 * arrays["regions"]})
+    np.testing.assert_array_equal(mor_bench.load_dataset(far).test.forces, test)
     without = {name: array for name, array in arrays.items() if name != "regions"}
     assert len(mor_bench.load_dataset(written(tmp_path, without), split="sample").test) == round(0.2 * n)
     with pytest.raises(InvalidInputError, match=r"a split by region needs the array `regions` in .*mine.npz; or split by sample"):
         mor_bench.load_dataset(path)
     held = np.arange(n) % 3 == 0
-    by_file = written(tmp_path, {**arrays, "test": held}, TOML + '[split]\nby = "file"\n')
+    by_file = written(tmp_path, {**arrays, "test": held}, TOML.replace(".npz", ".h5") + '[split]\nby = "file"\n')
     np.testing.assert_array_equal(mor_bench.load_dataset(by_file).test.forces, arrays["forces"][held])
     with pytest.raises(InvalidInputError, match="`test` must be true for some samples and false for others"):
         mor_bench.load_dataset(written(tmp_path, {**arrays, "test": held | True}, TOML + '[split]\nby = "file"\n'))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,5 +72,7 @@ def split_imported(spec: ImportedDatasetSpec, arrays: ImportedArrays, by: SplitB
             raise InvalidInputError(f"{spec.name}: `test` must be true for some samples and false for others.")
         return np.flatnonzero(~arrays.test), np.flatnonzero(arrays.test)
     loads = nodal_loads(arrays)
+    # Ids may have gaps of any size: what is drawn is their rank.
+    ids, ranks = np.unique(loads.patches, return_inverse=True)
     split = Split(test_fraction=spec.split.test_fraction, by=by_or_file)
-    return split_samples(loads, int(loads.patches.max()) + 1, split, IMPORTED_SEED)
+    return split_samples(replace(loads, patches=ranks.reshape(loads.patches.shape)), len(ids), split, IMPORTED_SEED)
