@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from mor_bench.harness.run import Listener
+    from mor_bench.snapshots.dataset import Dataset
+    from mor_bench.snapshots.test_sets import SetName
 
 app = typer.Typer(
     help="Compare model-order-reduction methods for hyperelastic solids: error at equal time, time at equal error.",
@@ -210,9 +212,9 @@ def generate(
     with _clear_errors():
         from mor_bench.snapshots.generate import generate as generate_shards
         from mor_bench.snapshots.test_sets import with_test_sets
-        from mor_bench.specs import load_dataset_spec
+        from mor_bench.specs import load_generated_spec
 
-        spec = load_dataset_spec(dataset, suite)
+        spec = load_generated_spec(dataset, suite)
         items = with_test_sets(spec) if tests else [spec]
         with _progress(_console(stderr=True)) as listener:
             folders = [generate_shards(item, limit, workers, cache, partial(listener.generating, item.name), cluster) for item in items]
@@ -234,9 +236,9 @@ def refine(
         from threadpoolctl import threadpool_limits
 
         from mor_bench.harness.discretisation import refine as refine_dataset
-        from mor_bench.specs import load_dataset_spec
+        from mor_bench.specs import load_generated_spec
 
-        spec = load_dataset_spec(dataset, suite)
+        spec = load_generated_spec(dataset, suite)
         with _progress(_console(stderr=True)) as listener, threadpool_limits(1):
             record = refine_dataset(
                 spec, loads, levels, max_dofs=max_dofs, cache=cache, suite=suite,
@@ -261,6 +263,62 @@ def report(out: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> Non
         print_tables(comparison, _console())
         for path in render(comparison):
             print(path)
+
+
+export_app = typer.Typer(help="Write samples for other programs.", no_args_is_help=True)
+app.add_typer(export_app, name="export")
+
+
+@export_app.command(name="vtu")
+def export_vtu(
+    dataset: Annotated[str, typer.Argument(help="Name or TOML file.")],
+    sample: Annotated[int, typer.Option(min=0, help="Number of the sample in its part.")],
+    out: Annotated[Path, typer.Option(help="Folder to write to.")],
+    part: Annotated[str, typer.Option(help="train, test, or the name of a test set.")] = "test",
+    model: Annotated[list[Path] | None, typer.Option("--model", help="File of a fitted model; repeat for more.")] = None,
+    limit: Limit = None,
+    cache: Cache = None,
+    suite: Suite = None,
+) -> None:
+    """Write a sample, and what fitted models predict for it, as VTU for ParaView."""
+    with _clear_errors():
+        from mor_bench.errors import InvalidInputError
+        from mor_bench.harness.export import PARTS
+        from mor_bench.harness.export import export_vtu as write
+        from mor_bench.snapshots.test_sets import SET_NAMES
+
+        known = {name: name for name in PARTS}
+        if part not in known:
+            raise InvalidInputError(f"`--part` must be {', '.join(known)}; got {part!r}.")
+        data = _dataset(dataset, limit, cache, suite, [name for name in SET_NAMES if name == part])
+        for path in write(data, sample, out, part=known[part], models=model or []):
+            print(path)
+
+
+@export_app.command(name="numpy")
+def export_numpy(
+    dataset: Annotated[str, typer.Argument(help="Name or TOML file.")],
+    out: Annotated[Path, typer.Option(help="The .npz file to write; a TOML that reads it in again goes beside it.")],
+    limit: Limit = None,
+    cache: Cache = None,
+    suite: Suite = None,
+) -> None:
+    """Write a dataset's training and test samples as NumPy arrays."""
+    with _clear_errors():
+        from mor_bench.harness.export import export_numpy as write
+
+        for path in write(_dataset(dataset, limit, cache, suite), out):
+            print(path)
+
+
+def _dataset(dataset: str, limit: int | None, cache: Path | None, suite: Path | None, tests: Sequence[SetName] = ()) -> Dataset:
+    """A dataset, with a bar for what must be generated first."""
+    from mor_bench.snapshots.dataset import load_dataset
+    from mor_bench.specs import load_dataset_spec
+
+    spec = load_dataset_spec(dataset, suite)
+    with _progress(_console(stderr=True)) as listener:
+        return load_dataset(spec, limit, tests=tests, cache=cache, progress=lambda done, total: listener.generating(spec.name, done, total))
 
 
 @app.callback(invoke_without_command=True)

@@ -28,7 +28,7 @@ from pydantic import (
     model_validator,
 )
 
-from mor_bench.errors import MissingDependencyError, SpecError
+from mor_bench.errors import MissingDependencyError, SpecError, UnsupportedSceneError
 
 _M = TypeVar("_M", bound=BaseModel)
 
@@ -408,8 +408,8 @@ def _without_paths(value: Any) -> Any:
     return [_without_paths(item) for item in value] if isinstance(value, list) else value
 
 
-class DatasetSpec(_Model):
-    """A dataset file.
+class _AnyDataset(_Model):
+    """What every dataset file has.
 
     `grid_nodes` are the nodes per axis of the regular grid for methods that need one, where the mesh lies in none.
     """
@@ -417,6 +417,21 @@ class DatasetSpec(_Model):
     name: str
     title: str
     source: str
+    needs: Needs
+    grid_nodes: Annotated[tuple[Side, Side, Side], Field(strict=False)] | None = None
+
+    def physics(self) -> dict[str, Any]:
+        """All that decides the samples: two datasets with equal physics have equal snapshots."""
+        raise NotImplementedError
+
+    def digest(self) -> str:
+        """Twelve hexadecimal digits of SHA-256 over `physics`."""
+        return hashlib.sha256(json.dumps(self.physics(), sort_keys=True).encode()).hexdigest()[:12]
+
+
+class DatasetSpec(_AnyDataset):
+    """A dataset file whose samples the full-order model generates."""
+
     geometry: Geometry
     discretisation: Discretisation = Discretisation()
     solver: SolverName = "auto"
@@ -425,19 +440,54 @@ class DatasetSpec(_Model):
     loads: Loads
     split: Split = Split()
     tests: ExtraTests = ExtraTests()
-    needs: Needs
-    grid_nodes: Annotated[tuple[Side, Side, Side], Field(strict=False)] | None = None
 
     def physics(self) -> dict[str, Any]:
-        """All that decides the samples: two datasets with equal physics have equal snapshots."""
         dumped = self.model_dump(mode="json", include={"geometry", "discretisation", "material", "supports", "loads"}, exclude_none=True)
         physics: dict[str, Any] = _without_paths(dumped)
         # Solvers agree to the tolerance only; the default one leaves no trace.
         return physics if self.solver == "auto" else {**physics, "solver": self.solver}
 
-    def digest(self) -> str:
-        """Twelve hexadecimal digits of SHA-256 over `physics`."""
-        return hashlib.sha256(json.dumps(self.physics(), sort_keys=True).encode()).hexdigest()[:12]
+
+class SnapshotsFile(_Model):
+    """Arrays of snapshots from another program, see `mor_bench.scene.imported`."""
+
+    file: File
+
+
+class ImportedSplit(_Model):
+    """Which imported samples are kept for the test: as `Split`, or by the file's own array `test`."""
+
+    test_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    by: SplitBy | Literal["file"] = "region"
+
+
+class ImportedDatasetSpec(_AnyDataset):
+    """A dataset file whose samples come from another program."""
+
+    snapshots: SnapshotsFile
+    split: ImportedSplit = ImportedSplit()
+
+    def physics(self) -> dict[str, Any]:
+        physics: dict[str, Any] = _without_paths(self.model_dump(mode="json", include={"snapshots"}))
+        return physics
+
+
+AnyDatasetSpec = DatasetSpec | ImportedDatasetSpec
+
+NO_EQUATIONS = "its snapshots were imported, so its equations are not known"
+
+
+def generated(spec: AnyDatasetSpec) -> DatasetSpec:
+    """The spec itself, if its samples are generated here.
+
+    Raises
+    ------
+    UnsupportedSceneError
+        If they were imported.
+    """
+    if isinstance(spec, ImportedDatasetSpec):
+        raise UnsupportedSceneError(f"{spec.name}: {NO_EQUATIONS}.")
+    return spec
 
 
 class Profile(_Model):
@@ -565,7 +615,7 @@ def _one_line(error: ValidationError, model: type[BaseModel], where: str) -> str
         return f"{where}: key `{key}.{problem['ctx']['discriminator'].strip(chr(39))}` is missing."
     if problem["type"] == "missing":
         return f"{where}: key `{key}` is missing."
-    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input should be ").rstrip(".")
     came = "" if problem["type"] == "value_error" and not key else f"; got {problem['input']!r}"
     return f"{where}: `{key}` must be {message}{came}." if problem["msg"].startswith("Input should") else f"{where}: `{key}`: {message}{came}."
 
@@ -620,15 +670,37 @@ def _resolve(kind: Literal["datasets", "methods"], source: str | Path, suite: Pa
     return known[source]
 
 
-def load_dataset_spec(source: str | Path | Mapping[str, Any], suite: Path | None = None) -> DatasetSpec:
-    """Read and validate a dataset: a name in the suite, the path of a TOML, or a dict with the same keys."""
+def load_dataset_spec(source: str | Path | Mapping[str, Any], suite: Path | None = None) -> AnyDatasetSpec:
+    """Read and validate a dataset: a name in the suite, the path of a TOML, or a dict with the same keys.
+
+    One with a table `snapshots` is an imported one.
+    """
     if not isinstance(source, str | Path | Mapping):
         raise SpecError(f"a dataset must be a name, the path of a TOML or a dict; got {type(source).__name__}.")
     if isinstance(source, Mapping):
         content = {"name": "scene", **source}
-        return _validated(DatasetSpec, {"title": content["name"], "source": "", **content}, "scene")
+        return _validated_dataset({"title": content["name"], "source": "", **content}, "scene")
     path = _resolve("datasets", source, suite)
-    return _validated(DatasetSpec, {**_read_toml(path), "name": path.stem}, str(path), path.parent)
+    return _validated_dataset({**_read_toml(path), "name": path.stem}, str(path), path.parent)
+
+
+def _validated_dataset(content: Mapping[str, Any], where: str, folder: Path | None = None) -> AnyDatasetSpec:
+    if "snapshots" in content:
+        return _validated(ImportedDatasetSpec, content, where, folder)
+    return _validated(DatasetSpec, content, where, folder)
+
+
+def load_generated_spec(source: str | Path | Mapping[str, Any], suite: Path | None = None) -> DatasetSpec:
+    """As `load_dataset_spec`, of a dataset whose samples are generated here.
+
+    Raises
+    ------
+    SpecError
+        If the dataset is not valid.
+    UnsupportedSceneError
+        If its samples were imported.
+    """
+    return generated(load_dataset_spec(source, suite))
 
 
 def is_method_file(path: Path) -> bool:

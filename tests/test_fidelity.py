@@ -19,7 +19,7 @@ from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import Scene, load_scene, with_cells
 from mor_bench.snapshots.dataset import Dataset
-from mor_bench.specs import DatasetSpec, TetrahedraGeometry, load_dataset_spec
+from mor_bench.specs import DatasetSpec, TetrahedraGeometry, load_generated_spec
 
 SHIPPED = ("beam-coarse", "beam-tiny")
 
@@ -60,7 +60,7 @@ def test_points_outside_are_refused_and_those_outside_by_round_off_are_not(tetra
 
 
 def with_element(name: str, element: str) -> Scene:
-    spec = load_dataset_spec(name)
+    spec = load_generated_spec(name)
     return load_scene(spec.model_copy(update={"discretisation": spec.discretisation.model_copy(update={"element": element})}))
 
 
@@ -91,7 +91,7 @@ def test_coarse_fem_is_the_coarse_model_where_the_meshes_share_nodes(tiny: Datas
 
 
 def box(**changes: Any) -> Scene:
-    content = {**load_dataset_spec("beam-tiny").model_dump(mode="json"), **changes}
+    content = {**load_generated_spec("beam-tiny").model_dump(mode="json"), **changes}
     return load_scene(content)
 
 
@@ -204,13 +204,13 @@ def test_samples_are_those_of_the_dataset_and_spread_over_its_patches(tiny: Data
 @pytest.fixture(scope="module")
 def changed() -> DatasetSpec:
     """beam-tiny with another stiffness: its physics has no shipped record."""
-    spec = load_dataset_spec("beam-tiny")
+    spec = load_generated_spec("beam-tiny")
     return spec.model_copy(update={"material": spec.material.model_copy(update={"young_pa": 600.0})})
 
 
 @pytest.mark.parametrize("discretisation", [{}, {"element": "tetrahedron"}, {"integration": "selective"}])
 def test_refinement_of_every_element(discretisation: dict[str, str], tmp_path: Path) -> None:
-    record = refine(box(discretisation=discretisation).spec, 2, 1, cache=tmp_path)
+    record = refine(box(discretisation=discretisation).generated, 2, 1, cache=tmp_path)
     n = 144 if "element" in discretisation else 24
     assert [mesh["n_cells"] for mesh in record["meshes"]] == [n, 8 * n]
     assert {load["limit"] for load in record["loads"]} == {"finest"}
@@ -232,7 +232,7 @@ def test_a_record_holds_what_it_is_made_of_and_serves_only_its_physics(changed: 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_records_belong_to_the_shipped_datasets(name: str, tmp_path: Path) -> None:
-    spec = load_dataset_spec(name)
+    spec = load_generated_spec(name)
     record = measured(spec, tmp_path)
     assert record is not None
     assert record["digest"] == spec.digest()
@@ -240,7 +240,7 @@ def test_shipped_records_belong_to_the_shipped_datasets(name: str, tmp_path: Pat
 
 
 def test_the_measured_error_arrives_in_every_row_and_page(cache: Path, tmp_path: Path) -> None:
-    spec = load_dataset_spec("beam-tiny")
+    spec = load_generated_spec("beam-tiny")
     record = measured(spec, tmp_path)
     assert record is not None
     run = mor_bench.run(["beam-tiny"], ["linear-fem", "fem-coarse"], out=tmp_path / "out", cache=cache)

@@ -20,7 +20,7 @@ from mor_bench.harness.results import Comparison
 from mor_bench.harness.run import Listener
 from mor_bench.harness.timing import N_QUERIES, N_WARM_UP, latency_summary, measure_latency, pinned_threads
 from mor_bench.snapshots.generate import generation_seconds
-from mor_bench.specs import load_dataset_spec
+from mor_bench.specs import load_generated_spec
 
 
 def test_metrics_by_hand() -> None:
@@ -152,7 +152,7 @@ def test_a_method_trains_on_the_training_set_and_spoils_only_its_own_row(spoil: 
 
 def test_data_costs_what_its_generation_took_and_only_those_who_learn_from_it(cache: Path, tmp_path: Path) -> None:
     comparison = mor_bench.run(["beam-tiny"], ["linear-fem", "pca-regression"], out=tmp_path / "out", cache=cache)
-    seconds = generation_seconds(load_dataset_spec("beam-tiny"), cache, 170)
+    seconds = generation_seconds(load_generated_spec("beam-tiny"), cache, 170)
     assert seconds is not None
     assert [row["offline_s"]["data"] for row in comparison.rows] == [0.0, seconds, seconds, seconds]
 

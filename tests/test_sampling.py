@@ -13,16 +13,17 @@ from scipy.stats import kstest
 import mor_bench
 from mor_bench.errors import InvalidInputError, SpecError
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.snapshots.dataset import Dataset, load_dataset, split_samples
+from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of, repeated
+from mor_bench.snapshots.split import split_samples
 from mor_bench.snapshots.test_sets import available_sets, check_regions, spec_of_set, why_not
-from mor_bench.specs import Split, list_suite, load_dataset_spec
+from mor_bench.specs import Split, list_suite, load_generated_spec
 
 PLANS = ("random", "latin-hypercube", "sobol")
 
 
 def tiny(**loads: Any) -> Scene:
-    spec = load_dataset_spec("beam-tiny").model_dump(mode="json")
+    spec = load_generated_spec("beam-tiny").model_dump(mode="json")
     return load_scene({**spec, "loads": {**spec["loads"], **loads}})
 
 
@@ -206,7 +207,7 @@ def test_the_sample_split_of_the_paper_has_its_counts() -> None:
 
 @pytest.fixture(scope="module")
 def with_sets(cache: Path) -> Dataset:
-    return load_dataset("beam-tiny", tests=available_sets(load_dataset_spec("beam-tiny")), cache=cache, workers=1)
+    return load_dataset("beam-tiny", tests=available_sets(load_generated_spec("beam-tiny")), cache=cache, workers=1)
 
 
 def test_named_sets_of_the_tiny_beam(with_sets: Dataset) -> None:
@@ -227,26 +228,29 @@ def test_named_sets_of_the_tiny_beam(with_sets: Dataset) -> None:
 
 def test_unseen_regions_share_no_facet_with_the_main_set(with_sets: Dataset) -> None:
     main, other = with_sets.scene, with_sets.tests["unseen-regions"].scene
-    check_regions(main.spec)
+    check_regions(main.generated)
     assert not set(main.patch_nodes) & set(other.patch_nodes)
     loaded = np.abs(with_sets.train.forces).sum(axis=(0, 2)) > 0
     unseen = np.abs(with_sets.tests["unseen-regions"].forces).sum(axis=(0, 2)) > 0
     assert not (loaded & unseen).any()
-    spec = main.spec.model_copy(update={"tests": main.spec.tests.model_copy(update={"unseen_region": "y-min"})})
+    spec = main.generated.model_copy(update={"tests": main.generated.tests.model_copy(update={"unseen_region": "y-min"})})
     with pytest.raises(InvalidInputError, match=r"must lie apart from `loads.region`; they share 0 facets of the surface and 7 centres"):
         check_regions(spec)
 
 
 def test_no_named_set_repeats_a_sample(with_sets: Dataset) -> None:
-    parts = [(part.scene, part.loads) for part in (with_sets.train, with_sets.test, *with_sets.tests.values())]
+    parts = []
+    for part in (with_sets.train, with_sets.test, *with_sets.tests.values()):
+        assert isinstance(part.loads, PatchLoads)
+        parts.append((part.scene, part.loads))
     assert repeated(parts) == 0
 
 
 def test_sets_that_a_dataset_has_not_say_why() -> None:
-    spec = load_dataset_spec("beam-tiny")
+    spec = load_generated_spec("beam-tiny")
     with pytest.raises(InvalidInputError, match=r"beam-tiny has no test set 'unseen-directions': its directions are all over the sphere"):
         spec_of_set(spec, "unseen-directions")
-    assert "several forces" in str(why_not(load_dataset_spec("beam-coarse-3-forces"), "several-forces"))
+    assert "several forces" in str(why_not(load_generated_spec("beam-coarse-3-forces"), "several-forces"))
     assert "known: in-range, 2x" in str(why_not(spec, "5x"))  # type: ignore[arg-type]
     with pytest.raises(InvalidInputError, match="has no test set '5x'"):
         load_dataset("beam-tiny", tests=["5x"])  # type: ignore[list-item]
@@ -254,7 +258,7 @@ def test_sets_that_a_dataset_has_not_say_why() -> None:
 
 @pytest.mark.parametrize("name", sorted(list_suite("datasets")))
 def test_every_shipped_dataset_has_sound_test_sets(name: str) -> None:
-    spec = load_dataset_spec(name)
+    spec = load_generated_spec(name)
     sets = available_sets(spec)
     assert {"in-range", "2x", "4x", "unseen-regions"} <= set(sets)
     check_regions(spec)

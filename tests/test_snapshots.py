@@ -11,8 +11,9 @@ import mor_bench
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.snapshots.dataset import Dataset, split_samples
+from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.sampling import PatchLoads, draw_loads
+from mor_bench.snapshots.split import split_samples
 from mor_bench.specs import Split
 
 
@@ -58,8 +59,8 @@ def test_a_sample_depends_on_seed_and_index_only() -> None:
     part = draw_loads(scene, 17, 23)
     np.testing.assert_array_equal(whole.vectors[17:23], part.vectors)
     np.testing.assert_array_equal(whole.patches[17:23], part.patches)
-    loads = scene.spec.loads.model_copy(update={"seed": 1})
-    other = draw_loads(load_scene(scene.spec.model_copy(update={"loads": loads})), 0, 50)
+    loads = scene.generated.loads.model_copy(update={"seed": 1})
+    other = draw_loads(load_scene(scene.generated.model_copy(update={"loads": loads})), 0, 50)
     assert not np.isclose(other.vectors, whole.vectors).any()
 
 

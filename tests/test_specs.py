@@ -11,7 +11,7 @@ import pytest
 import mor_bench
 from mor_bench.errors import MissingDependencyError, MorBenchError, SpecError
 from mor_bench.harness.check import check_file
-from mor_bench.specs import list_suite, load_dataset_spec, load_method_spec
+from mor_bench.specs import list_suite, load_generated_spec, load_method_spec
 
 SHIPPED = {
     "l-shape": (335, 540, 60, 6000),
@@ -51,7 +51,7 @@ def test_every_shipped_method_is_valid(name: str) -> None:
 
 def content() -> dict[str, Any]:
     """beam-tiny as a dict, to be spoilt."""
-    return {key: value for key, value in load_dataset_spec("beam-tiny").model_dump(mode="json").items() if key != "name"}
+    return {key: value for key, value in load_generated_spec("beam-tiny").model_dump(mode="json").items() if key != "name"}
 
 
 def set_(*path: str | int, value: Any) -> Callable[[dict[str, Any]], None]:
@@ -194,6 +194,6 @@ def test_profile_replaces_parameters_and_sweep(tmp_path: Path) -> None:
 
 
 def test_only_physics_decides_the_digest() -> None:
-    spec = load_dataset_spec("beam-tiny")
+    spec = load_generated_spec("beam-tiny")
     assert spec.digest() == spec.model_copy(update={"title": "other", "split": spec.split.model_copy(update={"by": "sample"})}).digest()
     assert spec.digest() != spec.model_copy(update={"material": spec.material.model_copy(update={"young_pa": 501.0})}).digest()

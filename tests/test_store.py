@@ -35,7 +35,7 @@ from mor_bench.snapshots.generate import dataset_folder, generate, generation_se
 from mor_bench.snapshots.manifest import read_manifest
 from mor_bench.snapshots.solve import pack
 from mor_bench.snapshots.store import HEADER_BYTES, parse_shard, read_shard, remove_leftovers, shard_bytes, write_shard
-from mor_bench.specs import DatasetSpec, load_dataset_spec
+from mor_bench.specs import DatasetSpec, load_generated_spec
 from tests.generator_process import Generators
 
 ROOT = Path(__file__).parents[1]
@@ -48,7 +48,7 @@ needs_signals = pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKIL
 
 def tiny_spec(samples_per_patch: int = 10, young_pa: float = 500.0, seed: int = 0) -> DatasetSpec:
     """beam-tiny with 21 times as many samples."""
-    spec = load_dataset_spec("beam-tiny").model_dump()
+    spec = load_generated_spec("beam-tiny").model_dump()
     changed = {"samples_per_patch": samples_per_patch, "seed": seed}
     return DatasetSpec.model_validate({**spec, "material": {**spec["material"], "young_pa": young_pa}, "loads": {**spec["loads"], **changed}})
 
@@ -72,7 +72,7 @@ def leftovers(folder: Path) -> list[Path]:
 @pytest.fixture(scope="module")
 def content(cache: Path, tiny: Dataset) -> bytes:
     """A shard of ten samples."""
-    return (dataset_folder(load_dataset_spec("beam-tiny"), cache) / "shard-00002.h5").read_bytes()
+    return (dataset_folder(load_generated_spec("beam-tiny"), cache) / "shard-00002.h5").read_bytes()
 
 
 # One shard
@@ -134,7 +134,7 @@ DAMAGE: dict[str, tuple[Callable[[bytes], bytes], str]] = {
 
 @pytest.mark.parametrize("name", DAMAGE)
 def test_damaged_files_say_what_they_are_and_are_made_again(tmp_path: Path, cache: Path, tiny: Dataset, name: str) -> None:
-    spec = load_dataset_spec("beam-tiny")
+    spec = load_generated_spec("beam-tiny")
     folder = dataset_folder(spec, tmp_path)
     shutil.copytree(dataset_folder(spec, cache), folder)
     before = files(folder)
@@ -191,7 +191,7 @@ def test_round_off_of_another_processor_is_not_damage(tmp_path: Path) -> None:
 
 
 def test_worker_count_changes_no_bit(tmp_path: Path, cache: Path, tiny: Dataset) -> None:
-    spec = load_dataset_spec("beam-tiny")
+    spec = load_generated_spec("beam-tiny")
     parallel = generate(spec, workers=2, cache=tmp_path)
     assert files(parallel) == files(dataset_folder(spec, cache))
     assert len(shards(parallel)) == 3
@@ -199,7 +199,7 @@ def test_worker_count_changes_no_bit(tmp_path: Path, cache: Path, tiny: Dataset)
 
 
 def test_a_limit_is_a_prefix_and_progress_counts_what_is_wanted(tmp_path: Path, cache: Path, tiny: Dataset) -> None:
-    spec = load_dataset_spec("beam-tiny")
+    spec = load_generated_spec("beam-tiny")
     told: list[tuple[int, int]] = []
     first = generate(spec, limit=120, workers=1, cache=tmp_path, progress=lambda *counts: told.append(counts))
     assert list(shards(first)) == ["shard-00000.h5", "shard-00001.h5"]
@@ -250,7 +250,7 @@ def test_a_killed_worker_of_the_pool_is_named_with_its_likely_cause() -> None:
 
 
 def test_the_manifest_alone_is_enough_to_generate_the_same_again(tmp_path: Path, cache: Path, tiny: Dataset) -> None:
-    original = dataset_folder(load_dataset_spec("beam-tiny"), cache)
+    original = dataset_folder(load_generated_spec("beam-tiny"), cache)
     manifest = read_manifest(original)
     assert (manifest.n_samples, manifest.shard_size) == (210, 100)
     assert set(manifest.environments[0]) == {"mor-bench", "python", "numpy", "scipy", "numba", "h5py", "platform", "machine"}

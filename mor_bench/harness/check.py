@@ -8,8 +8,9 @@ from mor_bench.errors import MissingDependencyError
 from mor_bench.mechanics.locking import locking_risk
 from mor_bench.mechanics.model import check_supports, missing_library
 from mor_bench.scene.scene import load_scene
+from mor_bench.snapshots.dataset import load_dataset
 from mor_bench.snapshots.sampling import n_samples_of
-from mor_bench.specs import check_method, is_method_file, load_dataset_spec, load_method_spec
+from mor_bench.specs import ImportedDatasetSpec, check_method, is_method_file, load_dataset_spec, load_method_spec
 
 
 def check_file(path: Path) -> str:
@@ -21,6 +22,8 @@ def check_file(path: Path) -> str:
     ------
     SpecError, UnconstrainedBodyError
         The first problem, in one line.
+    InvalidInputError
+        If imported samples cannot be split as the file says.
     MissingDependencyError
         If the method's class or the dataset's solver needs an extra that is not installed.
     """
@@ -29,6 +32,8 @@ def check_file(path: Path) -> str:
         check_method(method)
         return f"method, {len(method.configurations('quick'))} quick and {len(method.configurations('full'))} full configurations"
     spec = load_dataset_spec(path)
+    if isinstance(spec, ImportedDatasetSpec):
+        return _imported(spec)
     scene = load_scene(spec)
     check_supports(scene)
     missing = missing_library(spec.solver)
@@ -39,3 +44,12 @@ def check_file(path: Path) -> str:
     said = f"dataset, {scene.mesh.n_cells} cells, {scene.mesh.n_nodes} nodes, {n_patches} load patches, {samples} samples"
     risk = locking_risk(scene)
     return f"{said}; warning: {risk}" if risk else said
+
+
+def _imported(spec: ImportedDatasetSpec) -> str:
+    data = load_dataset(spec)
+    mesh = data.scene.mesh
+    return (
+        f"dataset of imported snapshots, {mesh.n_cells} cells, {mesh.n_nodes} nodes, {len(data.scene.fixed_nodes)} of them fixed, "
+        f"{len(data.train)} samples to train and {len(data.test)} to test"
+    )

@@ -26,7 +26,7 @@ from mor_bench.scene.scene import Scene, load_scene, refined
 from mor_bench.snapshots.generate import dataset_folder
 from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of
 from mor_bench.snapshots.store import write_atomically
-from mor_bench.specs import DatasetSpec, find_suite, load_dataset_spec
+from mor_bench.specs import DatasetSpec, find_suite, load_generated_spec
 
 FORMAT = "mor-bench discretisation error"
 SCHEMA_VERSION = 1
@@ -42,7 +42,7 @@ def chosen_samples(scene: Scene, n_loads: int) -> NDArray[np.int64]:
 
     Where patches come in random order, the first samples.
     """
-    loads, n_patches = scene.spec.loads, len(scene.patch_nodes)
+    loads, n_patches = scene.generated.loads, len(scene.patch_nodes)
     if loads.samples_per_patch is None:
         return np.arange(min(n_loads, n_samples_of(scene)))
     generator = np.random.default_rng([loads.seed, 0xD15C])
@@ -161,7 +161,7 @@ def refine(
     SolverError
         If no load has an equilibrium on every mesh.
     """
-    spec = dataset if isinstance(dataset, DatasetSpec) else load_dataset_spec(dataset, suite)
+    spec = dataset if isinstance(dataset, DatasetSpec) else load_generated_spec(dataset, suite)
     scene = load_scene(spec)
     n_patches = len(scene.patch_nodes)
     if not 1 <= n_loads <= n_patches:

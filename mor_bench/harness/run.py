@@ -27,7 +27,7 @@ from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.generate import generation_seconds
-from mor_bench.specs import DatasetSpec, MethodSpec, SplitBy, check_method, load_dataset_spec, load_method_spec
+from mor_bench.specs import AnyDatasetSpec, DatasetSpec, MethodSpec, SplitBy, check_method, load_dataset_spec, load_method_spec
 from mor_bench.surrogate import Surrogate, make_surrogate
 
 CORE_METHODS = ("fem", "pod", "hpod", "pca-regression", "umesh")
@@ -236,7 +236,7 @@ def run(
     for number, (spec, job) in enumerate((spec, job) for spec in specs for job in jobs):
         if number % len(jobs) == 0:
             data = _open(spec, comparison, listener, limit=limit, split=split, workers=workers, cache=cache)
-            data_seconds = generation_seconds(spec, cache, len(data.train))
+            data_seconds = generation_seconds(spec, cache, len(data.train)) if isinstance(spec, DatasetSpec) else None
         listener.starting(spec.name, job.label, number + 1, len(specs) * len(jobs))
         if comparison.has(spec.name, job.label, job.parameters):
             continue
@@ -265,15 +265,15 @@ def run(
     return comparison
 
 
-def _discretisation(spec: DatasetSpec, cache: Path | None, suite: Path | None) -> dict[str, float | None]:
+def _discretisation(spec: AnyDatasetSpec, cache: Path | None, suite: Path | None) -> dict[str, float | None]:
     """The part of every row that says how far the dataset's mesh is from the body; None where it was not measured."""
-    record = measured(spec, cache, suite) or {}
+    record = (measured(spec, cache, suite) if isinstance(spec, DatasetSpec) else None) or {}
     return {"discretisation_error_m": record.get("error_m"), "discretisation_rel_l2": record.get("relative_l2_median")}
 
 
 def _checked_specs(
     datasets: Sequence[str | Path | Mapping[str, Any]], methods: Sequence[str | Path], suite: Path | None
-) -> tuple[list[DatasetSpec], list[MethodSpec]]:
+) -> tuple[list[AnyDatasetSpec], list[MethodSpec]]:
     """Read all specifications and check them as far as they can be without running, so that no run fails half-way on one."""
     specs = [load_dataset_spec(dataset, suite) for dataset in datasets]
     method_specs = [load_method_spec(method, suite) for method in methods]
@@ -282,14 +282,16 @@ def _checked_specs(
             if names.count(name) > 1:
                 raise InvalidInputError(f"two {kind}s are called {name!r}; rename one of the files.")
     for spec in specs:
-        check_supports(load_scene(spec))
+        scene = load_scene(spec)
+        if isinstance(spec, DatasetSpec):
+            check_supports(scene)
     for method_spec in method_specs:
         with suppress(MissingDependencyError):  # that becomes a row with its reason
             check_method(method_spec)
     return specs, method_specs
 
 
-def _open_run(out: Path, specs: Sequence[DatasetSpec], settings: dict[str, Any]) -> Comparison:
+def _open_run(out: Path, specs: Sequence[AnyDatasetSpec], settings: dict[str, Any]) -> Comparison:
     """The comparison in a folder: a new one, or the one that was begun there with the same settings and datasets."""
     datasets = {spec.name: spec.model_dump(mode="json") for spec in specs}
     if (out / "results.json").exists():
@@ -305,7 +307,7 @@ def _open_run(out: Path, specs: Sequence[DatasetSpec], settings: dict[str, Any])
     return comparison
 
 
-def _open(spec: DatasetSpec, comparison: Comparison, listener: Listener, **options: Any) -> Dataset:
+def _open(spec: AnyDatasetSpec, comparison: Comparison, listener: Listener, **options: Any) -> Dataset:
     """Load a dataset and record what every figure of it needs."""
     data = load_dataset(spec, progress=lambda done, total: listener.generating(spec.name, done, total), **options)
     arrays = {

@@ -12,7 +12,9 @@ LOCKING_FROM = 0.45
 
 
 def locking_risk(scene: Scene) -> str | None:
-    """Why the scene's answers will be too stiff, and the remedy; None where they will not."""
+    """Why the scene's answers will be too stiff, and the remedy; None where they will not, or nothing is known of it."""
+    if scene.material is None:
+        return None
     poisson = scene.material.poisson_at_rest
     if poisson <= LOCKING_FROM or scene.selective:
         return None

@@ -10,7 +10,14 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import IllConditionedWarning, MissingDependencyError, SolverError, SpecError, UnconstrainedBodyError
+from mor_bench.errors import (
+    IllConditionedWarning,
+    MissingDependencyError,
+    SolverError,
+    SpecError,
+    UnconstrainedBodyError,
+    UnsupportedSceneError,
+)
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.linear import (
@@ -29,7 +36,7 @@ from mor_bench.mechanics.locking import warn_of_locking
 from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibria, solve_equilibrium
 from mor_bench.mechanics.rotated import BlockJacobi, JacobiFactor, RotatedRest, condition_number, conjugate_gradients
 from mor_bench.scene.scene import Scene
-from mor_bench.specs import SolverName
+from mor_bench.specs import NO_EQUATIONS, SolverName
 
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 """How equilibria are solved.
@@ -62,6 +69,11 @@ def missing_library(solver: SolverName) -> str | None:
     if solver == "pardiso" and find_spec("pypardiso") is None:
         return "the solver `pardiso` needs pypardiso: pip install 'mor-bench[mkl]'"
     return None
+
+
+def unknown_equations(scene: Scene) -> str | None:
+    """The reason why a scene has no full-order model; None if it has one."""
+    return NO_EQUATIONS if scene.material is None else None
 
 
 def free_rigid_modes(scene: Scene) -> list[str]:
@@ -99,6 +111,8 @@ class FullOrderModel:
 
     Raises
     ------
+    UnsupportedSceneError
+        If the scene's snapshots were imported, so that its equations are not known.
     UnconstrainedBodyError
         If the supports leave rigid motions free; the message names them.
     MissingDependencyError
@@ -106,9 +120,11 @@ class FullOrderModel:
     """
 
     def __init__(self, scene: Scene, solver: SolverName | None = None) -> None:
+        if scene.material is None:
+            raise UnsupportedSceneError(f"{scene.name}: {NO_EQUATIONS}.")
         check_supports(scene)
         warn_of_locking(scene)
-        self.solver = solver or scene.spec.solver
+        self.solver = solver or scene.generated.solver
         if self.solver not in SOLVERS:
             raise SpecError(f"`solver` must be one of {', '.join(SOLVERS)}; got {self.solver!r}.")
         missing = missing_library(self.solver)

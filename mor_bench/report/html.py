@@ -185,7 +185,9 @@ def _dataset_section(comparison: Comparison, dataset: str, drawn: Sequence[Drawn
 def _what_was_run(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> list[tuple[str, str]]:
     spec, needs = comparison.datasets.get(dataset, {}), needs_of(comparison, dataset)
     scene = [
-        (key, "; ".join(f"{k}: {v}" if k else v for k, v in _flat(spec[key]))) for key in ("geometry", "material", "supports", "loads") if key in spec
+        (key, "; ".join(f"{k}: {v}" if k else v for k, v in _flat(spec[key])))
+        for key in ("geometry", "material", "supports", "loads", "snapshots")
+        if key in spec
     ]
 
     def values(name: str) -> str:

@@ -89,8 +89,8 @@ def _nearest(cloud: Cloud, region: NearestRegion) -> NDArray[np.int64]:
 
 
 def _near_surface(cloud: Cloud, region: NearSurfaceRegion, near: float) -> NDArray[np.int64]:
-    from mor_bench.scene.surfaces import read_triangles
-    from mor_bench.scene.triangles import distances
+    from mor_bench.scene.files import read_triangles
+    from mor_bench.scene.triangle_distance import distances
 
     corners = read_triangles(region.near_surface.checked(), region.unit_m)
     return np.asarray(cloud.on_surface[distances(corners, cloud.points[cloud.on_surface]) <= region.within_m + near])

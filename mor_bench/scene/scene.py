@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
+from mor_bench.scene.imported import ImportedArrays, read_arrays
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets, Patches, cut_patches, spread_out
 from mor_bench.scene.materials import Material, make_material
@@ -23,12 +24,15 @@ from mor_bench.scene.mesh import Mesh, box_mesh, l_mesh
 from mor_bench.scene.regions import Cloud, region_points
 from mor_bench.scene.subdivision import subdivide
 from mor_bench.specs import (
+    AnyDatasetSpec,
     BoxGeometry,
     DatasetSpec,
     FileGeometry,
+    ImportedDatasetSpec,
     LShapeGeometry,
     TetrahedraGeometry,
     VoxelsGeometry,
+    generated,
     load_dataset_spec,
 )
 
@@ -39,33 +43,42 @@ class Scene:
 
     Attributes
     ----------
-    spec : DatasetSpec
+    spec : DatasetSpec or ImportedDatasetSpec
         The validated dataset file.
     mesh : Mesh
-    material : Material
+    material : Material or None
+        None if the snapshots were imported: then the equations are not known, and there are no patches.
     fixed_nodes : (n_fixed,) int64
         Nodes with u = 0.
     embedded_surface : Facets or None
         The smooth surface that a mesh of voxels is filled from, and that loads act on.
     point_sets : mapping of str to (n,) int64
         Named sets of nodes, of a mesh file.
+    imported_nodes : (n,) int64 or None
+        Nodes that imported forces act on.
     """
 
-    spec: DatasetSpec
+    spec: AnyDatasetSpec
     mesh: Mesh
-    material: Material
+    material: Material | None
     fixed_nodes: NDArray[np.int64]
     embedded_surface: Facets | None = field(default=None, repr=False)
     point_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict, repr=False)
+    imported_nodes: NDArray[np.int64] | None = field(default=None, repr=False)
 
     @property
     def name(self) -> str:
         return self.spec.name
 
     @property
+    def generated(self) -> DatasetSpec:
+        """The spec, if the scene's equations are known; raises `UnsupportedSceneError` if they are not."""
+        return generated(self.spec)
+
+    @property
     def selective(self) -> bool:
         """Whether the volumetric part of the energy is taken from the cells' mean gradients."""
-        return self.spec.discretisation.integration == "selective"
+        return self.generated.discretisation.integration == "selective"
 
     @cached_property
     def free_dofs(self) -> NDArray[np.int64]:
@@ -87,7 +100,7 @@ class Scene:
     def _loaded_points(self) -> NDArray[np.int64]:
         """Numbers of the surface's points in the load region."""
         sets = {} if self.embedded_surface else self.point_sets
-        return region_points(Cloud(self.surface.points, np.unique(self.surface.facets), sets), self.spec.loads.region)
+        return region_points(Cloud(self.surface.points, np.unique(self.surface.facets), sets), self.generated.loads.region)
 
     @cached_property
     def patch_nodes(self) -> NDArray[np.int64]:
@@ -95,7 +108,7 @@ class Scene:
 
         On a mesh's own boundary these are numbers of nodes.
         """
-        region, loads = self._loaded_points, self.spec.loads
+        region, loads = self._loaded_points, self.generated.loads
         if loads.n_patches is None:
             return region
         points = self.surface.points[region]
@@ -120,7 +133,7 @@ class Scene:
 
     @cached_property
     def _patches(self) -> Patches:
-        return cut_patches(self.surface, self.loaded_facets, self.patch_nodes, self.spec.loads.patch_area_m2)
+        return cut_patches(self.surface, self.loaded_facets, self.patch_nodes, self.generated.loads.patch_area_m2)
 
     @cached_property
     def patch_normals(self) -> NDArray[np.float64]:
@@ -157,12 +170,17 @@ class Scene:
             return _rows_to_one(sp.csr_array(shares @ interpolation_matrix(self.mesh, points)))
         return _rows_to_one(sp.csr_array(self._patches.areas @ self._patches.values))
 
+    @cached_property
+    def loaded_nodes(self) -> NDArray[np.int64]:
+        """(n,) the nodes that some load patch, or some imported force, acts on."""
+        return np.unique(self.patch_weights.indices) if self.imported_nodes is None else self.imported_nodes
+
 
 def _rows_to_one(matrix: sp.csr_array) -> sp.csr_array:
     return sp.csr_array(matrix.multiply(1.0 / matrix.sum(axis=1)[:, None]))
 
 
-def load_scene(source: str | Path | Mapping[str, Any] | DatasetSpec) -> Scene:
+def load_scene(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> Scene:
     """Build a scene from a dataset's name, the path of a TOML, a dict with the same keys, or a validated spec.
 
     Raises
@@ -170,11 +188,16 @@ def load_scene(source: str | Path | Mapping[str, Any] | DatasetSpec) -> Scene:
     SpecError
         If the dataset is unknown or not valid, or a region of it is empty.
     """
-    spec = source if isinstance(source, DatasetSpec) else load_dataset_spec(source)
+    spec = source if isinstance(source, DatasetSpec | ImportedDatasetSpec) else load_dataset_spec(source)
     try:
-        return _build(spec)
+        return _build(spec) if isinstance(spec, DatasetSpec) else imported_scene(spec, read_arrays(spec.snapshots.file))
     except SpecError as error:
         raise SpecError(f"{spec.name}: {error}") from None
+
+
+def imported_scene(spec: ImportedDatasetSpec, arrays: ImportedArrays) -> Scene:
+    """The scene of imported snapshots, of which the mesh and the supports are known and the equations are not."""
+    return Scene(spec, arrays.mesh, None, arrays.fixed_nodes, imported_nodes=arrays.loaded_nodes)
 
 
 def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
@@ -192,7 +215,7 @@ def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
     UnsupportedSceneError
         If the scene is neither, or has no such mesh.
     """
-    geometry = scene.spec.geometry
+    geometry = scene.generated.geometry
     name = f"{scene.name} with {' x '.join(map(str, cells))} cells"
     changed: dict[str, Any] = {"cells": cells}
     if isinstance(geometry, LShapeGeometry):
@@ -205,7 +228,7 @@ def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
             f"{scene.name}: only the mesh of a box or an L can be made finer or coarser; got `geometry.shape` {geometry.shape!r}."
         )
     try:
-        return _without_patches(scene.spec.model_copy(update={"geometry": geometry.model_copy(update=changed)}))
+        return _without_patches(scene.generated.model_copy(update={"geometry": geometry.model_copy(update=changed)}))
     except SpecError as error:
         raise UnsupportedSceneError(f"{name}: {error}") from None
 
@@ -215,7 +238,7 @@ def refined(scene: Scene) -> Scene:
 
     Of an embedded surface's voxels the steps stay as they are.
     """
-    geometry = scene.spec.geometry
+    geometry = scene.generated.geometry
     if isinstance(geometry, BoxGeometry) and scene.mesh.grid_shape is not None:
         nx, ny, nz = (2 * n for n in geometry.cells)
         return with_cells(scene, (nx, ny, nz))

@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
-from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.scene.scene import Scene, imported_scene, load_scene
 from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import Progress, generate, n_samples_to_generate, read_shards
+from mor_bench.snapshots.imported import NodalLoads, nodal_loads, read_samples
 from mor_bench.snapshots.sampling import PatchLoads, repeated
+from mor_bench.snapshots.split import split_imported, split_samples
 from mor_bench.snapshots.test_sets import SetName, check_regions, spec_of_set
-from mor_bench.specs import DatasetSpec, Split, SplitBy, load_dataset_spec
+from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, Split, SplitBy, generated, load_dataset_spec
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
@@ -33,15 +35,16 @@ class Snapshots:
     Attributes
     ----------
     scene : Scene
-    loads : PatchLoads
-        The forces in compact form.
+    loads : PatchLoads or NodalLoads
+        The forces in compact form, or imported ones as they came.
     free_displacements : (n_samples, n_free) float64
         At the free dofs, m; supports are exactly zero.
     min_det_f : (n_samples,) float64
+        NaN of imported ones.
     """
 
     scene: Scene = field(repr=False)
-    loads: PatchLoads
+    loads: PatchLoads | NodalLoads
     free_displacements: NDArray[np.float64]
     min_det_f: NDArray[np.float64]
 
@@ -50,13 +53,15 @@ class Snapshots:
 
     def __getitem__(self, index: NDArray[np.int64] | slice) -> Snapshots:
         loads = self.loads[index]
-        for array in (loads.patches, loads.vectors):
+        for array in (loads.patches, loads.forces if isinstance(loads, NodalLoads) else loads.vectors):
             read_only(array)
         return Snapshots(self.scene, loads, read_only(self.free_displacements[index]), read_only(self.min_det_f[index]))
 
     @cached_property
     def forces(self) -> NDArray[np.float64]:
         """(n_samples, n_nodes, 3) nodal forces, N."""
+        if isinstance(self.loads, NodalLoads):
+            return self.loads.forces
         return read_only(self.loads.nodal_forces(self.scene.patch_weights))
 
     @property
@@ -100,42 +105,8 @@ class Dataset:
     tests: dict[str, Snapshots] = field(default_factory=dict)
 
 
-def split_samples(loads: PatchLoads, n_regions: int, split: Split, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row numbers of the training and of the test samples, each sorted.
-
-    By sample, any go to the test. By region, whole load regions do, chosen independently of how many samples there are;
-    by direction, forces in a cone around a random axis. A sample of several forces is for the test if all of them are and
-    for training if none is; the part of the regions, or of the sphere, is such that the test has its fraction of those.
-
-    Raises
-    ------
-    InvalidInputError
-        If a part would be empty.
-    """
-    generator = np.random.default_rng([seed, 0x5917])
-    n, k = loads.patches.shape
-    if split.by == "sample":
-        held = np.zeros((n, 1), dtype=bool)
-        held[generator.permutation(n)[: round(split.test_fraction * n)]] = True
-    else:
-        # With p of the regions held out, p^k of the samples have all in them and (1 - p)^k none.
-        odds = (split.test_fraction / (1 - split.test_fraction)) ** (1 / k)
-        part = odds / (1 + odds)
-        if split.by == "region":
-            n_test = min(max(1, round(part * n_regions)), n_regions - 1)
-            held = np.isin(loads.patches, generator.permutation(n_regions)[:n_test])
-        else:
-            axis = generator.normal(size=3)
-            along = loads.vectors @ axis / (np.linalg.norm(axis) * np.maximum(np.linalg.norm(loads.vectors, axis=2), np.finfo(float).tiny))
-            held = along > 1 - 2 * part
-    test, train = held.all(axis=1), ~held.any(axis=1)
-    if not train.any() or not test.any():
-        raise InvalidInputError(f"{n} samples cannot be split by {split.by}: the training or the test part would be empty.")
-    return np.flatnonzero(train), np.flatnonzero(test)
-
-
 def load_dataset(
-    source: str | Path | Mapping[str, Any] | DatasetSpec,
+    source: str | Path | Mapping[str, Any] | AnyDatasetSpec,
     limit: int | None = None,
     *,
     split: SplitBy | None = None,
@@ -149,7 +120,7 @@ def load_dataset(
 
     Parameters
     ----------
-    source : str, Path, dict or DatasetSpec
+    source : str, Path, dict, DatasetSpec or ImportedDatasetSpec
         A name in the suite, the path of a TOML, or a dict with the same keys.
     limit : int, optional
         Only the first samples; they cover the load regions evenly.
@@ -181,7 +152,9 @@ def load_dataset(
     check_pool(workers, cluster)
     if split not in (None, *get_args(SplitBy)):
         raise InvalidInputError(f"`split` must be one of {', '.join(get_args(SplitBy))}; got {split!r}.")
-    spec = source if isinstance(source, DatasetSpec) else load_dataset_spec(source)
+    spec = source if isinstance(source, DatasetSpec | ImportedDatasetSpec) else load_dataset_spec(source)
+    if isinstance(spec, ImportedDatasetSpec):
+        return _imported(spec, limit, split, tests)
     others = {name: spec_of_set(spec, name) for name in tests}
     if "unseen-regions" in others:
         check_regions(spec)
@@ -197,6 +170,17 @@ def load_dataset(
         name: store.snapshots([np.flatnonzero(store.status == 0)])[0] for name, store in zip(others, stores[1:], strict=True)
     }
     return Dataset(main.scene, train, test, len(main.status) - len(valid), len(valid) - len(train) - len(test), sets)
+
+
+def _imported(spec: ImportedDatasetSpec, limit: int | None, by: SplitBy | None, tests: Sequence[SetName]) -> Dataset:
+    if tests:
+        raise InvalidInputError(f"{spec.name} has no test set {tests[0]!r}: its snapshots were imported.")
+    arrays = read_samples(spec, limit)
+    scene = imported_scene(spec, arrays)
+    loads, displacements = nodal_loads(arrays), arrays.displacements.reshape(len(arrays.forces), -1)[:, scene.free_dofs]
+    parts = split_imported(spec, arrays, by)
+    train, test = (Snapshots(scene, loads[part], displacements[part], np.full(len(part), np.nan))[:] for part in parts)
+    return Dataset(scene, train, test, 0, len(loads) - len(train) - len(test))
 
 
 class _Store:
@@ -220,10 +204,10 @@ class _Store:
 
 
 def stream(
-    source: str | Path | Mapping[str, Any] | DatasetSpec, limit: int | None = None, *, workers: int | None = None, cache: Path | None = None
+    source: str | Path | Mapping[str, Any] | AnyDatasetSpec, limit: int | None = None, *, workers: int | None = None, cache: Path | None = None
 ) -> Iterator[Snapshots]:  # fmt: skip
     """The valid samples of a dataset, train and test together, a hundred at a time; parameters as of `load_dataset`."""
-    spec = source if isinstance(source, DatasetSpec) else load_dataset_spec(source)
+    spec = generated(source if isinstance(source, DatasetSpec | ImportedDatasetSpec) else load_dataset_spec(source))
     scene = load_scene(spec)
     folder = generate(spec, limit, workers, cache)
     for shard in read_shards(folder, n_samples_to_generate(spec, limit)):

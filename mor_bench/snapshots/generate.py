@@ -83,7 +83,7 @@ class _Plan:
 
     @cached_property
     def key(self) -> str:
-        return dataset_key(self.scene.spec)
+        return dataset_key(self.scene.generated)
 
     @cached_property
     def _problem(self) -> bytes:
@@ -111,7 +111,7 @@ class _Plan:
         if shard.patches.shape != loads.patches.shape or shard.vectors.shape != loads.vectors.shape or len(shard.status) != len(loads):
             return False
         difference = np.abs(shard.vectors - loads.vectors).max()
-        return bool((shard.patches == loads.patches).all() and difference <= ROUND_OFF * self.scene.spec.loads.magnitude_n[1])
+        return bool((shard.patches == loads.patches).all() and difference <= ROUND_OFF * self.scene.generated.loads.magnitude_n[1])
 
 
 @contextmanager

@@ -65,7 +65,7 @@ class PatchLoads:
 
 def n_samples_of(scene: Scene) -> int:
     """How many samples a scene's plan has."""
-    loads = scene.spec.loads
+    loads = scene.generated.loads
     return len(scene.patch_nodes) * loads.samples_per_patch if loads.samples_per_patch else loads.samples or 0
 
 
@@ -77,7 +77,7 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
     SpecError
         If no patches are as far from each other as the plan asks, or too many combinations are.
     """
-    loads, numbers = scene.spec.loads, np.arange(start, stop)
+    loads, numbers = scene.generated.loads, np.arange(start, stop)
     chosen = _combinations(scene)
     row, turn = numbers % len(chosen), numbers // len(chosen)
     patches = chosen[row]
@@ -96,7 +96,7 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
 
 def _combinations(scene: Scene) -> NDArray[np.int64]:
     """(n_combinations, k) patches that are loaded together, in the order in which samples go through them."""
-    loads = scene.spec.loads
+    loads = scene.generated.loads
     n_patches = len(scene.patch_nodes)
     if loads.samples_per_patch:
         return np.arange(n_patches)[:, None]

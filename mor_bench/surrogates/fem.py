@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from mor_bench.errors import SolverError
-from mor_bench.mechanics.model import FullOrderModel, missing_library
+from mor_bench.mechanics.model import FullOrderModel, missing_library, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -35,7 +35,7 @@ class FullFEM(Surrogate):
         self.solver = solver
 
     def supports(self, scene: Scene) -> str | None:
-        return missing_library(self.solver or scene.spec.solver)
+        return unknown_equations(scene) or missing_library(self.solver or scene.generated.solver)
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
         """Assemble and factorise the rest-state stiffness; snapshots are not used."""

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from mor_bench.errors import UnconstrainedBodyError, UnsupportedSceneError
-from mor_bench.mechanics.model import FullOrderModel, check_supports
+from mor_bench.mechanics.model import FullOrderModel, check_supports, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.scene import Scene, with_cells
@@ -58,6 +58,8 @@ class CoarseFEM(Surrogate):
 
     def supports(self, scene: Scene) -> str | None:
         """The reason why there is no coarser mesh of a scene, or why it would not be held."""
+        if reason := unknown_equations(scene):
+            return reason
         try:
             check_supports(self._coarse(scene))
         except (UnsupportedSceneError, UnconstrainedBodyError) as error:
@@ -65,7 +67,7 @@ class CoarseFEM(Surrogate):
         return None
 
     def _coarse(self, scene: Scene) -> Scene:
-        nx, ny, nz = (ceil(n / self.coarsening) for n in getattr(scene.spec.geometry, "cells", (1, 1, 1)))
+        nx, ny, nz = (ceil(n / self.coarsening) for n in getattr(scene.generated.geometry, "cells", (1, 1, 1)))
         coarse = with_cells(scene, (nx, ny, nz))
         if coarse.mesh.n_cells == scene.mesh.n_cells:
             raise UnsupportedSceneError(f"{scene.name}: a mesh of one cell cannot be made coarser.")

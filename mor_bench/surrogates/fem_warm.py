@@ -10,7 +10,7 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import Scene
@@ -59,6 +59,9 @@ class WarmFEM(Surrogate):
     def needs_snapshots(self) -> bool:  # type: ignore[override]
         """Whether solutions are taken from the training samples."""
         return self.start == "nearest"
+
+    def supports(self, scene: Scene) -> str | None:
+        return unknown_equations(scene)
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         """Factorise the rest-state stiffness and, for `nearest`, sort the training samples by their linear responses."""

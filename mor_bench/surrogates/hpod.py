@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from mor_bench.errors import InvalidInputError
+from mor_bench.errors import InvalidInputError, UnsupportedSceneError
 from mor_bench.mechanics.assembly import Assembler
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.cubature import ecsw_system, sparse_nnls
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.specs import NO_EQUATIONS
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates.pod import predict_reduced
 
@@ -50,6 +51,9 @@ class HyperReducedPOD(Surrogate):
         self.n_cubature_snapshots = n_cubature_snapshots
         self.tolerance = tolerance
 
+    def supports(self, scene: Scene) -> str | None:
+        return unknown_equations(scene)
+
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             displacements = self._checked_snapshots(snapshots).free_displacements
@@ -75,6 +79,8 @@ class HyperReducedPOD(Surrogate):
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         self.modes_, self.cells_, self.weights_ = state["modes"], state["cells"], state["weights"]
         scene = self.scene_
+        if scene.material is None:
+            raise UnsupportedSceneError(NO_EQUATIONS)
         numbers, n_cells = self.cells_, scene.mesh.n_cells
         if numbers.dtype.kind != "i" or numbers.shape != self.weights_.shape or not ((numbers >= 0) & (numbers < n_cells)).all():
             raise InvalidInputError(f"`cells` must be integers in [0, {n_cells - 1}], as many as there are weights.")

@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
@@ -20,6 +20,9 @@ class LinearFEM(Surrogate):
 
     def __init__(self) -> None:
         pass
+
+    def supports(self, scene: Scene) -> str | None:
+        return unknown_equations(scene)
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
         """Factorise the rest-state stiffness; snapshots are not used."""

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -72,6 +72,9 @@ class PCARegression(Surrogate):
         self.n_output_modes = n_output_modes
         self.degree = degree
         self.ridge = ridge
+
+    def supports(self, scene: Scene) -> str | None:
+        return unknown_equations(scene) if self.input == "linear-response" else None
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         from sklearn.linear_model import Ridge

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.galerkin import GalerkinProblem
@@ -42,6 +42,9 @@ class PODGalerkin(Surrogate):
     def __init__(self, n_modes: Annotated[int, Field(ge=1)] = 20, tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8) -> None:
         self.n_modes = n_modes
         self.tolerance = tolerance
+
+    def supports(self, scene: Scene) -> str | None:
+        return unknown_equations(scene)
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):

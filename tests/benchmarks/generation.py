@@ -30,9 +30,9 @@ SIZES = (100, 300, 1000)
 def measure(dataset: str, samples: int, workers: int) -> dict[str, Any]:
     """Seconds and peak memory of one generation, in this process and its workers."""
     from mor_bench.snapshots.generate import SHARD_SIZE, dataset_folder, generate
-    from mor_bench.specs import load_dataset_spec
+    from mor_bench.specs import load_generated_spec
 
-    spec = load_dataset_spec(dataset)
+    spec = load_generated_spec(dataset)
     times: list[tuple[int, float]] = []
     with TemporaryDirectory() as cache:
         begun = perf_counter()

@@ -146,6 +146,7 @@ def test_two_runs_are_identical(law: str, kind: tuple[str, bool]) -> None:
 def test_nearly_incompressible_converges(law: str, kind: tuple[str, bool], poisson: float) -> None:
     scene = scene_of(law, kind, poisson)
     model, load = FullOrderModel(scene), patch_load(scene, -1, [0.0, 0.5, 1.0])
+    assert scene.material is not None
     assert scene.material.poisson_at_rest == pytest.approx(poisson, rel=1e-9)
     solution = model.solve(load)
     assert np.linalg.norm(load - model.force(solution.displacement).force) <= 1e-8 * np.linalg.norm(load)

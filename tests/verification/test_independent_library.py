@@ -24,8 +24,9 @@ Array = NDArray[np.float64]
 
 def felupe_law(scene: Scene) -> Any:
     """The scene's law, its energy written in C."""
+    assert scene.material is not None
     models, p = tensortrax.models.hyperelastic, scene.material.parameters
-    name = scene.spec.material.law
+    name = scene.generated.material.law
     if name == "saint-venant-kirchhoff":
         return tensortrax.Hyperelastic(models.saint_venant_kirchhoff, mu=p[1], lmbda=p[0])
 

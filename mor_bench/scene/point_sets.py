@@ -1,0 +1,101 @@
+"""Named sets of nodes, from what mesh formats call sets, physical groups and point data."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import meshio
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.errors import SpecError
+
+PointSets = dict[str, NDArray[np.int64]]
+
+
+def named_point_sets(mesh: meshio.Mesh, path: Path) -> PointSets:
+    """The sets of nodes that a file names; those of the same name are joined.
+
+    They are point sets (Abaqus NSET), the nodes of cell sets (ELSET) and of Gmsh's physical groups of any dimension, a group
+    without a name under its number, and point data of zeros and ones (VTK).
+
+    Raises
+    ------
+    SpecError
+        If an Abaqus file has two NSET of one name, of which only one would be read.
+    """
+    found: dict[str, list[NDArray[np.int64]]] = {}
+    abaqus = path.suffix.lower() == ".inp"
+    if abaqus:
+        _check_abaqus(path)
+    for name, nodes in mesh.point_sets.items():
+        found.setdefault(name, []).append(np.asarray(nodes, dtype=np.int64))
+    for name, chosen in (_abaqus_blocks(mesh, path) if abaqus else []) + _cell_sets(mesh) + _physical_groups(mesh):
+        nodes = [np.asarray(block.data)[rows].ravel() for block, rows in zip(mesh.cells, chosen, strict=True) if len(rows)]
+        found.setdefault(name, []).extend(np.asarray(part, dtype=np.int64) for part in nodes)
+    for name, values in mesh.point_data.items():
+        if values.ndim == 1 and values.dtype.kind in "biuf" and np.isin(values, [0, 1]).all() and values.any():
+            found.setdefault(name, []).append(np.flatnonzero(values))
+    return {name: np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *parts])) for name, parts in found.items()}
+
+
+_Rows = list[NDArray[np.int64]]
+"""For each block of cells the rows that are chosen."""
+
+_NO_ROWS = np.zeros(0, dtype=np.int64)
+
+
+def _cell_sets(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
+    sets = []
+    for name, members in mesh.cell_sets.items():
+        if name.startswith("gmsh:"):
+            continue
+        rows = [_NO_ROWS if part is None else np.asarray(part, dtype=np.int64) for part in members]
+        # A set that was defined before later cells has no part in them.
+        sets.append((name, (rows + [_NO_ROWS] * len(mesh.cells))[: len(mesh.cells)]))
+    return sets
+
+
+def _physical_groups(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
+    tags = mesh.cell_data.get("gmsh:physical")
+    if tags is None:
+        return []
+    names = {(int(tag), int(dimension)): name for name, (tag, dimension) in mesh.field_data.items()}
+    keys = sorted({(int(tag), block.dim) for block, values in zip(mesh.cells, tags, strict=True) for tag in np.unique(values) if tag != 0})
+    return [
+        (names.get(key, str(key[0])), [np.flatnonzero(values == key[0]) if block.dim == key[1] else _NO_ROWS
+                                       for block, values in zip(mesh.cells, tags, strict=True)])
+        for key in keys
+    ]  # fmt: skip
+
+
+def _keywords(path: Path, keyword: str, parameter: str) -> list[str | None]:
+    """For each line of a keyword in an Abaqus file the value of one of its parameters."""
+    lines = re.findall(rf"^\*{keyword}\s*((?:,.*)?)$", path.read_text(encoding="utf-8", errors="replace"), re.IGNORECASE | re.MULTILINE)
+    matches = [re.search(rf",\s*{parameter}\s*=\s*([^,]+)", line, re.IGNORECASE) for line in lines]
+    return [match and match[1].strip() for match in matches]
+
+
+def _check_abaqus(path: Path) -> None:
+    names = _keywords(path, "NSET", "NSET")
+    repeated = sorted({name for name in names if name is not None and names.count(name) > 1})
+    if repeated:
+        raise SpecError(f"{path}: NSET {repeated[0]!r} is defined more than once; join the parts in one.")
+
+
+def _abaqus_blocks(mesh: meshio.Mesh, path: Path) -> list[tuple[str, _Rows]]:
+    """Sets named in lines `*ELEMENT, ELSET=…`, which meshio gives to the wrong cells where a line has none.
+
+    What meshio made of them is removed from the mesh.
+    """
+    names = _keywords(path, "ELEMENT", "ELSET")
+    for name in {name for name in names if name is not None} - set(_keywords(path, "ELSET", "ELSET")):
+        mesh.cell_sets.pop(name, None)
+    if len(names) != len(mesh.cells):  # an included file brought cells: which ones are whose is not known
+        return []
+    return [
+        (name, [np.arange(len(block)) if i == k else _NO_ROWS for i, block in enumerate(mesh.cells)])
+        for k, name in enumerate(names)
+        if name is not None
+    ]
