@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -46,6 +47,7 @@ Suite = Annotated[Path | None, typer.Option(help="Folder with datasets/ and meth
 Cache = Annotated[Path | None, typer.Option(help="Folder for generated datasets. [default: the user's cache folder]")]
 Limit = Annotated[int | None, typer.Option(min=1, help="Only the first samples; they cover the load regions evenly.")]
 Workers = Annotated[int | None, typer.Option(min=1, help="Processes for data generation. [default: all cores]")]
+Cluster = Annotated[str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers generate instead: tcp://host:port.")]
 
 
 @contextmanager
@@ -76,24 +78,32 @@ def _console(stderr: bool = False) -> Console:
 
 @contextmanager
 def _progress(console: Console) -> Iterator[Listener]:
-    """A bar for generation and for the configurations, and a line for each finished one."""
+    """A bar for generation, with its rate, and one for the configurations, and a line for each finished one."""
+    from time import perf_counter
+
     from rich.markup import escape
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     from mor_bench.harness.run import Listener
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    texts = TextColumn("{task.description}"), TextColumn("{task.fields[rate]}")
+    columns = (texts[0], BarColumn(), MofNCompleteColumn(), texts[1], TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as bars:
         tasks: dict[str, Any] = {}
+        begun: dict[str, tuple[int, float]] = {}
 
         def generating(dataset: str, done: int, total: int) -> None:
             if dataset not in tasks:
-                tasks[dataset] = bars.add_task(f"samples of {escape(dataset)}", total=total)
-            bars.update(tasks[dataset], completed=done, total=total)
+                # What was there before is no part of the rate, nor of the time left that follows from it.
+                tasks[dataset] = bars.add_task(f"samples of {escape(dataset)}", total=total, completed=done, rate="")
+                begun[dataset] = done, perf_counter()
+            before, since = begun[dataset]
+            rate = f"{(done - before) / (perf_counter() - since):.1f}/s" if done > before else ""
+            bars.update(tasks[dataset], completed=done, total=total, rate=rate)
 
         def starting(dataset: str, label: str, number: int, total: int) -> None:
             if "run" not in tasks:
-                tasks["run"] = bars.add_task("", total=total)
+                tasks["run"] = bars.add_task("", total=total, rate="")
             bars.update(tasks["run"], description=escape(f"{dataset}: {label}"), completed=number - 1)
 
         def finished(row: dict[str, Any]) -> None:
@@ -192,23 +202,23 @@ def check(
 def generate(
     dataset: Annotated[str, typer.Argument(help="Name or TOML file.")],
     limit: Limit = None,
+    tests: Annotated[bool, typer.Option("--tests", help="Also the named test sets that the dataset has.")] = False,
     workers: Workers = None,
+    cluster: Cluster = None,
     cache: Cache = None,
     suite: Suite = None,
 ) -> None:
-    """Generate a dataset's snapshots; stop and resume at any moment."""
+    """Generate a dataset's snapshots; stop and resume at any moment. Prints its folder, and one for each test set."""
     with _clear_errors():
-        import os
-
         from mor_bench.snapshots.generate import generate as generate_shards
+        from mor_bench.snapshots.test_sets import with_test_sets
         from mor_bench.specs import load_generated_spec
 
         spec = load_generated_spec(dataset, suite)
+        items = with_test_sets(spec) if tests else [spec]
         with _progress(_console(stderr=True)) as listener:
-            folder = generate_shards(
-                spec, limit, workers or os.cpu_count() or 1, cache, lambda done, total: listener.generating(spec.name, done, total)
-            )
-        print(folder)
+            folders = [generate_shards(item, limit, workers, cache, partial(listener.generating, item.name), cluster) for item in items]
+        print(*folders, sep="\n")
 
 
 @app.command()

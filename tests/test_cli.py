@@ -73,7 +73,7 @@ def test_refine_prints_and_keeps_its_record(tmp_path: Path) -> None:
     (path,) = tmp_path.rglob("discretisation.json")
     assert json.loads(done.stdout) == json.loads(path.read_text())
     again = mor_bench("refine", "beam-tiny", "--loads", "2", "--levels", "2", "--max-dofs", "1000", "--cache", "c", cwd=tmp_path)
-    assert "left out for their size: 24 x 8 x 8 cells (6,075 dofs)" in again.stdout
+    assert "left out for their size: 1,536 cells (6,075 dofs)" in again.stdout
     assert "discretisation error of beam-tiny: mean e " in again.stdout
 
 
@@ -81,6 +81,15 @@ def test_generate_says_where(tmp_path: Path) -> None:
     done = mor_bench("generate", "beam-tiny", "--limit", "100", "--workers", "1", "--cache", "c", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert len(list((tmp_path / done.stdout.strip()).glob("shard-*.h5"))) == 1
+
+
+def test_generate_makes_the_test_sets_if_asked(tmp_path: Path) -> None:
+    done = mor_bench("generate", "beam-tiny", "--tests", "--limit", "5", "--workers", "1", "--cache", "c", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    folders = [Path(line) for line in done.stdout.splitlines()]
+    names = ["beam-tiny", *(f"beam-tiny--{name}" for name in ("in-range", "2x", "4x", "several-forces"))]
+    assert [folder.name.rsplit("-", 2)[0] for folder in folders] == names
+    assert all((tmp_path / folder / "shard-00000.h5").is_file() for folder in folders)
 
 
 @pytest.mark.parametrize(
@@ -93,6 +102,8 @@ def test_generate_says_where(tmp_path: Path) -> None:
         (["refine", "beam-tini"], "unknown dataset 'beam-tini'; did you mean 'beam-tiny'?"),
         (["refine", "beam-tiny", "--levels", "0", "--cache", "."], "`levels` must be an integer in [1, 10]; got 0."),
         (["refine", "beam-tiny", "--max-dofs", "900", "--cache", "."], "`max_dofs` must be at least 975"),
+        (["generate", "beam-tiny", "--workers", "2", "--cluster", "tcp://127.0.0.1:1", "--cache", "."], "`workers` and `cluster` exclude each other"),
+        (["generate", "beam-tiny", "--cluster", "host", "--cache", "."], "must be the address of a Dask scheduler, tcp://host:port; got 'host'"),
         (["run", "beam-tiny", "--threads", "100000"], "`threads` must be an integer in [1, "),
     ],
 )

@@ -17,7 +17,17 @@ from rich.console import Console
 from mor_bench.harness.metrics import SampleErrors, sample_errors, summary
 from mor_bench.harness.results import Comparison, label_of
 from mor_bench.report.html import render, write_report
-from mor_bench.report.summary import best_per_method, discretisation_error, entries_of, headline, number, percent, short_swept, size_of
+from mor_bench.report.summary import (
+    best_per_method,
+    discretisation_error,
+    entries_of,
+    headline,
+    number,
+    percent,
+    short_swept,
+    size_of,
+    warnings_of,
+)
 from mor_bench.report.tables import NOT_REACHED, print_tables, target_cells
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.specs import load_dataset_spec
@@ -278,3 +288,12 @@ def test_numbers() -> None:
     assert percent(0.008) == "0.8"
     assert [size_of(v) for v in (None, 12, 999.6, 12345, 2.5e9)] == ["–", "12 B", "1 kB", "12.3 kB", "2.5 GB"]
     assert short_swept({"n_modes": "20", "cubature_tolerance": "0.01", "n_heads": "4"}) == "r=20, ctol=0.01, nh=4"
+
+
+def test_a_warning_that_many_configurations_gave_is_said_once(tmp_path: Path) -> None:
+    made = Comparison(tmp_path, {})
+    for n in range(3):
+        add_row(made, "pod", {"n_modes": n}, 0.01, 1.0, warnings=["it locks"] + ["few modes"] * (n == 2))
+    entries = entries_of(made, "beam-tiny")
+    first, _, last = (entry.label for entry in entries)
+    assert warnings_of(entries) == [(f"{first} and 2 more", "it locks"), (last, "few modes")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 import mor_bench
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.mechanics.elements import element_of, shape_gradients
-from mor_bench.scene.scene import load_scene, with_cells
+from mor_bench.scene.scene import Scene, load_scene, with_cells
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -65,3 +66,81 @@ def test_meshes_of_other_sizes_keep_the_body() -> None:
 def test_a_cut_that_leaves_no_l_is_refused(cut: list[int], message: str) -> None:
     with pytest.raises(SpecError, match=message):
         load_scene(content(geometry={"cut_cells": cut}))
+
+
+@pytest.fixture(scope="module")
+def liver() -> Scene:
+    return load_scene("liver-hex")
+
+
+def test_forces_on_the_livers_surface_reach_the_grid_with_sum_and_moment(liver: Scene) -> None:
+    points, shares = liver.patch_points(np.arange(200))
+    weights = liver.patch_weights
+    assert (weights.toarray() >= -1e-15).all()
+    np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(weights @ liver.mesh.points, shares @ points, rtol=0, atol=1e-13)
+    forces = np.random.default_rng(0).normal(size=(len(liver.surface.points), 3))
+    nodal = liver.to_surface.T @ forces
+    moments = [np.cross(x, f).sum(axis=0) for x, f in ((liver.surface.points, forces), (liver.mesh.points, nodal))]
+    np.testing.assert_allclose(moments[0], moments[1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(nodal.sum(axis=0), forces.sum(axis=0), rtol=0, atol=1e-11)
+
+
+def test_displacements_of_the_grid_come_back_to_the_livers_surface(liver: Scene) -> None:
+    gradient, shift = np.random.default_rng(1).normal(size=(3, 3)), np.array([0.1, -0.2, 0.3])
+    np.testing.assert_allclose(liver.to_surface @ (liver.mesh.points @ gradient + shift), liver.surface.points @ gradient + shift, rtol=0, atol=1e-12)
+
+
+def test_the_liver_is_held_between_its_lobes_and_pressed_on_its_upper_half(liver: Scene) -> None:
+    held = liver.mesh.points[liver.fixed_nodes]
+    assert len(held) == 54
+    assert np.ptp(held, axis=0).max() < 0.1
+    assert liver.patch_centres[:, 2].min() >= 0
+    distance = np.linalg.norm(liver.patch_centres[:, None] - held, axis=2).min(axis=1)
+    assert distance.min() > np.sqrt(9e-4 / np.pi)
+    outwards = liver.patch_centres - liver.surface.points.mean(axis=0)
+    assert ((liver.patch_normals * outwards).sum(axis=1) > 0).mean() > 0.9
+
+
+def test_the_two_livers_are_one_body(liver: Scene) -> None:
+    other = load_scene("liver-tet")
+    assert other.mesh.cells.shape[1] == 4
+    np.testing.assert_allclose(other.mesh.bounds, [liver.surface.points.min(axis=0), liver.surface.points.max(axis=0)], atol=5e-4)
+    assert other.spec.grid_nodes == liver.mesh.grid_shape == (16, 15, 16)
+
+
+def cube_stl(path: Path) -> Path:
+    """A cube of 2 cm, in centimetres, its lowest corner at (1, 0, 0)."""
+    corners = np.array([[x, y, z] for x in (1, 3) for y in (0, 2) for z in (0, 2)], dtype=float)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    lines = ["solid cube"]
+    for a, b, c, d in quads:
+        for triangle in ((a, b, c), (a, c, d)):
+            vertices = "".join(f"vertex {' '.join(map(str, corners[v]))}\n" for v in triangle)
+            lines.append(f"facet normal 0 0 0\nouter loop\n{vertices}endloop\nendfacet")
+    path.write_text("\n".join([*lines, "endsolid cube"]))
+    return path
+
+
+def test_a_users_surface_becomes_a_scene_wherever_its_file_lies(tmp_path: Path) -> None:
+    base = {key: value for key, value in content().items() if key != "name"}
+    base["loads"] = {**base["loads"], "patch_area_m2": 1e-4, "magnitude_n": [0.0, 1e-3]}
+    cubes = []
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        cube_stl(tmp_path / folder / "cube.stl")
+        spec = {**base, "geometry": {"shape": "voxels", "surface": str(tmp_path / folder / "cube.stl"), "cells": [3, 2, 2], "unit_m": 0.01}}
+        cubes.append(load_scene(spec))
+    np.testing.assert_allclose(cubes[0].mesh.bounds, [[0.01, 0, 0], [0.03, 0.02, 0.02]], atol=1e-15)
+    assert cubes[0].mesh.n_cells == 12
+    assert cubes[0].spec.digest() == cubes[1].spec.digest()
+    load = np.zeros((cubes[0].mesh.n_nodes, 3))
+    load[:, 0] = 1e-6
+    answer = mor_bench.load_method("fem").fit(cubes[0], None).predict(load)
+    assert 0 < np.abs(answer).max() < 0.01
+    with pytest.raises(SpecError, match=r"nowhere.stl: no such file"):
+        load_scene({**base, "geometry": {"shape": "voxels", "surface": "nowhere.stl", "cells": [3, 2, 2]}})
+    kept = cubes[0].spec
+    (tmp_path / "one" / "cube.stl").write_text("solid other")
+    with pytest.raises(SpecError, match=r"cube.stl: the file has changed since the dataset was read"):
+        load_scene(kept)

@@ -12,14 +12,19 @@ import numpy as np
 import pytest
 
 import mor_bench
-from mor_bench.errors import InvalidInputError, MorBenchError, SpecError, StoreError, UnsupportedSceneError
-from mor_bench.snapshots.dataset import Dataset
+from mor_bench.errors import InvalidInputError, MorBenchError, SpecError, StoreError
+from mor_bench.scene.grid import grid_map
+from mor_bench.scene.mesh import box_mesh
+from mor_bench.scene.scene import load_scene
+from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.snapshots.sampling import draw_loads
+from mor_bench.specs import load_dataset_spec
 from mor_bench.surrogate import Surrogate
+from tests.irregular import irregular_box
 
 torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
 
-from mor_bench.scene.mesh import box_mesh  # noqa: E402 - after the check that torch is there
-from mor_bench.surrogates.umesh.grid import padded_grid  # noqa: E402
+from mor_bench.surrogates.umesh.grid import padded_grid  # noqa: E402 - after the check that torch is there
 from mor_bench.surrogates.umesh.network import UNet, new_network  # noqa: E402
 from mor_bench.surrogates.umesh.training import TrainingPlan, rate_factor, train  # noqa: E402
 
@@ -79,15 +84,14 @@ def test_the_bottom_sees_the_whole_small_grid() -> None:
 
 def test_grid_round_trip_and_padding() -> None:
     mesh = box_mesh((2.0, 1.0, 1.0), (6, 2, 2))
-    grid = padded_grid(mesh, 2)
+    grid = padded_grid(grid_map(mesh), 2)
     assert grid.shape == (8, 4, 4)
     nodal = torch.randn(5, mesh.n_nodes, 3, generator=torch.Generator().manual_seed(0))
     values = grid.to_grid(nodal)
     assert values.is_contiguous(memory_format=torch.channels_last_3d)
     torch.testing.assert_close(grid.to_nodes(values), nodal, rtol=0, atol=0)
     torch.testing.assert_close(values[:, :, :7, :3, :3], nodal.view(5, 7, 3, 3, 3).permute(0, 4, 1, 2, 3), rtol=0, atol=0)
-    assert float((values * (1 - grid.body)).abs().sum()) == 0.0
-    assert int(grid.body.sum()) == mesh.n_nodes
+    assert int((values != 0).sum()) == nodal.numel()
 
 
 def test_grid_of_a_part_of_a_box() -> None:
@@ -97,28 +101,44 @@ def test_grid_of_a_part_of_a_box() -> None:
     assert whole.grid_index is not None
     part = replace(whole, points=whole.points[kept], grid_index=whole.grid_index[kept])
     full = torch.randn(2, whole.n_nodes, 3, generator=torch.Generator().manual_seed(0))
-    values = padded_grid(part, 1).to_grid(full[:, kept])
-    expected = padded_grid(whole, 1).to_grid(full)
-    body = padded_grid(part, 1).body
-    assert int(body.sum()) == 40
-    torch.testing.assert_close(values, expected * body, rtol=0, atol=0)
+    grid = padded_grid(grid_map(part), 1)
+    values = grid.to_grid(full[:, kept])
+    body = grid.to_grid(torch.ones(1, 40, 3))
+    assert int(body.sum()) == 3 * 40
+    torch.testing.assert_close(values, padded_grid(grid_map(whole), 1).to_grid(full) * body, rtol=0, atol=0)
+    torch.testing.assert_close(grid.to_nodes(values), full[:, kept], rtol=0, atol=0)
 
 
-def test_padding_carries_no_loss() -> None:
-    """Targets at padding do not change the weights at all; targets in the body do."""
-    grid = padded_grid(box_mesh((2.0, 1.0, 1.0), (6, 2, 2)), 1)
+@pytest.mark.parametrize("regular", [True, False])
+def test_gradients_at_the_nodes_go_to_the_grid_points_around_them_and_none_to_padding(regular: bool) -> None:
+    """The product rule written out with the dense matrix N, and torch's own numerical gradients."""
+    mesh = box_mesh((2.0, 1.0, 1.0), (6, 2, 2)) if regular else irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
+    grid = padded_grid(grid_map(mesh), 2)
+    assert (grid.places is not None) == regular
+    matrix = torch.from_numpy(grid.grid.weights.toarray())
     source = torch.Generator().manual_seed(0)
-    inputs, targets, noise = (torch.randn(8, 3, *grid.shape, generator=source) for _ in range(3))
+    values = torch.randn(2, 3, *grid.shape, generator=source, requires_grad=True)
+    flat = values.permute(0, 2, 3, 4, 1).reshape(2, -1, 3)
+    goal = torch.randn(2, mesh.n_nodes, 3, generator=source)
+    torch.testing.assert_close(grid.to_nodes(values), matrix @ flat)
+    (own,) = torch.autograd.grad((grid.to_nodes(values) - goal).square().sum(), values)
+    (reference,) = torch.autograd.grad((matrix @ flat - goal).square().sum(), values)
+    torch.testing.assert_close(own, reference)
+    assert 0 < int((own != 0).sum()) < own.numel()
 
-    def weight(goal: Any) -> Any:
-        generator = torch.Generator().manual_seed(1)
-        network = new_network(4, 1, generator)
-        train(network, inputs, goal, grid.body, TrainingPlan(3, 4, 1e-3, "constant", 0.999), generator)
-        return network.head.weight.detach()
 
-    reference = weight(targets)
-    assert torch.equal(weight(targets + noise * (1 - grid.body)), reference)
-    assert not torch.equal(weight(targets + noise * grid.body), reference)
+def test_the_loss_is_the_mean_square_over_the_components_of_all_nodes() -> None:
+    """Before the first step, on one batch of all samples; values of the network at padding do not enter."""
+    mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
+    for grid in (padded_grid(grid_map(mesh), 2), padded_grid(grid_map(box_mesh((2.0, 1.0, 1.0), (6, 2, 2))), 2)):
+        generator = torch.Generator().manual_seed(0)
+        inputs = grid.to_grid(torch.randn(8, mesh.n_nodes, 3, generator=generator))
+        goal = torch.randn(8, mesh.n_nodes, 3, generator=generator)
+        network = new_network(4, 2, generator)
+        with torch.inference_mode():
+            flat = network(inputs).permute(0, 2, 3, 4, 1).reshape(8, -1, 3).numpy()
+        expected = np.square(grid.grid.weights.toarray() @ flat - goal.numpy()).mean()
+        assert train(network, grid, inputs, goal, TrainingPlan(1, 8, 1e-3, "constant", 0.999), generator)[0] == pytest.approx(expected, rel=1e-5)
 
 
 def test_one_cycle_rises_falls_and_stays_in_range() -> None:
@@ -211,13 +231,52 @@ def test_divergence_is_an_error(data: Dataset) -> None:
         method.fit(data.scene, data.train)
 
 
-def test_a_mesh_without_a_grid_is_not_supported(data: Dataset) -> None:
-    scene = replace(data.scene, mesh=replace(data.scene.mesh, grid_shape=None, grid_index=None))
-    method = mor_bench.load_method("umesh", **SMALL)
-    assert "regular grid" in str(method.supports(scene))
-    assert method.supports(data.scene) is None
-    with pytest.raises(UnsupportedSceneError, match="regular grid"):
-        method.fit(scene, data.train)
+@pytest.fixture(scope="module")
+def irregular() -> tuple[Snapshots, Snapshots]:
+    """Training and test samples of beam-tiny with tetrahedra whose nodes lie in no regular grid."""
+    spec = load_dataset_spec("beam-tiny").model_dump(mode="json", exclude_none=True)
+    scene = load_scene({**spec, "discretisation": {"element": "tetrahedron"}})
+    mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
+    scene = replace(scene, mesh=mesh, fixed_nodes=np.flatnonzero(mesh.points[:, 0] == 0))
+    loads = draw_loads(scene, 0, 140)
+    displacements = mor_bench.load_method("fem").fit(scene, None).predict(loads.nodal_forces(scene.patch_weights))
+    samples = Snapshots(scene, loads, displacements.reshape(140, -1)[:, scene.free_dofs], np.ones(140))
+    return samples[:100], samples[100:]
+
+
+@pytest.fixture(scope="module")
+def fitted_irregular(irregular: tuple[Snapshots, Snapshots]) -> Surrogate:
+    return mor_bench.load_method("umesh", **SMALL).fit(irregular[0].scene, irregular[0])
+
+
+def test_a_mesh_without_a_grid_is_learned(fitted_irregular: Surrogate, irregular: tuple[Snapshots, Snapshots]) -> None:
+    test = irregular[1]
+    assert test.scene.mesh.grid_index is None
+    assert fitted_irregular.grid_.places is None  # type: ignore[attr-defined]
+    answer = fitted_irregular.predict(test.forces)
+    assert mean_dof_error(answer, test.displacements) < 0.4 * mean_dof_error(np.zeros_like(answer), test.displacements)
+    assert (answer[:, test.scene.fixed_nodes] == 0).all()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_second_fit_without_a_grid_is_bit_identical(irregular: tuple[Snapshots, Snapshots], threads: int) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        first, second = (mor_bench.load_method("umesh", **{**SMALL, "iterations": 4}).fit(irregular[0].scene, irregular[0]) for _ in range(2))
+    finally:
+        torch.set_num_threads(before)
+    for name, array in first._state().items():
+        np.testing.assert_array_equal(array, second._state()[name], err_msg=name)
+
+
+def test_saved_and_loaded_without_a_grid_is_the_same_model(
+    fitted_irregular: Surrogate, irregular: tuple[Snapshots, Snapshots], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    path, test = tmp_path / "umesh.safetensors", irregular[1]
+    fitted_irregular.save(path)
+    monkeypatch.setattr("mor_bench.surrogate.load_scene", lambda _: test.scene)  # the file holds the spec, which names a box
+    np.testing.assert_array_equal(mor_bench.load_surrogate(path).predict(test.forces), fitted_irregular.predict(test.forces))
 
 
 @pytest.mark.parametrize(("knob", "value"), [("channels", 0), ("steps", 0), ("schedule", "step"), ("learning_rate", 0.0), ("seed", -1)])

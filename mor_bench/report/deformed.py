@@ -169,7 +169,7 @@ def _edges(facets: NDArray[np.int64]) -> NDArray[np.int64]:
 def _normals(points: NDArray[np.float64], facets: NDArray[np.int64]) -> NDArray[np.float64]:
     """(n_facets, 3) outward normals, as long as twice the facet's area."""
     corners = points[facets]
-    return np.asarray(np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]))
+    return np.asarray(np.cross(corners[:, 2] - corners[:, 0], corners[:, -1] - corners[:, 1]))
 
 
 def _facing(points: NDArray[np.float64], facets: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -23,6 +23,7 @@ from mor_bench.report.summary import (
     percent,
     short_names_used,
     size_of,
+    warnings_of,
 )
 from mor_bench.report.tables import target_cells
 from mor_bench.snapshots.store import write_atomically
@@ -248,7 +249,7 @@ def _configuration_table(entries: Sequence[Entry]) -> str:
 def _troubles(entries: Sequence[Entry]) -> str:
     """Failed and skipped configurations, those with failed samples, each with its reason, and all warnings."""
     said = [("bad", e.label, e.trouble) for e in entries if e.trouble]
-    said += [("", e.label, f"warning: {warning}") for e in entries for warning in e.warnings]
+    said += [("", label, f"warning: {warning}") for label, warning in warnings_of(entries)]
     rows = "".join(
         f'<tr class="{kind}"><td class="text">{escape(label)}</td><td class="reason">{escape(text)}</td></tr>' for kind, label, text in said
     )

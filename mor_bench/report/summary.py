@@ -122,6 +122,15 @@ def entries_of(comparison: Comparison, dataset: str) -> list[Entry]:
     ]
 
 
+def warnings_of(entries: Sequence[Entry]) -> list[tuple[str, str]]:
+    """Each different warning, after the label of the configuration that gave it, or how many did."""
+    labels: dict[str, list[str]] = {}
+    for entry in entries:
+        for warning in entry.warnings:
+            labels.setdefault(warning, []).append(entry.label)
+    return [(given[0] if len(given) == 1 else f"{given[0]} and {len(given) - 1} more", warning) for warning, given in labels.items()]
+
+
 def best_per_method(entries: Sequence[Entry]) -> list[Entry]:
     """Of each method that ran, the configuration with the smallest ē (then the smallest median error)."""
     ran = [entry for entry in entries if entry.ran]

@@ -26,6 +26,7 @@ from mor_bench.report.summary import (
     percent,
     short_names_used,
     short_swept,
+    warnings_of,
 )
 
 NOT_REACHED = "not reached"
@@ -177,7 +178,7 @@ def _dataset_group(comparison: Comparison, dataset: str, width: int) -> Group:
     entries, needs = entries_of(comparison, dataset), needs_of(comparison, dataset)
     title = str(comparison.datasets.get(dataset, {}).get("title", ""))
     notes = [Text(f"{entry.label}: {entry.trouble}", style="red") for entry in entries if entry.trouble]
-    notes += [Text(f"{entry.label}: warning: {warning}", style="yellow") for entry in entries for warning in entry.warnings]
+    notes += [Text(f"{label}: warning: {warning}", style="yellow") for label, warning in warnings_of(entries)]
     parts: list[RenderableType] = [
         Text(f"{dataset}{f' – {title}' if title else ''}", style="bold"),
         Text(f"needs: relative L2 (median) ≤ {percent(needs['error'])} %, latency (median) ≤ {number(needs['latency_ms'])} ms"),

@@ -7,7 +7,7 @@ of fixed area means the same load on every mesh.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil, sqrt
+from math import ceil, pi, sqrt
 
 import numpy as np
 import scipy.sparse as sp
@@ -140,10 +140,12 @@ def cut_patches(surface: Facets, facets: NDArray[np.int64], centres: NDArray[np.
     nearness = sqrt(area_m2) * 1e-9
     rows, columns, shares = [], [], []
     for row, centre in enumerate(surface.points[centres]):
-        distance = np.round(np.linalg.norm(positions - centre, axis=1) / nearness)
-        order = np.argsort(distance, kind="stable")
+        near, distance = _nearest(positions, areas, centre, area_m2)
+        distance = np.round(distance / nearness)
+        order = near[np.argsort(distance, kind="stable")]
+        distance = np.sort(distance)
         # Points at the same distance enter together, each with the same fraction, so that a symmetric patch stays so.
-        ends = np.flatnonzero(np.append(np.diff(distance[order]) > 0, True))
+        ends = np.flatnonzero(np.append(np.diff(distance) > 0, True))
         filled = np.cumsum(areas[order])[ends]
         last = min(int(np.searchsorted(filled, area_m2)), len(ends) - 1)
         first_of_last = ends[last - 1] + 1 if last else 0
@@ -156,6 +158,21 @@ def cut_patches(surface: Facets, facets: NDArray[np.int64], centres: NDArray[np.
     at = np.concatenate(rows), np.concatenate(columns)
     cut = sp.csr_array((np.concatenate(shares), at), shape=(len(centres), len(areas)))
     return Patches(cut, positions, values, vectors / areas[:, None])
+
+
+def _nearest(
+    positions: NDArray[np.float64], areas: NDArray[np.float64], centre: NDArray[np.float64], area_m2: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:  # fmt: skip
+    """Rising numbers of points around a centre that have more than the wanted area together, or of all; and their distances, m."""
+    distance = np.linalg.norm(positions - centre, axis=1)
+    reach = 2 * sqrt(area_m2 / pi)
+    while reach < distance.max():
+        # Points about as far as the furthest one belong together; none of them may be left out.
+        near = np.flatnonzero(distance <= reach)
+        if areas[distance <= 0.999 * reach].sum() > area_m2:
+            return near, distance[near]
+        reach *= 2
+    return np.arange(len(distance)), distance
 
 
 def spread_out(points: NDArray[np.float64], n: int) -> NDArray[np.int64]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene, imported_scene, load_scene
+from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import Progress, generate, n_samples_to_generate, read_shards
 from mor_bench.snapshots.imported import NodalLoads, nodal_loads, read_samples
 from mor_bench.snapshots.sampling import PatchLoads, repeated
@@ -102,7 +102,7 @@ class Dataset:
     test: Snapshots
     n_refused: int
     n_unused: int = 0
-    tests: dict[SetName, Snapshots] = field(default_factory=dict)
+    tests: dict[str, Snapshots] = field(default_factory=dict)
 
 
 def load_dataset(
@@ -112,6 +112,7 @@ def load_dataset(
     split: SplitBy | None = None,
     tests: Sequence[SetName] = (),
     workers: int | None = None,
+    cluster: str | None = None,
     cache: Path | None = None,
     progress: Progress | None = None,
 ) -> Dataset:
@@ -129,6 +130,8 @@ def load_dataset(
         Named test sets to read beside the main one, see `mor_bench.snapshots.test_sets`.
     workers : int, optional
         Processes for generation; all cores by default.
+    cluster : str, optional
+        Address of a Dask scheduler whose workers generate instead, ``tcp://host:port``.
     cache : Path, optional
         Cache folder; the user's by default.
     progress : callable, optional
@@ -139,11 +142,14 @@ def load_dataset(
     SpecError
         If the dataset is not valid.
     InvalidInputError
-        If ``limit`` or ``workers`` is less than 1, or a part of the split would be empty.
+        If ``limit`` or ``workers`` is less than 1, ``cluster`` is no address or given beside ``workers``, or a part of the
+        split would be empty.
+    StoreError, WorkerError, MissingDependencyError
+        If generation cannot go on, see `mor_bench.snapshots.generate.generate`.
     """
-    for name, value in (("limit", limit), ("workers", workers)):
-        if value is not None and value < 1:
-            raise InvalidInputError(f"`{name}` must be an integer >= 1; got {value}.")
+    if limit is not None and limit < 1:
+        raise InvalidInputError(f"`limit` must be an integer >= 1; got {limit}.")
+    check_pool(workers, cluster)
     if split not in (None, *get_args(SplitBy)):
         raise InvalidInputError(f"`split` must be one of {', '.join(get_args(SplitBy))}; got {split!r}.")
     spec = source if isinstance(source, DatasetSpec | ImportedDatasetSpec) else load_dataset_spec(source)
@@ -153,14 +159,16 @@ def load_dataset(
     if "unseen-regions" in others:
         check_regions(spec)
     by = Split(test_fraction=spec.split.test_fraction, by=split or spec.split.by)
-    stores = [_Store(item, generate(item, limit, workers or os.cpu_count() or 1, cache, progress), limit) for item in (spec, *others.values())]
-    if n_repeated := repeated([store.loads for store in stores]):
+    stores = [_Store(item, generate(item, limit, workers, cache, progress, cluster), limit) for item in (spec, *others.values())]
+    if n_repeated := repeated([(store.scene, store.loads) for store in stores]):
         raise InvalidInputError(f"{spec.name}: {n_repeated} samples repeat others; are `seed` and `magnitude_n` as they should be?")
     main = stores[0]
     valid = np.flatnonzero(main.status == 0)
     parts = split_samples(main.loads[valid], len(main.scene.patch_nodes), by, spec.loads.seed)
     train, test = main.snapshots([valid[part] for part in parts])
-    sets = {name: store.snapshots([np.flatnonzero(store.status == 0)])[0] for name, store in zip(others, stores[1:], strict=True)}
+    sets: dict[str, Snapshots] = {
+        name: store.snapshots([np.flatnonzero(store.status == 0)])[0] for name, store in zip(others, stores[1:], strict=True)
+    }
     return Dataset(main.scene, train, test, len(main.status) - len(valid), len(valid) - len(train) - len(test), sets)
 
 
@@ -201,6 +209,6 @@ def stream(
     """The valid samples of a dataset, train and test together, a hundred at a time; parameters as of `load_dataset`."""
     spec = generated(source if isinstance(source, DatasetSpec | ImportedDatasetSpec) else load_dataset_spec(source))
     scene = load_scene(spec)
-    folder = generate(spec, limit, workers or os.cpu_count() or 1, cache)
+    folder = generate(spec, limit, workers, cache)
     for shard in read_shards(folder, n_samples_to_generate(spec, limit)):
         yield Snapshots(scene, PatchLoads(shard.patches, shard.vectors), shard.displacements, shard.min_det_f)[np.flatnonzero(shard.status == 0)]

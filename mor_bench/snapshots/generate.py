@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, as_completed
 from contextlib import contextmanager, suppress
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from threading import Thread
-from time import perf_counter, sleep
 
 import numpy as np
 import platformdirs
-from threadpoolctl import threadpool_limits
 
-from mor_bench.errors import InvertedElementError, StoreError
-from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.mechanics.newton import Solution
-from mor_bench.scene.scene import load_scene
-from mor_bench.snapshots.sampling import draw_loads, n_samples_of
-from mor_bench.snapshots.store import SCHEMA_VERSION, STATUSES, Shard, read_shard, write_atomically, write_shard
+from mor_bench.errors import StoreError
+from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.snapshots.executors import KEPT, check_pool, open_pool
+from mor_bench.snapshots.manifest import Manifest, update_manifest
+from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of
+from mor_bench.snapshots.solve import GENERATOR_VERSION, Solved, Task, pack, solve_task
+from mor_bench.snapshots.store import SCHEMA_VERSION, STATUSES, Shard, read_shard, remove_leftovers, write_atomically, write_shard
 from mor_bench.specs import DatasetSpec
 
 SHARD_SIZE = 100
 """Samples per shard."""
 
-GENERATOR_VERSION = 3
-"""Raised when a change of the full-order model or of the sampling changes samples; part of a dataset's folder name."""
+ROUND_OFF = 1e-9
+"""Relative difference of loads that is another processor's round-off, and not another sample."""
 
 Progress = Callable[[int, int], None]
 """Called with the samples done and the samples wanted."""
@@ -39,9 +35,14 @@ def default_cache() -> Path:
     return Path(platformdirs.user_cache_dir("mor-bench"))
 
 
+def dataset_key(spec: DatasetSpec) -> str:
+    """What tells a dataset's samples from all others: a digest of all that decides them, and the versions."""
+    return f"{spec.digest()}-v{SCHEMA_VERSION}.{GENERATOR_VERSION}"
+
+
 def dataset_folder(spec: DatasetSpec, cache: Path | None) -> Path:
-    """Where a dataset lies: its name, and a digest of all that decides its samples."""
-    return (cache or default_cache()) / "datasets" / f"{spec.name}-{spec.digest()}-v{SCHEMA_VERSION}.{GENERATOR_VERSION}"
+    """Where a dataset lies: its name and its key."""
+    return (cache or default_cache()) / "datasets" / f"{spec.name}-{dataset_key(spec)}"
 
 
 def shard_path(folder: Path, number: int) -> Path:
@@ -60,122 +61,171 @@ def read_shards(folder: Path, n_samples: int) -> Iterator[Shard]:
         yield read_shard(shard_path(folder, start // SHARD_SIZE)).first(n_samples - start)
 
 
-@lru_cache(maxsize=1)
-def _model(spec_json: str) -> FullOrderModel:
-    """A worker builds the model once and keeps it for its later shards."""
-    return FullOrderModel(load_scene(DatasetSpec.model_validate_json(spec_json)))
+@dataclass(frozen=True)
+class _Plan:
+    """Which shards a folder should hold, each known by its number."""
 
+    folder: Path
+    scene: Scene
+    n_wanted: int
 
-def solve_shard(spec_json: str, number: int) -> tuple[Shard, float]:
-    """Solve the samples of one shard, on one thread; also the seconds that the solves took. Runs in a worker."""
-    model = _model(spec_json)
-    scene = model.scene
-    start = number * SHARD_SIZE
-    loads = draw_loads(scene, start, min(start + SHARD_SIZE, n_samples_of(scene)))
-    forces = loads.nodal_forces(scene.patch_weights).reshape(len(loads), -1)[:, scene.free_dofs]
-    displacements = np.full((len(loads), model.n_unknowns), np.nan)
-    min_det_f, status = np.full(len(loads), np.nan), np.zeros(len(loads), dtype=np.uint8)
-    with threadpool_limits(1):
-        begun = perf_counter()
-        for row, found in enumerate(model.solve_many(forces)):
-            if isinstance(found, Solution):
-                displacements[row], min_det_f[row] = found.displacement, found.min_det_f
-            else:
-                status[row] = STATUSES.index("inverted" if isinstance(found, InvertedElementError) else "no-equilibrium")
-        seconds = perf_counter() - begun
-    return Shard(start, loads.patches, loads.vectors, displacements, min_det_f, status), seconds
+    @property
+    def numbers(self) -> range:
+        return range(-(-self.n_wanted // SHARD_SIZE))
 
+    def n_wanted_of(self, number: int) -> int:
+        """How many of a shard's samples are wanted; it has more if a limit ends in it."""
+        return min(SHARD_SIZE, self.n_wanted - number * SHARD_SIZE)
 
-def _is_sound(path: Path) -> bool:
-    try:
-        read_shard(path)
-    except (StoreError, FileNotFoundError):
-        return False
-    return True
+    def loads(self, number: int) -> PatchLoads:
+        start = number * SHARD_SIZE
+        return draw_loads(self.scene, start, min(start + SHARD_SIZE, n_samples_of(self.scene)))
 
+    @cached_property
+    def key(self) -> str:
+        return dataset_key(self.scene.generated)
 
-def _end_with(parent: int) -> None:
-    """Let this worker end when its parent has died by a signal that no one can catch; otherwise it would wait for ever."""
+    @cached_property
+    def _problem(self) -> bytes:
+        return pack(self.scene)
 
-    def watch() -> None:
-        while os.getppid() == parent:
-            sleep(1.0)
-        os._exit(1)
+    def task(self, number: int) -> Task:
+        return Task(self.key, self._problem, number * SHARD_SIZE, self.loads(number))
 
-    Thread(target=watch, daemon=True).start()
+    def has(self, number: int) -> bool:
+        """Whether a shard is there, is sound, and is the one that it should be."""
+        try:
+            shard = read_shard(shard_path(self.folder, number))
+        except (StoreError, FileNotFoundError):
+            return False
+        named = shard.dataset == self.key and shard.start == number * SHARD_SIZE
+        return named and self._is_filled(shard) and self._is_loaded(shard, self.loads(number))
+
+    def _is_filled(self, shard: Shard) -> bool:
+        n = len(shard.status)
+        shapes = shard.displacements.shape == (n, len(self.scene.free_dofs)) and shard.min_det_f.shape == (n,)
+        valid = shard.status == 0
+        return bool(shapes and (shard.status < len(STATUSES)).all() and np.isfinite(shard.displacements[valid]).all())
+
+    def _is_loaded(self, shard: Shard, loads: PatchLoads) -> bool:
+        if shard.patches.shape != loads.patches.shape or shard.vectors.shape != loads.vectors.shape or len(shard.status) != len(loads):
+            return False
+        difference = np.abs(shard.vectors - loads.vectors).max()
+        return bool((shard.patches == loads.patches).all() and difference <= ROUND_OFF * self.scene.generated.loads.magnitude_n[1])
 
 
 @contextmanager
-def worker_pool(workers: int) -> Iterator[Executor]:
-    """Worker processes that need no `if __name__ == "__main__"` in the caller's script, and end with their parent."""
-    from loky import ProcessPoolExecutor
-
-    executor = ProcessPoolExecutor(max_workers=workers, initializer=_end_with, initargs=(os.getpid(),))
+def _writing(folder: Path) -> Iterator[None]:
+    """Turn the system's errors into one that names the folder."""
     try:
-        yield executor
-    except BaseException:
-        executor.shutdown(kill_workers=True)
-        raise
-    executor.shutdown()
+        yield
+    except OSError as error:
+        raise StoreError(f"{folder}: cannot be written: {error.strerror or error}. {KEPT}") from error
 
 
 def generate(
-    spec: DatasetSpec, limit: int | None = None, workers: int = 1, cache: Path | None = None, progress: Progress | None = None
-) -> Path:  # fmt: skip
+    spec: DatasetSpec,
+    limit: int | None = None,
+    workers: int | None = None,
+    cache: Path | None = None,
+    progress: Progress | None = None,
+    cluster: str | None = None,
+) -> Path:
     """Make sure that the shards of a dataset exist; what is there and sound is kept, what is damaged is made again.
+
+    Several processes may generate the same dataset into the same folder at once. No more than a few shards per worker are
+    in memory, however many there are. Neither what is stopped nor where it is solved changes a bit; processors of another
+    kind, with other instructions, agree to the solver's tolerance.
 
     Parameters
     ----------
     spec : DatasetSpec
     limit : int, optional
         Only the first samples.
-    workers : int
-        Processes; 1 solves in this one.
+    workers : int, optional
+        Processes, all cores by default; 1 solves in this one.
     cache : Path, optional
         Cache folder; the user's by default.
     progress : callable, optional
-        Called with (samples done, samples wanted) after each shard.
+        Called with (samples done, samples wanted) before the first and after each shard.
+    cluster : str, optional
+        Solve on the workers of the Dask scheduler at this address, ``tcp://host:port``. They need this version of
+        mor-bench, no disk in common, and one thread each for the best rate.
 
     Returns
     -------
     Path
         The dataset's folder.
+
+    Raises
+    ------
+    InvalidInputError
+        If ``workers`` is less than 1, ``cluster`` is no address, or both are given.
+    StoreError
+        If the folder cannot be written, as on a full disk. Finished shards stay.
+    WorkerError
+        If workers were killed, or the cluster cannot be reached. Finished shards stay.
+    MissingDependencyError
+        If ``cluster`` is given without the extra of that name.
     """
-    folder = dataset_folder(spec, cache)
-    folder.mkdir(parents=True, exist_ok=True)
-    total = n_samples_to_generate(spec, limit)
-    numbers = range(-(-total // SHARD_SIZE))
-    manifest = {
-        "schema_version": SCHEMA_VERSION,
-        "generator_version": GENERATOR_VERSION,
-        "shard_size": SHARD_SIZE,
-        "spec": spec.model_dump(mode="json"),
-    }
-    write_atomically(folder / "manifest.json", json.dumps(manifest, indent=1, sort_keys=True).encode())
-    missing = [number for number in numbers if not _is_sound(shard_path(folder, number))]
-    done = total - len(missing) * SHARD_SIZE
-
-    def commit(number: int, shard: Shard, seconds: float) -> None:
-        nonlocal done
-        write_shard(shard_path(folder, number), shard)
-        write_atomically(folder / f"seconds-{number:05d}.txt", f"{seconds:.6f}\n".encode())
-        done += SHARD_SIZE
-        if progress:
-            progress(min(max(done, 0), total), total)
-
-    text = spec.model_dump_json()
-    if missing:
+    check_pool(workers, cluster)
+    scene, folder = load_scene(spec), dataset_folder(spec, cache)
+    whole = n_samples_of(scene)
+    plan = _Plan(folder, scene, whole if limit is None else min(limit, whole))
+    with _writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(folder)
+    missing = [number for number in plan.numbers if not plan.has(number)]
+    with _writing(folder):
+        update_manifest(folder, Manifest(spec, GENERATOR_VERSION, whole, SHARD_SIZE), solves=bool(missing))
+    count = _Count(plan, missing, progress)
+    if missing and cluster is None:
         # Compiles the kernels, or reads them from numba's cache, here rather than in every worker at once.
-        commit(missing[0], *solve_shard(text, missing[0]))
-    if len(missing) > 1 and workers > 1:
-        with worker_pool(workers) as executor:
-            futures: dict[Future[tuple[Shard, float]], int] = {executor.submit(solve_shard, text, number): number for number in missing[1:]}
-            for future in as_completed(futures):
-                commit(futures[future], *future.result())
-    else:
-        for number in missing[1:]:
-            commit(number, *solve_shard(text, number))
+        _fill(plan, missing[:1], count, workers=1)
+        missing = missing[1:]
+    if missing:
+        _fill(plan, missing, count, workers if len(missing) > 1 else 1, cluster)
     return folder
+
+
+class _Count:
+    """How many of the samples that are wanted are there."""
+
+    def __init__(self, plan: _Plan, missing: list[int], progress: Progress | None) -> None:
+        self._plan, self._progress = plan, progress
+        self._done = plan.n_wanted - sum(map(plan.n_wanted_of, missing))
+        self._tell()
+
+    def add(self, number: int) -> None:
+        self._done += self._plan.n_wanted_of(number)
+        self._tell()
+
+    def _tell(self) -> None:
+        if self._progress:
+            self._progress(self._done, self._plan.n_wanted)
+
+
+def _fill(plan: _Plan, missing: list[int], count: _Count, workers: int | None, cluster: str | None = None) -> None:
+    """Solve the shards that are missing, and commit each when it is there."""
+
+    def tasks() -> Iterator[Task]:
+        for number in missing:
+            if plan.has(number):  # meanwhile another process has made it
+                count.add(number)
+            else:
+                yield plan.task(number)
+
+    with open_pool(workers, cluster) as pool:
+        for solved in pool.in_any_order(solve_task, tasks()):
+            number = solved.shard.start // SHARD_SIZE
+            _commit(plan.folder, number, solved)
+            count.add(number)
+
+
+def _commit(folder: Path, number: int, solved: Solved) -> None:
+    with _writing(folder):
+        write_shard(shard_path(folder, number), solved.shard)
+        write_atomically(folder / f"seconds-{number:05d}.txt", f"{solved.seconds:.6f}\n".encode())
 
 
 def generation_seconds(spec: DatasetSpec, cache: Path | None, n_samples: int) -> float | None:

@@ -17,6 +17,7 @@ Neither the order of generation nor the number of workers changes a sample.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -118,7 +119,7 @@ def far_apart(centres: bytes, k: int, distance: float) -> NDArray[np.int64]:
     apart &= np.triu(np.ones_like(apart), 1)
     sets, allowed = np.arange(len(points))[:, None], np.ones_like(apart)
     for _ in range(k - 1):
-        allowed = allowed & apart[sets[:, -1]] if len(sets[0]) > 1 else apart
+        allowed = allowed & apart[sets[:, -1]] if sets.shape[1] > 1 else apart
         n = int(allowed.sum())
         if n > MAX_COMBINATIONS:
             raise SpecError(f"`min_distance_m` must leave at most {MAX_COMBINATIONS:,} combinations of patches; {distance:g} leaves {n:,} or more.")
@@ -181,9 +182,9 @@ def _tangents(normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     return first, np.cross(normals, first)
 
 
-def repeated(parts: list[PatchLoads]) -> int:
-    """How many samples of some sets of loads are there already in the same or an earlier set."""
-    rows = [np.hstack([part.patches, part.vectors.reshape(len(part), -1)]) for part in parts if len(part)]
+def repeated(parts: Sequence[tuple[Scene, PatchLoads]]) -> int:
+    """How many samples of some sets of loads, all on one body, are there already in the same or an earlier set."""
+    rows = [np.hstack([scene.patch_nodes[loads.patches], loads.vectors.reshape(len(loads), -1)]) for scene, loads in parts]
     widest = max(row.shape[1] for row in rows)
     together = np.concatenate([np.pad(row, ((0, 0), (0, widest - row.shape[1])), constant_values=np.inf) for row in rows])
     ordered = together[np.lexsort(together.T)]

@@ -81,6 +81,20 @@ def spec_of_set(spec: DatasetSpec, name: SetName) -> DatasetSpec:
     return DatasetSpec.model_validate(content)
 
 
+def with_test_sets(spec: DatasetSpec) -> list[DatasetSpec]:
+    """A dataset and all the test sets that it has.
+
+    Raises
+    ------
+    InvalidInputError
+        If the loads of `unseen-regions` act where those of the main set do.
+    """
+    names = available_sets(spec)
+    if "unseen-regions" in names:
+        check_regions(spec)
+    return [spec, *(spec_of_set(spec, name) for name in names)]
+
+
 def check_regions(spec: DatasetSpec) -> None:
     """Check that the loads of the set `unseen-regions` act nowhere where those of the main set do.
 

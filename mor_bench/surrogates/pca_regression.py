@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from math import comb
 from typing import Annotated, Any, Literal, Self
 
@@ -16,9 +15,6 @@ from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
-
-LINEAR_TAIL = 1e-8
-"""Singular values of the linear response below this fraction of the largest are dropped."""
 
 
 def monomial_indices(n_variables: int, degree: int) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
@@ -85,74 +81,47 @@ class PCARegression(Surrogate):
 
         with self._fitting(scene):
             snapshots = self._checked_snapshots(snapshots)
-            loaded = self._loaded(scene)
-            forces, targets = snapshots.free_forces[:, loaded], snapshots.free_displacements
+            forces, targets = snapshots.free_forces, snapshots.free_displacements
             if self.input == "linear-response":
-                compliance = FullOrderModel(scene).rest_factor.solve(np.eye(len(scene.free_dofs))[:, loaded])
-                linear = pod(compliance.T)
-                response = linear.modes[:, linear.singular_values[: linear.modes.shape[1]] > LINEAR_TAIL * linear.singular_values[0]]
-                to_input = response.T @ compliance
-                targets = targets - forces @ compliance.T
+                inputs = FullOrderModel(scene).rest_factor.solve(forces.T).T
+                targets = targets - inputs
             else:
-                response, to_input = np.zeros((len(scene.free_dofs), 0)), np.eye(len(loaded))
-            inputs = forces @ to_input.T
-            axes = pod(inputs).modes[:, : self.n_input_modes]
-            axes = axes / np.sqrt(((inputs @ axes) ** 2).mean(axis=0))
+                inputs = forces
+            used = np.flatnonzero(inputs.any(axis=0))  # of forces only a few columns
+            modes = pod(inputs[:, used]).modes[:, : self.n_input_modes]
+            axes = np.zeros((inputs.shape[1], modes.shape[1]))
+            axes[used] = modes / np.sqrt(((inputs[:, used] @ modes) ** 2).mean(axis=0))
             features = monomials(inputs @ axes, monomial_indices(axes.shape[1], self.degree))
             feature_scale = np.sqrt((features**2).mean(axis=0))
             modes = pod(targets).modes[:, : self.n_output_modes]
             regression = Ridge(alpha=self.ridge * len(features), fit_intercept=False, solver="cholesky")
             regression.fit(features / feature_scale, targets @ modes)
             weights = np.atleast_2d(regression.coef_) / feature_scale
-            self._restore({"response": response, "to_input": to_input, "axes": axes, "modes": modes, "weights": weights})
+            self._restore({"axes": axes, "modes": modes, "weights": weights})
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces).reshape(-1, self.scene_.mesh.n_dofs)
         free = batch[:, self.scene_.free_dofs]
         out = np.zeros_like(batch)
-        if self.input == "linear-response" and free[:, self._elsewhere].any():
-            # Forces where no load region is: their linear response was not tabulated, so it is solved for.
-            linear = self.model_.rest_factor.solve(free.T).T
-            coordinates = linear @ self.response_
-        else:
-            coordinates = free[:, self._loaded_dofs] @ self.to_input_.T
-            linear = coordinates @ self.response_.T if self.input == "linear-response" else np.zeros_like(free)
-        features = monomials(coordinates @ self.axes_, self._levels)
-        out[:, self.scene_.free_dofs] = linear + (features @ self.weights_.T) @ self.modes_.T
+        inputs = self.model_.rest_factor.solve(free.T).T if self.input == "linear-response" else free
+        nonlinear = (monomials(inputs @ self.axes_, self._levels) @ self.weights_.T) @ self.modes_.T
+        out[:, self.scene_.free_dofs] = inputs + nonlinear if self.input == "linear-response" else nonlinear
         return out.reshape(np.shape(forces))
 
-    @staticmethod
-    def _loaded(scene: Scene) -> NDArray[np.int64]:
-        """Rows, among the free dofs, of those that loads act on."""
-        return np.flatnonzero(np.isin(scene.free_dofs // 3, scene.loaded_nodes))
-
     def _state(self) -> dict[str, NDArray[Any]]:
-        return {"response": self.response_, "to_input": self.to_input_, "axes": self.axes_, "modes": self.modes_, "weights": self.weights_}
+        return {"axes": self.axes_, "modes": self.modes_, "weights": self.weights_}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         # One memory order, fitted or loaded: BLAS rounds differently in another.
         state = {name: np.ascontiguousarray(array) for name, array in state.items()}
-        n_free, n_loaded = len(self.scene_.free_dofs), len(self._loaded(self.scene_))
-        n_inputs, n_modes = state["to_input"].shape[0], state["modes"].shape[1]
-        n_features = sum(comb(state["axes"].shape[1] + d - 1, d) for d in range(1, self.degree + 1))
-        shapes = {
-            "response": (n_free, n_inputs if self.input == "linear-response" else 0),
-            "to_input": (n_inputs, n_loaded),
-            "axes": (n_inputs, state["axes"].shape[1]),
-            "modes": (n_free, n_modes),
-            "weights": (n_modes, n_features),
-        }
-        for name, shape in shapes.items():
+        n_free, n_axes, n_modes = len(self.scene_.free_dofs), state["axes"].shape[1], state["modes"].shape[1]
+        n_features = sum(comb(n_axes + d - 1, d) for d in range(1, self.degree + 1))
+        for name, shape in {"axes": (n_free, n_axes), "modes": (n_free, n_modes), "weights": (n_modes, n_features)}.items():
             if state[name].shape != shape or not np.isfinite(state[name]).all():
                 raise InvalidInputError(f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}.")
-        self.response_, self.to_input_, self.axes_ = state["response"], state["to_input"], state["axes"]
-        self.modes_, self.weights_ = state["modes"], state["weights"]
-        self._loaded_dofs = self._loaded(self.scene_)
-        self._elsewhere = np.setdiff1d(np.arange(len(self.scene_.free_dofs)), self._loaded_dofs)
-        self._levels = monomial_indices(self.axes_.shape[1], self.degree)
-
-    @cached_property
-    def model_(self) -> FullOrderModel:
-        """The full-order model, for the linear response to forces outside the load region."""
-        return FullOrderModel(self.scene_)
+        self.axes_, self.modes_, self.weights_ = state["axes"], state["modes"], state["weights"]
+        self._levels = monomial_indices(n_axes, self.degree)
+        if self.input == "linear-response":
+            self.model_ = FullOrderModel(self.scene_)
+            _ = self.model_.rest_factor

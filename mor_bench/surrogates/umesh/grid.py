@@ -3,62 +3,78 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 import torch
 from torch import Tensor
 
-from mor_bench.scene.mesh import Mesh
+from mor_bench.scene.grid import GridMap
 
 
 @dataclass(frozen=True)
 class PaddedGrid:
-    """A regular grid whose sides are multiples of 2^k, and the place in it of each node of a mesh.
+    """A regular grid whose sides are multiples of 2^k, between the nodal forces and the nodal displacements of a mesh.
 
     Values lie channels-last in memory, as `Snapshots` has them: on a box without padding the grid is the nodal array itself.
 
     Attributes
     ----------
-    shape : (int, int, int)
-        Points per axis, padding included.
-    places : (n_nodes,) int64 tensor
-        Place of each node, flattened in C order.
-    body : (1, 1, x, y, z) float32 tensor
-        1 at nodes of the mesh, 0 at padding.
+    grid : GridMap
+        With the padding; weights in float32.
+    places : (n_nodes,) int64 tensor or None
+        The grid point on which each node lies, if each lies on one of its own. Values are then moved, which takes a fourth
+        of the time of a sparse product.
     """
 
-    shape: tuple[int, int, int]
-    places: Tensor
-    body: Tensor
+    grid: GridMap
+    places: Tensor | None
 
     @property
-    def n_points(self) -> int:
-        return self.body.numel()
+    def shape(self) -> tuple[int, int, int]:
+        """Points per axis, padding included."""
+        return self.grid.shape
 
-    def to_grid(self, nodal: Tensor) -> Tensor:
-        """(n, n_nodes, 3) → (n, 3, x, y, z) with zeros at padding, channels-last in memory."""
-        flat = nodal.new_zeros(len(nodal), self.n_points, 3)
-        flat[:, self.places] = nodal
+    def to_grid(self, forces: Tensor) -> Tensor:
+        """Nᵀ f: (n, n_nodes, 3) → (n, 3, x, y, z) with zeros at padding, channels-last in memory."""
+        if self.places is None:
+            flat = torch.from_numpy(self.grid.forces_to_grid(forces.numpy()))
+        else:
+            flat = forces.new_zeros(len(forces), self.grid.weights.shape[1], 3).index_copy_(1, self.places, forces)
         return flat.view(-1, *self.shape, 3).permute(0, 4, 1, 2, 3)
 
     def to_nodes(self, values: Tensor) -> Tensor:
-        """(n, 3, x, y, z) → (n, n_nodes, 3)."""
-        return values.permute(0, 2, 3, 4, 1).reshape(len(values), self.n_points, 3)[:, self.places]
+        """N u: (n, 3, x, y, z) → (n, n_nodes, 3), differentiable."""
+        nodal: Tensor = _ToNodes.apply(values, self)  # type: ignore[no-untyped-call]
+        return nodal
 
 
-def padded_grid(mesh: Mesh, steps: int) -> PaddedGrid:
-    """The grid of a mesh, padded at the high end of each axis to a multiple of 2^steps.
+class _ToNodes(torch.autograd.Function):
+    """N u, with the gradient Nᵀ g.
 
-    Raises
-    ------
-    ValueError
-        If the mesh lies in no regular grid.
+    Both add in a fixed order on any number of threads; the backward pass of torch's indexing adds atomically.
     """
-    if mesh.grid_shape is None or mesh.grid_index is None:
-        raise ValueError("the mesh lies in no regular grid.")
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, padded: PaddedGrid) -> Tensor:
+        ctx.padded = padded
+        flat = values.detach().permute(0, 2, 3, 4, 1).reshape(len(values), padded.grid.weights.shape[1], 3)
+        if padded.places is None:
+            return torch.from_numpy(padded.grid.displacements_to_nodes(flat.numpy()))
+        return flat.index_select(1, padded.places)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return ctx.padded.to_grid(gradient), None
+
+
+def padded_grid(grid: GridMap, steps: int) -> PaddedGrid:
+    """A grid, padded at the high end of each axis to a multiple of 2^steps."""
     multiple = 2**steps
-    nx, ny, nz = (-(-n // multiple) * multiple for n in mesh.grid_shape)
-    places = np.ravel_multi_index(np.unravel_index(mesh.grid_index, mesh.grid_shape), (nx, ny, nz))
-    body = np.zeros(nx * ny * nz, dtype=np.float32)
-    body[places] = 1.0
-    return PaddedGrid((nx, ny, nz), torch.from_numpy(places.astype(np.int64)), torch.from_numpy(body).view(1, 1, nx, ny, nz))
+    nx, ny, nz = (-(-n // multiple) * multiple for n in grid.shape)
+    entries = grid.weights.astype(np.float32).tocoo()
+    columns = np.ravel_multi_index(np.unravel_index(entries.col, grid.shape), (nx, ny, nz))
+    weights = sp.csr_array((entries.data, (entries.row, columns)), shape=(entries.shape[0], nx * ny * nz))
+    on_points = (np.diff(weights.indptr) == 1).all() and (weights.data == 1).all() and len(np.unique(columns)) == len(columns)
+    return PaddedGrid(GridMap((nx, ny, nz), weights), torch.from_numpy(weights.indices.astype(np.int64)) if on_points else None)

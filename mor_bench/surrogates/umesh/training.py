@@ -1,4 +1,4 @@
-"""Training of the U-Net: mean squared error over the body, Adam, a fixed number of iterations."""
+"""Training of the U-Net: mean squared error over the nodes, Adam, a fixed number of iterations."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mor_bench.errors import MorBenchError
+from mor_bench.surrogates.umesh.grid import PaddedGrid
 from mor_bench.surrogates.umesh.network import UNet
 
 Schedule = Literal["constant", "one-cycle"]
@@ -47,7 +48,9 @@ def rate_factor(schedule: Schedule, iteration: int, iterations: int) -> float:
     return 0.5 * (1.0 + cos(pi * (progress - WARM_UP) / (1.0 - WARM_UP)))
 
 
-def train(network: UNet, inputs: Tensor, targets: Tensor, body: Tensor, plan: TrainingPlan, generator: torch.Generator) -> NDArray[np.float64]:
+def train(
+    network: UNet, grid: PaddedGrid, inputs: Tensor, displacements: Tensor, plan: TrainingPlan, generator: torch.Generator
+) -> NDArray[np.float64]:  # fmt: skip
     """Change the network's weights to lower the mean squared error.
 
     Every epoch is a new permutation; a last, smaller batch is left out.
@@ -55,10 +58,12 @@ def train(network: UNet, inputs: Tensor, targets: Tensor, body: Tensor, plan: Tr
     Parameters
     ----------
     network : UNet
-    inputs, targets : (n_samples, 3, x, y, z) float32
-        Scaled forces and displacements on the padded grid.
-    body : (1, 1, x, y, z) float32
-        1 where the error counts, 0 at padding.
+    grid : PaddedGrid
+        Takes the network's output to the nodes, where the error counts.
+    inputs : (n_samples, 3, x, y, z) float32
+        Scaled forces on the grid.
+    displacements : (n_samples, n_nodes, 3) float32
+        Scaled displacements at the nodes.
     plan : TrainingPlan
     generator : torch.Generator
         Draws the permutations; no global random state is read or changed.
@@ -74,7 +79,7 @@ def train(network: UNet, inputs: Tensor, targets: Tensor, body: Tensor, plan: Tr
         If the loss is not finite.
     """
     batch_size = min(plan.batch_size, len(inputs))
-    per_batch = 1.0 / (batch_size * 3 * float(body.sum()))
+    per_batch = 1.0 / displacements[:batch_size].numel()
     optimiser = torch.optim.Adam(network.parameters(), lr=plan.learning_rate, betas=(0.9, plan.second_moment_decay), fused=True)
     order = torch.empty(0, dtype=torch.int64)
     curve: list[float] = []
@@ -85,9 +90,9 @@ def train(network: UNet, inputs: Tensor, targets: Tensor, body: Tensor, plan: Tr
         rows, order = order[:batch_size], order[batch_size:]
         for group in optimiser.param_groups:
             group["lr"] = plan.learning_rate * rate_factor(plan.schedule, iteration, plan.iterations)
-        loss = ((network(inputs[rows]) - targets[rows]) * body).square().sum() * per_batch
+        loss = (grid.to_nodes(network(inputs[rows])) - displacements[rows]).square().sum() * per_batch
         optimiser.zero_grad()
-        loss.backward()
+        torch.autograd.backward(loss)
         optimiser.step()
         total, n_summed = total + loss.detach(), n_summed + 1
         if n_summed == LOSS_INTERVAL or iteration == plan.iterations - 1:

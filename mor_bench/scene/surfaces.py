@@ -1,0 +1,140 @@
+"""Closed triangulated surfaces: read from STL or OBJ, checked, and asked which points they enclose."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.errors import SpecError
+from mor_bench.scene.triangles import winding_numbers
+
+FLAT = 1e-12
+"""Volumes below this part of the cubed diagonal of the bounding box are round-off."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A closed surface of triangles.
+
+    Attributes
+    ----------
+    points : (n, 3) float64
+        Positions, m.
+    triangles : (m, 3) int64
+        Point numbers, turned outwards: counter-clockwise as seen from outside the body.
+    """
+
+    points: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+
+    @cached_property
+    def volume_m3(self) -> float:
+        """Volume of the body, m³, by the divergence theorem; negative if the triangles are turned inwards."""
+        a, b, c = np.moveaxis(self.points[self.triangles] - self.bounds.mean(axis=0), 1, 0)
+        return float((a * np.cross(b, c)).sum() / 6)
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """(2, 3) lowest and highest corner, m."""
+        return np.array([self.points.min(axis=0), self.points.max(axis=0)])
+
+
+def inside(surface: Surface, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether each point lies in the body, by the surface's winding number around it.
+
+    Parameters
+    ----------
+    surface : Surface
+    points : (n, 3) float64
+        Positions, m. On the surface itself, to round-off, the answer is either.
+
+    Returns
+    -------
+    (n,) bool
+    """
+    windings = winding_numbers(surface.points[surface.triangles], np.ascontiguousarray(points, dtype=np.float64))
+    return np.asarray(windings > 0.5)
+
+
+def read_surface(path: str | Path, unit_m: float = 1.0) -> Surface:
+    """A closed surface from an STL or OBJ file.
+
+    Equal vertices become one, polygons become fans of triangles, and a surface that is turned inwards is turned outwards.
+    That parts of the surface do not cross each other is not checked.
+
+    Parameters
+    ----------
+    path : str or Path
+        Ends in .stl or .obj.
+    unit_m : float, default 1
+        The file's unit of length, m; 0.01 if it is in centimetres.
+
+    Raises
+    ------
+    SpecError
+        If there is no such file, it cannot be read or holds no triangles or NaN, or its surface is not closed, not
+        consistently oriented or encloses nothing. The message names the file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SpecError(f"{path}: no such file.")
+    points, triangles = _read(path)
+    if len(triangles) == 0:
+        raise SpecError(f"{path}: holds no triangles.")
+    if triangles.min() < 0 or triangles.max() >= len(points):
+        raise SpecError(f"{path}: a face names a vertex that is not among 1 to {len(points)}.")
+    if not np.isfinite(points[triangles]).all():
+        raise SpecError(f"{path}: holds a vertex that is NaN or infinite.")
+    # Adding zero turns -0.0, which other triangles may have as 0.0, into it.
+    vertices, number = np.unique(unit_m * points[triangles].reshape(-1, 3) + 0.0, axis=0, return_inverse=True)
+    triangles = number.reshape(-1, 3)
+    triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
+    if len(triangles) == 0:
+        raise SpecError(f"{path}: holds no triangles, only points and lines.")
+    return _turned_outwards(Surface(vertices, triangles), str(path))
+
+
+def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices (n, 3) and triangles (m, 3) as they stand in a file."""
+    import meshio
+
+    # meshio.read itself would end the process on a damaged file.
+    readers = {".stl": meshio.stl.read, ".obj": meshio.obj.read}
+    kind = path.suffix.lower()
+    if kind not in readers:
+        raise SpecError(f"{path}: the name of a surface must end in .stl or .obj.")
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()), np.errstate(over="ignore"):
+            content = readers[kind](str(path))
+        faces = [np.asarray(block.data, dtype=np.int64) for block in content.cells]
+        fans = [f[:, [0, i, i + 1]] for f in faces for i in range(1, f.shape[1] - 1)]
+        points = np.asarray(content.points, dtype=np.float64)[:, :3] if fans else np.empty((0, 3))
+    except Exception as error:  # whatever a parser of damaged text stumbles over
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise SpecError(f"{path}: cannot be read as {kind[1:].upper()}: {reason}") from error
+    return points, np.concatenate([np.empty((0, 3), dtype=np.int64), *fans])
+
+
+def _turned_outwards(surface: Surface, name: str) -> Surface:
+    """The surface, turned outwards if it is turned inwards.
+
+    Raises
+    ------
+    SpecError
+        If the surface is not closed, not consistently oriented or encloses nothing; the message begins with the name.
+    """
+    edges = surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    sharing = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]
+    if n_open := int((sharing != 2).sum()):
+        raise SpecError(f"{name}: the surface is not closed: {n_open} of its {len(sharing)} edges are not shared by exactly two triangles.")
+    if n_twisted := len(edges) - len(np.unique(edges, axis=0)):
+        raise SpecError(f"{name}: the triangles are not consistently oriented: across {n_twisted} of {len(sharing)} edges they turn over.")
+    if abs(surface.volume_m3) <= FLAT * np.linalg.norm(np.diff(surface.bounds, axis=0)) ** 3:
+        raise SpecError(f"{name}: the surface encloses no volume.")
+    return surface if surface.volume_m3 > 0 else Surface(surface.points, surface.triangles[:, ::-1].copy())

@@ -1,0 +1,131 @@
+"""The part of generation that runs in a worker, maybe on another machine: it reads no file and is given all that it needs."""
+
+from __future__ import annotations
+
+import pickle
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from mor_bench.errors import InvertedElementError, WorkerError
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import Solution
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.sampling import PatchLoads
+from mor_bench.snapshots.store import STATUSES, Shard
+
+GENERATOR_VERSION = 3
+"""Raised when a change of the full-order model or of the sampling changes samples; part of a dataset's folder name."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """The samples of one shard to be solved.
+
+    Attributes
+    ----------
+    dataset : str
+        See `Shard`.
+    problem : bytes
+        From `pack`; 0.5 MB for the 12,096 dofs of beam-fine, whose shards are 9 MB.
+    start : int
+        Number of the first sample.
+    loads : PatchLoads
+    generator_version : int
+        Of the sender.
+    """
+
+    dataset: str
+    problem: bytes
+    start: int
+    loads: PatchLoads
+    generator_version: int = GENERATOR_VERSION
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A shard, and the seconds that its solves took."""
+
+    shard: Shard
+    seconds: float
+
+
+def pack(scene: Scene) -> bytes:
+    """What a worker needs of a scene: mesh, material, supports and the patches' weights, without what it can work out."""
+    mesh = replace(scene.mesh)  # a copy without cached properties
+    return pickle.dumps((replace(scene, mesh=mesh, embedded_surface=None, point_sets={}), scene.patch_weights))
+
+
+class _Kept(threading.local):
+    """The model that a thread built last; threads share none, since a model works in its own buffers."""
+
+    problem: bytes = b""
+    model: FullOrderModel
+    weights: sp.csr_array
+
+    def of(self, problem: bytes) -> tuple[FullOrderModel, sp.csr_array]:
+        if self.problem != problem:
+            scene, self.weights = pickle.loads(problem)
+            self.model, self.problem = FullOrderModel(scene), problem
+        return self.model, self.weights
+
+
+_kept = _Kept()
+
+
+class _SingleThreaded:
+    """BLAS and OpenMP on one thread, for as long as any thread of the process solves."""
+
+    def __init__(self) -> None:
+        self._lock, self._n = threading.Lock(), 0
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        with self._lock:
+            if self._n == 0:
+                self._limits = threadpool_limits(1)
+            self._n += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._n -= 1
+                if self._n == 0:
+                    self._limits.restore_original_limits()
+
+
+_single_threaded = _SingleThreaded()
+
+
+def solve_task(task: Task) -> Solved:
+    """Solve the samples of one shard, on one thread.
+
+    Raises
+    ------
+    WorkerError
+        If the sender's version of mor-bench generates other samples.
+    """
+    if task.generator_version != GENERATOR_VERSION:
+        raise WorkerError(f"a worker generates samples of version {GENERATOR_VERSION}, wanted is {task.generator_version}; update its mor-bench.")
+    model, weights = _kept.of(task.problem)
+    loads = task.loads
+    forces = loads.nodal_forces(weights).reshape(len(loads), -1)[:, model.scene.free_dofs]
+    displacements = np.full((len(loads), model.n_unknowns), np.nan)
+    min_det_f: NDArray[np.float64] = np.full(len(loads), np.nan)
+    status = np.zeros(len(loads), dtype=np.uint8)
+    with _single_threaded():
+        begun = perf_counter()
+        for row, found in enumerate(model.solve_many(forces)):
+            if isinstance(found, Solution):
+                displacements[row], min_det_f[row] = found.displacement, found.min_det_f
+            else:
+                status[row] = STATUSES.index("inverted" if isinstance(found, InvertedElementError) else "no-equilibrium")
+        seconds = perf_counter() - begun
+    return Solved(Shard(task.dataset, task.start, loads.patches, loads.vectors, displacements, min_det_f, status), seconds)
