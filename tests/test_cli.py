@@ -87,7 +87,7 @@ def test_generate_makes_the_test_sets_if_asked(tmp_path: Path) -> None:
     done = mor_bench("generate", "beam-tiny", "--tests", "--limit", "5", "--workers", "1", "--cache", "c", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     folders = [Path(line) for line in done.stdout.splitlines()]
-    names = ["beam-tiny", *(f"beam-tiny--{name}" for name in ("in-range", "2x", "4x", "several-forces"))]
+    names = ["beam-tiny", *(f"beam-tiny--{name}" for name in ("in-range", "2x", "4x", "unseen-regions", "several-forces"))]
     assert [folder.name.rsplit("-", 2)[0] for folder in folders] == names
     assert all((tmp_path / folder / "shard-00000.h5").is_file() for folder in folders)
 

@@ -224,7 +224,7 @@ def test_every_region_holds_supports_and_loads(
     pushed = mor_bench.load_scene(of_file(folder / "beam.vtu", load=placed(region, folder)))
     expected = np.flatnonzero(inside(pushed.mesh.points))
     np.testing.assert_array_equal(pushed.patch_nodes, expected)
-    assert set(pushed.loaded_nodes) <= set(expected)
+    assert set(pushed.patch_weights.indices) <= set(expected)
 
 
 EMPTY: list[tuple[dict[str, Any], str]] = [

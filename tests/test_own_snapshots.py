@@ -57,6 +57,7 @@ def test_what_is_read_is_what_was_written(text: str, arrays: Arrays, tiny: Datas
     np.testing.assert_array_equal(data.scene.mesh.points, tiny.scene.mesh.points)
     np.testing.assert_array_equal(data.scene.mesh.cells, tiny.scene.mesh.cells)
     np.testing.assert_array_equal(data.scene.fixed_nodes, tiny.scene.fixed_nodes)
+    assert data.scene.material is None
     assert len(data.train) + len(data.test) == len(arrays["forces"])
     rows = {force.tobytes(): u for force, u in zip(arrays["forces"], arrays["displacements"], strict=True)}
     for part in (data.train, data.test):
@@ -65,12 +66,6 @@ def test_what_is_read_is_what_was_written(text: str, arrays: Arrays, tiny: Datas
     assert not set(data.train.regions) & set(data.test.regions)
     with pytest.raises(ValueError, match="read-only"):
         data.train.forces[0] = 0
-
-
-def test_loaded_nodes_are_those_of_the_forces(arrays: Arrays, tiny: Dataset, tmp_path: Path) -> None:
-    scene = mor_bench.load_scene(written(tmp_path, arrays))
-    np.testing.assert_array_equal(scene.loaded_nodes, tiny.scene.loaded_nodes)
-    assert scene.material is None
 
 
 def test_splits(arrays: Arrays, tmp_path: Path) -> None:
@@ -137,7 +132,6 @@ def test_a_known_law_is_learned(tmp_path: Path, arrays: Arrays) -> None:
     displacements = (forces[:, [4, 9]].reshape(len(forces), 6) @ matrix).reshape(forces.shape)
     mine = {"points": arrays["points"], "cells": arrays["cells"], "forces": forces, "displacements": displacements}
     data = mor_bench.load_dataset(written(tmp_path, mine), split="sample")
-    assert data.scene.loaded_nodes.tolist() == [4, 9]
     method = mor_bench.load_method("pca-regression-force", degree=1).fit(data.scene, data.train)
     np.testing.assert_allclose(method.predict(data.test.forces), data.test.displacements, atol=1e-4 * np.abs(displacements).max())
 

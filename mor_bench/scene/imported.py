@@ -58,11 +58,6 @@ class ImportedArrays:
     regions: NDArray[np.int64] | None
     test: NDArray[np.bool_] | None
 
-    @property
-    def loaded_nodes(self) -> NDArray[np.int64]:
-        """(n,) the nodes that the force of some sample acts on."""
-        return np.flatnonzero((self.forces != 0).any(axis=(0, 2)))
-
 
 def read_arrays(file: SourceFile) -> ImportedArrays:
     """Read and check a file of snapshots.

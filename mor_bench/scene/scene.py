@@ -54,8 +54,6 @@ class Scene:
         The smooth surface that a mesh of voxels is filled from, and that loads act on.
     point_sets : mapping of str to (n,) int64
         Named sets of nodes, of a mesh file.
-    imported_nodes : (n,) int64 or None
-        Nodes that imported forces act on.
     """
 
     spec: AnyDatasetSpec
@@ -64,7 +62,6 @@ class Scene:
     fixed_nodes: NDArray[np.int64]
     embedded_surface: Facets | None = field(default=None, repr=False)
     point_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict, repr=False)
-    imported_nodes: NDArray[np.int64] | None = field(default=None, repr=False)
 
     @property
     def name(self) -> str:
@@ -170,11 +167,6 @@ class Scene:
             return _rows_to_one(sp.csr_array(shares @ interpolation_matrix(self.mesh, points)))
         return _rows_to_one(sp.csr_array(self._patches.areas @ self._patches.values))
 
-    @cached_property
-    def loaded_nodes(self) -> NDArray[np.int64]:
-        """(n,) the nodes that some load patch, or some imported force, acts on."""
-        return np.unique(self.patch_weights.indices) if self.imported_nodes is None else self.imported_nodes
-
 
 def _rows_to_one(matrix: sp.csr_array) -> sp.csr_array:
     return sp.csr_array(matrix.multiply(1.0 / matrix.sum(axis=1)[:, None]))
@@ -197,7 +189,7 @@ def load_scene(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> Scene
 
 def imported_scene(spec: ImportedDatasetSpec, arrays: ImportedArrays) -> Scene:
     """The scene of imported snapshots, of which the mesh and the supports are known and the equations are not."""
-    return Scene(spec, arrays.mesh, None, arrays.fixed_nodes, imported_nodes=arrays.loaded_nodes)
+    return Scene(spec, arrays.mesh, None, arrays.fixed_nodes)
 
 
 def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
