@@ -124,6 +124,23 @@ def test_a_bad_dataset_is_one_clear_line(spoil: Callable[[dict[str, Any]], Any],
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("min_distance_m = 1.0", "min_distance_m = 9.0", r"must leave some 3 of the 64 patches that far apart; 9 leaves none"),
+        ("[0.2, 0.0, 0.0], [4.0, 0.0, 0.95]", "[0.2, 0.0, 0.0], [4.0, 0.0, 1.0]", r"`tests.unseen_region` must lie apart from `loads.region`"),
+        ("{ box_m = [[0.2, 0.0, 0.0], [4.0, 0.0, 0.95]] }", "{ box_m = [[9.0, 0.0, 0.0], [9.5, 0.0, 0.95]] }", r"holds no node of the mesh"),
+    ],
+)
+def test_check_looks_at_the_plan_and_at_the_test_sets(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = tmp_path / "mine.toml"
+    text = list_suite("datasets")["beam-coarse-3-forces"].read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(MorBenchError, match=message):
+        check_file(path)
+
+
 METHOD = """
 title = "t"
 source = "s"

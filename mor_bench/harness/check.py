@@ -9,21 +9,22 @@ from mor_bench.mechanics.locking import locking_risk
 from mor_bench.mechanics.model import check_supports, missing_library
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import load_dataset
-from mor_bench.snapshots.sampling import n_samples_of
+from mor_bench.snapshots.sampling import draw_loads, n_samples_of
+from mor_bench.snapshots.test_sets import check_regions
 from mor_bench.specs import ImportedDatasetSpec, check_method, is_method_file, load_dataset_spec, load_method_spec
 
 
 def check_file(path: Path) -> str:
     """Validate a file and say what it describes.
 
-    A dataset's mesh, regions and patches are built; every configuration of a method is checked against its class.
+    A dataset's mesh, regions and patches are built, and its first sample is drawn; every configuration of a method is checked against its class.
 
     Raises
     ------
     SpecError, UnconstrainedBodyError
         The first problem, in one line.
     InvalidInputError
-        If imported samples cannot be split as the file says.
+        If imported samples cannot be split as the file says, or `tests.unseen_region` is not apart from `loads.region`.
     MissingDependencyError
         If the method's class or the dataset's solver needs an extra that is not installed.
     """
@@ -39,6 +40,9 @@ def check_file(path: Path) -> str:
     missing = missing_library(spec.solver)
     if missing:
         raise MissingDependencyError(f"{missing}.")
+    draw_loads(scene, 0, 1)
+    if spec.tests.unseen_region is not None:
+        check_regions(spec)
     n_patches = len(scene.patch_nodes)
     samples = n_samples_of(scene)
     said = f"dataset, {scene.mesh.n_cells} cells, {scene.mesh.n_nodes} nodes, {n_patches} load patches, {samples} samples"

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
-from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.imported import NodalLoads
@@ -92,9 +91,8 @@ def _write(scene: Scene, fields: Mapping[str, NDArray[np.float64]], out: Path, s
     meshio.Mesh(scene.mesh.points, [(kind, scene.mesh.cells)], point_data=dict(fields)).write(paths[0], binary=True)
     surface = scene.embedded_surface
     if surface is not None:
-        at_points = interpolation_matrix(scene.mesh, surface.points)
         # The force stays at the nodes: what is a sum over nodes is not interpolated.
-        carried = {name: at_points @ values for name, values in fields.items() if name != "force"}
+        carried = {name: scene.to_surface @ values for name, values in fields.items() if name != "force"}
         paths.append(out / f"{stem}-surface.vtu")
         meshio.Mesh(surface.points, [("triangle", surface.facets)], point_data=carried).write(paths[1], binary=True)
     return paths
