@@ -166,10 +166,11 @@ def list_(suite: Suite = None, as_json: Annotated[bool, typer.Option("--json", h
         if as_json:
             print(json.dumps({"datasets": datasets, "methods": methods}, indent=1, ensure_ascii=False))
             return
+        width = max(len(entry["name"]) for entry in [*datasets, *methods])
         for heading, entries in (("Datasets", datasets), ("Methods", methods)):
             print(heading)
             for entry in entries:
-                print(f"  {entry['name']:<22} {entry['title']}")
+                print(f"  {entry['name']:<{width}}  {entry['title']}")
 
 
 @app.command()

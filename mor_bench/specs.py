@@ -656,7 +656,7 @@ def find_suite(suite: Path | None = None) -> Path:
 
 def list_suite(kind: Literal["datasets", "methods"], suite: Path | None = None) -> dict[str, Path]:
     """Names and files of the suite's datasets or methods, sorted by name."""
-    return {path.stem: path for path in sorted((find_suite(suite) / kind).glob("*.toml"))}
+    return {path.stem: path for path in sorted((find_suite(suite) / kind).glob("*.toml"), key=lambda path: path.stem)}
 
 
 def _resolve(kind: Literal["datasets", "methods"], source: str | Path, suite: Path | None) -> Path:
