@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import SpecError
+from mor_bench.scene.files import read_triangles
 from mor_bench.scene.triangles import winding_numbers
 
 FLAT = 1e-12
@@ -81,44 +80,14 @@ def read_surface(path: str | Path, unit_m: float = 1.0) -> Surface:
         If there is no such file, it cannot be read or holds no triangles or NaN, or its surface is not closed, not
         consistently oriented or encloses nothing. The message names the file.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise SpecError(f"{path}: no such file.")
-    points, triangles = _read(path)
-    if len(triangles) == 0:
-        raise SpecError(f"{path}: holds no triangles.")
-    if triangles.min() < 0 or triangles.max() >= len(points):
-        raise SpecError(f"{path}: a face names a vertex that is not among 1 to {len(points)}.")
-    if not np.isfinite(points[triangles]).all():
-        raise SpecError(f"{path}: holds a vertex that is NaN or infinite.")
+    corners = read_triangles(Path(path), unit_m)
     # Adding zero turns -0.0, which other triangles may have as 0.0, into it.
-    vertices, number = np.unique(unit_m * points[triangles].reshape(-1, 3) + 0.0, axis=0, return_inverse=True)
+    vertices, number = np.unique(corners.reshape(-1, 3) + 0.0, axis=0, return_inverse=True)
     triangles = number.reshape(-1, 3)
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     if len(triangles) == 0:
-        raise SpecError(f"{path}: holds no triangles, only points and lines.")
+        raise SpecError(f"{path}: a surface must hold triangles; got only points and lines.")
     return _turned_outwards(Surface(vertices, triangles), str(path))
-
-
-def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices (n, 3) and triangles (m, 3) as they stand in a file."""
-    import meshio
-
-    # meshio.read itself would end the process on a damaged file.
-    readers = {".stl": meshio.stl.read, ".obj": meshio.obj.read}
-    kind = path.suffix.lower()
-    if kind not in readers:
-        raise SpecError(f"{path}: the name of a surface must end in .stl or .obj.")
-    try:
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()), np.errstate(over="ignore"):
-            content = readers[kind](str(path))
-        faces = [np.asarray(block.data, dtype=np.int64) for block in content.cells]
-        fans = [f[:, [0, i, i + 1]] for f in faces for i in range(1, f.shape[1] - 1)]
-        points = np.asarray(content.points, dtype=np.float64)[:, :3] if fans else np.empty((0, 3))
-    except Exception as error:  # whatever a parser of damaged text stumbles over
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise SpecError(f"{path}: cannot be read as {kind[1:].upper()}: {reason}") from error
-    return points, np.concatenate([np.empty((0, 3), dtype=np.int64), *fans])
 
 
 def _turned_outwards(surface: Surface, name: str) -> Surface:
