@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.scene.scene import Scene, load_scene, with_cells
+from mor_bench.snapshots.test_sets import spec_of_set
+from mor_bench.specs import list_suite, load_generated_spec
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -66,6 +69,12 @@ def test_meshes_of_other_sizes_keep_the_body() -> None:
 def test_a_cut_that_leaves_no_l_is_refused(cut: list[int], message: str) -> None:
     with pytest.raises(SpecError, match=message):
         load_scene(content(geometry={"cut_cells": cut}))
+
+
+def mean_lengths(scene: Scene) -> NDArray[np.float64]:
+    """Length of the mean normal of each patch: 1 where it is flat."""
+    areas = scene._patches.areas
+    return np.asarray(np.linalg.norm(areas @ scene._patches.normals, axis=1) / areas.sum(axis=1))
 
 
 @pytest.fixture(scope="module")
@@ -144,3 +153,19 @@ def test_a_users_surface_becomes_a_scene_wherever_its_file_lies(tmp_path: Path) 
     (tmp_path / "one" / "cube.stl").write_text("solid other")
     with pytest.raises(SpecError, match=r"cube.stl: the file has changed since the dataset was read"):
         load_scene(kept)
+
+
+@pytest.mark.parametrize("name", sorted(list_suite("datasets")))
+def test_every_load_patch_lies_on_the_surface_and_pushes_something_that_can_move(name: str) -> None:
+    spec = load_generated_spec(name)
+    items = [spec, spec_of_set(spec, "unseen-regions")]
+    for scene in map(load_scene, items):
+        assert np.isin(scene.patch_nodes, scene.surface.facets).all()
+        assert mean_lengths(scene).min() > 0.6
+        free = np.setdiff1d(np.arange(scene.mesh.n_nodes), scene.fixed_nodes)
+        assert scene.patch_weights[:, free].sum(axis=1).min() > 0.2
+
+
+def test_a_load_region_inside_the_body_is_refused() -> None:
+    with pytest.raises(SpecError, match="nodes inside the body only"):
+        load_scene(content(loads={**content()["loads"], "region": {"sphere_m": [[6.3, 4.0, 6.2], 1.5]}}))

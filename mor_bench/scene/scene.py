@@ -96,8 +96,12 @@ class Scene:
     @cached_property
     def _loaded_points(self) -> NDArray[np.int64]:
         """Numbers of the surface's points in the load region."""
-        sets = {} if self.embedded_surface else self.point_sets
-        return region_points(Cloud(self.surface.points, np.unique(self.surface.facets), sets), self.generated.loads.region)
+        on_surface, region = np.unique(self.surface.facets), self.generated.loads.region
+        found = region_points(Cloud(self.surface.points, on_surface, {} if self.embedded_surface else self.point_sets), region)
+        found = np.intersect1d(found, on_surface)
+        if not len(found):
+            raise SpecError("the load region holds nodes inside the body only, and none of its surface.")
+        return found
 
     @cached_property
     def patch_nodes(self) -> NDArray[np.int64]:

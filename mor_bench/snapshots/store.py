@@ -158,6 +158,8 @@ def parse_shard(content: bytes, where: str) -> Shard:
     length, digest = header.get("bytes"), header.get("sha256")
     if _header(version, length, digest) != head:
         raise StoreError(f"{where}: damaged: the header is not as it was written.")
+    if not isinstance(length, int) or len(body) > length:
+        raise StoreError(f"{where}: damaged: it is not as long as its header says.")
     if len(body) < length:
         raise StoreError(f"{where}: truncated: {HEADER_BYTES + len(body):,} of {HEADER_BYTES + length:,} bytes are there.")
     if hashlib.sha256(body).hexdigest() != digest:
