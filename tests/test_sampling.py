@@ -14,7 +14,7 @@ import mor_bench
 from mor_bench.errors import InvalidInputError, SpecError
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Dataset, load_dataset
-from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of, repeated
+from mor_bench.snapshots.sampling import PatchLoads, draw_loads, far_apart, n_samples_of, repeated
 from mor_bench.snapshots.split import split_samples
 from mor_bench.snapshots.test_sets import available_sets, check_regions, spec_of_set, why_not
 from mor_bench.specs import Split, list_suite, load_generated_spec
@@ -150,10 +150,24 @@ def test_plans_that_cannot_be_drawn(loads: dict[str, Any], message: str) -> None
         draw_loads(several(**loads), 0, 1)
 
 
-def test_too_many_combinations_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mor_bench.snapshots.sampling.MAX_COMBINATIONS", 100)
-    with pytest.raises(SpecError, match=r"must leave at most 100 combinations of patches; 0\.61 leaves \d+ or more"):
-        draw_loads(several(min_distance_m=0.61), 0, 1)
+def test_combinations_too_many_to_list_are_drawn_far_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mor_bench.snapshots.sampling.MAX_COMBINATIONS", 20)
+    far_apart.cache_clear()
+    scene = several(seed=5)
+    drawn, part = draw_loads(scene, 0, 200), draw_loads(scene, 150, 160)
+    far_apart.cache_clear()
+    np.testing.assert_array_equal(drawn.patches[150:160], part.patches)
+    centres = scene.patch_centres[drawn.patches]
+    assert np.linalg.norm(centres - np.roll(centres, 1, axis=1), axis=2).min() >= 0.7 - 1e-9
+    assert (np.diff(drawn.patches, axis=1) > 0).all()
+    assert len(np.unique(drawn.patches)) == 21
+
+
+@pytest.mark.parametrize("n_patches", [1, 2])
+def test_too_few_patches_for_several_forces_are_said(n_patches: int) -> None:
+    spec = tiny(n_patches=n_patches).generated
+    assert "several-forces" not in available_sets(spec)
+    assert "it has no 3 load patches" in str(why_not(spec, "several-forces"))
 
 
 def test_patches_are_spread_over_the_region_and_away_from_the_supports() -> None:

@@ -2,7 +2,7 @@
 
 With one patch at a time sample i acts on patch i modulo the number of patches, so that every beginning of a dataset covers
 the load region evenly. With several, or a total number of samples, all admissible combinations of patches stand in one
-random order and are gone through again and again.
+random order and are gone through again and again; where there are more than `MAX_COMBINATIONS`, each sample draws its own.
 
 Each force has up to three coordinates in the unit interval, which become its direction and magnitude. They are
 
@@ -24,6 +24,7 @@ from functools import lru_cache
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 from scipy.stats import qmc
 
 from mor_bench.errors import SpecError
@@ -32,6 +33,9 @@ from mor_bench.specs import Loads, Sampling
 
 MAX_COMBINATIONS = 5_000_000
 """Combinations of patches that are listed at most, 120 MB of three each."""
+
+MAX_DRAWS = 1000
+"""Tries for each sample to draw patches that are far apart."""
 
 
 @dataclass(frozen=True)
@@ -75,18 +79,20 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
     Raises
     ------
     SpecError
-        If no patches are as far from each other as the plan asks, or too many combinations are.
+        If no patches are as far from each other as the plan asks.
     """
     loads, numbers = scene.generated.loads, np.arange(start, stop)
-    chosen = _combinations(scene)
-    row, turn = numbers % len(chosen), numbers // len(chosen)
-    patches = chosen[row]
-    k = loads.simultaneous
+    chosen, k = _combinations(scene), loads.simultaneous
+    if chosen is None:
+        patches = np.stack([_apart(scene, int(i)) for i in numbers])
+    else:
+        patches, turn = chosen[numbers % len(chosen)], numbers // len(chosen)
     if loads.sampling == "random":
         vectors = np.stack([_random_forces(loads, int(i), scene.patch_normals[p]) for i, p in zip(numbers, patches, strict=True)])
         return PatchLoads(patches, vectors)
     d = 3 * k if loads.kind == "force" else 2 * k if loads.kind == "tangential" else k
     if k == 1:
+        assert chosen is not None
         size = -(-n_samples_of(scene) // len(chosen))
         unit = np.stack([_design(loads.sampling, (loads.seed, int(p[0])), size, d)[t] for p, t in zip(patches, turn, strict=True)])
     else:
@@ -94,40 +100,56 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
     return PatchLoads(patches, _forces(loads, unit.reshape(len(numbers), k, d // k), scene.patch_normals[patches]))
 
 
-def _combinations(scene: Scene) -> NDArray[np.int64]:
-    """(n_combinations, k) patches that are loaded together, in the order in which samples go through them."""
+def _combinations(scene: Scene) -> NDArray[np.int64] | None:
+    """(n_combinations, k) patches that are loaded together, in the order in which samples go through them; None if too many."""
     loads = scene.generated.loads
     n_patches = len(scene.patch_nodes)
     if loads.samples_per_patch:
         return np.arange(n_patches)[:, None]
-    found = far_apart(scene.patch_centres.tobytes(), loads.simultaneous, loads.min_distance_m or 0.0)
-    return found[np.random.default_rng([loads.seed, 0xC0B1]).permutation(len(found))]
+    found: NDArray[np.int64] | None = far_apart(scene.patch_centres.tobytes(), loads.simultaneous, loads.min_distance_m or 0.0)
+    return found if found is None else found[np.random.default_rng([loads.seed, 0xC0B1]).permutation(len(found))]
 
 
 @lru_cache(maxsize=2)
-def far_apart(centres: bytes, k: int, distance: float) -> NDArray[np.int64]:
+def far_apart(centres: bytes, k: int, distance: float) -> NDArray[np.int64] | None:
     """(n, k) all sets of k points, given as the bytes of (n_points, 3) float64, m, that are pairwise a distance or more apart.
+
+    None if there are more than `MAX_COMBINATIONS`.
 
     Raises
     ------
     SpecError
-        If there is none, or there are more than `MAX_COMBINATIONS`.
+        If there is none.
     """
     points = np.frombuffer(centres).reshape(-1, 3)
     # A distance that is met up to round-off is met.
-    apart = np.linalg.norm(points[:, None] - points, axis=2) >= distance * (1 - 1e-9)
+    apart = cdist(points, points) >= distance * (1 - 1e-9)
     apart &= np.triu(np.ones_like(apart), 1)
     sets, allowed = np.arange(len(points))[:, None], np.ones_like(apart)
     for _ in range(k - 1):
         allowed = allowed & apart[sets[:, -1]] if sets.shape[1] > 1 else apart
-        n = int(allowed.sum())
-        if n > MAX_COMBINATIONS:
-            raise SpecError(f"`min_distance_m` must leave at most {MAX_COMBINATIONS:,} combinations of patches; {distance:g} leaves {n:,} or more.")
+        if allowed.sum() > MAX_COMBINATIONS:
+            return None
         row, new = np.nonzero(allowed)
         sets, allowed = np.hstack([sets[row], new[:, None]]), allowed[row]
     if not len(sets):
         raise SpecError(f"`min_distance_m` must leave some {k} of the {len(points)} patches that far apart; {distance:g} leaves none.")
     return sets
+
+
+def _apart(scene: Scene, number: int) -> NDArray[np.int64]:
+    """(k,) patches of one sample, drawn one after the other from those that are far enough from all before."""
+    loads, centres = scene.generated.loads, scene.patch_centres
+    generator = np.random.default_rng([loads.seed, 0xC0B1, number])
+    for _ in range(MAX_DRAWS):
+        chosen, allowed = np.zeros(0, dtype=np.int64), np.arange(len(centres))
+        while len(allowed) and len(chosen) < loads.simultaneous:
+            chosen = np.append(chosen, generator.choice(allowed))
+            near = np.linalg.norm(centres[allowed] - centres[chosen[-1]], axis=1)
+            allowed = allowed[near >= (loads.min_distance_m or 0.0) * (1 - 1e-9)]
+        if len(chosen) == loads.simultaneous:
+            return np.sort(chosen)
+    raise SpecError(f"`min_distance_m`: in {MAX_DRAWS} tries no {loads.simultaneous} patches were {loads.min_distance_m:g} m apart.")
 
 
 def _random_forces(loads: Loads, number: int, normals: NDArray[np.float64]) -> NDArray[np.float64]:

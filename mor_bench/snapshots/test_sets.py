@@ -18,6 +18,7 @@ from __future__ import annotations
 from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene, load_scene
@@ -46,6 +47,11 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
         return "its directions are all over the sphere; the split by direction holds some of them out of training"
     if name == "several-forces" and spec.loads.simultaneous > 1:
         return "its main set has several forces"
+    if name == "several-forces":
+        scene = load_scene(spec)
+        distance = FAR * _diagonal(scene)
+        if distance == 0 or farthest(scene.patch_centres, distance) < N_SEVERAL:
+            return f"it has no {N_SEVERAL} load patches that are {distance:g} m apart"
     return None
 
 
@@ -93,6 +99,15 @@ def with_test_sets(spec: DatasetSpec) -> list[DatasetSpec]:
     if "unseen-regions" in names:
         check_regions(spec)
     return [spec, *(spec_of_set(spec, name) for name in names)]
+
+
+def farthest(centres: NDArray[np.float64], distance: float) -> int:
+    """How many points, found one after the other from the first on, are all a distance apart."""
+    chosen: list[NDArray[np.float64]] = []
+    for centre in centres:
+        if all(np.linalg.norm(centre - other) >= distance for other in chosen):
+            chosen.append(centre)
+    return len(chosen)
 
 
 def check_regions(spec: DatasetSpec) -> None:
