@@ -28,6 +28,10 @@ app = typer.Typer(
 )
 
 
+SAY_EVERY_S = 10.0
+"""Between lines about generation, where there is no terminal to show a bar."""
+
+
 class ProfileName(StrEnum):
     """Budgets and sweeps of the method files."""
 
@@ -91,15 +95,21 @@ def _progress(console: Console) -> Iterator[Listener]:
     with Progress(*columns, console=console, transient=True) as bars:
         tasks: dict[str, Any] = {}
         begun: dict[str, tuple[int, float]] = {}
+        said: dict[str, tuple[int, float]] = {}
 
         def generating(dataset: str, done: int, total: int) -> None:
+            now = perf_counter()
             if dataset not in tasks:
                 # What was there before is no part of the rate, nor of the time left that follows from it.
                 tasks[dataset] = bars.add_task(f"samples of {escape(dataset)}", total=total, completed=done, rate="")
-                begun[dataset] = done, perf_counter()
+                begun[dataset] = said[dataset] = done, now
             before, since = begun[dataset]
-            rate = f"{(done - before) / (perf_counter() - since):.1f}/s" if done > before else ""
-            bars.update(tasks[dataset], completed=done, total=total, rate=rate)
+            rate = (done - before) / (now - since) if done > before else 0.0
+            bars.update(tasks[dataset], completed=done, total=total, rate=f"{rate:.1f}/s" if rate else "")
+            if rate and not console.is_terminal and (now - said[dataset][1] >= SAY_EVERY_S or done == total):
+                said[dataset] = done, now
+                left = (total - done) / rate
+                bars.console.print(f"{dataset}: {done:,} of {total:,} samples, {rate:.1f}/s, {left:.0f} s left", highlight=False, markup=False)
 
         def starting(dataset: str, label: str, number: int, total: int) -> None:
             if "run" not in tasks:
@@ -122,7 +132,8 @@ def _progress(console: Console) -> Iterator[Listener]:
 def run(
     datasets: Annotated[list[str] | None, typer.Argument(help="Names or TOML files. [default: beam-coarse]", show_default=False)] = None,
     method: Annotated[
-        list[str] | None, typer.Option("--method", "-m", help="Name or TOML file; repeat for more. [default: the five core methods]")
+        list[str] | None,
+        typer.Option("--method", "-m", help="Name or TOML file; repeat for more. [default: the core methods, or those that need no equations]"),
     ] = None,
     profile: Annotated[ProfileName, typer.Option(help="Budgets and sweeps of the method files.")] = ProfileName.quick,
     split: Annotated[SplitName | None, typer.Option(help="What the test part has that training has not. [default: as the dataset says]")] = None,
@@ -137,13 +148,12 @@ def run(
     """Fit, score and time methods on datasets; end with tables, figures and a report."""
     with _clear_errors():
         import mor_bench
-        from mor_bench.harness.run import CORE_METHODS
         from mor_bench.report import print_tables, render
 
         console = _console(stderr=as_json)
         with _progress(console) as listener:
             comparison = mor_bench.run(
-                datasets or ["beam-coarse"], method or CORE_METHODS, profile.value, out, limit=limit, split=split.value if split else None,
+                datasets or ["beam-coarse"], method or None, profile.value, out, limit=limit, split=split.value if split else None,
                 threads=threads, workers=workers, cache=cache, suite=suite, listener=listener,
             )  # fmt: skip
         print_tables(comparison, console)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import meshio
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 import mor_bench
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.mechanics.elements import element_of, shape_gradients
+from mor_bench.scene.loads import cut_patches
 from mor_bench.scene.scene import Scene, load_scene, with_cells
 from mor_bench.snapshots.test_sets import spec_of_set
 from mor_bench.specs import list_suite, load_generated_spec
@@ -169,3 +171,37 @@ def test_every_load_patch_lies_on_the_surface_and_pushes_something_that_can_move
 def test_a_load_region_inside_the_body_is_refused() -> None:
     with pytest.raises(SpecError, match="nodes inside the body only"):
         load_scene(content(loads={**content()["loads"], "region": {"sphere_m": [[6.3, 4.0, 6.2], 1.5]}}))
+
+
+def rod_stl(path: Path, n: int = 24) -> Path:
+    """A rod of 0.2 m with two long triangles for each of its n sides, as drawing programs write it."""
+    angle = 2 * np.pi * np.arange(n) / n
+    ring = 0.02 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ends = [np.column_stack([np.full(n, x), ring]) for x in (0.0, 0.2)]
+    centres = [np.array([x, 0.0, 0.0]) for x in (0.0, 0.2)]
+    triangles = []
+    for i in range(n):
+        j = (i + 1) % n
+        triangles += [(ends[0][i], ends[1][j], ends[1][i]), (ends[0][i], ends[0][j], ends[1][j])]
+        triangles += [(centres[0], ends[0][j], ends[0][i]), (centres[1], ends[1][i], ends[1][j])]
+    meshio.Mesh(np.array(triangles).reshape(-1, 3), [("triangle", np.arange(12 * n).reshape(-1, 3))]).write(path)
+    return path
+
+
+def test_patches_on_a_surface_of_long_triangles(tmp_path: Path) -> None:
+    base = {key: value for key, value in content().items() if key != "name"}
+    base["supports"] = [{"region": "x-min"}]
+    base["loads"] = {**base["loads"], "region": "x-max", "patch_area_m2": 2e-4, "kind": "normal"}
+    geometry = {"shape": "voxels", "surface": str(rod_stl(tmp_path / "rod.stl")), "cells": [20, 5, 5]}
+    with pytest.raises(SpecError, match="the area of the load region"):
+        load_scene({**base, "geometry": geometry, "loads": {**base["loads"], "patch_area_m2": 2e-3}})
+    scene = load_scene({**base, "geometry": geometry, "loads": {**base["loads"], "region": "surface"}})
+    np.testing.assert_allclose(scene._patches.areas.sum(axis=1), 2e-4, rtol=1e-12)
+    points, shares = scene.patch_points(np.arange(len(scene.patch_nodes)))
+    np.testing.assert_allclose(scene.patch_weights @ scene.mesh.points, shares @ points, rtol=0, atol=1e-13)
+    values = scene._patches.values
+    np.testing.assert_allclose(values @ scene.surface.points, scene._patches.points, rtol=0, atol=1e-15)
+    corners = scene.surface.points[scene.surface.facets]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    whole = cut_patches(scene.surface, scene.surface.facets, np.array([0]), area * (1 - 1e-9))
+    assert whole.areas.sum() == pytest.approx(area, rel=1e-8)

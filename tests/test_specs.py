@@ -83,7 +83,7 @@ BAD = [
     ),
     (set_("material", value={"law": "ogden", "mu_pa": [1.0], "alpha": [2.0, 3.0], "bulk_pa": 9.0}), r"`mu_pa` and `alpha` must have equal lengths"),
     (set_("material", value={"law": "ogden", "mu_pa": [1.0], "alpha": [-2.0], "bulk_pa": 9.0}), r"every product of `mu_pa` and `alpha` must be > 0"),
-    (set_("loads", "patch_area_m2", value=1e-9), r"`patch_area_m2` must be at least 0\.\d+, for facets with edges of up to 0\.5 m; got 1e-09"),
+    (set_("loads", "patch_area_m2", value=1e-9), r"`patch_area_m2` must be at least about 0\.\d+, for facets with edges of up to 0\.5 m; got 1e-09"),
     (set_("discretisation", value={"element": "wedge"}), r"`discretisation.element` must be 'hexahedron' or 'tetrahedron'; got 'wedge'"),
     (set_("discretisation", value={"element": "tetrahedron", "integration": "selective"}), r"`integration` of tetrahedra must be 'full'"),
     (set_("geometry", "shape", value="sphere"), r"`geometry.shape` must be 'box', 'l-shape', 'voxels', 'tetrahedra' or 'file'; got 'sphere'"),

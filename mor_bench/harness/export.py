@@ -125,11 +125,14 @@ def export_numpy(data: Dataset, out: str | Path) -> list[Path]:
     Raises
     ------
     InvalidInputError
-        If the file's name does not end in .npz.
+        If the file's name does not end in .npz, or one of the two is there already.
     """
     out = Path(out)
     if out.suffix != ".npz":
         raise InvalidInputError(f"`out` must end in .npz; got {str(out)!r}.")
+    for path in (out, out.with_suffix(".toml")):
+        if path.exists():
+            raise InvalidInputError(f"`out`: {path} exists and is not overwritten; remove it or choose another name.")
     out.parent.mkdir(parents=True, exist_ok=True)
     buffer = io.BytesIO()
     np.savez(buffer, **snapshot_arrays(data))  # type: ignore[arg-type]

@@ -27,11 +27,14 @@ from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.generate import generation_seconds
-from mor_bench.specs import AnyDatasetSpec, DatasetSpec, MethodSpec, SplitBy, check_method, load_dataset_spec, load_method_spec
+from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, MethodSpec, SplitBy, check_method, load_dataset_spec, load_method_spec
 from mor_bench.surrogate import Surrogate, make_surrogate
 
 CORE_METHODS = ("fem", "pod", "hpod", "pca-regression", "umesh")
 """What is compared when nothing else is asked for."""
+
+DATA_METHODS = ("pca-regression-force", "umesh")
+"""The same on imported snapshots, whose equations are not known."""
 
 PREDICTION_BATCH = 256
 """Test samples per call of `predict`, which bounds memory."""
@@ -171,7 +174,7 @@ def _default_out(names: Sequence[str]) -> Path:
 
 def run(
     datasets: Sequence[str | Path | Mapping[str, Any]] = ("beam-coarse",),
-    methods: Sequence[str | Path] = CORE_METHODS,
+    methods: Sequence[str | Path] | None = None,
     profile: str = "quick",
     out: str | Path | None = None,
     *,
@@ -192,7 +195,8 @@ def run(
     Parameters
     ----------
     datasets, methods : sequences of names or paths of TOML files
-        A dataset may also be a dict with the same keys.
+        A dataset may also be a dict with the same keys. Methods are `CORE_METHODS` by default, or `DATA_METHODS` on
+        imported snapshots.
     profile : {"quick", "full"}
         Which budget and sweep of the method files to use.
     out : path, optional
@@ -224,7 +228,7 @@ def run(
         raise InvalidInputError(f"`profile` must be 'quick' or 'full'; got {profile!r}.")
     if not 1 <= threads <= cores:
         raise InvalidInputError(f"`threads` must be an integer in [1, {cores}]; got {threads}.")
-    if not datasets or not methods:
+    if not datasets or (methods is not None and not methods):
         raise InvalidInputError("`datasets` and `methods` must name at least one each.")
     specs, method_specs = _checked_specs(datasets, methods, suite)
     discretisation = {spec.name: _discretisation(spec, cache, suite) for spec in specs}
@@ -251,6 +255,7 @@ def run(
             "reason": None,
             "n_train": len(data.train),
             "n_test": len(data.test),
+            "n_unused": data.n_unused,
             "n_failed": None,
             "threads": threads,
             "error": None,
@@ -272,10 +277,13 @@ def _discretisation(spec: AnyDatasetSpec, cache: Path | None, suite: Path | None
 
 
 def _checked_specs(
-    datasets: Sequence[str | Path | Mapping[str, Any]], methods: Sequence[str | Path], suite: Path | None
+    datasets: Sequence[str | Path | Mapping[str, Any]], methods: Sequence[str | Path] | None, suite: Path | None
 ) -> tuple[list[AnyDatasetSpec], list[MethodSpec]]:
     """Read all specifications and check them as far as they can be without running, so that no run fails half-way on one."""
     specs = [load_dataset_spec(dataset, suite) for dataset in datasets]
+    if methods is None:
+        defaults = [DATA_METHODS if isinstance(spec, ImportedDatasetSpec) else CORE_METHODS for spec in specs]
+        methods = list(dict.fromkeys(name for names in defaults for name in names))
     method_specs = [load_method_spec(method, suite) for method in methods]
     for kind, names in (("dataset", [spec.name for spec in specs]), ("method", [spec.name for spec in method_specs])):
         for name in names:

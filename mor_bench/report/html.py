@@ -193,10 +193,11 @@ def _what_was_run(comparison: Comparison, dataset: str, entries: Sequence[Entry]
     def values(name: str) -> str:
         return ", ".join(dict.fromkeys(str(entry.row.get(name)) for entry in entries)) or "–"
 
+    unused = f"; in neither part: {values('n_unused')}" if any(entry.row.get("n_unused") for entry in entries) else ""
     return [
         *([("source", str(spec["source"]))] if spec.get("source") else []),
         *scene,
-        ("split", f"by {values('split')}; training samples: {values('n_train')}; test samples: {values('n_test')}"),
+        ("split", f"by {values('split')}; training samples: {values('n_train')}; test samples: {values('n_test')}{unused}"),
         ("needs", f"median relative L2 error ≤ {percent(needs['error'])} %, median latency ≤ {number(needs['latency_ms'])} ms"),
         ("discretisation error of the scene itself", discretisation_error(entries)),
         ("threads", values("threads")),

@@ -178,6 +178,9 @@ def _dataset_group(comparison: Comparison, dataset: str, width: int) -> Group:
     entries, needs = entries_of(comparison, dataset), needs_of(comparison, dataset)
     title = str(comparison.datasets.get(dataset, {}).get("title", ""))
     notes = [Text(f"{entry.label}: {entry.trouble}", style="red") for entry in entries if entry.trouble]
+    unused = max((entry.row.get("n_unused") or 0 for entry in entries), default=0)
+    if unused:
+        notes.append(Text(f"{unused:,} samples with forces on both sides of the split are in neither part", style="yellow"))
     notes += [Text(f"{label}: warning: {warning}", style="yellow") for label, warning in warnings_of(entries)]
     parts: list[RenderableType] = [
         Text(f"{dataset}{f' – {title}' if title else ''}", style="bold"),

@@ -21,6 +21,9 @@ POINTS_PER_PATCH = 256
 MAX_SURFACE_POINTS = 200_000
 """More than these are a patch that is lost on its facet."""
 
+MAX_PIECES = 1_000_000
+"""Of long triangles, cut up; thin ones need many."""
+
 
 def _midpoints(n_corners: int, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Shape functions (n, n_corners) at the midpoints of the parts of a facet, and their derivatives (n, n_corners, 2).
@@ -128,12 +131,7 @@ def cut_patches(surface: Facets, facets: NDArray[np.int64], centres: NDArray[np.
     """
     if len(facets) == 0:
         raise SpecError("the load region holds nodes but no facet of the surface, so no traction can act on it.")
-    corners = surface.points[facets]
-    longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
-    least = POINTS_PER_PATCH * len(facets) * longest**2 / MAX_SURFACE_POINTS
-    if area_m2 < least:
-        raise SpecError(f"`patch_area_m2` must be at least {least:.3g}, for facets with edges of up to {longest:.3g} m; got {area_m2}.")
-    positions, vectors, values = _midpoint_rule(surface, facets, sqrt(area_m2 / POINTS_PER_PATCH))
+    positions, vectors, values = _points(surface, facets, area_m2)
     areas = np.linalg.norm(vectors, axis=1)
     if area_m2 > areas.sum() * (1 + 1e-12):
         raise SpecError(f"`patch_area_m2` must be in (0, {areas.sum():.6g}], the area of the load region; got {area_m2}.")
@@ -173,6 +171,57 @@ def _nearest(
             return near, distance[near]
         reach *= 2
     return np.arange(len(distance)), distance
+
+
+def _points(
+    surface: Facets, facets: NDArray[np.int64], area_m2: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], sp.csr_array]:  # fmt: skip
+    """As `_midpoint_rule`, after long triangles have been halved, and again, until there are few enough points."""
+    spacing = sqrt(area_m2 / POINTS_PER_PATCH)
+    longest = _longest_edge(surface.points[facets])
+    if len(facets) * max(2, ceil(longest / spacing)) ** 2 <= MAX_SURFACE_POINTS:
+        return _midpoint_rule(surface, facets, spacing)
+    if facets.shape[1] == 3:
+        pieces, to_corners = _halved(surface, facets, 2 * spacing)
+        if len(pieces.facets) <= MAX_PIECES:
+            corners = pieces.points[pieces.facets]
+            vectors = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            mean = sp.csr_array(sp.kron(sp.eye_array(len(corners)), np.full((1, 3), 1 / 3)))
+            return corners.mean(axis=1), vectors, sp.csr_array(mean @ to_corners)
+    least = POINTS_PER_PATCH * len(facets) * longest**2 / MAX_SURFACE_POINTS
+    raise SpecError(f"`patch_area_m2` must be at least about {least:.3g}, for facets with edges of up to {longest:.3g} m; got {area_m2}.")
+
+
+def _longest_edge(corners: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
+
+
+def _halved(surface: Facets, facets: NDArray[np.int64], length: float) -> tuple[Facets, sp.csr_array]:
+    """Triangles cut across their longest edges until none is longer than a length, m.
+
+    Returns
+    -------
+    pieces : Facets
+        With three points of its own for each triangle.
+    to_corners : (3 n_pieces, n_surface_points) sparse float64
+        Takes values at the surface's points to those of the pieces.
+    """
+    owner, shares = np.arange(len(facets)), np.tile(np.eye(3), (len(facets), 1, 1))
+    while True:
+        corners = np.einsum("pca,pai->pci", shares, surface.points[facets[owner]])
+        edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+        first = edges.argmax(axis=1)
+        long = edges.max(axis=1) > length
+        if not long.any() or len(owner) > MAX_PIECES:
+            break
+        rows, a = np.arange(long.sum()), first[long]
+        one, other = shares[long].copy(), shares[long].copy()
+        middle = 0.5 * (one[rows, a] + one[rows, (a + 1) % 3])
+        one[rows, (a + 1) % 3], other[rows, a] = middle, middle
+        owner, shares = np.concatenate([owner[~long], owner[long], owner[long]]), np.concatenate([shares[~long], one, other])
+    n = 3 * len(owner)
+    at = np.repeat(np.arange(n), 3), np.repeat(facets[owner], 3, axis=0).ravel()
+    return Facets(corners.reshape(-1, 3), np.arange(n).reshape(-1, 3)), sp.csr_array((shares.ravel(), at), shape=(n, len(surface.points)))
 
 
 def spread_out(points: NDArray[np.float64], n: int) -> NDArray[np.int64]:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from threading import Thread
 from time import sleep
@@ -142,10 +143,7 @@ def cluster_pool(address: str) -> Iterator[Pool]:
     except ModuleNotFoundError as error:
         raise MissingDependencyError(f"`cluster` needs {error.name}: pip install 'mor-bench[cluster]'") from error
 
-    try:
-        client = Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise WorkerError(f"no Dask scheduler answers at {address} within {CONNECT_S} s.") from error
+    client = _connected(address, partial(Client, address, timeout=CONNECT_S, set_as_default=False))
     try:
         try:
             client.wait_for_workers(1, timeout=CONNECT_S)
@@ -159,6 +157,23 @@ def cluster_pool(address: str) -> Iterator[Pool]:
         raise WorkerError(f"the connection to the Dask scheduler at {address} was lost. {KEPT}") from error
     finally:
         _close(client)
+
+
+def _connected(address: str, connect: Callable[[], Client]) -> Client:
+    """A client, or a `WorkerError` when its time is up: its own limit does not hold for a peer that accepts and stays silent."""
+    made: Future[Client] = Future()
+
+    def attempt() -> None:
+        try:
+            made.set_result(connect())
+        except BaseException as error:
+            made.set_exception(error)
+
+    Thread(target=attempt, daemon=True).start()
+    try:
+        return made.result(CONNECT_S + 2)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise WorkerError(f"no Dask scheduler answers at {address} within {CONNECT_S} s.") from error
 
 
 def _close(client: Client) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import platformdirs
 
-from mor_bench.errors import StoreError
+from mor_bench.errors import DamagedFileWarning, NewerSchemaError, StoreError
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.executors import KEPT, check_pool, open_pool
 from mor_bench.snapshots.manifest import Manifest, update_manifest
@@ -93,13 +94,22 @@ class _Plan:
         return Task(self.key, self._problem, number * SHARD_SIZE, self.loads(number))
 
     def has(self, number: int) -> bool:
-        """Whether a shard is there, is sound, and is the one that it should be."""
+        """Whether a shard is there, is sound, and is the one that it should be; warns if it is there and is not."""
+        path = shard_path(self.folder, number)
         try:
-            shard = read_shard(shard_path(self.folder, number))
-        except (StoreError, FileNotFoundError):
+            shard = read_shard(path)
+        except NewerSchemaError:
+            raise
+        except StoreError as error:
+            warnings.warn(f"{error} It is made again.", DamagedFileWarning, stacklevel=3)
+            return False
+        except FileNotFoundError:
             return False
         named = shard.dataset == self.key and shard.start == number * SHARD_SIZE
-        return named and self._is_filled(shard) and self._is_loaded(shard, self.loads(number))
+        if named and self._is_filled(shard) and self._is_loaded(shard, self.loads(number)):
+            return True
+        warnings.warn(f"{path}: not the samples that belong there. They are made again.", DamagedFileWarning, stacklevel=3)
+        return False
 
     def _is_filled(self, shard: Shard) -> bool:
         n = len(shard.status)
@@ -162,7 +172,7 @@ def generate(
     InvalidInputError
         If ``workers`` is less than 1, ``cluster`` is no address, or both are given.
     StoreError
-        If the folder cannot be written, as on a full disk. Finished shards stay.
+        If the folder cannot be written, as on a full disk, or holds files of a newer schema. Finished shards stay.
     WorkerError
         If workers were killed, or the cluster cannot be reached. Finished shards stay.
     MissingDependencyError

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from mor_bench import __version__
-from mor_bench.errors import StoreError
+from mor_bench.errors import NewerSchemaError, StoreError
 from mor_bench.snapshots.store import SCHEMA_VERSION, check_version, write_atomically
 from mor_bench.specs import DatasetSpec
 
@@ -107,6 +107,8 @@ def update_manifest(folder: Path, manifest: Manifest, *, solves: bool) -> None:
     """
     try:
         environments = read_manifest(folder).environments
+    except NewerSchemaError:
+        raise
     except (StoreError, FileNotFoundError):
         environments = ()
     if solves and this_environment() not in environments:

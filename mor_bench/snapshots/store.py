@@ -23,7 +23,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import StoreError
+from mor_bench.errors import NewerSchemaError, StoreError
 
 SCHEMA_VERSION = 3
 FORMAT = "mor-bench snapshots"
@@ -137,11 +137,17 @@ def read_shard(path: Path) -> Shard:
     Raises
     ------
     StoreError
-        If the file is foreign, of another schema, truncated, or a bit of it has changed.
+        If the file cannot be read, is foreign, of another schema, truncated, or a bit of it has changed.
     FileNotFoundError
         If there is none.
     """
-    return parse_shard(path.read_bytes(), str(path))
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be read: {error.strerror}.") from None
+    return parse_shard(content, str(path))
 
 
 def parse_shard(content: bytes, where: str) -> Shard:
@@ -175,5 +181,6 @@ def check_version(version: object, where: str) -> None:
     """Raise `StoreError`, saying what to do, if a file is of another schema than this version of mor-bench reads."""
     if version == SCHEMA_VERSION:
         return
-    remedy = "update mor-bench to read it" if isinstance(version, int) and version > SCHEMA_VERSION else "generate the dataset again"
-    raise StoreError(f"{where}: schema version {version}; this version of mor-bench reads version {SCHEMA_VERSION}: {remedy}.")
+    newer = isinstance(version, int) and version > SCHEMA_VERSION
+    kind, remedy = (NewerSchemaError, "update mor-bench to read it, or remove it") if newer else (StoreError, "generate the dataset again")
+    raise kind(f"{where}: schema version {version}; this version of mor-bench reads version {SCHEMA_VERSION}: {remedy}.")
