@@ -303,6 +303,14 @@ def two_parts(shift: float) -> meshio.Mesh:
     return meshio.Mesh(points, [("hexahedron", np.vstack([HEX.cells, HEX.cells + n]))])
 
 
+def hinge(kind: str, at: str) -> meshio.Mesh:
+    """Two of the eight blocks of a cube, which have an edge or a node in common."""
+    cube = box_mesh((2.0, 2.0, 2.0), (2, 2, 2), kind == "tetra")
+    centres = cube.points[cube.cells].mean(axis=1) > 1.0
+    blocks = centres.sum(axis=1) == 0, centres[:, :2].all(axis=1) & (centres[:, 2] == (at == "node"))
+    return meshio.Mesh(cube.points, [(kind, cube.cells[blocks[0] | blocks[1]])])
+
+
 def overlapping() -> meshio.Mesh:
     """Three tetrahedra on one face."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.1, 0.1, 2], [0.1, 0.1, -1]])
@@ -319,7 +327,8 @@ BAD: list[tuple[str, str | bytes | meshio.Mesh, str]] = [
     ("mesh.vtu", folded(), r"cell 1 \(counted from 0\) is flat or folded"),
     ("mesh.vtu", flat_tetrahedron(), r"cell 5 \(counted from 0\) is flat or folded"),
     ("mesh.vtu", two_parts(2.0), r"4 nodes lie in the place of others, as at \[2.0, 0.0, 0.0\] m; merge them"),
-    ("mesh.vtu", two_parts(5.0), r"it is 2 parts that share no node"),
+    ("mesh.vtu", two_parts(5.0), r"it is 2 parts that no face joins"),
+    *(("mesh.vtu", hinge(kind, at), "it is 2 parts that no face joins") for kind in ("hexahedron", "tetra") for at in ("edge", "node")),
     ("mesh.vtu", meshio.Mesh(HEX.points, [("hexahedron", np.vstack([HEX.cells, HEX.cells[:1, [1, 2, 3, 0, 5, 6, 7, 4]]]))]), "are there twice"),
     ("mesh.vtu", overlapping(), r"1 faces belong to more than two cells"),
     ("mesh.vtu", MIXED, r"all be linear hexahedra or all linear tetrahedra, hexahedron or tetra; got hexahedron and pyramid and tetra"),

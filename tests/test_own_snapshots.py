@@ -18,6 +18,7 @@ from mor_bench.harness.check import check_file
 from mor_bench.harness.discretisation import refine
 from mor_bench.harness.export import snapshot_arrays
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.scene.mesh import box_mesh
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import ImportedDatasetSpec, list_suite, load_generated_spec
 from tests.test_cli import mor_bench as command
@@ -181,6 +182,15 @@ def put(*index: Any, value: float) -> Callable[[NDArray[Any]], NDArray[Any]]:
     return change
 
 
+def hinged(arrays: Arrays) -> Arrays:
+    """On two blocks of a cube that have an edge in common."""
+    cube = box_mesh((2.0, 2.0, 1.0), (2, 2, 1))
+    cells = cube.cells[[0, 3]]
+    used, cells = np.unique(cells, return_inverse=True)
+    shared = {name: arrays[name][:, : len(used)] for name in ("forces", "displacements")}
+    return {"points": cube.points[used], "cells": cells.reshape(2, 8), **shared}
+
+
 BAD: list[tuple[Callable[[Arrays], Arrays], str]] = [
     (without("points"), "array `points` is missing"),
     (without("cells"), "array `cells` is missing"),
@@ -205,6 +215,7 @@ BAD: list[tuple[Callable[[Arrays], Arrays], str]] = [
     (with_(cells=put(0, 0, value=-1)), r"cells must have nodes in \[0, 62\]; got -1 to 62"),
     (with_(cells=lambda c: c[1:]), r"every node must belong to a cell; 1 of 63 do not|every node must belong to a cell; \d of 63 do not"),
     (with_(cells=put(3, 0, value=50)), "cell 3 .* is flat or folded"),
+    (hinged, "the mesh must be one body; it is 2 parts that no face joins"),
     (with_(cells=lambda c: c[:0]), "there must be points and cells"),
     (with_(fixed_nodes=put(0, value=63)), r"`fixed_nodes` must be in \[0, 62\]; got 1 to 63"),
     (with_(fixed_nodes=lambda n: np.arange(63)), "`fixed_nodes` holds every node"),

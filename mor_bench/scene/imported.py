@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.mesh import Mesh
-from mor_bench.scene.soundness import check_numbers, in_grid, outwards
+from mor_bench.scene.soundness import check_numbers, check_parts, in_grid, outwards
 from mor_bench.specs import SourceFile
 
 STILL = 1e-9
@@ -119,6 +119,7 @@ def _checked(arrays: Mapping[str, NDArray[Any]]) -> ImportedArrays:
     if (unused := n_nodes - len(np.unique(cells))) > 0:
         raise SpecError(f"every node must belong to a cell; {unused} of {n_nodes} do not.")
     cells = outwards(points, cells)
+    check_parts(cells)
     _check_samples(forces, displacements, fixed, regions)
     return ImportedArrays(in_grid(Mesh(points, cells)), forces, displacements, fixed, regions, arrays.get("test"))
 

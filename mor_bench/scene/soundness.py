@@ -47,7 +47,7 @@ def tidied(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[Mesh,
     ------
     SpecError
         If positions are not finite, nodes are doubled or not there, a cell is flat, inside out or there twice, or the
-        cells do not hang together.
+        cells do not hang together through faces.
     """
     check_numbers(points, cells)
     used = np.unique(cells)
@@ -57,7 +57,7 @@ def tidied(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[Mesh,
     _check_doubled(points)
     cells = outwards(points, cells)
     _check_overlap(cells)
-    _check_parts(cells)
+    check_parts(cells)
     order = _numbering(points, cells)
     number = np.empty_like(order)
     number[order] = np.arange(len(order))
@@ -131,18 +131,25 @@ def _check_doubled(points: NDArray[np.float64]) -> None:
 def _check_overlap(cells: NDArray[np.int64]) -> None:
     if len(np.unique(np.sort(cells, axis=1), axis=0)) < len(cells):
         raise SpecError("some cells are there twice.")
-    faces = np.sort(cells[:, FACES[cells.shape[1]]].reshape(-1, FACES[cells.shape[1]].shape[1]), axis=1)
-    shared = np.unique(faces, axis=0, return_counts=True)[1]
+    shared = np.bincount(_face_numbers(cells).ravel())
     if shared.max() > 2:
         raise SpecError(f"{int((shared > 2).sum())} faces belong to more than two cells: cells overlap.")
 
 
-def _check_parts(cells: NDArray[np.int64]) -> None:
-    rows = np.repeat(np.arange(len(cells)), cells.shape[1])
-    belongs = sp.csr_array((np.ones(cells.size), (rows, cells.ravel())))
-    n_parts = connected_components(sp.csr_array(belongs.T @ belongs), directed=False)[0]
+def check_parts(cells: NDArray[np.int64]) -> None:
+    """Raise `SpecError` if the cells do not hang together through faces: joined at an edge or a node, they are a hinge."""
+    faces = _face_numbers(cells)
+    belongs = sp.csr_array((np.ones(faces.size), (np.repeat(np.arange(len(cells)), faces.shape[1]), faces.ravel())))
+    n_parts = connected_components(sp.csr_array(belongs @ belongs.T), directed=False)[0]
     if n_parts > 1:
-        raise SpecError(f"the mesh must be one body; it is {n_parts} parts that share no node.")
+        raise SpecError(f"the mesh must be one body; it is {n_parts} parts that no face joins.")
+
+
+def _face_numbers(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each face of each cell (n_cells, 6 or 4) a number, which is the same for the faces that have the same nodes."""
+    corners = FACES[cells.shape[1]]
+    faces = np.sort(cells[:, corners].reshape(-1, corners.shape[1]), axis=1)
+    return np.unique(faces, axis=0, return_inverse=True)[1].reshape(len(cells), len(corners))
 
 
 def _numbering(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
