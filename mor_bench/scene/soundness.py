@@ -54,10 +54,7 @@ def tidied(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[Mesh,
     place = np.full(len(points), -1, dtype=np.int64)
     place[used] = np.arange(len(used))
     points, cells = points[used], place[cells]
-    _check_doubled(points)
-    cells = outwards(points, cells)
-    _check_overlap(cells)
-    check_parts(cells)
+    cells = sound_cells(points, cells)
     order = _numbering(points, cells)
     number = np.empty_like(order)
     number[order] = np.arange(len(order))
@@ -90,6 +87,22 @@ def check_numbers(points: NDArray[np.float64], cells: NDArray[np.int64]) -> None
         raise SpecError(f"positions must be finite; point {int(np.argwhere(~np.isfinite(points))[0, 0])} (counted from 0) is not.")
     if cells.min() < 0 or cells.max() >= len(points):
         raise SpecError(f"cells must have nodes in [0, {len(points) - 1}]; got {cells.min()} to {cells.max()}.")
+
+
+def sound_cells(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The cells turned outwards, see `outwards`, of a body that is sound.
+
+    Raises
+    ------
+    SpecError
+        If nodes are doubled, a cell is flat, inside out or there twice, more than two share a face, or they do not hang
+        together through faces.
+    """
+    _check_doubled(points)
+    cells = outwards(points, cells)
+    _check_overlap(cells)
+    _check_parts(cells)
+    return cells
 
 
 def outwards(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -136,7 +149,7 @@ def _check_overlap(cells: NDArray[np.int64]) -> None:
         raise SpecError(f"{int((shared > 2).sum())} faces belong to more than two cells: cells overlap.")
 
 
-def check_parts(cells: NDArray[np.int64]) -> None:
+def _check_parts(cells: NDArray[np.int64]) -> None:
     """Raise `SpecError` if the cells do not hang together through faces: joined at an edge or a node, they are a hinge."""
     faces = _face_numbers(cells)
     belongs = sp.csr_array((np.ones(faces.size), (np.repeat(np.arange(len(cells)), faces.shape[1]), faces.ravel())))
