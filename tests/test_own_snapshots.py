@@ -276,12 +276,25 @@ def test_bad_files_are_one_clear_line(file: str, bytes_: bytes, message: str, tm
     assert "\n" not in str(caught.value)
 
 
-def test_groups_in_hdf5_are_refused(arrays: Arrays, tmp_path: Path) -> None:
-    path = written(tmp_path, without("points")(arrays), TOML.replace(".npz", ".h5"))
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        (None, "`forces` must be an array of numbers; got a group"),
+        ("hi", "`forces` must be an array of numbers; got text"),
+        (3.0, r"`forces` must have shape \(1, 63, 3\); got \(\)"),
+        (h5py.ExternalLink("nowhere.h5", "/forces"), "`forces` cannot be read: .*"),
+    ],
+)
+def test_entries_of_hdf5_that_are_no_arrays_are_named(entry: Any, message: str, arrays: Arrays, tmp_path: Path) -> None:
+    path = written(tmp_path, without("forces")(arrays), TOML.replace(".npz", ".h5"))
     with h5py.File(tmp_path / "mine.h5", "a") as file:
-        file.create_group("points")
-    with pytest.raises(SpecError, match=r"mine.h5: not a readable .h5 file of arrays"):
+        if entry is None:
+            file.create_group("forces")
+        else:
+            file["forces"] = entry
+    with pytest.raises(SpecError, match=rf"mine.h5: {message}") as caught:
         check_file(path)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -90,12 +90,22 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
         if suffix in (".h5", ".hdf5"):
             with h5py.File(path, "r") as content:
                 _check_names(list(content))
-                return {name: np.asarray(content[name][()]) for name in content}
+                return {name: _entry(content, name) for name in content}
     except SpecError:
         raise
     except (OSError, ValueError, EOFError, TypeError, KeyError, AttributeError, zipfile.BadZipFile, UnpicklingError) as error:
         raise SpecError(f"not a readable {suffix} file of arrays: {' '.join(str(error).split())}") from None
     raise SpecError(f"snapshots must be in an .npz, .h5 or .hdf5 file; got {suffix!r}.")
+
+
+def _entry(content: h5py.File, name: str) -> NDArray[Any]:
+    try:
+        entry = content[name]
+        if isinstance(entry, h5py.Dataset) and h5py.check_string_dtype(entry.dtype) is None:
+            return np.asarray(entry[()] if entry.shape is not None else np.zeros(0))
+    except (OSError, KeyError, RuntimeError) as error:
+        raise SpecError(f"`{name}` cannot be read: {' '.join(str(error).split())}") from None
+    raise SpecError(f"`{name}` must be an array of numbers; got {'text' if isinstance(entry, h5py.Dataset) else 'a group'}.")
 
 
 def _check_names(names: list[str]) -> None:
