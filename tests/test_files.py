@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -383,6 +385,14 @@ def test_a_missing_file_or_one_that_has_changed_is_named(folder: Path) -> None:
     (folder / "beam.vtu").write_bytes(b"other")
     with pytest.raises(SpecError, match="has changed since"):
         mor_bench.load_scene(spec)
+
+
+def test_files_are_closed_again(folder: Path) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        read_triangles(folder / "plane.stl", 1.0)
+        gc.collect()
+    assert not [warning for warning in caught if warning.category is ResourceWarning]
 
 
 @pytest.mark.parametrize(

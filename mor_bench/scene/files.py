@@ -109,7 +109,8 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
         If the file is missing, cannot be read, or has positions that are not three-dimensional.
     """
     try:
-        head = path.open("rb").read(64)
+        with path.open("rb") as file:
+            head = file.read(64)
     except FileNotFoundError:
         raise SpecError(f"{path}: no such file.") from None
     except OSError as error:
