@@ -79,6 +79,17 @@ def write_gmsh(raw: meshio.Mesh, path: Path, version: str, binary: bool) -> None
     meshio.gmsh.write(path, mesh, fmt_version=version, binary=binary)
 
 
+def write_gmsh_reversed(raw: meshio.Mesh, path: Path) -> None:
+    """Gmsh gives the number of a group with a minus to a surface that the group holds turned over."""
+    write_gmsh(raw, path, "4.1", False)
+    lines = path.read_text().splitlines()
+    first = lines.index("$Entities") + 2  # surface 1: its number, its box, how many groups, the groups
+    words = lines[first].split()
+    assert words[:1] + words[7:9] == ["1", "1", "1"]
+    lines[first] = " ".join([*words[:8], "-1", *words[9:]])
+    path.write_text("\n".join([*lines, ""]))
+
+
 def write_gmsh1(raw: meshio.Mesh, path: Path) -> None:
     """By hand, from the manual: nodes and elements are numbered with gaps."""
     types = {"hexahedron": 5, "tetra": 4, "quad": 3, "triangle": 2}
@@ -114,6 +125,7 @@ FORMATS: dict[str, tuple[str, Callable[[meshio.Mesh, Path], None], str, str]] = 
     "gmsh 2.2 ascii": ("msh", lambda raw, path: write_gmsh(raw, path, "2.2", False), "left", "top"),
     "gmsh 2.2 binary": ("msh", lambda raw, path: write_gmsh(raw, path, "2.2", True), "left", "top"),
     "gmsh 4.1 ascii": ("msh", lambda raw, path: write_gmsh(raw, path, "4.1", False), "left", "top"),
+    "gmsh 4.1 with a reversed surface": ("msh", write_gmsh_reversed, "left", "top"),
     "gmsh 4.1 binary": ("msh", lambda raw, path: write_gmsh(raw, path, "4.1", True), "left", "top"),
     "abaqus": ("inp", write_abaqus, "left", "top"),
     "vtu": ("vtu", write_vtk("vtu", True), "left", "top"),
@@ -167,6 +179,21 @@ def test_what_is_no_regular_grid_is_not_taken_for_one() -> None:
     assert in_grid(both).grid_shape is None
     doubled = Mesh(np.vstack([mesh.points, mesh.points]), np.vstack([mesh.cells, mesh.cells + mesh.n_nodes]))
     assert in_grid(doubled).grid_shape is None
+
+
+def test_groups_of_one_number_are_told_apart_by_dimension(tmp_path: Path) -> None:
+    mesh = box_mesh(SIZE, CELLS)
+    sides = [mesh.boundary_facets[np.isclose(mesh.points[mesh.boundary_facets, axis], at).all(axis=1)] for axis, at in ((0, 0.0), (2, 0.4))]
+    blocks = [("hexahedron", mesh.cells), *(("quad", side) for side in sides)]
+    data = {
+        name: [np.full(len(block), tag) for (_, block), tag in zip(blocks, (1, 1, 2), strict=True)] for name in ("gmsh:physical", "gmsh:geometrical")
+    }
+    meshio.gmsh.write(tmp_path / "m.msh", meshio.Mesh(mesh.points, blocks, cell_data=data), fmt_version="2.2", binary=False)
+    read, sets = read_mesh(tmp_path / "m.msh", 1.0)
+    assert {name: len(nodes) for name, nodes in sets.items()} == {"surface 1": 9, "volume 1": 63, "2": 21}
+    np.testing.assert_array_equal(sets["surface 1"], np.flatnonzero(read.points[:, 0] == 0.0))
+    with pytest.raises(SpecError, match=r"unknown point set '1'\. Known: surface 1, volume 1, 2"):
+        mor_bench.load_scene(of_file(tmp_path / "m.msh", support={"point_set": "1"}))
 
 
 def test_inverted_cells_are_turned_over(beam: tuple[str, Mesh, meshio.Mesh], tmp_path: Path) -> None:

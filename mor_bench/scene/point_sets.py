@@ -18,7 +18,7 @@ def named_point_sets(mesh: meshio.Mesh, path: Path) -> PointSets:
     """The sets of nodes that a file names; those of the same name are joined.
 
     They are point sets (Abaqus NSET), the nodes of cell sets (ELSET) and of Gmsh's physical groups of any dimension, a group
-    without a name under its number, and point data of zeros and ones (VTK).
+    without a name under its number, with its dimension before it where others have it too, and point data of zeros and ones (VTK).
 
     Raises
     ------
@@ -43,6 +43,9 @@ def named_point_sets(mesh: meshio.Mesh, path: Path) -> PointSets:
 _Rows = list[NDArray[np.int64]]
 """For each block of cells the rows that are chosen."""
 
+_DIMENSIONS = ("point", "line", "surface", "volume")
+"""Gmsh's words for groups, by dimension."""
+
 _NO_ROWS = np.zeros(0, dtype=np.int64)
 
 
@@ -58,14 +61,17 @@ def _cell_sets(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
 
 
 def _physical_groups(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
-    tags = mesh.cell_data.get("gmsh:physical")
-    if tags is None:
+    data = mesh.cell_data.get("gmsh:physical")
+    if data is None:
         return []
+    tags = [np.abs(values) for values in data]  # negative where a group holds a surface turned over
     names = {(int(tag), int(dimension)): name for name, (tag, dimension) in mesh.field_data.items()}
     keys = sorted({(int(tag), block.dim) for block, values in zip(mesh.cells, tags, strict=True) for tag in np.unique(values) if tag != 0})
+    unnamed = [tag for tag, dimension in keys if (tag, dimension) not in names]
+    numbers = {(tag, dim): str(tag) if unnamed.count(tag) == 1 else f"{_DIMENSIONS[dim]} {tag}" for tag, dim in keys}
     return [
-        (names.get(key, str(key[0])), [np.flatnonzero(values == key[0]) if block.dim == key[1] else _NO_ROWS
-                                       for block, values in zip(mesh.cells, tags, strict=True)])
+        (names.get(key, numbers[key]), [np.flatnonzero(values == key[0]) if block.dim == key[1] else _NO_ROWS
+                                        for block, values in zip(mesh.cells, tags, strict=True)])
         for key in keys
     ]  # fmt: skip
 
