@@ -181,6 +181,16 @@ def test_what_is_no_regular_grid_is_not_taken_for_one() -> None:
     assert in_grid(doubled).grid_shape is None
 
 
+@pytest.mark.parametrize("line", ["*NODE, NSET=held", "*Node,nset=held", "*NODE, INPUT=, NSET = held"])
+def test_a_set_in_the_line_of_abaqus_nodes_holds_them_all(line: str, tmp_path: Path) -> None:
+    rows = [f"{i + 1}, {x:g}, {y:g}, {z:g}" for i, (x, y, z) in enumerate(HEX.points)]
+    cells = [", ".join(str(n) for n in (i + 1, *(cell + 1))) for i, cell in enumerate(HEX.cells)]
+    text = "\n".join([line, *rows, "*ELEMENT, TYPE=C3D8", *cells, "*NSET, NSET=left", "1, 2,", "3, 4", ""])
+    (tmp_path / "m.inp").write_text(text)
+    _, sets = read_mesh(tmp_path / "m.inp", 1.0)
+    assert {name: nodes.tolist() for name, nodes in sets.items()} == {"held": list(range(12)), "left": [0, 1, 2, 3]}
+
+
 def test_groups_of_one_number_are_told_apart_by_dimension(tmp_path: Path) -> None:
     mesh = box_mesh(SIZE, CELLS)
     sides = [mesh.boundary_facets[np.isclose(mesh.points[mesh.boundary_facets, axis], at).all(axis=1)] for axis, at in ((0, 0.0), (2, 0.4))]
@@ -375,6 +385,11 @@ BAD: list[tuple[str, str | bytes | meshio.Mesh, str]] = [
     ("mesh.inp", "*NODE\n1, 0, 0, 0\n*ELEMENT, TYPE=C3D8R5\n1, 1\n", "Element type not available: C3D8R5"),
     ("mesh.inp", "*NODE\n1, 0, 0\n2, 1, 0\n3, 0, 1\n*ELEMENT, TYPE=S3\n1, 1, 2, 3\n", r"must have three coordinates; got an array of shape \(3, 2\)"),
     ("mesh.inp", "*NODE\n1, 0, 0, 0\n*NSET, NSET=a\n1\n*NSET, NSET=a\n1\n", "NSET 'a' is defined more than once"),
+    (
+        "mesh.inp",
+        "*NODE, NSET=a\n1, 0, 0, 0\n*NODE\n2, 1, 0, 0\n*ELEMENT, TYPE=T3D2\n1, 1, 2\n",
+        r"under one line \*NODE; there are 2",
+    ),
     ("mesh.msh", GMSH1.replace("4 1 2 3 4\n", "4 1 2 3 9\n"), "not a sound Gmsh 1 file: there is no node, or no element type, 9"),
     ("mesh.msh", GMSH1.replace("1 4 1 1", "1 44 1 1"), "no element type, 44"),
     ("mesh.msh", GMSH1.replace("$ELM\n1\n", "$ELM\n2\n"), r"\$ELM must hold as many lines as its first says"),

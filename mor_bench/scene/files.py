@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mor_bench.errors import SpecError
 from mor_bench.scene.gmsh1 import is_gmsh1, read_gmsh1
 from mor_bench.scene.mesh import Mesh
-from mor_bench.scene.point_sets import PointSets, named_point_sets
+from mor_bench.scene.point_sets import PointSets, check_abaqus, named_point_sets
 from mor_bench.scene.soundness import tidied
 
 CELLS = {"hexahedron": 8, "tetra": 4}
@@ -117,6 +117,8 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
         raise SpecError(f"{path}: cannot be read: {error.strerror}.") from None
     if is_gmsh1(head):
         return read_gmsh1(path)
+    if path.suffix.lower() == ".inp":
+        check_abaqus(path)
     # Both Ansys and Gmsh write .msh; told which, meshio says what is wrong rather than that neither fits.
     file_format = "gmsh" if path.suffix.lower() == ".msh" and head.startswith(b"$") else None
     printed = StringIO()
