@@ -376,10 +376,12 @@ BAD: list[tuple[str, str | bytes | meshio.Mesh, str]] = [
     ("mesh.vtu", meshio.Mesh(np.random.default_rng(0).random((6, 3)), [("wedge", [range(6)])]), "got wedge"),
     ("mesh.vtu", meshio.Mesh(HEX.points, [("hexahedron", HEX.cells + 1)]), r"cells must have nodes in \[0, 11\]; got 1 to 12"),
     ("mesh.vtu", "<VTKFile", "meshio cannot read it"),
-    ("mesh.vtu", b"", "meshio cannot read it"),
+    ("mesh.vtu", b"", "the file is empty"),
+    ("mesh.msh", b"", "the file is empty"),
     ("mesh.vtk", "# vtk DataFile Version 4.2\nx\nASCII\n", "meshio cannot read it"),
     ("mesh.msh", "$MeshFormat\n9.9 0 8\n$EndMeshFormat\n", "meshio cannot read it"),
     ("mesh.msh", "nothing of the kind", "meshio cannot read it"),
+    ("mesh.msh", b"\n\n", "the file holds no mesh"),
     ("mesh.med", b"\x00\x01", "meshio cannot read it"),
     ("mesh.unknown", "x", "Could not deduce file format"),
     ("mesh.inp", "*NODE\n1, 0, 0, 0\n*ELEMENT, TYPE=C3D8R5\n1, 1\n", "Element type not available: C3D8R5"),
@@ -427,6 +429,16 @@ def test_a_missing_file_or_one_that_has_changed_is_named(folder: Path) -> None:
     (folder / "beam.vtu").write_bytes(b"other")
     with pytest.raises(SpecError, match="has changed since"):
         mor_bench.load_scene(spec)
+
+
+def test_half_a_binary_surface_is_one_clear_line(folder: Path) -> None:
+    corners = np.random.default_rng(0).random((60, 3))
+    meshio.Mesh(corners, [("triangle", np.arange(60).reshape(20, 3))]).write(folder / "half.stl", binary=True)
+    whole = (folder / "half.stl").read_bytes()
+    assert read_triangles(folder / "half.stl", 1.0).shape == (20, 3, 3)
+    (folder / "half.stl").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(SpecError, match=r"half.stl: cannot be read as STL: it is neither text nor a binary file of the length that it names\.$"):
+        read_triangles(folder / "half.stl", 1.0)
 
 
 def test_files_are_closed_again(folder: Path) -> None:
