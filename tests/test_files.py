@@ -356,6 +356,17 @@ def overlapping() -> meshio.Mesh:
     return meshio.Mesh(points, [("tetra", np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 2, 1, 5]]))])
 
 
+def on_one_side(kind: str) -> meshio.Mesh:
+    """A cell, and one that is twice as high on the same face; both are turned outwards."""
+    mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1), kind == "tetra")
+    cell = mesh.cells[0]
+    higher = cell.copy()
+    apex = np.flatnonzero(mesh.points[cell, 2] == 1.0) if kind == "hexahedron" else np.array([3])
+    higher[apex] = mesh.n_nodes + np.arange(len(apex))
+    points = np.vstack([mesh.points, mesh.points[cell[apex]] + [0.0, 0.0, 1.0]])
+    return meshio.Mesh(points, [(kind, np.vstack([cell, higher]))])
+
+
 MIXED = meshio.Mesh(
     np.vstack([HEX.points, [[3.0, 0.5, 0.5]]]),
     [("hexahedron", HEX.cells), ("pyramid", np.array([[8, 9, 11, 10, 12]])), ("tetra", np.array([[8, 9, 10, 12]]))],
@@ -370,6 +381,7 @@ BAD: list[tuple[str, str | bytes | meshio.Mesh, str]] = [
     *(("mesh.vtu", hinge(kind, at), "it is 2 parts that no face joins") for kind in ("hexahedron", "tetra") for at in ("edge", "node")),
     ("mesh.vtu", meshio.Mesh(HEX.points, [("hexahedron", np.vstack([HEX.cells, HEX.cells[:1, [1, 2, 3, 0, 5, 6, 7, 4]]]))]), "are there twice"),
     ("mesh.vtu", overlapping(), r"1 faces belong to more than two cells"),
+    *(("mesh.vtu", on_one_side(kind), "1 faces have both of their cells on one side") for kind in ("hexahedron", "tetra")),
     ("mesh.vtu", MIXED, r"all be linear hexahedra or all linear tetrahedra, hexahedron or tetra; got hexahedron and pyramid and tetra"),
     ("mesh.vtu", meshio.Mesh(HEX.points, [("quad", HEX.boundary_facets)]), "got no volume cells"),
     ("mesh.vtu", meshio.Mesh(np.random.default_rng(0).random((10, 3)), [("tetra10", [range(10)])]), "got tetra10"),

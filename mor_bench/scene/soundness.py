@@ -95,7 +95,7 @@ def sound_cells(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArra
     Raises
     ------
     SpecError
-        If nodes are doubled, a cell is flat, inside out or there twice, more than two share a face, or they do not hang
+        If nodes are doubled, a cell is flat, inside out or there twice, more than two share a face, two lie on one side of it, or they do not hang
         together through faces.
     """
     _check_doubled(points)
@@ -144,9 +144,17 @@ def _check_doubled(points: NDArray[np.float64]) -> None:
 def _check_overlap(cells: NDArray[np.int64]) -> None:
     if len(np.unique(np.sort(cells, axis=1), axis=0)) < len(cells):
         raise SpecError("some cells are there twice.")
-    shared = np.bincount(_face_numbers(cells).ravel())
+    numbers = _face_numbers(cells).ravel()
+    shared = np.bincount(numbers)
     if shared.max() > 2:
         raise SpecError(f"{int((shared > 2).sum())} faces belong to more than two cells: cells overlap.")
+    # Seen from outside, cells on either side of a face go round it in opposite senses.
+    corners = FACES[cells.shape[1]]
+    faces = cells[:, corners].reshape(-1, corners.shape[1])
+    second = faces[np.arange(len(faces)), (faces.argmin(axis=1) + 1) % faces.shape[1]]
+    n_sides = len(np.unique(np.stack([numbers, second], axis=1), axis=0))
+    if n_sides < len(faces):
+        raise SpecError(f"{len(faces) - n_sides} faces have both of their cells on one side: cells overlap.")
 
 
 def _check_parts(cells: NDArray[np.int64]) -> None:
