@@ -115,8 +115,6 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
         raise SpecError(f"{path}: no such file.") from None
     except OSError as error:
         raise SpecError(f"{path}: cannot be read: {error.strerror}.") from None
-    if not head:
-        raise SpecError(f"{path}: the file is empty.")
     if is_gmsh1(head):
         return read_gmsh1(path)
     if path.suffix.lower() == ".inp":
@@ -133,7 +131,7 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
         raise SpecError(f"{path}: cannot be read as {path.suffix[1:].upper()}: it is {broken}.") from None
     except (Exception, SystemExit) as error:
         if "need at least one array" in str(error):
-            raise SpecError(f"{path}: the file holds no mesh.") from None
+            raise SpecError(f"{path}: the file is empty or holds no mesh.") from None
         said = " ".join((printed.getvalue() if isinstance(error, SystemExit) else str(error)).split())
         raise SpecError(f"{path}: meshio cannot read it ({said or type(error).__name__}).") from None
     if raw.points.size and (raw.points.ndim != 2 or raw.points.shape[1] != 3):
