@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -99,6 +100,15 @@ def test_numpy_is_read_in_again_with_the_same_parts(by: str, cache: Path, tmp_pa
         assert one.files == two.files
         for name in one.files:
             np.testing.assert_array_equal(one[name], two[name])
+
+
+@pytest.mark.parametrize("name", ["😀", 'a"b\\c', "tab\tdel\x7fesc\x1bé"])
+def test_any_file_name_and_title_is_read_in_again(name: str, tiny: Dataset, tmp_path: Path) -> None:
+    spec = tiny.scene.spec.model_copy(update={"title": name, "source": name + "\n\x00"})
+    npz, toml = export_numpy(replace(tiny, scene=replace(tiny.scene, spec=spec)), tmp_path / f"{name}.npz")
+    assert tomllib.loads(toml.read_text(encoding="utf-8"))["snapshots"]["file"] == npz.name
+    again = mor_bench.load_scene(toml).spec
+    assert (again.title, again.source) == (spec.title, spec.source)
 
 
 def test_snapshots_without_regions_stay_without(tiny: Dataset, tmp_path: Path) -> None:

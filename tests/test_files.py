@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -77,6 +79,17 @@ def write_gmsh(raw: meshio.Mesh, path: Path, version: str, binary: bool) -> None
     meshio.gmsh.write(path, mesh, fmt_version=version, binary=binary)
 
 
+def write_gmsh_reversed(raw: meshio.Mesh, path: Path) -> None:
+    """Gmsh gives the number of a group with a minus to a surface that the group holds turned over."""
+    write_gmsh(raw, path, "4.1", False)
+    lines = path.read_text().splitlines()
+    first = lines.index("$Entities") + 2  # surface 1: its number, its box, how many groups, the groups
+    words = lines[first].split()
+    assert words[:1] + words[7:9] == ["1", "1", "1"]
+    lines[first] = " ".join([*words[:8], "-1", *words[9:]])
+    path.write_text("\n".join([*lines, ""]))
+
+
 def write_gmsh1(raw: meshio.Mesh, path: Path) -> None:
     """By hand, from the manual: nodes and elements are numbered with gaps."""
     types = {"hexahedron": 5, "tetra": 4, "quad": 3, "triangle": 2}
@@ -112,6 +125,7 @@ FORMATS: dict[str, tuple[str, Callable[[meshio.Mesh, Path], None], str, str]] = 
     "gmsh 2.2 ascii": ("msh", lambda raw, path: write_gmsh(raw, path, "2.2", False), "left", "top"),
     "gmsh 2.2 binary": ("msh", lambda raw, path: write_gmsh(raw, path, "2.2", True), "left", "top"),
     "gmsh 4.1 ascii": ("msh", lambda raw, path: write_gmsh(raw, path, "4.1", False), "left", "top"),
+    "gmsh 4.1 with a reversed surface": ("msh", write_gmsh_reversed, "left", "top"),
     "gmsh 4.1 binary": ("msh", lambda raw, path: write_gmsh(raw, path, "4.1", True), "left", "top"),
     "abaqus": ("inp", write_abaqus, "left", "top"),
     "vtu": ("vtu", write_vtk("vtu", True), "left", "top"),
@@ -165,6 +179,31 @@ def test_what_is_no_regular_grid_is_not_taken_for_one() -> None:
     assert in_grid(both).grid_shape is None
     doubled = Mesh(np.vstack([mesh.points, mesh.points]), np.vstack([mesh.cells, mesh.cells + mesh.n_nodes]))
     assert in_grid(doubled).grid_shape is None
+
+
+@pytest.mark.parametrize("line", ["*NODE, NSET=held", "*Node,nset=held", "*NODE, INPUT=, NSET = held"])
+def test_a_set_in_the_line_of_abaqus_nodes_holds_them_all(line: str, tmp_path: Path) -> None:
+    rows = [f"{i + 1}, {x:g}, {y:g}, {z:g}" for i, (x, y, z) in enumerate(HEX.points)]
+    cells = [", ".join(str(n) for n in (i + 1, *(cell + 1))) for i, cell in enumerate(HEX.cells)]
+    text = "\n".join([line, *rows, "*ELEMENT, TYPE=C3D8", *cells, "*NSET, NSET=left", "1, 2,", "3, 4", ""])
+    (tmp_path / "m.inp").write_text(text)
+    _, sets = read_mesh(tmp_path / "m.inp", 1.0)
+    assert {name: nodes.tolist() for name, nodes in sets.items()} == {"held": list(range(12)), "left": [0, 1, 2, 3]}
+
+
+def test_groups_of_one_number_are_told_apart_by_dimension(tmp_path: Path) -> None:
+    mesh = box_mesh(SIZE, CELLS)
+    sides = [mesh.boundary_facets[np.isclose(mesh.points[mesh.boundary_facets, axis], at).all(axis=1)] for axis, at in ((0, 0.0), (2, 0.4))]
+    blocks = [("hexahedron", mesh.cells), *(("quad", side) for side in sides)]
+    data = {
+        name: [np.full(len(block), tag) for (_, block), tag in zip(blocks, (1, 1, 2), strict=True)] for name in ("gmsh:physical", "gmsh:geometrical")
+    }
+    meshio.gmsh.write(tmp_path / "m.msh", meshio.Mesh(mesh.points, blocks, cell_data=data), fmt_version="2.2", binary=False)
+    read, sets = read_mesh(tmp_path / "m.msh", 1.0)
+    assert {name: len(nodes) for name, nodes in sets.items()} == {"surface 1": 9, "volume 1": 63, "2": 21}
+    np.testing.assert_array_equal(sets["surface 1"], np.flatnonzero(read.points[:, 0] == 0.0))
+    with pytest.raises(SpecError, match=r"unknown point set '1'\. Known: surface 1, volume 1, 2"):
+        mor_bench.load_scene(of_file(tmp_path / "m.msh", support={"point_set": "1"}))
 
 
 def test_inverted_cells_are_turned_over(beam: tuple[str, Mesh, meshio.Mesh], tmp_path: Path) -> None:
@@ -303,10 +342,29 @@ def two_parts(shift: float) -> meshio.Mesh:
     return meshio.Mesh(points, [("hexahedron", np.vstack([HEX.cells, HEX.cells + n]))])
 
 
+def hinge(kind: str, at: str) -> meshio.Mesh:
+    """Two of the eight blocks of a cube, which have an edge or a node in common."""
+    cube = box_mesh((2.0, 2.0, 2.0), (2, 2, 2), kind == "tetra")
+    centres = cube.points[cube.cells].mean(axis=1) > 1.0
+    blocks = centres.sum(axis=1) == 0, centres[:, :2].all(axis=1) & (centres[:, 2] == (at == "node"))
+    return meshio.Mesh(cube.points, [(kind, cube.cells[blocks[0] | blocks[1]])])
+
+
 def overlapping() -> meshio.Mesh:
     """Three tetrahedra on one face."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.1, 0.1, 2], [0.1, 0.1, -1]])
     return meshio.Mesh(points, [("tetra", np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 2, 1, 5]]))])
+
+
+def on_one_side(kind: str) -> meshio.Mesh:
+    """A cell, and one that is twice as high on the same face; both are turned outwards."""
+    mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1), kind == "tetra")
+    cell = mesh.cells[0]
+    higher = cell.copy()
+    apex = np.flatnonzero(mesh.points[cell, 2] == 1.0) if kind == "hexahedron" else np.array([3])
+    higher[apex] = mesh.n_nodes + np.arange(len(apex))
+    points = np.vstack([mesh.points, mesh.points[cell[apex]] + [0.0, 0.0, 1.0]])
+    return meshio.Mesh(points, [(kind, np.vstack([cell, higher]))])
 
 
 MIXED = meshio.Mesh(
@@ -319,9 +377,11 @@ BAD: list[tuple[str, str | bytes | meshio.Mesh, str]] = [
     ("mesh.vtu", folded(), r"cell 1 \(counted from 0\) is flat or folded"),
     ("mesh.vtu", flat_tetrahedron(), r"cell 5 \(counted from 0\) is flat or folded"),
     ("mesh.vtu", two_parts(2.0), r"4 nodes lie in the place of others, as at \[2.0, 0.0, 0.0\] m; merge them"),
-    ("mesh.vtu", two_parts(5.0), r"it is 2 parts that share no node"),
+    ("mesh.vtu", two_parts(5.0), r"it is 2 parts that no face joins"),
+    *(("mesh.vtu", hinge(kind, at), "it is 2 parts that no face joins") for kind in ("hexahedron", "tetra") for at in ("edge", "node")),
     ("mesh.vtu", meshio.Mesh(HEX.points, [("hexahedron", np.vstack([HEX.cells, HEX.cells[:1, [1, 2, 3, 0, 5, 6, 7, 4]]]))]), "are there twice"),
     ("mesh.vtu", overlapping(), r"1 faces belong to more than two cells"),
+    *(("mesh.vtu", on_one_side(kind), "1 faces have both of their cells on one side") for kind in ("hexahedron", "tetra")),
     ("mesh.vtu", MIXED, r"all be linear hexahedra or all linear tetrahedra, hexahedron or tetra; got hexahedron and pyramid and tetra"),
     ("mesh.vtu", meshio.Mesh(HEX.points, [("quad", HEX.boundary_facets)]), "got no volume cells"),
     ("mesh.vtu", meshio.Mesh(np.random.default_rng(0).random((10, 3)), [("tetra10", [range(10)])]), "got tetra10"),
@@ -329,14 +389,21 @@ BAD: list[tuple[str, str | bytes | meshio.Mesh, str]] = [
     ("mesh.vtu", meshio.Mesh(HEX.points, [("hexahedron", HEX.cells + 1)]), r"cells must have nodes in \[0, 11\]; got 1 to 12"),
     ("mesh.vtu", "<VTKFile", "meshio cannot read it"),
     ("mesh.vtu", b"", "meshio cannot read it"),
+    ("mesh.msh", b"", "the file is empty or holds no mesh"),
     ("mesh.vtk", "# vtk DataFile Version 4.2\nx\nASCII\n", "meshio cannot read it"),
     ("mesh.msh", "$MeshFormat\n9.9 0 8\n$EndMeshFormat\n", "meshio cannot read it"),
     ("mesh.msh", "nothing of the kind", "meshio cannot read it"),
+    ("mesh.msh", b"\n\n", "the file is empty or holds no mesh"),
     ("mesh.med", b"\x00\x01", "meshio cannot read it"),
     ("mesh.unknown", "x", "Could not deduce file format"),
     ("mesh.inp", "*NODE\n1, 0, 0, 0\n*ELEMENT, TYPE=C3D8R5\n1, 1\n", "Element type not available: C3D8R5"),
     ("mesh.inp", "*NODE\n1, 0, 0\n2, 1, 0\n3, 0, 1\n*ELEMENT, TYPE=S3\n1, 1, 2, 3\n", r"must have three coordinates; got an array of shape \(3, 2\)"),
     ("mesh.inp", "*NODE\n1, 0, 0, 0\n*NSET, NSET=a\n1\n*NSET, NSET=a\n1\n", "NSET 'a' is defined more than once"),
+    (
+        "mesh.inp",
+        "*NODE, NSET=a\n1, 0, 0, 0\n*NODE\n2, 1, 0, 0\n*ELEMENT, TYPE=T3D2\n1, 1, 2\n",
+        r"under one line \*NODE; there are 2",
+    ),
     ("mesh.msh", GMSH1.replace("4 1 2 3 4\n", "4 1 2 3 9\n"), "not a sound Gmsh 1 file: there is no node, or no element type, 9"),
     ("mesh.msh", GMSH1.replace("1 4 1 1", "1 44 1 1"), "no element type, 44"),
     ("mesh.msh", GMSH1.replace("$ELM\n1\n", "$ELM\n2\n"), r"\$ELM must hold as many lines as its first says"),
@@ -374,6 +441,24 @@ def test_a_missing_file_or_one_that_has_changed_is_named(folder: Path) -> None:
     (folder / "beam.vtu").write_bytes(b"other")
     with pytest.raises(SpecError, match="has changed since"):
         mor_bench.load_scene(spec)
+
+
+def test_half_a_binary_surface_is_one_clear_line(folder: Path) -> None:
+    corners = np.random.default_rng(0).random((60, 3))
+    meshio.Mesh(corners, [("triangle", np.arange(60).reshape(20, 3))]).write(folder / "half.stl", binary=True)
+    whole = (folder / "half.stl").read_bytes()
+    assert read_triangles(folder / "half.stl", 1.0).shape == (20, 3, 3)
+    (folder / "half.stl").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(SpecError, match=r"half.stl: cannot be read as STL: it is neither text nor a binary file of the length that it names\.$"):
+        read_triangles(folder / "half.stl", 1.0)
+
+
+def test_files_are_closed_again(folder: Path) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        read_triangles(folder / "plane.stl", 1.0)
+        gc.collect()
+    assert not [warning for warning in caught if warning.category is ResourceWarning]
 
 
 @pytest.mark.parametrize(

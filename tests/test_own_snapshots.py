@@ -18,8 +18,11 @@ from mor_bench.harness.check import check_file
 from mor_bench.harness.discretisation import refine
 from mor_bench.harness.export import snapshot_arrays
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.scene.imported import MAX_SIZE
+from mor_bench.scene.mesh import box_mesh
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import ImportedDatasetSpec, list_suite, load_generated_spec
+from mor_bench.surrogate import MAX_FORCE_N
 from tests.test_cli import mor_bench as command
 
 Arrays = dict[str, NDArray[Any]]
@@ -88,6 +91,8 @@ def test_splits(arrays: Arrays, tmp_path: Path) -> None:
     held = np.arange(n) % 3 == 0
     by_file = written(tmp_path, {**arrays, "test": held}, TOML.replace(".npz", ".h5") + '[split]\nby = "file"\n')
     np.testing.assert_array_equal(mor_bench.load_dataset(by_file).test.forces, arrays["forces"][held])
+    as_numbers = written(tmp_path, {**arrays, "test": held.astype(np.uint8)}, TOML.replace(".npz", ".h5") + '[split]\nby = "file"\n')
+    np.testing.assert_array_equal(mor_bench.load_dataset(as_numbers).test.forces, arrays["forces"][held])
     with pytest.raises(InvalidInputError, match="`test` must be true for some samples and false for others"):
         mor_bench.load_dataset(written(tmp_path, {**arrays, "test": held | True}, TOML + '[split]\nby = "file"\n'))
     with pytest.raises(InvalidInputError, match="a split by file needs the array `test`"):
@@ -121,6 +126,15 @@ def test_every_method_competes_or_says_why_not(name: str, arrays: Arrays, tmp_pa
     (tmp_path / "mine.npz").unlink()
     with pytest.raises(StoreError, match=r"model.safetensors: .*mine.npz: no such file"):
         mor_bench.load_surrogate(tmp_path / "model.safetensors")
+
+
+@pytest.mark.parametrize("none", [np.zeros(0), np.zeros(0, dtype=int), np.zeros(0, dtype=bool), np.zeros((0, 0))])
+def test_no_node_need_be_fixed(none: NDArray[Any], arrays: Arrays, tmp_path: Path) -> None:
+    assert mor_bench.load_scene(written(tmp_path, {**arrays, "fixed_nodes": none})).fixed_nodes.shape == (0,)
+
+
+def test_what_is_read_can_be_predicted_for() -> None:
+    assert MAX_SIZE["forces"] == MAX_FORCE_N
 
 
 def test_a_known_law_is_learned(tmp_path: Path, arrays: Arrays) -> None:
@@ -181,6 +195,15 @@ def put(*index: Any, value: float) -> Callable[[NDArray[Any]], NDArray[Any]]:
     return change
 
 
+def hinged(arrays: Arrays) -> Arrays:
+    """On two blocks of a cube that have an edge in common."""
+    cube = box_mesh((2.0, 2.0, 1.0), (2, 2, 1))
+    cells = cube.cells[[0, 3]]
+    used, cells = np.unique(cells, return_inverse=True)
+    shared = {name: arrays[name][:, : len(used)] for name in ("forces", "displacements")}
+    return {"points": cube.points[used], "cells": cells.reshape(2, 8), **shared}
+
+
 BAD: list[tuple[Callable[[Arrays], Arrays], str]] = [
     (without("points"), "array `points` is missing"),
     (without("cells"), "array `cells` is missing"),
@@ -205,13 +228,22 @@ BAD: list[tuple[Callable[[Arrays], Arrays], str]] = [
     (with_(cells=put(0, 0, value=-1)), r"cells must have nodes in \[0, 62\]; got -1 to 62"),
     (with_(cells=lambda c: c[1:]), r"every node must belong to a cell; 1 of 63 do not|every node must belong to a cell; \d of 63 do not"),
     (with_(cells=put(3, 0, value=50)), "cell 3 .* is flat or folded"),
+    (hinged, "the mesh must be one body; it is 2 parts that no face joins"),
     (with_(cells=lambda c: c[:0]), "there must be points and cells"),
     (with_(fixed_nodes=put(0, value=63)), r"`fixed_nodes` must be in \[0, 62\]; got 1 to 63"),
     (with_(fixed_nodes=lambda n: np.arange(63)), "`fixed_nodes` holds every node"),
     (with_(fixed_nodes=lambda n: [*n, 40]), r"`displacements` must be zero at `fixed_nodes`; sample \d+ has \S+ m"),
     (with_(regions=lambda r: r - 1), "`regions` must be ids from 0 on"),
     (with_(regions=lambda r: r[:-1]), r"`regions` must have shape \(210,\) or \(210, any\); got \(209,\)"),
-    (lambda a: {**a, "test": np.zeros(210, dtype=int)}, "`test` must hold booleans; got dtype int64"),
+    (lambda a: {**a, "test": np.arange(210) % 3}, "`test` must hold booleans, or 0 and 1 as integers; got 0 to 2"),
+    (lambda a: {**a, "test": np.zeros(210)}, "`test` must hold booleans, or 0 and 1 as integers; got dtype float64"),
+    (with_(forces=put(7, 30, 1, value=-1e31)), r"`forces` must be in \[-1e\+30, 1e\+30\] N; entry \[7, 30, 1\] is -1e\+31"),
+    (with_(displacements=put(2, 30, 0, value=1e200)), r"`displacements` must be in \[-1e\+30, 1e\+30\] m; entry \[2, 30, 0\] is 1e\+200"),
+    (with_(forces=lambda f: 0 * f), "`forces` must differ from zero somewhere, and be at most .* N; got zeros only"),
+    (with_(displacements=lambda u: 0 * u), "`displacements` must differ from zero somewhere, and be at most .* m; got zeros only"),
+    (with_(points=lambda x: np.vstack([x[:1], x[:1], x[2:]])), "1 nodes lie in the place of others"),
+    (with_(cells=lambda c: np.vstack([c, c[:1]])), "some cells are there twice"),
+    (with_(fixed_nodes=lambda n: n.astype(float)), "`fixed_nodes` must hold integers; got dtype float64"),
     (with_(forces=lambda f: np.concatenate([f[:1], f[:1], f[2:]])), "`forces`: 1 samples repeat others"),
     (with_(forces=lambda f: f[:0], displacements=lambda u: u[:0], regions=lambda r: r[:0]), "there must be samples; got none"),
     (with_(regions=lambda r: r * 0), "210 samples cannot be split by region"),
@@ -244,12 +276,25 @@ def test_bad_files_are_one_clear_line(file: str, bytes_: bytes, message: str, tm
     assert "\n" not in str(caught.value)
 
 
-def test_groups_in_hdf5_are_refused(arrays: Arrays, tmp_path: Path) -> None:
-    path = written(tmp_path, without("points")(arrays), TOML.replace(".npz", ".h5"))
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        (None, "`forces` must be an array of numbers; got a group"),
+        ("hi", "`forces` must be an array of numbers; got text"),
+        (3.0, r"`forces` must have shape \(1, 63, 3\); got \(\)"),
+        (h5py.ExternalLink("nowhere.h5", "/forces"), "`forces` cannot be read: .*"),
+    ],
+)
+def test_entries_of_hdf5_that_are_no_arrays_are_named(entry: Any, message: str, arrays: Arrays, tmp_path: Path) -> None:
+    path = written(tmp_path, without("forces")(arrays), TOML.replace(".npz", ".h5"))
     with h5py.File(tmp_path / "mine.h5", "a") as file:
-        file.create_group("points")
-    with pytest.raises(SpecError, match=r"mine.h5: not a readable .h5 file of arrays"):
+        if entry is None:
+            file.create_group("forces")
+        else:
+            file["forces"] = entry
+    with pytest.raises(SpecError, match=rf"mine.h5: {message}") as caught:
         check_file(path)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

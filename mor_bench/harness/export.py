@@ -141,15 +141,20 @@ def export_numpy(data: Dataset, out: str | Path) -> list[Path]:
     return [out, out.with_suffix(".toml")]
 
 
+def _quoted(text: str) -> str:
+    """A basic string of TOML: one of JSON, with the delete character escaped, and no surrogates."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
 def _toml(scene: Scene, file: str) -> str:
-    spec, quoted = scene.spec, json.dumps  # a JSON string is a TOML one
+    spec = scene.spec
     grid = spec.grid_nodes or scene.mesh.grid_shape
-    return f"""title = {quoted(spec.title, ensure_ascii=False)}
-source = {quoted(spec.source, ensure_ascii=False)}
+    return f"""title = {_quoted(spec.title)}
+source = {_quoted(spec.source)}
 {f"grid_nodes = {list(grid)}" if grid else ""}
 
 [snapshots]
-file = {quoted(file)}
+file = {_quoted(file)}
 
 [split]
 by = "file"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mor_bench.errors import SpecError
 from mor_bench.scene.gmsh1 import is_gmsh1, read_gmsh1
 from mor_bench.scene.mesh import Mesh
-from mor_bench.scene.point_sets import PointSets, named_point_sets
+from mor_bench.scene.point_sets import PointSets, check_abaqus, named_point_sets
 from mor_bench.scene.soundness import tidied
 
 CELLS = {"hexahedron": 8, "tetra": 4}
@@ -109,13 +109,16 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
         If the file is missing, cannot be read, or has positions that are not three-dimensional.
     """
     try:
-        head = path.open("rb").read(64)
+        with path.open("rb") as file:
+            head = file.read(64)
     except FileNotFoundError:
         raise SpecError(f"{path}: no such file.") from None
     except OSError as error:
         raise SpecError(f"{path}: cannot be read: {error.strerror}.") from None
     if is_gmsh1(head):
         return read_gmsh1(path)
+    if path.suffix.lower() == ".inp":
+        check_abaqus(path)
     # Both Ansys and Gmsh write .msh; told which, meshio says what is wrong rather than that neither fits.
     file_format = "gmsh" if path.suffix.lower() == ".msh" and head.startswith(b"$") else None
     printed = StringIO()
@@ -123,7 +126,12 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
         with redirect_stdout(printed), redirect_stderr(printed), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             raw = meshio.read(path, file_format)
+    except UnicodeDecodeError:
+        broken = "neither text nor a binary file of the length that it names" if path.suffix.lower() == ".stl" else "damaged, or of another format"
+        raise SpecError(f"{path}: cannot be read as {path.suffix[1:].upper()}: it is {broken}.") from None
     except (Exception, SystemExit) as error:
+        if "need at least one array" in str(error):
+            raise SpecError(f"{path}: the file is empty or holds no mesh.") from None
         said = " ".join((printed.getvalue() if isinstance(error, SystemExit) else str(error)).split())
         raise SpecError(f"{path}: meshio cannot read it ({said or type(error).__name__}).") from None
     if raw.points.size and (raw.points.ndim != 2 or raw.points.shape[1] != 3):

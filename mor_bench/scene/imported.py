@@ -2,7 +2,7 @@
 
 `points` (n_nodes, 3), m; `cells` (n_cells, 8 or 4), in VTK order, counted from 0; `forces` and `displacements`
 (n, n_nodes, 3), N and m; and, where there are any, `fixed_nodes` (n_fixed,); `regions` (n,), or (n, k) with k forces at
-once, load-region ids from 0; `test` (n,), true for the samples that are kept for the test.
+once, load-region ids from 0; `test` (n,), true, or 1, for the samples that are kept for the test.
 """
 
 from __future__ import annotations
@@ -22,16 +22,19 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.mesh import Mesh
-from mor_bench.scene.soundness import check_numbers, in_grid, outwards
+from mor_bench.scene.soundness import check_numbers, in_grid, sound_cells
 from mor_bench.specs import SourceFile
 
 STILL = 1e-9
 """Displacement of a fixed node, as a fraction of the largest of all, that is taken for zero."""
 
+MAX_SIZE = {"forces": 1e30, "displacements": 1e30}
+"""N and m; squares and products of what is no larger are far from overflow."""
+
 REQUIRED = ("points", "cells", "forces", "displacements")
 OPTIONAL = ("fixed_nodes", "regions", "test")
-_KINDS = {"cells": "iu", "fixed_nodes": "iu", "regions": "iu", "test": "b"}
-_WORDS = {"iu": "integers", "b": "booleans", "fiu": "real numbers"}
+_KINDS = {"cells": "iu", "fixed_nodes": "iu", "regions": "iu", "test": "biu"}
+_WORDS = {"iu": "integers", "biu": "booleans, or 0 and 1 as integers", "fiu": "real numbers"}
 
 
 @dataclass(frozen=True)
@@ -87,12 +90,22 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
         if suffix in (".h5", ".hdf5"):
             with h5py.File(path, "r") as content:
                 _check_names(list(content))
-                return {name: np.asarray(content[name][()]) for name in content}
+                return {name: _entry(content, name) for name in content}
     except SpecError:
         raise
     except (OSError, ValueError, EOFError, TypeError, KeyError, AttributeError, zipfile.BadZipFile, UnpicklingError) as error:
         raise SpecError(f"not a readable {suffix} file of arrays: {' '.join(str(error).split())}") from None
     raise SpecError(f"snapshots must be in an .npz, .h5 or .hdf5 file; got {suffix!r}.")
+
+
+def _entry(content: h5py.File, name: str) -> NDArray[Any]:
+    try:
+        entry = content[name]
+        if isinstance(entry, h5py.Dataset) and h5py.check_string_dtype(entry.dtype) is None:
+            return np.asarray(entry[()] if entry.shape is not None else np.zeros(0))
+    except (OSError, KeyError, RuntimeError) as error:
+        raise SpecError(f"`{name}` cannot be read: {' '.join(str(error).split())}") from None
+    raise SpecError(f"`{name}` must be an array of numbers; got {'text' if isinstance(entry, h5py.Dataset) else 'a group'}.")
 
 
 def _check_names(names: list[str]) -> None:
@@ -110,7 +123,7 @@ def _checked(arrays: Mapping[str, NDArray[Any]]) -> ImportedArrays:
     _check_shapes(arrays)
     points, cells = arrays["points"].astype(np.float64), _integers(arrays["cells"])
     fixed = np.unique(_integers(arrays.get("fixed_nodes", np.zeros(0))))
-    forces, displacements = (np.ascontiguousarray(arrays[name], dtype=np.float64) for name in ("forces", "displacements"))
+    forces, displacements = (_in_range(name, arrays[name]) for name in ("forces", "displacements"))
     n, n_nodes = forces.shape[:2]
     if n == 0:
         raise SpecError("there must be samples; got none.")
@@ -118,9 +131,9 @@ def _checked(arrays: Mapping[str, NDArray[Any]]) -> ImportedArrays:
     check_numbers(points, cells)
     if (unused := n_nodes - len(np.unique(cells))) > 0:
         raise SpecError(f"every node must belong to a cell; {unused} of {n_nodes} do not.")
-    cells = outwards(points, cells)
+    cells = sound_cells(points, cells)
     _check_samples(forces, displacements, fixed, regions)
-    return ImportedArrays(in_grid(Mesh(points, cells)), forces, displacements, fixed, regions, arrays.get("test"))
+    return ImportedArrays(in_grid(Mesh(points, cells)), forces, displacements, fixed, regions, _truths(arrays.get("test")))
 
 
 def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -130,7 +143,10 @@ def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
         "points": ((None, 3),), "cells": ((None, 8), (None, 4)), "forces": ((n, n_nodes, 3),), "displacements": ((n, n_nodes, 3),),
         "fixed_nodes": ((None,),), "regions": ((n,), (n, None)), "test": ((n,),),
     }  # fmt: skip
-    for name, array in arrays.items():
+    for name in (*REQUIRED, *OPTIONAL):
+        array = arrays.get(name)
+        if array is None or (name == "fixed_nodes" and array.size == 0):  # what is empty may have any type
+            continue
         kinds = _KINDS.get(name, "fiu")
         if array.dtype.kind not in kinds:
             raise SpecError(f"`{name}` must hold {_WORDS[kinds]}; got dtype {array.dtype}.")
@@ -148,6 +164,24 @@ def _has_shape(array: NDArray[Any], shape: tuple[int | None, ...]) -> bool:
 
 def _integers(array: NDArray[Any]) -> NDArray[np.int64]:
     return np.asarray(array).astype(np.int64)
+
+
+def _in_range(name: str, array: NDArray[Any]) -> NDArray[np.float64]:
+    with np.errstate(over="ignore"):  # a longer type may hold what is infinite here
+        numbers = np.ascontiguousarray(array, dtype=np.float64)
+    size, unit = np.abs(numbers), {"forces": "N", "displacements": "m"}[name]
+    if not (size <= MAX_SIZE[name]).all():
+        worst = [int(i) for i in np.unravel_index(size.argmax(), size.shape)]
+        raise SpecError(f"`{name}` must be in [-{MAX_SIZE[name]:g}, {MAX_SIZE[name]:g}] {unit}; entry {worst} is {numbers[tuple(worst)]:g}.")
+    if size.size and not size.any():
+        raise SpecError(f"`{name}` must differ from zero somewhere, and be at most {MAX_SIZE[name]:g} {unit}; got zeros only.")
+    return numbers
+
+
+def _truths(array: NDArray[Any] | None) -> NDArray[np.bool_] | None:
+    if array is not None and not np.isin(array, [0, 1]).all():
+        raise SpecError(f"`test` must hold {_WORDS['biu']}; got {array.min()} to {array.max()}.")
+    return None if array is None else array.astype(np.bool_)
 
 
 def _check_samples(

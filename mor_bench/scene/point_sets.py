@@ -17,18 +17,14 @@ PointSets = dict[str, NDArray[np.int64]]
 def named_point_sets(mesh: meshio.Mesh, path: Path) -> PointSets:
     """The sets of nodes that a file names; those of the same name are joined.
 
-    They are point sets (Abaqus NSET), the nodes of cell sets (ELSET) and of Gmsh's physical groups of any dimension, a group
-    without a name under its number, and point data of zeros and ones (VTK).
-
-    Raises
-    ------
-    SpecError
-        If an Abaqus file has two NSET of one name, of which only one would be read.
+    They are point sets (Abaqus NSET, also in a line `*NODE, NSET=…`), the nodes of cell sets (ELSET) and of Gmsh's physical
+    groups of any dimension, a group without a name under its number, with its dimension before it where others have it too,
+    and point data of zeros and ones (VTK). An Abaqus file is taken to have passed `check_abaqus`.
     """
     found: dict[str, list[NDArray[np.int64]]] = {}
     abaqus = path.suffix.lower() == ".inp"
     if abaqus:
-        _check_abaqus(path)
+        found |= {name: [np.arange(len(mesh.points))] for name in _keywords(path, "NODE", "NSET") if name is not None}
     for name, nodes in mesh.point_sets.items():
         found.setdefault(name, []).append(np.asarray(nodes, dtype=np.int64))
     for name, chosen in (_abaqus_blocks(mesh, path) if abaqus else []) + _cell_sets(mesh) + _physical_groups(mesh):
@@ -42,6 +38,9 @@ def named_point_sets(mesh: meshio.Mesh, path: Path) -> PointSets:
 
 _Rows = list[NDArray[np.int64]]
 """For each block of cells the rows that are chosen."""
+
+_DIMENSIONS = ("point", "line", "surface", "volume")
+"""Gmsh's words for groups, by dimension."""
 
 _NO_ROWS = np.zeros(0, dtype=np.int64)
 
@@ -58,14 +57,17 @@ def _cell_sets(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
 
 
 def _physical_groups(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
-    tags = mesh.cell_data.get("gmsh:physical")
-    if tags is None:
+    data = mesh.cell_data.get("gmsh:physical")
+    if data is None:
         return []
+    tags = [np.abs(values) for values in data]  # negative where a group holds a surface turned over
     names = {(int(tag), int(dimension)): name for name, (tag, dimension) in mesh.field_data.items()}
     keys = sorted({(int(tag), block.dim) for block, values in zip(mesh.cells, tags, strict=True) for tag in np.unique(values) if tag != 0})
+    unnamed = [tag for tag, dimension in keys if (tag, dimension) not in names]
+    numbers = {(tag, dim): str(tag) if unnamed.count(tag) == 1 else f"{_DIMENSIONS[dim]} {tag}" for tag, dim in keys}
     return [
-        (names.get(key, str(key[0])), [np.flatnonzero(values == key[0]) if block.dim == key[1] else _NO_ROWS
-                                       for block, values in zip(mesh.cells, tags, strict=True)])
+        (names.get(key, numbers[key]), [np.flatnonzero(values == key[0]) if block.dim == key[1] else _NO_ROWS
+                                        for block, values in zip(mesh.cells, tags, strict=True)])
         for key in keys
     ]  # fmt: skip
 
@@ -77,11 +79,14 @@ def _keywords(path: Path, keyword: str, parameter: str) -> list[str | None]:
     return [match and match[1].strip() for match in matches]
 
 
-def _check_abaqus(path: Path) -> None:
+def check_abaqus(path: Path) -> None:
+    """Raise `SpecError` if an Abaqus file has two NSET of one name, or two NODE, of which only one would be read."""
     names = _keywords(path, "NSET", "NSET")
     repeated = sorted({name for name in names if name is not None and names.count(name) > 1})
     if repeated:
         raise SpecError(f"{path}: NSET {repeated[0]!r} is defined more than once; join the parts in one.")
+    if (n_blocks := len(_keywords(path, "NODE", "NSET"))) > 1:
+        raise SpecError(f"{path}: the nodes must stand under one line *NODE; there are {n_blocks}, of which only the last would be read.")
 
 
 def _abaqus_blocks(mesh: meshio.Mesh, path: Path) -> list[tuple[str, _Rows]]:

@@ -47,17 +47,14 @@ def tidied(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[Mesh,
     ------
     SpecError
         If positions are not finite, nodes are doubled or not there, a cell is flat, inside out or there twice, or the
-        cells do not hang together.
+        cells do not hang together through faces.
     """
     check_numbers(points, cells)
     used = np.unique(cells)
     place = np.full(len(points), -1, dtype=np.int64)
     place[used] = np.arange(len(used))
     points, cells = points[used], place[cells]
-    _check_doubled(points)
-    cells = outwards(points, cells)
-    _check_overlap(cells)
-    _check_parts(cells)
+    cells = sound_cells(points, cells)
     order = _numbering(points, cells)
     number = np.empty_like(order)
     number[order] = np.arange(len(order))
@@ -90,6 +87,22 @@ def check_numbers(points: NDArray[np.float64], cells: NDArray[np.int64]) -> None
         raise SpecError(f"positions must be finite; point {int(np.argwhere(~np.isfinite(points))[0, 0])} (counted from 0) is not.")
     if cells.min() < 0 or cells.max() >= len(points):
         raise SpecError(f"cells must have nodes in [0, {len(points) - 1}]; got {cells.min()} to {cells.max()}.")
+
+
+def sound_cells(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The cells turned outwards, see `outwards`, of a body that is sound.
+
+    Raises
+    ------
+    SpecError
+        If nodes are doubled, a cell is flat, inside out or there twice, more than two share a face, two lie on one side of it, or they do not hang
+        together through faces.
+    """
+    _check_doubled(points)
+    cells = outwards(points, cells)
+    _check_overlap(cells)
+    _check_parts(cells)
+    return cells
 
 
 def outwards(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -131,18 +144,33 @@ def _check_doubled(points: NDArray[np.float64]) -> None:
 def _check_overlap(cells: NDArray[np.int64]) -> None:
     if len(np.unique(np.sort(cells, axis=1), axis=0)) < len(cells):
         raise SpecError("some cells are there twice.")
-    faces = np.sort(cells[:, FACES[cells.shape[1]]].reshape(-1, FACES[cells.shape[1]].shape[1]), axis=1)
-    shared = np.unique(faces, axis=0, return_counts=True)[1]
+    numbers = _face_numbers(cells).ravel()
+    shared = np.bincount(numbers)
     if shared.max() > 2:
         raise SpecError(f"{int((shared > 2).sum())} faces belong to more than two cells: cells overlap.")
+    # Seen from outside, cells on either side of a face go round it in opposite senses.
+    corners = FACES[cells.shape[1]]
+    faces = cells[:, corners].reshape(-1, corners.shape[1])
+    second = faces[np.arange(len(faces)), (faces.argmin(axis=1) + 1) % faces.shape[1]]
+    n_sides = len(np.unique(np.stack([numbers, second], axis=1), axis=0))
+    if n_sides < len(faces):
+        raise SpecError(f"{len(faces) - n_sides} faces have both of their cells on one side: cells overlap.")
 
 
 def _check_parts(cells: NDArray[np.int64]) -> None:
-    rows = np.repeat(np.arange(len(cells)), cells.shape[1])
-    belongs = sp.csr_array((np.ones(cells.size), (rows, cells.ravel())))
-    n_parts = connected_components(sp.csr_array(belongs.T @ belongs), directed=False)[0]
+    """Raise `SpecError` if the cells do not hang together through faces: joined at an edge or a node, they are a hinge."""
+    faces = _face_numbers(cells)
+    belongs = sp.csr_array((np.ones(faces.size), (np.repeat(np.arange(len(cells)), faces.shape[1]), faces.ravel())))
+    n_parts = connected_components(sp.csr_array(belongs @ belongs.T), directed=False)[0]
     if n_parts > 1:
-        raise SpecError(f"the mesh must be one body; it is {n_parts} parts that share no node.")
+        raise SpecError(f"the mesh must be one body; it is {n_parts} parts that no face joins.")
+
+
+def _face_numbers(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each face of each cell (n_cells, 6 or 4) a number, which is the same for the faces that have the same nodes."""
+    corners = FACES[cells.shape[1]]
+    faces = np.sort(cells[:, corners].reshape(-1, corners.shape[1]), axis=1)
+    return np.unique(faces, axis=0, return_inverse=True)[1].reshape(len(cells), len(corners))
 
 
 def _numbering(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
