@@ -134,3 +134,12 @@ def test_the_commands(pod: Path, cache: Path, tmp_path: Path) -> None:
     assert refused.stderr.strip() == (
         "mor-bench: `--part` must be train, test, in-range, 2x, 4x, unseen-regions, unseen-directions, several-forces; got 'trian'."
     )
+
+
+@pytest.mark.parametrize("there", ["body.toml", "body.npz"])
+def test_no_file_of_the_users_is_overwritten(there: str, tiny: Dataset, tmp_path: Path) -> None:
+    (tmp_path / there).write_text("mine")
+    with pytest.raises(InvalidInputError, match=f"{there} exists and is not overwritten"):
+        export_numpy(tiny, tmp_path / "body.npz")
+    assert [path.name for path in tmp_path.iterdir()] == [there]
+    assert (tmp_path / there).read_text() == "mine"

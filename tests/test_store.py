@@ -10,6 +10,7 @@ import os
 import pickle
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -21,17 +22,18 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import meshio
 import numpy as np
 import pytest
 
 import mor_bench
-from mor_bench.errors import InvalidInputError, MissingDependencyError, StoreError, WorkerError
+from mor_bench.errors import DamagedFileWarning, InvalidInputError, MissingDependencyError, NewerSchemaError, StoreError, WorkerError
 from mor_bench.snapshots import generate as generate_module
 from mor_bench.snapshots import manifest as manifest_module
 from mor_bench.snapshots import store
 from mor_bench.snapshots.dataset import Dataset
-from mor_bench.snapshots.executors import Pool, worker_pool
-from mor_bench.snapshots.generate import dataset_folder, generate, generation_seconds
+from mor_bench.snapshots.executors import Pool, cluster_pool, worker_pool
+from mor_bench.snapshots.generate import dataset_folder, generate, generation_seconds, shard_path
 from mor_bench.snapshots.manifest import read_manifest
 from mor_bench.snapshots.solve import pack
 from mor_bench.snapshots.store import HEADER_BYTES, parse_shard, read_shard, remove_leftovers, shard_bytes, write_shard
@@ -136,7 +138,6 @@ DAMAGE: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "foreign HDF5": (lambda content: foreign_hdf5(), "not a shard"),
     "other fields": (lambda content: with_other_fields(), "not that of a shard"),
     "empty": (lambda content: b"", "not a shard"),
-    "newer": (lambda content: of_schema(content, 9), "schema version 9.*update mor-bench"),
     "older": (lambda content: of_schema(content, 1), "schema version 1.*generate the dataset again"),
 }
 
@@ -275,10 +276,10 @@ def test_the_manifest_alone_is_enough_to_generate_the_same_again(tmp_path: Path,
         (lambda content: b"", "not a manifest"),
         (lambda content: b"[1]", "not a manifest"),
         (lambda content: content.replace(b"500.0", b"600.0"), "checksum"),
-        (lambda content: of_schema(content, 9), "schema version 9.*update mor-bench"),
+        (lambda content: of_schema(content, 1), "schema version 1.*generate the dataset again"),
         (lambda content: content.replace(manifest_module.FORMAT.encode(), b"another"), "not the manifest of a dataset"),
     ],
-    ids=["truncated", "empty", "foreign", "changed", "newer", "other format"],
+    ids=["truncated", "empty", "foreign", "changed", "older", "other format"],
 )
 def test_a_damaged_manifest_says_so_and_is_mended(tmp_path: Path, damage: Callable[[bytes], bytes], message: str) -> None:
     spec = tiny_spec()
@@ -618,3 +619,65 @@ def test_a_cluster_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.Monke
         generate(tiny_spec(), cache=tmp_path, cluster=cluster.address)
     with pytest.raises(WorkerError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:\d+ within 2 s"):
         generate(tiny_spec(), cache=tmp_path, cluster=cluster.address)
+
+
+def test_newer_files_are_kept_and_damaged_ones_named(tmp_path: Path, content: bytes) -> None:
+    spec = load_generated_spec("beam-tiny")
+    folder = generate(spec, workers=1, cache=tmp_path)
+    path = shard_path(folder, 1)
+    sound = path.read_bytes()
+    newer = of_schema(sound, 9)
+    path.write_bytes(newer)
+    with pytest.raises(NewerSchemaError, match=r"schema version 9; .* update mor-bench"):
+        generate(spec, workers=1, cache=tmp_path)
+    assert path.read_bytes() == newer
+    path.write_bytes(sound)
+    manifest = folder / "manifest.json"
+    before = manifest.read_bytes()
+    manifest.write_bytes(of_schema(before, 9))
+    with pytest.raises(NewerSchemaError, match="schema version 9"):
+        generate(spec, workers=1, cache=tmp_path)
+    assert manifest.read_bytes() == of_schema(before, 9)
+    manifest.write_bytes(before)
+    for spoilt in (b"a note of mine", sound[:-1], shard_path(folder, 0).read_bytes()):
+        path.write_bytes(spoilt)
+        with pytest.warns(DamagedFileWarning, match=r"shard-00001\.h5: .* made again"):
+            generate(spec, workers=1, cache=tmp_path)
+        assert path.read_bytes() == sound
+
+
+def test_a_folder_in_the_place_of_a_shard_is_an_error_of_the_store(tmp_path: Path) -> None:
+    spec = load_generated_spec("beam-tiny")
+    path = shard_path(dataset_folder(spec, tmp_path), 0)
+    path.mkdir(parents=True)
+    with pytest.raises(StoreError, match="cannot be read"):
+        read_shard(path)
+    with pytest.warns(DamagedFileWarning), pytest.raises(StoreError, match="cannot be written"):
+        generate(spec, workers=1, cache=tmp_path)
+
+
+def test_a_peer_that_stays_silent_is_given_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("mor_bench.snapshots.executors.CONNECT_S", 1)
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        begun = time.perf_counter()
+        with pytest.raises(WorkerError, match="no Dask scheduler answers"), cluster_pool(address):
+            pass
+        assert time.perf_counter() - begun < 30
+
+
+def test_a_dataset_of_a_users_file_is_made_again_from_its_folder_alone(tmp_path: Path) -> None:
+    mesh = mor_bench.load_scene("beam-tiny").mesh
+    body = tmp_path / "body.vtu"
+    meshio.Mesh(mesh.points, [("hexahedron", mesh.cells)]).write(body)
+    content = {**load_generated_spec("beam-tiny").model_dump(mode="json"), "geometry": {"shape": "file", "file": str(body)}}
+    spec = DatasetSpec.model_validate(content)
+    folder = generate(spec, 100, workers=1, cache=tmp_path / "one")
+    body.unlink()
+    kept = read_manifest(folder).spec
+    assert kept.digest() == spec.digest()
+    again = generate(kept, 100, workers=1, cache=tmp_path / "two")
+    assert shard_path(again, 0).read_bytes() == shard_path(folder, 0).read_bytes()

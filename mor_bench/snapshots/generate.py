@@ -15,7 +15,7 @@ import platformdirs
 from mor_bench.errors import DamagedFileWarning, NewerSchemaError, StoreError
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.executors import KEPT, check_pool, open_pool
-from mor_bench.snapshots.manifest import Manifest, update_manifest
+from mor_bench.snapshots.manifest import Manifest, keep_sources, update_manifest
 from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of
 from mor_bench.snapshots.solve import GENERATOR_VERSION, Solved, Task, pack, solve_task
 from mor_bench.snapshots.store import SCHEMA_VERSION, STATUSES, Shard, read_shard, remove_leftovers, write_atomically, write_shard
@@ -187,6 +187,7 @@ def generate(
         remove_leftovers(folder)
     missing = [number for number in plan.numbers if not plan.has(number)]
     with _writing(folder):
+        keep_sources(folder, spec)
         update_manifest(folder, Manifest(spec, GENERATOR_VERSION, whole, SHARD_SIZE), solves=bool(missing))
     count = _Count(plan, missing, progress)
     if missing and cluster is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -15,7 +16,7 @@ from pydantic import ValidationError
 from mor_bench import __version__
 from mor_bench.errors import NewerSchemaError, StoreError
 from mor_bench.snapshots.store import SCHEMA_VERSION, check_version, write_atomically
-from mor_bench.specs import DatasetSpec
+from mor_bench.specs import DatasetSpec, SourceFile
 
 FORMAT = "mor-bench dataset"
 NAME = "manifest.json"
@@ -28,7 +29,7 @@ class Manifest:
     Attributes
     ----------
     spec : DatasetSpec
-        A mesh or surface file is known by its path and its SHA-256.
+        A mesh or surface file is known by its path and its SHA-256; `keep_sources` puts a copy into the folder.
     generator_version : int
     n_samples : int
         Of the whole dataset.
@@ -87,11 +88,42 @@ def read_manifest(folder: Path) -> Manifest:
         check_version(content["schema_version"], str(path))
         if content.pop("sha256") != _digest(content):
             raise StoreError(f"{path}: damaged: the checksum does not match.")
-        spec = DatasetSpec.model_validate_json(json.dumps(content["spec"]))
+        spec = DatasetSpec.model_validate_json(json.dumps(_with_kept(content["spec"], folder)))
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         reason = "damaged" if not isinstance(error, ValidationError) else "its `spec` is not valid"
         raise StoreError(f"{path}: not a manifest of mor-bench, or {reason}.") from None
     return Manifest(spec, content["generator_version"], content["n_samples"], content["shard_size"], tuple(content["environments"]))
+
+
+def keep_sources(folder: Path, spec: DatasetSpec) -> None:
+    """Copy the files that a dataset is made from into its folder, so that it can be made again from there alone."""
+    for file in _sources(spec.model_dump(mode="json")):
+        kept = _kept(folder, file)
+        if not kept.is_file():
+            write_atomically(kept, SourceFile(**file).checked().read_bytes())
+
+
+def _kept(folder: Path, file: dict[str, str]) -> Path:
+    return folder / f"source-{file['sha256'][:12]}{Path(file['path']).suffix}"
+
+
+def _sources(value: Any) -> Iterator[dict[str, str]]:
+    """Every file, as its path and SHA-256, that a specification names."""
+    if isinstance(value, dict):
+        if value.keys() == {"path", "sha256"}:
+            yield value
+        value = list(value.values())
+    if isinstance(value, list):
+        for item in value:
+            yield from _sources(item)
+
+
+def _with_kept(spec: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The specification with the folder's copies in the place of files that are gone."""
+    for file in _sources(spec):
+        if not Path(file["path"]).is_file():
+            file["path"] = str(_kept(folder, file).resolve())
+    return spec
 
 
 def update_manifest(folder: Path, manifest: Manifest, *, solves: bool) -> None:
