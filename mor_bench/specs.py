@@ -458,7 +458,7 @@ class ImportedSplit(_Model):
     """Which imported samples are kept for the test: as `Split`, or by the file's own array `test`."""
 
     test_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
-    by: SplitBy | Literal["file"] = "region"
+    by: Literal["region", "sample", "direction", "file"] = "region"
 
 
 class ImportedDatasetSpec(_AnyDataset):
@@ -586,13 +586,19 @@ def _models_within(annotation: Any) -> Iterator[type[BaseModel]]:
             yield from _models_within(part)
 
 
+def _is_branch(model: type[BaseModel], step: int | str) -> bool:
+    """Whether a step of an error's location is the alternative that a model stands for: a region's key, or a shape or law."""
+    named = isinstance(step, str) and step.removeprefix("by ") in model.model_fields
+    return named or any(step in get_args(field.annotation) for field in model.model_fields.values() if get_origin(field.annotation) is Literal)
+
+
 def _valid_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     """The keys that the table at a location may hold."""
     models = [model]
     for step in location:
         fields = [m.model_fields[step].annotation for m in models if isinstance(step, str) and step in m.model_fields]
-        if fields:
-            models = [found for field in fields for found in _models_within(field)]
+        within = [found for field in fields for found in _models_within(field)]
+        models = within if fields else [m for m in models if _is_branch(m, step)] or models
     return sorted({key for m in models for key in m.model_fields if key != "name"})
 
 
@@ -606,6 +612,8 @@ def _one_line(error: ValidationError, model: type[BaseModel], where: str) -> str
     key = "".join(f"[{s}]" if isinstance(s, int) else f".{s}" for s in shown).lstrip(".")
     if problem["type"] == "extra_forbidden":
         valid = _valid_keys(model, problem["loc"][:-1])
+        if shown[-1] in _REGIONS:
+            return f"{where}: `{key}` cannot stand beside another key of a region. Allowed here: {', '.join(valid)}."
         return f"{where}: unknown key `{key}`{_nearest(str(shown[-1]), valid)} Allowed here: {', '.join(valid)}."
     if problem["type"] == "union_tag_invalid":
         context = problem["ctx"]

@@ -111,6 +111,11 @@ BAD = [
     (set_("loads", "magnitude_n", value=[0.0, 1e-300]), r"`loads.magnitude_n\[1\]` must be greater than or equal to 0.000000000001"),
     (set_("supports", 0, "region", value={"box_m": [[0.0, 0.0, 0.0], [2.0, 1.0, 1.0]]}), r"the supports fix every node"),
     (lambda spec: spec.pop("material"), r"key `material` is missing"),
+    (set_("geometry", "sise_m", value=1), r"Allowed here: cells, shape, size_m\."),
+    (
+        set_("supports", 0, "region", value={"box_m": [[0, 0, 0], [1, 1, 1]], "sphere_m": [[0, 0, 0], 1.0]}),
+        r"`supports\[0\]\.region\.sphere_m` cannot stand beside another key of a region\. Allowed here: box_m\.",
+    ),
     (lambda spec: spec["geometry"].pop("cells"), r"key `geometry.cells` is missing"),
 ]
 

@@ -22,10 +22,15 @@ def _overlapping(surface: Surface, cells: tuple[int, int, int], centres: NDArray
     """Whether each cell (nx, ny, nz) of the surface's bounding box shares volume with the body, for the cells' centres (n_cells, 3)."""
     low, high = surface.bounds
     corners = (surface.points - low) / (high - low) * cells
-    overlaps = np.asarray(met_cells(corners[surface.triangles], cells, 0.5 * (1 - TOUCHED)))
-    # A cell that no triangle enters is wholly inside or wholly outside.
-    overlaps[~overlaps] = inside(surface, centres[~overlaps.ravel()])
-    return overlaps
+    entered, touched = (np.asarray(met_cells(corners[surface.triangles], cells, 0.5 * (1 + sign * TOUCHED))) for sign in (-1, 1))
+    # Cells that no triangle touches and that faces join are all inside or all outside: one of each such part is asked.
+    part = label(~touched)[0]
+    first = np.unique(part, return_index=True)[1][1 if touched.any() else 0 :]
+    overlaps = entered | np.append(False, inside(surface, centres[first]))[part]
+    # Of those that are touched and not entered each is asked by itself.
+    only_touched = touched & ~entered
+    overlaps[only_touched] = inside(surface, centres[only_touched.ravel()])
+    return np.asarray(overlaps)
 
 
 def voxel_mesh(surface: Surface, cells: tuple[int, int, int]) -> Mesh:
