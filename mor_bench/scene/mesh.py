@@ -107,6 +107,15 @@ def l_mesh(size_m: tuple[float, float, float], cells: tuple[int, int, int], cut_
     return part_of(box, (x < cells[0] - cut_cells[0]) | (z < cells[2] - cut_cells[1]))
 
 
+def along_longest_axis(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The order (n,) of points (n, 3) along the longest axis of their bounding box, then the second, then the shortest.
+
+    Nodes of a slender body that are numbered so have a small bandwidth.
+    """
+    axes = np.argsort(-np.ptp(points, axis=0))
+    return np.lexsort(np.round(points / np.ptp(points), 9)[:, axes[::-1]].T)
+
+
 def part_of(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
     """The cells (n_cells,) that are kept, with their nodes, in the order and the grid that they had."""
     nodes, cells = np.unique(mesh.cells[kept], return_inverse=True)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.interpolation import _trilinear
-from mor_bench.scene.mesh import FACES, Mesh
+from mor_bench.scene.mesh import FACES, Mesh, along_longest_axis
 
 SAME_PLACE = 1e-9
 """Distance, as a fraction of the bounding box's diagonal, within which two nodes lie in one place."""
@@ -178,8 +178,7 @@ def _numbering(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray
 
     The banded solver takes this order or reverse Cuthill-McKee's, whichever is better.
     """
-    axes = np.argsort(-np.ptp(points, axis=0))
-    order = np.lexsort(np.round(points / np.ptp(points), 9)[:, axes[::-1]].T)
+    order = along_longest_axis(points)
     number = np.empty_like(order)
     number[order] = np.arange(len(order))
     return order if np.ptp(number[cells], axis=1).max() < np.ptp(cells, axis=1).max() else np.arange(len(order))

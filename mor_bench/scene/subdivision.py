@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.scene.mesh import Mesh
+from mor_bench.scene.mesh import Mesh, along_longest_axis
 
 _HEX = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
 """Places of a hexahedron's corners along its own axes, in VTK order."""
@@ -51,8 +51,7 @@ def subdivide(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
     numbers = numbers.reshape(mesh.n_cells, len(local))
     points = mesh.points[parents].mean(axis=1)
     cells = numbers[:, HEX_CHILDREN].reshape(-1, 8) if hexahedra else _tetrahedra(points, numbers)
-    axes = np.argsort(-np.ptp(points, axis=0))
-    order = np.lexsort(np.round(points / np.ptp(points), 9)[:, axes[::-1]].T)
+    order = along_longest_axis(points)
     place = np.empty(len(order), dtype=np.int64)
     place[order] = np.arange(len(order))
     return Mesh(points[order], place[cells]), parents[order]

@@ -16,7 +16,7 @@ from mor_bench.scene.scene import Scene, imported_scene, load_scene
 from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import Progress, generate, n_samples_to_generate, read_shards
 from mor_bench.snapshots.imported import NodalLoads, nodal_loads, read_samples
-from mor_bench.snapshots.sampling import PatchLoads, repeated
+from mor_bench.snapshots.sampling import PatchLoads, n_samples_of, repeated
 from mor_bench.snapshots.split import split_imported, split_samples
 from mor_bench.snapshots.test_sets import SetName, check_regions, spec_of_set
 from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, Split, SplitBy, generated, load_dataset_spec
@@ -188,7 +188,8 @@ class _Store:
 
     def __init__(self, spec: DatasetSpec, folder: Path, limit: int | None) -> None:
         self.scene = load_scene(spec)
-        self._folder, self._total = folder, n_samples_to_generate(spec, limit)
+        whole = n_samples_of(self.scene)
+        self._folder, self._total = folder, whole if limit is None else min(limit, whole)
         shards = [replace(shard, displacements=shard.displacements[:, :0]) for shard in read_shards(folder, self._total)]
         self.loads = PatchLoads(*(np.concatenate([getattr(shard, name) for shard in shards]) for name in ("patches", "vectors")))
         self.status, self._min_det_f = (np.concatenate([getattr(shard, name) for shard in shards]) for name in ("status", "min_det_f"))
