@@ -257,11 +257,18 @@ def run(
             "n_test": len(data.test),
             "n_unused": data.n_unused,
             "n_failed": None,
+            "n_dofs": data.scene.mesh.n_dofs,
             "threads": threads,
             "error": None,
             "latency_ms": None,
+            "all_threads_ms": None,
+            "throughput": None,
             "offline_s": None,
+            "memory_bytes": None,
             "model_bytes": None,
+            "cost": None,
+            "sets": {},
+            "hidden": None,
             **discretisation[spec.name],
             **outcome,
         }
@@ -322,6 +329,7 @@ def _open(spec: AnyDatasetSpec, comparison: Comparison, listener: Listener, **op
         "singular_values": pod(data.train.free_displacements).singular_values,
         "points": data.scene.mesh.points,
         "cells": data.scene.mesh.cells,
+        "test_regions": data.test.loads.patches,
     }
     comparison.add_dataset(spec.name, spec.model_dump(mode="json"), arrays)
     return data
