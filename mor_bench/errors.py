@@ -43,6 +43,10 @@ class UnconstrainedBodyError(MorBenchError, ValueError):
     """The supports leave rigid motions free."""
 
 
+class OutOfTimeError(MorBenchError):
+    """Fitting would take longer than it may; the message says how long."""
+
+
 class StoreError(MorBenchError):
     """A stored file is damaged, foreign or of a newer schema."""
 

@@ -39,6 +39,9 @@ class Surrogate(ABC):
     needs_snapshots: ClassVar[bool] = True
     """Whether `fit` learns from snapshots; their cost is charged only to methods that do."""
 
+    time_limit_s: float | None = None
+    """Seconds that a comparison leaves to `fit`; a method that sees early that they will not do raises `OutOfTimeError`."""
+
     @abstractmethod
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         """Learn from snapshots, forgetting earlier fits.
@@ -205,6 +208,24 @@ def load_surrogate(path: str | Path) -> Surrogate:
     StoreError
         If the file is missing, damaged, foreign or of a newer schema, or names a class that no method names.
     """
+    header, state = _read_model(path)
+    known = {load_method_spec(file).surrogate for file in list_suite("methods").values()}
+    if header.get("surrogate") not in known:
+        raise StoreError(f"{path}: class {header.get('surrogate')!r} is not named by any method of the suite.")
+    return _fitted(path, load_class(header["surrogate"]), None, header, state)
+
+
+def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surrogate:
+    """Read a fitted model of a class and a scene that are at hand; otherwise as `load_surrogate`."""
+    header, state = _read_model(path)
+    expected = f"{surrogate.__module__}:{surrogate.__qualname__}"
+    if header.get("surrogate") != expected:
+        raise StoreError(f"{path}: a model of class {header.get('surrogate')!r}; expected {expected!r}.")
+    return _fitted(path, surrogate, scene, header, state)
+
+
+def _read_model(path: str | Path) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:
+    """Header and arrays of a model's file, checked."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -219,13 +240,14 @@ def load_surrogate(path: str | Path) -> Surrogate:
         raise StoreError(f"{path}: schema version {header.get('schema_version')}; this version of mor-bench reads version {SCHEMA_VERSION}.")
     if header.get("sha256") != _digest(header, state):
         raise StoreError(f"{path}: damaged: the checksum does not match.")
-    known = {load_method_spec(file).surrogate for file in list_suite("methods").values()}
-    if header.get("surrogate") not in known:
-        raise StoreError(f"{path}: class {header.get('surrogate')!r} is not named by any method of the suite.")
+    return header, state
+
+
+def _fitted(path: str | Path, surrogate: type[Any], scene: Scene | None, header: dict[str, str], state: dict[str, NDArray[Any]]) -> Surrogate:
+    """The model that a file's content makes; without a scene at hand, of the scene in its header."""
     try:
-        method = make_surrogate(load_class(header["surrogate"]), json.loads(header["parameters"]))
-        scene_content = json.loads(header["scene"])
-        method.scene_ = load_scene(scene_content)
+        method = make_surrogate(surrogate, json.loads(header["parameters"]))
+        method.scene_ = scene or load_scene(json.loads(header["scene"]))
         method._restore(state)
     except (MorBenchError, KeyError, ValueError, IndexError, TypeError, AttributeError) as error:
         raise StoreError(f"{path}: its content does not make a {header['surrogate'].partition(':')[2]}: {error}") from None

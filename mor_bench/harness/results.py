@@ -69,7 +69,14 @@ def _write_json(path: Path, content: Any) -> None:
     write_atomically(path, json.dumps(_plain(content), indent=1, allow_nan=False).encode())
 
 
-def _write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read what `write_arrays` wrote."""
+    with h5py.File(path, "r") as file:
+        return {key: np.asarray(file[key][()]) for key in file}
+
+
+def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write named arrays to an HDF5 file, atomically."""
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         for name, array in arrays.items():
@@ -130,24 +137,25 @@ class Comparison:
     def _samples_path(self, name: str) -> Path:
         return self.out / "samples" / (re.sub(r"[^\w.=-]+", "-", name).strip("-") + ".h5")
 
-    def has(self, dataset: str, label: str, parameters: Mapping[str, Any]) -> bool:
-        """Whether a configuration has run; a row that did not succeed is forgotten, so that it is tried again."""
-        key = (dataset, label, parameters)
-        mine = [row for row in self.rows if (row["dataset"], row["label"], row["parameters"]) == key]
-        self.rows = [row for row in self.rows if row not in mine or row["status"] == "ok"]
-        return any(row["status"] == "ok" for row in mine)
-
-    def add(self, row: dict[str, Any], samples: Mapping[str, NDArray[Any]] | None = None) -> None:
-        """Append a row and write everything; raw samples first, so that a row on disk has its samples."""
+    def put(self, row: dict[str, Any], samples: Mapping[str, NDArray[Any]] | None = None) -> None:
+        """Add a row, or replace that of the same configuration, and write everything; raw samples first."""
         if samples:
-            _write_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"), samples)
-        self.rows.append(row)
+            write_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"), samples)
+        places = [i for i, other in enumerate(self.rows) if (other["dataset"], other["label"]) == (row["dataset"], row["label"])]
+        if places:
+            self.rows[places[0]] = row
+        else:
+            self.rows.append(row)
         self.write()
+
+    def add_samples(self, row: Mapping[str, Any], samples: Mapping[str, NDArray[Any]]) -> None:
+        """Write more raw samples of a row beside those that are there."""
+        write_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"), {**self.samples(row), **samples})
 
     def add_dataset(self, name: str, spec: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
         """Record a dataset: its spec and arrays such as `singular_values` (of the training snapshots)."""
         self.datasets[name] = spec
-        _write_arrays(self._samples_path(name), arrays)
+        write_arrays(self._samples_path(name), arrays)
 
     def samples(self, row: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
         """Raw samples of a row that ran.
@@ -156,23 +164,23 @@ class Comparison:
         that a query was timed in; `mean_dof_m`, `relative_l2`, `max_nodal_m`, `amplitude_m` (n_test,); and of the sample
         with the largest finite e `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3).
         """
-        return self._read_arrays(f"{row['dataset']}--{row['label']}")
+        return read_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"))
 
     def dataset_arrays(self, name: str) -> dict[str, NDArray[Any]]:
         """Arrays of a dataset: `singular_values`, `points` (n_nodes, 3), `cells` (n_cells, 8), `test_regions` (n_test, k)."""
-        return self._read_arrays(name)
+        return read_arrays(self._samples_path(name))
 
-    def _read_arrays(self, name: str) -> dict[str, NDArray[Any]]:
-        with h5py.File(self._samples_path(name), "r") as file:
-            return {key: file[key][()] for key in file}
+    def finish(self) -> None:
+        """Write everything, and what follows from all rows together, comparison.json."""
+        self.write()
+        _write_json(self.out / "comparison.json", self.frontier)
 
     def write(self) -> None:
-        """Write results.json, results.csv and comparison.json, each atomically."""
+        """Write results.json and results.csv, each atomically."""
         self.out.mkdir(parents=True, exist_ok=True)
         parts = ("machine", "settings", "datasets", "methods", "rows", "learning")
         content = {"schema_version": SCHEMA_VERSION, **{name: getattr(self, name) for name in parts}}
         _write_json(self.out / "results.json", content)
-        _write_json(self.out / "comparison.json", self.frontier)
         write_atomically(self.out / "results.csv", self.table.to_csv(index=False).encode())
 
     @classmethod
