@@ -154,7 +154,7 @@ class Outcome:
     fit : dict
         What fitting took and gave.
     scores : dict of str to dict of arrays
-        For each test set the per-sample errors, whether each load was flagged as out of range, and the worst sample.
+        For each test set the per-sample errors, whether each load was flagged as out of range if the method knows, and the worst sample.
     cost : dict or None
         Per query, on the main test set.
     cached : bool
@@ -342,7 +342,7 @@ def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[
         forces = np.load(test.forces, mmap_mode="r", allow_pickle=False)
         return {
             **errors,
-            "flagged": np.asarray(flagged, dtype=bool),
+            **({} if flagged is None else {"flagged": np.asarray(flagged, dtype=bool)}),
             "worst_prediction": np.array(predicted[worst]),
             "worst_reference": test.references[worst],
             "worst_forces": np.array(forces[worst]),

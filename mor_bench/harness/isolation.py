@@ -70,14 +70,14 @@ class Worker:
                 self._answers.put(line)
         self._answers.put(b"")
 
-    def ask(self, do: str, limit_s: float, **request: Any) -> dict[str, Any]:
+    def ask(self, do: str, within_s: float, /, **request: Any) -> dict[str, Any]:
         """Make a request and wait for its answer.
 
         Parameters
         ----------
         do : str
             A function of `mor_bench.harness.worker.Session`.
-        limit_s : float
+        within_s : float
             Seconds until the process is ended.
         **request
             The function's arguments.
@@ -93,7 +93,7 @@ class Worker:
         with suppress(BrokenPipeError, OSError):  # it has died: said below
             pickle.dump({"do": do, **request}, self._process.stdin)
             self._process.stdin.flush()
-        until = monotonic() + limit_s
+        until = monotonic() + within_s
         while True:
             try:
                 line = self._answers.get(timeout=max(0.0, min(LOOK_EVERY_S, until - monotonic())))
@@ -101,7 +101,7 @@ class Worker:
             except Empty:
                 if monotonic() >= until:
                     self.end()
-                    raise MethodFailedError(f"{_DOING.get(do, do)} took longer than the limit of {limit_s:g} s") from None
+                    raise MethodFailedError(f"{_DOING.get(do, do)} took longer than the limit of {within_s:g} s") from None
                 if (used := self._memory()) > self._memory_limit:
                     self.end()
                     raise MethodFailedError(

@@ -574,7 +574,7 @@ def set_summary(score: Mapping[str, Any]) -> dict[str, Any]:
     figures = summary(_errors(score))
     kept = {name: figures[name] for name in ("mean_dof_m", "rel_l2_median", "rel_l2_p95", "rel_l2_max")}
     failed = int((~np.isfinite(score["mean_dof_m"])).sum())
-    return {"n": len(score["mean_dof_m"]), "n_failed": failed, "n_flagged": int(score["flagged"].sum()), **kept}
+    return {"n": len(score["mean_dof_m"]), "n_failed": failed, "n_flagged": int(score["flagged"].sum()) if "flagged" in score else None, **kept}
 
 
 def _learning_sizes(n_train: int) -> list[int]:

@@ -175,12 +175,19 @@ class Session:
         return {}
 
     def flag(self, forces: Path) -> dict[str, Any]:
-        """Which loads the method says are out of its training range."""
+        """Which loads the method says are out of its training range; None if it does not know its range."""
         import numpy as np
+
+        from mor_bench.errors import UnknownRangeError
 
         self._seal.open(forces)
         loads = np.load(forces, mmap_mode="r", allow_pickle=False)
-        flagged = [flag for start in range(0, len(loads), 256) for flag in self.method.out_of_range(np.array(loads[start : start + 256])).tolist()]
+        flagged: list[bool] = []
+        try:
+            for start in range(0, len(loads), 256):
+                flagged += self.method.out_of_range(np.array(loads[start : start + 256])).tolist()
+        except UnknownRangeError:
+            return {"flagged": None}
         return {"flagged": flagged}
 
     def cost(self, forces: Path, n: int) -> dict[str, Any]:
