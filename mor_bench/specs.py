@@ -492,10 +492,11 @@ def generated(spec: AnyDatasetSpec) -> DatasetSpec:
 
 
 class Profile(_Model):
-    """What a profile changes: parameters replaced, swept values replaced."""
+    """What a profile changes: parameters replaced, swept values replaced, seconds of a fit."""
 
     parameters: dict[str, Any] = {}
     sweep: dict[str, list[Any]] = {}
+    fit_s: Positive | None = None
 
 
 class Regime(_Model):
@@ -513,7 +514,8 @@ class Regime(_Model):
 class MethodSpec(_Model):
     """A method file. `limits` says in plain words where the method fails.
 
-    `folder` is where the file lies, and a third party's module may; None for the suite's own.
+    `folder` is where the file lies, and a third party's module may; None for the suite's own. `fit_s` is about how long a fit
+    on beam-coarse takes on two cores.
     """
 
     name: str
@@ -523,6 +525,7 @@ class MethodSpec(_Model):
     limits: str = ""
     regime: Regime | None = None
     folder: Path | None = None
+    fit_s: Positive | None = None
     parameters: dict[str, Any] = {}
     sweep: dict[str, list[Any]] = {}
     profiles: dict[Literal["quick", "full"], Profile] = {}
@@ -551,6 +554,10 @@ class MethodSpec(_Model):
         """The file's parameters with the profile's on top, swept ones not included."""
         chosen = self.profiles.get(profile, Profile())  # type: ignore[call-overload]
         return {**self.parameters, **chosen.parameters}
+
+    def fit_seconds(self, profile: str) -> float | None:
+        """About how long a fit takes on beam-coarse on two cores, if the file says so."""
+        return self.profiles.get(profile, Profile()).fit_s or self.fit_s  # type: ignore[call-overload]
 
     def _sweep_of(self, profile: str) -> dict[str, list[Any]]:
         return self.profiles.get(profile, Profile()).sweep or self.sweep  # type: ignore[call-overload]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from os import cpu_count
 from time import perf_counter, process_time
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import MorBenchError
 from mor_bench.harness.isolation import Worker
+from mor_bench.harness.nursery import CAN_FORK, Nursery
 from mor_bench.harness.timing import pinned_threads
 
 BATCHES = (8, 64, 512)
@@ -148,12 +149,12 @@ class Opener:
     Attributes
     ----------
     open : callable
-        Starts the process and loads the model.
+        Starts the process, forked from a nursery if there is one, and loads the model.
     memory_bytes : float
         What the process is expected to take.
     """
 
-    open: Callable[[], Worker]
+    open: Callable[[Nursery | None], Worker]
     memory_bytes: float
 
 
@@ -189,10 +190,11 @@ def measure(
     order = np.random.default_rng(seed)
     groups = _groups(openers)
     total, done = protocol.processes * (protocol.rounds + 1) * len(openers), 0
-    for process in range(protocol.processes):
+    for process in range(protocol.processes if openers else 0):
         for group in groups:
             with ExitStack() as stack:
-                workers = _open_all(stack, {label: openers[label] for label in group}, forces, threads, timings)
+                nursery = stack.enter_context(closing(Nursery())) if CAN_FORK else None
+                workers = _open_all(stack, nursery, {label: openers[label] for label in group}, forces, threads, timings)
                 for number in range(protocol.rounds):
                     for label in order.permutation(list(workers)):
                         first = (process * protocol.rounds + number) * protocol.queries
@@ -221,14 +223,14 @@ def _groups(openers: Mapping[str, Opener]) -> list[list[str]]:
 
 
 def _open_all(
-    stack: ExitStack, openers: Mapping[str, Opener], forces: Any, threads: int, timings: Mapping[str, Timing]
+    stack: ExitStack, nursery: Nursery | None, openers: Mapping[str, Opener], forces: Any, threads: int, timings: Mapping[str, Timing]
 ) -> dict[str, Worker]:  # fmt: skip
     """Processes with a loaded and warm method each; what fails on the way says so in its timing."""
 
     def start(label: str) -> Worker | None:
         worker = None
         try:
-            worker = openers[label].open()
+            worker = openers[label].open(nursery)
             found = worker.ask("warm", ANSWER_LIMIT_S, forces=forces, threads=threads)
         except MorBenchError as error:
             timings[label].failed = str(error)

@@ -16,20 +16,19 @@ import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import MorBenchError
 from mor_bench.harness.code import code_digest
 from mor_bench.harness.handover import arrays_of, write_snapshots
 from mor_bench.harness.isolation import MethodFailedError, Worker
 from mor_bench.harness.metrics import sample_errors
+from mor_bench.harness.nursery import Nursery
 from mor_bench.harness.results import read_arrays, write_arrays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -68,6 +67,8 @@ class Place:
     fit_threads, threads : int
         Of a fit, and of a prediction.
     memory_limit_bytes : float
+    nursery : Nursery or None
+        What processes for fits are forked from.
     """
 
     cache: Path
@@ -76,6 +77,7 @@ class Place:
     fit_threads: int
     threads: int
     memory_limit_bytes: float
+    nursery: Nursery | None
 
 
 @dataclass(frozen=True)
@@ -222,10 +224,10 @@ class Entry:
         """Keep arrays."""
         write_arrays(self.folder / f"{name}.h5", {**arrays, "digest": np.array(digest_of(arrays).encode())})
 
-    def process(self) -> Worker:
+    def process(self, nursery: Nursery | None = None) -> Worker:
         """A fresh process for this method, without a model."""
         sealed = [*self.place.sealed, self.material.sealed]
-        return Worker(self.material.scene, sealed, self.job.method.folder, self.place.memory_limit_bytes)
+        return Worker(self.material.scene, sealed, self.job.method.folder, self.place.memory_limit_bytes, nursery or self.place.nursery)
 
     def ask_fit(self, worker: Worker, limit_s: float) -> tuple[dict[str, Any], Path]:
         """Let a process fit; its answer, and where the model is."""
@@ -236,9 +238,9 @@ class Entry:
         )  # fmt: skip
         return answer, model
 
-    def opened(self, limit_s: float = LOAD_LIMIT_S) -> Worker:
+    def opened(self, limit_s: float = LOAD_LIMIT_S, nursery: Nursery | None = None) -> Worker:
         """A fresh process with the fitted method: loaded, or fitted again where it cannot be saved."""
-        worker = self.process()
+        worker = self.process(nursery)
         try:
             if self.fit and self.fit["model_sha256"] is not None:
                 worker.ask("load", LOAD_LIMIT_S, surrogate=self.job.method.surrogate, model=self.model)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -20,6 +21,7 @@ import psutil
 
 from mor_bench import errors
 from mor_bench.errors import MorBenchError
+from mor_bench.harness.nursery import Nursery, environment
 from mor_bench.scene.scene import Scene
 
 LOOK_EVERY_S = 0.2
@@ -33,7 +35,7 @@ class MethodFailedError(MorBenchError):
 
 
 class Worker:
-    """A fresh Python process of `mor_bench.harness.worker`.
+    """A fresh process of `mor_bench.harness.worker`.
 
     Parameters
     ----------
@@ -44,15 +46,21 @@ class Worker:
         Where a third party's module lies.
     memory_limit_bytes : float
         Resident memory, of the process and its children, at which it is ended.
+    nursery : Nursery, optional
+        What the process is forked from; otherwise it is a new interpreter.
     """
 
-    def __init__(self, scene: Scene | None, sealed: list[Path], folder: Path | None = None, memory_limit_bytes: float = float("inf")) -> None:
+    def __init__(
+        self,
+        scene: Scene | None,
+        sealed: list[Path],
+        folder: Path | None = None,
+        memory_limit_bytes: float = float("inf"),
+        nursery: Nursery | None = None,
+    ) -> None:
         self._memory_limit = memory_limit_bytes
-        self._said = tempfile.TemporaryFile()
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "mor_bench.harness.worker"],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._said, env=_environment(),
-        )  # fmt: skip
+        self._said = tempfile.NamedTemporaryFile()  # noqa: SIM115 - closed by `end`
+        self._process = _Forked(nursery, self._said.name) if nursery else _Started(self._said)
         self._watched = psutil.Process(self._process.pid)
         self._answers: SimpleQueue[bytes] = SimpleQueue()
         Thread(target=self._listen, daemon=True).start()
@@ -64,9 +72,8 @@ class Worker:
             raise
 
     def _listen(self) -> None:
-        assert self._process.stdout
         with suppress(ValueError, OSError):
-            for line in self._process.stdout:
+            for line in self._process.answers:
                 self._answers.put(line)
         self._answers.put(b"")
 
@@ -89,10 +96,9 @@ class Worker:
         MorBenchError
             Of the kind that the method raised.
         """
-        assert self._process.stdin
-        with suppress(BrokenPipeError, OSError):  # it has died: said below
-            pickle.dump({"do": do, **request}, self._process.stdin)
-            self._process.stdin.flush()
+        with suppress(OSError):  # it has died: said below
+            pickle.dump({"do": do, **request}, self._process.requests)
+            self._process.requests.flush()
         until = monotonic() + within_s
         while True:
             try:
@@ -129,7 +135,7 @@ class Worker:
         return total
 
     def _how_it_died(self) -> str:
-        code = self._process.wait()
+        code = self._process.exit_code()
         self._said.seek(0)
         lines = self._said.read().decode(errors="replace").strip().splitlines()
         last = f": {lines[-1]}" if lines else ""
@@ -143,12 +149,10 @@ class Worker:
             for process in self._watched.children(recursive=True):
                 with suppress(psutil.Error):
                     process.kill()
-        self._process.kill()
-        self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout, self._said):
-            if stream:
-                with suppress(OSError):
-                    stream.close()
+        with suppress(psutil.Error):
+            self._watched.kill()
+        self._process.close()
+        self._said.close()
 
     def __enter__(self) -> Self:
         return self
@@ -161,10 +165,42 @@ _DOING = {"begin": "starting its process", "check": "importing it", "fit": "fitt
           "warm": "warming up", "time": "timing", "throughput": "timing batches", "cost": "counting the cost"}  # fmt: skip
 
 
-def _environment() -> dict[str, str]:
-    """The parent's, with its own package first: `-m` must find the same one."""
-    import os
+class _Started:
+    """A new interpreter."""
 
-    package = str(Path(errors.__file__).parents[1])
-    paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}
+    def __init__(self, said: Any) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "mor_bench.harness.worker"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, env=environment()
+        )
+        assert self._process.stdin
+        assert self._process.stdout
+        self.pid = self._process.pid
+        self.requests, self.answers = self._process.stdin, self._process.stdout
+
+    def exit_code(self) -> int:
+        return self._process.wait()
+
+    def close(self) -> None:
+        self._process.wait()
+        for stream in (self.requests, self.answers):
+            with suppress(OSError):
+                stream.close()
+
+
+class _Forked:
+    """A child of a nursery's server."""
+
+    def __init__(self, nursery: Nursery, said: str) -> None:
+        self._nursery = nursery
+        self._connection, self.pid = nursery.new_worker(said)
+        self.requests, self.answers = self._connection.makefile("wb"), self._connection.makefile("rb")
+
+    def exit_code(self) -> int:
+        return self._nursery.exit_code(self.pid)
+
+    def close(self) -> None:
+        with suppress(OSError):
+            self._connection.shutdown(socket.SHUT_RDWR)
+        for stream in (self.requests, self._connection):
+            with suppress(OSError):
+                stream.close()

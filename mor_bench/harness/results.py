@@ -61,7 +61,7 @@ def _with_numbers(row: dict[str, Any]) -> dict[str, Any]:
     def numbers(record: dict[str, Any]) -> dict[str, Any]:
         return {name: float(value) if value in ("nan", "inf", "-inf") else value for name, value in record.items()}
 
-    read = {key: row[key] and numbers(row[key]) for key in ("error", "hidden") if key in row}
+    read: dict[str, Any] = {key: row[key] and numbers(row[key]) for key in ("error", "hidden") if key in row}
     return {**row, **read, "sets": {name: numbers(record) for name, record in row.get("sets", {}).items()}}
 
 

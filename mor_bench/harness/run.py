@@ -6,7 +6,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -25,6 +25,7 @@ from mor_bench.harness.fits import Entry, Job, Material, Outcome, Place, RemoteF
 from mor_bench.harness.handover import arrays_of
 from mor_bench.harness.isolation import START_LIMIT_S, MethodFailedError, Worker
 from mor_bench.harness.metrics import SampleErrors, summary
+from mor_bench.harness.nursery import CAN_FORK, Nursery
 from mor_bench.harness.results import Comparison, label_of
 from mor_bench.harness.statistics import intervals_of
 from mor_bench.harness.timing import describe_machine
@@ -33,8 +34,8 @@ from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.executors import Pool, check_pool, cluster_pool
-from mor_bench.snapshots.generate import generation_seconds
 from mor_bench.snapshots.fresh import fresh_test_set
+from mor_bench.snapshots.generate import default_cache, generation_seconds
 from mor_bench.snapshots.test_sets import available_sets
 from mor_bench.specs import (
     AnyDatasetSpec,
@@ -218,9 +219,12 @@ def run(
     )  # fmt: skip
     comparison = _open_run(Path(out) if out else _default_out([spec.name for spec in specs]), specs, method_specs, settings)
     jobs_of_all = jobs_of(method_specs, profile)
-    with suppress(_StopRunError), tempfile.TemporaryDirectory(prefix="mor-bench-") as scratch:
+    with ExitStack() as stack:
+        nursery = stack.enter_context(closing(Nursery())) if CAN_FORK else None
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mor-bench-")))
+        stack.enter_context(suppress(_StopRunError))
         for number, spec in enumerate(specs):
-            _DatasetRun(spec, jobs_of_all, comparison, settings, Path(scratch), suite, number, len(specs)).go()
+            _DatasetRun(spec, jobs_of_all, comparison, settings, scratch, nursery, suite, number, len(specs)).go()
     comparison.finish()
     return comparison
 
@@ -327,12 +331,14 @@ class _DatasetRun:
     """All that a run does on one dataset."""
 
     def __init__(
-        self, spec: AnyDatasetSpec, jobs: list[Job], comparison: Comparison, settings: _Settings, scratch: Path, suite: Path | None, number: int, n: int
+        self, spec: AnyDatasetSpec, jobs: list[Job], comparison: Comparison, settings: _Settings, scratch: Path,
+        nursery: Nursery | None, suite: Path | None, number: int, n: int
     ) -> None:  # fmt: skip
         self.spec, self.jobs, self.comparison, self.settings = spec, jobs, comparison, settings
         self.first, self.total = number * len(jobs), n * len(jobs)
         self.folder = scratch / f"{number}"
         self.discretisation = _discretisation(spec, settings.cache, suite)
+        self.nursery = nursery
         self.spent: dict[str, float] = {}
         self.lock = Lock()
 
@@ -363,7 +369,7 @@ class _DatasetRun:
         sealed = [settings.cache / "datasets", settings.cache / "fits", self.comparison.out / "samples"]
         if isinstance(spec, ImportedDatasetSpec):
             sealed.append(Path(spec.snapshots.file.path))
-        self.place = place_of(settings.cache, sealed, settings.jobs, settings.threads, settings.memory_limit_bytes)
+        self.place = place_of(settings.cache, sealed, settings.jobs, settings.threads, settings.memory_limit_bytes, self.nursery)
 
     def _fit_all(self) -> dict[str, Entry]:
         """Every configuration's row but for its latency; the entries of those that can be timed, by label."""
@@ -548,11 +554,13 @@ class _DatasetRun:
         self.comparison.write()
 
 
-def place_of(cache: Path, sealed: Sequence[Path], jobs: int, threads: int, memory_limit_bytes: float) -> Place:
+def place_of(
+    cache: Path, sealed: Sequence[Path], jobs: int, threads: int, memory_limit_bytes: float, nursery: Nursery | None = None
+) -> Place:  # fmt: skip
     """Where methods run, and what they must not open."""
     machine = describe_machine()
     cores = machine["cores"]
-    return Place(cache, tuple(sealed), f"{machine['processor']} x {cores}", max(1, cores // jobs), threads, memory_limit_bytes)
+    return Place(cache, tuple(sealed), f"{machine['processor']} x {cores}", max(1, cores // jobs), threads, memory_limit_bytes, nursery)
 
 
 def _in_order(

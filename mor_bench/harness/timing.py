@@ -15,6 +15,7 @@ import psutil
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+
 @contextmanager
 def pinned_threads(threads: int) -> Iterator[None]:
     """Limit BLAS, OpenMP and, where it is loaded, torch to a number of threads."""

@@ -11,6 +11,7 @@ import gc
 import json
 import os
 import pickle
+import signal
 import sys
 import warnings
 from collections.abc import Callable
@@ -308,23 +309,32 @@ def _read(requests: BinaryIO, queue: SimpleQueue[dict[str, Any]]) -> None:
     while True:
         try:
             queue.put(pickle.load(requests))
-        except EOFError:
+        except (EOFError, OSError):
             os._exit(1)
 
 
-def main() -> None:
-    """Answer requests until there are no more."""
-    requests = os.fdopen(os.dup(0), "rb")
-    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what a method prints is no answer
+def work(requests: BinaryIO, answers: BinaryIO) -> None:
+    """Answer requests until there are no more. What a method prints is no answer: standard output goes where errors go."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent ends its workers
+    os.dup2(2, 1)
     with open(os.devnull, "rb") as nothing:
         os.dup2(nothing.fileno(), 0)
     queue: SimpleQueue[dict[str, Any]] = SimpleQueue()
     Thread(target=_read, args=(requests, queue), daemon=True).start()
     session = Session()
     while True:
-        answers.write(json.dumps(_answer(session, queue.get())) + "\n")
+        answers.write(json.dumps(_answer(session, queue.get())).encode() + b"\n")
         answers.flush()
+
+
+def main() -> None:
+    """Be a worker on standard input and output; or, given the path of a socket, the server that workers are forked from."""
+    if len(sys.argv) == 2:
+        from mor_bench.harness.nursery import serve
+
+        serve(sys.argv[1], work)
+    else:
+        work(os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb"))
 
 
 if __name__ == "__main__":

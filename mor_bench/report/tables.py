@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import hypot
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group, RenderableType
@@ -28,6 +28,9 @@ from mor_bench.report.summary import (
     short_swept,
     warnings_of,
 )
+
+if TYPE_CHECKING:
+    from mor_bench.harness.plan import Plan
 
 NOT_REACHED = "not reached"
 
@@ -247,3 +250,18 @@ def print_discretisation(record: dict[str, Any], console: Console | None = None)
             console.print(Text(f"{kind}: {shown}"))
     mean = f"mean e {metres(record['error_m'])} m, relative L2 {percent(record['relative_l2'])} % (median {percent(record['relative_l2_median'])} %)"
     console.print(Text(f"discretisation error of {record['dataset']}: {mean}", style="bold"))
+
+
+def print_plan(plan: Plan, console: Console | None = None) -> None:
+    """Print what a run would do: a row per dataset and configuration, and the time that all of it would take."""
+    console = console or Console(highlight=False, width=None if sys.stdout.isatty() else 120)
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1), show_edge=False)
+    for heading in ("dataset", "step"):
+        table.add_column(heading)
+    table.add_column("estimate", justify="right")
+    for step in plan.steps:
+        estimate = "unknown" if step.seconds is None else f"{number(step.seconds)} s"
+        table.add_row(step.dataset, Text(step.label), "in the cache" if step.done else estimate)
+    console.print(table, highlight=False)
+    unknown = f", and {plan.n_unknown} steps of which nothing is known" if plan.n_unknown else ""
+    console.print(Text(f"about {plan.seconds / 60:.1f} min, {plan.timing_s / 60:.1f} of them timing{unknown}", style="bold"))

@@ -25,7 +25,6 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
-from scipy.stats import qmc
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.scene import Scene
@@ -168,6 +167,8 @@ def _random_forces(loads: Loads, number: int, normals: NDArray[np.float64]) -> N
 @lru_cache(maxsize=4096)
 def _design(sampling: Sampling, seed: tuple[int, ...], n: int, d: int) -> NDArray[np.float64]:
     """n points of a space-filling design in the d-dimensional unit cube, (n, d)."""
+    from scipy.stats import qmc  # here, since it takes a quarter of the time of importing this package
+
     generator = np.random.default_rng(seed)
     if sampling == "latin-hypercube":
         return np.asarray(qmc.LatinHypercube(d, rng=generator).random(n))
