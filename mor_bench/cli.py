@@ -116,16 +116,23 @@ def _progress(console: Console) -> Iterator[Listener]:
                 tasks["run"] = bars.add_task("", total=total, rate="")
             bars.update(tasks["run"], description=escape(f"{dataset}: {label}"), completed=number - 1)
 
-        def finished(row: dict[str, Any]) -> None:
+        def fitted(row: dict[str, Any]) -> None:
             if row["status"] == "ok":
-                error, latency = row["error"], row["latency_ms"]
-                text = f"ē {error['mean_dof_m']:.2e} m   rel. l2 {error['rel_l2_median']:.3%}   {latency['median']:.3g} ms"
-                text += f"   fit {row['offline_s']['fit']:.3g} s"
+                error = row["error"]
+                text = f"ē {error['mean_dof_m']:.2e} m   rel. l2 {error['rel_l2_median']:.3%}   fit {row['offline_s']['fit']:.3g} s"
             else:
                 text = f"{row['status']}: {row['reason']}"
             bars.console.print(f"[bold]{escape(row['label']):<46}[/bold] {escape(text)}", highlight=False)
 
-        yield Listener(generating, starting, finished)
+        def timing(dataset: str, done: int, total: int) -> None:
+            name = f"timing {dataset}"
+            if name not in tasks:
+                tasks[name] = bars.add_task(escape(name), total=total, rate="")
+                if not console.is_terminal:
+                    bars.console.print(f"{dataset}: all fitted; timing them beside each other", highlight=False, markup=False)
+            bars.update(tasks[name], completed=done)
+
+        yield Listener(generating, starting, fitted, timing)
 
 
 @app.command()
@@ -141,6 +148,14 @@ def run(
     out: Annotated[Path | None, typer.Option(help="Where to write. [default: reports/runs/TIME-DATASETS]")] = None,
     threads: Annotated[int, typer.Option(min=1, help="Threads of a prediction; fitting uses all cores.")] = 1,
     workers: Workers = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Fits at once, which share the cores.")] = 1,
+    cluster: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers generate and fit: tcp://host:port.")] = None,
+    test_seed: Annotated[int | None, typer.Option(help="Also score on a fresh test set that this seed draws after all fits.")] = None,
+    time_limit: Annotated[float | None, typer.Option(metavar="SECONDS", help="Of all fits of a method on a dataset together.")] = None,
+    memory_limit: Annotated[float | None, typer.Option(metavar="GB", help="Of a method's process. [default: 3/4 of the memory]")] = None,
+    retime: Annotated[bool, typer.Option("--retime", help="Take timings again that the cache holds.")] = False,
+    fail_fast: Annotated[bool, typer.Option("--fail-fast", help="End at the first row that fails.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would run, and how long it would take.")] = False,
     cache: Cache = None,
     suite: Suite = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print results.json to standard output and the rest to standard error.")] = False,
@@ -151,17 +166,32 @@ def run(
         from mor_bench.report import print_tables, render
 
         console = _console(stderr=as_json)
+        if dry_run:
+            from mor_bench.harness.plan import plan
+            from mor_bench.report.tables import print_plan
+
+            planned = plan(
+                datasets or ["beam-coarse"], method or None, profile.value, limit=limit, split=split.value if split else None,
+                threads=threads, workers=workers, jobs=jobs, cache=cache, suite=suite,
+            )  # fmt: skip
+            if as_json:
+                print(json.dumps(planned.as_dict(), indent=1))
+            print_plan(planned, console)
+            return
         with _progress(console) as listener:
             comparison = mor_bench.run(
                 datasets or ["beam-coarse"], method or None, profile.value, out, limit=limit, split=split.value if split else None,
-                threads=threads, workers=workers, cache=cache, suite=suite, listener=listener,
+                threads=threads, workers=workers, jobs=jobs, cluster=cluster, test_seed=test_seed, time_limit_s=time_limit,
+                memory_limit_bytes=memory_limit and 1e9 * memory_limit, retime=retime, fail_fast=fail_fast, cache=cache, suite=suite,
+                listener=listener,
             )  # fmt: skip
         print_tables(comparison, console)
         for path in render(comparison):
             console.print(str(path), highlight=False, soft_wrap=True)
         if as_json:
             print((comparison.out / "results.json").read_text(encoding="utf-8"))
-        if not any(row["status"] == "ok" for row in comparison.rows):
+        failed = fail_fast and any(row["status"] == "failed" for row in comparison.rows)
+        if failed or not any(row["status"] == "ok" for row in comparison.rows):
             raise typer.Exit(1)
 
 

@@ -7,6 +7,7 @@ import hashlib
 import inspect
 import itertools
 import json
+import sys
 import tomllib
 import types
 from collections.abc import Iterator, Mapping
@@ -497,14 +498,31 @@ class Profile(_Model):
     sweep: dict[str, list[Any]] = {}
 
 
+class Regime(_Model):
+    """What a method was built for; a comparison without it says nothing final about the method.
+
+    `says` is that in words; `min_dofs` and `min_train` the least unknowns and training samples; `gpu` whether it needs one.
+    """
+
+    says: str
+    min_dofs: Annotated[int, Field(ge=1)] | None = None
+    min_train: Annotated[int, Field(ge=1)] | None = None
+    gpu: bool = False
+
+
 class MethodSpec(_Model):
-    """A method file. `limits` says in plain words where the method fails."""
+    """A method file. `limits` says in plain words where the method fails.
+
+    `folder` is where the file lies, and a third party's module may; None for the suite's own.
+    """
 
     name: str
     title: str
     surrogate: str
     source: str
     limits: str = ""
+    regime: Regime | None = None
+    folder: Path | None = None
     parameters: dict[str, Any] = {}
     sweep: dict[str, list[Any]] = {}
     profiles: dict[Literal["quick", "full"], Profile] = {}
@@ -526,8 +544,8 @@ class MethodSpec(_Model):
         return self
 
     def load_class(self) -> type[Any]:
-        """Import the surrogate's class."""
-        return load_class(self.surrogate)
+        """Import the surrogate's class, from beside its file if it lies there."""
+        return load_class(self.surrogate, self.folder)
 
     def parameters_of(self, profile: str) -> dict[str, Any]:
         """The file's parameters with the profile's on top, swept ones not included."""
@@ -547,8 +565,8 @@ class MethodSpec(_Model):
         return [{**self.parameters_of(profile), **dict(zip(sweep, row, strict=True))} for row in itertools.product(*sweep.values())]
 
 
-def load_class(target: str) -> type[Any]:
-    """Import ``package.module:Class``.
+def load_class(target: str, folder: Path | None = None) -> type[Any]:
+    """Import ``package.module:Class``, also from a folder that is not on the import path.
 
     Raises
     ------
@@ -558,6 +576,8 @@ def load_class(target: str) -> type[Any]:
         If the module or the class does not exist.
     """
     module, _, name = target.partition(":")
+    if folder is not None and str(folder) not in sys.path:
+        sys.path.append(str(folder))
     try:
         loaded = import_module(module)
     except ModuleNotFoundError as error:
@@ -719,7 +739,9 @@ def is_method_file(path: Path) -> bool:
 def load_method_spec(source: str | Path, suite: Path | None = None) -> MethodSpec:
     """Read and validate a method: a name in the suite or the path of a TOML."""
     path = _resolve("methods", source, suite)
-    return _validated(MethodSpec, {**_read_toml(path), "name": path.stem}, str(path))
+    content = _read_toml(path)
+    folder = None if str(content.get("surrogate", "")).startswith("mor_bench.") else path.parent.resolve()
+    return _validated(MethodSpec, {**content, "name": path.stem, "folder": folder}, str(path))
 
 
 def check_parameters(surrogate: type[Any], parameters: Mapping[str, Any], where: str | None = None) -> dict[str, Any]:

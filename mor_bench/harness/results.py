@@ -1,6 +1,6 @@
 """What a run leaves on disk, and the `Comparison` that reads it.
 
-OUT/results.json       schema version, machine, rows
+OUT/results.json       schema version, machine, rows, learning curves
 OUT/results.csv        the same rows, flat
 OUT/comparison.json    time at error, error at time
 OUT/samples/*.h5       raw latencies and per-sample errors of each row, singular values of each dataset
@@ -28,9 +28,12 @@ from mor_bench.snapshots.store import write_atomically
 if TYPE_CHECKING:
     import pandas as pd
 
-SCHEMA_VERSION = 1
-_WHAT_RAN = ("dataset", "split", "method", "label", "parameters", "n_train", "n_test", "threads")
-_WHAT_CAME_OUT = ("status", "reason", "n_failed", "error", "latency_ms", "offline_s", "model_bytes", "discretisation_error_m")
+SCHEMA_VERSION = 2
+_WHAT_RAN = ("dataset", "split", "method", "label", "parameters", "n_train", "n_test", "n_dofs", "threads")
+_WHAT_CAME_OUT = (
+    "status", "reason", "n_failed", "error", "latency_ms", "all_threads_ms", "throughput", "offline_s", "memory_bytes", "model_bytes",
+    "cost", "sets", "hidden", "discretisation_error_m",
+)  # fmt: skip
 ROW_KEYS = frozenset([*_WHAT_RAN, *_WHAT_CAME_OUT])
 """What every row of results.json has."""
 
@@ -54,14 +57,26 @@ def _plain(value: Any) -> Any:
 
 def _with_numbers(row: dict[str, Any]) -> dict[str, Any]:
     """A row read from JSON with the `nan` and `inf` of its errors as numbers again."""
-    return {**row, "error": row["error"] and {name: float(value) for name, value in row["error"].items()}}
+
+    def numbers(record: dict[str, Any]) -> dict[str, Any]:
+        return {name: float(value) if value in ("nan", "inf", "-inf") else value for name, value in record.items()}
+
+    read = {key: row[key] and numbers(row[key]) for key in ("error", "hidden") if key in row}
+    return {**row, **read, "sets": {name: numbers(record) for name, record in row.get("sets", {}).items()}}
 
 
 def _write_json(path: Path, content: Any) -> None:
     write_atomically(path, json.dumps(_plain(content), indent=1, allow_nan=False).encode())
 
 
-def _write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read what `write_arrays` wrote."""
+    with h5py.File(path, "r") as file:
+        return {key: np.asarray(file[key][()]) for key in file}
+
+
+def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write named arrays to an HDF5 file, atomically."""
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         for name, array in arrays.items():
@@ -83,13 +98,19 @@ class Comparison:
     rows : list of dict
         One per fitted configuration, in the order in which they ran: `dataset`, `split`, `method`, `label`,
         `parameters`, `status` (`ok`, `failed` or `skipped`), `reason`, `n_train`, `n_test`, `n_failed` (test samples
-        without a prediction), `threads`, `error`, `latency_ms`, `offline_s`, `model_bytes`, `warnings`; and of the
+        without a prediction), `n_dofs`, `threads`, `warnings`, and what was measured: `error`; `latency_ms` of single queries
+        with the interval `low`, `high` in which a repeated measurement's median is expected, the garbage collector's share
+        `gc` and whether it was `stable`; `all_threads_ms`; `throughput` in queries per second by size of the batch;
+        `offline_s`; `memory_bytes`, resident at most while fitting and while predicting; `model_bytes`; `cost` per query,
+        which no machine changes; `sets`, errors on the named test sets; `hidden`, on a test set of fresh draws. Of the
         dataset's own mesh against the limit of fine ones `discretisation_error_m` (mean e) and `discretisation_rel_l2`
-        (median), None where not measured.
-    datasets : dict
-        For each dataset its spec, as in its file.
+        (median). None where not measured.
+    datasets, methods : dict
+        For each its spec, as in its file.
+    learning : list of dict
+        Learning curves: `dataset`, `method`, `label`, `n_train`, `status`, `reason`, `fit_s`, `error`.
     settings : dict
-        Profile, split, limit, threads and version of the run.
+        Profile, split, limit, threads, budgets and version of the run.
     """
 
     out: Path
@@ -97,6 +118,8 @@ class Comparison:
     rows: list[dict[str, Any]] = field(default_factory=list)
     datasets: dict[str, dict[str, Any]] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
+    methods: dict[str, dict[str, Any]] = field(default_factory=dict)
+    learning: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def table(self) -> pd.DataFrame:
@@ -114,47 +137,50 @@ class Comparison:
     def _samples_path(self, name: str) -> Path:
         return self.out / "samples" / (re.sub(r"[^\w.=-]+", "-", name).strip("-") + ".h5")
 
-    def has(self, dataset: str, label: str, parameters: Mapping[str, Any]) -> bool:
-        """Whether a configuration has run; a row that did not succeed is forgotten, so that it is tried again."""
-        key = (dataset, label, parameters)
-        mine = [row for row in self.rows if (row["dataset"], row["label"], row["parameters"]) == key]
-        self.rows = [row for row in self.rows if row not in mine or row["status"] == "ok"]
-        return any(row["status"] == "ok" for row in mine)
-
-    def add(self, row: dict[str, Any], samples: Mapping[str, NDArray[Any]] | None = None) -> None:
-        """Append a row and write everything; raw samples first, so that a row on disk has its samples."""
+    def put(self, row: dict[str, Any], samples: Mapping[str, NDArray[Any]] | None = None) -> None:
+        """Add a row, or replace that of the same configuration, and write everything; raw samples first."""
         if samples:
-            _write_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"), samples)
-        self.rows.append(row)
+            write_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"), samples)
+        places = [i for i, other in enumerate(self.rows) if (other["dataset"], other["label"]) == (row["dataset"], row["label"])]
+        if places:
+            self.rows[places[0]] = row
+        else:
+            self.rows.append(row)
         self.write()
+
+    def add_samples(self, row: Mapping[str, Any], samples: Mapping[str, NDArray[Any]]) -> None:
+        """Write more raw samples of a row beside those that are there."""
+        write_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"), {**self.samples(row), **samples})
 
     def add_dataset(self, name: str, spec: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
         """Record a dataset: its spec and arrays such as `singular_values` (of the training snapshots)."""
         self.datasets[name] = spec
-        _write_arrays(self._samples_path(name), arrays)
+        write_arrays(self._samples_path(name), arrays)
 
     def samples(self, row: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
         """Raw samples of a row that ran.
 
-        `latency_ms` (n_queries,); `mean_dof_m`, `relative_l2`, `max_nodal_m`, `amplitude_m` (n_test,); and of the sample
+        `latency_ms`, `process`, `round` (n_queries,), the last two numbers of the fresh process and of the interleaved round
+        that a query was timed in; `mean_dof_m`, `relative_l2`, `max_nodal_m`, `amplitude_m` (n_test,); and of the sample
         with the largest finite e `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3).
         """
-        return self._read_arrays(f"{row['dataset']}--{row['label']}")
+        return read_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"))
 
     def dataset_arrays(self, name: str) -> dict[str, NDArray[Any]]:
-        """Arrays of a dataset: `singular_values`, `points` (n_nodes, 3), `cells` (n_cells, 8)."""
-        return self._read_arrays(name)
+        """Arrays of a dataset: `singular_values`, `points` (n_nodes, 3), `cells` (n_cells, 8), `test_regions` (n_test, k)."""
+        return read_arrays(self._samples_path(name))
 
-    def _read_arrays(self, name: str) -> dict[str, NDArray[Any]]:
-        with h5py.File(self._samples_path(name), "r") as file:
-            return {key: file[key][()] for key in file}
+    def finish(self) -> None:
+        """Write everything, and what follows from all rows together, comparison.json."""
+        self.write()
+        _write_json(self.out / "comparison.json", self.frontier)
 
     def write(self) -> None:
-        """Write results.json, results.csv and comparison.json, each atomically."""
+        """Write results.json and results.csv, each atomically."""
         self.out.mkdir(parents=True, exist_ok=True)
-        content = {"schema_version": SCHEMA_VERSION, "machine": self.machine, "settings": self.settings, "datasets": self.datasets, "rows": self.rows}
+        parts = ("machine", "settings", "datasets", "methods", "rows", "learning")
+        content = {"schema_version": SCHEMA_VERSION, **{name: getattr(self, name) for name in parts}}
         _write_json(self.out / "results.json", content)
-        _write_json(self.out / "comparison.json", self.frontier)
         write_atomically(self.out / "results.csv", self.table.to_csv(index=False).encode())
 
     @classmethod
@@ -177,7 +203,8 @@ class Comparison:
                 absent = ROW_KEYS - row.keys()
                 if absent:
                     raise StoreError(f"{path}: a row lacks {', '.join(sorted(absent))}.")
-            return cls(Path(out), content["machine"], rows, content["datasets"], content["settings"])
+            learning = [_with_numbers(record) for record in content["learning"]]
+            return cls(Path(out), content["machine"], rows, content["datasets"], content["settings"], content["methods"], learning)
         except FileNotFoundError:
             raise StoreError(f"{path}: no such file; is {out} the folder of a run?") from None
         except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -4,31 +4,49 @@ from __future__ import annotations
 
 import os
 import tempfile
-import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from time import perf_counter
+from threading import Lock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import psutil
 
 from mor_bench import __version__
 from mor_bench.errors import InvalidInputError, MissingDependencyError, MorBenchError, SolverError, UnsupportedSceneError
+from mor_bench.harness.clock import PROTOCOLS, Opener, Timing, measure, probe_s, summary_of_timing
 from mor_bench.harness.discretisation import measured
-from mor_bench.harness.metrics import SampleErrors, sample_errors, summary
+from mor_bench.harness.fits import Entry, Job, Material, Outcome, Place, RemoteFit, evaluate, fit_elsewhere
+from mor_bench.harness.handover import arrays_of
+from mor_bench.harness.isolation import START_LIMIT_S, MethodFailedError, Worker
+from mor_bench.harness.metrics import SampleErrors, summary
 from mor_bench.harness.results import Comparison, label_of
-from mor_bench.harness.timing import describe_machine, latency_summary, measure_latency, pinned_threads
+from mor_bench.harness.statistics import intervals_of
+from mor_bench.harness.timing import describe_machine
 from mor_bench.mechanics.model import check_supports
 from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import Dataset, load_dataset
+from mor_bench.snapshots.executors import Pool, check_pool, cluster_pool
 from mor_bench.snapshots.generate import generation_seconds
-from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, MethodSpec, SplitBy, check_method, load_dataset_spec, load_method_spec
-from mor_bench.surrogate import Surrogate, make_surrogate
+from mor_bench.snapshots.fresh import fresh_test_set
+from mor_bench.snapshots.test_sets import available_sets
+from mor_bench.specs import (
+    AnyDatasetSpec,
+    DatasetSpec,
+    ImportedDatasetSpec,
+    MethodSpec,
+    SplitBy,
+    check_method,
+    list_suite,
+    load_dataset_spec,
+    load_method_spec,
+)
 
 CORE_METHODS = ("fem", "pod", "hpod", "pca-regression", "umesh")
 """What is compared when nothing else is asked for."""
@@ -36,8 +54,26 @@ CORE_METHODS = ("fem", "pod", "hpod", "pca-regression", "umesh")
 DATA_METHODS = ("pca-regression-force", "umesh")
 """The same on imported snapshots, whose equations are not known."""
 
-PREDICTION_BATCH = 256
-"""Test samples per call of `predict`, which bounds memory."""
+MEMORY_SHARE = 0.75
+"""Of the machine's memory, that a method may take unless another limit is given."""
+
+EXTRA_SEEDS = 2
+"""Trainings with other seeds in a full comparison, beside that of the method's file."""
+
+LEARNING_STEP = 4
+LEAST_TRAINING = 20
+"""A learning curve goes from all training samples down by this factor, to no fewer than these."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What tuning a method may cost on a dataset: the same for every method."""
+
+    configurations: int
+    seconds: float
+
+
+BUDGETS = {"quick": Budget(12, 1200.0), "full": Budget(16, 1800.0)}
 
 
 @dataclass(frozen=True)
@@ -50,126 +86,43 @@ class Listener:
         (dataset, samples done, samples wanted)
     starting : callable
         (dataset, label, number of the configuration, how many there are)
+    fitted : callable
+        (row), scored but not yet timed
+    timing : callable
+        (dataset, turns done, turns in all)
     finished : callable
         (row)
     """
 
     generating: Callable[[str, int, int], None] = lambda *_: None
     starting: Callable[[str, str, int, int], None] = lambda *_: None
+    fitted: Callable[[dict[str, Any]], None] = lambda *_: None
+    timing: Callable[[str, int, int], None] = lambda *_: None
     finished: Callable[[dict[str, Any]], None] = lambda *_: None
 
 
 @dataclass(frozen=True)
-class _Job:
-    """One configuration of one method on one dataset."""
+class _Settings:
+    """The arguments of a run that its parts need."""
 
-    method: MethodSpec
-    parameters: dict[str, Any]
-    label: str
-
-
-def _jobs(methods: Sequence[MethodSpec], profile: str) -> list[_Job]:
-    jobs = []
-    for method in methods:
-        swept = method.swept_keys(profile)
-        for parameters in method.configurations(profile):
-            jobs.append(_Job(method, parameters, label_of(method.name, {key: parameters[key] for key in swept})))
-    return jobs
-
-
-def _predict_all(method: Surrogate, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Predictions for all samples; NaN where the method found no equilibrium, which counts as an infinite error."""
-    out = np.full(forces.shape, np.nan)
-    for start in range(0, len(forces), PREDICTION_BATCH):
-        batch = forces[start : start + PREDICTION_BATCH]
-        try:
-            # A copy: what a method does to its input must not reach the rows after it.
-            predicted = np.asarray(method.predict(batch.copy()))
-        except SolverError:
-            for row, force in enumerate(batch):
-                try:
-                    out[start + row] = method.predict(force.copy())
-                except SolverError:
-                    continue
-            continue
-        if predicted.shape != batch.shape or predicted.dtype.kind != "f":
-            raise InvalidInputError(f"`predict` must return floats of shape {batch.shape}; it returned {predicted.dtype} of shape {predicted.shape}.")
-        out[start : start + len(batch)] = predicted
-    return out
+    profile: str
+    limit: int | None
+    split: SplitBy | None
+    threads: int
+    workers: int | None
+    jobs: int
+    cluster: str | None
+    cache: Path
+    budget: Budget
+    memory_limit_bytes: float
+    test_seed: int | None
+    retime: bool
+    fail_fast: bool
+    listener: Listener
 
 
-def _model_bytes(method: Surrogate) -> int | None:
-    """Size of the file that `save` writes; None for a method that cannot be saved."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.safetensors"
-        try:
-            method.save(path)
-        except MorBenchError:
-            return None
-        return path.stat().st_size
-
-
-def _worst(errors: SampleErrors, predicted: NDArray[np.float64], data: Dataset) -> dict[str, NDArray[Any]]:
-    finite = np.where(np.isfinite(errors.mean_dof_m), errors.mean_dof_m, -1.0)
-    worst = int(finite.argmax())
-    return {
-        "worst_prediction": predicted[worst],
-        "worst_reference": data.test.displacements[worst],
-        "worst_forces": data.test.forces[worst],
-    }
-
-
-def _evaluate(job: _Job, data: Dataset, data_seconds: float | None, threads: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Fit, predict the test set, time single queries; the parts of a row that this yields, and the raw samples."""
-    method = make_surrogate(job.method.load_class(), job.parameters)
-    with pinned_threads(os.cpu_count() or 1):
-        start = perf_counter()
-        method.fit(data.scene, data.train if method.needs_snapshots else None)
-        fit_seconds = perf_counter() - start
-    with pinned_threads(threads):
-        predicted = _predict_all(method, data.test.forces)
-        errors = sample_errors(predicted, data.test.displacements)
-        answered = np.isfinite(errors.mean_dof_m)
-        if not answered.any():
-            raise SolverError(f"no valid prediction on any of {len(data.test)} test samples")
-        latency = measure_latency(method.predict, data.test.forces[answered].copy())
-    row = {
-        "status": "ok",
-        "n_failed": int((~answered).sum()),
-        "error": summary(errors),
-        "latency_ms": latency_summary(latency),
-        "offline_s": {"data": data_seconds if method.needs_snapshots else 0.0, "fit": fit_seconds},
-        "model_bytes": _model_bytes(method),
-    }
-    samples = {
-        "latency_ms": latency,
-        "mean_dof_m": errors.mean_dof_m,
-        "relative_l2": errors.relative_l2,
-        "max_nodal_m": errors.max_nodal_m,
-        "amplitude_m": errors.amplitude_m,
-        **_worst(errors, predicted, data),
-    }
-    return row, samples
-
-
-def _run_job(job: _Job, data: Dataset, data_seconds: float | None, threads: int) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """`_evaluate`, with any failure turned into a row that says why; a method's crash costs only its own row."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
-        try:
-            outcome, samples = _evaluate(job, data, data_seconds, threads)
-        except (MissingDependencyError, UnsupportedSceneError) as error:
-            outcome, samples = {"status": "skipped", "reason": str(error)}, {}
-        except MorBenchError as error:
-            outcome, samples = {"status": "failed", "reason": f"{type(error).__name__}: {error}"}, {}
-        except (Exception, SystemExit) as error:  # third parties' code runs here
-            outcome, samples = {"status": "failed", "reason": f"crashed with {type(error).__name__}: {error}"}, {}
-    notes = list(dict.fromkeys(str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)))
-    return {**outcome, "warnings": notes}, samples
-
-
-def _default_out(names: Sequence[str]) -> Path:
-    return Path("reports") / "runs" / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{'-'.join(names)}"
+class _StopRunError(Exception):
+    """A row failed where the first failure ends a run."""
 
 
 def run(
@@ -182,35 +135,61 @@ def run(
     split: SplitBy | None = None,
     threads: int = 1,
     workers: int | None = None,
+    jobs: int = 1,
+    cluster: str | None = None,
+    test_seed: int | None = None,
+    time_limit_s: float | None = None,
+    memory_limit_bytes: float | None = None,
+    retime: bool = False,
+    fail_fast: bool = False,
     cache: Path | None = None,
     suite: Path | None = None,
     listener: Listener = Listener(),
 ) -> Comparison:
     """Compare methods on datasets.
 
-    Every specification is checked before anything runs. Rows are written as they finish; the same run into the same
-    folder keeps the rows that are there and goes on. The discretisation error of a dataset's mesh is read from the record
-    that `mor_bench.harness.discretisation.refine` left, and is not measured here.
+    Every specification is checked before anything runs. Each configuration is fitted in a process of its own, which is
+    given the training samples only; when all are fitted they are timed beside each other in fresh processes. Fits, scores
+    and timings are kept in the cache under all that they depend on, so that a run that was stopped goes on, and another
+    one computes only what is new. The discretisation error of a dataset's mesh is read from the record that
+    `mor_bench.harness.discretisation.refine` left, and is not measured here.
+
+    A full comparison also scores the dataset's named test sets (`mor_bench.snapshots.test_sets`), trains with other seeds,
+    and draws learning curves.
 
     Parameters
     ----------
     datasets, methods : sequences of names or paths of TOML files
         A dataset may also be a dict with the same keys. Methods are `CORE_METHODS` by default, or `DATA_METHODS` on
-        imported snapshots.
+        imported snapshots, or with the profile "full" all of the suite; those of ``suite`` come in addition.
     profile : {"quick", "full"}
-        Which budget and sweep of the method files to use.
+        Which sweep of the method files, which budget and how much beside the headline.
     out : path, optional
         Where to write; ``reports/runs/TIME-DATASETS`` by default.
     limit : int, optional
         Only the first samples of each dataset.
-    split : {"region", "sample"}, optional
+    split : {"region", "sample", "direction"}, optional
         Instead of the split in the dataset's file.
     threads : int
         Threads of a prediction, one by default: steadiest and, on small scenes, fastest. Fitting uses all cores.
     workers : int, optional
         Processes for data generation; all cores by default.
+    jobs : int
+        Fits at once, which share the cores; seconds of fitting are honest with one.
+    cluster : str, optional
+        Address of a Dask scheduler, ``tcp://host:port``, whose workers generate and fit; timings are always taken here.
+    test_seed : int, optional
+        Also score on a test set of the same distribution that this seed draws when all methods are fitted.
+    time_limit_s : float, optional
+        Of all fits of a method on a dataset together: the tuning budget's seconds.
+    memory_limit_bytes : float, optional
+        Of a method's process; three quarters of the machine's memory by default.
+    retime : bool
+        Take timings again that the cache holds.
+    fail_fast : bool
+        End the run at the first row that fails.
     cache, suite : Path, optional
-        Cache folder of datasets; folder with ``datasets/`` and ``methods/``.
+        Cache folder; folder with ``datasets/`` and ``methods/``.
     listener : Listener
         Told of progress.
 
@@ -224,66 +203,69 @@ def run(
         If the record of a discretisation error is damaged.
     """
     cores = os.cpu_count() or 1
-    if profile not in ("quick", "full"):
-        raise InvalidInputError(f"`profile` must be 'quick' or 'full'; got {profile!r}.")
-    if not 1 <= threads <= cores:
-        raise InvalidInputError(f"`threads` must be an integer in [1, {cores}]; got {threads}.")
+    _check(profile, threads, jobs, cores, time_limit_s, memory_limit_bytes)
+    check_pool(workers, cluster)
     if not datasets or (methods is not None and not methods):
         raise InvalidInputError("`datasets` and `methods` must name at least one each.")
-    specs, method_specs = _checked_specs(datasets, methods, suite)
-    discretisation = {spec.name: _discretisation(spec, cache, suite) for spec in specs}
-    jobs = _jobs(method_specs, profile)
-    settings = {"profile": profile, "split": split, "limit": limit, "threads": threads, "version": __version__}
-    comparison = _open_run(Path(out) if out else _default_out([spec.name for spec in specs]), specs, settings)
-    comparison.rows = [{**row, **discretisation[row["dataset"]]} for row in comparison.rows]
-    comparison.write()
-    for number, (spec, job) in enumerate((spec, job) for spec in specs for job in jobs):
-        if number % len(jobs) == 0:
-            data = _open(spec, comparison, listener, limit=limit, split=split, workers=workers, cache=cache)
-            data_seconds = generation_seconds(spec, cache, len(data.train)) if isinstance(spec, DatasetSpec) else None
-        listener.starting(spec.name, job.label, number + 1, len(specs) * len(jobs))
-        if comparison.has(spec.name, job.label, job.parameters):
-            continue
-        outcome, samples = _run_job(job, data, data_seconds, threads)
-        row: dict[str, Any] = {
-            "dataset": spec.name,
-            "split": split or spec.split.by,
-            "method": job.method.name,
-            "label": job.label,
-            "parameters": job.parameters,
-            "status": "",
-            "reason": None,
-            "n_train": len(data.train),
-            "n_test": len(data.test),
-            "n_unused": data.n_unused,
-            "n_failed": None,
-            "threads": threads,
-            "error": None,
-            "latency_ms": None,
-            "offline_s": None,
-            "model_bytes": None,
-            **discretisation[spec.name],
-            **outcome,
-        }
-        comparison.add(row, samples)
-        listener.finished(row)
+    specs, method_specs = checked_specs(datasets, methods, profile, suite)
+    if test_seed is not None:
+        _check_test_seed(test_seed, specs)
+    budget = BUDGETS[profile]
+    settings = _Settings(
+        profile, limit, split, threads, workers, jobs, cluster, cache or default_cache(),
+        replace(budget, seconds=time_limit_s or budget.seconds),
+        memory_limit_bytes or MEMORY_SHARE * psutil.virtual_memory().total, test_seed, retime, fail_fast, listener,
+    )  # fmt: skip
+    comparison = _open_run(Path(out) if out else _default_out([spec.name for spec in specs]), specs, method_specs, settings)
+    jobs_of_all = jobs_of(method_specs, profile)
+    with suppress(_StopRunError), tempfile.TemporaryDirectory(prefix="mor-bench-") as scratch:
+        for number, spec in enumerate(specs):
+            _DatasetRun(spec, jobs_of_all, comparison, settings, Path(scratch), suite, number, len(specs)).go()
+    comparison.finish()
     return comparison
 
 
-def _discretisation(spec: AnyDatasetSpec, cache: Path | None, suite: Path | None) -> dict[str, float | None]:
-    """The part of every row that says how far the dataset's mesh is from the body; None where it was not measured."""
-    record = (measured(spec, cache, suite) if isinstance(spec, DatasetSpec) else None) or {}
-    return {"discretisation_error_m": record.get("error_m"), "discretisation_rel_l2": record.get("relative_l2_median")}
+def _check(profile: str, threads: int, jobs: int, cores: int, time_limit_s: float | None, memory_limit_bytes: float | None) -> None:
+    if profile not in BUDGETS:
+        raise InvalidInputError(f"`profile` must be 'quick' or 'full'; got {profile!r}.")
+    for name, count in (("threads", threads), ("jobs", jobs)):
+        if not 1 <= count <= cores:
+            raise InvalidInputError(f"`{name}` must be an integer in [1, {cores}]; got {count}.")
+    if time_limit_s is not None and not time_limit_s > 0:
+        raise InvalidInputError(f"`time_limit_s` must be above 0; got {time_limit_s}.")
+    if memory_limit_bytes is not None and not memory_limit_bytes >= 1e8:
+        raise InvalidInputError(f"`memory_limit_bytes` must be at least 1e8, which a process takes without a method; got {memory_limit_bytes:g}.")
 
 
-def _checked_specs(
-    datasets: Sequence[str | Path | Mapping[str, Any]], methods: Sequence[str | Path] | None, suite: Path | None
+def _check_test_seed(test_seed: int, specs: Sequence[AnyDatasetSpec]) -> None:
+    for spec in specs:
+        if isinstance(spec, ImportedDatasetSpec):
+            raise InvalidInputError(f"`test_seed`: no fresh test set can be drawn of {spec.name}, whose snapshots were imported.")
+        if test_seed == spec.loads.seed or test_seed < 0:
+            raise InvalidInputError(f"`test_seed` must be an integer >= 0 other than the seed of {spec.name}, {spec.loads.seed}; got {test_seed}.")
+
+
+def _default_out(names: Sequence[str]) -> Path:
+    return Path("reports") / "runs" / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{'-'.join(names)}"
+
+
+def jobs_of(methods: Sequence[MethodSpec], profile: str) -> list[Job]:
+    """Every configuration of every method."""
+    jobs = []
+    for method in methods:
+        swept = method.swept_keys(profile)
+        for parameters in method.configurations(profile):
+            jobs.append(Job(method, parameters, label_of(method.name, {key: parameters[key] for key in swept})))
+    return jobs
+
+
+def checked_specs(
+    datasets: Sequence[str | Path | Mapping[str, Any]], methods: Sequence[str | Path] | None, profile: str, suite: Path | None
 ) -> tuple[list[AnyDatasetSpec], list[MethodSpec]]:
     """Read all specifications and check them as far as they can be without running, so that no run fails half-way on one."""
     specs = [load_dataset_spec(dataset, suite) for dataset in datasets]
     if methods is None:
-        defaults = [DATA_METHODS if isinstance(spec, ImportedDatasetSpec) else CORE_METHODS for spec in specs]
-        methods = list(dict.fromkeys(name for names in defaults for name in names))
+        methods = _default_methods(specs, profile, suite)
     method_specs = [load_method_spec(method, suite) for method in methods]
     for kind, names in (("dataset", [spec.name for spec in specs]), ("method", [spec.name for spec in method_specs])):
         for name in names:
@@ -294,20 +276,46 @@ def _checked_specs(
         if isinstance(spec, DatasetSpec):
             check_supports(scene)
     for method_spec in method_specs:
-        with suppress(MissingDependencyError):  # that becomes a row with its reason
-            check_method(method_spec)
+        _check_method(method_spec)
     return specs, method_specs
 
 
-def _open_run(out: Path, specs: Sequence[AnyDatasetSpec], settings: dict[str, Any]) -> Comparison:
+def _default_methods(specs: Sequence[AnyDatasetSpec], profile: str, suite: Path | None) -> list[str]:
+    own = list(list_suite("methods", suite)) if suite else []
+    if profile == "full":
+        shipped = list(list_suite("methods"))
+        core = [name for name in CORE_METHODS if name in shipped]
+        return list(dict.fromkeys([*core, *shipped, *own]))
+    defaults = [DATA_METHODS if isinstance(spec, ImportedDatasetSpec) else CORE_METHODS for spec in specs]
+    return list(dict.fromkeys([*(name for names in defaults for name in names), *own]))
+
+
+def _check_method(spec: MethodSpec) -> None:
+    """Check knobs; a third party's class in a process of its own, where its import may crash or hang: that becomes a row."""
+    if spec.surrogate.startswith("mor_bench."):
+        with suppress(MissingDependencyError):  # that becomes a row with its reason
+            check_method(spec)
+        return
+    with suppress(MethodFailedError, MissingDependencyError), Worker(None, [], spec.folder) as worker:
+        for profile in ("quick", "full"):
+            where = f"method {spec.name} ({profile})"
+            worker.ask("check", START_LIMIT_S, surrogate=spec.surrogate, configurations=spec.configurations(profile), where=where)
+
+
+def _open_run(out: Path, specs: Sequence[AnyDatasetSpec], methods: Sequence[MethodSpec], settings: _Settings) -> Comparison:
     """The comparison in a folder: a new one, or the one that was begun there with the same settings and datasets."""
     datasets = {spec.name: spec.model_dump(mode="json") for spec in specs}
+    said = {
+        "profile": settings.profile, "split": settings.split, "limit": settings.limit, "threads": settings.threads, "test_seed": settings.test_seed,
+        "budget": {"configurations": settings.budget.configurations, "seconds": settings.budget.seconds}, "version": __version__,
+    }  # fmt: skip
     if (out / "results.json").exists():
-        begun = Comparison.read(out)
-        if begun.settings != settings or any(datasets.get(name) != spec for name, spec in begun.datasets.items()):
+        comparison = Comparison.read(out)
+        if comparison.settings != said or any(datasets.get(name) != spec for name, spec in comparison.datasets.items()):
             raise InvalidInputError(f"{out} holds a run with other settings or datasets; choose another folder or remove it.")
-        return begun
-    comparison = Comparison(out, describe_machine(), settings=settings)
+    else:
+        comparison = Comparison(out, describe_machine(), settings=said)
+    comparison.methods |= {method.name: method.model_dump(mode="json", exclude={"folder"}) for method in methods}
     try:
         comparison.write()
     except OSError as error:
@@ -315,13 +323,280 @@ def _open_run(out: Path, specs: Sequence[AnyDatasetSpec], settings: dict[str, An
     return comparison
 
 
-def _open(spec: AnyDatasetSpec, comparison: Comparison, listener: Listener, **options: Any) -> Dataset:
-    """Load a dataset and record what every figure of it needs."""
-    data = load_dataset(spec, progress=lambda done, total: listener.generating(spec.name, done, total), **options)
+class _DatasetRun:
+    """All that a run does on one dataset."""
+
+    def __init__(
+        self, spec: AnyDatasetSpec, jobs: list[Job], comparison: Comparison, settings: _Settings, scratch: Path, suite: Path | None, number: int, n: int
+    ) -> None:  # fmt: skip
+        self.spec, self.jobs, self.comparison, self.settings = spec, jobs, comparison, settings
+        self.first, self.total = number * len(jobs), n * len(jobs)
+        self.folder = scratch / f"{number}"
+        self.discretisation = _discretisation(spec, settings.cache, suite)
+        self.spent: dict[str, float] = {}
+        self.lock = Lock()
+
+    def go(self) -> None:
+        """Fit and score all configurations, time them, and what a full comparison adds."""
+        self._lay_out()
+        entries = self._fit_all()
+        if self.settings.profile == "full":
+            self._other_seeds(entries)
+        self._time(entries)
+        if self.settings.profile == "full":
+            self._learning_curves(entries)
+        if self.settings.test_seed is not None:
+            self._fresh_test(entries, self.settings.test_seed)
+
+    def _lay_out(self) -> None:
+        settings, spec = self.settings, self.spec
+        sets = available_sets(spec) if settings.profile == "full" and isinstance(spec, DatasetSpec) else []
+        progress = partial(settings.listener.generating, spec.name)
+        self.data = load_dataset(
+            spec, settings.limit, split=settings.split, tests=sets, workers=None if settings.cluster else settings.workers,
+            cluster=settings.cluster, cache=settings.cache, progress=progress,
+        )  # fmt: skip
+        record_dataset(self.comparison, spec, self.data)
+        n = len(self.data.train)
+        self.data_seconds = generation_seconds(spec, settings.cache, n) if isinstance(spec, DatasetSpec) else None
+        self.material = Material(self.data.scene, self.data.train, {"test": self.data.test, **self.data.tests}, self.folder)
+        sealed = [settings.cache / "datasets", settings.cache / "fits", self.comparison.out / "samples"]
+        if isinstance(spec, ImportedDatasetSpec):
+            sealed.append(Path(spec.snapshots.file.path))
+        self.place = place_of(settings.cache, sealed, settings.jobs, settings.threads, settings.memory_limit_bytes)
+
+    def _fit_all(self) -> dict[str, Entry]:
+        """Every configuration's row but for its latency; the entries of those that can be timed, by label."""
+        entries: dict[str, Entry] = {}
+        with ExitStack() as stack:
+            pool = stack.enter_context(cluster_pool(self.settings.cluster)) if self.settings.cluster else None
+            n_threads = pool.window() if pool else self.settings.jobs
+            executor = stack.enter_context(ThreadPoolExecutor(n_threads))
+            ahead = _in_order(executor, n_threads, self.jobs, partial(self._fit_one, pool))
+            for job, (entry, row, samples) in zip(self.jobs, ahead, strict=True):
+                self.comparison.put(row, samples)
+                self.settings.listener.fitted(row)
+                if entry is not None:
+                    entries[job.label] = entry
+                elif row["status"] == "failed" and self.settings.fail_fast:
+                    executor.shutdown(cancel_futures=True)
+                    raise _StopRunError
+        return entries
+
+    def _fit_one(self, pool: Pool | None, job: Job) -> tuple[Entry | None, dict[str, Any], dict[str, Any]]:
+        number = self.jobs.index(job)
+        self.settings.listener.starting(self.spec.name, job.label, self.first + number + 1, self.total)
+        row = self._empty_row(job)
+        with self.lock:
+            left = self.settings.budget.seconds - self.spent.get(job.method.name, 0.0)
+        allowed = [other for other in self.jobs if other.method is job.method][: self.settings.budget.configurations]
+        if job not in allowed:
+            reason = f"beyond the tuning budget of {self.settings.budget.configurations} configurations"
+            return None, {**row, "status": "skipped", "reason": reason}, {}
+        if left <= 0:
+            return None, {**row, "status": "skipped", "reason": f"beyond the tuning budget of {self.settings.budget.seconds:g} s of fitting"}, {}
+        try:
+            entry = Entry(job, self.material, self.place)
+            outcome = evaluate(entry, left, self._remote(pool, job))
+            found, samples = self._scored(outcome)
+        except (MissingDependencyError, UnsupportedSceneError) as error:
+            return None, {**row, "status": "skipped", "reason": str(error)}, {}
+        except MethodFailedError as error:
+            return None, {**row, "status": "failed", "reason": str(error)}, {}
+        except MorBenchError as error:
+            return None, {**row, "status": "failed", "reason": f"{type(error).__name__}: {error}"}, {}
+        with self.lock:
+            self.spent[job.method.name] = self.spent.get(job.method.name, 0.0) + outcome.fit["fit_s"]
+        return entry, {**row, **found}, samples
+
+    def _remote(self, pool: Pool | None, job: Job) -> RemoteFit | None:
+        """Fitting on the cluster; a third party's class is not installed there."""
+        if pool is None or job.method.folder is not None:
+            return None
+
+        def fit(entry: Entry, limit_s: float) -> tuple[dict[str, Any], bytes | None]:
+            limits = (limit_s, self.place.memory_limit_bytes)
+            arrays = arrays_of(self.data.train)
+            return pool.executor.submit(fit_elsewhere, self.data.scene, arrays, job.method.surrogate, job.parameters, limits).result()
+
+        return fit
+
+    def _empty_row(self, job: Job) -> dict[str, Any]:
+        data = self.data
+        return {
+            "dataset": self.spec.name, "split": self.settings.split or self.spec.split.by, "method": job.method.name, "label": job.label,
+            "parameters": job.parameters, "status": "", "reason": None, "n_train": len(data.train), "n_test": len(data.test),
+            "n_unused": data.n_unused, "n_failed": None, "n_dofs": data.scene.mesh.n_dofs, "threads": self.settings.threads,
+            "error": None, "latency_ms": None, "all_threads_ms": None, "throughput": None, "offline_s": None, "memory_bytes": None,
+            "model_bytes": None, "cost": None, "sets": {}, "hidden": None, **self.discretisation, "warnings": [],
+        }  # fmt: skip
+
+    def _scored(self, outcome: Outcome) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What a fit and its scores put into a row, and the raw samples."""
+        fit, scores = outcome.fit, dict(outcome.scores)
+        main = scores.pop("test")
+        failed = int((~np.isfinite(main["mean_dof_m"])).sum())
+        if failed == len(main["mean_dof_m"]):
+            raise SolverError(f"no valid prediction on any of {failed} test samples")
+        return {
+            "status": "ok",
+            "n_failed": failed,
+            "error": summary(_errors(main)),
+            "offline_s": {"data": self.data_seconds if fit["needs_snapshots"] else 0.0, "fit": fit["fit_s"]},
+            "memory_bytes": {"fit": fit["fit_memory_bytes"], "predict": None},
+            "model_bytes": fit["model_bytes"],
+            "cost": outcome.cost,
+            "sets": {name: set_summary(score) for name, score in scores.items()},
+            "warnings": fit["warnings"],
+        }, main
+
+    def _other_seeds(self, entries: Mapping[str, Entry]) -> None:
+        """Train methods that draw random numbers again, and keep the errors beside those of the first seed."""
+        for label, entry in entries.items():
+            seed = (entry.fit or {})["parameters"].get("seed")
+            if not isinstance(seed, int):
+                continue
+            errors = []
+            for other in range(seed + 1, seed + 1 + EXTRA_SEEDS):
+                job = replace(entry.job, parameters={**entry.job.parameters, "seed": other})
+                with suppress(MorBenchError):
+                    outcome = evaluate(Entry(job, self.material.first(self.material.n_train), self.place), self.settings.budget.seconds, count=False)
+                    errors.append(outcome.scores["test"]["relative_l2"])
+            if errors:
+                self.comparison.add_samples(self._row(label), {"seeds_relative_l2": np.array(errors)})
+
+    def _row(self, label: str) -> dict[str, Any]:
+        return next(row for row in self.comparison.rows if (row["dataset"], row["label"]) == (self.spec.name, label))
+
+    def _time(self, entries: Mapping[str, Entry]) -> None:
+        """Time all configurations that have no timing from this machine at this speed, and complete the rows."""
+        settings = self.settings
+        protocol = PROTOCOLS[settings.profile]
+        name = f"timing-{protocol.processes}x{protocol.rounds}-{settings.threads}-{self.material.sets['test'].digest[:12]}"
+        speed = probe_s()
+        timings: dict[str, Timing] = {}
+        for label, entry in entries.items():
+            kept = None if settings.retime else entry.arrays(name)
+            if kept is not None and (timing := Timing.of_arrays(kept)).holds(speed):
+                timings[label] = timing
+        openers = {
+            label: Opener(partial(entry.opened, settings.budget.seconds), (entry.fit or {})["fit_memory_bytes"])
+            for label, entry in entries.items()
+            if label not in timings
+        }
+        fresh = measure(
+            openers, self.material.sets["test"].forces, protocol, settings.threads, partial(settings.listener.timing, self.spec.name)
+        )  # fmt: skip
+        for label, timing in fresh.items():
+            if not timing.failed:
+                timing.probe_s = speed
+                entries[label].keep_arrays(name, timing.arrays)
+        timings |= fresh
+        intervals = intervals_of({label: timing.samples for label, timing in timings.items() if not timing.failed})
+        for label in entries:
+            row, timing = self._row(label), timings[label]
+            if timing.failed:
+                row.update(status="failed", reason=timing.failed)
+            else:
+                row.update(summary_of_timing(timing, intervals[label], settings.threads))
+                row["memory_bytes"]["predict"] = timing.memory_bytes
+                self.comparison.add_samples(row, timing.samples)
+        self.comparison.write()
+        for label in entries:
+            settings.listener.finished(self._row(label))
+        if settings.fail_fast and any(timing.failed for timing in timings.values()):
+            raise _StopRunError
+
+    def _learning_curves(self, entries: Mapping[str, Entry]) -> None:
+        """Errors over the number of training samples, of the most accurate configuration of each method that learns."""
+        self.comparison.learning = [record for record in self.comparison.learning if record["dataset"] != self.spec.name]
+        for method in dict.fromkeys(entry.job.method.name for entry in entries.values()):
+            rows = [self._row(label) for label, entry in entries.items() if entry.job.method.name == method and (entry.fit or {})["needs_snapshots"]]
+            if not rows:
+                continue
+            best = min(rows, key=lambda row: row["error"]["rel_l2_median"])
+            for n in _learning_sizes(self.material.n_train):
+                self.comparison.learning.append(self._learnt(entries[best["label"]], n, best))
+                self.comparison.write()
+
+    def _learnt(self, entry: Entry, n: int, row: Mapping[str, Any]) -> dict[str, Any]:
+        record = {"dataset": self.spec.name, "method": entry.job.method.name, "label": entry.job.label, "n_train": n, "status": "ok", "reason": None}
+        if n == self.material.n_train:
+            return {**record, "fit_s": row["offline_s"]["fit"], "error": row["error"]}
+        try:
+            outcome = evaluate(Entry(entry.job, self.material.first(n), self.place), self.settings.budget.seconds, count=False)
+        except MorBenchError as error:
+            return {**record, "status": "failed", "reason": str(error), "fit_s": None, "error": None}
+        return {**record, "fit_s": outcome.fit["fit_s"], "error": summary(_errors(outcome.scores["test"]))}
+
+    def _fresh_test(self, entries: Mapping[str, Entry], seed: int) -> None:
+        """Score on a test set that did not exist while anything was fitted."""
+        assert isinstance(self.spec, DatasetSpec)
+        by = self.settings.split or self.spec.split.by
+        fresh = fresh_test_set(self.spec, self.data.scene, by, seed, len(self.data.test))
+        material = self.material.first(self.material.n_train)
+        material.sets = {"hidden": material.add_set(f"hidden-{seed}", fresh)}
+        for label, entry in entries.items():
+            row = self._row(label)
+            try:
+                outcome = evaluate(Entry(entry.job, material, self.place), self.settings.budget.seconds, count=False)
+            except MorBenchError as error:
+                row["warnings"] = [*row["warnings"], f"no score on the fresh test set: {error}"]
+                continue
+            row["hidden"] = {"seed": seed, **set_summary(outcome.scores["hidden"])}
+            self.comparison.add_samples(row, {"hidden_relative_l2": outcome.scores["hidden"]["relative_l2"]})
+        self.comparison.write()
+
+
+def place_of(cache: Path, sealed: Sequence[Path], jobs: int, threads: int, memory_limit_bytes: float) -> Place:
+    """Where methods run, and what they must not open."""
+    machine = describe_machine()
+    cores = machine["cores"]
+    return Place(cache, tuple(sealed), f"{machine['processor']} x {cores}", max(1, cores // jobs), threads, memory_limit_bytes)
+
+
+def _in_order(
+    executor: ThreadPoolExecutor, window: int, jobs: Sequence[Job], function: Callable[[Job], tuple[Entry | None, dict[str, Any], dict[str, Any]]]
+) -> Iterator[tuple[Entry | None, dict[str, Any], dict[str, Any]]]:  # fmt: skip
+    """Results in the order of the jobs; with a window of one each is begun when the one before has been taken."""
+    if window == 1:
+        yield from map(function, jobs)
+    else:
+        yield from executor.map(function, jobs)
+
+
+def _errors(score: Mapping[str, Any]) -> SampleErrors:
+    return SampleErrors(*(score[name] for name in ("mean_dof_m", "relative_l2", "max_nodal_m", "amplitude_m")))
+
+
+def set_summary(score: Mapping[str, Any]) -> dict[str, Any]:
+    """What a row says of a named test set."""
+    figures = summary(_errors(score))
+    kept = {name: figures[name] for name in ("mean_dof_m", "rel_l2_median", "rel_l2_p95", "rel_l2_max")}
+    failed = int((~np.isfinite(score["mean_dof_m"])).sum())
+    return {"n": len(score["mean_dof_m"]), "n_failed": failed, "n_flagged": int(score["flagged"].sum()) if "flagged" in score else None, **kept}
+
+
+def _learning_sizes(n_train: int) -> list[int]:
+    """All training samples, and fewer and fewer of the first."""
+    sizes = [n_train]
+    while sizes[-1] // LEARNING_STEP >= LEAST_TRAINING:
+        sizes.append(sizes[-1] // LEARNING_STEP)
+    return sizes[::-1]
+
+
+def _discretisation(spec: AnyDatasetSpec, cache: Path | None, suite: Path | None) -> dict[str, float | None]:
+    """The part of every row that says how far the dataset's mesh is from the body; None where it was not measured."""
+    record = (measured(spec, cache, suite) if isinstance(spec, DatasetSpec) else None) or {}
+    return {"discretisation_error_m": record.get("error_m"), "discretisation_rel_l2": record.get("relative_l2_median")}
+
+
+def record_dataset(comparison: Comparison, spec: AnyDatasetSpec, data: Dataset) -> None:
+    """Record what every figure of a dataset needs."""
     arrays = {
         "singular_values": pod(data.train.free_displacements).singular_values,
         "points": data.scene.mesh.points,
         "cells": data.scene.mesh.cells,
+        "test_regions": data.test.loads.patches,
     }
     comparison.add_dataset(spec.name, spec.model_dump(mode="json"), arrays)
-    return data

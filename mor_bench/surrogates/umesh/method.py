@@ -125,6 +125,7 @@ class UMesh(Surrogate):
                 displacements / self.displacement_scale_,
                 plan,
                 generator,
+                self.time_limit_s,
             )
             self.network_.eval()
         return self

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import cos, isfinite, pi
+from time import perf_counter
 from typing import Literal
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mor_bench.errors import MorBenchError
+from mor_bench.errors import MorBenchError, OutOfTimeError
 from mor_bench.surrogates.umesh.grid import PaddedGrid
 from mor_bench.surrogates.umesh.network import UNet
 
@@ -19,6 +20,9 @@ Schedule = Literal["constant", "one-cycle"]
 
 LOSS_INTERVAL = 50
 """Iterations per point of the loss curve; reading the loss more often would cost a little and show mostly noise."""
+
+LOOK_AHEAD = 5
+"""Iterations from which the time of all is estimated, after one that makes what the others find."""
 
 WARM_UP = 0.1
 """Part of a one-cycle schedule during which the learning rate rises."""
@@ -49,8 +53,14 @@ def rate_factor(schedule: Schedule, iteration: int, iterations: int) -> float:
 
 
 def train(
-    network: UNet, grid: PaddedGrid, inputs: Tensor, displacements: Tensor, plan: TrainingPlan, generator: torch.Generator
-) -> NDArray[np.float64]:  # fmt: skip
+    network: UNet,
+    grid: PaddedGrid,
+    inputs: Tensor,
+    displacements: Tensor,
+    plan: TrainingPlan,
+    generator: torch.Generator,
+    time_limit_s: float | None = None,
+) -> NDArray[np.float64]:
     """Change the network's weights to lower the mean squared error.
 
     Every epoch is a new permutation; a last, smaller batch is left out.
@@ -67,6 +77,8 @@ def train(
     plan : TrainingPlan
     generator : torch.Generator
         Draws the permutations; no global random state is read or changed.
+    time_limit_s : float, optional
+        Seconds that training may take; it is not begun in earnest when it would take longer.
 
     Returns
     -------
@@ -77,6 +89,8 @@ def train(
     ------
     MorBenchError
         If the loss is not finite.
+    OutOfTimeError
+        If the first iterations say that all would take longer than the limit.
     """
     batch_size = min(plan.batch_size, len(inputs))
     per_batch = 1.0 / displacements[:batch_size].numel()
@@ -94,6 +108,10 @@ def train(
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         optimiser.step()
+        if iteration == 0:
+            start = perf_counter()
+        elif iteration == LOOK_AHEAD and time_limit_s is not None:
+            _check_time((perf_counter() - start) / LOOK_AHEAD, plan.iterations, time_limit_s)
         total, n_summed = total + loss.detach(), n_summed + 1
         if n_summed == LOSS_INTERVAL or iteration == plan.iterations - 1:
             curve.append(float(total) / n_summed)
@@ -101,3 +119,11 @@ def train(
                 raise MorBenchError(f"training diverged before iteration {iteration + 1}: `learning_rate` {plan.learning_rate} is too high.")
             total, n_summed = torch.zeros(()), 0
     return np.array(curve)
+
+
+def _check_time(each_s: float, iterations: int, limit_s: float) -> None:
+    """Raise `OutOfTimeError` if that many iterations are too many."""
+    if each_s * iterations > limit_s:
+        raise OutOfTimeError(
+            f"{iterations:,} iterations at {each_s:.3g} s would take {each_s * iterations / 3600:.3g} h; the limit is {limit_s:.0f} s."
+        )

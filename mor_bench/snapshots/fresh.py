@@ -1,0 +1,53 @@
+"""A test set that does not exist before it is asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mor_bench.errors import SolverError
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import Solution
+from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.sampling import draw_loads, n_samples_of
+from mor_bench.snapshots.split import split_samples
+from mor_bench.specs import DatasetSpec, Split, SplitBy
+
+MAX_FRESH = 400
+"""Samples of a fresh test set; it is solved in one process, while the run waits."""
+
+
+def fresh_test_set(spec: DatasetSpec, scene: Scene, by: SplitBy, seed: int, n: int) -> Snapshots:
+    """A test set of the same distribution that no one has seen: other draws in the load regions, or directions, held out.
+
+    It is solved here and kept in memory only.
+
+    Parameters
+    ----------
+    spec : DatasetSpec
+    scene : Scene
+        Of the dataset.
+    by : {"region", "sample", "direction"}
+        How training and test are parted.
+    seed : int
+        Of the draws, in the place of the dataset's.
+    n : int
+        Most samples wanted, no more than `MAX_FRESH`; fewer where the draws do not hold as many.
+
+    Raises
+    ------
+    SolverError
+        If not one of the loads has a valid equilibrium.
+    """
+    other = spec.model_copy(update={"loads": spec.loads.model_copy(update={"seed": seed})})
+    drawn = draw_loads(load_scene(other), 0, n_samples_of(scene))
+    split = Split(test_fraction=spec.split.test_fraction, by=by)
+    held = drawn[split_samples(drawn, len(scene.patch_nodes), split, spec.loads.seed)[1]]
+    held = held[: min(n, MAX_FRESH)]
+    forces = held.nodal_forces(scene.patch_weights).reshape(len(held), -1)[:, scene.free_dofs]
+    found = FullOrderModel(scene).solve_many(forces)
+    solved = [(i, answer) for i, answer in enumerate(found) if isinstance(answer, Solution)]
+    if not solved:
+        raise SolverError(f"{spec.name}: no fresh test load has a valid equilibrium.")
+    displacements = np.array([answer.displacement for _, answer in solved])
+    return Snapshots(scene, held[np.array([i for i, _ in solved])], displacements, np.array([answer.min_det_f for _, answer in solved]))
