@@ -9,9 +9,10 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from mor_bench import counting
 from mor_bench.mechanics.elements import H8, element_of, shape_gradients
-from mor_bench.mechanics.kernels import LANES, internal_force, internal_force_and_tangent
-from mor_bench.mechanics.laws import general_force
+from mor_bench.mechanics.kernels import FORCE_MULTIPLY_ADDS, LANES, TANGENT_MULTIPLY_ADDS, internal_force, internal_force_and_tangent
+from mor_bench.mechanics.laws import general_force, general_multiply_adds
 from mor_bench.scene.materials import Material, SaintVenantKirchhoff
 
 Array = NDArray[np.float64]
@@ -189,12 +190,17 @@ class Assembler:
             self._w_mu = _batched(weights * quadrature.parameters[:, 1], 0.0)
             self._dofs = _batched(dofs.astype(np.int32), n_dofs)
             self._slots = _batched(slots, len(self.pattern.indices))
+            per_point = FORCE_MULTIPLY_ADDS, FORCE_MULTIPLY_ADDS + TANGENT_MULTIPLY_ADDS
         else:
             self._gradients, self._weights, self._parameters = quadrature.gradients, weights, quadrature.parameters
             self._dofs, self._slots = dofs.astype(np.int32), slots
+            per_point = general_multiply_adds(material.law, quadrature.parameters.shape[1], n_nodes)
+        self._multiply_adds = n_cells * n_points * per_point[0], n_cells * n_points * per_point[1]
 
     def _sum(self, u: Array, dofs: NDArray[np.int32], force: Array, values: Array) -> tuple[float, float]:
         """Add the cells' forces and, where ``values`` is not empty, tangents; returns energy and min det F."""
+        if counting.running is not None:
+            counting.running.add(element_evaluations=self.n_cells, multiply_adds=self._multiply_adds[len(values) > 0])
         if not self._vectorised:
             law, parameters = self.material.law, self._parameters
             return general_force(u, dofs, self._gradients, self._weights, law, parameters, self._slots, force, values)  # type: ignore[no-any-return]

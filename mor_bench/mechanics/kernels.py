@@ -25,6 +25,12 @@ LANES = 32
 N_UPPER = 300
 """Entries in the upper triangle of a 24x24 element matrix."""
 
+FORCE_MULTIPLY_ADDS = 219
+"""Of the internal force at one Gauss point: H 72, E 24, S 8, energy 7, det F 9, P 27, f 72."""
+
+TANGENT_MULTIPLY_ADDS = 1200
+"""What the tangent adds at one Gauss point: M 24, h and t 192, diagonal blocks 144, the others 840."""
+
 
 @njit(inline="always")
 def _component(u_e, g, i, j, l):

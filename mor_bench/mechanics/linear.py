@@ -6,6 +6,8 @@ whether the matrix was positive definite instead of going on with a meaningless 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,6 +18,8 @@ from scipy.linalg.lapack import dpbtrf, dpbtrs
 from scipy.sparse import linalg as sp_linalg
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from mor_bench import counting
+from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
 from mor_bench.errors import SolverError
 from mor_bench.mechanics.assembly import Pattern
 
@@ -118,6 +122,11 @@ def banded_solve(band, right_hand_sides):
             x[j + 1], x[j + 2], x[j + 3] = x1, x2, x3
 
 
+def _n_columns(rhs: NDArray[Any]) -> int:
+    """Right-hand sides in (n,) or (n, m)."""
+    return 1 if rhs.ndim == 1 else int(rhs.shape[1])
+
+
 class BandedFactor:
     """A banded Cholesky factor, in LAPACK's upper storage."""
 
@@ -125,6 +134,9 @@ class BandedFactor:
         self._band, self._order = band, order
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        if counting.running is not None:
+            (width, n), m = self._band.shape, _n_columns(rhs)
+            counting.running.add(back_solves=m, multiply_adds=m * triangular_multiply_adds(n, width - 1))
         if self._order is None:
             return np.asarray(dpbtrs(self._band, rhs)[0]).reshape(rhs.shape)
         solution = np.empty_like(rhs)
@@ -152,6 +164,9 @@ class SingleBandedFactor:
 
     def solve_in_place(self, x: NDArray[np.float32]) -> None:
         """Overwrite the right-hand sides x (m, n), in the factor's order, by the solutions."""
+        if counting.running is not None:
+            n, width = self._columns.shape
+            counting.running.add(back_solves=len(x), multiply_adds=len(x) * triangular_multiply_adds(n, width - 1))
         banded_solve(self._columns, x)
 
 
@@ -176,6 +191,8 @@ class BandedCholesky:
         return self._pattern.n * (self.bandwidth + 1)
 
     def factor(self, values: NDArray[np.float64]) -> BandedFactor:
+        if counting.running is not None:
+            counting.running.add(factorisations=1, multiply_adds=cholesky_multiply_adds(self._pattern.n, self.bandwidth))
         rows, columns = self._pattern.rows, self._pattern.indices
         if self._place is not None:
             rows, columns = self._place[rows], self._place[columns]
@@ -186,6 +203,20 @@ class BandedCholesky:
         if info != 0:
             raise NotPositiveDefiniteError
         return BandedFactor(band, self._order)
+
+
+@dataclass(frozen=True)
+class SparseFactor:
+    """SuperLU's factors."""
+
+    lu: sp_linalg.SuperLU
+    solver: SparseLU
+
+    def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        if counting.running is not None:
+            m = _n_columns(rhs)
+            counting.running.add(back_solves=m, multiply_adds=m * self.solver.multiply_adds[1])
+        return np.asarray(self.lu.solve(rhs))
 
 
 class SparseLU:
@@ -200,16 +231,31 @@ class SparseLU:
         template.sort_indices()
         self._template, self._gather = template, template.data - 1
 
-    def factor(self, values: NDArray[np.float64]) -> Factor:
+    def _splu(self, entries: NDArray[np.float64]) -> sp_linalg.SuperLU:
         t = self._template
-        matrix = sp.csc_matrix((values[self._gather], t.indices, t.indptr), shape=t.shape)
+        matrix = sp.csc_matrix((entries, t.indices, t.indptr), shape=t.shape)
+        return sp_linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+    @cached_property
+    def multiply_adds(self) -> tuple[int, int]:
+        """Of a factorisation, which does not make use of the symmetry, and of a solve; by factors in which no entry cancels."""
+        t = self._template
+        counts = np.diff(t.indptr)
+        columns = np.repeat(np.arange(len(counts)), counts)
+        lu = self._splu(np.where(t.indices == columns, counts[columns], -1.0))
+        below, right = np.diff(lu.L.tocsc().indptr) - 1, np.diff(lu.U.tocsr().indptr) - 1
+        return int((below * (1 + right)).sum()), int((below + right + 1).sum())
+
+    def factor(self, values: NDArray[np.float64]) -> SparseFactor:
+        if counting.running is not None:
+            counting.running.add(factorisations=1, multiply_adds=self.multiply_adds[0])
         try:
-            lu = sp_linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+            lu = self._splu(values[self._gather])
         except RuntimeError as error:
             raise NotPositiveDefiniteError from error
         if not np.all(lu.U.diagonal() > 0):
             raise NotPositiveDefiniteError
-        return lu
+        return SparseFactor(lu, self)
 
 
 class Pardiso:
@@ -237,9 +283,21 @@ class Pardiso:
             self._phase(22, np.zeros(len(self._matrix.indptr) - 1))
         except self._error as error:
             raise NotPositiveDefiniteError from error
+        if counting.running is not None:
+            # MKL reports millions of operations; that L's columns are equally long is the least that its entries allow.
+            least = self._entries**2 // (2 * self._matrix.shape[0])
+            counting.running.add(factorisations=1, multiply_adds=max(500_000 * int(self._solver.get_iparm(19)), least))
         return self
 
+    @property
+    def _entries(self) -> int:
+        """Of L, as MKL reports them."""
+        return int(self._solver.get_iparm(18))
+
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        if counting.running is not None:
+            m = _n_columns(rhs)
+            counting.running.add(back_solves=m, multiply_adds=m * 2 * self._entries)
         return self._phase(33, rhs)
 
 
@@ -257,7 +315,9 @@ class Multigrid:
         self._pattern, self._points = pattern, points
 
     def factor(self, values: NDArray[np.float64]) -> MultigridFactor:
-        """Build the hierarchy; that the matrix is positive definite is not noticed."""
+        """Build the hierarchy, which counts as a factorisation without arithmetic; that the matrix is positive definite is not noticed."""
+        if counting.running is not None:
+            counting.running.add(factorisations=1)
         return MultigridFactor(self._pattern, values, self._points)
 
 
@@ -282,6 +342,9 @@ class MultigridFactor:
                 coarse_solver=coarse,
             )  # fmt: skip
             self._cycle, self._dtype = levels.aspreconditioner(), dtype
+            # Of a cycle: three sweeps over each level's matrix (smoother, residual, smoother), its transfers, the coarsest solve.
+            transfers = sum(3 * level.A.nnz + level.R.nnz + level.P.nnz for level in levels.levels[:-1])
+            self._cycle_multiply_adds = int(transfers + levels.levels[-1].A.shape[0] ** 2)
             try:
                 response = self._cycle @ np.ones(pattern.n, dtype)
             except np.linalg.LinAlgError:
@@ -294,6 +357,8 @@ class MultigridFactor:
         return self
 
     def solve_in_place(self, x: NDArray[np.float32]) -> None:
+        if counting.running is not None:
+            counting.running.add(back_solves=len(x), multiply_adds=len(x) * self._cycle_multiply_adds)
         for row in x:
             row[:] = self._cycle @ row.astype(self._dtype)
 
@@ -301,7 +366,13 @@ class MultigridFactor:
         if rhs.ndim == 2:
             return np.stack([self.solve(column) for column in rhs.T], axis=1)
         scale = float(np.abs(rhs).max()) or 1.0
-        cycle = sp_linalg.LinearOperator(self._matrix.shape, lambda r: self._cycle @ r.astype(self._dtype), dtype=np.float64)
+
+        def one_cycle(residual: NDArray[np.float64]) -> NDArray[Any]:
+            if counting.running is not None:  # a cycle, a product with the matrix, and six with vectors
+                counting.running.add(back_solves=1, multiply_adds=self._cycle_multiply_adds + self._matrix.nnz + 6 * len(rhs))
+            return np.asarray(self._cycle @ residual.astype(self._dtype))
+
+        cycle = sp_linalg.LinearOperator(self._matrix.shape, one_cycle, dtype=np.float64)
         solution, failed = sp_linalg.cg(self._matrix, rhs / scale, rtol=CYCLE_TOLERANCE, maxiter=MAX_CYCLES, M=cycle)
         missed = float(np.linalg.norm(self._matrix @ solution - rhs / scale) / np.linalg.norm(rhs / scale)) if failed else 0.0
         if not missed <= ACCEPTED_RESIDUAL:

@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from mor_bench import counting
 from mor_bench.mechanics.assembly import Pattern
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
 
@@ -55,7 +56,13 @@ def nodal_rotations(u, cell_nodes, centre_gradients, volumes, rotations):
     volumes : (n_cells,) float64
     rotations : (n_free_nodes + 1, 3, 3) float64
         Overwritten.
+
+    Returns
+    -------
+    int
+        Iterations for polar factors, summed over the nodes.
     """
+    iterations = 0
     rotations[:] = 0.0
     n = cell_nodes.shape[1]
     for k in range(len(cell_nodes)):
@@ -83,6 +90,7 @@ def nodal_rotations(u, cell_nodes, centre_gradients, volumes, rotations):
         d, e, f = scale * Q[1, 0], scale * Q[1, 1], scale * Q[1, 2]
         g, h, i = scale * Q[2, 0], scale * Q[2, 1], scale * Q[2, 2]
         for _ in range(8):  # Newton's iteration for the polar factor (Higham): quadratic, from within the basin
+            iterations += 1
             ca, cb, cc = e * i - f * h, f * g - d * i, d * h - e * g
             det = a * ca + b * cb + c * cc
             if not det > 1e-6:  # a collapsed or mirrored neighbourhood: no rotation to speak of
@@ -99,6 +107,7 @@ def nodal_rotations(u, cell_nodes, centre_gradients, volumes, rotations):
             if change < 1e-4:  # the next one would change by its square
                 break
         Q[0, 0], Q[0, 1], Q[0, 2], Q[1, 0], Q[1, 1], Q[1, 2], Q[2, 0], Q[2, 1], Q[2, 2] = a, b, c, d, e, f, g, h, i
+    return iterations
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -180,7 +189,9 @@ class RotatedRest:
         if q is None:
             return self._identity
         rotations = np.empty_like(self._identity)
-        nodal_rotations(np.append(q, np.zeros(3)).reshape(-1, 3), *self._cells, rotations)
+        iterations = nodal_rotations(np.append(q, np.zeros(3)).reshape(-1, 3), *self._cells, rotations)
+        if counting.running is not None:  # per component of a cell's nodes, per node, per iteration
+            counting.running.add(multiply_adds=4 * self._cells[1].size + 20 * len(self._place) + 40 * int(iterations))
         return rotations
 
     def solve_many(self, residuals: Sequence[Array], rotations: Sequence[Array]) -> Array:
@@ -194,6 +205,8 @@ class RotatedRest:
         for row, residual, Q, scale in zip(work, residuals, rotations, scales, strict=True):
             _turn_back(self._place, Q, scale, residual, row)
         self._factor.solve_in_place(work)
+        if counting.running is not None:
+            counting.running.add(multiply_adds=8 * work.size)
         z = np.empty(work.shape)
         for out, row, Q, scale in zip(z, work, rotations, scales, strict=True):
             _turn(self._place, Q, scale, row, out)
@@ -202,11 +215,14 @@ class RotatedRest:
     @cached_property
     def _soft(self) -> NDArray[np.float32]:
         response = np.random.default_rng(0).normal(size=(1, 3 * len(self._place))).astype(np.float32)
-        self._factor.solve_in_place(response)
+        with counting.uncounted():
+            self._factor.solve_in_place(response)
         return np.asarray(response[0] / np.abs(response).max())
 
     def soft(self, rotations: Array) -> Array:
         """The response at rest to a random force, of size one, turned."""
+        if counting.running is not None:
+            counting.running.add(multiply_adds=4 * len(self._soft))
         z = np.empty(len(self._soft))
         _turn(self._place, rotations, 1.0, self._soft, z)
         return z
@@ -237,12 +253,16 @@ class BlockJacobi:
 
     def take(self, values: Array) -> None:
         """Invert the diagonal blocks of a tangent."""
+        if counting.running is not None:
+            counting.running.add(multiply_adds=27 * len(self._places))
         try:
             self._inverse = np.linalg.inv(values[self._places].reshape(-1, 3, 3))
         except np.linalg.LinAlgError as error:
             raise NotPositiveDefiniteError from error
 
     def solve(self, residual: Array) -> Array:
+        if counting.running is not None:
+            counting.running.add(multiply_adds=9 * len(self._places))
         return np.asarray((self._inverse @ residual.reshape(-1, 3, 1)).ravel())
 
 
@@ -285,6 +305,8 @@ def conjugate_gradients(
         rz, before = float(r @ z), rz
         p = z + (rz / before) * p
         multiply(pattern.indptr, pattern.indices, values, p, q)
+        if counting.running is not None:  # the product with K, of which one triangle is stored, and six with vectors
+            counting.running.add(multiply_adds=2 * len(values) + 5 * len(p))
         curvature = float(p @ q)
         if not curvature > 0.0:
             raise NotPositiveDefiniteError

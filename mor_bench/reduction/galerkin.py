@@ -10,6 +10,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs
 
+from mor_bench import counting
+from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
@@ -33,6 +35,9 @@ class _DenseFactor:
         self._cholesky = cholesky
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        if counting.running is not None:
+            r, m = len(rhs), 1 if rhs.ndim == 1 else rhs.shape[1]
+            counting.running.add(back_solves=m, reduced_back_solves=m, multiply_adds=m * triangular_multiply_adds(r, r - 1))
         return np.asarray(dpotrs(self._cholesky, rhs)[0]).reshape(rhs.shape)
 
 
@@ -75,10 +80,15 @@ class GalerkinProblem:
         return State(self.modes.T @ state.force, state.energy_j, state.min_det_f)
 
     def force(self, q: NDArray[np.float64]) -> State:
+        if counting.running is not None:
+            counting.running.add(multiply_adds=2 * self.modes.size)
         return self._project(self.assembler.force(self.modes @ q))
 
     def linearise(self, q: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
         state, values = self.assembler.force_and_tangent(self.modes @ q)
+        if counting.running is not None:  # Φq, Φᵀf, KΦ with the K of which one triangle is stored, ΦᵀKΦ
+            n, r = self.modes.shape
+            counting.running.add(multiply_adds=2 * n * r + (2 * len(values) - n) * r + n * r**2)
         pattern, product = self.assembler.pattern, np.zeros_like(self.modes)
         _symmetric_product(pattern.indptr, pattern.indices, values, self.modes, product)
         return self._project(state), self.modes.T @ product
@@ -93,6 +103,9 @@ class GalerkinProblem:
 
     def factor(self, tangent: NDArray[np.float64]) -> Factor:
         """Dense Cholesky; raises `NotPositiveDefiniteError`."""
+        if counting.running is not None:
+            r = len(tangent)
+            counting.running.add(factorisations=1, reduced_factorisations=1, multiply_adds=cholesky_multiply_adds(r, r - 1))
         cholesky, info = dpotrf(tangent)
         if info != 0:
             raise NotPositiveDefiniteError

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
@@ -104,6 +105,10 @@ class PCARegression(Surrogate):
         batch = self._checked_forces(forces).reshape(-1, self.scene_.mesh.n_dofs)
         free = batch[:, self.scene_.free_dofs]
         out = np.zeros_like(batch)
+        if counting.running is not None:
+            monomial_products = self.weights_.shape[1] - self.axes_.shape[1]
+            products = self.axes_.size + monomial_products + self.weights_.size + self.modes_.size
+            counting.running.add(multiply_adds=len(batch) * products)
         inputs = self.model_.rest_factor.solve(free.T).T if self.input == "linear-response" else free
         nonlinear = (monomials(inputs @ self.axes_, self._levels) @ self.weights_.T) @ self.modes_.T
         out[:, self.scene_.free_dofs] = inputs + nonlinear if self.input == "linear-response" else nonlinear

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from mor_bench import counting
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.basis import pod
@@ -22,6 +23,8 @@ def predict_reduced(
 ) -> NDArray[np.float64]:  # fmt: skip
     """Solve the reduced equilibrium for each load (n, n_nodes, 3), N, and expand to all nodes, m."""
     out = np.zeros((len(batch), scene.mesh.n_dofs))
+    if counting.running is not None:
+        counting.running.add(multiply_adds=2 * modes.size * len(batch))
     for row, load in zip(out, batch.reshape(-1, scene.mesh.n_dofs), strict=True):
         solution = solve_equilibrium(problem, modes.T @ load[scene.free_dofs], options=NewtonOptions(tolerance))
         row[scene.free_dofs] = modes @ solution.displacement

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.scene import Scene
@@ -132,6 +133,9 @@ class UMesh(Surrogate):
     @torch.inference_mode()
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         checked = self._checked_forces(forces)
+        if counting.running is not None:  # with one scaling of each input and each output
+            products = self.network_.multiply_adds(self.grid_.shape) + self.grid_.multiply_adds + 2 * self.scene_.mesh.n_dofs
+            counting.running.add(multiply_adds=len(checked) * products)
         scaled = torch.from_numpy((checked / self.force_scale_).astype(np.float32))
         answers = [self.grid_.to_nodes(self.network_(self.grid_.to_grid(chunk))) for chunk in torch.split(scaled, PREDICTION_CHUNK)]
         displacements = torch.cat(answers).numpy().astype(np.float64) * self.displacement_scale_

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from math import prod
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +19,11 @@ class DoubleConvolution(nn.Sequential):
             nn.Conv3d(c_out, c_out, 3, padding=1),
             nn.ReLU(inplace=True),
         )
+
+
+def _n_weights(module: nn.Module) -> int:
+    """Entries of the weights, without those of the biases."""
+    return sum(parameter.numel() for parameter in module.parameters() if parameter.dim() > 1)
 
 
 class UNet(nn.Module):
@@ -44,6 +50,17 @@ class UNet(nn.Module):
         self.up = nn.ModuleList(nn.ConvTranspose3d(below, here, 2, stride=2) for here, below in reversed(levels))
         self.decoder = nn.ModuleList(DoubleConvolution(2 * here, here) for here, _ in reversed(levels))
         self.head = nn.Conv3d(channels, 3, 1)
+
+    def multiply_adds(self, shape: tuple[int, int, int]) -> int:
+        """Of the convolutions for one sample on a grid of this shape, their zero padding included."""
+        points: list[int] = [prod(shape) // 8**level for level in range(len(self.up) + 1)]  # from the finest level down
+        total = points[0] * _n_weights(self.head)
+        for block, n in zip([*self.encoder, self.bottom], points, strict=True):
+            total += n * _n_weights(block)
+        for up, decode, n in zip(self.up, self.decoder, reversed(points[:-1]), strict=True):
+            # Each point below gives 2 x 2 x 2 points, each by one of the eight matrices of the transposed convolution.
+            total += n // 8 * _n_weights(up) + n * _n_weights(decode)
+        return total
 
     def forward(self, x: Tensor) -> Tensor:
         """(n, 3, x, y, z) → (n, 3, x, y, z)."""

@@ -1,0 +1,445 @@
+"""Counted work against numbers made by hand: kernels executed with numbers that count, solvers, every method on beam-tiny."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike, NDArray
+
+import mor_bench
+from mor_bench import counting
+from mor_bench.counting import Cost, cholesky_multiply_adds, counted, triangular_multiply_adds, uncounted
+from mor_bench.errors import SolverError
+from mor_bench.harness.cost import cost_of
+from mor_bench.mechanics import kernels, laws
+from mor_bench.mechanics.linear import BandedCholesky, MultigridFactor, Pardiso, SparseLU
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.rotated import BlockJacobi, conjugate_gradients
+from mor_bench.scene.scene import Scene, with_cells
+from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.specs import SolverName
+from mor_bench.surrogate import Surrogate
+
+
+class Counted:
+    """A number that counts the multiplications, divisions, powers, roots and logarithms in which it takes part."""
+
+    total = 0
+
+    def __init__(self, value: float) -> None:
+        self.value = float(value)
+
+    def _times(self, value: float) -> Counted:
+        Counted.total += 1
+        return Counted(value)
+
+    def __mul__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else self._times(self.value * float(other))
+
+    def __truediv__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else self._times(self.value / float(other))
+
+    def __pow__(self, other: Any) -> Counted:
+        return self._times(self.value ** float(other))
+
+    def __rmul__(self, other: Any) -> Any:
+        return self * other
+
+    def __rtruediv__(self, other: Any) -> Counted:
+        return self._times(float(other) / self.value)
+
+    def __add__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else Counted(self.value + float(other))
+
+    def __radd__(self, other: Any) -> Any:
+        return self + other
+
+    def __sub__(self, other: Any) -> Any:
+        return NotImplemented if isinstance(other, np.ndarray) else Counted(self.value - float(other))
+
+    def __rsub__(self, other: Any) -> Counted:
+        return Counted(float(other) - self.value)
+
+    def __neg__(self) -> Counted:
+        return Counted(-self.value)
+
+    def __abs__(self) -> Counted:
+        return Counted(abs(self.value))
+
+    def __float__(self) -> float:
+        return self.value
+
+    def __lt__(self, other: Any) -> bool:
+        return self.value < float(other)
+
+    def __gt__(self, other: Any) -> bool:
+        return self.value > float(other)
+
+    def sqrt(self) -> Counted:
+        return self._times(math.sqrt(self.value))
+
+
+def counted_array(values: Any) -> np.ndarray:
+    return np.asarray(np.vectorize(Counted, otypes=[object])(np.asarray(values, dtype=float)))
+
+
+class CountingNumpy:
+    """As much of numpy as the kernels use, with arrays of `Counted`."""
+
+    inf = math.inf
+    array, outer, sqrt = staticmethod(np.array), staticmethod(np.outer), staticmethod(np.sqrt)
+
+    class linalg:  # noqa: N801
+        @staticmethod
+        def eigh(matrix: Any) -> tuple[np.ndarray, np.ndarray]:
+            values, vectors = np.linalg.eigh(matrix.astype(float))
+            return counted_array(values), counted_array(vectors)
+
+    @staticmethod
+    def zeros(shape: Any) -> np.ndarray:
+        return counted_array(np.zeros(shape))
+
+    empty = zeros
+
+    @staticmethod
+    def full(shape: Any, value: float) -> np.ndarray:
+        return counted_array(np.full(shape, value))
+
+    @staticmethod
+    def eye(n: int) -> np.ndarray:
+        return counted_array(np.eye(n))
+
+
+def interpreted(module: Any) -> dict[str, Any]:
+    """The functions of a module of kernels, uncompiled, one element per batch, on arrays of `Counted`."""
+    source = Path(module.__file__).read_text(encoding="utf-8")
+    for line in ("import numpy as np\n", "from numba import njit\n", "from math import log, sqrt\n"):
+        source = source.replace(line, "")
+    source = source.replace("LANES = 32", "LANES = 1").replace("from __future__ import annotations\n", "")
+
+    def njit(**_: Any) -> Callable[[Any], Any]:
+        return lambda function: function
+
+    names = {"np": CountingNumpy, "njit": njit, "sqrt": Counted.sqrt, "log": lambda x: x._times(math.log(x.value))}
+    exec(compile(source, module.__file__, "exec"), names)
+    return names
+
+
+def one_cell(n_points: int, n_nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Displacements of a cell's nodes and the dummy, gradients (1, n_points, n_nodes, 3), and weights (1, n_points)."""
+    rng = np.random.default_rng(0)
+    gradients = 0.3 * rng.normal(size=(1, n_points, n_nodes, 3))
+    return counted_array(0.02 * rng.normal(size=3 * n_nodes + 1)), counted_array(gradients), counted_array(np.ones((1, n_points)))
+
+
+def test_the_vectorised_kernel_multiplies_as_often_as_is_said() -> None:
+    kernel = interpreted(kernels)
+    u, gradients, w = one_cell(8, 8)
+    arguments = u, np.arange(24).reshape(1, 24, 1), gradients.reshape(1, 8, 24), w[:, :, None], w[:, :, None]
+    force, values = counted_array(np.zeros(25)), counted_array(np.zeros(301))
+    Counted.total = 0
+    kernel["internal_force"](*arguments, force)
+    assert Counted.total == 8 * kernels.FORCE_MULTIPLY_ADDS
+    Counted.total = 0
+    kernel["internal_force_and_tangent"](*arguments, np.arange(300).reshape(1, 300, 1), force, values)
+    assert Counted.total == 8 * (kernels.FORCE_MULTIPLY_ADDS + kernels.TANGENT_MULTIPLY_ADDS)
+
+
+LAWS = {
+    "saint-venant-kirchhoff": (laws.SAINT_VENANT_KIRCHHOFF, [1.0, 2.0]),
+    "neo-hookean": (laws.NEO_HOOKEAN, [1.0, 2.0]),
+    "mooney-rivlin": (laws.MOONEY_RIVLIN, [1.0, 2.0, 3.0]),
+    "ogden, one term": (laws.OGDEN, [3.0, 1.0, 2.0]),
+    "ogden, two terms": (laws.OGDEN, [3.0, 1.0, 2.0, -1.0, -2.0]),
+}
+
+
+@pytest.mark.parametrize("n_nodes", [4, 8])
+@pytest.mark.parametrize("name", LAWS)
+def test_the_general_kernel_multiplies_as_often_as_is_said(name: str, n_nodes: int) -> None:
+    law, parameters = LAWS[name]
+    kernel = interpreted(laws)
+    u, gradients, weights = one_cell(1, n_nodes)
+    n_upper = 3 * n_nodes * (3 * n_nodes + 1) // 2
+    slots = np.arange(n_upper).reshape(1, n_upper)
+    eigenvectors = 122 if law == laws.OGDEN else 0
+    expected = laws.general_multiply_adds(law, len(parameters), n_nodes)
+    for values, said in zip((np.zeros(0), counted_array(np.zeros(n_upper + 1))), expected, strict=True):
+        Counted.total = 0
+        force = counted_array(np.zeros(3 * n_nodes + 1))
+        dofs = np.arange(3 * n_nodes).reshape(1, -1)
+        kernel["general_force"](u, dofs, gradients, weights, law, counted_array([parameters]), slots, force, values)
+        assert Counted.total + eigenvectors == said
+
+
+@pytest.mark.parametrize(("n", "bandwidth"), [(1, 0), (7, 6), (9, 2), (12, 11)])
+def test_banded_arithmetic_by_loops(n: int, bandwidth: int) -> None:
+    factor = solve = 0
+    for j in range(n):
+        below = min(bandwidth, n - 1 - j)
+        factor += 1 + below + sum(1 for a in range(below) for _ in range(a + 1))
+        solve += 2 * (1 + below)
+    assert cholesky_multiply_adds(n, bandwidth) == factor
+    assert triangular_multiply_adds(n, bandwidth) == solve
+
+
+def test_the_fields_of_a_count_and_counts_within_counts() -> None:
+    with counted() as outer:
+        with counted() as inner, uncounted():
+            assert counting.running is None
+        with counted() as inner:
+            inner.add(back_solves=2, multiply_adds=7)
+        outer.add(back_solves=1)
+        with uncounted():
+            assert counting.running is None
+    assert inner == Cost(back_solves=2, multiply_adds=7)
+    assert outer == Cost(back_solves=3, multiply_adds=7)
+    assert counting.running is None
+    with pytest.raises(ZeroDivisionError), counted():
+        _ = 1 / 0
+    assert counting.running is None
+
+
+def n_nonzeros(model: FullOrderModel) -> int:
+    """Of the whole tangent."""
+    return 2 * len(model.assembler.pattern.indices) - model.n_unknowns
+
+
+def cost(action: Callable[[], Any]) -> Cost:
+    with counted() as found:
+        action()
+    return found
+
+
+@pytest.fixture(scope="module")
+def loads(tiny: Dataset) -> np.ndarray:
+    return tiny.test.forces[:8]
+
+
+def test_linear_fem_is_one_back_solve(tiny: Dataset, loads: np.ndarray) -> None:
+    method = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
+    n, b = 54 * 3, BandedCholesky(FullOrderModel(tiny.scene).assembler.pattern).bandwidth
+    assert cost(lambda: method.predict(loads[0])) == Cost(back_solves=1, multiply_adds=2 * (n * (b + 1) - b * (b + 1) // 2))
+    assert cost_of(method, loads) == {**asdict(Cost()), "back_solves": 1, "multiply_adds": triangular_multiply_adds(n, b)}
+
+
+def test_fem_evaluates_and_solves_once_per_iteration(tiny: Dataset, loads: np.ndarray) -> None:
+    """At each iteration a residual, before each a back-solve, and for the three probes three residuals and two back-solves."""
+    model = FullOrderModel(tiny.scene)
+    free = tiny.scene.free_dofs
+    _ = model.rest_factor
+    bandwidth = BandedCholesky(model.assembler.pattern).bandwidth
+    for force in loads:
+        with counted() as found:
+            solution = model.solve(force.ravel()[free])
+        assert found.element_evaluations == 24 * (solution.iterations + 3)
+        assert found.back_solves == solution.iterations + 2
+        assert (found.factorisations, found.reduced_back_solves) == (0, 0)
+        kernel = found.element_evaluations * 8 * kernels.FORCE_MULTIPLY_ADDS
+        solves = found.back_solves * triangular_multiply_adds(model.n_unknowns, bandwidth)
+        assert kernel + solves < found.multiply_adds < 1.15 * (kernel + solves)
+
+
+@pytest.mark.parametrize("solver", ["cholesky", "superlu", "pardiso"])
+def test_newton_with_direct_factors(tiny: Dataset, loads: np.ndarray, solver: SolverName) -> None:
+    """From rest one back-solve; then a tangent, a factor and a back-solve per step, or a last residual alone."""
+    if solver == "pardiso":
+        pytest.importorskip("pypardiso")
+    model = FullOrderModel(tiny.scene, solver)
+    _ = model.rest_factor
+    with counted() as found:
+        model.solve(loads[0].ravel()[tiny.scene.free_dofs])
+    assert found.factorisations >= 2
+    assert found.back_solves == found.factorisations + 1
+    assert found.element_evaluations % 24 == 0
+    assert found.factorisations <= found.element_evaluations // 24 <= 2 * found.factorisations + 1
+
+
+def dense_lu_structure(matrix: np.ndarray, order: np.ndarray) -> tuple[int, int]:
+    """Multiply-adds of an LU factorisation and of a solve, by elimination of the pattern in a given order."""
+    pattern = (matrix != 0)[np.ix_(order, order)]
+    factor = solve = 0
+    for j in range(len(pattern)):
+        below = np.flatnonzero(pattern[j + 1 :, j]) + j + 1
+        pattern[np.ix_(below, below)] = True
+        factor += len(below) * (1 + len(below))
+        solve += 1 + 2 * len(below)
+    return factor, solve
+
+
+def test_sparse_lu_by_elimination_of_its_pattern(tiny: Dataset) -> None:
+    model = FullOrderModel(tiny.scene, "superlu")
+    solver = SparseLU(model.assembler.pattern)
+    factor = solver.factor(model.rest_tangent)
+    pattern = model.assembler.pattern
+    upper = np.zeros((pattern.n, pattern.n))
+    upper[pattern.rows, pattern.indices] = 1.0
+    by_factor, by_solve = dense_lu_structure(upper + upper.T, np.argsort(factor.lu.perm_c))
+    assert cost(lambda: solver.factor(model.rest_tangent)) == Cost(factorisations=1, multiply_adds=by_factor)
+    assert cost(lambda: factor.solve(np.ones((pattern.n, 3)))) == Cost(back_solves=3, multiply_adds=3 * by_solve)
+
+
+def test_pardiso_lies_near_sparse_lu(tiny: Dataset) -> None:
+    """Both keep the fill-in low; Pardiso makes use of the symmetry: half the multiply-adds."""
+    pytest.importorskip("pypardiso")
+    model = FullOrderModel(tiny.scene, "pardiso")
+    lu, pardiso = SparseLU(model.assembler.pattern), Pardiso(model.assembler.pattern)
+    by_lu, by_pardiso = (cost(lambda solver=solver: solver.factor(model.rest_tangent)) for solver in (lu, pardiso))  # type: ignore[misc]
+    assert by_pardiso.factorisations == 1
+    assert 0.25 * by_lu.multiply_adds < by_pardiso.multiply_adds < 2.0 * by_lu.multiply_adds
+    rhs = np.ones(model.n_unknowns)
+    by_lu, by_pardiso = cost(lambda: lu.factor(model.rest_tangent).solve(rhs)), cost(lambda: pardiso.solve(rhs))
+    assert by_pardiso.back_solves == by_lu.back_solves == 1
+
+
+def test_conjugate_gradients_per_iteration(tiny: Dataset) -> None:
+    model = FullOrderModel(tiny.scene)
+    jacobi = BlockJacobi(model.assembler.pattern)
+    n, tangent = model.n_unknowns, model.rest_tangent
+    assert cost(lambda: jacobi.take(tangent)) == Cost(multiply_adds=9 * n)
+    with counted() as found:
+        _, iterations = conjugate_gradients(model.assembler.pattern, tangent, jacobi, np.ones(n), 1e-6)
+    assert iterations > 5
+    assert found == Cost(multiply_adds=iterations * (n_nonzeros(model) + 6 * n + 3 * n))
+
+
+def test_a_multigrid_cycle_by_its_operators(tiny: Dataset) -> None:
+    model = FullOrderModel(tiny.scene)
+    points = tiny.scene.mesh.points[tiny.scene.free_dofs[::3] // 3]
+    factor = MultigridFactor(model.assembler.pattern, model.rest_tangent, points)
+    n = model.n_unknowns
+    one = cost(lambda: factor.solve_in_place(np.ones((2, n), dtype=np.float32)))
+    assert one.back_solves == 2
+    # 162 unknowns are fewer than a hierarchy's coarsest level may have: the cycle is one dense solve.
+    assert one.multiply_adds == 2 * n**2
+    whole = cost(lambda: factor.solve(np.ones(n)))
+    assert whole.multiply_adds == whole.back_solves * (n**2 + n_nonzeros(model) + 6 * n)
+
+
+def test_a_multigrid_cycle_of_two_levels() -> None:
+    """Three sweeps over the matrix; the transfers, of six columns for each aggregate nearby, have two thirds of its entries each."""
+    model = FullOrderModel(with_cells(mor_bench.load_scene("beam-coarse"), (16, 6, 6)))
+    points = model.scene.mesh.points[model.scene.free_dofs[::3] // 3]
+    factor = MultigridFactor(model.assembler.pattern, model.rest_tangent, points)
+    one = cost(lambda: factor.solve_in_place(np.ones((1, model.n_unknowns), dtype=np.float32)))
+    assert 3 * n_nonzeros(model) < one.multiply_adds < 5 * n_nonzeros(model)
+
+
+@pytest.mark.parametrize(("name", "knobs"), [("pod", {}), ("hpod", {"cubature_tolerance": 1e-2})])
+def test_reduced_models_evaluate_their_cells(tiny: Dataset, loads: np.ndarray, name: str, knobs: dict[str, Any]) -> None:
+    method: Any = mor_bench.load_method(name, n_modes=6, **knobs).fit(tiny.scene, tiny.train)
+    problem = method.problem_
+    n_cells = len(method.cells_) if name == "hpod" else 24
+    assert problem.assembler.n_cells == n_cells
+    assert n_cells < 24 or name == "pod"
+    per_force = n_cells * 8 * kernels.FORCE_MULTIPLY_ADDS
+    per_tangent = per_force + n_cells * 8 * kernels.TANGENT_MULTIPLY_ADDS
+    n, r, stored = problem.assembler.n_dofs, 6, len(problem.assembler.pattern.indices)
+    reduction = 2 * n * r + (2 * stored - n) * r + n * r * r
+    q = np.zeros(r)
+    assert cost(lambda: problem.force(q)) == Cost(element_evaluations=n_cells, multiply_adds=per_force + 2 * n * r)
+    assert cost(lambda: problem.linearise(q)) == Cost(element_evaluations=n_cells, multiply_adds=per_tangent + reduction)
+    found = cost(lambda: method.predict(loads[0]))
+    steps, evaluations = found.factorisations, found.element_evaluations // n_cells
+    assert found.element_evaluations % n_cells == 0
+    assert found.reduced_factorisations == steps
+    assert found.reduced_back_solves == found.back_solves == steps + 1  # the first with the factor at rest
+    assert steps <= evaluations <= 2 * steps + 1
+    tangents = steps  # each is factorised; the other evaluations are of the force alone
+    dense = steps * cholesky_multiply_adds(r, r - 1) + (steps + 1) * triangular_multiply_adds(r, r - 1)
+    expected = tangents * (per_tangent + reduction) + (evaluations - tangents) * (per_force + 2 * n * r) + dense
+    assert found.multiply_adds == expected + 2 * len(tiny.scene.free_dofs) * r
+
+
+def test_pca_regression_by_its_products(tiny: Dataset, loads: np.ndarray) -> None:
+    method = mor_bench.load_method("pca-regression", n_input_modes=4, n_output_modes=5, degree=3).fit(tiny.scene, tiny.train)
+    n = len(tiny.scene.free_dofs)
+    features = 4 + 10 + 20
+    products = n * 4 + (10 + 20) + 5 * features + n * 5
+    bandwidth = BandedCholesky(FullOrderModel(tiny.scene).assembler.pattern).bandwidth
+    assert cost(lambda: method.predict(loads[0])) == Cost(back_solves=1, multiply_adds=triangular_multiply_adds(n, bandwidth) + products)
+
+
+def test_u_mesh_by_its_layers_and_by_torch(tiny: Dataset, loads: np.ndarray) -> None:
+    torch = pytest.importorskip("torch")
+    from torch.utils.flop_counter import FlopCounterMode
+
+    method: Any = mor_bench.load_method("umesh", channels=4, steps=2, iterations=2, batch_size=4).fit(tiny.scene, tiny.train)
+    # 7 x 3 x 3 nodes are padded to 8 x 4 x 4 points.
+    fine, middle, bottom = 128, 16, 2
+    convolutions = 27 * (fine * (3 * 4 + 4 * 4) + middle * (4 * 8 + 8 * 8) + bottom * (8 * 16 + 16 * 16))
+    convolutions += 8 * (bottom * 16 * 8 + middle * 8 * 4) + 27 * (middle * (16 * 8 + 8 * 8) + fine * (8 * 4 + 4 * 4)) + fine * 4 * 3
+    found = cost(lambda: method.predict(loads[0]))
+    assert found == Cost(multiply_adds=convolutions + 2 * tiny.scene.mesh.n_dofs)
+    with FlopCounterMode(display=False) as flops, torch.no_grad():
+        method.network_(torch.zeros(1, 3, 8, 4, 4))
+    assert flops.get_total_flops() == 2 * convolutions
+
+
+SMALL: dict[str, dict[str, Any]] = {
+    "fem": {},
+    "fem-coarse": {},
+    "fem-warm": {},
+    "fem-jacobi-pcg": {},
+    "linear-fem": {},
+    "pod": {"n_modes": 6},
+    "hpod": {"n_modes": 6, "cubature_tolerance": 1e-2},
+    "pca-regression": {"n_input_modes": 4},
+    "pca-regression-force": {"n_input_modes": 4},
+    "umesh": {"channels": 2, "steps": 1, "iterations": 1},
+}
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_batch_costs_what_its_samples_cost_and_counting_changes_nothing(tiny: Dataset, loads: np.ndarray, name: str) -> None:
+    if name == "umesh":
+        pytest.importorskip("torch")
+    method = mor_bench.load_method(name, **SMALL[name])
+    method.fit(tiny.scene, tiny.train if method.needs_snapshots else None)
+    uncounted_answer = method.predict(loads)
+    with counted() as batch:
+        answer = method.predict(loads)
+    np.testing.assert_array_equal(answer, uncounted_answer)
+    means = cost_of(method, loads)
+    assert means == {field: total / len(loads) for field, total in asdict(batch).items()}
+    assert means is not None
+    assert means["multiply_adds"] > 1000
+    assert cost_of(method, loads) == means
+
+
+class Silent(Surrogate):
+    """A third party's method, which counts nothing."""
+
+    needs_snapshots = False
+
+    def __init__(self) -> None:
+        pass
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Silent:
+        with self._fitting(scene):
+            pass
+        return self
+
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+        return np.asarray(0.0 * self._checked_forces(forces).reshape(np.shape(forces)))
+
+
+def test_a_method_that_counts_nothing_has_no_cost(tiny: Dataset, loads: np.ndarray) -> None:
+    assert cost_of(Silent().fit(tiny.scene), loads) is None
+
+
+def test_work_without_an_answer_counts(tiny: Dataset, loads: np.ndarray) -> None:
+    method = mor_bench.load_method("fem").fit(tiny.scene, None)
+    hopeless = loads[:1] * 1e6
+    with pytest.raises(SolverError):
+        method.predict(hopeless)
+    means, one = cost_of(method, np.concatenate([loads[:1], hopeless])), cost_of(method, loads[:1])
+    assert means is not None
+    assert one is not None
+    assert means["element_evaluations"] > 10 * one["element_evaluations"]
