@@ -131,6 +131,8 @@ class Surrogate(ABC):
     @property
     def parameters(self) -> dict[str, Any]:
         """The knobs and their values."""
+        if type(self).__init__ is object.__init__:
+            return {}
         return {name: getattr(self, name) for name in list(inspect.signature(type(self).__init__).parameters)[1:]}
 
     def save(self, path: str | Path) -> None:

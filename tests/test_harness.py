@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +14,13 @@ from hypothesis import strategies as st
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, SpecError, StoreError
+from mor_bench.harness import clock
+from mor_bench.harness.clock import LEAST_QUERIES
 from mor_bench.harness.frontier import Point, error_at_time, non_dominated, time_at_error
 from mor_bench.harness.metrics import sample_errors, summary
 from mor_bench.harness.results import Comparison
 from mor_bench.harness.run import Listener
-from mor_bench.harness.timing import N_QUERIES, N_WARM_UP, latency_summary, measure_latency, pinned_threads
+from mor_bench.harness.timing import pinned_threads
 from mor_bench.snapshots.generate import generation_seconds
 from mor_bench.specs import load_generated_spec
 
@@ -86,24 +88,6 @@ def test_frontier_stays_between_its_points(points: list[tuple[float, float]], er
         assert front[-1].error * (1 - 1e-9) <= at_time["error"] <= at_time["best"]["error"] * (1 + 1e-9)
 
 
-def test_latency_keeps_every_raw_sample_and_turns_the_collector_on_again() -> None:
-    import gc
-
-    seen: list[bytes] = []
-    samples = measure_latency(lambda query: seen.append(query.tobytes()), np.random.default_rng(0).normal(size=(50, 4, 3)))
-    assert len(samples) == N_QUERIES
-    assert (samples > 0).all()
-    assert len(set(seen[-N_QUERIES:])) == 50
-    assert gc.isenabled()
-    assert latency_summary(np.arange(101.0)) == {"median": 50.0, "p95": 95.0, "p99": 99.0}
-
-
-def test_warm_up_comes_first_and_is_not_timed() -> None:
-    calls: list[int] = []
-    assert len(measure_latency(lambda query: calls.append(1), np.zeros((3, 4, 3)))) == N_QUERIES
-    assert len(calls) == N_QUERIES + N_WARM_UP
-
-
 def test_threads_are_pinned_and_given_back() -> None:
     from threadpoolctl import threadpool_info
 
@@ -113,41 +97,19 @@ def test_threads_are_pinned_and_given_back() -> None:
     assert [pool["num_threads"] for pool in threadpool_info()] == before
 
 
-class Recorder(mor_bench.Surrogate):
-    """A third party's class that keeps what it is given and then spoils it."""
-
-    seen: ClassVar[dict[str, Any]] = {}
-
-    def __init__(self, spoil: str = "test") -> None:
-        self.spoil = spoil
-
-    def fit(self, scene, snapshots):  # type: ignore[no-untyped-def]
-        with self._fitting(scene):
-            Recorder.seen["regions"] = set(snapshots.regions)
-            Recorder.seen["vectors"] = snapshots.loads.vectors.copy()
-            if self.spoil == "train":
-                snapshots.free_displacements[:] *= 0.5
-            if self.spoil == "exit":
-                raise SystemExit(3)
-        return self
-
-    def predict(self, forces):  # type: ignore[no-untyped-def]
-        out = np.zeros(np.shape(forces))
-        forces *= 0.0
-        return out
-
-
 @pytest.mark.parametrize("spoil", ["test", "train", "exit"])
 def test_a_method_trains_on_the_training_set_and_spoils_only_its_own_row(spoil: str, cache: Path, tmp_path: Path) -> None:
-    path = tmp_path / "recorder.toml"
-    path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "tests.test_harness:Recorder"\n[parameters]\nspoil = "{spoil}"')
+    path, notes = tmp_path / "recorder.toml", tmp_path / "notes.json"
+    knobs = f'spoil = "{spoil}"\nnotes = "{notes.as_posix()}"'
+    path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Recorder"\n[parameters]\n{knobs}')
     comparison = mor_bench.run(["beam-tiny"], [path, "linear-fem"], out=tmp_path / "out", cache=cache)
-    alone = mor_bench.run(["beam-tiny"], ["linear-fem"], out=tmp_path / "alone", cache=cache)
-    assert comparison.rows[0]["status"] == ("ok" if spoil == "test" else "failed")
+    alone = mor_bench.run(["beam-tiny"], ["linear-fem"], out=tmp_path / "alone", cache=tmp_path / "another")
+    assert comparison.rows[0]["status"] == ("ok" if spoil == "test" else "failed"), comparison.rows[0]["reason"]
     assert comparison.rows[1]["error"] == alone.rows[0]["error"]
     data = mor_bench.load_dataset("beam-tiny", cache=cache)
-    np.testing.assert_array_equal(Recorder.seen["vectors"], data.train.loads.vectors)
-    assert not Recorder.seen["regions"] & set(data.test.regions)
+    seen = json.loads(notes.read_text())
+    np.testing.assert_array_equal(seen["vectors"], data.train.loads.vectors)
+    assert not set(seen["regions"]) & set(data.test.regions)
 
 
 def test_data_costs_what_its_generation_took_and_only_those_who_learn_from_it(cache: Path, tmp_path: Path) -> None:
@@ -157,7 +119,9 @@ def test_data_costs_what_its_generation_took_and_only_those_who_learn_from_it(ca
     assert [row["offline_s"]["data"] for row in comparison.rows] == [0.0, seconds, seconds, seconds]
 
 
-def test_a_stopped_run_goes_on_and_another_run_is_refused(cache: Path, tmp_path: Path) -> None:
+def test_a_stopped_run_goes_on_and_another_run_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clock, "SAME_SPEED", float("inf"))  # timings of a machine that is busy otherwise hold no longer
+
     class StopError(Exception):
         pass
 
@@ -165,19 +129,23 @@ def test_a_stopped_run_goes_on_and_another_run_is_refused(cache: Path, tmp_path:
         if row["label"] == "pod [n_modes=3]":
             raise StopError
 
-    out = tmp_path / "out"
+    out, cache = tmp_path / "out", tmp_path / "cache"
     arguments: dict[str, Any] = {"datasets": ["beam-tiny"], "methods": ["linear-fem", "pod"], "out": out, "cache": cache}
     with pytest.raises(StopError):
-        mor_bench.run(**arguments, listener=Listener(finished=stop))
+        mor_bench.run(**arguments, listener=Listener(fitted=stop))
     begun = Comparison.read(out).rows
     assert [row["label"] for row in begun] == ["linear-fem", "pod [n_modes=1]", "pod [n_modes=3]"]
-    finished: list[str] = []
-    whole = mor_bench.run(**arguments, listener=Listener(finished=lambda row: finished.append(row["label"])))
-    assert finished == [f"pod [n_modes={r}]" for r in (5, 10, 20, 40, 80)]
-    assert whole.rows[:3] == begun
+    fits = {path: path.stat().st_mtime_ns for path in (cache / "fits").glob("*/fit.json")}
+    assert len(fits) == 3
+    whole = mor_bench.run(**arguments)
+    assert len(whole.rows) == 8
+    assert all(path.stat().st_mtime_ns == changed for path, changed in fits.items())
+    assert [row["error"] for row in whole.rows[:3]] == [row["error"] for row in begun]
+    timed = [row["latency_ms"] for row in whole.rows]
+    assert [row["latency_ms"] for row in mor_bench.run(**arguments).rows] == timed
     with pytest.raises(InvalidInputError, match="holds a run with other settings"):
         mor_bench.run(**{**arguments, "split": "sample"})
-    assert Comparison.read(out).rows == whole.rows
+    assert len(Comparison.read(out).rows) == 8
 
 
 def test_everything_is_checked_before_anything_runs(cache: Path, tmp_path: Path) -> None:
@@ -196,35 +164,13 @@ def test_everything_is_checked_before_anything_runs(cache: Path, tmp_path: Path)
         mor_bench.run(["beam-tiny"], ["fem"], out=out, cache=cache)
 
 
-class Broken(mor_bench.Surrogate):
-    """A third party's class that fits and then crashes, or answers NaN now and then."""
-
-    def __init__(self, how: str = "crash") -> None:
-        self.how = how
-
-    def fit(self, scene, snapshots):  # type: ignore[no-untyped-def]
-        with self._fitting(scene):
-            pass
-        return self
-
-    def predict(self, forces):  # type: ignore[no-untyped-def]
-        batch = self._checked_forces(forces)
-        if self.how == "crash":
-            raise ZeroDivisionError("on purpose")
-        if self.how == "shape":
-            return batch[:, :-1]
-        out = np.full_like(batch, 1e-3)
-        out[batch[:, :, 0].sum(axis=1) > 0] = np.nan
-        return out.reshape(np.shape(forces))
-
-
 @pytest.fixture(scope="module")
 def comparison(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Comparison:
     folder = tmp_path_factory.mktemp("methods")
     methods: list[str | Path] = ["fem", "pod"]
     for how in ("crash", "shape", "nan"):
         path = folder / f"broken-{how}.toml"
-        path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "tests.test_harness:Broken"\n[parameters]\nhow = "{how}"')
+        path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Broken"\n[parameters]\nhow = "{how}"')
         methods.append(path)
     return mor_bench.run(["beam-tiny"], methods, out=tmp_path_factory.mktemp("out") / "run", cache=cache, threads=1)
 
@@ -252,12 +198,18 @@ def test_rows_hold_what_the_schema_promises(comparison: Comparison) -> None:
     assert (row["dataset"], row["method"], row["parameters"]["n_modes"]) == ("beam-tiny", "pod", 3)
     assert (row["n_train"], row["n_test"], row["threads"], row["split"]) == (170, 40, 1, "region")
     assert set(row["error"]) == {"mean_dof_m", "std_dof_m", "max_dof_m", "rel_l2_median", "rel_l2_p95", "rel_l2_max", "max_nodal_m", "slope"}
-    assert set(row["latency_ms"]) == {"median", "p95", "p99"}
+    assert set(row["latency_ms"]) == {"median", "p95", "p99", "low", "high", "gc", "n_queries", "n_processes", "stable", "unstable_because"}
+    assert 0 < row["latency_ms"]["low"] <= row["latency_ms"]["median"] <= row["latency_ms"]["high"]
+    assert row["all_threads_ms"]["median"] > 0
+    assert set(row["throughput"]) == {"8", "64", "512"}
+    assert min(row["memory_bytes"].values()) > 5e7
+    assert row["cost"]["element_evaluations"] >= 24
     assert row["offline_s"]["fit"] > 0
     assert row["offline_s"]["data"] > 0
     assert row["model_bytes"] > 8 * 3 * 162
     samples = comparison.samples(row)
-    assert len(samples["latency_ms"]) == N_QUERIES
+    assert len(samples["latency_ms"]) == len(samples["process"]) == len(samples["round"]) >= LEAST_QUERIES
+    assert set(samples["process"]) == {0, 1}
     assert samples["mean_dof_m"].mean() == pytest.approx(row["error"]["mean_dof_m"])
     worst = np.abs(samples["worst_prediction"] - samples["worst_reference"]).mean()
     assert worst == pytest.approx(row["error"]["max_dof_m"])
@@ -288,15 +240,27 @@ def test_the_same_run_gives_the_same_errors_to_the_last_digit(comparison: Compar
 def test_listener_hears_of_every_row(cache: Path, tmp_path: Path) -> None:
     heard: list[str] = []
     listener = Listener(
-        starting=lambda dataset, label, number, total: heard.append(f"{number}/{total} {label}"), finished=lambda row: heard.append(row["status"])
+        starting=lambda dataset, label, number, total: heard.append(f"{number}/{total} {label}"),
+        fitted=lambda row: heard.append(f"{row['status']} {row['latency_ms']}"),
+        finished=lambda row: heard.append("timed" if row["latency_ms"] else "not"),
     )
     mor_bench.run(["beam-tiny"], ["linear-fem"], out=tmp_path / "out", cache=cache, listener=listener)
-    assert heard == ["1/1 linear-fem", "ok"]
+    assert heard == ["1/1 linear-fem", "ok None", "timed"]
 
 
 def test_bad_arguments_are_refused_before_anything_runs(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    arguments: list[dict[str, Any]] = [{"profile": "fast"}, {"threads": 0}, {"threads": 10_000}, {"methods": []}, {"datasets": []}]
+    arguments: list[dict[str, Any]] = [
+        {"profile": "fast"},
+        {"threads": 0},
+        {"threads": 10_000},
+        {"jobs": 0},
+        {"time_limit_s": 0.0},
+        {"memory_limit_bytes": 1.0},
+        {"test_seed": 0},
+        {"methods": []},
+        {"datasets": []},
+    ]
     for bad in arguments:
         with pytest.raises(InvalidInputError):
             mor_bench.run(**{"datasets": ["beam-tiny"], "methods": ["fem"], "out": out, **bad})

@@ -17,7 +17,7 @@ from mor_bench.errors import InvalidInputError, MissingDependencyError, SpecErro
 from mor_bench.harness.check import check_file
 from mor_bench.harness.discretisation import refine
 from mor_bench.harness.export import snapshot_arrays
-from mor_bench.harness.run import CORE_METHODS, DATA_METHODS, _checked_specs
+from mor_bench.harness.run import CORE_METHODS, DATA_METHODS, checked_specs
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.imported import MAX_SIZE
 from mor_bench.scene.mesh import box_mesh
@@ -163,8 +163,8 @@ def test_there_is_no_full_order_model_of_it(arrays: Arrays, tmp_path: Path) -> N
 
 def test_by_default_the_methods_run_that_can(arrays: Arrays, tmp_path: Path) -> None:
     path = written(tmp_path, arrays)
-    assert [method.name for method in _checked_specs([path], None, None)[1]] == list(DATA_METHODS)
-    both = [method.name for method in _checked_specs(["beam-tiny", path], None, None)[1]]
+    assert [method.name for method in checked_specs([path], None, "quick", None)[1]] == list(DATA_METHODS)
+    both = [method.name for method in checked_specs(["beam-tiny", path], None, "quick", None)[1]]
     assert both == [*CORE_METHODS, "pca-regression-force"]
 
 

@@ -10,9 +10,7 @@ from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-import numpy as np
 import psutil
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 
@@ -29,11 +27,6 @@ def pinned_threads(threads: int) -> Iterator[None]:
         finally:
             if torch:
                 torch.set_num_threads(before)
-
-
-def latency_summary(samples_ms: NDArray[np.float64]) -> dict[str, float]:
-    """Median, 95th and 99th percentile, ms."""
-    return {"median": float(np.median(samples_ms)), "p95": float(np.percentile(samples_ms, 95)), "p99": float(np.percentile(samples_ms, 99))}
 
 
 def _processor() -> str:
