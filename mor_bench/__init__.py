@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mor_bench.errors import MorBenchError
+    from mor_bench.harness.pick import Pick, pick
     from mor_bench.harness.results import Comparison
     from mor_bench.harness.run import run
     from mor_bench.scene.scene import Scene, load_scene
@@ -26,6 +27,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Comparison",
     "MorBenchError",
+    "Pick",
     "Scene",
     "Snapshots",
     "Surrogate",
@@ -33,12 +35,14 @@ __all__ = [
     "load_method",
     "load_scene",
     "load_surrogate",
+    "pick",
     "run",
 ]
 
 _HOMES = {
     "Comparison": "mor_bench.harness.results",
     "MorBenchError": "mor_bench.errors",
+    "Pick": "mor_bench.harness.pick",
     "Scene": "mor_bench.scene.scene",
     "Snapshots": "mor_bench.snapshots.dataset",
     "Surrogate": "mor_bench.surrogate",
@@ -46,6 +50,7 @@ _HOMES = {
     "load_method": "mor_bench.surrogate",
     "load_scene": "mor_bench.scene.scene",
     "load_surrogate": "mor_bench.surrogate",
+    "pick": "mor_bench.harness.pick",
     "run": "mor_bench.harness.run",
 }
 

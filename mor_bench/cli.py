@@ -362,6 +362,35 @@ def _dataset(dataset: str, limit: int | None, cache: Path | None, suite: Path | 
         return load_dataset(spec, limit, tests=tests, cache=cache, progress=lambda done, total: listener.generating(spec.name, done, total))
 
 
+@app.command()
+def pick(
+    dataset: Annotated[str, typer.Argument(help="Name or TOML file.")],
+    error: Annotated[float | None, typer.Option(help="Relative l2, median over the test set; 0.01 is 1 %. [default: the dataset's need]")] = None,
+    latency: Annotated[float | None, typer.Option(help="Of one query, median, ms. [default: the dataset's need]")] = None,
+    memory: Annotated[float | None, typer.Option(help="Of the process that predicts, resident at most, MB (1e6 bytes). [default: any]")] = None,
+    offline: Annotated[float | None, typer.Option(help="Data generation (core-seconds) and fit together, s. [default: any]")] = None,
+    run: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder of the run that is the evidence. [default: the newest finished one, or a new comparison]"),
+    ] = None,
+    cache: Cache = None,
+    suite: Suite = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the choice to standard output as JSON.")] = False,
+) -> None:
+    """Name the cheapest configuration that meets a dataset's needs, with the evidence; or, with exit code 1, what would have to give."""
+    with _clear_errors():
+        import mor_bench
+
+        with _progress(_console(stderr=True)) as listener:
+            chosen = mor_bench.pick(
+                dataset, error=error, latency_ms=latency, memory_bytes=None if memory is None else 1e6 * memory, offline_s=offline,
+                comparison=run, cache=cache, suite=suite, listener=listener,
+            )  # fmt: skip
+        print(json.dumps(chosen.as_json(), indent=1, ensure_ascii=False, allow_nan=False) if as_json else chosen.text())
+        if chosen.choice is None:
+            raise typer.Exit(1)
+
+
 @app.callback(invoke_without_command=True)
 def main(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
     """Compare model-order-reduction methods for hyperelastic solids: error at equal time, time at equal error."""
