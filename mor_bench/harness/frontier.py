@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from math import exp, isfinite, log
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 TARGET_ERRORS = (0.10, 0.03, 0.01, 0.003, 0.001)
 """Relative l2, median over the test set."""
 
@@ -76,6 +79,61 @@ def error_at_time(points: Sequence[Point], target_ms: float) -> dict[str, Any]:
         p = front[len(within)]
         error = _interpolate(target_ms, real.latency_ms, max(real.error, EXACT), p.latency_ms, max(p.error, EXACT))
     return {"error": error, "best": {"label": real.label, "latency_ms": real.latency_ms, "error": real.error}}
+
+
+def frontier_draws(
+    log_latencies: NDArray[np.float64], log_errors: NDArray[np.float64], errors: Sequence[float], times_ms: Sequence[float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """`time_at_error` and `error_at_time` of many resamples at once.
+
+    Parameters
+    ----------
+    log_latencies, log_errors : (n_configurations, n) float64
+        Natural logarithms, of ms and of relative l2; the errors no smaller than that of `EXACT`.
+    errors, times_ms : sequence of float
+        Targets.
+
+    Returns
+    -------
+    (n_errors, n) float64
+        Logarithms of the latencies at the errors, infinite where not reached.
+    (n_times, n) float64
+        Logarithms of the errors at the latencies, infinite where not reached.
+    """
+    order = np.lexsort((log_errors, log_latencies), axis=0)
+    latency, error = np.take_along_axis(log_latencies, order, 0), np.take_along_axis(log_errors, order, 0)
+    n_configurations, n = latency.shape
+    numbers, columns = np.arange(n_configurations)[:, None], np.arange(n)
+    least = np.minimum.accumulate(error, axis=0)
+    on_front = np.vstack([np.isfinite(error[:1]), (error[1:] < least[:-1])])
+    last = np.maximum.accumulate(np.where(on_front, numbers, -1), axis=0)  # of the front's points so far
+    at_error, at_time = np.full((len(errors), n), np.inf), np.full((len(times_ms), n), np.inf)
+    for out, target in zip(at_error, np.log(np.maximum(errors, EXACT)), strict=True):
+        meets = error <= target
+        real = meets.argmax(axis=0)
+        before = np.where(real > 0, last[real - 1, columns], -1)
+        here = latency[real, columns]
+        share = _share(target, error[before, columns], error[real, columns])
+        between = latency[before, columns] + share * (here - latency[before, columns])
+        out[:] = np.where(meets.any(axis=0), np.where(before >= 0, between, here), np.inf)
+    for out, target in zip(at_time, np.log(times_ms), strict=True):
+        count = (latency <= target).sum(axis=0)
+        real = np.where(count > 0, last[count - 1, columns], -1)
+        later = on_front & (numbers >= count)
+        after = later.argmax(axis=0)
+        here = error[real, columns]
+        share = _share(target, latency[real, columns], latency[after, columns])
+        with np.errstate(invalid="ignore"):
+            between = here + share * (error[after, columns] - here)
+        out[:] = np.where(real >= 0, np.where(later.any(axis=0), between, here), np.inf)
+    return at_error, at_time
+
+
+def _share(x: float, start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far x is from start to end; all of it where they are one, or not finite."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = (x - start) / (end - start)
+    return np.where(np.isfinite(share), share, 1.0)
 
 
 def compare(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
