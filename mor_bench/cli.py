@@ -276,7 +276,7 @@ def report(out: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> Non
             print(path)
 
 
-export_app = typer.Typer(help="Write samples for other programs.", no_args_is_help=True)
+export_app = typer.Typer(help="Write samples and results for other programs.", no_args_is_help=True)
 app.add_typer(export_app, name="export")
 
 
@@ -319,6 +319,22 @@ def export_numpy(
         from mor_bench.harness.export import export_numpy as write
 
         for path in write(_dataset(dataset, limit, cache, suite), out):
+            print(path)
+
+
+@export_app.command(name="asv")
+def export_asv(
+    folder: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="Folder of a run.")],
+    out: Annotated[Path, typer.Option(help="asv's folder of results, by asv.conf.json .asv/results.")],
+    commit: Annotated[str | None, typer.Option(help="Commit of mor-bench that ran it. [default: HEAD of the checkout in the working folder]")] = None,
+    machine: Annotated[str | None, typer.Option(help="Machine that it ran on. [default: this one, if it is]")] = None,
+) -> None:
+    """Write a comparison's figures as results of asv, so that its dashboard shows them over commits."""
+    with _clear_errors():
+        import mor_bench
+        from mor_bench.harness.export_asv import export_asv as write
+
+        for path in write(mor_bench.Comparison.read(folder), out, commit=commit, machine=machine):
             print(path)
 
 
