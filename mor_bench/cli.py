@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -351,6 +352,9 @@ def _dataset(dataset: str, limit: int | None, cache: Path | None, suite: Path | 
 @app.callback(invoke_without_command=True)
 def main(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
     """Compare model-order-reduction methods for hyperelastic solids: error at equal time, time at equal error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # Windows' encodings of files and pipes lack letters such as ē
+            stream.reconfigure(errors="replace")
     if version:
         from mor_bench import __version__
 
