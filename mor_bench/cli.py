@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -306,7 +307,7 @@ def report(out: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> Non
             print(path)
 
 
-export_app = typer.Typer(help="Write samples for other programs.", no_args_is_help=True)
+export_app = typer.Typer(help="Write samples and results for other programs.", no_args_is_help=True)
 app.add_typer(export_app, name="export")
 
 
@@ -352,6 +353,22 @@ def export_numpy(
             print(path)
 
 
+@export_app.command(name="asv")
+def export_asv(
+    folder: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="Folder of a run.")],
+    out: Annotated[Path, typer.Option(help="asv's folder of results, by asv.conf.json .asv/results.")],
+    commit: Annotated[str | None, typer.Option(help="Commit of mor-bench that ran it. [default: HEAD of the checkout in the working folder]")] = None,
+    machine: Annotated[str | None, typer.Option(help="Machine that it ran on. [default: this one, if it is]")] = None,
+) -> None:
+    """Write a comparison's figures as results of asv, so that its dashboard shows them over commits."""
+    with _clear_errors():
+        import mor_bench
+        from mor_bench.harness.export_asv import export_asv as write
+
+        for path in write(mor_bench.Comparison.read(folder), out, commit=commit, machine=machine):
+            print(path)
+
+
 def _dataset(dataset: str, limit: int | None, cache: Path | None, suite: Path | None, tests: Sequence[SetName] = ()) -> Dataset:
     """A dataset, with a bar for what must be generated first."""
     from mor_bench.snapshots.dataset import load_dataset
@@ -394,6 +411,9 @@ def pick(
 @app.callback(invoke_without_command=True)
 def main(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
     """Compare model-order-reduction methods for hyperelastic solids: error at equal time, time at equal error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # Windows' encodings of files and pipes lack letters such as ē
+            stream.reconfigure(errors="replace")
     if version:
         from mor_bench import __version__
 

@@ -113,3 +113,10 @@ def test_errors_are_one_line_and_nothing_is_written(tmp_path: Path, arguments: l
     assert message in done.stderr
     assert "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_an_encoding_without_our_letters_stops_nothing(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONIOENCODING", "ascii")  # that of files and pipes on Windows lacks ē too
+    done = mor_bench("run", "beam-tiny", "-m", "linear-fem", "--out", "out", "--cache", str(cache), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "linear-fem" in done.stdout

@@ -172,8 +172,10 @@ class Comparison:
 
     def finish(self) -> None:
         """Write everything, and what follows from all rows together, comparison.json."""
+        from mor_bench.harness.analysis import analyse
+
         self.write()
-        _write_json(self.out / "comparison.json", self.frontier)
+        _write_json(self.out / "comparison.json", analyse(self))
 
     def write(self) -> None:
         """Write results.json and results.csv, each atomically."""

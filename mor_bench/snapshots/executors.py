@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import contextmanager
@@ -96,11 +97,21 @@ def _end_with(parent: int) -> None:
     """Let this worker end when its parent has died by a signal that no one can catch; otherwise it would wait for ever."""
 
     def watch() -> None:
-        while os.getppid() == parent:
-            sleep(1.0)
+        _wait_for_end_of_parent(parent)
         os._exit(1)
 
     Thread(target=watch, daemon=True).start()
+
+
+def _wait_for_end_of_parent(parent: int) -> None:
+    if sys.platform == "win32":  # where a process keeps the number of a parent that is no more
+        import ctypes
+
+        synchronize, infinite = 0x00100000, 0xFFFFFFFF
+        ctypes.windll.kernel32.WaitForSingleObject(ctypes.windll.kernel32.OpenProcess(synchronize, False, parent), infinite)
+    else:
+        while os.getppid() == parent:
+            sleep(1.0)
 
 
 @contextmanager

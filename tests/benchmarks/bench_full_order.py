@@ -1,40 +1,53 @@
-"""The full-order model on one thread: its kernels, a factorisation, and a whole solve."""
+"""The full-order model on one thread: its kernels, a factorisation, a whole solve, its memory, its steps and its error."""
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 import mor_bench
-from mor_bench.harness.timing import pinned_threads
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.snapshots.sampling import draw_loads
+from mor_bench.specs import list_suite
 
 N_DRAWN = 64
 """Loads that are drawn; the one of median size is solved, since iterations grow with the load."""
 
+REFERENCE_TOLERANCE = 1e-11
+
+
+def median_load(scene: Any) -> Any:
+    """Forces on the free dofs, (n_free,) N."""
+    drawn = draw_loads(scene, 0, N_DRAWN)
+    median = int(np.linalg.norm(drawn.vectors, axis=(1, 2)).argsort()[N_DRAWN // 2])
+    return drawn.nodal_forces(scene.patch_weights)[median].ravel()[scene.free_dofs]
+
 
 class FullOrder:
-    """One call each, from rest, at the median load and the deformed state that it leads to."""
+    """One call each, from rest, at the median load and the deformed state that it leads to.
 
-    params = ("beam-tiny", "beam-coarse")
+    The scenes take different kernels: two sizes of Saint Venant-Kirchhoff in H8, neo-Hookean with selective integration, T4.
+    """
+
+    params = ("beam-tiny", "beam-coarse", "beam-nearly-incompressible", "liver-tet")
     param_names = ("dataset",)
 
     def setup(self, dataset: str) -> None:
-        self.pinned = ExitStack()
-        self.pinned.enter_context(pinned_threads(1))
+        if dataset not in list_suite("datasets"):
+            raise NotImplementedError(f"{dataset} is not there")
+        self.pinned = threadpool_limits(1)
         scene = mor_bench.load_scene(dataset)
-        drawn = draw_loads(scene, 0, N_DRAWN)
-        median = int(np.linalg.norm(drawn.vectors, axis=(1, 2)).argsort()[N_DRAWN // 2])
-        self.load = drawn.nodal_forces(scene.patch_weights)[median].ravel()[scene.free_dofs]
+        self.load = median_load(scene)
         self.model = FullOrderModel(scene)
         self.state = self.model.solve(self.load).displacement
         self.tangent = self.model.linearise(self.state)[1]
         self.model.force(self.state)
 
     def teardown(self, dataset: str) -> None:
-        self.pinned.close()
+        self.pinned.restore_original_limits()
 
     def time_residual(self, dataset: str) -> None:
         self.model.force(self.state)
@@ -45,5 +58,23 @@ class FullOrder:
     def time_factor(self, dataset: str) -> None:
         self.model.factor(self.tangent)
 
+    def time_back_solve(self, dataset: str) -> None:
+        self.model.rest_factor.solve(self.load)
+
     def time_solve(self, dataset: str) -> None:
         self.model.solve(self.load)
+
+    def peakmem_solve(self, dataset: str) -> None:
+        self.model.solve(self.load)
+
+    def track_iterations(self, dataset: str) -> int:
+        return self.model.solve(self.load).iterations
+
+    track_iterations.unit = "iterations"  # type: ignore[attr-defined]
+
+    def track_relative_error(self, dataset: str) -> float:
+        """Relative l2 difference from a solution to a residual of `REFERENCE_TOLERANCE`."""
+        reference = self.model.solve(self.load, options=NewtonOptions(REFERENCE_TOLERANCE)).displacement
+        return float(np.linalg.norm(self.state - reference) / np.linalg.norm(reference))
+
+    track_relative_error.unit = "relative l2"  # type: ignore[attr-defined]

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +22,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.table import Table
+
+from .memory import peak_mb
 
 SIZES = (100, 300, 1000)
 
@@ -48,8 +49,8 @@ def measure(dataset: str, samples: int, workers: int) -> dict[str, Any]:
         "rate": done / seconds,
         "rate_beyond": (done - SHARD_SIZE) / (times[-1][1] - first) if done > SHARD_SIZE else None,
         "disk_mb": megabytes,
-        "parent_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "worker_mb": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024 if done > SHARD_SIZE else None,
+        "parent_mb": peak_mb(),
+        "worker_mb": peak_mb(of_children=True) if done > SHARD_SIZE else None,
     }
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import subprocess
 import sys
 from time import perf_counter
@@ -20,6 +19,8 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
+
+from .memory import peak_mb
 
 SIZES = (4, 6, 8, 11, 14, 18, 23, 29)
 """Cells across; four times as many along."""
@@ -57,7 +58,7 @@ def measure(across: int) -> dict[str, Any]:
         "set_up_s": set_up,
         "solve_s": float(np.median(seconds)),
         "iterations": float(np.median(iterations)),
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_mb": peak_mb(),
     }
 
 
@@ -85,8 +86,10 @@ def main(
     if len(rows) > 1:
         unknowns = np.log([row["unknowns"] for row in rows])
         for key in ("solve_s", "set_up_s", "peak_mb"):
-            slope = np.polyfit(unknowns, np.log([row[key] for row in rows]), 1)[0]
-            console.print(f"{key} grows as unknowns to the power {slope:.2f}", highlight=False)
+            values = np.log([row[key] for row in rows])
+            if np.isfinite(values).all():
+                slope = np.polyfit(unknowns, values, 1)[0]
+                console.print(f"{key} grows as unknowns to the power {slope:.2f}", highlight=False)
 
 
 if __name__ == "__main__":

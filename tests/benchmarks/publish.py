@@ -1,0 +1,75 @@
+"""Publish the dashboard of asv's results, and of comparisons exported beside them, as a folder that needs no internet.
+
+    python -m tests.benchmarks.publish
+    python -m http.server --directory .asv/html
+
+As `asv publish`, but its page loads jQuery, Flot and Bootstrap from copies in the folder instead of from the internet, and
+comparisons that `mor-bench export asv` wrote are shown even if `asv run` has rewritten its list of benchmarks since.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+from mor_bench.errors import MorBenchError
+
+COPIES = Path(__file__).parent / "dashboard"
+
+_CDNJS = "https://cdnjs.cloudflare.com/ajax/libs"
+_JSDELIVR = "https://cdn.jsdelivr.net/npm"
+LOCAL = {
+    "https://code.jquery.com/jquery-3.3.1.min.js": "jquery.min.js",
+    f"{_CDNJS}/flot/0.8.3/jquery.flot.min.js": "jquery.flot.js",
+    f"{_CDNJS}/flot/0.8.3/jquery.flot.time.min.js": "jquery.flot.time.js",
+    f"{_CDNJS}/flot/0.8.3/jquery.flot.selection.min.js": "jquery.flot.selection.js",
+    f"{_CDNJS}/flot/0.8.3/jquery.flot.categories.min.js": "jquery.flot.categories.js",
+    f"{_JSDELIVR}/flot-orderbars@1.0.0/js/jquery.flot.orderBars.js": "jquery.flot.orderBars.js",
+    f"{_CDNJS}/stupidtable/1.0.1/stupidtable.min.js": "stupidtable.min.js",
+    f"{_CDNJS}/blueimp-md5/2.19.0/js/md5.min.js": "md5.min.js",
+    f"{_JSDELIVR}/bootstrap@3.1.1/dist/js/bootstrap.min.js": "bootstrap.min.js",
+    f"{_JSDELIVR}/bootstrap@3.1.1/dist/css/bootstrap.min.css": "bootstrap.min.css",
+}
+"""What the page loads, and the file in `COPIES` that stands in for it."""
+
+_TAG = re.compile(r'<(?P<tag>script|link)\b[^>]*?\b(?P<where>src|href)="(?P<url>(?:https?:)?//[^"]+)"[^>]*>')
+
+
+def make_offline(folder: Path) -> None:
+    """Make the page of a published folder load copies.
+
+    Raises
+    ------
+    MorBenchError
+        If it loads something of which there is no copy, as a newer asv's may.
+    """
+    page = folder / "index.html"
+
+    def local(match: re.Match[str]) -> str:
+        if match["url"] not in LOCAL:
+            raise MorBenchError(f"{page}: loads {match['url']}, of which {COPIES} has no copy; add one, and its licence.")
+        kind = 'rel="stylesheet" ' if match["tag"] == "link" else 'onerror="js_load_failure()" '
+        return f'<{match["tag"]} {kind}{match["where"]}="offline/{LOCAL[match["url"]]}">'
+
+    written = _TAG.sub(local, page.read_text(encoding="utf-8"))
+    shutil.copytree(COPIES, folder / "offline", dirs_exist_ok=True)
+    page.write_text(written, encoding="utf-8")
+
+
+def publish(configuration: Path) -> Path:
+    """Publish what an asv.conf.json describes; returns the folder."""
+    from asv.commands.publish import Publish
+    from asv.config import Config
+
+    from mor_bench.harness.export_asv import describe
+
+    config = Config.load(str(configuration))
+    describe(config.results_dir)
+    Publish.run(config)
+    make_offline(Path(config.html_dir))
+    return Path(config.html_dir)
+
+
+if __name__ == "__main__":
+    print(publish(Path("asv.conf.json")))
