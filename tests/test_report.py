@@ -60,13 +60,13 @@ def add_row(comparison: Comparison, method: str, swept: dict[str, Any], error: f
         "latency_ms": latencies, "mean_dof_m": errors.mean_dof_m, "relative_l2": errors.relative_l2, "max_nodal_m": errors.max_nodal_m,
         "amplitude_m": errors.amplitude_m, "worst_prediction": prediction[worst], "worst_reference": reference[worst], "worst_forces": forces,
     }  # fmt: skip
-    comparison.add(row, samples if row["status"] == "ok" else None)
+    comparison.put(row, samples if row["status"] == "ok" else None)
     return row
 
 
 def add_failed(comparison: Comparison, method: str, swept: dict[str, Any], status: str, reason: str, dataset: str = "beam-tiny") -> None:
     """Add a row without any figure."""
-    comparison.add(
+    comparison.put(
         {
             "dataset": dataset, "split": "region", "method": method, "label": label_of(method, swept), "parameters": dict(swept),
             "status": status, "reason": reason, "n_train": 200, "n_test": N_TEST, "n_failed": None, "threads": 1, "error": None,
