@@ -43,7 +43,7 @@ def test_a_method_that_looks_for_the_test_set_does_not_find_it(
     mor_bench.run(["beam-tiny"], ["linear-fem"], out=out, cache=cache)  # so that there are results to look at, too
     path = method_file(tmp_path, "peeker", "tests.third_party:Peeker", folders=folders[:3])
     comparison = mor_bench.run(["beam-tiny"], ["linear-fem", path], out=out, cache=cache)
-    assert comparison.rows[1]["status"] == "ok"
+    assert comparison.rows[1]["status"] == "ok", comparison.rows[1]["reason"]
     assert any(text.startswith("saw ") for text in comparison.rows[1]["warnings"])
     assert saw(comparison.rows[1]) == []
     # The same method outside of a comparison finds all of it: it does look.

@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import mor_bench
+from mor_bench.errors import MorBenchError
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.surrogates.fem import FullFEM
 
 
 class Zero(mor_bench.Surrogate):
@@ -42,17 +44,20 @@ class Zero(mor_bench.Surrogate):
         pass
 
 
-class Slow(Zero):
-    """Busy for a time per query."""
+class Slowed(FullFEM):
+    """The full-order model, which then does nothing for a part of the time that it took."""
 
-    def __init__(self, busy_s: float = 1e-3) -> None:
-        self.busy_s = busy_s
+    def __init__(self, tolerance: float = 1e-4, part: float = 0.0) -> None:
+        super().__init__(tolerance)
+        self.part = part
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        until = time.perf_counter() + self.busy_s
-        while time.perf_counter() < until:
+        start = time.perf_counter()
+        answer = super().predict(forces)
+        until = time.perf_counter() + self.part * (time.perf_counter() - start)
+        while self.part and time.perf_counter() < until:
             pass
-        return super().predict(forces)
+        return answer
 
 
 class Recorder(mor_bench.Surrogate):
@@ -143,7 +148,7 @@ class Peeker(Zero):
             for way in (self._list, self._open, self._hdf5, self._program, self._load):
                 try:
                     found += [f"{way.__name__} {item}" for item in way(folder)]
-                except (OSError, subprocess.SubprocessError):
+                except (OSError, subprocess.SubprocessError, MorBenchError):
                     continue
         return found
 

@@ -165,6 +165,8 @@ def measure(
     threads: int,
     progress: Callable[[int, int], None] = lambda *_: None,
     seed: int = 0,
+    *,
+    single_only: bool = False,
 ) -> dict[str, Timing]:
     """Time configurations beside each other.
 
@@ -181,6 +183,8 @@ def measure(
         Called with (turns done, turns in all).
     seed : int
         Of the order in which configurations take their turns.
+    single_only : bool
+        Leave out what runs on all cores.
 
     Returns
     -------
@@ -201,7 +205,7 @@ def measure(
                         _attempt(timings[label], _turn, workers[label], protocol.queries, first, threads, process, number)
                         done += 1
                         progress(done, total)
-                for label, worker in workers.items():
+                for label, worker in workers.items() if not single_only else ():
                     _attempt(timings[label], _on_all_cores, worker, protocol.queries, process == 0)
                     done += 1
                     progress(done, total)

@@ -37,7 +37,9 @@ WARM_UP_S = 2.0
 PROGRAM_EVENTS = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.startfile")
 """Audit events of launching a program, which would not be under this process's seal."""
 
-FILE_EVENTS = ("open", "os.listdir", "os.scandir")
+FILE_EVENTS = (
+    "open", "os.listdir", "os.scandir", "os.mkdir", "os.remove", "os.rename", "os.rmdir", "os.link", "os.symlink", "os.truncate", "shutil.rmtree",
+)  # fmt: skip
 
 
 class Seal:
@@ -61,7 +63,8 @@ class Seal:
 
         def refuse(event: str, arguments: tuple[Any, ...]) -> None:
             if event in FILE_EVENTS:
-                check(arguments[0])
+                for argument in arguments[:2]:
+                    check(argument)
             elif event in PROGRAM_EVENTS:
                 raise PermissionError(f"{event}: a method may not start programs while it is compared.")
 

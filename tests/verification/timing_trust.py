@@ -1,0 +1,132 @@
+"""Whether timings can be trusted: `python -m tests.verification.timing_trust [comparisons]` on a machine that does nothing else.
+
+Identical code under two names, an injected slow-down of a tenth, re-runs against the stated intervals, and a busy neighbour;
+prints the four shares and exits with 1 if one misses its target. Takes about a quarter of an hour for 100 comparisons.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mor_bench.harness.clock import PROTOCOLS, Opener, Timing, measure, why_unstable
+from mor_bench.harness.isolation import Worker
+from mor_bench.harness.nursery import Nursery
+from mor_bench.harness.statistics import compare_latency, intervals_of
+from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.snapshots.sampling import draw_loads
+
+DATASET = "beam-tiny"
+AT_ONCE = 20
+"""Comparisons, of three processes each, that are measured beside each other."""
+
+RERUNS = 6
+RERUN_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
+    "fem": ("mor_bench.surrogates.fem:FullFEM", {"tolerance": 1e-4}),
+    "fem-tight": ("mor_bench.surrogates.fem:FullFEM", {"tolerance": 1e-8}),
+    "fem-coarse": ("mor_bench.surrogates.fem_coarse:CoarseFEM", {"coarsening": 2}),
+    "fem-jacobi": ("mor_bench.surrogates.fem:FullFEM", {"solver": "jacobi-pcg"}),
+    "linear-fem": ("mor_bench.surrogates.linear_fem:LinearFEM", {}),
+}
+
+
+@dataclass(frozen=True)
+class _Method:
+    """A method that needs no snapshots, fitted in each process."""
+
+    scene: Scene
+    folder: Path
+    surrogate: str
+    parameters: dict[str, Any]
+
+    def __call__(self, nursery: Nursery | None) -> Worker:
+        worker = Worker(self.scene, [], nursery=nursery)
+        model = self.folder / "model.safetensors"
+        worker.ask(
+            "fit", 60.0, surrogate=self.surrogate, parameters=self.parameters, train=self.folder, model=model, threads=1, limit_s=60.0
+        )  # fmt: skip
+        return worker
+
+
+def _queries(scene: Scene, folder: Path) -> Path:
+    path = folder / "forces.npy"
+    np.save(path, draw_loads(scene, 0, 200).nodal_forces(scene.patch_weights), allow_pickle=False)
+    return path
+
+
+def _measured(scene: Scene, folder: Path, methods: dict[str, tuple[str, dict[str, Any]]], seed: int, processes: str = "full") -> dict[str, Timing]:
+    openers = {name: Opener(_Method(scene, folder, *method), 1e8) for name, method in methods.items()}
+    timings = measure(openers, _queries(scene, folder), PROTOCOLS[processes], 1, seed=seed, single_only=True)
+    failed = {name: timing.failed for name, timing in timings.items() if timing.failed}
+    if failed:
+        raise SystemExit(f"failed: {failed}")
+    return timings
+
+
+def comparisons(n: int, scene: Scene, folder: Path) -> tuple[int, int]:
+    """Of n comparisons, how many call identical code different, and how many call what is slowed by a tenth slower."""
+    false, found = 0, 0
+    for start in range(0, n, AT_ONCE):
+        methods: dict[str, tuple[str, dict[str, Any]]] = {
+            f"{name}{i}": ("tests.third_party:Slowed", {"part": 0.1 if name == "slowed" else 0.0})
+            for i in range(start, min(n, start + AT_ONCE))
+            for name in ("one", "same", "slowed")
+        }
+        samples = {name: timing.samples for name, timing in _measured(scene, folder, methods, start).items()}
+        for i in range(start, min(n, start + AT_ONCE)):
+            false += compare_latency(samples[f"one{i}"], samples[f"same{i}"])["verdict"] != "undecided"
+            found += compare_latency(samples[f"slowed{i}"], samples[f"one{i}"])["verdict"] == "slower"
+        print(f"{min(n, start + AT_ONCE)} comparisons: {false} identical called different, {found} slowed found", flush=True)
+    return false, found
+
+
+def reruns(scene: Scene, folder: Path, protocol: str) -> float:
+    """The share of medians, measured again, in the interval that the measurement before states."""
+    runs = [{name: timing.samples for name, timing in _measured(scene, folder, RERUN_METHODS, seed, protocol).items()} for seed in range(RERUNS)]
+    inside = []
+    for before, after in pairwise(runs):
+        stated = intervals_of(before)
+        inside += [stated[name][0] <= np.median(after[name]["latency_ms"]) <= stated[name][1] for name in after]
+    return float(np.mean(inside))
+
+
+def beside_a_busy_process(scene: Scene, folder: Path) -> bool:
+    """Whether a timing is called unstable beside a process that computes, and is not without it."""
+    methods = {"fem": RERUN_METHODS["fem"]}
+    quiet = why_unstable(_measured(scene, folder, methods, 0)["fem"], 1)
+    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        disturbed = why_unstable(_measured(scene, folder, methods, 0)["fem"], 1)
+    finally:
+        busy.kill()
+        busy.wait()
+    print(json.dumps({"quiet": quiet, "beside a busy process": disturbed}), flush=True)
+    return bool(disturbed) and not quiet
+
+
+def main() -> None:
+    """Print the shares, each with its target."""
+    n = int(sys.argv[1]) if len(sys.argv) > 1 else 100
+    scene = load_scene(DATASET)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        marked = beside_a_busy_process(scene, folder)
+        print(f"a timing beside a busy process is marked, and a quiet one is not: {marked}", flush=True)
+        shares = {protocol: reruns(scene, folder, protocol) for protocol in PROTOCOLS}
+        print(f"medians measured again inside the stated interval (target 90 %): {shares}", flush=True)
+        false, found = comparisons(n, scene, folder)
+    print(f"identical code called different: {false} of {n} (target at most 5 %); slowed by a tenth found: {found} of {n} (target at least 95 %)")
+    if not (marked and min(shares.values()) >= 0.9 and false <= 0.05 * n and found >= 0.95 * n):
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()
