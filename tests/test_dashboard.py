@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+import mor_bench
 from mor_bench.errors import InvalidInputError, MorBenchError, StoreError
 from mor_bench.harness.export_asv import describe, export_asv
 from mor_bench.harness.results import Comparison
@@ -25,6 +26,7 @@ from mor_bench.harness.timing import describe_machine
 from mor_bench.specs import list_suite
 from tests.benchmarks.bench_surrogates import METHODS
 from tests.benchmarks.publish import LOCAL, make_offline, publish
+from tests.test_cli import mor_bench as command
 
 CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
@@ -146,6 +148,16 @@ def test_what_cannot_be_exported_is_named(checkout: Path) -> None:
     (checkout / "pyproject.toml").unlink()
     with pytest.raises(InvalidInputError, match="is in no git checkout of mor-bench"):
         export_asv(comparison(row("fem")), out)
+
+
+def test_the_command_exports_a_run(checkout: Path, cache: Path, tmp_path: Path) -> None:
+    mor_bench.run(datasets=["beam-tiny"], methods=["linear-fem"], out=tmp_path / "run", cache=cache)
+    done = command("export", "asv", str(tmp_path / "run"), "--out", "results", cwd=checkout)
+    assert done.returncode == 0, done.stderr
+    assert {Path(line) for line in done.stdout.splitlines()} == {path.relative_to(checkout) for path in checkout.glob("results/**/*.json")}
+    error = results(checkout / "results", git(checkout, "rev-parse", "HEAD"))["comparison.beam-tiny.relative_error"][0][0]
+    assert 0.01 < error < 0.05  # linear elasticity on the loads of beam-tiny
+    assert command("export", "asv", str(tmp_path / "run"), "--out", "results", cwd=tmp_path).returncode == 2
 
 
 def test_asv_follows_every_method_of_the_suite() -> None:
