@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.harness.frontier import EXACT, TARGET_ERRORS, TARGET_TIMES_MS, compare, frontier_draws
+from mor_bench.harness.frontier import EXACT, TARGET_ERRORS, TARGET_TIMES_MS, compare, frontier_draws, is_point
 from mor_bench.harness.statistics import (
     LEVEL,
     clusters_of,
@@ -159,7 +159,7 @@ def _draws_of(comparison: Comparison, dataset: str, n: int, generator: np.random
             intervals[label]["mean_dof_m"] = quantiles(widened(weighted_means(e, drawn), float(e.mean()), factor, (float(e.min()), float(e.max()))))
     for label, interval in intervals_of(raw).items():
         intervals[label]["latency_ms"] = interval
-    usable = [row for row in ran if row["latency_ms"] and row["error"] and 0 < _number(row["latency_ms"]["median"]) < inf]
+    usable = [row for row in ran if is_point(row)]
     medians = np.array([row["latency_ms"]["median"] for row in usable], dtype=float)
     latencies = latency_draws([raw[row["label"]] for row in usable], medians, n, generator)
     plain = [errors.get(row["label"], np.full(n, _number(row["error"]["rel_l2_median"]))) for row in usable]
