@@ -80,6 +80,9 @@ def test_every_headline_has_an_interval_around_it(comparison: Comparison, analys
         assert 1.05 < record["rel_l2_median"]["high"] / record["rel_l2_median"]["low"] < 2.5
         assert 1.02 < record["latency_ms"]["high"] / record["latency_ms"]["low"] < 1.3
     assert analysis["clusters"] == [{"dataset": "beam-coarse", "of": "load regions", "n": 13}]
+    assert analysis["timing"][0]["n_processes"] == 5
+    assert analysis["timing"][0]["specific"] == pytest.approx(0.014, rel=0.3)
+    assert 0 < analysis["timing"][0]["common"] < 0.02
     entries = entries_of(comparison, "beam-coarse", analysis)
     assert all(entry.intervals.keys() == {"rel_l2_median", "mean_dof_m", "latency_ms"} for entry in entries)
 

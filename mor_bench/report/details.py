@@ -180,25 +180,16 @@ def break_even(dataset: str, analysis: Mapping[str, Any], entries: Sequence[Entr
         if record["dataset"] != dataset or record["verdict"] == "not reached":
             continue
         row = by_label[record["label"]]
-        queries = f"{record['queries']:,}" if record["queries"] is not None else f"{record['verdict']}: {record['reason']}"
+        queries = f"{record['queries']:,}" if record["queries"] is not None else record["verdict"]
+        why = f"\n{record['reason']}" if record["verdict"] == "unknown" else ""
         offline, full = record["offline_s"], record["fem_latency_ms"]
         times = [number(record["latency_ms"]), number(full), *(number(offline[key]) for key in ("data", "fit"))]
         sizes = [size_of(row.figure("memory_bytes", "fit")), size_of(row.row.get("model_bytes"))]
-        rows.append([record["method"], f"{percent(record['target_rel_l2_median'])} %", record["label"], *times, *sizes, queries])
-    headings = [
-        "method",
-        "error",
-        "configuration",
-        "latency (ms)",
-        "full-order (ms)",
-        "data (s)",
-        "fit (s)",
-        "memory to fit",
-        "model",
-        "break-even queries",
-    ]
+        rows.append([record["method"], f"{percent(record['target_rel_l2_median'])} %", record["label"], queries + why, *times, *sizes])
+    headings = ["method", "error", "configuration", "break-even queries", "latency (ms)", "full-order (ms)", "data (s)", "fit (s)", "memory", "model"]
     note = (
-        "Offline time, data included, over what a query saves against the fastest full-order configuration that is at least as accurate. "
+        "Break-even: offline time, data included, over what a query saves against the fastest full-order configuration that is at least as accurate; "
+        "never, where that one is as fast. "
         "Of each method the fastest configuration with at most the error; errors that it does not reach are left out."
     )
     return Grid("Whole cost", note, headings, rows) if rows else None

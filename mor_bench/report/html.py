@@ -16,6 +16,7 @@ from mor_bench.report.figures import write_figures
 from mor_bench.report.paper import Grid
 from mor_bench.report.summary import (
     Entry,
+    basis_of,
     dataset_names,
     discretisation_error,
     entries_of,
@@ -198,11 +199,12 @@ def _dataset_section(comparison: Comparison, dataset: str, drawn: Sequence[Drawn
     return f"""<h2>{escape(dataset)}{f": {escape(str(spec['title']))}" if spec.get("title") else ""}</h2>
 <h3>What was run</h3><dl>{"".join(_definition(key, value) for key, value in _what_was_run(comparison, dataset, entries))}</dl>
 <h3>Configurations</h3><div class="wide">{_configuration_table(entries)}</div>
-<p class="quiet">Green: meets the needs. Bold: on the Pareto front. Red: failed, skipped, or samples without a prediction. ~: timing not stable.</p>
+<p class="quiet">Green: meets the needs. Bold: on the Pareto front. Red: failed, skipped, or samples without a prediction. ~: timing not stable.
+{escape(basis_of(dataset, analysis))}</p>
 {_troubles(entries, notes_of(comparison, dataset, analysis))}
 {targets}<p class="quiet">{note}</p>
-{"".join(map(_grid, dataset_details(comparison, dataset, analysis)))}
-{"".join(map(_figure, drawn)) or "<p>There are no figures: no configuration gave samples to draw.</p>"}"""
+{"".join(map(_figure, drawn)) or "<p>There are no figures: no configuration gave samples to draw.</p>"}
+{"".join(map(_grid, dataset_details(comparison, dataset, analysis)))}"""
 
 
 def _what_was_run(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> list[tuple[str, str]]:

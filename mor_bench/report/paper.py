@@ -109,16 +109,16 @@ def _measures(label: str, size: tuple[int, int], entry: Entry | None, paper: Pub
 
     fit = ours("offline_s", "fit")
     cells = [label or "not run here", str(size[0]), str(size[1]), str(size[0] * 2 ** size[1])]
-    for mine, theirs in (
-        (metres(ours("error", "mean_dof_m")), metres(paper.mean_m) if paper else "–"),
-        (metres(ours("error", "std_dof_m")), metres(paper.std_m) if paper else "–"),
-        (metres(ours("error", "max_dof_m")), metres(paper.max_m) if paper else "–"),
-        (metres(ours("error", "slope")), metres(paper.slope) if paper else "–"),
-        (number(ours("latency_ms", "median")), number(paper.predict_ms) if paper else "–"),
-        (number(None if fit is None else fit / 60), number(paper.train_min) if paper else "–"),
-    ):
-        cells += [mine, theirs]
+    printed = (paper.mean_m, paper.std_m, paper.max_m, paper.slope, paper.predict_ms, paper.train_min) if paper else (None,) * 6
+    measured = [metres(ours("error", key)) for key in ("mean_dof_m", "std_dof_m", "max_dof_m", "slope")]
+    measured += [number(ours("latency_ms", "median")), number(None if fit is None else fit / 60)]
+    for mine, theirs in zip(measured, printed, strict=True):
+        cells += [mine, _as_printed(theirs)]
     return cells
+
+
+def _as_printed(value: float | None) -> str:
+    return "–" if value is None else f"{value:g}"
 
 
 def same_error(dataset: str, entries: Sequence[Entry]) -> Grid | None:
@@ -165,6 +165,6 @@ def _comparison(title: str, note: str, dataset: str, chosen: dict[str, Entry | N
     for method, entry in chosen.items():
         cells = [method, *([entry.label, number(entry.latency_ms), metres(entry.mean_error_m)] if entry else ["not reached", "–", "–"])]
         time, error = published.get(method, (None, None))
-        rows.append(cells + ([number(time), metres(error)] if published else []))
+        rows.append(cells + ([_as_printed(time), _as_printed(error)] if published else []))
     headings = ["method", "configuration", "time (ms)", "ē (m)", *(["paper: time (ms)", "paper: e (m)"] if published else [])]
     return Grid(title, note, headings, rows)

@@ -185,6 +185,18 @@ def _and_more(labels: Sequence[str]) -> str:
     return labels[0] if len(labels) == 1 else f"{labels[0]} and {len(labels) - 1} more"
 
 
+def basis_of(dataset: str, analysis: Mapping[str, Any]) -> str:
+    """What the intervals of a dataset rest on, in a sentence; empty if there are none."""
+    said = [f"Ranges hold 95 %: errors over {c['n']} {c['of']}" for c in analysis["clusters"] if c["dataset"] == dataset]
+    for found in analysis["timing"]:
+        if found["dataset"] == dataset:
+            spread = "with a spread that is typical" if found["specific"] is None else f"that differ by {percent(found['specific'])} %"
+            drift = f" and drift together by {percent(found['common'])} %" if found["common"] else ""
+            n = found["n_processes"]
+            said.append(f"latencies from one process {spread} of processes" if n == 1 else f"latencies over {n} processes {spread}{drift}")
+    return f"{', '.join(said)}." if said else ""
+
+
 def best_per_method(entries: Sequence[Entry]) -> list[Entry]:
     """Of each method that ran, the configuration with the smallest ē (then the smallest median error)."""
     ran = [entry for entry in entries if entry.ran]

@@ -17,6 +17,7 @@ from mor_bench.harness.analysis import analyse
 from mor_bench.harness.results import Comparison
 from mor_bench.report.summary import (
     Entry,
+    basis_of,
     dataset_names,
     discretisation_error,
     entries_of,
@@ -186,6 +187,8 @@ def target_cells(comparison: Comparison, dataset: str, kind: str, analysis: Anal
 def _sure(record: Mapping[str, Any], shown: Callable[[float | None], str]) -> str:
     """The interval of a target; where an end is beyond what was reached in enough resamples, it says so."""
     low, high = record.get("low"), record.get("high")
+    if low == high == 0:
+        return ""
     if low is None:
         return f"{NOT_REACHED} in {percent(record['not_reached'])} %" if record.get("not_reached") else ""
     return f"{shown(low)}–{NOT_REACHED if high is None else shown(high)}"
@@ -275,7 +278,7 @@ def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: A
     ):
         headings, rows = target_cells(comparison, dataset, kind, analysis)
         parts += [Text(""), Text(heading, style="bold"), _target_table(headings, rows, width)]
-    said = ["Ranges hold 95 %." if any(entry.intervals for entry in entries) else "", short_names_used(entries), "Nothing is extrapolated."]
+    said = [basis_of(dataset, analysis), short_names_used(entries), "Nothing is extrapolated."]
     parts.append(Text("  ".join(filter(None, said)), style="dim"))
     parts += _pairwise_parts(comparison, dataset, analysis)
     parts += [Text(""), Text(headline(comparison, dataset), style="bold"), Text("")]
