@@ -14,10 +14,14 @@ import pytest
 from matplotlib.image import imread
 from rich.console import Console
 
+from mor_bench.harness.analysis import analyse
 from mor_bench.harness.metrics import SampleErrors, sample_errors, summary
 from mor_bench.harness.results import Comparison, label_of
+from mor_bench.report.details import dataset_details
 from mor_bench.report.html import render, write_report
+from mor_bench.report.paper import PUBLISHED, error_measures, same_error, same_time
 from mor_bench.report.summary import (
+    Entry,
     best_per_method,
     discretisation_error,
     entries_of,
@@ -28,13 +32,17 @@ from mor_bench.report.summary import (
     size_of,
     warnings_of,
 )
-from mor_bench.report.tables import NOT_REACHED, print_tables, target_cells
+from mor_bench.report.tables import NOT_REACHED, pairwise_cells, print_tables, target_cells
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.specs import load_dataset_spec
+from tests.synthetic import synthetic_comparison
 
 HOSTILE = "<script>alert(1)</script> & [bold]$x_1$"
 REASON = "OutOfMemoryError: 31 GiB <needed> & 24 GiB there"
 N_TEST = 40
+UNMEASURED: dict[str, Any] = {
+    "n_dofs": 135, "all_threads_ms": None, "throughput": None, "memory_bytes": None, "cost": None, "sets": {}, "hidden": None,
+}  # fmt: skip
 MESH = box_mesh((2.0, 1.0, 1.0), (4, 2, 2))
 
 
@@ -52,7 +60,7 @@ def add_row(comparison: Comparison, method: str, swept: dict[str, Any], error: f
     latencies = latency_ms * np.linspace(0.9, 1.1, 41)
     row = {
         "dataset": "beam-tiny", "split": "region", "method": method, "label": label_of(method, swept), "parameters": dict(swept),
-        "status": "ok", "reason": None, "n_train": 200, "n_test": N_TEST, "n_failed": 0, "threads": 1, "error": summary(errors),
+        "status": "ok", "reason": None, "n_train": 200, "n_test": N_TEST, "n_failed": 0, "threads": 1, "error": summary(errors), **UNMEASURED,
         "latency_ms": {"median": latency_ms, "p95": 1.09 * latency_ms, "p99": 1.1 * latency_ms},
         "offline_s": {"data": 3.0, "fit": 0.5}, "model_bytes": 12345, "discretisation_error_m": None, **more,
     }  # fmt: skip
@@ -70,7 +78,7 @@ def add_failed(comparison: Comparison, method: str, swept: dict[str, Any], statu
         {
             "dataset": dataset, "split": "region", "method": method, "label": label_of(method, swept), "parameters": dict(swept),
             "status": status, "reason": reason, "n_train": 200, "n_test": N_TEST, "n_failed": None, "threads": 1, "error": None,
-            "latency_ms": None, "offline_s": None, "model_bytes": None, "discretisation_error_m": None,
+            "latency_ms": None, "offline_s": None, "model_bytes": None, "discretisation_error_m": None, **UNMEASURED,
         }
     )  # fmt: skip
 
@@ -215,7 +223,7 @@ def test_the_page_escapes_and_needs_no_network(written: list[Path]) -> None:
 
 def test_figures_are_pictures(comparison: Comparison, written: list[Path]) -> None:
     kinds = ["error-against-time", "error-against-deformation", "worst-samples", "singular-values"]
-    assert [path.name for path in written[:-1]] == [f"beam-tiny--{kind}.png" for kind in kinds]
+    assert [path.name for path in written[:-1]] == [*(f"beam-tiny--{kind}.png" for kind in kinds), "all-datasets--performance-profile.png"]
     for path in written[:-1]:
         assert path.parent == comparison.out / "figures"
         assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
@@ -297,3 +305,115 @@ def test_a_warning_that_many_configurations_gave_is_said_once(tmp_path: Path) ->
     entries = entries_of(made, "beam-tiny")
     first, _, last = (entry.label for entry in entries)
     assert warnings_of(entries) == [(f"{first} and 2 more", "it locks"), (last, "few modes")]
+
+
+@pytest.fixture(scope="module")
+def rich(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+    """Two datasets with everything that a run can measure."""
+    return synthetic_comparison(tmp_path_factory.mktemp("rich"), ("beam-coarse", "beam-fine"))
+
+
+@pytest.fixture(scope="module")
+def analysis(rich: Comparison) -> dict[str, Any]:
+    return analyse(rich, n_resamples=300)
+
+
+def page_text(page: Path) -> str:
+    return unescape(re.sub(r"<[^>]*>", " ", page.read_text(encoding="utf-8")))
+
+
+def test_the_page_has_a_section_for_all_that_was_measured(rich: Comparison, analysis: dict[str, Any]) -> None:
+    paths = render(rich, analysis)
+    kinds = ["error-against-time", "learning-curves", "error-against-deformation", "worst-samples", "singular-values"]
+    names = [f"{dataset}--{kind}.png" for dataset in ("beam-coarse", "beam-fine") for kind in kinds]
+    assert [path.name for path in paths] == [*names, "all-datasets--performance-profile.png", "report.html"]
+    page = paths[-1].read_text(encoding="utf-8")
+    assert page.count("<img ") == len(names) + 1
+    titles = re.findall("<h3>(.*?)</h3>", page)
+    assert [title for title in titles if not title.startswith("Who is faster")] == [
+        *[
+            "What was run", "Configurations", "Failures, skips and warnings", "Time at error: median latency at a median relative L2 error",
+            "Error at time: median relative L2 error within a median latency", "Whole cost", "Timing", "Memory and cost", "Named test sets",
+            "Hidden test set", "Tuning budget", "Error measures of the networks", "Comparison at the same error", "Comparison at the same time",
+        ] * 2,
+        "Performance profile", "In its regime",
+    ]  # fmt: skip
+    text = page_text(paths[-1])
+    for said in (
+        "processes differ by 14 %", "4.2 times as large as on the shipped one", "not tested in its regime: 20,000 samples or more, on a GPU",
+        "errors over 13 load regions, latencies over 5 processes that differ by", "6 of 5 (over)", "flagged 41.7 % of 60",
+        "Who is faster at 1 %, the error that is needed",
+    ):  # fmt: skip
+        assert said in text
+
+
+def test_nothing_is_shown_of_what_was_not_measured(comparison: Comparison, written: list[Path]) -> None:
+    page = written[-1].read_text(encoding="utf-8")
+    for absent in ("Timing<", "Memory and cost", "Named test sets", "Hidden test set", "Tuning budget", "In its regime", "Error measures"):
+        assert absent not in page
+    assert "nan" not in page_text(written[-1]).split()
+    assert not re.search("<tbody></tbody>", page)
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_the_console_shows_doubts_and_pairs(rich: Comparison, analysis: dict[str, Any], width: int) -> None:
+    stream = io.StringIO()
+    print_tables(rich, Console(file=stream, width=width), analysis)
+    text = stream.getvalue()
+    assert max(map(len, text.splitlines())) <= width
+    assert re.search(r"^linear-fem .*\d~ ", text, re.MULTILINE)
+    assert "linear-fem: timing not stable: processes differ by 14 %" in text
+    assert "pca-regression [n_input_modes=5]: on the hidden test set" in text
+    assert "Who is faster at 1 %, the error that is needed" in text
+    found = re.search(r"^\(1\) fem +· +([+-?][\d.]+) +([+-?][\d.]+)", text, re.MULTILINE)
+    assert found is not None
+    assert found[1].startswith("+")
+    assert found[2].startswith("-")
+    assert len(text.splitlines()) < 2 * 100 + (width < 100) * 60
+
+
+def test_the_matrix_and_its_targets_carry_intervals(rich: Comparison, analysis: dict[str, Any]) -> None:
+    reached, cells, absent = pairwise_cells(rich, "beam-coarse", 0.01, analysis)
+    assert (reached, absent) == (["fem", "pod", "pca-regression"], ["hpod", "linear-fem", "umesh"])
+    assert [line[i] for i, line in enumerate(cells)] == ["·"] * 3
+    assert cells[0][1][1:] == cells[1][0][1:]
+    record = next(r for r in analysis["pairwise"] if (r["dataset"], r["target_rel_l2_median"], r["a"], r["b"]) == ("beam-coarse", 0.01, "pod", "fem"))
+    assert cells[1][0] == f"-{number(record['ratio'])}"
+    matrix = next(grid for grid in dataset_details(rich, "beam-coarse", analysis) if "1 %, the error" in grid.title)
+    assert matrix.rows[1][1] == f"-{number(record['ratio'])}\n{number(record['low'])}–{number(record['high'])}"
+    assert matrix.rows[0][2] == f"+{number(record['ratio'])}\n{number(record['low'])}–{number(record['high'])}"
+    _, rows = target_cells(rich, "beam-coarse", "time_at_error", analysis)
+    assert re.fullmatch(r"[\d.]+ ms \([\d.]+\)\nr=\d+\n[\d.]+–[\d.]+", rows["pod"][1])
+
+
+def test_the_tables_of_the_paper(rich: Comparison) -> None:
+    entries = entries_of(rich, "beam-coarse")
+    network = next(entry for entry in entries if entry.method == "umesh")
+    measures = error_measures(
+        "beam-coarse", [*entries, Entry({**network.row, "label": "large", "parameters": {"channels": 128, "steps": 3}}, False, False)]
+    )
+    assert measures is not None
+    assert len(measures.rows) == 2 + 8 - 1  # both of ours; of the paper's eight, one has the size of one of ours
+    small, large = dict(zip(measures.headings, measures.rows[0], strict=False)), measures.rows[1]
+    assert (small["c"], small["k"], small["FSS"]) == ("16", "2", "64")
+    assert large[:4] == ["large", "128", "3", "1024"]
+    assert large[5::2] == ["0.0007", "0.0006", "–", "0.00352", "2.5", "35"]
+    assert [row[0] for row in measures.rows[2:]] == ["not run here"] * 7
+    fine = entries_of(rich, "beam-fine")
+    error, time = same_error("beam-fine", fine), same_time("beam-fine", fine)
+    assert error is not None
+    assert time is not None
+    assert {row[0]: row[4:] for row in error.rows}["pod"] == ["120", "0.006"]
+    assert {row[0]: row[4:] for row in time.rows}["hpod"] == ["5", "0.084"]
+    assert {row[0]: row[1] for row in error.rows}["linear-fem"] == "not reached"
+    assert {row[0]: row[1] for row in error.rows}["fem"] == "fem [tolerance=0.1]"
+    others = [entry for entry in entries if entry.method != "umesh"]
+    assert (error_measures("beam-coarse", others), same_error("beam-coarse", others), same_time("beam-coarse", others)) == (None, None, None)
+
+
+def test_the_figures_of_the_paper_are_those_of_its_tables() -> None:
+    sizes = {(row.dataset, row.channels, row.steps): row for row in PUBLISHED}
+    assert len(sizes) == len(PUBLISHED) == 13
+    assert sizes["beam-coarse", 64, 5].train_min == 426
+    assert sizes["liver-tet", 128, 3].mean_m == 5.33e-5
+    assert {row.dataset for row in PUBLISHED} <= {"beam-coarse", "beam-coarse-3-forces", "beam-fine", "l-shape", "liver-hex", "liver-tet"}

@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.harness.frontier import EXACT, TARGET_ERRORS, TARGET_TIMES_MS, compare, frontier_draws
+from mor_bench.harness.frontier import EXACT, TARGET_ERRORS, TARGET_TIMES_MS, compare, frontier_draws, is_point
 from mor_bench.harness.statistics import (
     LEVEL,
     clusters_of,
     intervals_of,
     latency_draws,
+    n_processes_of,
     quantiles,
     resample_weights,
+    spreads_of,
     verdict_of,
     weighted_means,
     weighted_medians,
@@ -49,8 +51,8 @@ class _Draws:
         Natural logarithms; resample i of all rows holds the same load regions and the same moments.
     intervals : dict
         By label, those of `rel_l2_median`, `mean_dof_m` and `latency_ms` where there are raw samples.
-    clusters : dict
-        What was resampled.
+    clusters, timing : dict
+        What was resampled; how processes scatter.
     """
 
     rows: list[Row]
@@ -58,6 +60,7 @@ class _Draws:
     log_errors: NDArray[np.float64]
     intervals: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
     clusters: dict[str, Any] = field(default_factory=dict)
+    timing: dict[str, Any] = field(default_factory=dict)
 
 
 def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -> dict[str, Any]:
@@ -86,12 +89,15 @@ def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -
         `pairwise`: for each ordered pair of methods and error the ratio of their times, and what is sure of the first.
         `break_even`: from how many queries on a method's offline time pays off.
         `profile`: Dolan and Moré's performance profile.
-        `regimes`, `tuning`, `hidden`, `clusters`: see the functions of these names.
+        `regimes`, `tuning`, `hidden`: see the functions of these names.
+        `clusters`: what the bootstrap of each dataset resamples, and how many there are.
+        `timing`: the processes of each dataset, and the relative standard deviations of what is specific to a configuration
+        and what all share; None where a single process leaves only typical ones to be assumed.
     """
     analysis: dict[str, Any] = {
         "settings": {"n_resamples": n_resamples, "seed": seed, "level": LEVEL},
         **compare(comparison.rows),
-        **{name: [] for name in ("rows", "pairwise", "break_even", "hidden", "clusters")},
+        **{name: [] for name in ("rows", "pairwise", "break_even", "hidden", "clusters", "timing")},
     }
     for dataset in dict.fromkeys(row["dataset"] for row in comparison.rows):
         draws = _draws_of(comparison, dataset, n_resamples, np.random.default_rng(seed))
@@ -100,7 +106,8 @@ def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -
         analysis["pairwise"] += _with_intervals(mine, draws, needed_error(comparison, dataset))
         analysis["break_even"] += break_even(comparison.rows, mine["time_at_error"])
         analysis["hidden"] += hidden(comparison.rows, dataset, draws.intervals)
-        analysis["clusters"] += [{"dataset": dataset, **draws.clusters}] if draws.clusters else []
+        for name, facts in (("clusters", draws.clusters), ("timing", draws.timing)):
+            analysis[name] += [{"dataset": dataset, **facts}] if facts else []
     analysis["profile"] = profile(analysis["time_at_error"])
     analysis["regimes"] = regimes(comparison)
     analysis["tuning"] = tuning(comparison)
@@ -159,11 +166,17 @@ def _draws_of(comparison: Comparison, dataset: str, n: int, generator: np.random
             intervals[label]["mean_dof_m"] = quantiles(widened(weighted_means(e, drawn), float(e.mean()), factor, (float(e.min()), float(e.max()))))
     for label, interval in intervals_of(raw).items():
         intervals[label]["latency_ms"] = interval
-    usable = [row for row in ran if row["latency_ms"] and row["error"] and 0 < _number(row["latency_ms"]["median"]) < inf]
+    timed = [samples for samples in raw.values() if len(samples.get("latency_ms", ()))]
+    timing: dict[str, Any] = {}
+    if timed:
+        spreads = spreads_of(timed)
+        specific, common = (spread.sd if spread.df > 0 else None for spread in (spreads.specific, spreads.common))
+        timing = {"n_processes": max(map(n_processes_of, timed)), "specific": specific, "common": common}
+    usable = [row for row in ran if is_point(row)]
     medians = np.array([row["latency_ms"]["median"] for row in usable], dtype=float)
     latencies = latency_draws([raw[row["label"]] for row in usable], medians, n, generator)
     plain = [errors.get(row["label"], np.full(n, _number(row["error"]["rel_l2_median"]))) for row in usable]
-    return _Draws(usable, latencies, np.log(np.maximum(np.array(plain).reshape(len(usable), n), EXACT)), intervals, found)
+    return _Draws(usable, latencies, np.log(np.maximum(np.array(plain).reshape(len(usable), n), EXACT)), intervals, found, timing)
 
 
 def _error_draws(samples: dict[str, NDArray[Any]], weights: NDArray[np.int32], factor: float, generator: np.random.Generator) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, isfinite, log
+from math import exp, inf, isfinite, log
 from typing import Any
 
 import numpy as np
@@ -136,6 +136,14 @@ def _share(x: float, start: NDArray[np.float64], end: NDArray[np.float64]) -> ND
     return np.where(np.isfinite(share), share, 1.0)
 
 
+def is_point(row: dict[str, Any]) -> bool:
+    """Whether a results row has a place on the plane: it ran, was timed and was scored."""
+    if row["status"] != "ok":
+        return False
+    latency, error = (row["latency_ms"] or {}).get("median"), (row["error"] or {}).get("rel_l2_median")
+    return latency is not None and error is not None and 0 < latency < inf
+
+
 def compare(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Both tables over all datasets and methods of results rows; a method without a usable row reaches nothing."""
     at_error, at_time = [], []
@@ -143,7 +151,7 @@ def compare(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         points = [
             Point(row["latency_ms"]["median"], row["error"]["rel_l2_median"], row["label"])
             for row in rows
-            if (row["dataset"], row["method"]) == (dataset, method) and row["status"] == "ok"
+            if (row["dataset"], row["method"]) == (dataset, method) and is_point(row)
         ]
         key = {"dataset": dataset, "method": method}
         at_error += [{**key, "target_rel_l2_median": target, **time_at_error(points, target)} for target in TARGET_ERRORS]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import ceil, isfinite
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from mor_bench.harness.results import Comparison
 from mor_bench.report.canvas import GREY, INK, LIGHT, Drawn, Note, Style, annotate, dress, new_figure, plain, save, shortened, styles_of
+from mor_bench.report.curves import learning_curves, performance_profile
 from mor_bench.report.deformed import worst_samples
 from mor_bench.report.summary import Entry, best_per_method, dataset_names, entries_of, needs_of, number, percent, short_names_used, short_swept
 
@@ -25,12 +27,14 @@ ROUND_OFF = 1e-12
 """Relative singular values below are not shown: there the decomposition's round-off begins."""
 
 
-def write_figures(comparison: Comparison) -> list[Drawn]:
+def write_figures(comparison: Comparison, analysis: Mapping[str, Any]) -> list[Drawn]:
     """Draw and write every figure for which there is data.
 
     Parameters
     ----------
     comparison : Comparison
+    analysis : dict
+        From `mor_bench.harness.analysis.analyse`.
 
     Returns
     -------
@@ -40,14 +44,16 @@ def write_figures(comparison: Comparison) -> list[Drawn]:
     styles = styles_of(comparison)
     drawn: list[Drawn | None] = []
     for dataset in dataset_names(comparison):
-        for draw in (error_against_time, error_against_amplitude, worst_samples, singular_values):
+        drawn.append(error_against_time(comparison, dataset, styles, analysis))
+        for draw in (learning_curves, error_against_amplitude, worst_samples, singular_values):
             drawn.append(draw(comparison, dataset, styles))
+    drawn.append(performance_profile(comparison, analysis, styles))
     return [figure for figure in drawn if figure is not None]
 
 
-def error_against_time(comparison: Comparison, dataset: str, styles: dict[str, Style]) -> Drawn | None:
+def error_against_time(comparison: Comparison, dataset: str, styles: dict[str, Style], analysis: Mapping[str, Any]) -> Drawn | None:
     """Median error over median latency, log-log, a point per configuration; None if no configuration has both."""
-    entries = entries_of(comparison, dataset)
+    entries = entries_of(comparison, dataset, analysis)
     shown = [e for e in entries if e.ran and isfinite(e.error) and isfinite(e.latency_ms)]
     if not shown:
         return None
@@ -59,7 +65,7 @@ def error_against_time(comparison: Comparison, dataset: str, styles: dict[str, S
     box_label = _draw_needs(axes, needs)
     lines, handles = _draw_series(axes, shown, styles)
     lines.append(_draw_front(axes, [e for e in shown if e.on_front]))
-    axes.set_xlabel("latency of one query, median; whisker to p95 (ms)")
+    axes.set_xlabel("latency of one query, median (ms)")
     axes.set_ylabel("relative L2 error, median over the test set (%)")
     axes.set_title(plain(f"Error against time – {dataset}"), loc="left", fontsize=13, color=INK)
     front = Line2D([], [], color=INK, linewidth=1.2, linestyle=(0, (4, 2)), marker="o", markerfacecolor="none", markersize=9, label="Pareto front")
@@ -76,17 +82,21 @@ def _place(entry: Entry) -> tuple[float, float]:
 
 
 def _time_caption(entries: Sequence[Entry], shown: Sequence[Entry]) -> str:
-    parts = [
-        "Each point is one fitted configuration; left and down is better. A thin line joins the swept configurations of a method in order, "
-        "the whisker reaches to the 95th percentile of the latency, and the dashed steps through the ringed points are the Pareto front: "
-        "no other configuration is both faster and more accurate. In the shaded box the scene's needs are met.",
-    ]
+    parts = ["Each point is one fitted configuration; left and down is better. A thin line joins the swept configurations of a method in order."]
+    if any(e.intervals for e in shown):
+        parts.append("Bars hold 95 % of what a repeated timing and other load regions would give.")
+    parts.append(
+        "The dashed steps through the ringed points are the Pareto front: no other configuration is both faster and more accurate. "
+        "In the shaded box the scene's needs are met."
+    )
     if any(len(e.swept) > 1 for e in shown):
         parts.append("Of a method with two swept parameters, labels give the first one, the legend the second.")
     names = short_names_used(shown)
     parts.append(f"Labels: {names}." if names else "")
     if any(100 * e.error < FLOOR_PERCENT for e in shown):
         parts.append(f"An arrow marks errors below {FLOOR_PERCENT:g} %, drawn at that floor so that they do not squash the rest.")
+    if any(e.unstable for e in shown):
+        parts.append("A cross marks timings that were not stable.")
     missing = [e.label for e in entries if e.ran and e not in shown]
     if missing:
         parts.append(f"Not shown, since the median error is infinite: {', '.join(missing)}.")
@@ -94,11 +104,12 @@ def _time_caption(entries: Sequence[Entry], shown: Sequence[Entry]) -> str:
 
 
 def _log_limits(axes: Axes, shown: Sequence[Entry], needs: dict[str, float]) -> None:
-    """Logarithmic axes with plain numbers, wide enough for the points, their whiskers and the corner of the needs."""
+    """Logarithmic axes with plain numbers, wide enough for the points, their bars and the corner of the needs."""
     axes.set_xscale("log")
     axes.set_yscale("log")
-    x = [e.latency_ms for e in shown] + [e.figure("latency_ms", "p95") or e.latency_ms for e in shown] + [needs["latency_ms"]]
-    y = [_place(e)[1] for e in shown] + [100 * needs["error"]]
+    bars = np.array([_bars(e) for e in shown])
+    x = [*bars[:, 0].ravel().tolist(), needs["latency_ms"]]
+    y = [*bars[:, 1].ravel().tolist(), 100 * needs["error"]]
     x, y = [v for v in x if isfinite(v) and v > 0], [v for v in y if isfinite(v)]
     axes.set_xlim(min(x) / 1.6, max(x) * 1.6)
     axes.set_ylim(min(y) / 2.0, max(y) * 2.0)
@@ -107,6 +118,15 @@ def _log_limits(axes: Axes, shown: Sequence[Entry], needs: dict[str, float]) -> 
         axis.set_major_locator(LogLocator(subs=subs, numticks=20))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_formatter(NullFormatter())
+
+
+def _bars(entry: Entry) -> NDArray[np.float64]:
+    """(2, 2) ends of the intervals of latency in ms and of the error in percent, never above or below the point itself."""
+    x, y = _place(entry)
+    ends = np.array([entry.intervals.get("latency_ms", (x, x)), np.multiply(100, entry.intervals.get("rel_l2_median", (y / 100, y / 100)))])
+    ends[1] = np.maximum(ends[1], FLOOR_PERCENT)
+    ends = np.where(np.isfinite(ends), ends, np.array([[x], [y]]))
+    return np.stack([np.minimum(ends[:, 0], [x, y]), np.maximum(ends[:, 1], [x, y])], axis=1)
 
 
 def _draw_needs(axes: Axes, needs: dict[str, float]) -> Artist | None:
@@ -131,9 +151,12 @@ def _draw_series(axes: Axes, shown: Sequence[Entry], styles: dict[str, Style]) -
         for rank, (others, members) in enumerate(series.items()):
             xy = np.array([_place(e) for e in members])
             lines.append(xy)
-            p95 = np.array([e.figure("latency_ms", "p95") or e.latency_ms for e in members])
+            bars = np.array([_bars(e) for e in members])
             axes.plot(xy[:, 0], xy[:, 1], color=style.colour, linewidth=0.9, alpha=0.6, zorder=2)
-            axes.hlines(xy[:, 1], xy[:, 0], np.maximum(p95, xy[:, 0]), color=style.colour, linewidth=0.9, alpha=0.5, zorder=2)
+            axes.hlines(xy[:, 1], *bars[:, 0].T, color=style.colour, linewidth=2.2, alpha=0.4, zorder=2)
+            axes.vlines(xy[:, 0], *bars[:, 1].T, color=style.colour, linewidth=2.2, alpha=0.4, zorder=2)
+            unsteady = np.array([bool(e.unstable) for e in members])
+            axes.plot(*xy[unsteady].T, "x", color=INK, markersize=10, markeredgewidth=1.4, zorder=6)
             low = np.array([100 * e.error < FLOOR_PERCENT for e in members])
             hollow = rank % 2 == 1
             face, edge = ("white", style.colour) if hollow else (style.colour, "white")

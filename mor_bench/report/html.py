@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
+from mor_bench.harness.analysis import analyse
 from mor_bench.harness.results import Comparison
 from mor_bench.report.canvas import Drawn
+from mor_bench.report.details import dataset_details, interval_cells, overall
 from mor_bench.report.figures import write_figures
+from mor_bench.report.paper import Grid
 from mor_bench.report.summary import (
     Entry,
+    basis_of,
     dataset_names,
     discretisation_error,
     entries_of,
     headline,
     metres,
     needs_of,
+    notes_of,
     number,
     percent,
     short_names_used,
@@ -53,10 +58,16 @@ figure { margin: 18px 0 26px; } figure img { width: 100%; height: auto; border: 
 @media (max-width: 700px) { dl { grid-template-columns: 1fr; } dd { margin-bottom: 6px; } }
 """
 
+SURE = "95 %"
+"""The column of intervals."""
+
+OF_TEXT = frozenset({"configuration", "test set", "stable", "verdict", "where it belongs", "tested there"})
+"""Columns that are no figures."""
+
 GROUPS = (
-    ("relative L2 (%)", (("median", "rel_l2_median"), ("p95", "rel_l2_p95"), ("max", "rel_l2_max"))),
-    ("latency (ms)", (("median", "median"), ("p95", "p95"), ("p99", "p99"))),
-    ("per degree of freedom (m)", (("ē", "mean_dof_m"), ("σ(e)", "std_dof_m"), ("max e", "max_dof_m"))),
+    ("relative L2 (%)", (("median", "rel_l2_median"), (SURE, "rel_l2_median"), ("p95", "rel_l2_p95"), ("max", "rel_l2_max"))),
+    ("latency (ms)", (("median", "median"), (SURE, "latency_ms"), ("p95", "p95"), ("p99", "p99"))),
+    ("per degree of freedom (m)", (("ē", "mean_dof_m"), (SURE, "mean_dof_m"), ("σ(e)", "std_dof_m"), ("max e", "max_dof_m"))),
     ("offline (s)", (("data", "data"), ("fit", "fit"))),
     ("nodal (m)", (("max", "max_nodal_m"),)),
     ("e over u", (("slope", "slope"),)),
@@ -75,6 +86,12 @@ DEFINITIONS = (
     (
         "latency",
         "wall-clock time of one query at a time, from nodal forces to nodal displacements on the host, after warm-up; percentiles over the queries.",
+    ),
+    (
+        "95 %",
+        "of an error: the interval that other load regions (and training seeds, where several were tried) would give, from a bootstrap over the "
+        "load regions of the test set, the same for all methods. Of a latency: the interval in which the median of a repeated measurement in as many "
+        "fresh processes is expected. Of the ratio of two times: both, without what the two share. Nothing is corrected for the number of pairs.",
     ),
     ("failures", "a test sample without a prediction counts as an infinite error; it is never dropped."),
     ("meets the needs", "the median relative L2 error and the median latency are both within what the dataset's file asks for."),
@@ -95,37 +112,41 @@ DEFINITIONS = (
 RAW_FILES = (
     ("results.json", "all rows, machine and datasets"),
     ("results.csv", "the same rows, flat"),
-    ("comparison.json", "time at error and error at time"),
+    ("comparison.json", "time at error, error at time, pairs of methods, break-even and more, with intervals"),
     ("samples/", "raw latencies and per-sample errors of every row (HDF5)"),
     ("figures/", "the figures of this page (PNG)"),
 )
 
 
-def render(comparison: Comparison) -> list[Path]:
+def render(comparison: Comparison, analysis: Mapping[str, Any] | None = None) -> list[Path]:
     """Write all figures and the page.
 
     Parameters
     ----------
     comparison : Comparison
+    analysis : dict, optional
+        From `mor_bench.harness.analysis.analyse`, which is called if it is not given.
 
     Returns
     -------
     list of Path
         The figures, and OUT/report.html last.
     """
-    drawn = write_figures(comparison)
-    return [*(figure.path for figure in drawn), _write_page(comparison, drawn)]
+    analysis = analysis or analyse(comparison)
+    drawn = write_figures(comparison, analysis)
+    return [*(figure.path for figure in drawn), _write_page(comparison, drawn, analysis)]
 
 
-def write_report(comparison: Comparison) -> Path:
+def write_report(comparison: Comparison, analysis: Mapping[str, Any] | None = None) -> Path:
     """Write all figures and OUT/report.html; return the page's path."""
-    return render(comparison)[-1]
+    return render(comparison, analysis)[-1]
 
 
-def _write_page(comparison: Comparison, drawn: Sequence[Drawn]) -> Path:
+def _write_page(comparison: Comparison, drawn: Sequence[Drawn], analysis: Mapping[str, Any]) -> Path:
     names = dataset_names(comparison)
-    sections = "\n".join(_dataset_section(comparison, name, [figure for figure in drawn if figure.dataset == name]) for name in names)
+    sections = "\n".join(_dataset_section(comparison, name, [figure for figure in drawn if figure.dataset == name], analysis) for name in names)
     headlines = "".join(f'<p class="headline"><b>{escape(name)}</b>: {escape(headline(comparison, name))}</p>' for name in names)
+    shared = "".join(map(_grid, overall(analysis))) + "".join(_figure(figure) for figure in drawn if figure.dataset not in names)
     raw = "".join(f'<dt><a href="{name}">{name}</a></dt><dd>{escape(what)}</dd>' for name, what in RAW_FILES)
     words = "".join(f"<dt>{escape(word)}</dt><dd>{escape(meaning)}</dd>" for word, meaning in DEFINITIONS)
     page = f"""<!DOCTYPE html>
@@ -135,6 +156,7 @@ def _write_page(comparison: Comparison, drawn: Sequence[Drawn]) -> Path:
 <p class="quiet">Speed against error of model-order-reduction methods, on the same snapshots and the same machine.</p>
 {headlines or "<p>There is nothing to report: no dataset was run.</p>"}
 {sections}
+{f"<h2>All datasets together</h2>{shared}" if shared else ""}
 <h2>Machine</h2><dl>{"".join(_definition(key, value) for key, value in _flat(comparison.machine))}</dl>
 <h2>How the numbers are defined</h2><dl class="words">{words}</dl>
 <h2>Raw files</h2><p class="quiet">Beside this page:</p><dl>{raw}</dl>
@@ -162,24 +184,27 @@ def _definition(key: str, value: str) -> str:
     return f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>"
 
 
-def _dataset_section(comparison: Comparison, dataset: str, drawn: Sequence[Drawn]) -> str:
-    entries, spec = entries_of(comparison, dataset), comparison.datasets.get(dataset, {})
+def _dataset_section(comparison: Comparison, dataset: str, drawn: Sequence[Drawn], analysis: Mapping[str, Any]) -> str:
+    entries, spec = entries_of(comparison, dataset, analysis), comparison.datasets.get(dataset, {})
     names = short_names_used(entries)
     targets = "".join(
-        f"<h3>{title}</h3>{_target_table(comparison, dataset, kind)}"
+        f"<h3>{title}</h3>{_target_table(comparison, dataset, kind, analysis)}"
         for kind, title in (
             ("time_at_error", "Time at error: median latency at a median relative L2 error"),
             ("error_at_time", "Error at time: median relative L2 error within a median latency"),
         )
     )
-    note = f"In brackets and below: the best real configuration. {escape(names)}{'.' if names else ''}"
+    note = f"In brackets and below: the best real configuration{', and the 95 % interval' if any(e.intervals for e in entries) else ''}. "
+    note += f"{escape(names)}{'.' if names else ''}"
     return f"""<h2>{escape(dataset)}{f": {escape(str(spec['title']))}" if spec.get("title") else ""}</h2>
 <h3>What was run</h3><dl>{"".join(_definition(key, value) for key, value in _what_was_run(comparison, dataset, entries))}</dl>
 <h3>Configurations</h3><div class="wide">{_configuration_table(entries)}</div>
-<p class="quiet">Green: meets the needs. Bold: on the Pareto front. Red: failed, skipped, or test samples without a prediction.</p>
-{_troubles(entries)}
+<p class="quiet">Green: meets the needs. Bold: on the Pareto front. Red: failed, skipped, or samples without a prediction. ~: timing not stable.
+{escape(basis_of(dataset, analysis))}</p>
+{_troubles(entries, notes_of(comparison, dataset, analysis))}
 {targets}<p class="quiet">{note}</p>
-{"".join(map(_figure, drawn)) or "<p>There are no figures: no configuration gave samples to draw.</p>"}"""
+{"".join(map(_figure, drawn)) or "<p>There are no figures: no configuration gave samples to draw.</p>"}
+{"".join(map(_grid, dataset_details(comparison, dataset, analysis)))}"""
 
 
 def _what_was_run(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> list[tuple[str, str]]:
@@ -209,7 +234,11 @@ def _what_was_run(comparison: Comparison, dataset: str, entries: Sequence[Entry]
     ]
 
 
-def _cell(group: str, key: str, entry: Entry) -> str:
+def _cell(group: str, name: str, key: str, entry: Entry) -> str:
+    if name == SURE:
+        return interval_cells(entry)[key]
+    if (group, key) == ("latency (ms)", "median") and entry.unstable:
+        return number(entry.latency_ms) + "~"
     if group.startswith("latency"):
         return number(entry.figure("latency_ms", key))
     if group.startswith("offline"):
@@ -223,14 +252,16 @@ def _count(value: object) -> str:
 
 
 def _configuration_table(entries: Sequence[Entry]) -> str:
-    over = "".join(f'<th class="group" colspan="{len(columns)}">{escape(group)}</th>' for group, columns in GROUPS)
-    under = "".join(f"<th>{escape(name)}</th>" for _, columns in GROUPS for name, _ in columns)
+    sure = any(entry.intervals for entry in entries)
+    groups = [(group, [column for column in columns if sure or column[0] != SURE]) for group, columns in GROUPS]
+    over = "".join(f'<th class="group" colspan="{len(columns)}">{escape(group)}</th>' for group, columns in groups)
+    under = "".join(f"<th>{escape(name)}</th>" for _, columns in groups for name, _ in columns)
     plain = ("size", "threads", "n train", "n test", "without<br>prediction", "discretisation<br>error (m)")
     tail = "".join(f'<th rowspan="2">{name}</th>' for name in plain)
     body = []
     for entry in entries:
         row = entry.row
-        cells = [escape(_cell(group, key, entry)) for group, columns in GROUPS for _, key in columns]
+        cells = [escape(_cell(group, name, key, entry)) for group, columns in groups for name, key in columns]
         discretisation = row.get("discretisation_error_m")
         cells += [escape(size_of(row.get("model_bytes"))), *(escape(_count(row.get(key))) for key in ("threads", "n_train", "n_test", "n_failed"))]
         cells.append("not measured" if discretisation is None else metres(float(discretisation)))
@@ -247,9 +278,10 @@ def _configuration_table(entries: Sequence[Entry]) -> str:
     return f'<table class="pinned">{head}<tbody>{"".join(body)}</tbody></table>'
 
 
-def _troubles(entries: Sequence[Entry]) -> str:
-    """Failed and skipped configurations, those with failed samples, each with its reason, and all warnings."""
+def _troubles(entries: Sequence[Entry], notes: Sequence[str]) -> str:
+    """Failed and skipped configurations, those with failed samples, each with its reason, what casts doubt, and all warnings."""
     said = [("bad", e.label, e.trouble) for e in entries if e.trouble]
+    said += [("", label, doubt) for label, _, doubt in (note.partition(": ") for note in notes)]
     said += [("", label, f"warning: {warning}") for label, warning in warnings_of(entries)]
     rows = "".join(
         f'<tr class="{kind}"><td class="text">{escape(label)}</td><td class="reason">{escape(text)}</td></tr>' for kind, label, text in said
@@ -260,15 +292,36 @@ def _troubles(entries: Sequence[Entry]) -> str:
     return f'<h3>Failures, skips and warnings</h3><div class="wide"><table>{head}<tbody>{rows}</tbody></table></div>'
 
 
-def _target_table(comparison: Comparison, dataset: str, kind: str) -> str:
-    headings, rows = target_cells(comparison, dataset, kind)
+def _target_table(comparison: Comparison, dataset: str, kind: str, analysis: Mapping[str, Any]) -> str:
+    headings, rows = target_cells(comparison, dataset, kind, analysis)
     head = "".join(f"<th>{escape(heading)}</th>" for heading in headings)
     body = []
     for method, cells in rows.items():
         lines = (cell.partition("\n") for cell in cells)
-        tds = "".join(f"<td>{escape(first)}<br><small>{escape(second)}</small></td>" for first, _, second in lines)
+        tds = "".join(f"<td>{escape(first)}<br><small>{_lines(second)}</small></td>" for first, _, second in lines)
         body.append(f'<tr><td class="text">{escape(method)}</td>{tds}</tr>')
     return f'<div class="wide"><table><thead><tr><th class="text">method</th>{head}</tr></thead><tbody>{"".join(body)}</tbody></table></div>'
+
+
+def _lines(text: str) -> str:
+    return escape(text).replace("\n", "<br>")
+
+
+def _grid(grid: Grid) -> str:
+    """A table with its title; further lines of a cell in small print, long texts folded."""
+    kinds = ["text" if i == 0 or heading in OF_TEXT else "" for i, heading in enumerate(grid.headings)]
+    head = "".join(f'<th class="{kind}">{escape(heading)}</th>' for kind, heading in zip(kinds, grid.headings, strict=True))
+    body = []
+    for row in grid.rows:
+        cells = []
+        for kind, cell in zip(kinds, row, strict=True):
+            first, _, more = cell.partition("\n")
+            cells.append(
+                f'<td class="{"reason" if len(first) > 60 else kind}">{escape(first)}{f"<br><small>{_lines(more)}</small>" if more else ""}</td>'
+            )
+        body.append(f"<tr>{''.join(cells)}</tr>")
+    table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
+    return f'<h3>{escape(grid.title)}</h3><div class="wide">{table}</div><p class="quiet">{escape(grid.note)}</p>\n'
 
 
 def _figure(drawn: Drawn) -> str:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from math import inf, isfinite, isnan
 from typing import Any
 
@@ -30,11 +30,14 @@ class Entry:
         It ran, and its median error and median latency are within what the scene needs.
     on_front : bool
         No other configuration of the dataset is both faster and more accurate.
+    intervals : dict
+        By `rel_l2_median`, `mean_dof_m`, `latency_ms`: the ends of the 95 % interval, where there is one.
     """
 
     row: dict[str, Any]
     meets_needs: bool
     on_front: bool
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -75,6 +78,14 @@ class Entry:
         return _or_infinite(self.figure("latency_ms", "median"))
 
     @property
+    def unstable(self) -> list[str]:
+        """Why the timing is not to be relied on; empty if it is, or if nobody looked."""
+        latency = self.row.get("latency_ms") or {}
+        if latency.get("stable") is not False:
+            return []
+        return [str(reason) for reason in latency.get("unstable_because") or ["no reason given"]]
+
+    @property
     def mean_error_m(self) -> float:
         """ē, m; infinite if there is none."""
         return _or_infinite(self.figure("error", "mean_dof_m"))
@@ -110,16 +121,38 @@ def needs_of(comparison: Comparison, dataset: str) -> dict[str, float]:
     return {key: float(needs.get(key, inf)) for key in ("error", "latency_ms")}
 
 
-def entries_of(comparison: Comparison, dataset: str) -> list[Entry]:
-    """The configurations of a dataset in the order in which they ran, failed and skipped ones included."""
+def entries_of(comparison: Comparison, dataset: str, analysis: Mapping[str, Any] | None = None) -> list[Entry]:
+    """The configurations of a dataset in the order in which they ran, failed and skipped ones included.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    dataset : str
+        Its name.
+    analysis : dict, optional
+        From `mor_bench.harness.analysis.analyse`, for the intervals.
+    """
     needs = needs_of(comparison, dataset)
-    plain = [Entry(row, False, False) for row in comparison.rows if row["dataset"] == dataset]
+    rows = [row for row in comparison.rows if row["dataset"] == dataset]
+    plain = [Entry(row, False, False) for row in rows]
     points = [Point(e.latency_ms, e.error, str(i)) for i, e in enumerate(plain) if e.ran and isfinite(e.latency_ms)]
     front = {point.label for point in non_dominated(points)}
+    intervals = {record["label"]: _intervals(record) for record in (analysis or {}).get("rows", ()) if record["dataset"] == dataset}
     return [
-        Entry(e.row, e.ran and e.error <= needs["error"] and e.latency_ms <= needs["latency_ms"] and isfinite(e.error), str(i) in front)
+        Entry(
+            e.row,
+            e.ran and e.error <= needs["error"] and e.latency_ms <= needs["latency_ms"] and isfinite(e.error),
+            str(i) in front,
+            intervals.get(e.label, {}),
+        )
         for i, e in enumerate(plain)
     ]
+
+
+def _intervals(record: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """Of a record of the analysis, the intervals that have a lower end; an upper one of None is infinite."""
+    figures = {name: record[name] for name in ("rel_l2_median", "mean_dof_m", "latency_ms")}
+    return {name: (f["low"], inf if f["high"] is None else f["high"]) for name, f in figures.items() if f["low"] is not None}
 
 
 def warnings_of(entries: Sequence[Entry]) -> list[tuple[str, str]]:
@@ -128,7 +161,40 @@ def warnings_of(entries: Sequence[Entry]) -> list[tuple[str, str]]:
     for entry in entries:
         for warning in entry.warnings:
             labels.setdefault(warning, []).append(entry.label)
-    return [(given[0] if len(given) == 1 else f"{given[0]} and {len(given) - 1} more", warning) for warning, given in labels.items()]
+    return [(_and_more(given), warning) for warning, given in labels.items()]
+
+
+def notes_of(comparison: Comparison, dataset: str, analysis: Mapping[str, Any]) -> list[str]:
+    """What a reader must know before believing the tables: timings that are not stable, test sets that disagree, untested regimes."""
+    entries = entries_of(comparison, dataset)
+    said: dict[str, list[str]] = {}
+    for entry in entries:
+        for reason in entry.unstable:
+            said.setdefault(reason, []).append(entry.label)
+    notes = [f"{_and_more(labels)}: timing not stable: {reason}" for reason, labels in said.items()]
+    for record in analysis["hidden"]:
+        if record["dataset"] == dataset and record["worse"]:
+            ratio = "infinitely" if record["ratio"] is None else f"{number(record['ratio'])} times"
+            notes.append(f"{record['label']}: on the hidden test set the median error is {ratio} as large as on the shipped one")
+    methods = {entry.method for entry in entries}
+    notes += [f"{record['method']}: {record['verdict']}" for record in analysis["regimes"] if record["method"] in methods and not record["in_regime"]]
+    return notes
+
+
+def _and_more(labels: Sequence[str]) -> str:
+    return labels[0] if len(labels) == 1 else f"{labels[0]} and {len(labels) - 1} more"
+
+
+def basis_of(dataset: str, analysis: Mapping[str, Any]) -> str:
+    """What the intervals of a dataset rest on, in a sentence; empty if there are none."""
+    said = [f"Ranges hold 95 %: errors over {c['n']} {c['of']}" for c in analysis["clusters"] if c["dataset"] == dataset]
+    for found in analysis["timing"]:
+        if found["dataset"] == dataset:
+            spread = "with a spread that is typical" if found["specific"] is None else f"that differ by {percent(found['specific'])} %"
+            drift = f" and drift together by {percent(found['common'])} %" if found["common"] else ""
+            n = found["n_processes"]
+            said.append(f"latencies from one process {spread} of processes" if n == 1 else f"latencies over {n} processes {spread}{drift}")
+    return f"{', '.join(said)}." if said else ""
 
 
 def best_per_method(entries: Sequence[Entry]) -> list[Entry]:
@@ -189,6 +255,14 @@ def number(value: float | None) -> str:
     if size == 0 or 1e-3 <= size < 99.95:
         return f"{value:.3g}"
     return f"{value:.0f}" if 1 <= size < 1e5 else f"{value:.1e}"
+
+
+def span(interval: tuple[float, float] | None, scale: float = 1.0, of: Callable[[float], str] | None = None) -> str:
+    """An interval such as ``0.51–0.56``; a dash if there is none."""
+    if interval is None:
+        return "–"
+    low, high = ((of or number)(scale * end) for end in interval)
+    return f"{low}–{high}"
 
 
 def metres(value: float | None) -> str:

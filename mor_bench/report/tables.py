@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot
 from typing import TYPE_CHECKING, Any
@@ -13,24 +13,31 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from mor_bench.harness.analysis import analyse
 from mor_bench.harness.results import Comparison
 from mor_bench.report.summary import (
     Entry,
+    basis_of,
     dataset_names,
     discretisation_error,
     entries_of,
     headline,
     metres,
     needs_of,
+    notes_of,
     number,
     percent,
     short_names_used,
     short_swept,
+    span,
     warnings_of,
 )
 
 if TYPE_CHECKING:
     from mor_bench.harness.plan import Plan
+
+Analysis = Mapping[str, Any]
+"""The content of comparison.json, from `mor_bench.harness.analysis.analyse`."""
 
 NOT_REACHED = "not reached"
 
@@ -70,6 +77,14 @@ def _mark(entry: Entry) -> str:
     return "yes" if entry.meets_needs else "no" if entry.ran else entry.row["status"]
 
 
+def _latency(entry: Entry) -> str:
+    return number(entry.figure("latency_ms", "median")) + ("~" if entry.unstable else "")
+
+
+def _megabytes(value: float | None) -> str:
+    return number(None if value is None else value / 1e6)
+
+
 COLUMNS = (
     Column("ē\nm", lambda e: metres(e.figure("error", "mean_dof_m")), 9),
     Column("σ(e)\nm", lambda e: metres(e.figure("error", "std_dof_m")), 3),
@@ -77,10 +92,14 @@ COLUMNS = (
     Column("rel L2\nmed %", lambda e: percent(e.figure("error", "rel_l2_median")), 9),
     Column("\np95 %", lambda e: _bounded(e.figure("error", "rel_l2_p95")), 8),
     Column("\nmax %", lambda e: _bounded(e.figure("error", "rel_l2_max")), 8),
-    Column("latency\nmed ms", lambda e: number(e.figure("latency_ms", "median")), 9),
+    Column("latency\nmed ms", _latency, 9),
+    Column("\n95 %", lambda e: span(e.intervals.get("latency_ms")), 7),
     Column("\np95", lambda e: number(e.figure("latency_ms", "p95")), 8),
     Column("\np99", lambda e: number(e.figure("latency_ms", "p99")), 5),
+    Column("all\nthr", lambda e: number(e.figure("all_threads_ms", "median")), 3),
+    Column("q/s\nby 64", lambda e: number(e.figure("throughput", "64")), 4),
     Column("fit\ns", lambda e: number(e.figure("offline_s", "fit")), 6),
+    Column("mem\nMB", lambda e: _megabytes(e.figure("memory_bytes", "predict")), 3),
     Column("size\nkB", lambda e: _kilobytes(e.row.get("model_bytes")), 4),
     Column("\nthr", lambda e: str(e.row.get("threads") or "–"), 4),
     Column("Pa-\nreto", lambda e: "*" if e.on_front else "", 9),
@@ -94,13 +113,13 @@ def _columns_for(entries: Sequence[Entry], width: int) -> tuple[list[Column], in
     def needed(column: Column) -> int:
         return 1 + max(len(line) for line in [*column.heading.split("\n"), *map(column.cell, entries)])
 
-    chosen = list(COLUMNS)
+    chosen = [column for column in COLUMNS if column.weight == 9 or any(column.cell(entry) not in ("", "–") for entry in entries)]
     while len(chosen) > 5 and LABEL_WIDTH + sum(map(needed, chosen)) > width:
         chosen.remove(min(chosen, key=lambda column: column.weight))
     return chosen, max(width - sum(map(needed, chosen)), 8)
 
 
-def configuration_table(comparison: Comparison, dataset: str, width: int = 120) -> Table:
+def configuration_table(comparison: Comparison, dataset: str, width: int = 120, analysis: Analysis | None = None) -> Table:
     """A row per configuration of a dataset.
 
     Parameters
@@ -108,10 +127,12 @@ def configuration_table(comparison: Comparison, dataset: str, width: int = 120) 
     comparison : Comparison
     dataset : str
         Its name.
+    analysis : dict, optional
+        From `mor_bench.harness.analysis.analyse`, for the intervals.
     width : int
         Characters of a line; columns of little weight are left out where it is small.
     """
-    entries = entries_of(comparison, dataset)
+    entries = entries_of(comparison, dataset, analysis)
     columns, room = _columns_for(entries, width)
     table = Table(box=SIMPLE_HEAD, padding=0, show_edge=False)
     table.add_column("configuration", overflow="fold", max_width=room)
@@ -135,8 +156,8 @@ def _target_table(headings: Sequence[str], rows: dict[str, list[str]], width: in
     return table
 
 
-def target_cells(comparison: Comparison, dataset: str, kind: str) -> tuple[list[str], dict[str, list[str]]]:
-    """Headings and, for each method, a cell per target: the interpolated value, and the best real configuration.
+def target_cells(comparison: Comparison, dataset: str, kind: str, analysis: Analysis | None = None) -> tuple[list[str], dict[str, list[str]]]:
+    """Headings and, for each method, a cell per target: the interpolated value, the best real configuration and the 95 % interval.
 
     Parameters
     ----------
@@ -145,27 +166,38 @@ def target_cells(comparison: Comparison, dataset: str, kind: str) -> tuple[list[
         Its name.
     kind : {"time_at_error", "error_at_time"}
         Which table.
+    analysis : dict, optional
+        From `mor_bench.harness.analysis.analyse`, for the intervals.
     """
-    wanted: list[dict[str, Any]] = [record for record in comparison.frontier[kind] if record["dataset"] == dataset]
+    wanted: list[dict[str, Any]] = [record for record in (analysis or comparison.frontier)[kind] if record["dataset"] == dataset]
     swept = {entry.label: short_swept(entry.swept) for entry in entries_of(comparison, dataset)}
+    of_time = kind == "time_at_error"
     headings: dict[str, None] = {}
     rows: dict[str, list[str]] = {}
     for record in wanted:
-        if kind == "time_at_error":
-            heading, value, unit = f"{percent(record['target_rel_l2_median'])} %", number(record["latency_ms"]), "ms"
-        else:
-            heading, value, unit = f"{number(record['target_latency_ms'])} ms", percent(record["error"]), "%"
-        best = record["best"]
+        heading = f"{percent(record['target_rel_l2_median'])} %" if of_time else f"{number(record['target_latency_ms'])} ms"
+        value, best = record["latency_ms" if of_time else "error"], record["best"]
+        shown, unit = (number, "ms") if of_time else (percent, "%")
         cell = NOT_REACHED
         if best is not None:
-            real = number(best["latency_ms"]) if unit == "ms" else percent(best["error"])
-            cell = f"{value} {unit} ({real})\n{swept[best['label']]}".rstrip()
+            lines = [f"{shown(value)} {unit} ({shown(best['latency_ms' if of_time else 'error'])})", swept[best["label"]], _sure(record, shown)]
+            cell = "\n".join(filter(None, lines))
         headings[heading] = None
         rows.setdefault(record["method"], []).append(cell)
     return list(headings), rows
 
 
-def tables(comparison: Comparison, width: int = 120) -> list[RenderableType]:
+def _sure(record: Mapping[str, Any], shown: Callable[[float | None], str]) -> str:
+    """The interval of a target; where an end is beyond what was reached in enough resamples, it says so."""
+    low, high = record.get("low"), record.get("high")
+    if low == high == 0:
+        return ""
+    if low is None:
+        return f"{NOT_REACHED} in {percent(record['not_reached'])} %" if record.get("not_reached") else ""
+    return f"{shown(low)}–{NOT_REACHED if high is None else shown(high)}"
+
+
+def tables(comparison: Comparison, width: int = 120, analysis: Analysis | None = None) -> list[RenderableType]:
     """All console tables, a group for each dataset.
 
     Parameters
@@ -173,39 +205,90 @@ def tables(comparison: Comparison, width: int = 120) -> list[RenderableType]:
     comparison : Comparison
     width : int
         Characters of a line.
+    analysis : dict, optional
+        From `mor_bench.harness.analysis.analyse`, which is called if it is not given.
     """
-    return [_dataset_group(comparison, name, width) for name in dataset_names(comparison)]
+    analysis = analysis or analyse(comparison)
+    return [_dataset_group(comparison, name, width, analysis) for name in dataset_names(comparison)]
 
 
-def _dataset_group(comparison: Comparison, dataset: str, width: int) -> Group:
-    entries, needs = entries_of(comparison, dataset), needs_of(comparison, dataset)
+def pairwise_cells(comparison: Comparison, dataset: str, target: float, analysis: Analysis) -> tuple[list[str], list[list[str]], list[str]]:
+    """Who is faster than whom at an error: the methods that reach it, a row of cells for each, and those that do not.
+
+    ``+2.3``: the row's method is 2.3 times faster than the column's, ``-2.3``: slower; ``?1.1``: undecided.
+    """
+    records = [r for r in analysis["pairwise"] if r["dataset"] == dataset and r["target_rel_l2_median"] == target]
+    verdicts = {(record["a"], record["b"]): record for record in records}
+    methods = list(dict.fromkeys(row["method"] for row in comparison.rows if row["dataset"] == dataset))
+    absent = {name for record in records for name in record["by"]}
+    reached = [method for method in methods if method not in absent]
+    cells = [["·" if a == b else _verdict(verdicts[a, b]) for b in reached] for a in reached] if records else []
+    return reached, cells, [method for method in methods if method in absent]
+
+
+def _verdict(record: Mapping[str, Any]) -> str:
+    ratio = float(record["ratio"])
+    if record["verdict"] == "undecided":
+        return f"?{number(1 / ratio)}"
+    return f"+{number(1 / ratio)}" if record["verdict"] == "faster" else f"-{number(ratio)}"
+
+
+PAIRWISE_LEGEND = (
+    "+2: the row's method is 2 times faster than the column's; -2: slower; ?1.1: 1.1 times faster, but the 95 % interval of the ratio holds 1."
+)
+
+
+def _pairwise_parts(comparison: Comparison, dataset: str, analysis: Analysis) -> list[RenderableType]:
+    """Who is faster at the error that the dataset needs; nothing where less than two methods reach it."""
+    error = needs_of(comparison, dataset)["error"]
+    reached, cells, absent = pairwise_cells(comparison, dataset, error, analysis)
+    if len(reached) < 2:
+        return []
+    table = Table(box=SIMPLE_HEAD, padding=0, show_edge=False)
+    table.add_column("", overflow="fold")
+    for i in range(len(reached)):
+        table.add_column(f"({i + 1})", justify="right", min_width=5)
+    for i, (method, line) in enumerate(zip(reached, cells, strict=True)):
+        texts = (Text(cell, style={"+": "green", "-": "red"}.get(cell[0], "dim")) for cell in line)
+        table.add_row(Text(f"({i + 1}) {method}"), *texts)
+    legend = PAIRWISE_LEGEND + (f" Not reached by {', '.join(absent)}." if absent else "")
+    return [Text(""), Text(f"Who is faster at {percent(error)} %, the error that is needed", style="bold"), table, Text(legend, style="dim")]
+
+
+def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: Analysis) -> Group:
+    entries, needs = entries_of(comparison, dataset, analysis), needs_of(comparison, dataset)
     title = str(comparison.datasets.get(dataset, {}).get("title", ""))
     notes = [Text(f"{entry.label}: {entry.trouble}", style="red") for entry in entries if entry.trouble]
     unused = max((entry.row.get("n_unused") or 0 for entry in entries), default=0)
     if unused:
         notes.append(Text(f"{unused:,} samples with forces on both sides of the split are in neither part", style="yellow"))
+    notes += [Text(note, style="yellow") for note in notes_of(comparison, dataset, analysis)]
     notes += [Text(f"{label}: warning: {warning}", style="yellow") for label, warning in warnings_of(entries)]
+    marks = "Pareto *: no other configuration is both faster and more accurate (medians)."
+    marks += " Latency ~: not stable, see below." if any(entry.unstable for entry in entries) else ""
     parts: list[RenderableType] = [
         Text(f"{dataset}{f' – {title}' if title else ''}", style="bold"),
         Text(f"needs: relative L2 (median) ≤ {percent(needs['error'])} %, latency (median) ≤ {number(needs['latency_ms'])} ms"),
         Text(f"discretisation error of the scene itself: {discretisation_error(entries)}"),
         Text(""),
-        configuration_table(comparison, dataset, width),
-        Text("Pareto *: no other configuration is both faster and more accurate (medians).", style="dim"),
+        configuration_table(comparison, dataset, width, analysis),
+        Text(marks, style="dim"),
         *notes,
     ]
     for kind, heading in (
         ("time_at_error", "Time at error: median latency at a median relative L2 error (in brackets: the fastest real configuration)"),
         ("error_at_time", "Error at time: median relative L2 error within a median latency (in brackets: the best real configuration)"),
     ):
-        headings, rows = target_cells(comparison, dataset, kind)
+        headings, rows = target_cells(comparison, dataset, kind, analysis)
         parts += [Text(""), Text(heading, style="bold"), _target_table(headings, rows, width)]
-    parts.append(Text("  ".join(filter(None, [short_names_used(entries), "Nothing is extrapolated."])), style="dim"))
+    said = [basis_of(dataset, analysis), short_names_used(entries), "Nothing is extrapolated."]
+    parts.append(Text("  ".join(filter(None, said)), style="dim"))
+    parts += _pairwise_parts(comparison, dataset, analysis)
     parts += [Text(""), Text(headline(comparison, dataset), style="bold"), Text("")]
     return Group(*parts)
 
 
-def print_tables(comparison: Comparison, console: Console | None = None) -> None:
+def print_tables(comparison: Comparison, console: Console | None = None, analysis: Analysis | None = None) -> None:
     """Print all tables.
 
     Parameters
@@ -213,10 +296,12 @@ def print_tables(comparison: Comparison, console: Console | None = None) -> None
     comparison : Comparison
     console : rich.console.Console, optional
         Standard output by default, 120 characters wide where that is no terminal.
+    analysis : dict, optional
+        From `mor_bench.harness.analysis.analyse`, which is called if it is not given.
     """
     console = console or Console(highlight=False, width=None if sys.stdout.isatty() else 120)
     with console.capture() as captured:
-        for part in tables(comparison, console.width):
+        for part in tables(comparison, console.width, analysis):
             console.print(part, highlight=False)
     encoding = console.encoding or "utf-8"  # a redirected stream of a legacy code page must not end a long run with an error
     console.file.write(captured.get().encode(encoding, "replace").decode(encoding))
