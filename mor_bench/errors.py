@@ -23,6 +23,10 @@ class NotFittedError(MorBenchError, RuntimeError):
     """`predict` or `save` was called before `fit`."""
 
 
+class UnknownRangeError(MorBenchError, RuntimeError):
+    """A method cannot tell whether a load is out of its training range, since it does not know its training loads."""
+
+
 class UnsupportedSceneError(MorBenchError):
     """A method cannot handle a scene; the message says why."""
 

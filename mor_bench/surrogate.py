@@ -14,9 +14,10 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mor_bench.errors import InvalidInputError, MorBenchError, NotFittedError, StoreError, UnsupportedSceneError
+from mor_bench.errors import InvalidInputError, MorBenchError, NotFittedError, StoreError, UnknownRangeError, UnsupportedSceneError
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.load_range import LoadRange
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import check_parameters, list_suite, load_class, load_method_spec
 
@@ -25,16 +26,21 @@ SCHEMA_VERSION = 1
 MAX_FORCE_N = 1e30
 """Largest nodal force component; its cube must not overflow."""
 
+RANGE = "range."
+"""Beginning of the names of the arrays that hold the range of the training loads; `_state` has none such."""
+
 
 class Surrogate(ABC):
     """A map from nodal forces to nodal displacements of one scene.
 
     A subclass stores its knobs in ``__init__`` under their own names and nothing else, annotates them (pydantic `Field`
-    constraints give their range), fits inside ``with self._fitting(scene)``, and begins `predict` with `_checked_forces`.
+    constraints give their range), fits inside ``with self._fitting(scene)``, takes its samples from `_checked_snapshots`, and
+    begins `predict` with `_checked_forces`.
     What it learns ends in an underscore.
     """
 
     scene_: Scene
+    range_: LoadRange
 
     needs_snapshots: ClassVar[bool] = True
     """Whether `fit` learns from snapshots; their cost is charged only to methods that do."""
@@ -82,6 +88,43 @@ class Surrogate(ABC):
         """None, or the reason why the method cannot handle a scene."""
         return None
 
+    def out_of_range(self, forces: ArrayLike) -> NDArray[np.bool_]:
+        """Which loads lie out of the range of the training loads.
+
+        A flag says that training held nothing like the load, see `mor_bench.snapshots.load_range`; it is no bound on the
+        error. A method that needs no snapshots has no such range and flags nothing.
+
+        Parameters
+        ----------
+        forces : (n_nodes, 3) or (n, n_nodes, 3)
+            Nodal forces, N.
+
+        Returns
+        -------
+        bool array of shape () or (n,)
+
+        Raises
+        ------
+        InvalidInputError
+            On a wrong shape or dtype, NaN or infinity.
+        NotFittedError
+            Before `fit`.
+        UnknownRangeError
+            If the method learns but its range is not known: its `fit` does not check its snapshots by `_checked_snapshots`,
+            or it was loaded from a file that was written before ranges were.
+        """
+        batch = self._checked_forces(forces)
+        if not self.needs_snapshots:
+            flags = np.zeros(len(batch), dtype=bool)
+        elif hasattr(self, "range_"):
+            flags = self.range_.excludes(batch)
+        else:
+            raise UnknownRangeError(
+                f"the loads that this {type(self).__name__} was trained on are not known: its `fit` does not check them by `_checked_snapshots`, "
+                "or its file is of an older version; then fit it again."
+            )
+        return flags.reshape(np.shape(forces)[:-2])
+
     @property
     def parameters(self) -> dict[str, Any]:
         """The knobs and their values."""
@@ -106,7 +149,8 @@ class Surrogate(ABC):
             "parameters": json.dumps(self.parameters),
             "scene": self.scene_.spec.model_dump_json(),
         }
-        arrays = {name: np.ascontiguousarray(array) for name, array in self._state().items()}
+        known = {RANGE + name: array for name, array in self.range_.arrays().items()} if hasattr(self, "range_") else {}
+        arrays = {name: np.ascontiguousarray(array) for name, array in {**self._state(), **known}.items()}
         header["sha256"] = _digest(header, arrays)
         write_atomically(Path(path), serialise(arrays, metadata=header))
 
@@ -135,11 +179,12 @@ class Surrogate(ABC):
             raise
 
     def _checked_snapshots(self, snapshots: Snapshots | None) -> Snapshots:
-        """The training samples, which this method cannot do without."""
+        """The training samples, which this method cannot do without; the range of their loads is remembered."""
         if snapshots is None or len(snapshots) == 0:
             raise InvalidInputError(f"{type(self).__name__} needs at least one training sample; got none.")
         if not np.isfinite(snapshots.free_displacements).all() or not np.isfinite(snapshots.loads.vectors).all():
             raise InvalidInputError("the training snapshots hold NaN or infinity.")
+        self.range_ = LoadRange.of(snapshots)
         return snapshots
 
     def _checked_forces(self, forces: ArrayLike) -> NDArray[np.float64]:
@@ -226,7 +271,10 @@ def load_surrogate(path: str | Path) -> Surrogate:
         method = make_surrogate(load_class(header["surrogate"]), json.loads(header["parameters"]))
         scene_content = json.loads(header["scene"])
         method.scene_ = load_scene(scene_content)
+        ranges = {name.removeprefix(RANGE): state.pop(name) for name in list(state) if name.startswith(RANGE)}
         method._restore(state)
+        if ranges:
+            method.range_ = LoadRange.from_arrays(ranges, method.scene_.mesh.n_nodes)
     except (MorBenchError, KeyError, ValueError, IndexError, TypeError, AttributeError) as error:
         raise StoreError(f"{path}: its content does not make a {header['surrogate'].partition(':')[2]}: {error}") from None
     return method
