@@ -184,7 +184,7 @@ class Surrogate(ABC):
             raise InvalidInputError(f"{type(self).__name__} needs at least one training sample; got none.")
         displacements, vectors = snapshots.free_displacements, snapshots.loads.vectors
         shape = (len(snapshots), len(self.scene_.free_dofs))
-        if displacements.shape != shape or displacements.dtype.kind not in "fiu" or vectors.dtype.kind not in "fiu":
+        if displacements.shape != shape or not {displacements.dtype.kind, vectors.dtype.kind} <= set("fiu"):
             raise InvalidInputError(
                 f"the training samples must be real numbers, displacements of shape {shape}; got {displacements.dtype} of shape "
                 f"{displacements.shape} and forces in {vectors.dtype}."
