@@ -408,6 +408,39 @@ def pick(
             raise typer.Exit(1)
 
 
+@app.command()
+def stress(
+    method: Annotated[
+        list[str] | None, typer.Option("--method", "-m", help="Name or TOML file; repeat for more. [default: all of the suite]")
+    ] = None,
+    case: Annotated[list[str] | None, typer.Option("--case", help="Name of a hard case; repeat for more. [default: all]")] = None,
+    profile: Annotated[ProfileName, typer.Option(help="Parameters of the method files; quick also cuts trainings short.")] = ProfileName.quick,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="JSON file to write.")] = None,
+    cache: Cache = None,
+    suite: Suite = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output and the rest to standard error.")] = False,
+) -> None:
+    """Try the hard cases on the full-order model and every method: what is expected, what happened. Falling short is no error."""
+    with _clear_errors():
+        from rich.status import Status
+
+        from mor_bench.harness.stress import stress as run_cases
+        from mor_bench.report.hard_cases import print_stress
+
+        console = _console(stderr=as_json)
+        with Status("", console=console) as status:
+            found = run_cases(
+                method or None, case or None, profile.value, cache=cache, suite=suite,
+                starting=lambda name, tried, number, total: status.update(f"{number} of {total}: {name}, {tried}"),
+            )  # fmt: skip
+        print_stress(found, console)
+        if out is not None:
+            found.write(out)
+            console.print(str(out), highlight=False, soft_wrap=True)
+        if as_json:
+            print(json.dumps(found.as_dict(), indent=1, allow_nan=False, ensure_ascii=False))
+
+
 @app.callback(invoke_without_command=True)
 def main(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
     """Compare model-order-reduction methods for hyperelastic solids: error at equal time, time at equal error."""

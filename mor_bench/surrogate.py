@@ -187,7 +187,14 @@ class Surrogate(ABC):
         """The training samples, which this method cannot do without; the range of their loads is remembered."""
         if snapshots is None or len(snapshots) == 0:
             raise InvalidInputError(f"{type(self).__name__} needs at least one training sample; got none.")
-        if not np.isfinite(snapshots.free_displacements).all() or not np.isfinite(snapshots.loads.vectors).all():
+        displacements, vectors = snapshots.free_displacements, snapshots.loads.vectors
+        shape = (len(snapshots), len(self.scene_.free_dofs))
+        if displacements.shape != shape or not {displacements.dtype.kind, vectors.dtype.kind} <= set("fiu"):
+            raise InvalidInputError(
+                f"the training samples must be real numbers, displacements of shape {shape}; got {displacements.dtype} of shape "
+                f"{displacements.shape} and forces in {vectors.dtype}."
+            )
+        if not np.isfinite(displacements).all() or not np.isfinite(vectors).all():
             raise InvalidInputError("the training snapshots hold NaN or infinity.")
         self.range_ = LoadRange.of(snapshots)
         return snapshots
@@ -196,7 +203,10 @@ class Surrogate(ABC):
         """Forces as (n, n_nodes, 3) float64; the first line of every `predict`."""
         if not hasattr(self, "scene_"):
             raise NotFittedError(f"{type(self).__name__} must be fitted before it predicts.")
-        array = np.asarray(forces)
+        try:
+            array = np.asarray(forces)
+        except (ValueError, TypeError) as error:
+            raise InvalidInputError(f"`forces` must be an array of real numbers: {error}") from None
         n_nodes = self.scene_.mesh.n_nodes
         if array.dtype.kind not in "fiu":
             raise InvalidInputError(f"`forces` must hold real numbers; got dtype {array.dtype}.")

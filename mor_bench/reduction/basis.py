@@ -46,12 +46,12 @@ def pod(snapshots: NDArray[np.float64], n_modes: int | None = None) -> Basis:
     Raises
     ------
     InvalidInputError
-        If the snapshots are all zero.
+        If the snapshots are all zero, or hold NaN or infinity.
     """
+    if not (snapshots.any() and np.isfinite(snapshots).all()):
+        raise InvalidInputError("the snapshots are all zero, or not finite: they span no basis.")
     _, values, vt = svd(snapshots, full_matrices=False, check_finite=False)
     rank = int((values > values[0] * max(snapshots.shape) * np.finfo(float).eps).sum())
-    if rank == 0:
-        raise InvalidInputError("the snapshots are all zero: they span no basis.")
     if n_modes is not None and n_modes > rank:
         warnings.warn(f"{n_modes} modes were asked for, but the {len(snapshots)} snapshots have rank {rank}: {rank} are used.", stacklevel=2)
     kept = rank if n_modes is None else min(n_modes, rank)

@@ -80,9 +80,11 @@ def in_grid(mesh: Mesh) -> Mesh:
 
 
 def check_numbers(points: NDArray[np.float64], cells: NDArray[np.int64]) -> None:
-    """Raise `SpecError` if there is nothing, a position is not finite, or a cell has a node that is not there."""
+    """Raise `SpecError` if there is nothing, a position is not finite, or a cell has too few nodes or one that is not there."""
     if not len(points) or not len(cells):
         raise SpecError("there must be points and cells; got none.")
+    if cells.ndim != 2 or cells.shape[1] not in FACES:
+        raise SpecError(f"cells must have shape (n_cells, 8) for H8 or (n_cells, 4) for T4; got {cells.shape}.")
     if not np.isfinite(points).all():
         raise SpecError(f"positions must be finite; point {int(np.argwhere(~np.isfinite(points))[0, 0])} (counted from 0) is not.")
     if cells.min() < 0 or cells.max() >= len(points):

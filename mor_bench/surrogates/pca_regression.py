@@ -51,9 +51,9 @@ class PCARegression(Surrogate):
     input : {"linear-response", "force"}
         What the coordinates z are taken of.
     n_input_modes : int
-        Length of z; capped at the rank of the input.
+        Length of z; capped at the rank of the input with a warning.
     n_output_modes : int
-        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank.
+        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a warning.
     degree : int
         Highest degree of the monomials.
     ridge : float
@@ -89,12 +89,12 @@ class PCARegression(Surrogate):
             else:
                 inputs = forces
             used = np.flatnonzero(inputs.any(axis=0))  # of forces only a few columns
-            modes = pod(inputs[:, used]).modes[:, : self.n_input_modes]
+            modes = pod(inputs[:, used], self.n_input_modes).modes
             axes = np.zeros((inputs.shape[1], modes.shape[1]))
             axes[used] = modes / np.sqrt(((inputs[:, used] @ modes) ** 2).mean(axis=0))
             features = monomials(inputs @ axes, monomial_indices(axes.shape[1], self.degree))
             feature_scale = np.sqrt((features**2).mean(axis=0))
-            modes = pod(targets).modes[:, : self.n_output_modes]
+            modes = pod(targets, self.n_output_modes).modes
             regression = Ridge(alpha=self.ridge * len(features), fit_intercept=False, solver="cholesky")
             regression.fit(features / feature_scale, targets @ modes)
             weights = np.atleast_2d(regression.coef_) / feature_scale

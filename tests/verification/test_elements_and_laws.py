@@ -13,14 +13,13 @@ from scipy.spatial.transform import Rotation
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, SolverError
+from mor_bench.harness.stress.setups import cantilever, dense, distorted_box, free_assembler, patch_test_error, tip
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.elements import H8, T4, shape_gradients
 from mor_bench.mechanics.linear import BandedCholesky
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.materials import Material, MooneyRivlin, NeoHookean, Ogden, SaintVenantKirchhoff
 from mor_bench.scene.mesh import Mesh, box_mesh
-
-from .test_full_order import dense, free_assembler
 
 Array = NDArray[np.float64]
 LAWS: dict[str, Material] = {
@@ -39,23 +38,13 @@ ELEMENTS = [("hexahedron", False), ("hexahedron", True), ("tetrahedron", False)]
 EVERY = list(itertools.product(LAWS, ELEMENTS))
 
 
-def warped(element: str, cells: tuple[int, int, int] = (2, 2, 2), seed: int = 0) -> Mesh:
-    """A unit box whose inner nodes are moved by up to 0.3 of a cell's edge (0.15 with tetrahedra, which are thinner)."""
-    mesh = box_mesh((1.0, 1.0, 1.0), cells, element == "tetrahedron")
-    inner = np.all((mesh.points > 1e-9) & (mesh.points < 1 - 1e-9), axis=1)
-    reach = (0.15 if element == "tetrahedron" else 0.3) / np.array(cells)
-    points = mesh.points.copy()
-    points[inner] += np.random.default_rng(seed).uniform(-1, 1, (int(inner.sum()), 3)) * reach
-    return Mesh(points, mesh.cells)
-
-
-def assembler(mesh: Mesh, law: Material, selective: bool = False) -> Assembler:
-    return Assembler(mesh.points, mesh.cells, np.arange(mesh.n_dofs).reshape(-1, 3), mesh.n_dofs, law, selective=selective)
+def warped(element: str, cells: tuple[int, int, int] = (2, 2, 2)) -> Mesh:
+    return distorted_box(cells, element == "tetrahedron")
 
 
 @pytest.mark.parametrize(("law", "kind"), EVERY)
 def test_taylor(law: str, kind: tuple[str, bool]) -> None:
-    model = assembler(warped(kind[0]), LAWS[law], kind[1])
+    model = free_assembler(warped(kind[0]), LAWS[law], kind[1])
     worst = np.inf
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -73,7 +62,7 @@ def test_taylor(law: str, kind: tuple[str, bool]) -> None:
 @pytest.mark.parametrize(("law", "kind"), EVERY)
 def test_rest_is_stress_free_with_six_zero_modes_and_rotations_cost_nothing(law: str, kind: tuple[str, bool]) -> None:
     mesh = warped(kind[0])
-    model = assembler(mesh, LAWS[law], kind[1])
+    model = free_assembler(mesh, LAWS[law], kind[1])
     state, tangent = model.force_and_tangent(np.zeros(mesh.n_dofs))
     stiffness = dense(model, tangent)
     size = np.linalg.norm(stiffness, 2)
@@ -87,24 +76,13 @@ def test_rest_is_stress_free_with_six_zero_modes_and_rotations_cost_nothing(law:
 
 @pytest.mark.parametrize(("law", "kind"), EVERY)
 def test_patch_of_warped_cells(law: str, kind: tuple[str, bool]) -> None:
-    mesh = warped(kind[0], (3, 3, 3))
-    gradient = np.eye(3) + np.array([[0.1, 0.05, -0.02], [0.03, -0.08, 0.04], [0.0, 0.06, 0.07]])
-    exact = mesh.points @ (gradient - np.eye(3)).T
-    outer = np.any((mesh.points < 1e-9) | (mesh.points > 1 - 1e-9), axis=1)
-    model = assembler(mesh, LAWS[law], kind[1])
-    inner = np.flatnonzero(np.repeat(~outer, 3))
-    u = exact.ravel().copy()
-    u[inner] += 0.01 * np.random.default_rng(0).normal(size=len(inner)) * 0.3
-    for _ in range(12):
-        state, values = model.force_and_tangent(u)
-        u[inner] -= np.linalg.solve(dense(model, values)[np.ix_(inner, inner)], state.force[inner])
-    assert np.abs(u.reshape(-1, 3) - exact).max() <= 1e-12
+    assert patch_test_error(warped(kind[0], (3, 3, 3)), LAWS[law], kind[1]) <= 1e-12
 
 
 def homogeneous(gradient: Array, law: Material, element: str, selective: bool) -> tuple[Array, float]:
     """First Piola-Kirchhoff stress and energy density of a unit cube under the deformation gradient F, from nodal forces."""
     mesh = box_mesh((1.0, 1.0, 1.0), (2, 2, 2), element == "tetrahedron")
-    state = assembler(mesh, law, selective).force((mesh.points @ (gradient - np.eye(3)).T).ravel())
+    state = free_assembler(mesh, law, selective).force((mesh.points @ (gradient - np.eye(3)).T).ravel())
     forces = state.force.reshape(-1, 3)
     return np.stack([forces[mesh.points[:, axis] == 1.0].sum(axis=0) for axis in range(3)], axis=1), state.energy_j
 
@@ -170,7 +148,7 @@ def test_stress_of_homogeneous_states(law: str, kind: tuple[str, bool], state: s
 @pytest.mark.parametrize("law", list(LAWS))
 def test_tangent_where_two_stretches_are_equal(law: str) -> None:
     """There the derivative of the principal stresses is a limit."""
-    model = assembler(box_mesh((1.0, 1.0, 1.0), (2, 2, 2)), LAWS[law])
+    model = free_assembler(box_mesh((1.0, 1.0, 1.0), (2, 2, 2)), LAWS[law])
     points = box_mesh((1.0, 1.0, 1.0), (2, 2, 2)).points
     u, direction = (points * [0.3, -0.1, -0.1]).ravel(), np.random.default_rng(0).normal(size=model.n_dofs)
     here = dense(model, model.force_and_tangent(u)[1]) @ direction
@@ -205,7 +183,7 @@ def test_stress_of_saint_venant_kirchhoff_is_least_at_one_over_root_three(kind: 
 @pytest.mark.parametrize(("law", "kind"), EVERY)
 def test_the_derivative_of_the_force_is_symmetric(law: str, kind: tuple[str, bool]) -> None:
     """Reciprocity from forces alone, and the tangent's own matrix, whose lower triangle is its upper one."""
-    model = assembler(warped(kind[0]), LAWS[law], kind[1])
+    model = free_assembler(warped(kind[0]), LAWS[law], kind[1])
     rng = np.random.default_rng(0)
     u, one, other = 0.02 * rng.normal(size=model.n_dofs), rng.normal(size=model.n_dofs), rng.normal(size=model.n_dofs)
 
@@ -241,7 +219,7 @@ def test_the_vectorised_kernel_is_the_general_one() -> None:
     u = 0.03 * np.random.default_rng(0).normal(size=mesh.n_dofs)
     for selective in (False, True):
         (fast, k), (slow, l) = (
-            assembler(mesh, law, selective).force_and_tangent(u) for law in (SaintVenantKirchhoff(500.0, 0.4), Renamed(500.0, 0.4))
+            free_assembler(mesh, law, selective).force_and_tangent(u) for law in (SaintVenantKirchhoff(500.0, 0.4), Renamed(500.0, 0.4))
         )
         np.testing.assert_allclose(fast.force, slow.force, atol=1e-12 * np.abs(slow.force).max() * 10)
         np.testing.assert_allclose(k, l, atol=1e-13 * np.abs(l).max() * 10)
@@ -312,39 +290,6 @@ def test_manufactured_solution_converges_at_the_right_order(law: str, kind: tupl
     order = np.log(np.divide(coarse, fine)) / np.log(n[1] / n[0])
     assert order[0] >= 1.95
     assert order[1] >= 0.95
-
-
-def material_spec(law: str, young: float, poisson: float) -> dict[str, Any]:
-    """The material table of a law with Young's modulus, Pa, and Poisson's ratio at rest."""
-    shear, bulk = young / (2 * (1 + poisson)), young / (3 * (1 - 2 * poisson))
-    if law == "mooney-rivlin":
-        return {"law": law, "c10_pa": 0.4 * shear, "c01_pa": 0.1 * shear, "bulk_pa": bulk}
-    if law == "ogden":
-        return {"law": law, "mu_pa": [1.6 * shear / 2.1, -0.4 * shear / 1.7], "alpha": [2.1, -1.7], "bulk_pa": bulk}
-    return {"law": law, "young_pa": young, "poisson": poisson}
-
-
-def cantilever(size: list[float], cells: list[int], poisson: float, integration: str = "full", law: str = "saint-venant-kirchhoff") -> FullOrderModel:
-    spec: dict[str, Any] = {
-        "geometry": {"shape": "box", "size_m": size, "cells": cells},
-        "discretisation": {"integration": integration},
-        "material": material_spec(law, 12e3, poisson),
-        "supports": [{"region": "x-min"}],
-        "loads": {"region": "x-max", "kind": "force", "patch_area_m2": size[1] * size[2], "samples_per_patch": 1, "magnitude_n": [0.0, 1.0]},
-        "needs": {"error": 0.01, "latency_ms": 1.0},
-    }
-    return FullOrderModel(mor_bench.load_scene(spec))
-
-
-def tip(model: FullOrderModel, force_z: float) -> Array:
-    """Mean displacement of the end face under a force spread over it."""
-    scene = model.scene
-    load = np.zeros((scene.mesh.n_nodes, 3))
-    load[:, 2] = scene.patch_weights.toarray()[0] * force_z
-    u = np.zeros(scene.mesh.n_dofs)
-    u[scene.free_dofs] = model.solve(load.ravel()[scene.free_dofs]).displacement
-    end = scene.mesh.points[:, 0] == scene.mesh.points[:, 0].max()
-    return np.asarray(u.reshape(-1, 3)[end].mean(axis=0))
 
 
 @pytest.fixture(scope="module")

@@ -7,45 +7,22 @@ import warnings
 
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import mor_bench
 from mor_bench.errors import IllConditionedWarning, InvalidInputError, SolverError, UnconstrainedBodyError
+from mor_bench.harness.stress.setups import LAW, dense, distorted_box, free_assembler
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.linear import BandedCholesky, MultigridFactor, NotPositiveDefiniteError, SparseLU
 from mor_bench.mechanics.model import SOLVERS, FullOrderModel
 from mor_bench.mechanics.rotated import BlockJacobi, conjugate_gradients
-from mor_bench.reduction.galerkin import GalerkinProblem
-from mor_bench.scene.materials import Material, SaintVenantKirchhoff
+from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import SolverName
 
 Array = NDArray[np.float64]
-LAW = SaintVenantKirchhoff(young_pa=500.0, poisson=0.4)
-
-
-def free_assembler(mesh: Mesh, law: SaintVenantKirchhoff = LAW) -> Assembler:
-    """All dofs free, numbered as in the mesh."""
-    return Assembler(mesh.points, mesh.cells, np.arange(mesh.n_dofs).reshape(-1, 3), mesh.n_dofs, law)
-
-
-def distorted(cells: tuple[int, int, int], seed: int = 0) -> Mesh:
-    """A unit box whose inner nodes are moved by up to 0.3 of a cell's edge."""
-    mesh = box_mesh((1.0, 1.0, 1.0), cells)
-    points = mesh.points.copy()
-    inner = np.all((points > 1e-9) & (points < 1 - 1e-9), axis=1)
-    points[inner] += np.random.default_rng(seed).uniform(-0.3, 0.3, (inner.sum(), 3)) / np.array(cells)
-    return Mesh(points, mesh.cells)
-
-
-def dense(assembler: Assembler, values: Array) -> Array:
-    """The whole tangent as a dense matrix."""
-    pattern = assembler.pattern
-    upper = sp.csr_array((values, pattern.indices, pattern.indptr), shape=(pattern.n, pattern.n)).toarray()
-    return np.asarray(upper + np.triu(upper, 1).T)
 
 
 def stress(gradient: Array, law: SaintVenantKirchhoff = LAW) -> Array:
@@ -57,7 +34,7 @@ def stress(gradient: Array, law: SaintVenantKirchhoff = LAW) -> Array:
 
 
 def test_patch_of_distorted_cells() -> None:
-    mesh = distorted((3, 3, 3))
+    mesh = distorted_box((3, 3, 3))
     gradient = np.eye(3) + np.array([[0.1, 0.05, -0.02], [0.03, -0.08, 0.04], [0.0, 0.06, 0.07]])
     exact = mesh.points @ (gradient - np.eye(3)).T
     outer = np.any((mesh.points < 1e-9) | (mesh.points > 1 - 1e-9), axis=1)
@@ -73,7 +50,7 @@ def test_patch_of_distorted_cells() -> None:
 @pytest.mark.parametrize("seed", range(20))
 def test_taylor_energy_to_force_and_force_to_tangent(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    mesh = distorted((2, 2, 2), seed)
+    mesh = distorted_box((2, 2, 2), seed=seed)
     assembler = free_assembler(mesh)
     u, direction = 0.05 * rng.normal(size=mesh.n_dofs), rng.normal(size=mesh.n_dofs)
     state, values = assembler.force_and_tangent(u)
@@ -91,7 +68,7 @@ def test_taylor_energy_to_force_and_force_to_tangent(seed: int) -> None:
 
 
 def test_force_alone_equals_force_with_tangent() -> None:
-    assembler = free_assembler(distorted((2, 3, 2)))
+    assembler = free_assembler(distorted_box((2, 3, 2)))
     u = 0.05 * np.random.default_rng(0).normal(size=assembler.n_dofs)
     alone, (state, _) = assembler.force(u), assembler.force_and_tangent(u)
     np.testing.assert_allclose(alone.force, state.force, rtol=1e-13, atol=1e-13)
@@ -100,7 +77,7 @@ def test_force_alone_equals_force_with_tangent() -> None:
 
 
 def test_free_body_at_rest_has_exactly_six_zero_modes() -> None:
-    assembler = free_assembler(distorted((2, 2, 2)))
+    assembler = free_assembler(distorted_box((2, 2, 2)))
     stiffness = dense(assembler, assembler.force_and_tangent(np.zeros(assembler.n_dofs))[1])
     values = np.linalg.eigvalsh(stiffness)
     assert (np.abs(values) <= 1e-12 * values[-1]).sum() == 6
@@ -108,7 +85,7 @@ def test_free_body_at_rest_has_exactly_six_zero_modes() -> None:
 
 
 def test_rigid_rotations_cost_nothing() -> None:
-    mesh = distorted((2, 2, 2))
+    mesh = distorted_box((2, 2, 2))
     assembler = free_assembler(mesh)
     stiffness = dense(assembler, assembler.force_and_tangent(np.zeros(mesh.n_dofs))[1])
     for rotation in Rotation.random(100, random_state=0).as_matrix():
@@ -136,17 +113,6 @@ def test_simple_shear() -> None:
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
     u = (mesh.points @ (gradient - np.eye(3)).T).ravel()
     assert free_assembler(mesh).force(u).energy_j == pytest.approx(30.69196, abs=1e-5)
-
-
-def confined_column(law: Material = LAW, tetrahedra: bool = False, selective: bool = False) -> GalerkinProblem:
-    """One cube between rigid lateral walls whose top moves along the axis as one: a single unknown."""
-    mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1), tetrahedra)
-    dofs = np.full((8, 3), 4)
-    dofs[mesh.points[:, 0] == 1.0, 0] = np.arange(4)
-    return GalerkinProblem(Assembler(mesh.points, mesh.cells, dofs, 4, law, selective=selective), np.ones((4, 1)))
-
-
-LIMIT_PA = -206.19652
 
 
 def test_a_huge_load_ends_in_the_answer_or_in_a_typed_error() -> None:

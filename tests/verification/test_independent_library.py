@@ -13,11 +13,12 @@ from tensortrax.math import log, sqrt, trace
 from tensortrax.math.linalg import det
 
 import mor_bench
+from mor_bench.harness.stress.setups import material_table
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.scene import Scene
 
-from .test_elements_and_laws import LAWS, material_spec
+from .test_elements_and_laws import LAWS
 
 Array = NDArray[np.float64]
 
@@ -76,7 +77,7 @@ def test_agrees_with_felupe_on_fifty_random_loads() -> None:
 @pytest.mark.parametrize("law", list(LAWS))
 def test_agrees_with_felupe_on_every_law_and_element(law: str, element: str) -> None:
     spec = mor_bench.load_scene("beam-tiny").spec.model_dump(mode="json")
-    material = material_spec(law, 500.0, 0.4)
+    material = material_table(law, 500.0, 0.4)
     if law == "ogden":
         material |= {"alpha": [2.0, -2.0], "mu_pa": [140.0, -35.0]}
     compare(mor_bench.load_scene({**spec, "discretisation": {"element": element}, "material": material}), 5)

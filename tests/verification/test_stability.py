@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -11,15 +10,11 @@ from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.errors import NoEquilibriumError, SolverError
-from mor_bench.mechanics.assembly import Assembler
+from mor_bench.harness.stress.setups import LAW, LIMIT_PA, Arch, confined_column, dense, make_arch
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import solve_equilibrium
 from mor_bench.mechanics.stability import LimitPoint, limit_load, lowest_tangent_eigenvalue, solve_on_path
-from mor_bench.reduction.galerkin import GalerkinProblem
-from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import Scene
-
-from .test_full_order import LAW, LIMIT_PA, confined_column, dense
 
 Array = NDArray[np.float64]
 
@@ -64,54 +59,27 @@ def test_lowest_eigenvalue_of_a_large_tangent_is_that_of_the_dense_matrices() ->
     assert lowest_tangent_eigenvalue(model, 0 * u) == pytest.approx(1.0, rel=1e-10)
 
 
-@dataclass(frozen=True)
-class Arch:
-    """Two straight bars between hinges 4 m apart, the crown 0.4 m above them; the load is 2 N downwards on the crown's edge."""
-
-    problem: GalerkinProblem
-    load: Array
-    crown: NDArray[np.int64]
-    limit: LimitPoint
+@pytest.fixture(scope="module")
+def arch() -> Arch:
+    return make_arch()
 
 
 @pytest.fixture(scope="module")
-def arch() -> Arch:
-    mesh = box_mesh((4.0, 1.0, 0.2), (8, 1, 2))
-    x, _, z = mesh.points.T
-    fixed = ((x == 0) | (x == 4.0)) & np.isclose(z, 0.1)
-    crown_nodes = np.flatnonzero((x == 2.0) & (z == 0.2))
-    lifted = Mesh(mesh.points + np.outer(0.4 * (1 - np.abs(x / 2 - 1)), [0, 0, 1]), mesh.cells)
-    n = 3 * int((~fixed).sum())
-    dofs = np.full((mesh.n_nodes, 3), n)
-    dofs[~fixed] = np.arange(n).reshape(-1, 3)
-    problem = GalerkinProblem(Assembler(lifted.points, lifted.cells, dofs, n, LAW), np.eye(n))
-    crown = dofs[crown_nodes, 2]
-    load = np.zeros(n)
-    load[crown] = -1.0
-    limit = limit_load(problem, load)
-    assert limit is not None
-    return Arch(problem, load, crown, limit)
+def limit(arch: Arch) -> LimitPoint:
+    found = limit_load(arch.problem, arch.load)
+    assert found is not None
+    return found
 
 
-def test_limit_of_the_arch_is_the_greatest_reaction_to_a_prescribed_displacement(arch: Arch) -> None:
-    others = np.setdiff1d(np.arange(len(arch.load)), arch.crown)
-    q, reactions = np.zeros(len(arch.load)), []
-    for depth in np.linspace(0.0, 0.4, 81):
-        q[arch.crown] = -depth
-        for _ in range(8):
-            state, tangent = arch.problem.linearise(q)
-            q[others] -= np.linalg.solve(tangent[np.ix_(others, others)], state.force[others])
-        reactions.append(-arch.problem.force(q).force[arch.crown].mean())
-    most = int(np.argmax(reactions))
-    top = np.polynomial.Polynomial.fit(np.arange(most - 2, most + 3), reactions[most - 2 : most + 3], 4)
-    assert arch.limit.factor == pytest.approx(top(np.linspace(most - 1, most + 1, 2001)).max(), rel=1e-6)
-    assert 0 < arch.limit.lowest_eigenvalue < 1e-3
-    assert reactions[-1] < reactions[most]
+def test_limit_of_the_arch_is_the_greatest_reaction_to_a_prescribed_displacement(arch: Arch, limit: LimitPoint) -> None:
+    assert limit.factor == pytest.approx(arch.greatest_reaction(), rel=1e-6)
+    assert 0 < limit.lowest_eigenvalue < 1e-3
+    assert arch.reactions(np.linspace(0.0, 0.4, 81))[-1] < limit.factor
 
 
 @pytest.mark.parametrize("factor", [1.01, 1.5, 3.0])
-def test_beyond_its_limit_the_arch_snaps_to_a_stable_state_or_says_why_not(arch: Arch, factor: float) -> None:
-    load = factor * arch.limit.factor * arch.load
+def test_beyond_its_limit_the_arch_snaps_to_a_stable_state_or_says_why_not(arch: Arch, limit: LimitPoint, factor: float) -> None:
+    load = factor * limit.factor * arch.load
     with pytest.raises(NoEquilibriumError) as caught:
         solve_on_path(arch.problem, load)
     assert named(caught.value)[0] == pytest.approx(1 / factor, abs=1e-6)
@@ -128,14 +96,9 @@ def test_beyond_its_limit_the_arch_snaps_to_a_stable_state_or_says_why_not(arch:
 
 def test_an_unstable_equilibrium_is_never_returned_by_the_accelerated_pass() -> None:
     """The arch as a whole model, held on the falling part of its path: the residual vanishes, the tangent is indefinite."""
-    mesh = box_mesh((4.0, 1.0, 0.2), (8, 1, 2))
-    x, _, z = mesh.points.T
-    lifted = Mesh(mesh.points + np.outer(0.4 * (1 - np.abs(x / 2 - 1)), [0, 0, 1]), mesh.cells)
-    fixed = np.flatnonzero(((x == 0) | (x == 4.0)) & np.isclose(z, 0.1))
-    model = FullOrderModel(Scene(mor_bench.load_scene("beam-tiny").spec, lifted, LAW, fixed))
-    free = np.full(mesh.n_dofs, -1)
-    free[model.scene.free_dofs] = np.arange(model.n_unknowns)
-    crown = free.reshape(-1, 3)[(x == 2.0) & (z == 0.2), 2]
+    arch = make_arch()
+    model = FullOrderModel(Scene(mor_bench.load_scene("beam-tiny").spec, arch.mesh, LAW, np.flatnonzero(arch.fixed)))
+    crown = arch.crown
     others, q = np.setdiff1d(np.arange(model.n_unknowns), crown), np.zeros(model.n_unknowns)
     for depth in np.linspace(0.0, 0.35, 71):
         q[crown] = -depth

@@ -1,0 +1,224 @@
+"""Bodies with a known answer that the hard cases, and the tests of the full-order model, load."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.linear import BandedCholesky, Factor
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.reduction.galerkin import GalerkinProblem
+from mor_bench.scene.materials import Material, SaintVenantKirchhoff
+from mor_bench.scene.mesh import Mesh, box_mesh
+from mor_bench.scene.scene import load_scene
+from mor_bench.specs import SolverName
+
+Array = NDArray[np.float64]
+
+LAW = SaintVenantKirchhoff(young_pa=500.0, poisson=0.4)
+
+LIMIT_PA = -206.19652
+"""Limit of `LAW` in confined compression, at stretch 1/√3: P = (λ + 2μ) (α³ - α) / 2."""
+
+
+def dense(assembler: Assembler, values: Array) -> Array:
+    """The whole tangent as a dense matrix."""
+    pattern = assembler.pattern
+    upper = sp.csr_array((values, pattern.indices, pattern.indptr), shape=(pattern.n, pattern.n)).toarray()
+    return np.asarray(upper + np.triu(upper, 1).T)
+
+
+def free_assembler(mesh: Mesh, law: Material = LAW, selective: bool = False) -> Assembler:
+    """All dofs free, numbered as in the mesh."""
+    return Assembler(mesh.points, mesh.cells, np.arange(mesh.n_dofs).reshape(-1, 3), mesh.n_dofs, law, selective=selective)
+
+
+def distorted_box(cells: tuple[int, int, int], tetrahedra: bool = False, seed: int = 0) -> Mesh:
+    """A unit box whose inner nodes are moved by up to 0.3 of a cell's edge (0.15 with tetrahedra, which are thinner)."""
+    mesh = box_mesh((1.0, 1.0, 1.0), cells, tetrahedra)
+    inner = np.all((mesh.points > 1e-9) & (mesh.points < 1 - 1e-9), axis=1)
+    points = mesh.points.copy()
+    points[inner] += np.random.default_rng(seed).uniform(-1, 1, (int(inner.sum()), 3)) * (0.15 if tetrahedra else 0.3) / np.array(cells)
+    return Mesh(points, mesh.cells)
+
+
+def patch_test_error(mesh: Mesh, law: Material = LAW, selective: bool = False) -> float:
+    """Largest error, m, inside a unit box whose surface is given a homogeneous deformation, after Newton's method from near by."""
+    gradient = np.eye(3) + np.array([[0.1, 0.05, -0.02], [0.03, -0.08, 0.04], [0.0, 0.06, 0.07]])
+    exact = mesh.points @ (gradient - np.eye(3)).T
+    outer = np.any((mesh.points < 1e-9) | (mesh.points > 1 - 1e-9), axis=1)
+    model = free_assembler(mesh, law, selective)
+    inner = np.flatnonzero(np.repeat(~outer, 3))
+    u = exact.ravel().copy()
+    u[inner] += 0.003 * np.random.default_rng(0).normal(size=len(inner))
+    for _ in range(12):
+        state, values = model.force_and_tangent(u)
+        u[inner] -= np.linalg.solve(dense(model, values)[np.ix_(inner, inner)], state.force[inner])
+    return float(np.abs(u.reshape(-1, 3) - exact).max())
+
+
+def confined_column(law: Material = LAW, tetrahedra: bool = False, selective: bool = False) -> GalerkinProblem:
+    """One cube between rigid lateral walls whose top moves along the axis as one: a single unknown."""
+    mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1), tetrahedra)
+    dofs = np.full((8, 3), 4)
+    dofs[mesh.points[:, 0] == 1.0, 0] = np.arange(4)
+    return GalerkinProblem(Assembler(mesh.points, mesh.cells, dofs, 4, law, selective=selective), np.ones((4, 1)))
+
+
+@dataclass(frozen=True)
+class Arch:
+    """Two straight bars between hinges 4 m apart, the crown 0.4 m above them; the load is 2 N downwards on the crown's edge.
+
+    Attributes
+    ----------
+    mesh : Mesh
+    fixed : (n_nodes,) bool
+    problem : GalerkinProblem
+        On the basis of all free dofs.
+    load : (n_free,) float64
+        N.
+    crown : (2,) int64
+        The free dofs that are loaded.
+    """
+
+    mesh: Mesh
+    fixed: NDArray[np.bool_]
+    problem: GalerkinProblem
+    load: Array
+    crown: NDArray[np.int64]
+
+    def reactions(self, depths: Array) -> Array:
+        """The load on each loaded dof, N, that holds the crown at prescribed depths, m, which follow each other closely."""
+        others = np.setdiff1d(np.arange(len(self.load)), self.crown)
+        q, found = np.zeros(len(self.load)), []
+        for depth in depths:
+            q[self.crown] = -depth
+            for _ in range(8):
+                state, tangent = self.problem.linearise(q)
+                q[others] -= np.linalg.solve(tangent[np.ix_(others, others)], state.force[others])
+            found.append(-self.problem.force(q).force[self.crown].mean())
+        return np.array(found)
+
+    def greatest_reaction(self) -> float:
+        """The top of the path under a prescribed displacement, N: the load at which the arch snaps through."""
+        found = self.reactions(np.linspace(0.0, 0.4, 81))
+        most = int(np.argmax(found))
+        top = np.polynomial.Polynomial.fit(np.arange(most - 2, most + 3), found[most - 2 : most + 3], 4)
+        return float(top(np.linspace(most - 1, most + 1, 2001)).max())
+
+
+def make_arch() -> Arch:
+    """The arch, of 16 H8."""
+    mesh = box_mesh((4.0, 1.0, 0.2), (8, 1, 2))
+    x, _, z = mesh.points.T
+    fixed = ((x == 0) | (x == 4.0)) & np.isclose(z, 0.1)
+    lifted = Mesh(mesh.points + np.outer(0.4 * (1 - np.abs(x / 2 - 1)), [0, 0, 1]), mesh.cells)
+    dofs, n = _numbered(mesh, ~fixed)
+    problem = GalerkinProblem(Assembler(lifted.points, lifted.cells, dofs, n, LAW), np.eye(n))
+    crown = dofs[(x == 2.0) & (z == 0.2), 2]
+    load = np.zeros(n)
+    load[crown] = -1.0
+    return Arch(lifted, fixed, problem, load, crown)
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Two bars of 1 m in series, clamped at one end, the second a million times softer: all of the stretch is in it."""
+
+    stretch = 1.2
+    assembler: Assembler
+    load: Array
+    end: NDArray[np.bool_]
+
+    @property
+    def rest(self) -> tuple[Array, Factor]:
+        """The stiffness at rest, and its factor."""
+        values = self.assembler.force_and_tangent(np.zeros(self.assembler.n_dofs))[1]
+        return values, BandedCholesky(self.assembler.pattern).factor(values)
+
+    def end_displacement(self) -> Array:
+        """Displacement of the loaded end's nodes along the bars by twelve Newton steps, m; exactly the stretch less 1."""
+        u = np.zeros(self.assembler.n_dofs)
+        for _ in range(12):
+            state, values = self.assembler.force_and_tangent(u)
+            u += BandedCholesky(self.assembler.pattern).factor(values).solve(self.load - state.force)
+        return np.asarray(u.reshape(-1, 3)[self.end, 0])
+
+
+def make_bars(tetrahedra: bool = False, selective: bool = False, contrast: float = 1e6) -> Bars:
+    """The bars, of Saint Venant-Kirchhoff with Y = 1 Pa in the soft one and ν = 0."""
+    mesh = box_mesh((2.0, 1.0, 1.0), (2, 1, 1), tetrahedra)
+    free = mesh.points[:, 0] > 0
+    dofs, n = _numbered(mesh, free)
+    stiff = mesh.points[mesh.cells].mean(axis=1)[:, 0] < 1
+    assembler = Assembler(mesh.points, mesh.cells, dofs, n, SaintVenantKirchhoff(1.0, 0.0), np.where(stiff, contrast, 1.0), selective)
+    load = np.zeros((mesh.n_nodes, 3))
+    for facet in mesh.boundary_facets[(mesh.points[mesh.boundary_facets][:, :, 0] == 2.0).all(axis=1)]:
+        load[facet, 0] += 0.5 * (Bars.stretch**3 - Bars.stretch) / (4 if len(facet) == 4 else 6)
+    return Bars(assembler, load[free].ravel(), mesh.points[free][:, 0] == 2.0)
+
+
+def _numbered(mesh: Mesh, free: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
+    """The numbers (n_nodes, 3) of the dofs of free nodes, and how many there are."""
+    n = 3 * int(free.sum())
+    dofs = np.full((mesh.n_nodes, 3), n)
+    dofs[free] = np.arange(n).reshape(-1, 3)
+    return dofs, n
+
+
+def material_table(law: str, young: float, poisson: float) -> dict[str, Any]:
+    """The material table of a law with Young's modulus, Pa, and Poisson's ratio at rest."""
+    shear, bulk = young / (2 * (1 + poisson)), young / (3 * (1 - 2 * poisson))
+    if law == "mooney-rivlin":
+        return {"law": law, "c10_pa": 0.4 * shear, "c01_pa": 0.1 * shear, "bulk_pa": bulk}
+    if law == "ogden":
+        return {"law": law, "mu_pa": [1.6 * shear / 2.1, -0.4 * shear / 1.7], "alpha": [2.1, -1.7], "bulk_pa": bulk}
+    return {"law": law, "young_pa": young, "poisson": poisson}
+
+
+def cantilever_spec(
+    size: list[float], cells: list[int], poisson: float, integration: str = "full", law: str = "saint-venant-kirchhoff"
+) -> dict[str, Any]:  # fmt: skip
+    """A beam of Y = 12 kPa along x, clamped at its start, a force on the whole of its end: EI = 1000 N m² if it is 1 m wide and high."""
+    return {
+        "geometry": {"shape": "box", "size_m": size, "cells": cells},
+        "discretisation": {"integration": integration},
+        "material": material_table(law, 12e3, poisson),
+        "supports": [{"region": "x-min"}],
+        "loads": {"region": "x-max", "kind": "force", "patch_area_m2": size[1] * size[2], "samples_per_patch": 1, "magnitude_n": [0.0, 1.0]},
+        "needs": {"error": 0.01, "latency_ms": 1.0},
+    }
+
+
+def cantilever(
+    size: list[float],
+    cells: list[int],
+    poisson: float,
+    integration: str = "full",
+    law: str = "saint-venant-kirchhoff",
+    solver: SolverName | None = None,
+) -> FullOrderModel:
+    """The full-order model of `cantilever_spec`."""
+    return FullOrderModel(load_scene(cantilever_spec(size, cells, poisson, integration, law)), solver)
+
+
+def tip_load(model: FullOrderModel, force_z: float) -> Array:
+    """(n_free,) a force, N, spread over the end face of a cantilever."""
+    scene = model.scene
+    load = np.zeros((scene.mesh.n_nodes, 3))
+    load[:, 2] = scene.patch_weights.toarray()[0] * force_z
+    return np.asarray(load.ravel()[scene.free_dofs])
+
+
+def tip(model: FullOrderModel, force_z: float) -> Array:
+    """(3,) mean displacement of the end face of a cantilever under a force spread over it, m."""
+    scene = model.scene
+    u = np.zeros(scene.mesh.n_dofs)
+    u[scene.free_dofs] = model.solve(tip_load(model, force_z)).displacement
+    end = scene.mesh.points[:, 0] == scene.mesh.points[:, 0].max()
+    return np.asarray(u.reshape(-1, 3)[end].mean(axis=0))
