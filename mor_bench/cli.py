@@ -186,8 +186,9 @@ def run(
                 memory_limit_bytes=memory_limit and 1e9 * memory_limit, retime=retime, fail_fast=fail_fast, cache=cache, suite=suite,
                 listener=listener,
             )  # fmt: skip
-        print_tables(comparison, console)
-        for path in render(comparison):
+        analysis = comparison.finish()
+        print_tables(comparison, console, analysis)
+        for path in render(comparison, analysis):
             console.print(str(path), highlight=False, soft_wrap=True)
         if as_json:
             print((comparison.out / "results.json").read_text(encoding="utf-8"))
@@ -302,8 +303,9 @@ def report(out: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> Non
         from mor_bench.report import print_tables, render
 
         comparison = mor_bench.Comparison.read(out)
-        print_tables(comparison, _console())
-        for path in render(comparison):
+        analysis = comparison.finish()
+        print_tables(comparison, _console(), analysis)
+        for path in render(comparison, analysis):
             print(path)
 
 

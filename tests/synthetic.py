@@ -85,7 +85,7 @@ def add_configuration(
         "amplitude_m": errors.amplitude_m, "worst_reference": reference, "worst_forces": forces,
         "worst_prediction": reference * (1 + min(errors.relative_l2.max(), 1.0) * generator.random()),
     }  # fmt: skip
-    comparison.add(row, samples)
+    comparison.put(row, samples)
     return row
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from mor_bench.errors import InvalidInputError, StoreError
+from mor_bench.harness.analysis import analyse
 from mor_bench.harness.results import Comparison, _plain
 from mor_bench.harness.run import Listener, run
 from mor_bench.specs import AnyDatasetSpec, load_dataset_spec
@@ -283,8 +284,19 @@ def pick(
     else:
         evidence = comparison if isinstance(comparison, Comparison) else Comparison.read(comparison)
         _check_evidence(evidence, spec)
-    chosen = choose(evidence.rows, requirements, spec.name)
+    chosen = choose(_with_intervals(evidence), requirements, spec.name)
     return replace(chosen, run=evidence.out, processor=str(evidence.machine.get("processor", "")))
+
+
+def _with_intervals(comparison: Comparison) -> list[Row]:
+    """Rows with the upper end of their median error's interval."""
+    high = {(record["dataset"], record["label"]): record["rel_l2_median"]["high"] for record in analyse(comparison)["rows"]}
+
+    def extended(row: Row) -> Row:
+        bound = high.get((row["dataset"], row["label"]))
+        return row if bound is None or not row["error"] else {**row, "error": {**row["error"], "rel_l2_median_high": bound}}
+
+    return [extended(row) for row in comparison.rows]
 
 
 def _is_of(comparison: Comparison, spec: AnyDatasetSpec) -> bool:

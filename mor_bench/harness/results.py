@@ -2,7 +2,7 @@
 
 OUT/results.json       schema version, machine, rows, learning curves
 OUT/results.csv        the same rows, flat
-OUT/comparison.json    time at error, error at time
+OUT/comparison.json    time at error, error at time, intervals, pairs, whole cost: see `mor_bench.harness.analysis.analyse`
 OUT/samples/*.h5       raw latencies and per-sample errors of each row, singular values of each dataset
 OUT/figures/*.png, OUT/report.html
 """
@@ -170,12 +170,14 @@ class Comparison:
         """Arrays of a dataset: `singular_values`, `points` (n_nodes, 3), `cells` (n_cells, 8), `test_regions` (n_test, k)."""
         return read_arrays(self._samples_path(name))
 
-    def finish(self) -> None:
-        """Write everything, and what follows from all rows together, comparison.json."""
+    def finish(self) -> dict[str, Any]:
+        """Write everything, and what follows from all rows together, comparison.json; that is returned."""
         from mor_bench.harness.analysis import analyse
 
         self.write()
-        _write_json(self.out / "comparison.json", analyse(self))
+        analysis = analyse(self)
+        _write_json(self.out / "comparison.json", analysis)
+        return analysis
 
     def write(self) -> None:
         """Write results.json and results.csv, each atomically."""
