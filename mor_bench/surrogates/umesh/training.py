@@ -21,8 +21,9 @@ Schedule = Literal["constant", "one-cycle"]
 LOSS_INTERVAL = 50
 """Iterations per point of the loss curve; reading the loss more often would cost a little and show mostly noise."""
 
-LOOK_AHEAD = 5
-"""Iterations from which the time of all is estimated, after one that makes what the others find."""
+LOOKS_AHEAD = {5: 3.0, 100: 1.0}
+"""After how many iterations, beside a first one that makes what the others find, the time of all is estimated, and how many
+times the limit that may be: a machine that is busy for a moment ends no training."""
 
 WARM_UP = 0.1
 """Part of a one-cycle schedule during which the learning rate rises."""
@@ -110,8 +111,8 @@ def train(
         optimiser.step()
         if iteration == 0:
             start = perf_counter()
-        elif iteration == LOOK_AHEAD and time_limit_s is not None:
-            _check_time((perf_counter() - start) / LOOK_AHEAD, plan.iterations, time_limit_s)
+        elif iteration in LOOKS_AHEAD and time_limit_s is not None:
+            _check_time((perf_counter() - start) / iteration, plan.iterations, time_limit_s, LOOKS_AHEAD[iteration])
         total, n_summed = total + loss.detach(), n_summed + 1
         if n_summed == LOSS_INTERVAL or iteration == plan.iterations - 1:
             curve.append(float(total) / n_summed)
@@ -121,9 +122,9 @@ def train(
     return np.array(curve)
 
 
-def _check_time(each_s: float, iterations: int, limit_s: float) -> None:
-    """Raise `OutOfTimeError` if that many iterations are too many."""
-    if each_s * iterations > limit_s:
+def _check_time(each_s: float, iterations: int, limit_s: float, factor: float) -> None:
+    """Raise `OutOfTimeError` if that many iterations take longer than some times the limit."""
+    if each_s * iterations > factor * limit_s:
         raise OutOfTimeError(
             f"{iterations:,} iterations at {each_s:.3g} s would take {each_s * iterations / 3600:.3g} h; the limit is {limit_s:.0f} s."
         )
