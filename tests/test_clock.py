@@ -1,0 +1,111 @@
+"""Timing: what is kept, what is called unstable, and what a method that fails meanwhile costs."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mor_bench.harness.clock import (
+    BATCHES,
+    CHUNK_S,
+    LEAST_QUERIES,
+    PROTOCOLS,
+    Opener,
+    Timing,
+    _groups,
+    measure,
+    probe_s,
+    summary_of_timing,
+    why_unstable,
+)
+from mor_bench.harness.isolation import MethodFailedError, Worker
+from mor_bench.harness.nursery import Nursery
+from mor_bench.snapshots.dataset import Dataset
+
+
+def timing(latencies: list[float], others: float = 0.0, own: float = 1.0) -> Timing:
+    """Two processes of five rounds with 20 queries each, of given medians."""
+    times = np.repeat(np.resize(latencies, 10), 20).tolist()
+    where = np.repeat(np.arange(10), 20)
+    return Timing(
+        times, [0.01] * 200, (where // 5).tolist(), (where % 5).tolist(), [2.0] * 20, dict.fromkeys(map(str, BATCHES), 100.0), 10**8,
+        [(0.1, 0.1 * own, 0.1 * others)] * 10,
+    )  # fmt: skip
+
+
+def test_a_quiet_timing_is_stable_and_a_disturbed_one_is_not() -> None:
+    assert why_unstable(timing([1.0, 1.01]), 1) == []
+    assert why_unstable(timing([1.0], others=1.0), 1) == ["other processes used 1.00 cores meanwhile"]
+    assert why_unstable(timing([1.0], own=0.5), 1) == ["its process had 50% of a core"]
+    assert why_unstable(timing([1.0], own=0.5), 2) == []
+    assert any("10 rounds spread" in reason for reason in why_unstable(timing([1.0, 1.5]), 1))
+    assert why_unstable(timing([1.0] * 5 + [1.5] * 5), 1)[-1] == "medians of 2 processes spread by 20%"
+
+
+def test_a_summary_says_all_of_it() -> None:
+    latency = summary_of_timing(timing([1.0, 1.01]), (0.9, 1.1), 1)["latency_ms"]
+    assert latency["low"] < latency["median"] < latency["high"]
+    assert (latency["n_queries"], latency["n_processes"], latency["stable"], latency["gc"]) == (200, 2, True, pytest.approx(0.01))
+
+
+def test_a_timing_comes_back_from_its_arrays() -> None:
+    kept = timing([1.0, 2.0])
+    kept.throughput["512"] = None
+    kept.probe_s = 0.5
+    again = Timing.of_arrays(kept.arrays)
+    assert again == kept
+    assert again.holds(0.51)
+    assert not again.holds(0.6)
+
+
+def test_the_probe_takes_a_moment() -> None:
+    assert 1e-5 < probe_s() < 5.0
+
+
+def test_groups_fit_into_memory() -> None:
+    from psutil import virtual_memory
+
+    half = 0.5 * virtual_memory().available
+    openers = {
+        name: Opener(lambda nursery: pytest.fail("not opened"), size * half) for name, size in (("a", 0.3), ("b", 0.3), ("c", 0.9), ("d", 5.0))
+    }
+    assert _groups(openers) == [["a", "b"], ["c"], ["d"]]
+
+
+def opened(tiny: Dataset, surrogate: str, parameters: dict[str, object], folder: Path, nursery: Nursery | None) -> Worker:
+    worker = Worker(tiny.scene, [], nursery=nursery)
+    worker.ask(
+        "fit", 60.0, surrogate=surrogate, parameters=parameters, train=folder, model=folder / "model.safetensors", threads=1, limit_s=60.0
+    )  # fmt: skip
+    return worker
+
+
+def test_configurations_are_timed_in_turn_and_fail_alone(tiny: Dataset, tmp_path: Path) -> None:
+    def dead(nursery: Nursery | None) -> Worker:
+        raise MethodFailedError("it does not open")
+
+    forces = tmp_path / "forces.npy"
+    np.save(forces, tiny.test.forces)
+    openers = {
+        "plain": Opener(partial(opened, tiny, "tests.third_party:Slowed", {}, tmp_path), 1e8),
+        "slow": Opener(partial(opened, tiny, "tests.third_party:Slowed", {"part": 4.0}, tmp_path), 1e8),
+        "broken": Opener(partial(opened, tiny, "tests.third_party:Broken", {"how": "crash"}, tmp_path), 1e8),
+        "dead": Opener(dead, 1e8),
+    }
+    turns: list[int] = []
+    timings = measure(openers, forces, PROTOCOLS["quick"], 1, lambda done, total: turns.append(done))
+    assert timings["dead"].failed == "it does not open"
+    assert "crashed with ZeroDivisionError" in str(timings["broken"].failed)
+    for name in ("plain", "slow"):
+        samples = timings[name].samples
+        assert len(samples["latency_ms"]) >= LEAST_QUERIES
+        assert {tuple(pair) for pair in zip(samples["process"], samples["round"], strict=True)} == {(p, r) for p in range(2) for r in range(5)}
+        assert samples["used"][:, 0].min() >= CHUNK_S
+        assert len(samples["all_threads_ms"]) >= 2 * 20
+        assert set(timings[name].throughput) == {"8", "64", "512"}
+        assert timings[name].memory_bytes > 5e7
+    assert 3.5 < np.median(timings["slow"].latency_ms) / np.median(timings["plain"].latency_ms) < 6.5
+    assert turns == sorted(turns)
