@@ -24,6 +24,7 @@ from mor_bench.harness.export_asv import describe, export_asv
 from mor_bench.harness.results import Comparison
 from mor_bench.harness.timing import describe_machine
 from mor_bench.specs import list_suite
+from tests.benchmarks.bench_full_order import FullOrder
 from tests.benchmarks.bench_surrogates import METHODS
 from tests.benchmarks.publish import LOCAL, make_offline, publish
 from tests.test_cli import mor_bench as command
@@ -162,6 +163,19 @@ def test_the_command_exports_a_run(checkout: Path, cache: Path, tmp_path: Path) 
 
 def test_asv_follows_every_method_of_the_suite() -> None:
     assert METHODS.keys() == list_suite("methods").keys()
+
+
+@pytest.mark.parametrize("dataset", FullOrder.params)
+def test_nothing_of_the_full_order_model_is_skipped(dataset: str) -> None:
+    benchmark = FullOrder()
+    benchmark.setup(dataset)  # an error in it, as on an old commit, is a skip to asv
+    found = [name for name in vars(FullOrder) if name.startswith(("time_", "peakmem_"))]
+    assert len(found) >= 6
+    for name in found:
+        getattr(benchmark, name)(dataset)
+    assert 0 < benchmark.track_iterations(dataset) < 50
+    assert 0 < benchmark.track_relative_error(dataset) < 1e-6
+    benchmark.teardown(dataset)
 
 
 @pytest.fixture

@@ -83,10 +83,10 @@ class _Fitted:
     setup_cache.timeout = 600  # type: ignore[attr-defined]
 
     def setup(self, dataset: str, method: str) -> None:
+        self.pinned = threadpool_limits(1)  # first, since what is skipped is torn down too
         self.record = json.loads(record_file(dataset, method).read_text(encoding="utf-8"))
         if "unavailable" in self.record:
             raise NotImplementedError(self.record["unavailable"])
-        self.pinned = threadpool_limits(1)
 
     def teardown(self, dataset: str, method: str) -> None:
         self.pinned.restore_original_limits()
@@ -99,7 +99,7 @@ class Query(_Fitted):
         super().setup(dataset, method)
         test = load_limited(dataset).test
         self.surrogate = mor_bench.load_surrogate(model_file(dataset, method))
-        sizes = np.linalg.norm(test.loads.vectors, axis=(1, 2))
+        sizes = np.linalg.norm(test.forces, axis=(1, 2))
         self.force = test.forces[int(sizes.argsort()[len(sizes) // 2])]
         self.surrogate.predict(self.force)
 
