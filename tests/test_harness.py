@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import mor_bench
 from mor_bench.errors import InvalidInputError, SpecError, StoreError
 from mor_bench.harness import clock
-from mor_bench.harness.clock import LEAST_QUERIES
+from mor_bench.harness.clock import LEAST_QUERIES, MOST_S
 from mor_bench.harness.frontier import Point, error_at_time, non_dominated, time_at_error
 from mor_bench.harness.metrics import sample_errors, summary
 from mor_bench.harness.results import Comparison
@@ -208,7 +208,8 @@ def test_rows_hold_what_the_schema_promises(comparison: Comparison) -> None:
     assert row["offline_s"]["data"] > 0
     assert row["model_bytes"] > 8 * 3 * 162
     samples = comparison.samples(row)
-    assert len(samples["latency_ms"]) == len(samples["process"]) == len(samples["round"]) >= LEAST_QUERIES
+    assert len(samples["latency_ms"]) == len(samples["process"]) == len(samples["round"])
+    assert len(samples["latency_ms"]) >= LEAST_QUERIES or samples["used"][:, 0].max() > MOST_S
     assert set(samples["process"]) == {0, 1}
     assert samples["mean_dof_m"].mean() == pytest.approx(row["error"]["mean_dof_m"])
     worst = np.abs(samples["worst_prediction"] - samples["worst_reference"]).mean()

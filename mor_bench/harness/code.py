@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import platform
+from collections.abc import Iterator
 from functools import cache
 from importlib.machinery import PathFinder
 from importlib.metadata import PackageNotFoundError, version
@@ -55,7 +56,7 @@ def _source_digest(path: Path, changed: int) -> bytes:
 def _imports_of(path: Path, changed: int, package: str) -> tuple[str, ...]:
     """Names that a source file imports, anywhere in it; of ``from a import b`` both a and a.b."""
     names: list[str] = []
-    for node in ast.walk(ast.parse(path.read_bytes())):
+    for node in _nodes(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -65,11 +66,20 @@ def _imports_of(path: Path, changed: int, package: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
+def _nodes(tree: ast.AST) -> Iterator[ast.AST]:
+    """All nodes but those for type checkers only."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            continue
+        yield node
+        yield from _nodes(node)
+
+
 def _closure(module: str, folder: Path | None) -> dict[str, Path]:
-    """All modules of this package, and of the method's own, that a module imports, with their files."""
+    """All modules of this package, and of the method's own, that a module imports, with their files; and what all methods are."""
     own = module.partition(".")[0]
     found: dict[str, Path] = {}
-    waiting = [module]
+    waiting = [module, "mor_bench.surrogate"]
     while waiting:
         name = waiting.pop()
         if name in found or name in DATA_ONLY or name.partition(".")[0] not in (own, "mor_bench"):
