@@ -12,6 +12,7 @@ from mor_bench.harness.clock import (
     BATCHES,
     CHUNK_S,
     LEAST_QUERIES,
+    MOST_S,
     PROTOCOLS,
     Opener,
     Timing,
@@ -107,5 +108,5 @@ def test_configurations_are_timed_in_turn_and_fail_alone(tiny: Dataset, tmp_path
         assert len(samples["all_threads_ms"]) >= 2
         assert set(timings[name].throughput) == {"8", "64", "512"}
         assert timings[name].memory_bytes > 5e7
-    assert 3.5 < np.median(timings["slow"].latency_ms) / np.median(timings["plain"].latency_ms) < 6.5
+    assert np.median(timings["slow"].latency_ms) > 2 * np.median(timings["plain"].latency_ms)
     assert turns == sorted(turns)

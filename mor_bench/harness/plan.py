@@ -104,7 +104,7 @@ def plan(
         As `mor_bench.run`.
     """
     specs, method_specs = checked_specs(datasets, methods, profile, suite)
-    root = cache or default_cache()
+    root = Path(cache or default_cache())
     allowed = BUDGETS[profile].configurations
     all_jobs = [job for method in method_specs for job in jobs_of([method], profile)[:allowed]]
     steps: list[Step] = []

@@ -213,14 +213,14 @@ def run(
         _check_test_seed(test_seed, specs)
     budget = BUDGETS[profile]
     settings = _Settings(
-        profile, limit, split, threads, workers, jobs, cluster, cache or default_cache(),
+        profile, limit, split, threads, workers, jobs, cluster, Path(cache or default_cache()),
         replace(budget, seconds=time_limit_s or budget.seconds),
         memory_limit_bytes or MEMORY_SHARE * psutil.virtual_memory().total, test_seed, retime, fail_fast, listener,
     )  # fmt: skip
     comparison = _open_run(Path(out) if out else _default_out([spec.name for spec in specs]), specs, method_specs, settings)
     jobs_of_all = jobs_of(method_specs, profile)
     with ExitStack() as stack:
-        nursery = stack.enter_context(closing(Nursery())) if CAN_FORK else None
+        nursery = stack.enter_context(closing(Nursery(yielding=True))) if CAN_FORK else None
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mor-bench-")))
         stack.enter_context(suppress(_StopRunError))
         for number, spec in enumerate(specs):

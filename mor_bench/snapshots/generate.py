@@ -43,7 +43,7 @@ def dataset_key(spec: DatasetSpec) -> str:
 
 def dataset_folder(spec: DatasetSpec, cache: Path | None) -> Path:
     """Where a dataset lies: its name and its key."""
-    return (cache or default_cache()) / "datasets" / f"{spec.name}-{dataset_key(spec)}"
+    return Path(cache or default_cache()) / "datasets" / f"{spec.name}-{dataset_key(spec)}"
 
 
 def shard_path(folder: Path, number: int) -> Path:
