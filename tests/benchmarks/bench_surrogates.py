@@ -30,6 +30,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "pca-regression": {"n_input_modes": 10},
     "pca-regression-force": {"n_input_modes": 20, "n_output_modes": 20},
     "umesh": {"channels": 8, "steps": 2, "iterations": 200, "batch_size": 16, "learning_rate": 3e-3},
+    "umesh-small": {"channels": 8, "iterations": 200},
 }
 """Methods and their knobs. U-Mesh's latency does not depend on how long it was trained; the error of so short a training says little."""
 
