@@ -30,8 +30,8 @@ Arrays = dict[str, NDArray[Any]]
 
 TOML = 'title = "Mine"\nsource = "SOFA"\n[snapshots]\nfile = "mine.npz"\n[needs]\nerror = 0.01\nlatency_ms = 3.0\n'
 
-COMPETE = {"pca-regression-force", "umesh"}
-CHEAP = {"umesh": {"channels": 4, "steps": 1, "iterations": 5}}
+COMPETE = {"pca-regression-force", "umesh", "umesh-small"}
+CHEAP = dict.fromkeys(("umesh", "umesh-small"), {"channels": 4, "steps": 1, "iterations": 5})
 
 
 @pytest.fixture(scope="module")
