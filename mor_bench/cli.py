@@ -151,7 +151,9 @@ def run(
     workers: Workers = None,
     jobs: Annotated[int, typer.Option(min=1, help="Fits at once, which share the cores.")] = 1,
     cluster: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers generate and fit: tcp://host:port.")] = None,
-    test_seed: Annotated[int | None, typer.Option(help="Also score on a fresh test set that this seed draws after all fits.")] = None,
+    test_seed: Annotated[
+        str | None, typer.Option(metavar="N|fresh", help="Also score on a test set drawn after all fits, by this seed or one that no one knows.")
+    ] = None,
     time_limit: Annotated[float | None, typer.Option(metavar="SECONDS", help="Of all fits of a method on a dataset together.")] = None,
     memory_limit: Annotated[float | None, typer.Option(metavar="GB", help="Of a method's process. [default: 3/4 of the memory]")] = None,
     retime: Annotated[bool, typer.Option("--retime", help="Take timings again that the cache holds.")] = False,
@@ -179,10 +181,11 @@ def run(
                 print(json.dumps(planned.as_dict(), indent=1))
             print_plan(planned, console)
             return
+        seed = int(test_seed) if test_seed and test_seed.isdecimal() else test_seed
         with _progress(console) as listener:
             comparison = mor_bench.run(
                 datasets or ["beam-coarse"], method or None, profile.value, out, limit=limit, split=split.value if split else None,
-                threads=threads, workers=workers, jobs=jobs, cluster=cluster, test_seed=test_seed, time_limit_s=time_limit,
+                threads=threads, workers=workers, jobs=jobs, cluster=cluster, test_seed=seed, time_limit_s=time_limit,
                 memory_limit_bytes=memory_limit and 1e9 * memory_limit, retime=retime, fail_fast=fail_fast, cache=cache, suite=suite,
                 listener=listener,
             )  # fmt: skip

@@ -502,12 +502,15 @@ class Profile(_Model):
 class Regime(_Model):
     """What a method was built for; a comparison without it says nothing final about the method.
 
-    `says` is that in words; `min_dofs` and `min_train` the least unknowns and training samples; `gpu` whether it needs one.
+    `says` is that in words; `min_dofs`, `min_train` and `min_iterations` the least degrees of freedom, training samples and
+    iterations; `split` how training and test are parted; `gpu` whether it needs a graphics processor.
     """
 
     says: str
     min_dofs: Annotated[int, Field(ge=1)] | None = None
     min_train: Annotated[int, Field(ge=1)] | None = None
+    min_iterations: Annotated[int, Field(ge=1)] | None = None
+    split: SplitBy | None = None
     gpu: bool = False
 
 

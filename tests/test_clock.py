@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,8 +16,10 @@ from mor_bench.harness.clock import (
     MOST_S,
     PROTOCOLS,
     Opener,
+    Queries,
     Timing,
     _groups,
+    check_answers,
     measure,
     probe_s,
     summary_of_timing,
@@ -39,9 +42,10 @@ def timing(latencies: list[float], others: float = 0.0, own: float = 1.0) -> Tim
 
 def test_a_quiet_timing_is_stable_and_a_disturbed_one_is_not() -> None:
     assert why_unstable(timing([1.0, 1.01]), 1) == []
-    assert why_unstable(timing([1.0], others=1.0), 1) == ["other processes used 1.00 cores meanwhile"]
+    assert why_unstable(timing([1.0], others=1.0), 1) == ["other processes used about 1.0 cores meanwhile"]
     assert why_unstable(timing([1.0], own=0.5), 1) == ["its process had 50% of a core"]
     assert why_unstable(timing([1.0], own=0.5), 2) == []
+    assert why_unstable(timing([1.0], own=1.9), 1) == ["it used 1.9 cores though pinned to one"]
     assert any("10 rounds spread" in reason for reason in why_unstable(timing([1.0, 1.5]), 1))
     assert why_unstable(timing([1.0] * 5 + [1.5] * 5), 1)[-1] == "medians of 2 processes spread by 20%"
 
@@ -55,9 +59,10 @@ def test_a_summary_says_all_of_it() -> None:
 def test_a_timing_comes_back_from_its_arrays() -> None:
     kept = timing([1.0, 2.0])
     kept.throughput["512"] = None
+    kept.checked = [(3, 0.1)]
     kept.probe_s = 0.5
     again = Timing.of_arrays(kept.arrays)
-    assert again == kept
+    assert replace(again, checked=kept.checked) == kept
     assert again.holds(0.51)
     assert not again.holds(0.6)
 
@@ -88,8 +93,7 @@ def test_configurations_are_timed_in_turn_and_fail_alone(tiny: Dataset, tmp_path
     def dead(nursery: Nursery | None) -> Worker:
         raise MethodFailedError("it does not open")
 
-    forces = tmp_path / "forces.npy"
-    np.save(forces, tiny.test.forces)
+    queries = Queries(tiny.test.forces, tiny.test.displacements, tmp_path)
     openers = {
         "plain": Opener(partial(opened, tiny, "tests.third_party:Slowed", {}, tmp_path), 1e8),
         "slow": Opener(partial(opened, tiny, "tests.third_party:Slowed", {"part": 4.0}, tmp_path), 1e8),
@@ -97,7 +101,7 @@ def test_configurations_are_timed_in_turn_and_fail_alone(tiny: Dataset, tmp_path
         "dead": Opener(dead, 1e8),
     }
     turns: list[int] = []
-    timings = measure(openers, forces, PROTOCOLS["quick"], 1, lambda done, total: turns.append(done))
+    timings = measure(openers, queries, PROTOCOLS["quick"], 1, lambda done, total: turns.append(done))
     assert timings["dead"].failed == "it does not open"
     assert "crashed with ZeroDivisionError" in str(timings["broken"].failed)
     for name in ("plain", "slow"):
@@ -110,3 +114,14 @@ def test_configurations_are_timed_in_turn_and_fail_alone(tiny: Dataset, tmp_path
         assert timings[name].memory_bytes > 5e7
     assert np.median(timings["slow"].latency_ms) > 2 * np.median(timings["plain"].latency_ms)
     assert turns == sorted(turns)
+
+
+def test_answers_that_are_worse_while_timed_than_when_scored_are_found(tiny: Dataset, tmp_path: Path) -> None:
+    queries = Queries(tiny.test.forces, tiny.test.displacements, tmp_path)
+    honest = Opener(partial(opened, tiny, "tests.third_party:Slowed", {}, tmp_path), 1e8)
+    zero = Opener(partial(opened, tiny, "tests.third_party:Zero", {}, tmp_path), 1e8)
+    timings = measure({"honest": honest, "zero": zero}, queries, PROTOCOLS["quick"], 1, single_only=True)
+    scored = np.full(len(queries.forces), 1e-6)
+    check_answers(timings["honest"], scored)
+    with pytest.raises(MethodFailedError, match="median relative l2 error is 1 while it is timed, on loads on which it was scored with 1e-06"):
+        check_answers(timings["zero"], scored)

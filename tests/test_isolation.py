@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 import mor_bench
-from mor_bench.errors import SpecError
+from mor_bench.errors import InvalidInputError, SpecError
 from mor_bench.harness.isolation import MethodFailedError, Worker
 from mor_bench.harness.nursery import CAN_FORK, Nursery
 from mor_bench.harness.results import Comparison
@@ -66,12 +66,26 @@ def test_a_fresh_test_set_is_drawn_after_all_fits_and_tells_the_same_as_the_ship
     assert not list(cache.glob("**/*hidden*"))
 
 
+HOW = {
+    "hang": "fitting took longer than the limit of 8 s",
+    "memory": "fitting took more memory than the limit",
+    "segfault": "SIGSEGV",
+    "end": "ended with code 7",
+    "orphan": "ended with code 7",
+    "kill-group": "SIGKILL",
+    "kill-parent": "",
+    "odd-text": "crashed with RuntimeError: file ?",
+    "batches-only": "while timed: InvalidInputError: a single load",
+    "print": None,
+    "fork": None,
+}
+"""What a broken method does, and what its row must say; None where it still answers."""
+
+
 @pytest.fixture(scope="module")
 def broken(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
     folder = tmp_path_factory.mktemp("broken")
-    methods: list[str | Path] = [
-        method_file(folder, how, "tests.third_party:Broken", how=how) for how in ("hang", "memory", "segfault", "end", "print")
-    ]
+    methods: list[str | Path] = [method_file(folder, how, "tests.third_party:Broken", how=how) for how in HOW]
     out = folder / "out"
     return mor_bench.run(["beam-tiny"], [*methods, "linear-fem"], out=out, cache=cache, time_limit_s=8.0, memory_limit_bytes=1.5e9)
 
@@ -79,13 +93,54 @@ def broken(cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
 def test_what_hangs_or_eats_memory_or_dies_costs_its_own_row_only(broken: Comparison) -> None:
     rows = {row["method"]: row for row in broken.rows}
     assert rows["linear-fem"]["status"] == "ok"
-    assert {name: row["status"] for name, row in rows.items() if name not in ("linear-fem", "print")} == dict.fromkeys(
-        ("hang", "memory", "segfault", "end"), "failed"
-    )
-    assert rows["hang"]["reason"] == "fitting took longer than the limit of 8 s"
-    assert "fitting took more memory than the limit" in rows["memory"]["reason"]
-    assert "SIGSEGV" in rows["segfault"]["reason"]
-    assert "ended with code 7" in rows["end"]["reason"]
+    for how, words in HOW.items():
+        assert rows[how]["status"] == ("ok" if words is None else "failed"), (how, rows[how]["reason"])
+        assert words is None or words in rows[how]["reason"]
+    assert Comparison.read(broken.out).rows == json.loads(json.dumps(broken.rows))
+
+
+def test_fits_that_fail_cost_their_part_of_the_budget(cache: Path, tmp_path: Path) -> None:
+    path = tmp_path / "hang.toml"
+    path.write_text('title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Broken"\n[sweep]\nhow = ["hang", "print", "end"]')
+    rows = mor_bench.run(["beam-tiny"], [path], out=tmp_path / "out", cache=cache, time_limit_s=2.0).rows
+    assert [row["status"] for row in rows] == ["failed", "skipped", "skipped"]
+    assert rows[1]["reason"] == "beyond the tuning budget of 2 s of fitting"
+    assert rows[0]["tuning_s"] >= 2.0
+
+
+def test_what_one_method_learns_from_no_other_can_change(tmp_path: Path) -> None:
+    poison = method_file(tmp_path, "poison", "tests.third_party:Poison")
+    poisoned = mor_bench.run(["beam-tiny"], [poison, "pca-regression-force"], out=tmp_path / "a", cache=tmp_path / "cache")
+    clean = mor_bench.run(["beam-tiny"], ["pca-regression-force"], out=tmp_path / "b", cache=tmp_path / "other")
+    assert (poisoned.rows[0]["status"], poisoned.rows[0]["reason"]) == ("failed", "it wrote over the training samples")
+    assert poisoned.rows[1]["error"] == clean.rows[0]["error"]
+
+
+def test_all_configurations_are_fitted_before_one_is_asked_for_the_test_set(cache: Path, tmp_path: Path) -> None:
+    path = tmp_path / "leaky.toml"
+    note = tmp_path / "forces.npy"
+    knobs = f'[parameters]\npath = "{note.as_posix()}"\n[sweep]\nn = [1, 2, 3]'
+    path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Leaky"\n{knobs}')
+    rows = mor_bench.run(["beam-tiny"], [path], out=tmp_path / "out", cache=cache).rows
+    assert note.exists()
+    assert [(row["status"], row["warnings"]) for row in rows] == [("ok", [])] * 3
+
+
+def test_a_method_that_answers_otherwise_when_it_is_timed_fails(cache: Path, tmp_path: Path) -> None:
+    path = method_file(tmp_path, "worse", "tests.third_party:Broken", how="worse-alone")
+    row = mor_bench.run(["beam-tiny"], [path], out=tmp_path / "out", cache=cache).rows[0]
+    assert row["status"] == "failed"
+    assert "while it is timed, on loads on which it was scored with" in row["reason"]
+
+
+def test_two_runs_do_not_write_to_one_folder(cache: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / ".running").write_text(f"{os.getppid()} {psutil.Process(os.getppid()).create_time()!r}")
+    with pytest.raises(InvalidInputError, match="another run, process"):
+        mor_bench.run(["beam-tiny"], ["linear-fem"], out=out, cache=cache)
+    (out / ".running").write_text("1234567 1.0")
+    assert mor_bench.run(["beam-tiny"], ["linear-fem"], out=out, cache=cache).rows[0]["status"] == "ok"
 
 
 def test_what_a_method_prints_is_no_answer(broken: Comparison) -> None:
@@ -140,8 +195,9 @@ def test_the_first_failure_ends_a_run_that_is_to_fail_fast(cache: Path, tmp_path
 
 
 def test_a_changed_source_is_fitted_again_and_nothing_else(cache: Path, tmp_path: Path) -> None:
-    source = tmp_path / "changing.py"
-    source.write_text("from tests.third_party import Zero\n\nclass Mine(Zero):\n    pass\n")
+    source = tmp_path / "aside.py"
+    source.write_text("VALUE = 1")
+    (tmp_path / "changing.py").write_text("from aside import VALUE\nfrom tests.third_party import Zero\n\nclass Mine(Zero):\n    value = VALUE\n")
     path = method_file(tmp_path, "changing", "changing:Mine")
     own = tmp_path / "cache"
     mor_bench.run(["beam-tiny"], [path, "linear-fem"], out=tmp_path / "a", cache=own)
@@ -161,6 +217,10 @@ def test_a_damaged_fit_is_made_again(cache: Path, tmp_path: Path) -> None:
     model.write_bytes(model.read_bytes()[:-1] + b"x")
     for path in own.glob("fits/*/*.h5"):
         path.write_bytes(b"nothing")
+    for content in (b"null", b"[]", b"{}", b'{"model_sha256": null}'):
+        mor_bench.run(["beam-tiny"], ["linear-fem"], out=tmp_path / "c", cache=own)
+        next(own.glob("fits/linear-fem-*/fit.json")).write_bytes(content)
+        assert mor_bench.run(["beam-tiny"], ["linear-fem"], out=tmp_path / "c", cache=own).rows[0]["status"] == "ok"
     again = mor_bench.run(["beam-tiny"], ["pca-regression-force"], out=tmp_path / "b", cache=own)
     assert again.rows[0]["status"] == "ok"
     assert again.rows[0]["error"] == first.rows[0]["error"]

@@ -31,7 +31,7 @@ Arrays = dict[str, NDArray[Any]]
 TOML = 'title = "Mine"\nsource = "SOFA"\n[snapshots]\nfile = "mine.npz"\n[needs]\nerror = 0.01\nlatency_ms = 3.0\n'
 
 COMPETE = {"pca-regression-force", "umesh", "umesh-small"}
-CHEAP = dict.fromkeys(("umesh", "umesh-small"), {"channels": 4, "steps": 1, "iterations": 5})
+CHEAP = {name: {"channels": 4, "steps": 1, "iterations": 5} for name in ("umesh", "umesh-small")}
 
 
 @pytest.fixture(scope="module")

@@ -101,6 +101,19 @@ class Broken(Zero):
             os.kill(os.getpid(), signal.SIGSEGV)
         if self.how == "end":
             os._exit(7)
+        if self.how == "orphan":  # a child that would hold the pipe
+            if os.fork() == 0:
+                time.sleep(60)
+            os._exit(7)
+        if self.how == "fork":  # and both go on
+            os.fork()
+        if self.how == "kill-group":
+            os.killpg(0, signal.SIGKILL)
+        if self.how == "kill-parent":
+            os.kill(os.getppid(), signal.SIGKILL)
+            time.sleep(60)
+        if self.how == "odd-text":
+            raise RuntimeError("file \udcff")
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
@@ -109,12 +122,48 @@ class Broken(Zero):
             raise ZeroDivisionError("on purpose")
         if self.how == "shape":
             return batch[:, :-1]
+        if self.how == "batches-only" and np.ndim(forces) == 2:
+            return None  # type: ignore[return-value]
+        if self.how == "worse-alone" and np.ndim(forces) == 2:
+            return np.asarray(5.0 * batch[0])
         if self.how == "print":
             print('{"fit_s": 0}', flush=True)
         out = np.full_like(batch, 1e-3)
         if self.how == "nan":
             out[batch[:, :, 0].sum(axis=1) > 0] = np.nan
         return out.reshape(np.shape(forces))
+
+
+class Poison(mor_bench.Surrogate):
+    """Writes over the training samples where they lie."""
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Poison:
+        with self._fitting(scene):
+            assert snapshots is not None
+            array: Any = snapshots.free_displacements
+            np.load(array.filename, mmap_mode="r+")[:] = 1.0
+        return self
+
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+        return np.zeros_like(self._checked_forces(forces)).reshape(np.shape(forces))
+
+
+class Leaky(Zero):
+    """Passes the forces that it is asked for on to its next configuration."""
+
+    def __init__(self, path: str, n: int = 1) -> None:
+        self.path = path
+        self.n = n
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Leaky:
+        if Path(self.path).exists():
+            warnings.warn("saw forces of the test set", stacklevel=2)
+        super().fit(scene, snapshots)
+        return self
+
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+        np.save(self.path, np.asarray(forces))
+        return super().predict(forces)
 
 
 class Peeker(Zero):

@@ -399,34 +399,45 @@ def share_within(factors: Sequence[float | None], tau: float) -> float:
 
 
 def regimes(comparison: Comparison) -> list[Row]:
-    """Whether each method was tested where its file says that it belongs; of those whose file says so."""
+    """Whether each method was tested where its file says that it belongs, and what was missing if not."""
     out = []
     device = str(comparison.settings.get("device") or "cpu")
     for method in dict.fromkeys(row["method"] for row in comparison.rows):
         regime = (comparison.methods.get(method) or {}).get("regime")
         if not regime:
+            out.append({"method": method, "says": "", "in_regime": None, "verdict": "its file names no regime"})
             continue
-        inside = any(
-            row["status"] == "ok"
-            and (row.get("n_dofs") or 0) >= (regime.get("min_dofs") or 0)
-            and (row.get("n_train") or 0) >= (regime.get("min_train") or 0)
-            and (not regime.get("gpu") or device != "cpu")
-            for row in comparison.rows
-            if row["method"] == method
-        )
+        missing = [_outside(row, regime, device) for row in comparison.rows if row["method"] == method and row["status"] == "ok"]
+        least = min(missing, key=len, default=["no configuration ran"])
         says = str(regime.get("says") or "")
-        verdict = "in its regime" if inside else f"not tested in its regime: {says}"
-        out.append({"method": method, "says": says, "in_regime": inside, "verdict": verdict})
+        verdict = "not tested in its regime" + f" ({', '.join(least)}): {says}" if least else "in its regime"
+        out.append({"method": method, "says": says, "in_regime": not least, "verdict": verdict})
     return out
 
 
+def _outside(row: Row, regime: Row, device: str) -> list[str]:
+    """What a row lacks of a regime."""
+    missing = []
+    for name, what in (("min_dofs", "degrees of freedom"), ("min_train", "training samples"), ("min_iterations", "iterations")):
+        least = regime.get(name)
+        has = {"min_dofs": row.get("n_dofs"), "min_train": row.get("n_train"), "min_iterations": row["parameters"].get("iterations")}[name] or 0
+        if least and has < least:
+            missing.append(f"{has:,} of {least:,} {what}")
+    if regime.get("split") and row.get("split") != regime["split"]:
+        missing.append(f"split by {row.get('split')}")
+    if regime.get("gpu") and device == "cpu":
+        missing.append("no graphics processor")
+    return missing
+
+
 def tuning(comparison: Comparison) -> list[Row]:
-    """What each method was allowed to try on each dataset, and what it did; seconds are of fitting."""
+    """What each method was allowed to try on each dataset, and what it did; seconds are of fitting, failed fits included."""
     budget = comparison.settings.get("budget") or {}
     out = []
     for dataset, method in dict.fromkeys((row["dataset"], row["method"]) for row in comparison.rows):
         tried = [row for row in comparison.rows if (row["dataset"], row["method"]) == (dataset, method) and row["status"] != "skipped"]
-        seconds = sum((row["offline_s"] or {}).get("fit") or 0.0 for row in tried)
+        seconds = sum(row.get("tuning_s") or (row["offline_s"] or {}).get("fit") or 0.0 for row in tried)
+        seeds = max(((row.get("seeds") or {}).get("n", 1) for row in tried), default=0)
         allowed = {"configurations_allowed": budget.get("configurations"), "seconds_allowed": budget.get("seconds")}
-        out.append({"dataset": dataset, "method": method, "configurations": len(tried), "seconds": seconds, **allowed})
+        out.append({"dataset": dataset, "method": method, "configurations": len(tried), "seconds": seconds, "seeds": seeds, **allowed})
     return out

@@ -12,6 +12,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from os import cpu_count
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter, process_time
 from typing import Any, Self
 
@@ -20,7 +22,8 @@ import psutil
 from numpy.typing import NDArray
 
 from mor_bench.errors import MorBenchError
-from mor_bench.harness.isolation import Worker
+from mor_bench.harness.isolation import MethodFailedError, Worker
+from mor_bench.harness.metrics import sample_errors
 from mor_bench.harness.nursery import CAN_FORK, Nursery
 from mor_bench.harness.timing import pinned_threads
 
@@ -42,8 +45,12 @@ ANSWER_LIMIT_S = 300.0
 BUSY = 0.2
 """Cores that others may use, or a tenth of all cores if that is more, before a timing counts as disturbed."""
 
-STARVED = 0.9
-"""Part of a core that a process on one thread must have had."""
+STARVED, MORE_THAN_ONE = 0.9, 1.2
+"""Part of a core that a process on one thread must have had, and may not exceed."""
+
+SAME_ERROR = 2.0, 1e-6
+"""Factor and addend by which the median error of what is answered while timed may exceed the scored one; a solve that starts at
+the answer before need not end where a single one does."""
 
 SAME_SPEED = 0.1
 """Relative change of `probe_s` from which an earlier timing is taken again."""
@@ -90,6 +97,8 @@ class Timing:
         Why there is no timing.
     probe_s : float
         Of `probe_s` when it was measured.
+    checked : list of (int, float)
+        Of some queries their number and the relative l2 error of what was answered.
     """
 
     latency_ms: list[float] = field(default_factory=list)
@@ -102,6 +111,7 @@ class Timing:
     used: list[tuple[float, float, float]] = field(default_factory=list)
     failed: str | None = None
     probe_s: float = 0.0
+    checked: list[tuple[int, float]] = field(default_factory=list)
 
     def holds(self, probe_s: float) -> bool:
         """Whether the machine is as fast as it was then."""
@@ -158,9 +168,26 @@ class Opener:
     memory_bytes: float
 
 
+@dataclass(frozen=True)
+class Queries:
+    """What methods are asked while they are timed.
+
+    Attributes
+    ----------
+    forces, references : (n, n_nodes, 3) float64
+        Loads, N, and the displacements that answer them, m, which methods do not get.
+    scratch : Path
+        A folder for answers.
+    """
+
+    forces: NDArray[np.float64]
+    references: NDArray[np.float64]
+    scratch: Path
+
+
 def measure(
     openers: Mapping[str, Opener],
-    forces: Any,
+    queries: Queries,
     protocol: Protocol,
     threads: int,
     progress: Callable[[int, int], None] = lambda *_: None,
@@ -174,8 +201,7 @@ def measure(
     ----------
     openers : dict of str to Opener
         By label.
-    forces : Path
-        File of the queries, (n, n_nodes, 3) float64, N.
+    queries : Queries
     protocol : Protocol
     threads : int
         Threads of a single query; batches and a turn of single queries also run on all cores.
@@ -198,15 +224,14 @@ def measure(
         for group in groups:
             with ExitStack() as stack:
                 nursery = stack.enter_context(closing(Nursery())) if CAN_FORK else None
-                workers = _open_all(stack, nursery, {label: openers[label] for label in group}, forces, threads, timings)
+                workers = _open_all(stack, nursery, {label: openers[label] for label in group}, queries, threads, seed + process, timings)
                 for number in range(protocol.rounds):
                     for label in order.permutation(list(workers)):
-                        first = (process * protocol.rounds + number) * protocol.queries
-                        _attempt(timings[label], _turn, workers[label], protocol.queries, first, threads, process, number)
+                        _attempt(timings[label], _turn, workers[label], queries, protocol.queries, threads, process, number)
                         done += 1
                         progress(done, total)
                 for label, worker in workers.items() if not single_only else ():
-                    _attempt(timings[label], _on_all_cores, worker, protocol.queries, process == 0)
+                    _attempt(timings[label], _on_all_cores, worker, queries, protocol.queries, process == 0)
                     done += 1
                     progress(done, total)
     return timings
@@ -227,7 +252,8 @@ def _groups(openers: Mapping[str, Opener]) -> list[list[str]]:
 
 
 def _open_all(
-    stack: ExitStack, nursery: Nursery | None, openers: Mapping[str, Opener], forces: Any, threads: int, timings: Mapping[str, Timing]
+    stack: ExitStack, nursery: Nursery | None, openers: Mapping[str, Opener], queries: Queries, threads: int, seed: int,
+    timings: Mapping[str, Timing],
 ) -> dict[str, Worker]:  # fmt: skip
     """Processes with a loaded and warm method each; what fails on the way says so in its timing."""
 
@@ -235,7 +261,7 @@ def _open_all(
         worker = None
         try:
             worker = openers[label].open(nursery)
-            found = worker.ask("warm", ANSWER_LIMIT_S, forces=forces, threads=threads)
+            found = worker.ask("warm", ANSWER_LIMIT_S, forces=queries.forces, threads=threads, seed=seed)
         except MorBenchError as error:
             timings[label].failed = str(error)
             if worker:
@@ -260,10 +286,24 @@ def _attempt(timing: Timing, measurement: Callable[..., None], worker: Worker, *
         timing.failed = f"while timed: {error}"
 
 
-def _turn(timing: Timing, worker: Worker, n: int, first: int, threads: int, process: int, number: int) -> None:
+def _ask(timing: Timing, worker: Worker, queries: Queries, n: int, threads: int) -> dict[str, Any]:
+    """A turn of single queries; errors of the answers that were kept are noted."""
+    with TemporaryDirectory(dir=queries.scratch) as folder:
+        out = Path(folder) / "answers.npy"
+        found = worker.ask("time", ANSWER_LIMIT_S, out=out, n=n, floor_s=CHUNK_S, most_s=MOST_S, threads=threads)
+        try:
+            answers, references = np.load(out, allow_pickle=False), queries.references[found["checked"]]
+            errors = sample_errors(answers, references).relative_l2
+        except (OSError, ValueError, IndexError, KeyError, TypeError) as error:
+            raise MethodFailedError(f"its answers cannot be read: {error}") from None
+    timing.checked += list(zip(found["checked"], errors.tolist(), strict=True))
+    return found
+
+
+def _turn(timing: Timing, worker: Worker, queries: Queries, n: int, threads: int, process: int, number: int) -> None:
     busy, own = _busy_s(), process_time()
     start = perf_counter()
-    found = worker.ask("time", ANSWER_LIMIT_S, first=first, n=n, floor_s=CHUNK_S, most_s=MOST_S, threads=threads)
+    found = _ask(timing, worker, queries, n, threads)
     wall = perf_counter() - start
     others = max(0.0, _busy_s() - busy - (process_time() - own) - found["cpu_all_s"])
     timing.latency_ms += found["latency_ms"]
@@ -273,9 +313,9 @@ def _turn(timing: Timing, worker: Worker, n: int, first: int, threads: int, proc
     timing.used.append((wall, found["cpu_s"] / found["wall_s"] * wall, others))
 
 
-def _on_all_cores(timing: Timing, worker: Worker, n: int, batches: bool) -> None:
+def _on_all_cores(timing: Timing, worker: Worker, queries: Queries, n: int, batches: bool) -> None:
     cores = cpu_count() or 1
-    timing.all_threads_ms += worker.ask("time", ANSWER_LIMIT_S, first=0, n=n, floor_s=CHUNK_S, most_s=MOST_S, threads=cores)["latency_ms"]
+    timing.all_threads_ms += _ask(timing, worker, queries, n, cores)["latency_ms"]
     if batches:
         found = worker.ask("throughput", ANSWER_LIMIT_S, sizes=list(BATCHES), floor_s=BATCH_S, most_s=MOST_BATCH_S, threads=cores)
         timing.throughput = found["throughput"]
@@ -292,9 +332,11 @@ def why_unstable(timing: Timing, threads: int) -> list[str]:
     reasons = []
     wall, own, others = np.sum(timing.used, axis=0)
     if others / wall > max(BUSY, 0.1 * (cpu_count() or 1)):
-        reasons.append(f"other processes used {others / wall:.2f} cores meanwhile")
+        reasons.append(f"other processes used about {others / wall:.1f} cores meanwhile")
     if threads == 1 and own / wall < STARVED:
         reasons.append(f"its process had {own / wall:.0%} of a core")
+    if threads == 1 and own / wall > MORE_THAN_ONE:
+        reasons.append(f"it used {own / wall:.1f} cores though pinned to one")
     samples = timing.samples
     for name, groups in (("rounds", samples["process"] * (samples["round"].max() + 1) + samples["round"]), ("processes", samples["process"])):
         medians = [float(np.median(samples["latency_ms"][groups == group])) for group in np.unique(groups)]
@@ -310,6 +352,23 @@ def _spread(medians: Sequence[float]) -> float:
         return (max(medians) - min(medians)) / (2 * float(np.mean(medians)))
     low, middle, high = np.percentile(medians, [25, 50, 75])
     return float((high - low) / (2 * middle))
+
+
+def check_answers(timing: Timing, scored: NDArray[np.float64]) -> None:
+    """Raise `MethodFailedError` if a method answers otherwise while it is timed than when it was scored.
+
+    Parameters
+    ----------
+    timing : Timing
+    scored : (n_queries,) float64
+        Relative l2 error of each query when the method was scored.
+    """
+    if not timing.checked:
+        return
+    numbers, errors = (np.array(column) for column in zip(*timing.checked, strict=True))
+    then, now = float(np.median(scored[numbers.astype(int)])), float(np.median(errors))
+    if now > SAME_ERROR[0] * then + SAME_ERROR[1]:
+        raise MethodFailedError(f"its median relative l2 error is {now:.3g} while it is timed, on loads on which it was scored with {then:.3g}")
 
 
 def summary_of_timing(timing: Timing, interval: tuple[float, float], threads: int) -> dict[str, Any]:

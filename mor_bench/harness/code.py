@@ -82,9 +82,9 @@ def _closure(module: str, folder: Path | None) -> dict[str, Path]:
     waiting = [module, "mor_bench.surrogate"]
     while waiting:
         name = waiting.pop()
-        if name in found or name in DATA_ONLY or name.partition(".")[0] not in (own, "mor_bench"):
+        if name in found or name in DATA_ONLY:
             continue
-        path = _file_of(name, folder)
+        path = _file_of(name, folder if name.partition(".")[0] != "mor_bench" else None, installed=name.partition(".")[0] in (own, "mor_bench"))
         if path is None:
             continue
         found[name] = path
@@ -93,8 +93,8 @@ def _closure(module: str, folder: Path | None) -> dict[str, Path]:
     return found
 
 
-def _file_of(name: str, folder: Path | None) -> Path | None:
-    """The source of a module, found without importing anything."""
+def _file_of(name: str, folder: Path | None, installed: bool) -> Path | None:
+    """The source of a module, found without importing anything: beside the method's file, or an installed one that is its own."""
     parts = name.split(".")
     roots = [Path(mor_bench.__file__).parent.parent] if parts[0] == "mor_bench" else [folder] if folder else []
     for root in roots:
@@ -102,7 +102,7 @@ def _file_of(name: str, folder: Path | None) -> Path | None:
         for path in (stem.with_suffix(".py"), stem / "__init__.py"):
             if path.is_file():
                 return path
-    if parts[0] == "mor_bench":
+    if parts[0] == "mor_bench" or not installed:
         return None
     search: list[str] | None = None
     spec = None

@@ -16,9 +16,11 @@ import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -27,7 +29,7 @@ from numpy.typing import NDArray
 from mor_bench.harness.code import code_digest
 from mor_bench.harness.handover import arrays_of, write_snapshots
 from mor_bench.harness.isolation import MethodFailedError, Worker
-from mor_bench.harness.metrics import sample_errors
+from mor_bench.harness.metrics import SampleErrors, sample_errors
 from mor_bench.harness.nursery import Nursery
 from mor_bench.harness.results import read_arrays, write_arrays
 from mor_bench.scene.scene import Scene
@@ -39,6 +41,10 @@ N_COUNTED = 32
 """Test loads over which the cost of a query is averaged."""
 
 SCORE_CHUNK = 256
+"""Samples that are predicted at once."""
+
+FIT_KEYS = {"fit_s", "fit_memory_bytes", "model_bytes", "needs_snapshots", "parameters", "warnings", "n_train", "n_dofs", "model_sha256"}
+"""What a record of a fit holds."""
 
 LOAD_LIMIT_S = 300.0
 
@@ -82,11 +88,24 @@ class Place:
 
 @dataclass(frozen=True)
 class TestSet:
-    """Forces that methods are asked for, in a file that they may open only then, and the answers, which stay here."""
+    """Forces that methods are asked for, and the displacements that answer them: both stay in this process until scoring.
 
-    forces: Path
+    Attributes
+    ----------
+    forces, references : (n, n_nodes, 3) float64
+        N and m.
+    digest : str
+        Of both.
+    """
+
+    forces: NDArray[np.float64]
     references: NDArray[np.float64]
     digest: str
+
+    @classmethod
+    def of(cls, snapshots: Snapshots) -> TestSet:
+        """A test set from snapshots."""
+        return cls(snapshots.forces, snapshots.displacements, digest_of({"f": snapshots.forces, "u": snapshots.displacements}))
 
 
 def digest_of(arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -99,37 +118,42 @@ def digest_of(arrays: Mapping[str, NDArray[Any]]) -> str:
 
 
 class Material:
-    """A dataset laid out for the methods' processes: training snapshots in a folder, test forces in sealed files.
+    """A dataset laid out for the methods' processes: training snapshots in a folder; test sets in memory.
 
     Parameters
     ----------
     scene : Scene
     train : Snapshots
-    sets : dict of str to Snapshots
-        Test sets; the main one is ``test``.
+    sets : dict of str to TestSet
+        The main one is ``test``.
     scratch : Path
-        A folder of its own.
+        An existing folder that every method's process may write to.
     """
 
-    def __init__(self, scene: Scene, train: Snapshots, sets: Mapping[str, Snapshots], scratch: Path) -> None:
-        self.scene = scene
-        self.scratch = scratch
+    def __init__(self, scene: Scene, train: Snapshots, sets: Mapping[str, TestSet], scratch: Path) -> None:
+        self.scene, self.scratch, self.sets = scene, scratch, dict(sets)
         self.n_train = len(train)
-        self.open_folder = scratch / "open"
-        self.sealed = scratch / "sealed"
-        for folder in (scratch, self.open_folder, self.sealed):
-            folder.mkdir(exist_ok=True)
         self._train = train
-        self.train_folder = Path(tempfile.mkdtemp(dir=self.open_folder)) / "train"
-        write_snapshots(self.train_folder, train)
-        self.sets = {name: self.add_set(name, snapshots) for name, snapshots in sets.items()}
+        self._lay_out()
 
-    def add_set(self, name: str, snapshots: Snapshots) -> TestSet:
-        """Lay out one more test set."""
-        path = self.sealed / f"{name}.npy"
-        if not path.exists():
-            np.save(path, snapshots.forces, allow_pickle=False)
-        return TestSet(path, snapshots.displacements, digest_of({"f": snapshots.forces, "u": snapshots.displacements}))
+    def _lay_out(self) -> None:
+        self.train_folder = Path(tempfile.mkdtemp(dir=self.scratch)) / "train"
+        write_snapshots(self.train_folder, self._train)
+        self._files = self._file_digests()
+
+    def _file_digests(self) -> dict[str, str]:
+        return {path.name: _file_digest(path) for path in sorted(self.train_folder.iterdir())}
+
+    def check_unchanged(self) -> None:
+        """Raise `MethodFailedError`, and lay the samples out anew, if a method wrote over them."""
+        try:
+            unchanged = self._file_digests() == self._files
+        except OSError:
+            unchanged = False
+        if not unchanged:
+            shutil.rmtree(self.train_folder.parent, ignore_errors=True)
+            self._lay_out()
+            raise MethodFailedError("it wrote over the training samples")
 
     @cached_property
     def train_digest(self) -> str:
@@ -139,12 +163,13 @@ class Material:
 
     def first(self, n: int) -> Material:
         """With only the first training samples, and the main test set."""
-        less = object.__new__(Material)
-        less.scene, less.scratch, less.open_folder, less.sealed = self.scene, self.scratch, self.open_folder, self.sealed
-        less._train, less.n_train, less.sets = self._train[:n], n, {"test": self.sets["test"]}
-        less.train_folder = Path(tempfile.mkdtemp(dir=self.open_folder)) / "train"
-        write_snapshots(less.train_folder, less._train)
-        return less
+        return Material(self.scene, self._train[:n], {"test": self.sets["test"]}, self.scratch)
+
+    def with_sets(self, sets: Mapping[str, TestSet]) -> Material:
+        """With the same training samples and other test sets."""
+        other = copy(self)
+        other.sets = dict(sets)
+        return other
 
 
 @dataclass
@@ -159,14 +184,11 @@ class Outcome:
         For each test set the per-sample errors, whether each load was flagged as out of range if the method knows, and the worst sample.
     cost : dict or None
         Per query, on the main test set.
-    cached : bool
-        Whether nothing had to be computed.
     """
 
     fit: dict[str, Any]
     scores: dict[str, dict[str, NDArray[Any]]]
     cost: dict[str, float] | None
-    cached: bool
 
 
 class Entry:
@@ -174,6 +196,7 @@ class Entry:
 
     def __init__(self, job: Job, material: Material, place: Place) -> None:
         self.job, self.material, self.place = job, material, place
+        self._held: Worker | None = None
         parts = {
             "data": material.train_digest,
             "surrogate": job.method.surrogate,
@@ -193,12 +216,14 @@ class Entry:
     def fit(self) -> dict[str, Any] | None:
         """What is known of the fit; None if it is not there, or damaged."""
         try:
-            record: dict[str, Any] = json.loads((self.folder / "fit.json").read_bytes())
-            if record["model_sha256"] is not None and record["model_sha256"] != _file_digest(self.model):
+            record = json.loads((self.folder / "fit.json").read_bytes())
+            whole = isinstance(record, dict) and record.keys() >= FIT_KEYS and isinstance(record["parameters"], dict)
+            if not whole or (record["model_sha256"] is not None and record["model_sha256"] != _file_digest(self.model)):
                 return None
-        except (OSError, ValueError, KeyError):
+        except (OSError, ValueError):
             return None
-        return record
+        found: dict[str, Any] = record
+        return found
 
     def keep_fit(self, record: dict[str, Any], model: Path | None) -> dict[str, Any]:
         """Keep a fit; the record commits it."""
@@ -226,20 +251,26 @@ class Entry:
 
     def process(self, nursery: Nursery | None = None) -> Worker:
         """A fresh process for this method, without a model."""
-        sealed = [*self.place.sealed, self.material.sealed]
-        return Worker(self.material.scene, sealed, self.job.method.folder, self.place.memory_limit_bytes, nursery or self.place.nursery)
+        return Worker(
+            self.material.scene, list(self.place.sealed), self.job.method.folder, self.place.memory_limit_bytes, nursery or self.place.nursery
+        )
 
     def ask_fit(self, worker: Worker, limit_s: float) -> tuple[dict[str, Any], Path]:
         """Let a process fit; its answer, and where the model is."""
-        model = Path(tempfile.mkdtemp(dir=self.material.open_folder)) / "model.safetensors"
+        model = Path(tempfile.mkdtemp(dir=self.material.scratch)) / "model.safetensors"
         answer = worker.ask(
             "fit", limit_s, surrogate=self.job.method.surrogate, parameters=self.job.parameters, train=self.material.train_folder,
             model=model, threads=self.place.fit_threads, limit_s=limit_s,
         )  # fmt: skip
+        if answer["needs_snapshots"]:
+            self.material.check_unchanged()
         return answer, model
 
     def opened(self, limit_s: float = LOAD_LIMIT_S, nursery: Nursery | None = None) -> Worker:
-        """A fresh process with the fitted method: loaded, or fitted again where it cannot be saved."""
+        """A process with the fitted method: a fresh one with the model, or one that fits again where it cannot be saved."""
+        if self._held and nursery is None:
+            worker, self._held = self._held, None
+            return worker
         worker = self.process(nursery)
         try:
             if self.fit and self.fit["model_sha256"] is not None:
@@ -251,6 +282,16 @@ class Entry:
             raise
         return worker
 
+    def hold(self, worker: Worker) -> None:
+        """Keep the process of a method that cannot be saved until it has been scored."""
+        self._held = worker
+
+    def release(self) -> None:
+        """End what is held."""
+        if self._held:
+            self._held.end()
+            self._held = None
+
 
 def _file_digest(path: Path) -> str:
     with path.open("rb") as file:
@@ -260,55 +301,86 @@ def _file_digest(path: Path) -> str:
 RemoteFit = Callable[[Entry, float], tuple[dict[str, Any], bytes | None]]
 
 
-def evaluate(entry: Entry, limit_s: float, remote: RemoteFit | None = None, *, count: bool = True) -> Outcome:
-    """Fit and score a configuration, as far as the cache has not got it.
+def fit(entry: Entry, limit_s: float, remote: RemoteFit | None = None) -> dict[str, Any]:
+    """Fit a configuration, unless the cache has it: what fitting took and gave. No test set is known to the process.
 
     Parameters
     ----------
     entry : Entry
     limit_s : float
-        Seconds for the fit, and again for the predictions.
+        Seconds for the fit.
     remote : callable, optional
         Fits elsewhere: answer and content of the model's file.
+
+    Raises
+    ------
+    MethodFailedError
+        If the method crashes, hangs, takes too much memory or changes what others are to learn from.
+    MorBenchError
+        Of the kind that the method raised.
+    """
+    if entry.fit is not None:
+        return entry.fit
+    if remote is not None:
+        return _keep_remote(entry, *remote(entry, limit_s))
+    worker = entry.process()
+    try:
+        answer, model = entry.ask_fit(worker, limit_s)
+        saved = answer["model_bytes"] is not None
+        record = entry.keep_fit(_record(entry, answer), model if saved else None)
+        shutil.rmtree(model.parent, ignore_errors=True)
+    except BaseException:
+        worker.end()
+        raise
+    if saved:
+        worker.end()
+    else:
+        entry.hold(worker)
+    return record
+
+
+def score(entry: Entry, limit_s: float, *, count: bool = True) -> Outcome:
+    """Score a fitted configuration on all test sets, as far as the cache has not got it.
+
+    Parameters
+    ----------
+    entry : Entry
+    limit_s : float
+        Seconds for the predictions.
     count : bool
         Whether to count the cost of a query.
 
     Raises
     ------
-    MethodFailedError
-        If the method crashes, hangs or takes too much memory.
-    MorBenchError
-        Of the kind that the method raised.
+    MethodFailedError, MorBenchError
+        As `fit`.
     """
+    assert entry.fit is not None
     with ExitStack() as stack:
+        stack.callback(entry.release)
         worker: Worker | None = None
-        cached = True
 
         def opened() -> Worker:
-            nonlocal worker, cached
+            nonlocal worker
             if worker is None:
-                worker, cached = entry.opened(limit_s), False
+                worker = entry.opened(limit_s)
                 stack.callback(worker.end)
             return worker
 
-        fit = entry.fit
-        if fit is None and remote is not None:
-            fit, cached = _keep_remote(entry, *remote(entry, limit_s)), False
-        if fit is None:
-            worker, cached = entry.process(), False
-            stack.callback(worker.end)
-            answer, model = entry.ask_fit(worker, limit_s)
-            fit = entry.keep_fit(_record(entry, answer), model if answer["model_bytes"] is not None else None)
-            shutil.rmtree(model.parent)
         scores = {}
         for name, test in entry.material.sets.items():
-            score = entry.arrays(f"score-{test.digest[:20]}")
-            if score is None:
-                score = _score(entry, opened(), test, limit_s)
-                entry.keep_arrays(f"score-{test.digest[:20]}", score)
-            scores[name] = score
-        cost = _cost(entry, opened) if count else None
-    return Outcome(fit, scores, cost, cached)
+            found = entry.arrays(f"score-{test.digest[:20]}")
+            if found is None:
+                found = _score(entry, opened(), test, limit_s)
+                entry.keep_arrays(f"score-{test.digest[:20]}", found)
+            scores[name] = found
+        return Outcome(entry.fit, scores, _cost(entry, opened) if count else None)
+
+
+def evaluate(entry: Entry, limit_s: float) -> Outcome:
+    """Fit and score a configuration; see `fit` and `score`."""
+    fit(entry, limit_s)
+    return score(entry, limit_s, count=False)
 
 
 def _record(entry: Entry, answer: dict[str, Any]) -> dict[str, Any]:
@@ -328,39 +400,55 @@ def _keep_remote(entry: Entry, answer: dict[str, Any], content: bytes | None) ->
 
 def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[str, NDArray[Any]]:
     """Errors of each sample of a test set, and the worst sample."""
-    out = entry.material.sealed / f"answers-{entry.key}.npy"
+    parts: list[SampleErrors] = []
+    flagged: list[bool] | None = []
+    worst: tuple[float, int, NDArray[np.float64]] = (-1.0, 0, np.full(test.references.shape[1:], np.nan))
+    until = monotonic() + limit_s
+    with tempfile.TemporaryDirectory(dir=entry.material.scratch) as folder:
+        for start in range(0, len(test.forces), SCORE_CHUNK):
+            rows = slice(start, start + SCORE_CHUNK)
+            predicted = ask_answers(
+                worker, "predict", max(1.0, until - monotonic()), Path(folder) / "answers.npy", test.forces[rows], entry.place.threads
+            )
+            parts.append(sample_errors(predicted, test.references[rows]))
+            finite = np.where(np.isfinite(parts[-1].mean_dof_m), parts[-1].mean_dof_m, -1.0)
+            if finite.max() > worst[0]:
+                worst = float(finite.max()), start + int(finite.argmax()), predicted[finite.argmax()].copy()
+            flags = worker.ask("flag", LOAD_LIMIT_S, forces=test.forces[rows])["flagged"]
+            flagged = None if flags is None or flagged is None else flagged + flags
+    return {
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])},
+        **({} if flagged is None else {"flagged": np.asarray(flagged, dtype=bool)}),
+        "worst_prediction": worst[2],
+        "worst_reference": test.references[worst[1]],
+        "worst_forces": test.forces[worst[1]],
+    }
+
+
+def ask_answers(worker: Worker, do: str, limit_s: float, out: Path, forces: NDArray[np.float64], threads: int) -> NDArray[np.float64]:
+    """Predictions that a process writes to a file, checked: a third party's code ran there."""
+    worker.ask(do, limit_s, forces=forces, out=out, threads=threads)
     try:
-        worker.ask("predict", limit_s, forces=test.forces, out=out, threads=entry.place.threads)
-        flagged = worker.ask("flag", limit_s, forces=test.forces)["flagged"]
-        predicted = np.load(out, mmap_mode="r", allow_pickle=False)
-        if predicted.shape != test.references.shape or predicted.dtype != np.float64:
-            raise MethodFailedError(f"its predictions have shape {predicted.shape}; expected {test.references.shape}")
-        parts = [
-            sample_errors(np.asarray(predicted[start : start + SCORE_CHUNK]), test.references[start : start + SCORE_CHUNK])
-            for start in range(0, len(predicted), SCORE_CHUNK)
-        ]
-        errors = {name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
-        worst = int(np.where(np.isfinite(errors["mean_dof_m"]), errors["mean_dof_m"], -1.0).argmax())
-        forces = np.load(test.forces, mmap_mode="r", allow_pickle=False)
-        return {
-            **errors,
-            **({} if flagged is None else {"flagged": np.asarray(flagged, dtype=bool)}),
-            "worst_prediction": np.array(predicted[worst]),
-            "worst_reference": test.references[worst],
-            "worst_forces": np.array(forces[worst]),
-        }
-    finally:
-        out.unlink(missing_ok=True)
+        predicted = np.load(out, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise MethodFailedError(f"its predictions cannot be read: {error}") from None
+    if predicted.shape != forces.shape or predicted.dtype != np.float64:
+        raise MethodFailedError(f"its predictions have shape {predicted.shape} and are {predicted.dtype}; expected {forces.shape} and float64")
+    out.unlink()
+    return np.asarray(predicted)
 
 
 def _cost(entry: Entry, opened: Callable[[], Worker]) -> dict[str, float] | None:
     """Cost of a query, counted once and kept with the fit."""
-    name = f"cost-{entry.material.sets['test'].digest[:20]}.json"
+    test = entry.material.sets["test"]
+    path = entry.folder / f"cost-{test.digest[:20]}.json"
     with suppress(OSError, ValueError):
-        kept: dict[str, float] | None = json.loads((entry.folder / name).read_bytes())
-        return kept
-    cost: dict[str, float] | None = opened().ask("cost", LOAD_LIMIT_S, forces=entry.material.sets["test"].forces, n=N_COUNTED)["cost"]
-    write_atomically(entry.folder / name, json.dumps(cost).encode())
+        kept = json.loads(path.read_bytes())
+        if kept is None or (isinstance(kept, dict) and all(isinstance(value, int | float) for value in kept.values())):
+            return kept
+    chosen = np.linspace(0, len(test.forces) - 1, min(N_COUNTED, len(test.forces))).astype(int)
+    cost: dict[str, float] | None = opened().ask("cost", LOAD_LIMIT_S, forces=test.forces[chosen])["cost"]
+    write_atomically(path, json.dumps(cost).encode())
     return cost
 
 

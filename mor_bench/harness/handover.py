@@ -14,9 +14,6 @@ from mor_bench.snapshots.imported import NodalLoads
 from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.surrogate import Surrogate
 
-PREDICTION_BATCH = 256
-"""Samples per call of `predict`, which bounds memory."""
-
 
 def arrays_of(snapshots: Snapshots) -> dict[str, NDArray[np.generic]]:
     """All that snapshots hold beside their scene."""
@@ -40,35 +37,30 @@ def read_snapshots(folder: Path, scene: Scene) -> Snapshots:
     return Snapshots(scene, loads, arrays["free_displacements"], arrays["min_det_f"])
 
 
-def predict_all(method: Surrogate, forces: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """Predictions for all samples; NaN where the method found no equilibrium, which counts as an infinite error.
+def predict_all(method: Surrogate, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Predictions (n, n_nodes, 3), m; NaN where the method found no equilibrium, which counts as an infinite error.
 
     Parameters
     ----------
     method : Surrogate
     forces : (n, n_nodes, 3) float64
         N.
-    out : (n, n_nodes, 3) float64
-        Takes the displacements, m.
 
     Raises
     ------
     InvalidInputError
         If the method answers with another shape or no floats.
     """
-    for start in range(0, len(forces), PREDICTION_BATCH):
-        rows = slice(start, start + PREDICTION_BATCH)
-        # Copies: what a method does to its input must not reach the rows after it.
-        batch = np.array(forces[rows])
-        try:
-            predicted = np.asarray(method.predict(batch.copy()))
-        except SolverError:
-            predicted = np.full(batch.shape, np.nan)
-            for answer, force in zip(predicted, batch, strict=True):
-                try:
-                    answer[:] = method.predict(force.copy())
-                except SolverError:
-                    continue
-        if predicted.shape != batch.shape or predicted.dtype.kind != "f":
-            raise InvalidInputError(f"`predict` must return floats of shape {batch.shape}; it returned {predicted.dtype} of shape {predicted.shape}.")
-        out[rows] = predicted
+    try:
+        # Copies: what a method does to its input must not reach the scoring.
+        predicted = np.asarray(method.predict(forces.copy()))
+    except SolverError:
+        predicted = np.full(forces.shape, np.nan)
+        for answer, force in zip(predicted, forces, strict=True):
+            try:
+                answer[:] = method.predict(force.copy())
+            except SolverError:
+                continue
+    if predicted.shape != forces.shape or predicted.dtype.kind != "f":
+        raise InvalidInputError(f"`predict` must return floats of shape {forces.shape}; it returned {predicted.dtype} of shape {predicted.shape}.")
+    return predicted.astype(np.float64, copy=False)

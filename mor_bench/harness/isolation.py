@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import signal
 import socket
@@ -108,6 +109,9 @@ class Worker:
                 if monotonic() >= until:
                     self.end()
                     raise MethodFailedError(f"{_DOING.get(do, do)} took longer than the limit of {within_s:g} s") from None
+                if self._is_dead() and self._answers.empty():  # a child of it may hold the pipe
+                    line = b""
+                    break
                 if (used := self._memory()) > self._memory_limit:
                     self.end()
                     raise MethodFailedError(
@@ -126,6 +130,12 @@ class Worker:
         if isinstance(kind, type) and issubclass(kind, MorBenchError):
             raise kind(answer["message"])
         raise MethodFailedError(answer["message"])
+
+    def _is_dead(self) -> bool:
+        try:
+            return bool(self._watched.status() == psutil.STATUS_ZOMBIE)
+        except psutil.Error:
+            return True
 
     def _memory(self) -> int:
         total = 0
@@ -149,6 +159,9 @@ class Worker:
             for process in self._watched.children(recursive=True):
                 with suppress(psutil.Error):
                     process.kill()
+        if hasattr(os, "killpg"):
+            with suppress(OSError):  # what it started without a session of its own
+                os.killpg(self._process.pid, signal.SIGKILL)
         with suppress(psutil.Error):
             self._watched.kill()
         self._process.close()
@@ -170,7 +183,12 @@ class _Started:
 
     def __init__(self, said: Any) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "mor_bench.harness.worker"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, env=environment()
+            [sys.executable, "-m", "mor_bench.harness.worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=said,
+            env=environment(),
+            start_new_session=True,
         )
         assert self._process.stdin
         assert self._process.stdout

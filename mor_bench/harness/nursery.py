@@ -14,8 +14,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from threading import Condition, Thread
+from threading import Condition, Lock, Thread
 from time import monotonic, sleep
 from typing import Any, BinaryIO
 
@@ -48,17 +49,20 @@ class Nursery:
         self._path = os.path.join(self._folder.name, "s")
         self._ended: dict[int, int] = {}
         self._news = Condition()
+        self._lock = Lock()
+        self._environment = {**({"OMP_WAIT_POLICY": "passive"} if yielding else {}), **environment()}
+        self._start()
+
+    def _start(self) -> None:
         self._process = subprocess.Popen(
             [sys.executable, "-m", "mor_bench.harness.worker", self._path],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            env={**({"OMP_WAIT_POLICY": "passive"} if yielding else {}), **environment()},
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=self._environment, start_new_session=True,
         )  # fmt: skip
-        Thread(target=self._listen, daemon=True).start()
+        Thread(target=self._listen, args=(self._process.stdout,), daemon=True).start()
 
-    def _listen(self) -> None:
+    def _listen(self, news: BinaryIO) -> None:
         """Take down how workers ended."""
-        assert self._process.stdout
-        for line in self._process.stdout:
+        for line in news:
             pid, status = map(int, line.split())
             with self._news:
                 self._ended[pid] = os.waitstatus_to_exitcode(status)
@@ -66,6 +70,10 @@ class Nursery:
 
     def new_worker(self, said: str) -> tuple[socket.socket, int]:
         """A connection to a new worker, and its process id; its standard error goes to a file."""
+        with self._lock:
+            if self._process.poll() is not None:  # a method has ended it
+                Path(self._path).unlink(missing_ok=True)
+                self._start()
         until = monotonic() + START_S
         connection = socket.socket(socket.AF_UNIX)
         while True:
@@ -88,7 +96,8 @@ class Nursery:
     def close(self) -> None:
         """End the server; its workers end with their connections."""
         assert self._process.stdin
-        self._process.stdin.close()
+        with suppress(OSError):
+            self._process.stdin.close()
         self._process.wait()
         self._folder.cleanup()
 
@@ -148,6 +157,7 @@ def serve(path: str, work: Callable[[BinaryIO, BinaryIO], Any]) -> None:
             while not said.endswith(b"\n"):
                 said += connection.recv(4096)
             if os.fork() == 0:
+                os.setsid()  # what a method does to its process group is done to its own
                 signal.set_wakeup_fd(-1)
                 signal.signal(signal.SIGCHLD, signal.SIG_DFL)
                 for descriptor in (listener.fileno(), news, woken, wake):

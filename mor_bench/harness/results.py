@@ -102,7 +102,8 @@ class Comparison:
         with the interval `low`, `high` in which a repeated measurement's median is expected, the garbage collector's share
         `gc` and whether it was `stable`; `all_threads_ms`; `throughput` in queries per second by size of the batch;
         `offline_s`; `memory_bytes`, resident at most while fitting and while predicting; `model_bytes`; `cost` per query,
-        which no machine changes; `sets`, errors on the named test sets; `hidden`, on a test set of fresh draws. Of the
+        which no machine changes; `sets`, errors on the named test sets; `hidden`, on a test set of fresh draws; `seeds`, with how
+        many seeds it was trained, and which failed; `tuning_s`, what it took of the tuning budget. Of the
         dataset's own mesh against the limit of fine ones `discretisation_error_m` (mean e) and `discretisation_rel_l2`
         (median). None where not measured.
     datasets, methods : dict

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
+import secrets
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from threading import Lock
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -19,9 +22,9 @@ import psutil
 
 from mor_bench import __version__
 from mor_bench.errors import InvalidInputError, MissingDependencyError, MorBenchError, SolverError, UnsupportedSceneError
-from mor_bench.harness.clock import PROTOCOLS, Opener, Timing, measure, probe_s, summary_of_timing
+from mor_bench.harness.clock import PROTOCOLS, Opener, Queries, Timing, check_answers, measure, probe_s, summary_of_timing
 from mor_bench.harness.discretisation import measured
-from mor_bench.harness.fits import Entry, Job, Material, Outcome, Place, RemoteFit, evaluate, fit_elsewhere
+from mor_bench.harness.fits import Entry, Job, Material, Outcome, Place, RemoteFit, TestSet, evaluate, fit, fit_elsewhere, score
 from mor_bench.harness.handover import arrays_of
 from mor_bench.harness.isolation import START_LIMIT_S, MethodFailedError, Worker
 from mor_bench.harness.metrics import SampleErrors, summary
@@ -57,6 +60,9 @@ DATA_METHODS = ("pca-regression-force", "umesh")
 
 MEMORY_SHARE = 0.75
 """Of the machine's memory, that a method may take unless another limit is given."""
+
+MOST_QUERIES = 400
+"""Loads of the test set from which a timing's queries are drawn."""
 
 EXTRA_SEEDS = 2
 """Trainings with other seeds in a full comparison, beside that of the method's file."""
@@ -116,7 +122,7 @@ class _Settings:
     cache: Path
     budget: Budget
     memory_limit_bytes: float
-    test_seed: int | None
+    test_seed: int | str | None
     retime: bool
     fail_fast: bool
     listener: Listener
@@ -138,7 +144,7 @@ def run(
     workers: int | None = None,
     jobs: int = 1,
     cluster: str | None = None,
-    test_seed: int | None = None,
+    test_seed: int | str | None = None,
     time_limit_s: float | None = None,
     memory_limit_bytes: float | None = None,
     retime: bool = False,
@@ -179,8 +185,9 @@ def run(
         Fits at once, which share the cores; seconds of fitting are honest with one.
     cluster : str, optional
         Address of a Dask scheduler, ``tcp://host:port``, whose workers generate and fit; timings are always taken here.
-    test_seed : int, optional
-        Also score on a test set of the same distribution that this seed draws when all methods are fitted.
+    test_seed : int or "fresh", optional
+        Also score on a test set of the same distribution that this seed draws when all methods are fitted. A number can be
+        repeated, and known to a method; "fresh" is drawn then, too, and recorded with the result.
     time_limit_s : float, optional
         Of all fits of a method on a dataset together: the tuning budget's seconds.
     memory_limit_bytes : float, optional
@@ -208,7 +215,7 @@ def run(
     check_pool(workers, cluster)
     if not datasets or (methods is not None and not methods):
         raise InvalidInputError("`datasets` and `methods` must name at least one each.")
-    specs, method_specs = checked_specs(datasets, methods, profile, suite)
+    specs, method_specs = checked_specs(datasets, methods, profile, suite, cache, memory_limit_bytes)
     if test_seed is not None:
         _check_test_seed(test_seed, specs)
     budget = BUDGETS[profile]
@@ -220,6 +227,7 @@ def run(
     comparison = _open_run(Path(out) if out else _default_out([spec.name for spec in specs]), specs, method_specs, settings)
     jobs_of_all = jobs_of(method_specs, profile)
     with ExitStack() as stack:
+        stack.enter_context(_alone(comparison.out))
         nursery = stack.enter_context(closing(Nursery(yielding=True))) if CAN_FORK else None
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mor-bench-")))
         stack.enter_context(suppress(_StopRunError))
@@ -241,12 +249,14 @@ def _check(profile: str, threads: int, jobs: int, cores: int, time_limit_s: floa
         raise InvalidInputError(f"`memory_limit_bytes` must be at least 1e8, which a process takes without a method; got {memory_limit_bytes:g}.")
 
 
-def _check_test_seed(test_seed: int, specs: Sequence[AnyDatasetSpec]) -> None:
+def _check_test_seed(test_seed: int | str, specs: Sequence[AnyDatasetSpec]) -> None:
     for spec in specs:
         if isinstance(spec, ImportedDatasetSpec):
             raise InvalidInputError(f"`test_seed`: no fresh test set can be drawn of {spec.name}, whose snapshots were imported.")
-        if test_seed == spec.loads.seed or test_seed < 0:
-            raise InvalidInputError(f"`test_seed` must be an integer >= 0 other than the seed of {spec.name}, {spec.loads.seed}; got {test_seed}.")
+        if test_seed != "fresh" and (not isinstance(test_seed, int) or test_seed == spec.loads.seed or test_seed < 0):
+            raise InvalidInputError(
+                f"`test_seed` must be 'fresh' or an integer >= 0 other than the seed of {spec.name}, {spec.loads.seed}; got {test_seed!r}."
+            )
 
 
 def _default_out(names: Sequence[str]) -> Path:
@@ -264,7 +274,12 @@ def jobs_of(methods: Sequence[MethodSpec], profile: str) -> list[Job]:
 
 
 def checked_specs(
-    datasets: Sequence[str | Path | Mapping[str, Any]], methods: Sequence[str | Path] | None, profile: str, suite: Path | None
+    datasets: Sequence[str | Path | Mapping[str, Any]],
+    methods: Sequence[str | Path] | None,
+    profile: str,
+    suite: Path | None,
+    cache: Path | None = None,
+    memory_limit_bytes: float | None = None,
 ) -> tuple[list[AnyDatasetSpec], list[MethodSpec]]:
     """Read all specifications and check them as far as they can be without running, so that no run fails half-way on one."""
     specs = [load_dataset_spec(dataset, suite) for dataset in datasets]
@@ -280,7 +295,7 @@ def checked_specs(
         if isinstance(spec, DatasetSpec):
             check_supports(scene)
     for method_spec in method_specs:
-        _check_method(method_spec)
+        _check_method(method_spec, Path(cache or default_cache()), memory_limit_bytes)
     return specs, method_specs
 
 
@@ -294,13 +309,14 @@ def _default_methods(specs: Sequence[AnyDatasetSpec], profile: str, suite: Path 
     return list(dict.fromkeys([*(name for names in defaults for name in names), *own]))
 
 
-def _check_method(spec: MethodSpec) -> None:
+def _check_method(spec: MethodSpec, cache: Path, memory_limit_bytes: float | None) -> None:
     """Check knobs; a third party's class in a process of its own, where its import may crash or hang: that becomes a row."""
     if spec.surrogate.startswith("mor_bench."):
         with suppress(MissingDependencyError):  # that becomes a row with its reason
             check_method(spec)
         return
-    with suppress(MethodFailedError, MissingDependencyError), Worker(None, [], spec.folder) as worker:
+    memory = MEMORY_SHARE * psutil.virtual_memory().total if memory_limit_bytes is None else memory_limit_bytes
+    with suppress(MethodFailedError, MissingDependencyError), Worker(None, sealed_folders(cache), spec.folder, memory) as worker:
         for profile in ("quick", "full"):
             where = f"method {spec.name} ({profile})"
             worker.ask("check", START_LIMIT_S, surrogate=spec.surrogate, configurations=spec.configurations(profile), where=where)
@@ -311,7 +327,8 @@ def _open_run(out: Path, specs: Sequence[AnyDatasetSpec], methods: Sequence[Meth
     datasets = {spec.name: spec.model_dump(mode="json") for spec in specs}
     said = {
         "profile": settings.profile, "split": settings.split, "limit": settings.limit, "threads": settings.threads, "test_seed": settings.test_seed,
-        "budget": {"configurations": settings.budget.configurations, "seconds": settings.budget.seconds}, "version": __version__,
+        "budget": {"configurations": settings.budget.configurations, "seconds": settings.budget.seconds},
+        "seeds": 1 + (EXTRA_SEEDS if settings.profile == "full" else 0), "device": "cpu", "version": __version__,
     }  # fmt: skip
     if (out / "results.json").exists():
         comparison = Comparison.read(out)
@@ -325,6 +342,21 @@ def _open_run(out: Path, specs: Sequence[AnyDatasetSpec], methods: Sequence[Meth
     except OSError as error:
         raise InvalidInputError(f"`out`: {out} cannot be written: {error.strerror}.") from None
     return comparison
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """No other run writes to the folder meanwhile; what a killed one left is no hindrance."""
+    lock = out / ".running"
+    with suppress(OSError, ValueError, psutil.Error):
+        number, created = map(float, lock.read_text().split())
+        if psutil.Process(int(number)).create_time() == created and int(number) != os.getpid():
+            raise InvalidInputError(f"{out}: another run, process {int(number)}, writes there; wait for it or choose another folder.")
+    lock.write_text(f"{os.getpid()} {psutil.Process().create_time()!r}")
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
 
 
 class _DatasetRun:
@@ -352,7 +384,8 @@ class _DatasetRun:
         if self.settings.profile == "full":
             self._learning_curves(entries)
         if self.settings.test_seed is not None:
-            self._fresh_test(entries, self.settings.test_seed)
+            seed = self.settings.test_seed
+            self._fresh_test(entries, seed if isinstance(seed, int) else secrets.randbelow(2**53))
 
     def _lay_out(self) -> None:
         settings, spec = self.settings, self.spec
@@ -365,55 +398,68 @@ class _DatasetRun:
         record_dataset(self.comparison, spec, self.data)
         n = len(self.data.train)
         self.data_seconds = generation_seconds(spec, settings.cache, n) if isinstance(spec, DatasetSpec) else None
-        self.material = Material(self.data.scene, self.data.train, {"test": self.data.test, **self.data.tests}, self.folder)
-        sealed = [settings.cache / "datasets", settings.cache / "fits", self.comparison.out / "samples"]
+        self.folder.mkdir()
+        tests = {name: TestSet.of(snapshots) for name, snapshots in {"test": self.data.test, **self.data.tests}.items()}
+        self.material = Material(self.data.scene, self.data.train, tests, self.folder)
+        sealed = sealed_folders(settings.cache, self.comparison.out)
         if isinstance(spec, ImportedDatasetSpec):
             sealed.append(Path(spec.snapshots.file.path))
         self.place = place_of(settings.cache, sealed, settings.jobs, settings.threads, settings.memory_limit_bytes, self.nursery)
 
     def _fit_all(self) -> dict[str, Entry]:
-        """Every configuration's row but for its latency; the entries of those that can be timed, by label."""
+        """Every configuration's row but for its latency; the entries of those that can be timed, by label.
+
+        A method is fitted in all its configurations before the first of them is asked for the test set.
+        """
         entries: dict[str, Entry] = {}
         with ExitStack() as stack:
             pool = stack.enter_context(cluster_pool(self.settings.cluster)) if self.settings.cluster else None
-            n_threads = pool.window() if pool else self.settings.jobs
-            executor = stack.enter_context(ThreadPoolExecutor(n_threads))
-            ahead = _in_order(executor, n_threads, self.jobs, partial(self._fit_one, pool))
-            for job, (entry, row, samples) in zip(self.jobs, ahead, strict=True):
-                self.comparison.put(row, samples)
-                self.settings.listener.fitted(row)
-                if entry is not None:
-                    entries[job.label] = entry
-                elif row["status"] == "failed" and self.settings.fail_fast:
-                    executor.shutdown(cancel_futures=True)
-                    raise _StopRunError
+            executor = stack.enter_context(ThreadPoolExecutor(pool.window() if pool else self.settings.jobs))
+            for _, group in groupby(self.jobs, key=lambda job: job.method.name):
+                jobs = list(group)
+                fitted = list(executor.map(partial(self._fit_one, pool), range(len(jobs)), jobs))
+                for job, entry, (row, samples) in zip(jobs, [entry for entry, _ in fitted], executor.map(self._score_one, fitted), strict=True):
+                    self.comparison.put(row, samples)
+                    self.settings.listener.fitted(row)
+                    if entry is not None and row["status"] == "ok":
+                        entries[job.label] = entry
+                    elif row["status"] == "failed" and self.settings.fail_fast:
+                        raise _StopRunError
         return entries
 
-    def _fit_one(self, pool: Pool | None, job: Job) -> tuple[Entry | None, dict[str, Any], dict[str, Any]]:
-        number = self.jobs.index(job)
-        self.settings.listener.starting(self.spec.name, job.label, self.first + number + 1, self.total)
+    def _fit_one(self, pool: Pool | None, number: int, job: Job) -> tuple[Entry | None, dict[str, Any]]:
+        """Fit a configuration, the number-th of its method: its entry, if it is fitted, and its row so far."""
+        budget, method = self.settings.budget, job.method.name
+        self.settings.listener.starting(self.spec.name, job.label, self.first + self.jobs.index(job) + 1, self.total)
         row = self._empty_row(job)
         with self.lock:
-            left = self.settings.budget.seconds - self.spent.get(job.method.name, 0.0)
-        allowed = [other for other in self.jobs if other.method is job.method][: self.settings.budget.configurations]
-        if job not in allowed:
-            reason = f"beyond the tuning budget of {self.settings.budget.configurations} configurations"
-            return None, {**row, "status": "skipped", "reason": reason}, {}
+            left = budget.seconds - self.spent.get(method, 0.0)
+        if number >= budget.configurations:
+            return None, {**row, "status": "skipped", "reason": f"beyond the tuning budget of {budget.configurations} configurations"}
         if left <= 0:
-            return None, {**row, "status": "skipped", "reason": f"beyond the tuning budget of {self.settings.budget.seconds:g} s of fitting"}, {}
+            return None, {**row, "status": "skipped", "reason": f"beyond the tuning budget of {budget.seconds:g} s of fitting"}
+        began = monotonic()
+        entry = Entry(job, self.material, self.place)
         try:
-            entry = Entry(job, self.material, self.place)
-            outcome = evaluate(entry, left, self._remote(pool, job))
-            found, samples = self._scored(outcome)
-        except (MissingDependencyError, UnsupportedSceneError) as error:
-            return None, {**row, "status": "skipped", "reason": str(error)}, {}
-        except MethodFailedError as error:
-            return None, {**row, "status": "failed", "reason": str(error)}, {}
+            spent = fit(entry, left, self._remote(pool, job))["fit_s"]
         except MorBenchError as error:
-            return None, {**row, "status": "failed", "reason": f"{type(error).__name__}: {error}"}, {}
-        with self.lock:
-            self.spent[job.method.name] = self.spent.get(job.method.name, 0.0) + outcome.fit["fit_s"]
-        return entry, {**row, **found}, samples
+            spent = monotonic() - began  # a fit that failed has cost its time, too
+            return None, {**row, **_failure(error), "tuning_s": spent}
+        finally:
+            with self.lock:
+                self.spent[method] = self.spent.get(method, 0.0) + spent
+        return entry, {**row, "tuning_s": spent}
+
+    def _score_one(self, fitted: tuple[Entry | None, dict[str, Any]]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """A configuration's row with its errors, and the raw samples."""
+        entry, row = fitted
+        if entry is None:
+            return row, {}
+        try:
+            found, samples = self._scored(score(entry, self.settings.budget.seconds))
+        except MorBenchError as error:
+            return {**row, **_failure(error)}, {}
+        return {**row, **found}, samples
 
     def _remote(self, pool: Pool | None, job: Job) -> RemoteFit | None:
         """Fitting on the cluster; a third party's class is not installed there."""
@@ -434,7 +480,7 @@ class _DatasetRun:
             "parameters": job.parameters, "status": "", "reason": None, "n_train": len(data.train), "n_test": len(data.test),
             "n_unused": data.n_unused, "n_failed": None, "n_dofs": data.scene.mesh.n_dofs, "threads": self.settings.threads,
             "error": None, "latency_ms": None, "all_threads_ms": None, "throughput": None, "offline_s": None, "memory_bytes": None,
-            "model_bytes": None, "cost": None, "sets": {}, "hidden": None, **self.discretisation, "warnings": [],
+            "model_bytes": None, "cost": None, "sets": {}, "hidden": None, "seeds": None, **self.discretisation, "warnings": [],
         }  # fmt: skip
 
     def _scored(self, outcome: Outcome) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -458,16 +504,22 @@ class _DatasetRun:
 
     def _other_seeds(self, entries: Mapping[str, Entry]) -> None:
         """Train methods that draw random numbers again, and keep the errors beside those of the first seed."""
+        main = self.material.with_sets({"test": self.material.sets["test"]})
         for label, entry in entries.items():
             seed = (entry.fit or {})["parameters"].get("seed")
             if not isinstance(seed, int):
                 continue
-            errors = []
+            errors, failed = [], []
             for other in range(seed + 1, seed + 1 + EXTRA_SEEDS):
                 job = replace(entry.job, parameters={**entry.job.parameters, "seed": other})
-                with suppress(MorBenchError):
-                    outcome = evaluate(Entry(job, self.material.first(self.material.n_train), self.place), self.settings.budget.seconds, count=False)
+                try:
+                    outcome = evaluate(Entry(job, main, self.place), self.settings.budget.seconds)
                     errors.append(outcome.scores["test"]["relative_l2"])
+                except MorBenchError as error:
+                    failed.append(f"seed {other}: {error}")
+            row = self._row(label)
+            row["seeds"] = {"n": 1 + len(errors), "failed": failed}
+            row["warnings"] = [*row["warnings"], *failed]
             if errors:
                 self.comparison.add_samples(self._row(label), {"seeds_relative_l2": np.array(errors)})
 
@@ -490,10 +542,15 @@ class _DatasetRun:
             for label, entry in entries.items()
             if label not in timings
         }
-        fresh = measure(
-            openers, self.material.sets["test"].forces, protocol, settings.threads, partial(settings.listener.timing, self.spec.name)
-        )  # fmt: skip
+        test = self.material.sets["test"]
+        chosen = np.linspace(0, len(test.forces) - 1, min(MOST_QUERIES, len(test.forces))).astype(int)
+        queries = Queries(test.forces[chosen], test.references[chosen], self.folder)
+        fresh = measure(openers, queries, protocol, settings.threads, partial(settings.listener.timing, self.spec.name))
         for label, timing in fresh.items():
+            try:
+                check_answers(timing, self.comparison.samples(self._row(label))["relative_l2"][chosen])
+            except MethodFailedError as error:
+                timing.failed = timing.failed or str(error)
             if not timing.failed:
                 timing.probe_s = speed
                 entries[label].keep_arrays(name, timing.arrays)
@@ -530,7 +587,7 @@ class _DatasetRun:
         if n == self.material.n_train:
             return {**record, "fit_s": row["offline_s"]["fit"], "error": row["error"]}
         try:
-            outcome = evaluate(Entry(entry.job, self.material.first(n), self.place), self.settings.budget.seconds, count=False)
+            outcome = evaluate(Entry(entry.job, self.material.first(n), self.place), self.settings.budget.seconds)
         except MorBenchError as error:
             return {**record, "status": "failed", "reason": str(error), "fit_s": None, "error": None}
         return {**record, "fit_s": outcome.fit["fit_s"], "error": summary(_errors(outcome.scores["test"]))}
@@ -540,18 +597,26 @@ class _DatasetRun:
         assert isinstance(self.spec, DatasetSpec)
         by = self.settings.split or self.spec.split.by
         fresh = fresh_test_set(self.spec, self.data.scene, by, seed, len(self.data.test))
-        material = self.material.first(self.material.n_train)
-        material.sets = {"hidden": material.add_set(f"hidden-{seed}", fresh)}
+        material = self.material.with_sets({"hidden": TestSet.of(fresh)})
         for label, entry in entries.items():
             row = self._row(label)
             try:
-                outcome = evaluate(Entry(entry.job, material, self.place), self.settings.budget.seconds, count=False)
+                outcome = evaluate(Entry(entry.job, material, self.place), self.settings.budget.seconds)
             except MorBenchError as error:
+                # No answer is an infinite error here as everywhere: who fails on what is fresh does not get away with it.
                 row["warnings"] = [*row["warnings"], f"no score on the fresh test set: {error}"]
+                lost = dict.fromkeys(("mean_dof_m", "rel_l2_median", "rel_l2_p95", "rel_l2_max"), float("inf"))
+                row["hidden"] = {"seed": seed, "n": len(fresh), "n_failed": len(fresh), "n_flagged": None, **lost}
                 continue
             row["hidden"] = {"seed": seed, **set_summary(outcome.scores["hidden"])}
             self.comparison.add_samples(row, {"hidden_relative_l2": outcome.scores["hidden"]["relative_l2"]})
         self.comparison.write()
+
+
+def sealed_folders(cache: Path, out: Path | None = None) -> list[Path]:
+    """What no method may open: datasets, results of others, here and in the default places."""
+    caches = [folder / part for folder in (cache, default_cache()) for part in ("datasets", "fits")]
+    return [*caches, Path("reports") / "runs", *([out / "samples"] if out else [])]
 
 
 def place_of(
@@ -563,14 +628,13 @@ def place_of(
     return Place(cache, tuple(sealed), f"{machine['processor']} x {cores}", max(1, cores // jobs), threads, memory_limit_bytes, nursery)
 
 
-def _in_order(
-    executor: ThreadPoolExecutor, window: int, jobs: Sequence[Job], function: Callable[[Job], tuple[Entry | None, dict[str, Any], dict[str, Any]]]
-) -> Iterator[tuple[Entry | None, dict[str, Any], dict[str, Any]]]:  # fmt: skip
-    """Results in the order of the jobs; with a window of one each is begun when the one before has been taken."""
-    if window == 1:
-        yield from map(function, jobs)
-    else:
-        yield from executor.map(function, jobs)
+def _failure(error: MorBenchError) -> dict[str, str]:
+    """The part of a row that says why there is no more of it."""
+    if isinstance(error, MissingDependencyError | UnsupportedSceneError):
+        return {"status": "skipped", "reason": str(error)}
+    if isinstance(error, MethodFailedError):
+        return {"status": "failed", "reason": str(error)}
+    return {"status": "failed", "reason": f"{type(error).__name__}: {error}"}
 
 
 def _errors(score: Mapping[str, Any]) -> SampleErrors:

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 SETTLE_QUERIES = 3
 """Untimed queries before each round, after which the caches are the method's own again."""
 
+CHECKED_ANSWERS, CHECKED_SHARE = 4, 0.2
+"""Answers of a turn that are kept at most, and the share of queries that are asked for it."""
+
 WARM_UP_QUERIES = 20
 WARM_UP_S = 2.0
 
@@ -42,38 +45,27 @@ FILE_EVENTS = (
 )  # fmt: skip
 
 
-class Seal:
-    """Keeps a process out of folders: those of the datasets and of results, which hold what the method must predict.
+def seal(folders: list[str]) -> None:
+    """Keep this process out of folders: those of datasets and results, which hold what the method must predict.
 
-    It stops Python's ways to a file and the launching of programs, not native code. What is proof against that too is a
-    test set that does not exist before the method is fitted (`--test-seed`).
+    It stops Python's usual ways to a file and the launching of programs: what a method does by mistake, or half by mistake.
+    It does not stop one that attacks the machine.
     """
+    prefixes = tuple(os.path.realpath(folder) + os.sep for folder in folders)
 
-    def __init__(self, folders: list[str]) -> None:
-        folders = [os.path.realpath(folder) for folder in folders]
-        self._opened: list[str] = []
-        opened, prefixes = self._opened, tuple(folder + os.sep for folder in folders)
+    def check(path: object) -> None:
+        if isinstance(path, str | bytes | os.PathLike) and (os.path.realpath(os.fsdecode(path)) + os.sep).startswith(prefixes):
+            raise PermissionError(f"{os.fsdecode(path)}: a method may not look at datasets and results while it is compared.")
 
-        def check(path: object) -> None:
-            if not isinstance(path, str | bytes | os.PathLike):
-                return
-            real = os.path.realpath(os.fsdecode(path)) + os.sep
-            if real.startswith(prefixes) and real[:-1] not in opened:
-                raise PermissionError(f"{os.fsdecode(path)}: a method may not look at datasets and results while it is compared.")
+    def refuse(event: str, arguments: tuple[Any, ...]) -> None:
+        if event in FILE_EVENTS:
+            for argument in arguments[:2]:
+                check(argument)
+        elif event in PROGRAM_EVENTS:
+            raise PermissionError(f"{event}: a method may not start programs while it is compared.")
 
-        def refuse(event: str, arguments: tuple[Any, ...]) -> None:
-            if event in FILE_EVENTS:
-                for argument in arguments[:2]:
-                    check(argument)
-            elif event in PROGRAM_EVENTS:
-                raise PermissionError(f"{event}: a method may not start programs while it is compared.")
-
-        sys.addaudithook(refuse)
-        _guard_hdf5(check)
-
-    def open(self, path: Path) -> None:
-        """Let one file be opened after all."""
-        self._opened.append(os.path.realpath(path))
+    sys.addaudithook(refuse)
+    _guard_hdf5(check)
 
 
 def _guard_hdf5(check: Callable[[object], None]) -> None:
@@ -106,11 +98,12 @@ class Session:
 
     method: Surrogate
     queries: NDArray[np.float64]
+    generator: np.random.Generator
 
     def begin(self, path: list[str], scene: Scene, sealed: list[str]) -> dict[str, Any]:
         """Take over the parent's import path and keep out of some folders."""
         self.scene = scene
-        self._seal = Seal(sealed)
+        seal(sealed)
         sys.path[:] = path
         return {}
 
@@ -127,7 +120,6 @@ class Session:
         self, surrogate: str, parameters: dict[str, Any], train: Path, model: Path, threads: int, limit_s: float
     ) -> dict[str, Any]:  # fmt: skip
         """Fit on the snapshots of a folder and save."""
-        from mor_bench.errors import MorBenchError
         from mor_bench.harness.handover import read_snapshots
         from mor_bench.harness.timing import pinned_threads
         from mor_bench.specs import load_class
@@ -144,7 +136,7 @@ class Session:
         saved = True
         try:
             method.save(model)
-        except MorBenchError:
+        except Exception:  # a method that cannot be saved is fitted again where it is timed
             saved = False
         return {
             "fit_s": seconds,
@@ -162,97 +154,98 @@ class Session:
         self.method = load_fitted(model, load_class(surrogate), self.scene)
         return {}
 
-    def predict(self, forces: Path, out: Path, threads: int) -> dict[str, Any]:
-        """Predict all forces of a file, writing the displacements to another."""
+    def predict(self, forces: NDArray[np.float64], out: Path, threads: int) -> dict[str, Any]:
+        """Predict loads, (n, n_nodes, 3), N, writing the displacements to a file."""
         import numpy as np
 
         from mor_bench.harness.handover import predict_all
         from mor_bench.harness.timing import pinned_threads
 
-        self._seal.open(forces)
-        self._seal.open(out)
-        loads = np.load(forces, mmap_mode="r", allow_pickle=False)
-        answers = np.lib.format.open_memmap(out, mode="w+", dtype=np.float64, shape=loads.shape)
         with pinned_threads(threads):
-            predict_all(self.method, loads, answers)
-        answers.flush()
+            np.save(out, predict_all(self.method, forces), allow_pickle=False)
         return {}
 
-    def flag(self, forces: Path) -> dict[str, Any]:
+    def flag(self, forces: NDArray[np.float64]) -> dict[str, Any]:
         """Which loads the method says are out of its training range; None if it does not know its range."""
-        import numpy as np
+        from mor_bench.errors import InvalidInputError, UnknownRangeError
 
-        from mor_bench.errors import UnknownRangeError
-
-        self._seal.open(forces)
-        loads = np.load(forces, mmap_mode="r", allow_pickle=False)
-        flagged: list[bool] = []
         try:
-            for start in range(0, len(loads), 256):
-                flagged += self.method.out_of_range(np.array(loads[start : start + 256])).tolist()
+            flagged = self.method.out_of_range(forces)
         except UnknownRangeError:
             return {"flagged": None}
-        return {"flagged": flagged}
+        if flagged.shape != (len(forces),):
+            raise InvalidInputError(f"`out_of_range` must return {len(forces)} flags for as many loads; it returned shape {flagged.shape}.")
+        return {"flagged": [bool(flag) for flag in flagged]}
 
-    def cost(self, forces: Path, n: int) -> dict[str, Any]:
+    def cost(self, forces: NDArray[np.float64]) -> dict[str, Any]:
         """What a query costs on any machine: the mean over some loads."""
-        import numpy as np
-
         from mor_bench.harness.cost import cost_of
 
-        self._seal.open(forces)
-        loads = np.load(forces, mmap_mode="r", allow_pickle=False)
-        chosen = np.linspace(0, len(loads) - 1, min(n, len(loads))).astype(int)
-        return {"cost": cost_of(self.method, np.array(loads[chosen]))}
+        return {"cost": cost_of(self.method, forces)}
 
-    def warm(self, forces: Path, threads: int) -> dict[str, Any]:
-        """Take the queries into memory and answer some of them."""
+    def warm(self, forces: NDArray[np.float64], threads: int, seed: int) -> dict[str, Any]:
+        """Take the queries, (n, n_nodes, 3), N, and answer some of them."""
         import numpy as np
 
         from mor_bench.harness.timing import pinned_threads
 
-        self._seal.open(forces)
-        self.queries = np.load(forces, allow_pickle=False)
+        self.queries = forces
+        self.generator = np.random.default_rng(seed)
         with pinned_threads(threads):
             start = perf_counter()
             for i in range(WARM_UP_QUERIES):
-                self.method.predict(self.queries[-1 - i % len(self.queries)])
+                self.method.predict(self.queries[-1 - i % len(self.queries)].copy())
                 if perf_counter() - start > WARM_UP_S:
                     break
         return {"memory_bytes": peak_memory_bytes()}
 
-    def time(self, first: int, n: int, floor_s: float, most_s: float, threads: int) -> dict[str, Any]:
-        """Wall times of single queries, ms, from one on: n and at least for a time, but for no longer than another.
+    def time(self, out: Path, n: int, floor_s: float, most_s: float, threads: int) -> dict[str, Any]:
+        """Wall times of single queries, ms: n and at least for a time, but for no longer than another.
 
+        No load comes twice: each is one of the queries, drawn at random and made smaller by a random factor. Some are not
+        made smaller, and what is answered to those is written to a file, so that it can be compared with what was scored.
         The garbage collector runs as it would for a user; its part of each query is told apart.
         """
+        import numpy as np
+
         from mor_bench.harness.timing import pinned_threads
 
         times: list[float] = []
         collecting: list[float] = []
+        kept: dict[int, Any] = {}
         clock = _CollectorClock()
-        predict, queries = self.method.predict, self.queries
-        begun = process_time()
+        predict, queries, draw = self.method.predict, self.queries, self.generator
+        begun, cpu, wall = process_time(), 0.0, 0.0
         with pinned_threads(threads):
-            for i in range(SETTLE_QUERIES):
-                predict(queries[(first - 1 - i) % len(queries)])
+            for _ in range(SETTLE_QUERIES):
+                predict(queries[draw.integers(len(queries))] * draw.uniform(0.5, 1.0))
             gc.callbacks.append(clock)
-            cpu, start = process_time(), perf_counter()
             try:
                 while True:
-                    query = queries[(first + len(times)) % len(queries)]
-                    clock.seconds = 0.0
+                    number, check = int(draw.integers(len(queries))), len(kept) < CHECKED_ANSWERS and draw.random() < CHECKED_SHARE
+                    query = queries[number] * (1.0 if check else draw.uniform(0.5, 1.0))
+                    clock.seconds, busy = 0.0, process_time()
                     before = perf_counter()
-                    predict(query)
+                    answer = predict(query)
                     after = perf_counter()
+                    cpu += process_time() - busy
+                    wall += after - before
                     times.append(1e3 * (after - before))
                     collecting.append(1e3 * clock.seconds)
-                    if after - start > most_s or (len(times) >= n and after - start > floor_s):
+                    if check:
+                        kept[number] = np.array(answer, dtype=float)
+                    if wall > most_s or (len(times) >= n and wall > floor_s):
                         break
             finally:
                 gc.callbacks.remove(clock)
-            wall, cpu = perf_counter() - start, process_time() - cpu
-        return {"latency_ms": times, "gc_ms": collecting, "cpu_s": cpu, "wall_s": wall, "cpu_all_s": process_time() - begun}
+        if {answer.shape for answer in kept.values()} - {queries.shape[1:]}:
+            from mor_bench.errors import InvalidInputError
+
+            raise InvalidInputError(f"a single load of shape {queries.shape[1:]} is not answered in that shape.")
+        np.save(out, np.array(list(kept.values())).reshape(-1, *queries.shape[1:]), allow_pickle=False)
+        return {
+            "latency_ms": times, "gc_ms": collecting, "cpu_s": cpu, "wall_s": wall, "cpu_all_s": process_time() - begun, "checked": list(kept),
+        }  # fmt: skip
 
     def throughput(self, sizes: list[int], floor_s: float, most_s: float, threads: int) -> dict[str, Any]:
         """Queries per second in batches of some sizes; None where one batch would take longer than a time."""
@@ -300,11 +293,16 @@ def _answer(session: Session, request: dict[str, Any]) -> dict[str, Any]:
         try:
             answer = getattr(session, request.pop("do"))(**request)
         except MorBenchError as error:
-            answer = {"error": type(error).__name__, "message": str(error)}
+            answer = {"error": type(error).__name__, "message": _printable(error)}
         except (Exception, SystemExit) as error:  # third parties' code runs here
-            answer = {"error": None, "message": f"crashed with {type(error).__name__}: {error}"}
-    notes = list(dict.fromkeys(str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)))
+            answer = {"error": None, "message": f"crashed with {type(error).__name__}: {_printable(error)}"}
+    notes = list(dict.fromkeys(_printable(warning.message) for warning in caught if issubclass(warning.category, UserWarning)))
     return {**answer, "warnings": notes}
+
+
+def _printable(error: object) -> str:
+    """Its text, without what no file of text can hold."""
+    return str(error).encode("utf-8", "replace").decode()
 
 
 def _read(requests: BinaryIO, queue: SimpleQueue[dict[str, Any]]) -> None:
@@ -324,9 +322,12 @@ def work(requests: BinaryIO, answers: BinaryIO) -> None:
         os.dup2(nothing.fileno(), 0)
     queue: SimpleQueue[dict[str, Any]] = SimpleQueue()
     Thread(target=_read, args=(requests, queue), daemon=True).start()
-    session = Session()
+    session, process = Session(), os.getpid()
     while True:
-        answers.write(json.dumps(_answer(session, queue.get())).encode() + b"\n")
+        answer = _answer(session, queue.get())
+        if os.getpid() != process:  # a method has forked, and this is the copy
+            os._exit(0)
+        answers.write(json.dumps(answer).encode() + b"\n")
         answers.flush()
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mor_bench.harness.clock import PROTOCOLS, Opener, Timing, measure, why_unstable
+from mor_bench.harness.clock import PROTOCOLS, Opener, Queries, Timing, measure, why_unstable
 from mor_bench.harness.isolation import Worker
 from mor_bench.harness.nursery import Nursery
 from mor_bench.harness.statistics import compare_latency, intervals_of
@@ -56,10 +56,9 @@ class _Method:
         return worker
 
 
-def _queries(scene: Scene, folder: Path) -> Path:
-    path = folder / "forces.npy"
-    np.save(path, draw_loads(scene, 0, 200).nodal_forces(scene.patch_weights), allow_pickle=False)
-    return path
+def _queries(scene: Scene, folder: Path) -> Queries:
+    forces = draw_loads(scene, 0, 200).nodal_forces(scene.patch_weights)
+    return Queries(forces, np.ones_like(forces), folder)
 
 
 def _measured(scene: Scene, folder: Path, methods: dict[str, tuple[str, dict[str, Any]]], seed: int, processes: str = "full") -> dict[str, Timing]:
