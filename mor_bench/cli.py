@@ -189,7 +189,7 @@ def run(
                 memory_limit_bytes=memory_limit and 1e9 * memory_limit, retime=retime, fail_fast=fail_fast, cache=cache, suite=suite,
                 listener=listener,
             )  # fmt: skip
-        analysis = comparison.finish()
+        analysis = comparison.analysis
         print_tables(comparison, console, analysis)
         for path in render(comparison, analysis):
             console.print(str(path), highlight=False, soft_wrap=True)
@@ -429,9 +429,12 @@ def stress(
     with _clear_errors():
         from rich.status import Status
 
+        from mor_bench.errors import InvalidInputError
         from mor_bench.harness.stress import stress as run_cases
         from mor_bench.report.hard_cases import print_stress
 
+        if out is not None and not out.resolve().parent.is_dir():
+            raise InvalidInputError(f"`--out`: there is no folder {out.resolve().parent}.")
         console = _console(stderr=as_json)
         with Status("", console=console) as status:
             found = run_cases(

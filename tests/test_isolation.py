@@ -75,7 +75,7 @@ HOW = {
     "kill-group": "SIGKILL",
     "kill-parent": "",
     "odd-text": "crashed with RuntimeError: file ?",
-    "batches-only": "while timed: InvalidInputError: a single load",
+    "batches-only": "while timed: a single load of shape (63, 3) is not answered in that shape",
     "print": None,
     "fork": None,
 }
@@ -202,7 +202,7 @@ def test_a_changed_source_is_fitted_again_and_nothing_else(cache: Path, tmp_path
     own = tmp_path / "cache"
     mor_bench.run(["beam-tiny"], [path, "linear-fem"], out=tmp_path / "a", cache=own)
     before = {item.parent.name: item.stat().st_mtime_ns for item in own.glob("fits/*/fit.json")}
-    source.write_text(source.read_text() + "\n    answer = 42\n")
+    source.write_text("VALUE = 2")
     mor_bench.run(["beam-tiny"], [path, "linear-fem"], out=tmp_path / "b", cache=own)
     after = {item.parent.name: item.stat().st_mtime_ns for item in own.glob("fits/*/fit.json")}
     assert len(before) == 2

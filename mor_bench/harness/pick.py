@@ -103,6 +103,8 @@ class Pick:
         Folder of the comparison that is the evidence.
     processor : str
         On which it was timed.
+    kind : str
+        Profile, split and number of samples of the run.
     """
 
     dataset: str
@@ -117,6 +119,7 @@ class Pick:
     n_without_answers: int
     run: Path | None = None
     processor: str = ""
+    kind: str = ""
 
     def as_json(self) -> dict[str, Any]:
         """Everything, for `json.dumps`; infinite errors are strings."""
@@ -135,7 +138,7 @@ class Pick:
             lines.append(f"None of {self.n_configurations} configurations meets all{self._left_out()}.")
             lines += self._what_would_have_to_give()
         if self.run is not None:
-            lines.append(f"Evidence: {self.run}{f', timed on {self.processor}' if self.processor else ''}")
+            lines.append(f"Evidence: {self.run}{f', {self.kind}' if self.kind else ''}{f', timed on {self.processor}' if self.processor else ''}")
         return "\n".join(lines)
 
     def _left_out(self) -> str:
@@ -285,7 +288,13 @@ def pick(
         evidence = comparison if isinstance(comparison, Comparison) else Comparison.read(comparison)
         _check_evidence(evidence, spec)
     chosen = choose(_with_intervals(evidence), requirements, spec.name)
-    return replace(chosen, run=evidence.out, processor=str(evidence.machine.get("processor", "")))
+    return replace(chosen, run=evidence.out, processor=str(evidence.machine.get("processor", "")), kind=_kind(evidence))
+
+
+def _kind(comparison: Comparison) -> str:
+    settings = comparison.settings
+    parts = [f"profile {settings.get('profile')}", f"split by {settings['split']}" if settings.get("split") else ""]
+    return ", ".join(filter(None, [*parts, f"first {settings['limit']:,} samples" if settings.get("limit") else ""]))
 
 
 def _with_intervals(comparison: Comparison) -> list[Row]:
@@ -318,15 +327,20 @@ def _check_evidence(comparison: Comparison, spec: AnyDatasetSpec) -> None:
 
 
 def newest_run(spec: AnyDatasetSpec, runs: Path = RUNS) -> Comparison | None:
-    """The newest finished run of a dataset in a folder of runs; comparison.json is written when a run ends."""
-    for file in sorted(runs.glob("*/comparison.json"), key=lambda file: file.stat().st_mtime, reverse=True):
+    """The newest finished run of a dataset in a folder of runs, one of all samples before others, and a full one before quick ones.
+
+    comparison.json is written when a run ends.
+    """
+    found: list[tuple[tuple[bool, bool, float], Comparison]] = []
+    for file in runs.glob("*/comparison.json"):
         try:
             comparison = Comparison.read(file.parent)
         except StoreError:  # of another version, or damaged
             continue
         if _is_of(comparison, spec) and any(row["dataset"] == spec.name and row["status"] == "ok" for row in comparison.rows):
-            return comparison
-    return None
+            settings = comparison.settings
+            found.append(((settings.get("limit") is None, settings.get("profile") == "full", file.stat().st_mtime), comparison))
+    return max(found, key=lambda item: item[0])[1] if found else None
 
 
 _NAMES = {"error": "error", "latency_ms": "latency", "memory_bytes": "memory", "offline_s": "offline time"}

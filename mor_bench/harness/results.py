@@ -110,6 +110,8 @@ class Comparison:
         For each its spec, as in its file.
     learning : list of dict
         Learning curves: `dataset`, `method`, `label`, `n_train`, `status`, `reason`, `fit_s`, `error`.
+    analysis : dict or None
+        The content of comparison.json, once `finish` has written it.
     settings : dict
         Profile, split, limit, threads, budgets and version of the run.
     """
@@ -121,6 +123,7 @@ class Comparison:
     settings: dict[str, Any] = field(default_factory=dict)
     methods: dict[str, dict[str, Any]] = field(default_factory=dict)
     learning: list[dict[str, Any]] = field(default_factory=list)
+    analysis: dict[str, Any] | None = field(default=None, repr=False, compare=False)
 
     @property
     def table(self) -> pd.DataFrame:
@@ -178,6 +181,7 @@ class Comparison:
         self.write()
         analysis = analyse(self)
         _write_json(self.out / "comparison.json", analysis)
+        self.analysis = analysis
         return analysis
 
     def write(self) -> None:

@@ -348,10 +348,12 @@ def _open_run(out: Path, specs: Sequence[AnyDatasetSpec], methods: Sequence[Meth
 def _alone(out: Path) -> Iterator[None]:
     """No other run writes to the folder meanwhile; what a killed one left is no hindrance."""
     lock = out / ".running"
+    other = None
     with suppress(OSError, ValueError, psutil.Error):
         number, created = map(float, lock.read_text().split())
-        if psutil.Process(int(number)).create_time() == created and int(number) != os.getpid():
-            raise InvalidInputError(f"{out}: another run, process {int(number)}, writes there; wait for it or choose another folder.")
+        other = int(number) if psutil.Process(int(number)).create_time() == created else None
+    if other not in (None, os.getpid()):
+        raise InvalidInputError(f"{out}: another run, process {other}, writes there; wait for it or choose another folder.")
     lock.write_text(f"{os.getpid()} {psutil.Process().create_time()!r}")
     try:
         yield

@@ -15,6 +15,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
@@ -25,7 +26,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from mor_bench.harness.stress.case import Case, Subject
     from mor_bench.scene.scene import Scene
+    from mor_bench.specs import MethodSpec
     from mor_bench.surrogate import Surrogate
 
 SETTLE_QUERIES = 3
@@ -99,6 +102,8 @@ class Session:
     method: Surrogate
     queries: NDArray[np.float64]
     generator: np.random.Generator
+    subject: Subject
+    concerning: list[tuple[Case, str | None]]
 
     def begin(self, path: list[str], scene: Scene, sealed: list[str]) -> dict[str, Any]:
         """Take over the parent's import path and keep out of some folders."""
@@ -115,6 +120,22 @@ class Session:
         for configuration in configurations:
             check_parameters(loaded, configuration, where)
         return {}
+
+    def stress(self, method: MethodSpec, profile: str, cases: list[str], cache: Path | None) -> dict[str, Any]:
+        """Which hard cases concern a method."""
+        from mor_bench.harness.stress import concerning
+        from mor_bench.harness.stress.case import Scenes, Subject
+
+        self.subject = Subject(method, profile, Scenes(cache))
+        self.concerning = concerning(self.subject, cases)
+        return {"cases": [[case.name, case.part] for case, _ in self.concerning]}
+
+    def stress_case(self, number: int) -> dict[str, Any]:
+        """Try one of them."""
+        from mor_bench.harness.stress import attempt
+
+        case, missing = self.concerning[number]
+        return {"row": asdict(attempt(case, self.subject, missing))}
 
     def fit(
         self, surrogate: str, parameters: dict[str, Any], train: Path, model: Path, threads: int, limit_s: float

@@ -79,7 +79,7 @@ def timing(entries: Sequence[Entry]) -> Grid | None:
     }
     note = (
         "Latency was taken in fresh processes, the configurations in turn. The collector's share is the mean time of garbage collection per query, "
-        "which the latencies do not hold. Throughput: queries per second when they come in batches of 8, 64 and 512."
+        "which the latencies contain. Throughput: queries per second when they come in batches of 8, 64 and 512."
     )
     return _grid("Timing", note, entries, columns)
 

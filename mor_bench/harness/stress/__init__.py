@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from math import isfinite
@@ -12,18 +13,28 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+from psutil import virtual_memory
+
 from mor_bench import __version__
-from mor_bench.errors import InvalidInputError, MissingDependencyError, UnsupportedSceneError
+from mor_bench.errors import InvalidInputError, MissingDependencyError, MorBenchError, OutOfTimeError, UnsupportedSceneError
+from mor_bench.harness.isolation import Worker
 from mor_bench.harness.stress import mechanics, methods, reduction
 from mor_bench.harness.stress.case import LONGEST, Case, Outcome, Scenes, Subject, Verdict, every
 from mor_bench.harness.timing import describe_machine, pinned_threads
 from mor_bench.snapshots.store import write_atomically
-from mor_bench.specs import check_parameters, list_suite, load_method_spec
+from mor_bench.specs import MethodSpec, check_parameters, list_suite, load_method_spec
 
 CASES: tuple[Case, ...] = (*mechanics.CASES, *reduction.CASES, *methods.CASES)
 """All of them, in the order in which they are tried."""
 
 CASE_NAMES = tuple(dict.fromkeys(case.name for case in CASES))
+
+
+CASE_S = 300.0
+"""Seconds that a third party's method may take for a case."""
+
+MEMORY_SHARE = 0.75
+"""Of the machine's memory, that it may take."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +112,8 @@ def stress(
 ) -> Stress:
     """Try the hard cases on methods; each outcome is computed and judged, and a crash costs only its own row.
 
+    A third party's method is tried in a process of its own, so that one that hangs or ends it costs its own rows only.
+
     Methods are tried on beam-tiny with the parameters of their files, none swept.
 
     Parameters
@@ -134,43 +147,108 @@ def stress(
             near = get_close_matches(name, CASE_NAMES, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else "."
             raise InvalidInputError(f"`cases` must be of {', '.join(CASE_NAMES)}; got {name!r}{hint}")
+    if methods is not None and (isinstance(methods, str | Path) or not methods):
+        raise InvalidInputError(f"`methods` must be a list of names or paths, not empty; got {methods!r}.")
     scenes = Scenes(cache)
     _ = scenes.tiny  # what keeps it from being read is no method's fault
-    wanted = [case for case in CASES if not cases or case.name in cases]
+    wanted = [case.name for case in CASES if not cases or case.name in cases]
     specs = [load_method_spec(method, suite) for method in (list_suite("methods", suite) if methods is None else methods)]
-    plan: list[tuple[Case, Subject, str | None]] = []
-    for spec in specs:
-        subject = Subject(spec, profile, scenes)
-        try:
-            check_parameters(spec.load_class(), spec.parameters_of(profile), f"method {spec.name}")
-            method = subject.fresh()
-        except MissingDependencyError as error:
-            plan += [(case, subject, str(error)) for case in wanted if case.concerns is every]
-            continue
-        plan += [(case, subject, None) for case in wanted if case.concerns(method)]
-    # One thread: on scenes as small as these the fastest, and answers do not depend on the number of cores.
-    rows: list[Row] = []
-    with pinned_threads(1):
-        for number, (case, subject, missing) in enumerate(plan):
-            starting(_label(case.name, case.part), subject.name, number + 1, len(plan))
-            rows.append(_try(case, subject, missing))
-            finished(rows[-1])
+    with ExitStack() as stack:
+        tried = [_Here(spec, profile, wanted, scenes) if spec.folder is None else _Apart(spec, profile, wanted, cache) for spec in specs]
+        for trial in tried:
+            stack.callback(trial.end)
+        total = sum(len(trial.cases) for trial in tried)
+        if total == 0:
+            raise InvalidInputError(f"none of the cases {', '.join(cases or ())} concerns {', '.join(spec.name for spec in specs)}.")
+        rows: list[Row] = []
+        for trial in tried:
+            for number, (name, part) in enumerate(trial.cases):
+                starting(_label(name, part), trial.name, len(rows) + 1, total)
+                rows.append(trial.row(number))
+                finished(rows[-1])
+            trial.end()
     return Stress(rows, profile, describe_machine())
+
+
+def concerning(subject: Subject, names: Sequence[str]) -> list[tuple[Case, str | None]]:
+    """The cases that concern a method, and what is missing to try it."""
+    wanted = [case for case in CASES if case.name in names]
+    try:
+        method = subject.fresh()
+    except MissingDependencyError as error:
+        return [(case, str(error)) for case in wanted if case.concerns is every]
+    return [(case, None) for case in wanted if case.concerns(method)]
+
+
+class _Here:
+    """A method of the suite, tried in this process."""
+
+    def __init__(self, spec: MethodSpec, profile: str, names: Sequence[str], scenes: Scenes) -> None:
+        self.name = spec.name
+        self._subject = Subject(spec, profile, scenes)
+        with suppress(MissingDependencyError):
+            check_parameters(spec.load_class(), spec.parameters_of(profile), f"method {spec.name}")
+        self._concerning = concerning(self._subject, names)
+        self.cases = [(case.name, case.part) for case, _ in self._concerning]
+
+    def row(self, number: int) -> Row:
+        case, missing = self._concerning[number]
+        return attempt(case, self._subject, missing)
+
+    def end(self) -> None:
+        """Nothing is held."""
+
+
+class _Apart:
+    """A third party's method, tried in a process of its own, which is started again after a case that ended it."""
+
+    def __init__(self, spec: MethodSpec, profile: str, names: Sequence[str], cache: Path | None) -> None:
+        self.name = spec.name
+        self._spec, self._profile, self._names, self._cache = spec, profile, list(names), cache
+        self._worker: Worker | None = None
+        self.cases = self._start()
+
+    def _start(self) -> list[tuple[str, str]]:
+        self._worker = Worker(None, [], self._spec.folder, MEMORY_SHARE * virtual_memory().total)
+        asked = {"method": self._spec, "profile": self._profile, "cases": self._names, "cache": self._cache}
+        where = f"method {self._spec.name}"
+        self._worker.ask("check", CASE_S, surrogate=self._spec.surrogate, configurations=[self._spec.parameters_of(self._profile)], where=where)
+        return [(name, part) for name, part in self._worker.ask("stress", CASE_S, **asked)["cases"]]
+
+    def row(self, number: int) -> Row:
+        begun = perf_counter()
+        name, part = self.cases[number]
+        case = next(case for case in CASES if (case.name, case.part) == (name, part))
+        try:
+            if self._worker is None:
+                self._start()
+            assert self._worker is not None
+            return Row(**self._worker.ask("stress_case", CASE_S, number=number)["row"])
+        except MorBenchError as error:
+            self.end()
+            return Row(name, part, self.name, case.expected, str(error), "fall short", {}, perf_counter() - begun)
+
+    def end(self) -> None:
+        """End the process."""
+        if self._worker:
+            self._worker.end()
+            self._worker = None
 
 
 def _label(name: str, part: str) -> str:
     return f"{name}: {part}" if part else name
 
 
-def _try(case: Case, subject: Subject, missing: str | None) -> Row:
+def attempt(case: Case, subject: Subject, missing: str | None) -> Row:
     """Try a case on a method, which ``missing`` may say that cannot be had."""
     begun = perf_counter()
-    with warnings.catch_warnings():
+    # One thread: on scenes as small as these the fastest, and answers do not depend on the number of cores.
+    with warnings.catch_warnings(), pinned_threads(1):
         warnings.simplefilter("ignore")
         try:
             reason = missing or subject.fresh().supports(subject.data.scene)
             outcome = Outcome("not applicable", reason) if reason else case.examine(subject)
-        except (MissingDependencyError, UnsupportedSceneError) as error:
+        except (MissingDependencyError, UnsupportedSceneError, OutOfTimeError) as error:
             outcome = Outcome("not applicable", str(error))
         except (Exception, SystemExit) as error:  # third parties' code runs here
             outcome = Outcome("fall short", f"crashed with {type(error).__name__}: {error}")

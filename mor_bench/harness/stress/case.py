@@ -24,6 +24,9 @@ Verdict = Literal["pass", "fall short", "not applicable"]
 LONGEST = {"quick": 300, "full": None}
 """Iterations of a training at most, by profile: what is judged is behaviour, and errors are published, not compared."""
 
+LONGEST_S = 1800.0
+"""Seconds of a training at most; a method that sees that they will not do says so."""
+
 BRIEF = 20
 """Iterations of a training of which only its manners matter."""
 
@@ -94,7 +97,9 @@ class Subject:
         longest = BRIEF if brief else LONGEST[self._profile]
         if longest is not None and "iterations" in parameters:
             parameters["iterations"] = min(parameters["iterations"], longest)
-        return make_surrogate(self._spec.load_class(), parameters)
+        method = make_surrogate(self._spec.load_class(), parameters)
+        method.time_limit_s = LONGEST_S
+        return method
 
     def fit(self, data: Dataset, brief: bool = False, **knobs: Any) -> Surrogate:
         method = self.fresh(brief, **knobs)

@@ -49,14 +49,20 @@ def poor_snapshots(subject: Subject) -> Outcome:
                 continue
         said = any("rank" in str(warning.message) for warning in caught)
         wrong += [f"{kind}: {what}" for what in _faults(method, snapshots, said)]
-        told.append(f"{kind}: fitted{', cut to the rank with a warning' if said else ''}")
+        modes = getattr(method, "modes_", None)
+        kept = f", {modes.shape[1]} modes kept of rank {_rank(snapshots)}" if isinstance(modes, np.ndarray) else ""
+        told.append(f"{kind}: fitted{kept}{', with a warning' if said else ''}")
     return judged(not wrong, "; ".join(wrong or told), wrong=len(wrong))
+
+
+def _rank(snapshots: Snapshots) -> int:
+    return int(np.linalg.matrix_rank(snapshots.free_displacements))
 
 
 def _faults(method: Surrogate, snapshots: Snapshots, said: bool) -> list[str]:
     """What is wrong with a method that was fitted to poor snapshots; ``said`` is whether it warned of their rank."""
     faults = []
-    rank = int(np.linalg.matrix_rank(snapshots.free_displacements))
+    rank = _rank(snapshots)
     asked = [value for name, value in method.parameters.items() if name.endswith("modes") and isinstance(value, int)]
     if asked and max(asked) > rank and not said:
         faults.append(f"{max(asked)} modes asked for of rank {rank}, and no warning")
@@ -65,8 +71,8 @@ def _faults(method: Surrogate, snapshots: Snapshots, said: bool) -> list[str]:
         off = float(np.linalg.norm(modes.T @ modes - np.eye(modes.shape[1])))
         if not off <= 1e-12:
             faults.append(f"basis off orthonormal by {off:.1e}")
-        if modes.shape[1] > len(snapshots):
-            faults.append(f"{modes.shape[1]} modes of {len(snapshots)} samples")
+        if modes.shape[1] > rank:
+            faults.append(f"{modes.shape[1]} modes of rank {rank}")
     try:
         finite = not np.isinf(answers(method, snapshots.forces)).any()
         if not finite:
