@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -181,6 +182,22 @@ class Unchecked(PODGalerkin):
         return self
 
 
+class Unfit(PODGalerkin):
+    """Cannot be fitted."""
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
+        raise ZeroDivisionError("on purpose")
+
+
+class Ending(PODGalerkin):
+    """Ends Python where there is no force."""
+
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+        if not np.asarray(forces).any():
+            os._exit(7)
+        return super().predict(forces)
+
+
 class Alarmed(PODGalerkin):
     """Flags every load."""
 
@@ -234,12 +251,25 @@ def test_a_learner_that_does_not_check_its_samples_falls_short(tmp_path: Path, c
 
 
 def test_a_fit_that_fails_costs_its_own_method_only(tmp_path: Path, cache: Path) -> None:
-    broken = method_file(tmp_path, "broken", "tests.test_stress:Unchecked", "n_modes = 3")
+    broken = method_file(tmp_path, "broken", "tests.test_stress:Unfit", "n_modes = 3")
     good = method_file(tmp_path, "good")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Unchecked, "fit", lambda *_: 1 / 0)
-        found = stress([broken, good], ["zero-force", "symmetry"], cache=cache)
+    found = stress([broken, good], ["zero-force", "symmetry"], cache=cache)
     assert [(row.method, row.verdict) for row in found.rows] == [("broken", "fall short")] * 2 + [("good", "pass")] * 2
+
+
+def test_a_method_that_ends_its_process_costs_its_own_rows_only(tmp_path: Path, cache: Path) -> None:
+    methods = [method_file(tmp_path, "ending", "tests.test_stress:Ending", "n_modes = 3"), method_file(tmp_path, "good")]
+    found = stress(methods, ["zero-force", "symmetry"], cache=cache)
+    assert [(row.method, row.case, row.verdict) for row in found.rows[:2]] == [("ending", "zero-force", "fall short"), ("ending", "symmetry", "pass")]
+    assert "ended with code 7" in found.rows[0].happened
+    assert {row.verdict for row in found.rows[2:]} == {"pass"}
+
+
+def test_nothing_to_try_is_an_error(cache: Path) -> None:
+    with pytest.raises(InvalidInputError, match="none of the cases nnls concerns fem"):
+        stress(["fem"], ["nnls"], cache=cache)
+    with pytest.raises(InvalidInputError, match="`methods` must be a list"):
+        stress("pod", cache=cache)
 
 
 def answered(*_: Any, **__: Any) -> Solution:

@@ -51,8 +51,8 @@ class Requirements:
 
     def __post_init__(self) -> None:
         for name, limit in self.asked.items():
-            if not (limit > 0 and isfinite(limit)):
-                raise InvalidInputError(f"`{name}` must be a positive number; got {limit}.")
+            if isinstance(limit, bool) or not isinstance(limit, int | float) or not (limit > 0 and isfinite(limit)):
+                raise InvalidInputError(f"`{name}` must be a positive number; got {limit!r}.")
 
     @property
     def asked(self) -> dict[str, float]:
@@ -284,6 +284,8 @@ def pick(
     )
     if comparison is None:
         evidence = newest_run(spec) or run([dataset], cache=cache, suite=suite, listener=listener)
+    elif not isinstance(comparison, Comparison | str | Path):
+        raise InvalidInputError(f"`comparison` must be a Comparison or the folder of a run; got {type(comparison).__name__}.")
     else:
         evidence = comparison if isinstance(comparison, Comparison) else Comparison.read(comparison)
         _check_evidence(evidence, spec)

@@ -15,7 +15,7 @@ from typing import Any
 
 from mor_bench.harness.clock import PROTOCOLS
 from mor_bench.harness.fits import Entry, Job, Material
-from mor_bench.harness.run import BUDGETS, checked_specs, jobs_of, place_of
+from mor_bench.harness.run import BUDGETS, EXTRA_SEEDS, LEARNING_STEP, checked_specs, jobs_of, place_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import load_dataset
@@ -28,6 +28,9 @@ REFERENCE = ("beam-coarse", 768, 5120)
 
 PROBED = 8
 """Samples that are solved to see how long one takes."""
+
+LEARNING_POINTS = 4
+"""Of a learning curve, about, beside that of all samples."""
 
 TURN_S = 0.1
 START_S = 2.0
@@ -105,7 +108,8 @@ def plan(
     """
     specs, method_specs = checked_specs(datasets, methods, profile, suite)
     root = Path(cache or default_cache())
-    allowed = BUDGETS[profile].configurations
+    budget = BUDGETS[profile]
+    allowed = budget.configurations
     all_jobs = [job for method in method_specs for job in jobs_of([method], profile)[:allowed]]
     steps: list[Step] = []
     for spec in specs:
@@ -115,10 +119,23 @@ def plan(
         n_dofs, n_train = _size(spec, limit)
         for job in all_jobs:
             seconds = _fit_s(job, profile, n_dofs, n_train, _earlier(root, job))
-            steps.append(Step(spec.name, job.label, job.label in done, None if seconds is None else seconds / jobs))
+            steps.append(Step(spec.name, job.label, job.label in done, None if seconds is None else min(seconds, budget.seconds) / jobs))
+        if profile == "full":
+            steps += _extras(spec.name, all_jobs, steps[-len(all_jobs) :])
     protocol = PROTOCOLS[profile]
     turns = protocol.processes * (protocol.rounds + 2) * len(all_jobs) * len(specs)
     return Plan(steps, turns * TURN_S + protocol.processes * START_S * len(specs))
+
+
+def _extras(dataset: str, jobs: Sequence[Job], fits: Sequence[Step]) -> list[Step]:
+    """What a full comparison fits beside: other seeds of what is trained by iterations, and learning curves."""
+    extras = []
+    for method in dict.fromkeys(job.method.name for job in jobs):
+        mine = [(job, step.seconds or 0.0) for job, step in zip(jobs, fits, strict=True) if job.method.name == method]
+        trained = "iterations" in mine[0][0].parameters
+        seconds = EXTRA_SEEDS * sum(s for _, s in mine) + LEARNING_POINTS * mine[-1][1] if trained else mine[-1][1] / (LEARNING_STEP - 1)
+        extras.append(Step(dataset, f"{method}: {'other seeds, ' if trained else ''}learning curve", False, seconds))
+    return extras
 
 
 def _size(spec: AnyDatasetSpec, limit: int | None) -> tuple[int, int]:
