@@ -213,6 +213,7 @@ def _row(method: str, label: str, error: float, latency: float, data: float | No
     return {
         "dataset": "d", "method": method, "label": label, "status": "ok", "error": {"rel_l2_median": error}, "latency_ms": {"median": latency},
         "offline_s": {"data": data, "fit": fit}, "n_dofs": 600, "n_train": 1000, "n_test": 100,
+        "parameters": {}, "split": "region",
     }  # fmt: skip
 
 
@@ -256,15 +257,20 @@ def test_regimes_and_tuning(tmp_path: Path) -> None:
     made = Comparison(tmp_path, {}, settings={"budget": {"configurations": 2, "seconds": 15.0}})
     made.rows = [_row("a", "a1", 0.1, 1.0), _row("a", "a2", 0.1, 1.0), {**_row("a", "a3", 0.1, 1.0), "status": "skipped"}, _row("b", "b", 0.1, 1.0)]
     assert tuning(made)[0] == {
-        "dataset": "d", "method": "a", "configurations": 2, "seconds": 20.0, "configurations_allowed": 2, "seconds_allowed": 15.0,
+        "dataset": "d", "method": "a", "configurations": 2, "seconds": 20.0, "seeds": 1, "configurations_allowed": 2, "seconds_allowed": 15.0,
     }  # fmt: skip
     wanted = {"says": "large meshes", "min_dofs": 600, "min_train": None, "gpu": False}
-    for change, expected in (({}, True), ({"min_dofs": 601}, False), ({"min_train": 1001}, False), ({"gpu": True}, False)):
+    for change, lacks in (
+        ({}, ""), ({"min_dofs": 601}, "600 of 601 degrees of freedom"), ({"min_train": 1001}, "1,000 of 1,001 training samples"),
+        ({"gpu": True}, "no graphics processor"), ({"split": "sample"}, "split by region"), ({"min_iterations": 5}, "0 of 5 iterations"),
+    ):  # fmt: skip
         made.methods = {"a": {"regime": wanted | change}, "b": {"regime": None}}
         found = regimes(made)
-        assert [(record["method"], record["in_regime"]) for record in found] == [("a", expected)]
-        assert found[0]["verdict"] == ("in its regime" if expected else "not tested in its regime: large meshes")
+        assert [(record["method"], record["in_regime"]) for record in found] == [("a", not lacks), ("b", None)]
+        assert found[0]["verdict"] == (f"not tested in its regime ({lacks}): large meshes" if lacks else "in its regime")
+        assert found[1]["verdict"] == "its file names no regime"
     made.settings["device"] = "gpu"
+    made.methods["a"] = {"regime": wanted | {"gpu": True}}
     assert regimes(made)[0]["in_regime"]
 
 

@@ -340,7 +340,7 @@ def test_the_page_has_a_section_for_all_that_was_measured(rich: Comparison, anal
     ]  # fmt: skip
     text = page_text(paths[-1])
     for said in (
-        "processes differ by 14 %", "4.2 times as large as on the shipped one", "not tested in its regime: 20,000 samples or more, on a GPU",
+        "processes differ by 14 %", "4.2 times as large as on the shipped one", "no graphics processor): 20,000 samples or more, on a GPU",
         "errors over 13 load regions, latencies over 5 processes that differ by", "6 of 5 (over)", "flagged 41.7 % of 60",
         "Who is faster at 1 %, the error that is needed",
     ):  # fmt: skip

@@ -177,7 +177,9 @@ def notes_of(comparison: Comparison, dataset: str, analysis: Mapping[str, Any]) 
             ratio = "infinitely" if record["ratio"] is None else f"{number(record['ratio'])} times"
             notes.append(f"{record['label']}: on the hidden test set the median error is {ratio} as large as on the shipped one")
     methods = {entry.method for entry in entries}
-    notes += [f"{record['method']}: {record['verdict']}" for record in analysis["regimes"] if record["method"] in methods and not record["in_regime"]]
+    notes += [
+        f"{record['method']}: {record['verdict']}" for record in analysis["regimes"] if record["method"] in methods and record["in_regime"] is False
+    ]
     return notes
 
 
