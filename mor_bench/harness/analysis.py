@@ -400,7 +400,9 @@ def share_within(factors: Sequence[float | None], tau: float) -> float:
 
 def regimes(comparison: Comparison) -> list[Row]:
     """Whether each method was tested where its file says that it belongs, and what was missing if not."""
-    out = []
+    out: list[Row] = []
+    if not any((method or {}).get("regime") for method in comparison.methods.values()):
+        return out
     device = str(comparison.settings.get("device") or "cpu")
     for method in dict.fromkeys(row["method"] for row in comparison.rows):
         regime = (comparison.methods.get(method) or {}).get("regime")

@@ -72,7 +72,7 @@ class Protocol:
         return -(-LEAST_QUERIES // (self.processes * self.rounds))
 
 
-PROTOCOLS = {"quick": Protocol(2, 5), "full": Protocol(5, 5)}
+PROTOCOLS = {"quick": Protocol(2, 5), "full": Protocol(8, 5)}
 
 
 @dataclass

@@ -26,8 +26,8 @@ COMPARISON_LEVEL = 0.98
 TYPICAL_SPREAD = 0.014
 """Relative standard deviation of a configuration's median between fresh processes on a quiet machine."""
 
-TYPICAL_DRIFT = 0.007
-"""The same of what slows all configurations of a process alike."""
+TYPICAL_DRIFT = 0.02
+"""The same of what slows all configurations alike, between runs that are minutes apart; within a run it is 0.7 %. It cancels in ratios."""
 
 PRIOR_DF = 2.0
 """Degrees of freedom that these count for beside what was measured: two processes may agree by chance to 0.01 %."""
