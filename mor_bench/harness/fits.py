@@ -134,11 +134,8 @@ class Material:
         self.scene, self.scratch, self.sets = scene, scratch, dict(sets)
         self.n_train = len(train)
         self._train = train
-        self._lay_out()
-
-    def _lay_out(self) -> None:
-        self.train_folder = Path(tempfile.mkdtemp(dir=self.scratch)) / "train"
-        write_snapshots(self.train_folder, self._train)
+        self.train_folder = Path(tempfile.mkdtemp(dir=scratch)) / "train"
+        write_snapshots(self.train_folder, train)
         self._files = self._file_digests()
 
     def _file_digests(self) -> dict[str, str]:
@@ -151,8 +148,8 @@ class Material:
         except OSError:
             unchanged = False
         if not unchanged:
-            shutil.rmtree(self.train_folder.parent, ignore_errors=True)
-            self._lay_out()
+            shutil.rmtree(self.train_folder, ignore_errors=True)
+            write_snapshots(self.train_folder, self._train)  # where all that share it look for it
             raise MethodFailedError("it wrote over the training samples")
 
     @cached_property

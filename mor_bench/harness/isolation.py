@@ -30,6 +30,14 @@ LOOK_EVERY_S = 0.2
 
 START_LIMIT_S = 120.0
 
+MEMORY_SHARE = 0.75
+"""Of the machine's memory, that a method may take unless another limit is given."""
+
+
+def default_memory_limit_bytes() -> float:
+    """What a method's process may take unless another limit is given."""
+    return MEMORY_SHARE * float(psutil.virtual_memory().total)
+
 
 class MethodFailedError(MorBenchError):
     """A method crashed, its process died, or it took more time or memory than it may."""

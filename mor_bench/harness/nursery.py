@@ -15,6 +15,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from threading import Condition, Lock, Thread
 from time import monotonic, sleep
@@ -112,24 +113,28 @@ def _exactly(connection: socket.socket, n: int) -> bytes:
     return received
 
 
+PRELOADED = (
+    "sklearn.linear_model", "mor_bench.harness.cost", "mor_bench.harness.handover", "mor_bench.harness.timing", "mor_bench.surrogates.fem",
+    "mor_bench.surrogates.hpod", "mor_bench.surrogates.pca_regression", "mor_bench.surrogates.pod",
+)  # fmt: skip
+"""What methods import: no fit's time holds an import. PyTorch is not among it, since few need it and it takes two seconds."""
+
+
 def _preload() -> None:
     """Import what methods import, and load the compiled kernels by solving once."""
     import numpy as np
 
-    import mor_bench.harness.cost
-    import mor_bench.harness.handover
-    import mor_bench.surrogates.fem
-    import mor_bench.surrogates.hpod
-    import mor_bench.surrogates.pca_regression
-    import mor_bench.surrogates.pod
+    for module in PRELOADED:
+        import_module(module)
     from mor_bench.harness.timing import pinned_threads
     from mor_bench.scene.scene import load_scene
+    from mor_bench.surrogates.fem import FullFEM
 
     with pinned_threads(1):
         scene = load_scene("beam-tiny")
         force = np.zeros((scene.mesh.n_nodes, 3))
         force[-1] = 0.1
-        mor_bench.surrogates.fem.FullFEM().fit(scene).predict(force)
+        FullFEM().fit(scene).predict(force)
 
 
 def serve(path: str, work: Callable[[BinaryIO, BinaryIO], Any]) -> None:
@@ -154,9 +159,9 @@ def serve(path: str, work: Callable[[BinaryIO, BinaryIO], Any]) -> None:
         if listener.fileno() in ready:
             connection, _ = listener.accept()
             said = b""
-            while not said.endswith(b"\n"):
-                said += connection.recv(4096)
-            if os.fork() == 0:
+            while not said.endswith(b"\n") and (part := connection.recv(4096)):
+                said += part
+            if said.endswith(b"\n") and os.fork() == 0:
                 os.setsid()  # what a method does to its process group is done to its own
                 signal.set_wakeup_fd(-1)
                 signal.signal(signal.SIGCHLD, signal.SIG_DFL)

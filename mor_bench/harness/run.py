@@ -26,7 +26,7 @@ from mor_bench.harness.clock import PROTOCOLS, Opener, Queries, Timing, check_an
 from mor_bench.harness.discretisation import measured
 from mor_bench.harness.fits import Entry, Job, Material, Outcome, Place, RemoteFit, TestSet, evaluate, fit, fit_elsewhere, score
 from mor_bench.harness.handover import arrays_of
-from mor_bench.harness.isolation import START_LIMIT_S, MethodFailedError, Worker
+from mor_bench.harness.isolation import START_LIMIT_S, MethodFailedError, Worker, default_memory_limit_bytes
 from mor_bench.harness.metrics import SampleErrors, summary
 from mor_bench.harness.nursery import CAN_FORK, Nursery
 from mor_bench.harness.results import Comparison, label_of
@@ -57,9 +57,6 @@ CORE_METHODS = ("fem", "pod", "hpod", "pca-regression", "umesh")
 
 DATA_METHODS = ("pca-regression-force", "umesh")
 """The same on imported snapshots, whose equations are not known."""
-
-MEMORY_SHARE = 0.75
-"""Of the machine's memory, that a method may take unless another limit is given."""
 
 MOST_QUERIES = 400
 """Loads of the test set from which a timing's queries are drawn."""
@@ -222,7 +219,7 @@ def run(
     settings = _Settings(
         profile, limit, split, threads, workers, jobs, cluster, Path(cache or default_cache()),
         replace(budget, seconds=time_limit_s or budget.seconds),
-        memory_limit_bytes or MEMORY_SHARE * psutil.virtual_memory().total, test_seed, retime, fail_fast, listener,
+        memory_limit_bytes or default_memory_limit_bytes(), test_seed, retime, fail_fast, listener,
     )  # fmt: skip
     comparison = _open_run(Path(out) if out else _default_out([spec.name for spec in specs]), specs, method_specs, settings)
     jobs_of_all = jobs_of(method_specs, profile)
@@ -315,8 +312,8 @@ def _check_method(spec: MethodSpec, cache: Path, memory_limit_bytes: float | Non
         with suppress(MissingDependencyError):  # that becomes a row with its reason
             check_method(spec)
         return
-    memory = MEMORY_SHARE * psutil.virtual_memory().total if memory_limit_bytes is None else memory_limit_bytes
-    with suppress(MethodFailedError, MissingDependencyError), Worker(None, sealed_folders(cache), spec.folder, memory) as worker:
+    limit = memory_limit_bytes or default_memory_limit_bytes()
+    with suppress(MethodFailedError, MissingDependencyError), Worker(None, sealed_folders(cache), spec.folder, limit) as worker:
         for profile in ("quick", "full"):
             where = f"method {spec.name} ({profile})"
             worker.ask("check", START_LIMIT_S, surrogate=spec.surrogate, configurations=spec.configurations(profile), where=where)
@@ -420,6 +417,9 @@ class _DatasetRun:
             for _, group in groupby(self.jobs, key=lambda job: job.method.name):
                 jobs = list(group)
                 fitted = list(executor.map(partial(self._fit_one, pool), range(len(jobs)), jobs))
+                for entry, _ in fitted:
+                    if entry is not None:
+                        stack.callback(entry.release)
                 for job, entry, (row, samples) in zip(jobs, [entry for entry, _ in fitted], executor.map(self._score_one, fitted), strict=True):
                     self.comparison.put(row, samples)
                     self.settings.listener.fitted(row)

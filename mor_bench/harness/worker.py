@@ -223,8 +223,8 @@ class Session:
     def time(self, out: Path, n: int, floor_s: float, most_s: float, threads: int) -> dict[str, Any]:
         """Wall times of single queries, ms: n and at least for a time, but for no longer than another.
 
-        No load comes twice: each is one of the queries, drawn at random and made smaller by a random factor. Some are not
-        made smaller, and what is answered to those is written to a file, so that it can be compared with what was scored.
+        Each load is one of the queries, drawn at random and made smaller by a random factor, so that none comes twice. A few
+        are not made smaller, and what is answered to those is written to a file, to be compared with what was scored.
         The garbage collector runs as it would for a user; its part of each query is told apart.
         """
         import numpy as np

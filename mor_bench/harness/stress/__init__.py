@@ -13,11 +13,9 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from psutil import virtual_memory
-
 from mor_bench import __version__
 from mor_bench.errors import InvalidInputError, MissingDependencyError, MorBenchError, OutOfTimeError, UnsupportedSceneError
-from mor_bench.harness.isolation import Worker
+from mor_bench.harness.isolation import Worker, default_memory_limit_bytes
 from mor_bench.harness.stress import mechanics, methods, reduction
 from mor_bench.harness.stress.case import LONGEST, Case, Outcome, Scenes, Subject, Verdict, every
 from mor_bench.harness.timing import describe_machine, pinned_threads
@@ -32,9 +30,6 @@ CASE_NAMES = tuple(dict.fromkeys(case.name for case in CASES))
 
 CASE_S = 300.0
 """Seconds that a third party's method may take for a case."""
-
-MEMORY_SHARE = 0.75
-"""Of the machine's memory, that it may take."""
 
 
 @dataclass(frozen=True)
@@ -209,7 +204,7 @@ class _Apart:
         self.cases = self._start()
 
     def _start(self) -> list[tuple[str, str]]:
-        self._worker = Worker(None, [], self._spec.folder, MEMORY_SHARE * virtual_memory().total)
+        self._worker = Worker(None, [], self._spec.folder, default_memory_limit_bytes())
         asked = {"method": self._spec, "profile": self._profile, "cases": self._names, "cache": self._cache}
         where = f"method {self._spec.name}"
         self._worker.ask("check", CASE_S, surrogate=self._spec.surrogate, configurations=[self._spec.parameters_of(self._profile)], where=where)
