@@ -17,7 +17,7 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from mor_bench.harness.run import Listener
+    from mor_bench.harness.on_dataset import Listener
     from mor_bench.snapshots.dataset import Dataset
     from mor_bench.snapshots.test_sets import SetName
 
@@ -89,7 +89,7 @@ def _progress(console: Console) -> Iterator[Listener]:
     from rich.markup import escape
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    from mor_bench.harness.run import Listener
+    from mor_bench.harness.on_dataset import Listener
 
     texts = TextColumn("{task.description}"), TextColumn("{task.fields[rate]}")
     columns = (texts[0], BarColumn(), MofNCompleteColumn(), texts[1], TimeElapsedColumn(), TimeRemainingColumn())

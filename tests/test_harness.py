@@ -18,8 +18,8 @@ from mor_bench.harness import clock
 from mor_bench.harness.clock import LEAST_QUERIES, MOST_S
 from mor_bench.harness.frontier import Point, error_at_time, non_dominated, time_at_error
 from mor_bench.harness.metrics import sample_errors, summary
+from mor_bench.harness.on_dataset import Listener
 from mor_bench.harness.results import Comparison
-from mor_bench.harness.run import Listener
 from mor_bench.harness.timing import pinned_threads
 from mor_bench.snapshots.generate import generation_seconds
 from mor_bench.specs import load_generated_spec

@@ -14,10 +14,10 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, SpecError
+from mor_bench.harness.contestants import CORE_METHODS, checked_specs
 from mor_bench.harness.isolation import MethodFailedError, Worker
 from mor_bench.harness.nursery import CAN_FORK, Nursery
 from mor_bench.harness.results import Comparison
-from mor_bench.harness.run import CORE_METHODS, checked_specs
 from mor_bench.snapshots.dataset import Dataset
 from tests.third_party import Peeker
 

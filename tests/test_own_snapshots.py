@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 import mor_bench
 from mor_bench.errors import InvalidInputError, MissingDependencyError, SpecError, StoreError, UnsupportedSceneError
 from mor_bench.harness.check import check_file
+from mor_bench.harness.contestants import CORE_METHODS, DATA_METHODS, checked_specs
 from mor_bench.harness.discretisation import refine
 from mor_bench.harness.export import snapshot_arrays
-from mor_bench.harness.run import CORE_METHODS, DATA_METHODS, checked_specs
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.imported import MAX_SIZE
 from mor_bench.scene.mesh import box_mesh

@@ -263,7 +263,7 @@ def test_where_the_evidence_comes_from(comparison: Comparison, tmp_path: Path, m
 
 def test_without_evidence_the_comparison_is_run(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("mor_bench.harness.run.CORE_METHODS", ("fem", "linear-fem"))
+    monkeypatch.setattr("mor_bench.harness.contestants.CORE_METHODS", ("fem", "linear-fem"))
     chosen = mor_bench.pick("beam-tiny", latency_ms=1e4, cache=cache)
     assert chosen.run is not None
     assert chosen.run.parent == Path("reports") / "runs"

@@ -183,7 +183,8 @@ class Worker:
 
 
 _DOING = {"begin": "starting its process", "check": "importing it", "fit": "fitting", "load": "loading the model", "predict": "predicting",
-          "warm": "warming up", "time": "timing", "throughput": "timing batches", "cost": "counting the cost"}  # fmt: skip
+          "warm": "warming up", "time": "timing", "throughput": "timing batches", "cost": "counting the cost",
+          "flag": "telling its range", "stress": "importing it", "stress_case": "the case"}  # fmt: skip
 
 
 class _Started:

@@ -18,8 +18,9 @@ from typing import Any
 
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.harness.analysis import analyse
+from mor_bench.harness.on_dataset import Listener
 from mor_bench.harness.results import Comparison, _plain
-from mor_bench.harness.run import Listener, run
+from mor_bench.harness.run import run
 from mor_bench.specs import AnyDatasetSpec, load_dataset_spec
 
 Row = Mapping[str, Any]

@@ -14,8 +14,9 @@ from time import perf_counter
 from typing import Any
 
 from mor_bench.harness.clock import PROTOCOLS
+from mor_bench.harness.contestants import BUDGETS, checked_specs, jobs_of
 from mor_bench.harness.fits import Entry, Job, Material
-from mor_bench.harness.run import BUDGETS, EXTRA_SEEDS, LEARNING_STEP, checked_specs, jobs_of, place_of
+from mor_bench.harness.on_dataset import EXTRA_SEEDS, LEARNING_STEP, place_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import load_dataset
