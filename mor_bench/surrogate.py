@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,9 @@ from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.load_range import LoadRange
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import check_parameters, list_suite, load_class, load_method_spec
+
+if TYPE_CHECKING:
+    from mor_bench.mechanics.indicator import ErrorIndicator, Indication
 
 SCHEMA_VERSION = 1
 
@@ -41,6 +44,7 @@ class Surrogate(ABC):
 
     scene_: Scene
     range_: LoadRange
+    _indicator: tuple[Scene, ErrorIndicator]
 
     needs_snapshots: ClassVar[bool] = True
     """Whether `fit` learns from snapshots; their cost is charged only to methods that do."""
@@ -75,7 +79,7 @@ class Surrogate(ABC):
         Returns
         -------
         array of the same shape, float64
-            Nodal displacements, m, on the host.
+            Nodal displacements, m, on the host. Nodes that the scene's ``needs.outputs`` leaves out may hold NaN.
 
         Raises
         ------
@@ -127,6 +131,38 @@ class Surrogate(ABC):
                 "or its file is of an older version; then fit it again."
             )
         return flags.reshape(np.shape(forces)[:-2])
+
+    def indicate_error(self, forces: ArrayLike, displacements: ArrayLike) -> Indication:
+        """Indicate how wrong predictions are, by what they leave of the equations; see `mor_bench.mechanics.indicator`.
+
+        Parameters
+        ----------
+        forces, displacements : (n_nodes, 3) or (n, n_nodes, 3)
+            Loads, N, and what `predict` answered, m.
+
+        Returns
+        -------
+        Indication
+            With arrays of shape (1,) or (n,).
+
+        Raises
+        ------
+        InvalidInputError
+            On a wrong shape or dtype, or forces that are not finite.
+        NotFittedError
+            Before `fit`.
+        UnsupportedSceneError
+            If the scene's equations are not known.
+        """
+        from mor_bench.mechanics.indicator import ErrorIndicator
+
+        batch = self._checked_forces(forces)
+        predicted = np.asarray(displacements)
+        if predicted.dtype.kind != "f" or predicted.shape != np.shape(forces):
+            raise InvalidInputError(f"`displacements` must be floats of shape {np.shape(forces)}; got {predicted.dtype} of shape {predicted.shape}.")
+        if not hasattr(self, "_indicator") or self._indicator[0] is not self.scene_:
+            self._indicator = self.scene_, ErrorIndicator(self.scene_)
+        return self._indicator[1](batch, predicted.reshape(batch.shape).astype(np.float64, copy=False))
 
     @property
     def parameters(self) -> dict[str, Any]:

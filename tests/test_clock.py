@@ -93,7 +93,7 @@ def test_configurations_are_timed_in_turn_and_fail_alone(tiny: Dataset, tmp_path
     def dead(nursery: Nursery | None) -> Worker:
         raise MethodFailedError("it does not open")
 
-    queries = Queries(tiny.test.forces, tiny.test.displacements, tmp_path)
+    queries = Queries(tiny.test.forces, tiny.test.displacements, tiny.scene.output_nodes, tmp_path)
     openers = {
         "plain": Opener(partial(opened, tiny, "tests.third_party:Slowed", {}, tmp_path), 1e8),
         "slow": Opener(partial(opened, tiny, "tests.third_party:Slowed", {"part": 4.0}, tmp_path), 1e8),
@@ -117,7 +117,7 @@ def test_configurations_are_timed_in_turn_and_fail_alone(tiny: Dataset, tmp_path
 
 
 def test_answers_that_are_worse_while_timed_than_when_scored_are_found(tiny: Dataset, tmp_path: Path) -> None:
-    queries = Queries(tiny.test.forces, tiny.test.displacements, tmp_path)
+    queries = Queries(tiny.test.forces, tiny.test.displacements, tiny.scene.output_nodes, tmp_path)
     honest = Opener(partial(opened, tiny, "tests.third_party:Slowed", {}, tmp_path), 1e8)
     zero = Opener(partial(opened, tiny, "tests.third_party:Zero", {}, tmp_path), 1e8)
     timings = measure({"honest": honest, "zero": zero}, queries, PROTOCOLS["quick"], 1, single_only=True)

@@ -22,7 +22,7 @@ from mor_bench.harness.on_dataset import Listener
 from mor_bench.harness.results import Comparison
 from mor_bench.harness.timing import pinned_threads
 from mor_bench.snapshots.generate import generation_seconds
-from mor_bench.specs import load_generated_spec
+from mor_bench.specs import list_suite, load_generated_spec
 
 
 def test_metrics_by_hand() -> None:
@@ -279,3 +279,45 @@ def test_reading_a_folder_that_is_no_run(tmp_path: Path) -> None:
     (tmp_path / "results.json").write_text('{"schema_version": 99}')
     with pytest.raises(StoreError, match="schema version 99"):
         Comparison.read(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def tip_only(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """beam-tiny, of which only the tip's displacements are wanted."""
+    path = tmp_path_factory.mktemp("datasets") / "tip.toml"
+    path.write_text(list_suite("datasets")["beam-tiny"].read_text().replace('outputs    = "all"', 'outputs = "x-max"'))
+    return path
+
+
+def test_errors_count_the_wanted_nodes_alone(tip_only: Path, cache: Path, tmp_path: Path) -> None:
+    comparison = mor_bench.run([tip_only], ["fem", "pod-tensor"], out=tmp_path / "run", cache=cache, threads=1, profile="quick")
+    data = mor_bench.load_dataset(tip_only, cache=cache)
+    tip = data.scene.output_nodes
+    assert (data.scene.mesh.points[tip, 0] == data.scene.mesh.points[:, 0].max()).all()
+    row = next(row for row in comparison.rows if row["label"] == "pod-tensor [n_modes=10]")
+    method = mor_bench.load_method("pod-tensor", n_modes=10).fit(data.scene, data.train)
+    predicted, reference = method.predict(data.test.forces), data.test.displacements
+    assert np.isnan(np.delete(predicted, tip, axis=1)).all()
+    errors = np.abs(predicted[:, tip] - reference[:, tip]).mean(axis=(1, 2))
+    assert row["error"]["mean_dof_m"] == pytest.approx(errors.mean(), rel=1e-6)
+    assert row["indicator"] is None
+    hybrid = mor_bench.load_method("hybrid", steps=2).fit(data.scene, data.train).predict(data.test.forces[:3])
+    assert np.isfinite(hybrid).all()
+
+
+def test_indicated_errors_stand_in_the_row(cache: Path, tmp_path: Path) -> None:
+    comparison = mor_bench.run(["beam-tiny"], ["fem", "pod-tensor"], out=tmp_path / "run", cache=cache, threads=1)
+    for row in comparison.rows:
+        if row["method"] == "pod-tensor":
+            assert row["indicator"]["n"] > 30
+            assert 0.8 < row["indicator"]["ratio_median"] < 1.25
+            assert row["indicator"]["rank_correlation"] > 0.8
+    assert comparison.rows[3]["label"] == "fem [tolerance=1e-08]"
+    assert comparison.rows[3]["indicator"] is None
+
+
+def test_a_region_of_outputs_without_nodes_is_an_error_of_the_dataset(tip_only: Path, tmp_path: Path) -> None:
+    path = tmp_path / "none.toml"
+    path.write_text(tip_only.read_text().replace('"x-max"\nerror', "{ sphere_m = [[90.0, 0.0, 0.0], 1.0] }\nerror"))
+    with pytest.raises(SpecError, match="holds no node"):
+        mor_bench.load_scene(path)

@@ -176,12 +176,15 @@ class Queries:
     ----------
     forces, references : (n, n_nodes, 3) float64
         Loads, N, and the displacements that answer them, m, which methods do not get.
+    nodes : (n_output_nodes,) int64
+        The nodes where answers count.
     scratch : Path
         A folder for answers.
     """
 
     forces: NDArray[np.float64]
     references: NDArray[np.float64]
+    nodes: NDArray[np.int64]
     scratch: Path
 
 
@@ -293,7 +296,7 @@ def _ask(timing: Timing, worker: Worker, queries: Queries, n: int, threads: int)
         found = worker.ask("time", ANSWER_LIMIT_S, out=out, n=n, floor_s=CHUNK_S, most_s=MOST_S, threads=threads)
         try:
             answers, references = np.load(out, allow_pickle=False), queries.references[found["checked"]]
-            errors = sample_errors(answers, references).relative_l2
+            errors = sample_errors(answers, references, queries.nodes).relative_l2
         except (OSError, ValueError, IndexError, KeyError, TypeError) as error:
             raise MethodFailedError(f"its answers cannot be read: {error}") from None
     timing.checked += list(zip(found["checked"], errors.tolist(), strict=True))

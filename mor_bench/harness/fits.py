@@ -14,6 +14,7 @@ import json
 import os
 import shutil
 import tempfile
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from copy import copy
@@ -32,10 +33,14 @@ from mor_bench.harness.isolation import MethodFailedError, Worker
 from mor_bench.harness.metrics import SampleErrors, sample_errors
 from mor_bench.harness.nursery import Nursery
 from mor_bench.harness.results import read_arrays, write_arrays
+from mor_bench.mechanics.indicator import ErrorIndicator
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.store import write_atomically
-from mor_bench.specs import MethodSpec
+from mor_bench.specs import MethodSpec, list_suite, load_method_spec
+
+N_INDICATED = 64
+"""Test loads, spread evenly, whose errors are also indicated by what the predictions leave of the equations."""
 
 N_COUNTED = 32
 """Test loads over which the cost of a query is averaged."""
@@ -94,18 +99,28 @@ class TestSet:
     ----------
     forces, references : (n, n_nodes, 3) float64
         N and m.
+    nodes : (n_output_nodes,) int64
+        The nodes where answers count.
     digest : str
-        Of both.
+        Of all.
     """
 
     forces: NDArray[np.float64]
     references: NDArray[np.float64]
+    nodes: NDArray[np.int64]
     digest: str
 
     @classmethod
     def of(cls, snapshots: Snapshots) -> TestSet:
         """A test set from snapshots."""
-        return cls(snapshots.forces, snapshots.displacements, digest_of({"f": snapshots.forces, "u": snapshots.displacements}))
+        nodes = snapshots.scene.output_nodes
+        arrays = {"f": snapshots.forces, "u": snapshots.displacements}
+        return cls(
+            snapshots.forces,
+            snapshots.displacements,
+            nodes,
+            digest_of(arrays if len(nodes) == snapshots.scene.mesh.n_nodes else {**arrays, "nodes": nodes}),
+        )
 
 
 def digest_of(arrays: Mapping[str, NDArray[Any]]) -> str:
@@ -155,8 +170,18 @@ class Material:
     @cached_property
     def train_digest(self) -> str:
         """Of the training snapshots and the scene."""
-        scene = json.dumps([self.scene.spec.physics(), self.scene.spec.grid_nodes], sort_keys=True)
+        spec = self.scene.spec
+        asked = [] if spec.needs.outputs == "all" else [spec.needs.model_dump(mode="json", include={"outputs"})]
+        scene = json.dumps([spec.physics(), spec.grid_nodes, *asked], sort_keys=True)
         return digest_of(arrays_of(self._train)) + hashlib.sha256(scene.encode()).hexdigest()
+
+    @cached_property
+    def indicator(self) -> ErrorIndicator | None:
+        """None where the equations are not known, or not all displacements are asked for."""
+        whole = self.scene.material is not None and len(self.scene.output_nodes) == self.scene.mesh.n_nodes
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of the scene; methods say the same
+            return ErrorIndicator(self.scene) if whole else None
 
     def first(self, n: int) -> Material:
         """With only the first training samples, and the main test set."""
@@ -198,7 +223,7 @@ class Entry:
             "data": material.train_digest,
             "surrogate": job.method.surrogate,
             "parameters": job.parameters,
-            "code": code_digest(job.method.surrogate, job.method.folder),
+            "code": [code_digest(job.method.surrogate, job.method.folder), *_code_of_named(job.parameters)],
             "machine": place.machine,
             "threads": place.fit_threads,
         }
@@ -288,6 +313,13 @@ class Entry:
         if self._held:
             self._held.end()
             self._held = None
+
+
+def _code_of_named(parameters: Mapping[str, Any]) -> list[str]:
+    """Of the methods of the suite that knobs name."""
+    shipped = list_suite("methods")
+    named = [value for value in parameters.values() if isinstance(value, str) and value in shipped]
+    return [code_digest(load_method_spec(shipped[name]).surrogate) for name in named]
 
 
 def _file_digest(path: Path) -> str:
@@ -400,6 +432,8 @@ def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[
     parts: list[SampleErrors] = []
     flagged: list[bool] | None = []
     worst: tuple[float, int, NDArray[np.float64]] = (-1.0, 0, np.full(test.references.shape[1:], np.nan))
+    indicated: list[tuple[int, float, float]] = []
+    chosen = _indicated_rows(entry, test)
     until = monotonic() + limit_s
     with tempfile.TemporaryDirectory(dir=entry.material.scratch) as folder:
         for start in range(0, len(test.forces), SCORE_CHUNK):
@@ -407,19 +441,31 @@ def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[
             predicted = ask_answers(
                 worker, "predict", max(1.0, until - monotonic()), Path(folder) / "answers.npy", test.forces[rows], entry.place.threads
             )
-            parts.append(sample_errors(predicted, test.references[rows]))
+            parts.append(sample_errors(predicted, test.references[rows], test.nodes))
             finite = np.where(np.isfinite(parts[-1].mean_dof_m), parts[-1].mean_dof_m, -1.0)
             if finite.max() > worst[0]:
                 worst = float(finite.max()), start + int(finite.argmax()), predicted[finite.argmax()].copy()
+            for row in chosen[(chosen >= start) & (chosen < start + SCORE_CHUNK)]:
+                assert entry.material.indicator is not None
+                found = entry.material.indicator(test.forces[row, None], predicted[row - start, None])
+                indicated.append((int(row), float(found.relative_correction[0]), float(found.relative_residual[0])))
             flags = worker.ask("flag", LOAD_LIMIT_S, forces=test.forces[rows])["flagged"]
             flagged = None if flags is None or flagged is None else flagged + flags
     return {
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])},
         **({} if flagged is None else {"flagged": np.asarray(flagged, dtype=bool)}),
+        **({"indicated": np.array(indicated)} if indicated else {}),
         "worst_prediction": worst[2],
         "worst_reference": test.references[worst[1]],
         "worst_forces": test.forces[worst[1]],
     }
+
+
+def _indicated_rows(entry: Entry, test: TestSet) -> NDArray[np.int64]:
+    """Test loads whose errors are indicated: some of the main set, none of others."""
+    if test is not entry.material.sets["test"] or entry.material.indicator is None:
+        return np.zeros(0, dtype=np.int64)
+    return np.unique(np.linspace(0, len(test.forces) - 1, N_INDICATED).astype(np.int64))
 
 
 def ask_answers(worker: Worker, do: str, limit_s: float, out: Path, forces: NDArray[np.float64], threads: int) -> NDArray[np.float64]:

@@ -34,11 +34,16 @@ class SampleErrors:
     amplitude_m: NDArray[np.float64]
 
 
-def sample_errors(predicted: NDArray[np.float64], reference: NDArray[np.float64]) -> SampleErrors:
+def sample_errors(
+    predicted: NDArray[np.float64], reference: NDArray[np.float64], nodes: NDArray[np.int64] | None = None
+) -> SampleErrors:  # fmt: skip
     """Errors of predictions (n, n_nodes, 3) against references of the same shape, both in m.
 
-    NaN in a prediction means that there is none, and gives infinite errors.
+    NaN in a prediction means that there is none, and gives infinite errors. Where only some nodes are wanted, the others
+    do not count.
     """
+    if nodes is not None and len(nodes) < reference.shape[1]:
+        predicted, reference = predicted[:, nodes], reference[:, nodes]
     difference = predicted - reference
     norm = np.linalg.norm(reference, axis=(1, 2))
     relative = np.linalg.norm(difference, axis=(1, 2)) / np.where(norm > 0, norm, 1.0)

@@ -44,6 +44,10 @@ from mor_bench.specs import (
 MOST_QUERIES = 400
 """Loads of the test set from which a timing's queries are drawn."""
 
+LEAST_INDICATED = 10
+EXACT = 1e-6
+"""Errors of full-order answers are round-off and tolerance, of which the reference has as much: nothing to indicate."""
+
 EXTRA_SEEDS = 2
 """Trainings with other seeds in a full comparison, beside that of the method's file."""
 
@@ -225,7 +229,7 @@ class DatasetRun:
             "parameters": job.parameters, "status": "", "reason": None, "n_train": len(data.train), "n_test": len(data.test),
             "n_unused": data.n_unused, "n_failed": None, "n_dofs": data.scene.mesh.n_dofs, "threads": self.settings.threads,
             "error": None, "latency_ms": None, "all_threads_ms": None, "throughput": None, "offline_s": None, "memory_bytes": None,
-            "model_bytes": None, "cost": None, "sets": {}, "hidden": None, "seeds": None, **self.discretisation, "warnings": [],
+            "model_bytes": None, "cost": None, "indicator": None, "sets": {}, "hidden": None, "seeds": None, **self.discretisation, "warnings": [],
         }  # fmt: skip
 
     def _scored(self, outcome: Outcome) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -243,6 +247,7 @@ class DatasetRun:
             "memory_bytes": {"fit": fit["fit_memory_bytes"], "predict": None},
             "model_bytes": fit["model_bytes"],
             "cost": outcome.cost,
+            "indicator": _indicator(main),
             "sets": {name: set_summary(score) for name, score in scores.items()},
             "warnings": fit["warnings"],
         }, main
@@ -289,7 +294,7 @@ class DatasetRun:
         }
         test = self.material.sets["test"]
         chosen = np.linspace(0, len(test.forces) - 1, min(MOST_QUERIES, len(test.forces))).astype(int)
-        queries = Queries(test.forces[chosen], test.references[chosen], self.folder)
+        queries = Queries(test.forces[chosen], test.references[chosen], test.nodes, self.folder)
         fresh = measure(openers, queries, protocol, settings.threads, partial(settings.listener.timing, self.spec.name))
         for label, timing in fresh.items():
             try:
@@ -378,6 +383,25 @@ def _failure(error: MorBenchError) -> dict[str, str]:
 
 def _errors(score: Mapping[str, Any]) -> SampleErrors:
     return SampleErrors(*(score[name] for name in ("mean_dof_m", "relative_l2", "max_nodal_m", "amplitude_m")))
+
+
+def _indicator(score: Mapping[str, Any]) -> dict[str, float] | None:
+    """How far the indicated errors of some samples tell the measured ones; None where there are too few."""
+    from scipy.stats import spearmanr
+
+    rows, correction, residual = score.get("indicated", np.zeros((0, 3))).T
+    measured = score["relative_l2"][rows.astype(int)]
+    usable = np.isfinite(measured) & (measured > 0) & np.isfinite(correction) & np.isfinite(residual)
+    measured, correction, residual = measured[usable], correction[usable], residual[usable]
+    if len(measured) < LEAST_INDICATED or measured.max() < EXACT:
+        return None
+    ratio = correction / measured
+    return {
+        "n": len(measured),
+        "rank_correlation": float(spearmanr(measured, correction)[0]),
+        "residual_rank_correlation": float(spearmanr(measured, residual)[0]),
+        **{f"ratio_{name}": float(np.quantile(ratio, share)) for name, share in (("p5", 0.05), ("median", 0.5), ("p95", 0.95))},
+    }
 
 
 def set_summary(score: Mapping[str, Any]) -> dict[str, Any]:

@@ -190,7 +190,8 @@ class FullOrderModel:
         return self._direct.factor(tangent)
 
     @cached_property
-    def _rotated(self) -> RotatedRest:
+    def turned_rest(self) -> RotatedRest:
+        """An approximate inverse of all tangents, R K₀⁻¹ Rᵀ, where there is a factor of the stiffness at rest."""
         mesh, factor = self.scene.mesh, self.rest_factor
         assert isinstance(factor, BandedFactor | MultigridFactor)
         element = element_of(mesh.cells)
@@ -215,7 +216,7 @@ class FullOrderModel:
 
     @property
     def accelerator(self) -> RotatedRest | None:
-        return self._rotated if self.solver == "auto" else None
+        return self.turned_rest if self.solver == "auto" else None
 
     def step(
         self, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64], tolerance: float
@@ -225,7 +226,7 @@ class FullOrderModel:
             self._jacobi.take(tangent)
             return conjugate_gradients(pattern, tangent, self._jacobi, residual, tolerance, JACOBI_ITERATIONS)[0]
         if self._iterative:
-            return conjugate_gradients(pattern, tangent, self._rotated.at(q), residual, tolerance)[0]
+            return conjugate_gradients(pattern, tangent, self.turned_rest.at(q), residual, tolerance)[0]
         return self.factor(tangent).solve(residual)
 
     def solve(self, load: NDArray[np.float64], start: NDArray[np.float64] | None = None, options: NewtonOptions = NewtonOptions()) -> Solution:

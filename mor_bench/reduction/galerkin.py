@@ -41,6 +41,17 @@ class _DenseFactor:
         return np.asarray(dpotrs(self._cholesky, rhs)[0]).reshape(rhs.shape)
 
 
+def dense_factor(tangent: NDArray[np.float64]) -> Factor:
+    """Cholesky factor of a reduced tangent (r, r); raises `NotPositiveDefiniteError`."""
+    if counting.running is not None:
+        r = len(tangent)
+        counting.running.add(factorisations=1, reduced_factorisations=1, multiply_adds=cholesky_multiply_adds(r, r - 1))
+    cholesky, info = dpotrf(tangent)
+    if info != 0:
+        raise NotPositiveDefiniteError
+    return _DenseFactor(cholesky)
+
+
 class GalerkinProblem:
     """A reduced model over all cells (plain POD) or over weighted ones (ECSW).
 
@@ -102,11 +113,4 @@ class GalerkinProblem:
         """Nothing to do: every step has a Cholesky factor."""
 
     def factor(self, tangent: NDArray[np.float64]) -> Factor:
-        """Dense Cholesky; raises `NotPositiveDefiniteError`."""
-        if counting.running is not None:
-            r = len(tangent)
-            counting.running.add(factorisations=1, reduced_factorisations=1, multiply_adds=cholesky_multiply_adds(r, r - 1))
-        cholesky, info = dpotrf(tangent)
-        if info != 0:
-            raise NotPositiveDefiniteError
-        return _DenseFactor(cholesky)
+        return dense_factor(tangent)

@@ -111,8 +111,8 @@ def _limits(mesh: Mesh, samples: list[WorstSample], arrows: list[NDArray[np.floa
     shapes = [mesh.points, *(arrow for arrow in arrows if arrow is not None)]
     for sample in samples:
         shapes.append(mesh.points + sample.reference)
-        if np.isfinite(sample.prediction).all():
-            shapes.append(mesh.points + np.clip(sample.prediction, -0.5 * span, 0.5 * span))
+        predicted = np.isfinite(sample.prediction).all(axis=1)
+        shapes.append((mesh.points + np.clip(sample.prediction, -0.5 * span, 0.5 * span))[predicted])
     screen = np.concatenate([_project(shape)[0] for shape in shapes])
     margin = 0.06 * float(np.ptp(screen[:, 0]))
     return np.array([screen.min(axis=0) - margin, screen.max(axis=0) + margin])
@@ -144,9 +144,11 @@ def _panel(axes: Axes, mesh: Mesh, sample: WorstSample, arrow: NDArray[np.float6
     axes.add_collection(LineCollection(list(rest[_edges(facets)]), colors="#c4c4c4", linewidths=0.5, zorder=1))
     reference = mesh.points + sample.reference
     _draw_surface(axes, reference, facets)
-    if np.isfinite(sample.prediction).all():
+    predicted = np.asarray(np.isfinite(sample.prediction).all(axis=1))
+    if predicted.any():
         screen, _ = _project(mesh.points + sample.prediction)
-        front = facets[_facing(mesh.points + sample.prediction, facets)]
+        whole = facets[predicted[facets].all(axis=1)]
+        front = whole[_facing(mesh.points + sample.prediction, whole)]
         axes.add_collection(LineCollection(list(screen[_edges(front)]), colors=PREDICTION, linewidths=0.9, zorder=4))
         figures = f"e = {metres(sample.error_m)} m, relative L2 = {percent(sample.relative_l2)} %"
         if sample.entry.n_failed:

@@ -27,6 +27,7 @@ def dataset_details(comparison: Comparison, dataset: str, analysis: Mapping[str,
         break_even(dataset, analysis, entries),
         timing(entries),
         resources(entries),
+        indicated(entries),
         test_sets(entries),
         hidden(dataset, entries, analysis),
         tuning(dataset, analysis),
@@ -112,6 +113,23 @@ def resources(entries: Sequence[Entry]) -> Grid | None:
     return _grid(
         "Memory and cost", "Memory: most of it resident at a time. Counts: means per query; they do not depend on the machine.", entries, columns
     )
+
+
+def indicated(entries: Sequence[Entry]) -> Grid | None:
+    """How well the error of a prediction is told without the right answer."""
+    columns: dict[str, Cell] = {
+        "indicated / measured, median": _figure("indicator", "ratio_median"),
+        "5 %": _figure("indicator", "ratio_p5"),
+        "95 %": _figure("indicator", "ratio_p95"),
+        "rank correlation": _figure("indicator", "rank_correlation"),
+        "that of the residual": _figure("indicator", "residual_rank_correlation"),
+    }
+    note = (
+        "The first correction that the full-order solve would make from a prediction, relative to it, as an estimate of its relative L2 error "
+        "(`Surrogate.indicate_error`); it costs about one iteration of that solve. For comparison the plain residual, relative to the load. "
+        "Over some samples of the test set; nothing for answers that are exact."
+    )
+    return _grid("Indicated errors", note, entries, columns)
 
 
 def test_sets(entries: Sequence[Entry]) -> Grid | None:

@@ -84,6 +84,16 @@ class Scene:
         return np.setdiff1d(np.arange(self.mesh.n_dofs), fixed)
 
     @cached_property
+    def _cloud(self) -> Cloud:
+        return Cloud(self.mesh.points, np.unique(self.mesh.boundary_facets), self.point_sets)
+
+    @cached_property
+    def output_nodes(self) -> NDArray[np.int64]:
+        """(n_output_nodes,) the nodes whose displacements are wanted, sorted; raises `SpecError` if the region holds none."""
+        outputs = self.spec.needs.outputs
+        return np.arange(self.mesh.n_nodes) if outputs == "all" else region_points(self._cloud, outputs)
+
+    @cached_property
     def surface(self) -> Facets:
         """What loads act on: the mesh's own boundary, or the embedded surface."""
         return self.embedded_surface or Facets(self.mesh.points, self.mesh.boundary_facets)
@@ -303,5 +313,5 @@ def _check_element(spec: DatasetSpec, mesh: Mesh) -> None:
 
 def _build(spec: DatasetSpec) -> Scene:
     scene = _without_patches(spec)
-    _ = scene.patch_weights  # an empty load region is an error of the dataset: raised here, not at the first solve
+    _ = scene.patch_weights, scene.output_nodes  # an empty region is an error of the dataset: raised here, not at the first solve
     return scene

@@ -60,7 +60,7 @@ class _Method:
 
 def _queries(scene: Scene, folder: Path) -> Queries:
     forces = draw_loads(scene, 0, 200).nodal_forces(scene.patch_weights)
-    return Queries(forces, np.ones_like(forces), folder)
+    return Queries(forces, np.ones_like(forces), np.arange(forces.shape[1]), folder)
 
 
 def _measured(scene: Scene, folder: Path, methods: dict[str, tuple[str, dict[str, Any]]], seed: int, processes: str = "full") -> dict[str, Timing]:

@@ -1,0 +1,85 @@
+"""How wrong a displacement is, told without the right one: the residual that it leaves, and the correction that this asks for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.errors import InvalidInputError
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Indication:
+    """Per prediction, (n,) float64; both are zero at an exact equilibrium.
+
+    Attributes
+    ----------
+    relative_residual
+        ‖f - f_int(u)‖ / ‖f‖ over the free dofs. Short waves of small displacement dominate it.
+    relative_correction
+        ‖R K₀⁻¹ Rᵀ (f - f_int(u))‖ / ‖u‖: the first correction that the full-order solve would make from u, an estimate of
+        the relative l2 error.
+    """
+
+    relative_residual: NDArray[np.float64]
+    relative_correction: NDArray[np.float64]
+
+
+class ErrorIndicator:
+    """Indicates the errors of any method's predictions of a scene; costs about one iteration of the full-order solve each.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Raises
+    ------
+    UnsupportedSceneError
+        If the scene's equations are not known.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._model = FullOrderModel(scene, "auto")
+        self._inverse = self._model.turned_rest
+
+    def __call__(self, forces: NDArray[np.float64], displacements: NDArray[np.float64]) -> Indication:
+        """Indicate.
+
+        Parameters
+        ----------
+        forces, displacements : (n, n_nodes, 3) float64
+            Nodal forces, N, and predicted displacements at all nodes, m. A prediction that is not finite has an infinite error.
+
+        Raises
+        ------
+        InvalidInputError
+            On other shapes.
+        """
+        shape = (len(forces), self._scene.mesh.n_nodes, 3)
+        if forces.shape != shape or displacements.shape != shape:
+            raise InvalidInputError(f"forces and displacements must have shape (n, {shape[1]}, 3); got {forces.shape} and {displacements.shape}.")
+        free = self._scene.free_dofs
+        loads, fields = forces.reshape(len(forces), -1)[:, free], displacements.reshape(len(forces), -1)[:, free]
+        pairs = np.array([self._indicated(load, u) for load, u in zip(loads, fields, strict=True)]).reshape(-1, 2)
+        return Indication(pairs[:, 0], pairs[:, 1])
+
+    def _indicated(self, load: NDArray[np.float64], u: NDArray[np.float64]) -> tuple[float, float]:
+        if not np.isfinite(u).all():
+            return np.inf, np.inf
+        residual = load - self._model.force(u).force
+        if not np.isfinite(residual).all():
+            return np.inf, np.inf
+        if not residual.any():
+            return 0.0, 0.0
+        correction = self._inverse.solve_many([residual], [self._inverse.turned(u)])[0]
+        return _ratio(residual, load), _ratio(correction, u)
+
+
+def _ratio(part: NDArray[np.float64], whole: NDArray[np.float64]) -> float:
+    size = float(np.linalg.norm(whole))
+    return float(np.linalg.norm(part)) / size if size > 0 else np.inf

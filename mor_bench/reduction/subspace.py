@@ -1,0 +1,64 @@
+"""Between the nodes of a scene and the coordinates of a linear subspace: loads in, the wanted displacements out."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mor_bench import counting
+from mor_bench.scene.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _project(modes, load, reduced):  # type: ignore[no-untyped-def]
+    """reduced = Φᵀ load over the components that are not zero; returns their number."""
+    reduced[:] = 0.0
+    loaded = 0
+    for dof in range(len(load)):
+        if load[dof] != 0.0:
+            loaded += 1
+            for i in range(modes.shape[1]):
+                reduced[i] += load[dof] * modes[dof, i]
+    return loaded
+
+
+class Subspace:
+    """u = Φq on the nodes of a scene.
+
+    Loads act on few nodes, and only displacements that ``scene.spec.needs.outputs`` asks for are expanded.
+
+    Parameters
+    ----------
+    scene : Scene
+    modes : (n_free, r) float64
+        Φ on the free dofs.
+    """
+
+    def __init__(self, scene: Scene, modes: Array) -> None:
+        self.n_modes = modes.shape[1]
+        self._modes = np.zeros((scene.mesh.n_dofs, self.n_modes))
+        self._modes[scene.free_dofs] = modes
+        nodes = scene.output_nodes
+        self._wanted = None if len(nodes) == scene.mesh.n_nodes else (3 * nodes[:, None] + np.arange(3)).ravel()
+        self._expanding = self._modes if self._wanted is None else self._modes[self._wanted]
+
+    def project(self, load: Array) -> Array:
+        """Φᵀf (r,) of nodal forces (n_dofs,), N."""
+        reduced = np.empty(self.n_modes)
+        loaded = int(_project(self._modes, load, reduced))
+        if counting.running is not None:
+            counting.running.add(multiply_adds=loaded * self.n_modes)
+        return reduced
+
+    def expand(self, q: Array, out: Array) -> None:
+        """Write Φq into ``out`` (n_dofs,), m; NaN where no output is wanted."""
+        if counting.running is not None:
+            counting.running.add(multiply_adds=self._expanding.size)
+        if self._wanted is None:
+            np.dot(self._expanding, q, out=out)
+        else:
+            out[:] = np.nan
+            out[self._wanted] = self._expanding @ q

@@ -1,0 +1,381 @@
+"""The reduced energy of Saint Venant-Kirchhoff as the quartic polynomial that it is: Galerkin projection without quadrature.
+
+With H = Σ qᵢ Hᵢ the displacement gradient of u = Φq, the Green-Lagrange strain is E = Σ qᵢ eᵢ + ½ Σ qᵢ qⱼ s_ij, with
+eᵢ = sym(Hᵢ) and s_ij = sym(HᵢᵀHⱼ), and the energy ½ ∫ E:C:E has degree four in q. Its coefficients are summed over the mesh
+once (Barbič and James: Real-time subspace integration for St. Venant-Kirchhoff deformable models, ACM Trans. Graph. 24,
+2005); afterwards no query sees the mesh, and nothing is approximated beyond the basis.
+
+Pairs (i <= j) are numbered j (j + 1) / 2 + i, so that the leading modes' own polynomial is the leading part of each array.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cholesky
+
+from mor_bench import counting
+from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
+from mor_bench.errors import InvalidInputError
+from mor_bench.mechanics.assembly import State, quadrature_of
+from mor_bench.mechanics.linear import Factor
+from mor_bench.mechanics.newton import HOPELESS
+from mor_bench.reduction.galerkin import dense_factor
+from mor_bench.scene.materials import SaintVenantKirchhoff
+
+Array = NDArray[np.float64]
+
+CHUNK_BYTES = 64e6
+"""Of the strains of the pairs of modes, which are summed a few cells at a time."""
+
+MAX_SENTINELS = 64
+"""Quadrature points at which det F is watched."""
+
+QUICK_ITERATIONS = 15
+"""Newton steps before the safeguarded solve takes over; 3 to 6 are usual."""
+
+
+def n_pairs(r: int) -> int:
+    """Of modes (i <= j)."""
+    return r * (r + 1) // 2
+
+
+def _pairs(r: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(i, j) of each pair, in order."""
+    j, i = np.tril_indices(r)
+    return i, j
+
+
+@dataclass(frozen=True)
+class ReducedTensors:
+    """The symmetric derivatives of the reduced energy at rest.
+
+    Attributes
+    ----------
+    quadratic : (r, r) float64
+        Second derivatives, the stiffness ΦᵀK₀Φ.
+    cubic : (n_pairs, r) float64
+        Third derivatives: of pair (i, j) and mode k.
+    quartic : (n_pairs, n_pairs) float64
+        Fourth derivatives: of pairs (i, j) and (k, l).
+    """
+
+    quadratic: Array
+    cubic: Array
+    quartic: Array
+
+    @property
+    def n_modes(self) -> int:
+        return len(self.quadratic)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _strains(gradients: Any, rows: Any) -> None:
+    """Components 00 11 22 √2·01 √2·02 √2·12 of eᵢ, then of s_ij, from Hᵢ at points: (n, 3, 3, r) → (n, 6, r + n_pairs)."""
+    root = np.sqrt(0.5)
+    r = gradients.shape[3]
+    for point in range(len(gradients)):
+        H, out = gradients[point], rows[point]
+        for i in range(r):
+            out[0, i], out[1, i], out[2, i] = H[0, 0, i], H[1, 1, i], H[2, 2, i]
+            out[3, i] = root * (H[0, 1, i] + H[1, 0, i])
+            out[4, i] = root * (H[0, 2, i] + H[2, 0, i])
+            out[5, i] = root * (H[1, 2, i] + H[2, 1, i])
+        for j in range(r):
+            first = r + j * (j + 1) // 2
+            for c in range(3):
+                x, y, z = H[c, 0, j], H[c, 1, j], H[c, 2, j]
+                if c == 0:
+                    out[:, first : first + j + 1] = 0.0
+                for i in range(j + 1):
+                    out[0, first + i] += H[c, 0, i] * x
+                    out[1, first + i] += H[c, 1, i] * y
+                    out[2, first + i] += H[c, 2, i] * z
+                    out[3, first + i] += root * (H[c, 0, i] * y + H[c, 1, i] * x)
+                    out[4, first + i] += root * (H[c, 0, i] * z + H[c, 2, i] * x)
+                    out[5, first + i] += root * (H[c, 1, i] * z + H[c, 2, i] * y)
+
+
+def reduce_energy(
+    points: Array,
+    cells: NDArray[np.int64],
+    cell_dofs: NDArray[np.int64],
+    modes: Array,
+    material: SaintVenantKirchhoff,
+    selective: bool,
+    samples: Array,
+) -> tuple[ReducedTensors, Array]:
+    """Sum the reduced energy over a mesh, and find the points where det F is to be watched.
+
+    Parameters
+    ----------
+    points : (n_nodes, 3) float64
+        m.
+    cells : (n_cells, n_cell_nodes) int
+    cell_dofs : (n_cells, 3 n_cell_nodes) int
+        Row of Φ of each cell's dofs; the number of rows for supports.
+    modes : (n_dofs, r) float64
+        Φ.
+    material : SaintVenantKirchhoff
+    selective : bool
+        As of `Assembler`.
+    samples : (n_samples, r) float64
+        Reduced coordinates of typical displacements.
+
+    Returns
+    -------
+    tensors : ReducedTensors
+    sentinels : (n, 9, r) float64
+        Gradients of the modes at those points, at most `MAX_SENTINELS`, where the samples have their smallest det F.
+    """
+    quadrature = quadrature_of(points, cells, material, selective)
+    n_cells, n_points, n_nodes, _ = quadrature.gradients.shape
+    r = modes.shape[1]
+    width = r + n_pairs(r)
+    padded = np.vstack([modes, np.zeros(r)])
+    gram = np.zeros((width, width))
+    step = max(1, int(CHUNK_BYTES / (8 * 6 * width * n_points)))
+    least, where = np.full(len(samples), np.inf), np.zeros(len(samples), dtype=np.int64)
+    watched: dict[int, Array] = {}
+    for first in range(0, n_cells, step):
+        part = slice(first, first + step)
+        local = padded[cell_dofs[part]].reshape(-1, n_nodes, 3, r)
+        gradients = np.einsum("cqaj,caim->cqijm", quadrature.gradients[part], local, optimize=True).reshape(-1, 3, 3, r)
+        rows = np.empty((len(gradients), 6, width))
+        _strains(gradients, rows)
+        weights = quadrature.weights[part].reshape(-1, 1, 1)
+        lame_lambda, lame_mu = np.tile(quadrature.parameters, (len(local), 1)).T.reshape(2, -1, 1)
+        stress = 2 * lame_mu[..., None] * rows
+        stress[:, :3] += (lame_lambda * rows[:, :3].sum(axis=1))[:, None]
+        stress *= weights
+        gram += rows.reshape(-1, width).T @ stress.reshape(-1, width)
+        _watch(gradients.reshape(-1, 9, r), samples, first * n_points, least, where, watched)
+    chosen = list(dict.fromkeys(where[np.argsort(least, kind="stable")].tolist()))[:MAX_SENTINELS]
+    return _symmetric(gram, r), np.array([watched[number] for number in chosen]).reshape(-1, 9, r)
+
+
+def _watch(gradients: Array, samples: Array, first: int, least: Array, where: NDArray[np.int64], watched: dict[int, Array]) -> None:
+    """Note each sample's smallest det F so far and its point, whose gradients (9, r) are kept."""
+    for start in range(0, len(samples), 32):
+        part = slice(start, start + 32)
+        F = (gradients.reshape(-1, gradients.shape[2]) @ samples[part].T).reshape(-1, 9, len(samples[part])) + np.eye(3).reshape(1, 9, 1)
+        det = (
+            F[:, 0] * (F[:, 4] * F[:, 8] - F[:, 5] * F[:, 7])
+            - F[:, 1] * (F[:, 3] * F[:, 8] - F[:, 5] * F[:, 6])
+            + F[:, 2] * (F[:, 3] * F[:, 7] - F[:, 4] * F[:, 6])
+        )
+        lowest = det.argmin(axis=0)
+        smaller = np.flatnonzero(det.min(axis=0) < least[part])
+        for s in smaller:
+            least[start + s], where[start + s] = det[lowest[s], s], first + lowest[s]
+            watched[first + int(lowest[s])] = gradients[lowest[s]].copy()
+
+
+def _symmetric(gram: Array, r: int) -> ReducedTensors:
+    """Derivatives from the Gram matrix of strains, which is ∫ e:C:e, ∫ e:C:s and ∫ s:C:s.
+
+    W = ½ q q ee + ½ q qq es + ⅛ qq qq ss; a derivative is the sum over the ways to distribute its indices.
+    """
+    i, j = _pairs(r)
+    number = np.empty((r, r), dtype=np.int64)
+    number[i, j] = number[j, i] = np.arange(len(i))
+    mixed, quartic = gram[:r, r:], gram[r:, r:]
+    k = np.arange(r)
+    cubic = mixed[k, np.arange(len(i))[:, None]] + mixed[i[:, None], number[j[:, None], k]] + mixed[j[:, None], number[i[:, None], k]]
+    symmetric = quartic.copy()
+    for row in range(len(i)):
+        symmetric[row] += quartic[number[i[row], i], number[j[row], j]] + quartic[number[i[row], j], number[j[row], i]]
+    return ReducedTensors(0.5 * (gram[:r, :r] + gram[:r, :r].T), cubic, 0.5 * (symmetric + symmetric.T))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+def _dot(a, b, n):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for i in range(n):
+        total += a[i] * b[i]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _evaluate(quadratic: Any, cubic: Any, quartic: Any, q: Any, products: Any, force: Any, hessian: Any) -> float:
+    """Force and lower Hessian at q, both from one sweep over the tensors; returns the energy."""
+    r, p = len(q), 0
+    for j in range(r):
+        for i in range(j):
+            products[p] = q[i] * q[j]
+            p += 1
+        products[p] = 0.5 * q[j] * q[j]
+        p += 1
+    energy = 0.0
+    for i in range(r):
+        force[i] = 0.0
+    pair = 0
+    for j in range(r):
+        for i in range(j + 1):
+            k = quadratic[j, i]
+            third = _dot(cubic[pair], q, r)
+            fourth = _dot(quartic[pair], products, p)
+            hessian[j, i] = k + third + fourth
+            share = k + third / 2 + fourth / 3
+            force[j] += share * q[i]
+            density = (k / 2 + third / 6 + fourth / 12) * q[i] * q[j]
+            if i != j:
+                force[i] += share * q[j]
+                density *= 2.0
+            energy += density
+            pair += 1
+    return energy
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _cholesky(a, r):  # type: ignore[no-untyped-def]
+    """Factorise the lower triangle in place; False if it is not positive definite."""
+    for j in range(r):
+        pivot = a[j, j] - _dot(a[j], a[j], j)
+        if not pivot > 0.0:
+            return False
+        root = np.sqrt(pivot)
+        a[j, j] = root
+        for i in range(j + 1, r):
+            a[i, j] = (a[i, j] - _dot(a[i], a[j], j)) / root
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _back_solve(a, r, x):  # type: ignore[no-untyped-def]
+    for i in range(r):
+        x[i] = (x[i] - _dot(a[i], x, i)) / a[i, i]
+    for i in range(r - 1, -1, -1):
+        x[i] /= a[i, i]
+        for k in range(i):
+            x[k] -= a[i, k] * x[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _equilibrium(quadratic: Any, cubic: Any, quartic: Any, rest: Any, load: Any, tolerance: float, q: Any) -> int:
+    """Full Newton steps from the linear response, by the rest-state factor; the Hessian at the answer is positive definite.
+
+    Returns the number of Hessians, negative where there is no answer.
+    """
+    r = len(load)
+    products, force, step, hessian = np.empty(r * (r + 1) // 2), np.empty(r), np.empty(r), np.empty((r, r))
+    q[:] = load
+    _back_solve(rest, r, q)
+    size = np.sqrt(_dot(load, load, r))
+    for iteration in range(1, QUICK_ITERATIONS + 1):
+        _evaluate(quadratic, cubic, quartic, q, products, force, hessian)
+        for i in range(r):
+            step[i] = load[i] - force[i]
+        residual = np.sqrt(_dot(step, step, r))
+        if not residual <= HOPELESS * size or not _cholesky(hessian, r):
+            return -iteration
+        if residual <= tolerance * size:
+            return iteration
+        _back_solve(hessian, r, step)
+        for i in range(r):
+            q[i] += step[i]
+    return -QUICK_ITERATIONS
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _min_det_f(sentinels, q):  # type: ignore[no-untyped-def]
+    least = np.inf
+    r = len(q)
+    for point in range(len(sentinels)):
+        H = sentinels[point]
+        a, b, c = 1.0 + _dot(H[0], q, r), _dot(H[1], q, r), _dot(H[2], q, r)
+        d, e, f = _dot(H[3], q, r), 1.0 + _dot(H[4], q, r), _dot(H[5], q, r)
+        g, h, i = _dot(H[6], q, r), _dot(H[7], q, r), 1.0 + _dot(H[8], q, r)
+        least = min(least, a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+    return least
+
+
+class TensorProblem:
+    """A reduced model of Saint Venant-Kirchhoff by its polynomial.
+
+    Parameters
+    ----------
+    tensors : ReducedTensors
+    sentinels : (n, 9, r) float64
+        Gradients of the modes where det F is watched.
+    extent : float
+        Reduced coordinates of this size are displacements of the size of the body.
+
+    Raises
+    ------
+    InvalidInputError
+        If an array has another shape than the others ask for, NaN or infinity: the kernels behind check no bounds.
+    """
+
+    accelerator = None
+
+    def __init__(self, tensors: ReducedTensors, sentinels: Array, extent: float) -> None:
+        r = tensors.n_modes
+        shapes = {"quadratic": (r, r), "cubic": (n_pairs(r), r), "quartic": (n_pairs(r), n_pairs(r)), "sentinels": (len(sentinels), 9, r)}
+        arrays = {**vars(tensors), "sentinels": sentinels}
+        for name, shape in shapes.items():
+            if arrays[name].dtype != np.float64 or arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
+                raise InvalidInputError(f"`{name}` must be finite float64 of shape {shape}; got {arrays[name].dtype} of shape {arrays[name].shape}.")
+        self._arrays = tuple(np.ascontiguousarray(arrays[name]) for name in ("quadratic", "cubic", "quartic"))
+        self.tensors, self.sentinels = tensors, np.ascontiguousarray(sentinels)
+        self.n_unknowns = r
+        self.extent = extent
+        try:
+            self._rest = np.ascontiguousarray(cholesky(tensors.quadratic, lower=True))
+        except LinAlgError:
+            raise InvalidInputError("`quadratic`, the reduced stiffness at rest, must be positive definite.") from None
+
+    def quick(self, load: Array, tolerance: float) -> Array | None:
+        """The equilibrium (r,) by full Newton steps, or None where they lead to none that is stable with det F > 0."""
+        q = np.empty(self.n_unknowns)
+        quadratic, cubic, quartic = self._arrays
+        iterations: int = _equilibrium(quadratic, cubic, quartic, self._rest, load, tolerance, q)
+        if counting.running is not None:
+            r, times = self.n_unknowns, abs(iterations)
+            work = self._evaluation + cholesky_multiply_adds(r, r - 1) + triangular_multiply_adds(r, r - 1)
+            counting.running.add(factorisations=times, reduced_factorisations=times, multiply_adds=times * work)
+            counting.running.add(back_solves=times, reduced_back_solves=times)
+        return q if iterations > 0 and self.min_det_f(q) > 0 else None
+
+    @property
+    def _evaluation(self) -> int:
+        """Multiply-adds of a force with its tangent."""
+        r = self.n_unknowns
+        return n_pairs(r) * (n_pairs(r) + r + 1)
+
+    def min_det_f(self, q: Array) -> float:
+        """The smallest det F at the watched points."""
+        if counting.running is not None:
+            counting.running.add(multiply_adds=self.sentinels.size)
+        return float(_min_det_f(self.sentinels, q))
+
+    def linearise(self, q: Array) -> tuple[State, Array]:
+        r = self.n_unknowns
+        products, force, hessian = np.empty(n_pairs(r)), np.empty(r), np.empty((r, r))
+        if counting.running is not None:
+            counting.running.add(multiply_adds=self._evaluation)
+        quadratic, cubic, quartic = self._arrays
+        energy = _evaluate(quadratic, cubic, quartic, q, products, force, hessian)
+        return State(force, energy, self.min_det_f(q)), np.tril(hessian) + np.tril(hessian, -1).T
+
+    def force(self, q: Array) -> State:
+        return self.linearise(q)[0]
+
+    def step(self, q: Array, tangent: Array, residual: Array, tolerance: float) -> Array:
+        return dense_factor(tangent).solve(residual)
+
+    def certify(self, q: Array) -> None:
+        """Nothing to do: every step has a Cholesky factor."""
+
+    @cached_property
+    def rest_tangent(self) -> Array:
+        return self._arrays[0]
+
+    @cached_property
+    def rest_factor(self) -> Factor:
+        return dense_factor(self.rest_tangent)

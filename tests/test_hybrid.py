@@ -1,0 +1,105 @@
+"""Other methods' answers corrected by the full-order model, and indicated errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+
+import mor_bench
+from mor_bench.errors import InvalidInputError, SpecError
+from mor_bench.harness.metrics import sample_errors
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.snapshots.dataset import Dataset
+from mor_bench.surrogate import Surrogate
+from mor_bench.surrogates.hybrid import Hybrid
+
+
+@pytest.fixture(scope="module")
+def coarse(cache: Path) -> Dataset:
+    return mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
+
+
+def error(method: Surrogate, data: Dataset, n: int = 40) -> float:
+    return float(sample_errors(method.predict(data.test.forces[:n]), data.test.displacements[:n]).relative_l2.mean())
+
+
+@pytest.mark.parametrize("start", ["linear-fem", "pod-tensor", "pca-regression"])
+def test_each_correction_lowers_the_error(coarse: Dataset, start: str) -> None:
+    errors = [error(mor_bench.load_method(start).fit(coarse.scene, coarse.train), coarse)]
+    for steps in (1, 2, 4):
+        errors.append(error(Hybrid(start, steps=steps).fit(coarse.scene, coarse.train), coarse))
+        assert errors[-1] < 0.7 * errors[-2]
+    assert errors[-1] < 1e-3
+
+
+def test_a_tolerance_is_met(coarse: Dataset) -> None:
+    method = Hybrid("pod-tensor", {"n_modes": 10}, tolerance=1e-6).fit(coarse.scene, coarse.train)
+    model, free = FullOrderModel(coarse.scene), coarse.scene.free_dofs
+    for force in coarse.test.forces[:20]:
+        load = force.ravel()[free]
+        u = method.predict(force).ravel()[free]
+        assert np.linalg.norm(load - model.force(u).force) <= 1e-6 * np.linalg.norm(load)
+
+
+class Nonsense(Surrogate):
+    """Turns the body inside out."""
+
+    needs_snapshots = False
+
+    def fit(self, scene, snapshots=None):  # type: ignore[no-untyped-def]
+        with self._fitting(scene):
+            pass
+        return self
+
+    def predict(self, forces):  # type: ignore[no-untyped-def]
+        return np.broadcast_to(-2.0 * self.scene_.mesh.points, np.shape(forces)).copy()
+
+
+def test_a_start_that_is_nonsense_costs_time_and_not_the_answer(coarse: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Hybrid, "_unfitted", lambda self: Nonsense())
+    for knobs in ({"steps": 1}, {"tolerance": 1e-8}):
+        assert error(Hybrid(**knobs).fit(coarse.scene, coarse.train), coarse, 10) < 1e-6
+
+
+@pytest.mark.parametrize("knobs", [{}, {"steps": 1, "tolerance": 1e-2}])
+def test_exactly_one_stopping_rule(coarse: Dataset, knobs: dict[str, float]) -> None:
+    with pytest.raises(InvalidInputError, match="exactly one of `steps` and `tolerance`"):
+        Hybrid(**knobs).fit(coarse.scene, coarse.train)  # type: ignore[arg-type]
+
+
+def test_knobs_of_the_start_are_checked(coarse: Dataset) -> None:
+    with pytest.raises(SpecError, match="n_mode"):
+        Hybrid(start_parameters={"n_mode": 3}, steps=1).fit(coarse.scene, coarse.train)
+    with pytest.raises(SpecError):
+        Hybrid("pod-tenser", steps=1).fit(coarse.scene, coarse.train)
+
+
+@pytest.mark.parametrize("name", ["linear-fem", "pod-tensor", "pca-regression"])
+def test_indicated_errors_tell_the_measured_ones(coarse: Dataset, name: str) -> None:
+    """The correction estimates the error itself; the residual does not even rank them, which is why it is not offered alone."""
+    method = mor_bench.load_method(name).fit(coarse.scene, coarse.train)
+    forces = coarse.test.forces[:60]
+    predicted = method.predict(forces)
+    measured = sample_errors(predicted, coarse.test.displacements[:60]).relative_l2
+    indicated = method.indicate_error(forces, predicted)
+    assert spearmanr(measured, indicated.relative_correction)[0] > 0.95
+    assert 0.9 < np.median(indicated.relative_correction / measured) < 1.1
+    single = method.indicate_error(forces[3], predicted[3])
+    assert single.relative_correction[0] == indicated.relative_correction[3]
+
+
+def test_indication_at_an_equilibrium_and_at_none(coarse: Dataset) -> None:
+    fem = mor_bench.load_method("fem", tolerance=1e-10).fit(coarse.scene, None)
+    force = coarse.test.forces[:2]
+    exact = fem.indicate_error(force, fem.predict(force))
+    assert (exact.relative_residual <= 1e-10).all()
+    assert (exact.relative_correction <= 1e-7).all()
+    missing = fem.indicate_error(force, np.full(force.shape, np.nan))
+    assert np.isinf(missing.relative_correction).all()
+    rest = fem.indicate_error(np.zeros_like(force), np.zeros_like(force))
+    assert (rest.relative_correction == 0).all()
+    with pytest.raises(InvalidInputError, match="`displacements` must be floats"):
+        fem.indicate_error(force, np.zeros((3, 3)))
