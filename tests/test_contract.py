@@ -20,7 +20,7 @@ from mor_bench.surrogate import Surrogate
 from mor_bench.surrogate import _digest as file_digest
 
 CHEAP_UMESH = {"channels": 8, "steps": 1, "iterations": 150, "batch_size": 16, "learning_rate": 3e-3}
-CHEAP: dict[str, dict[str, Any]] = {"umesh": CHEAP_UMESH, "umesh-small": CHEAP_UMESH, "hybrid": {"steps": 1}}
+CHEAP: dict[str, dict[str, Any]] = {"umesh": CHEAP_UMESH, "umesh-small": CHEAP_UMESH}
 """Parameters that keep a costly method's battery short."""
 
 NEEDS_NO_SNAPSHOTS = ("fem", "fem-coarse", "fem-jacobi-pcg", "fem-pardiso", "linear-fem")

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from mor_bench.harness.code import code_digest
 from mor_bench.harness.handover import arrays_of, write_snapshots
+from mor_bench.harness.indicated import Indicated
 from mor_bench.harness.isolation import MethodFailedError, Worker
 from mor_bench.harness.metrics import SampleErrors, sample_errors
 from mor_bench.harness.nursery import Nursery
@@ -38,9 +39,6 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import MethodSpec, list_suite, load_method_spec
-
-N_INDICATED = 64
-"""Test loads, spread evenly, whose errors are also indicated by what the predictions leave of the equations."""
 
 N_COUNTED = 32
 """Test loads over which the cost of a query is averaged."""
@@ -432,8 +430,8 @@ def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[
     parts: list[SampleErrors] = []
     flagged: list[bool] | None = []
     worst: tuple[float, int, NDArray[np.float64]] = (-1.0, 0, np.full(test.references.shape[1:], np.nan))
-    indicated: list[tuple[int, float, float]] = []
-    chosen = _indicated_rows(entry, test)
+    main = test is entry.material.sets["test"]
+    indicated = Indicated(entry.material.indicator if main else None, len(test.forces))
     until = monotonic() + limit_s
     with tempfile.TemporaryDirectory(dir=entry.material.scratch) as folder:
         for start in range(0, len(test.forces), SCORE_CHUNK):
@@ -445,27 +443,17 @@ def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[
             finite = np.where(np.isfinite(parts[-1].mean_dof_m), parts[-1].mean_dof_m, -1.0)
             if finite.max() > worst[0]:
                 worst = float(finite.max()), start + int(finite.argmax()), predicted[finite.argmax()].copy()
-            for row in chosen[(chosen >= start) & (chosen < start + SCORE_CHUNK)]:
-                assert entry.material.indicator is not None
-                found = entry.material.indicator(test.forces[row, None], predicted[row - start, None])
-                indicated.append((int(row), float(found.relative_correction[0]), float(found.relative_residual[0])))
+            indicated.add(start, test.forces[rows], predicted)
             flags = worker.ask("flag", LOAD_LIMIT_S, forces=test.forces[rows])["flagged"]
             flagged = None if flags is None or flagged is None else flagged + flags
     return {
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])},
         **({} if flagged is None else {"flagged": np.asarray(flagged, dtype=bool)}),
-        **({"indicated": np.array(indicated)} if indicated else {}),
+        **indicated.arrays,
         "worst_prediction": worst[2],
         "worst_reference": test.references[worst[1]],
         "worst_forces": test.forces[worst[1]],
     }
-
-
-def _indicated_rows(entry: Entry, test: TestSet) -> NDArray[np.int64]:
-    """Test loads whose errors are indicated: some of the main set, none of others."""
-    if test is not entry.material.sets["test"] or entry.material.indicator is None:
-        return np.zeros(0, dtype=np.int64)
-    return np.unique(np.linspace(0, len(test.forces) - 1, N_INDICATED).astype(np.int64))
 
 
 def ask_answers(worker: Worker, do: str, limit_s: float, out: Path, forces: NDArray[np.float64], threads: int) -> NDArray[np.float64]:

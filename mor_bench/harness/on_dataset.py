@@ -22,6 +22,7 @@ from mor_bench.harness.contestants import Budget, sealed_folders
 from mor_bench.harness.discretisation import measured
 from mor_bench.harness.fits import Entry, Job, Material, Outcome, Place, RemoteFit, TestSet, evaluate, fit, fit_elsewhere, score
 from mor_bench.harness.handover import arrays_of
+from mor_bench.harness.indicated import indicator_summary
 from mor_bench.harness.isolation import MethodFailedError
 from mor_bench.harness.metrics import SampleErrors, summary
 from mor_bench.harness.nursery import Nursery
@@ -43,10 +44,6 @@ from mor_bench.specs import (
 
 MOST_QUERIES = 400
 """Loads of the test set from which a timing's queries are drawn."""
-
-LEAST_INDICATED = 10
-EXACT = 1e-6
-"""Errors of full-order answers are round-off and tolerance, of which the reference has as much: nothing to indicate."""
 
 EXTRA_SEEDS = 2
 """Trainings with other seeds in a full comparison, beside that of the method's file."""
@@ -247,7 +244,7 @@ class DatasetRun:
             "memory_bytes": {"fit": fit["fit_memory_bytes"], "predict": None},
             "model_bytes": fit["model_bytes"],
             "cost": outcome.cost,
-            "indicator": _indicator(main),
+            "indicator": indicator_summary(main),
             "sets": {name: set_summary(score) for name, score in scores.items()},
             "warnings": fit["warnings"],
         }, main
@@ -383,25 +380,6 @@ def _failure(error: MorBenchError) -> dict[str, str]:
 
 def _errors(score: Mapping[str, Any]) -> SampleErrors:
     return SampleErrors(*(score[name] for name in ("mean_dof_m", "relative_l2", "max_nodal_m", "amplitude_m")))
-
-
-def _indicator(score: Mapping[str, Any]) -> dict[str, float] | None:
-    """How far the indicated errors of some samples tell the measured ones; None where there are too few."""
-    from scipy.stats import spearmanr
-
-    rows, correction, residual = score.get("indicated", np.zeros((0, 3))).T
-    measured = score["relative_l2"][rows.astype(int)]
-    usable = np.isfinite(measured) & (measured > 0) & np.isfinite(correction) & np.isfinite(residual)
-    measured, correction, residual = measured[usable], correction[usable], residual[usable]
-    if len(measured) < LEAST_INDICATED or measured.max() < EXACT:
-        return None
-    ratio = correction / measured
-    return {
-        "n": len(measured),
-        "rank_correlation": float(spearmanr(measured, correction)[0]),
-        "residual_rank_correlation": float(spearmanr(measured, residual)[0]),
-        **{f"ratio_{name}": float(np.quantile(ratio, share)) for name, share in (("p5", 0.05), ("median", 0.5), ("p95", 0.95))},
-    }
 
 
 def set_summary(score: Mapping[str, Any]) -> dict[str, Any]:

@@ -40,9 +40,9 @@ class Hybrid(Surrogate):
     start_parameters : dict
         Knobs of that method that differ from its file's.
     steps : int, optional
-        Corrections.
+        Corrections; without a tolerance 1 by default.
     tolerance : float, optional
-        Norm of the residual relative to that of the load at which to stop; exactly one of both must be given.
+        Instead of steps: norm of the residual relative to that of the load at which to stop.
     """
 
     model_: FullOrderModel
@@ -72,8 +72,8 @@ class Hybrid(Surrogate):
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         """Fit the start, and factorise the rest-state stiffness."""
-        if (self.steps is None) == (self.tolerance is None):
-            raise InvalidInputError(f"exactly one of `steps` and `tolerance` must be given; got {self.steps} and {self.tolerance}.")
+        if self.steps is not None and self.tolerance is not None:
+            raise InvalidInputError(f"`steps` and `tolerance` exclude each other; got {self.steps} and {self.tolerance}.")
         with self._fitting(scene):
             start = self._unfitted()
             if start.needs_snapshots:
@@ -106,9 +106,8 @@ class Hybrid(Surrogate):
         return self.model_.solve(load).displacement if corrected is None else corrected
 
     def _corrected(self, load: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        assert self.steps is not None
         inverse, memory, u = self.model_.turned_rest, Anderson(len(guess)), guess
-        for _ in range(self.steps):
+        for _ in range(self.steps or 1):
             residual = load - self.model_.force(u).force
             correction = inverse.solve_many([residual], [inverse.turned(u)])[0]
             u = u + memory.advance(u, correction, residual)
