@@ -27,6 +27,10 @@ KINDS: dict[str, dict[str, Any]] = {
     "H8, selective": {"discretisation": {"integration": "selective"}},
     "T4": {"discretisation": {"element": "tetrahedron"}},
     "auxetic": {"material": {"law": "saint-venant-kirchhoff", "young_pa": 500.0, "poisson": -0.3}},
+    "auxetic, selective": {
+        "material": {"law": "saint-venant-kirchhoff", "young_pa": 500.0, "poisson": -0.3},
+        "discretisation": {"integration": "selective"},
+    },
 }
 
 

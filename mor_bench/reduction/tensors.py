@@ -75,30 +75,39 @@ class ReducedTensors:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _strains(gradients: Any, rows: Any) -> None:
-    """Components 00 11 22 √2·01 √2·02 √2·12 of eᵢ, then of s_ij, from Hᵢ at points: (n, 3, 3, r) → (n, 6, r + n_pairs)."""
-    root = np.sqrt(0.5)
+def _strains(gradients: Any, shape_scale: Any, volume_scale: Any, rows: Any) -> None:
+    """eᵢ, then s_ij, at points from Hᵢ (n, 3, 3, r): (n, 6, r + n_pairs) in an orthonormal basis of symmetric tensors, scaled.
+
+    First five components of the deviator, then the trace over √3.
+    """
     r = gradients.shape[3]
+    trace, half, sixth = np.sqrt(1.0 / 3.0), np.sqrt(0.5), np.sqrt(1.0 / 6.0)
     for point in range(len(gradients)):
-        H, out = gradients[point], rows[point]
+        H, out, a, b = gradients[point], rows[point], shape_scale[point], volume_scale[point]
         for i in range(r):
-            out[0, i], out[1, i], out[2, i] = H[0, 0, i], H[1, 1, i], H[2, 2, i]
-            out[3, i] = root * (H[0, 1, i] + H[1, 0, i])
-            out[4, i] = root * (H[0, 2, i] + H[2, 0, i])
-            out[5, i] = root * (H[1, 2, i] + H[2, 1, i])
+            x, y, z = H[0, 0, i], H[1, 1, i], H[2, 2, i]
+            out[0, i] = a * half * (H[0, 1, i] + H[1, 0, i])
+            out[1, i] = a * half * (H[0, 2, i] + H[2, 0, i])
+            out[2, i] = a * half * (H[1, 2, i] + H[2, 1, i])
+            out[3, i] = a * half * (x - y)
+            out[4, i] = a * sixth * (x + y - 2.0 * z)
+            out[5, i] = b * trace * (x + y + z)
         for j in range(r):
             first = r + j * (j + 1) // 2
-            for c in range(3):
-                x, y, z = H[c, 0, j], H[c, 1, j], H[c, 2, j]
-                if c == 0:
-                    out[:, first : first + j + 1] = 0.0
-                for i in range(j + 1):
-                    out[0, first + i] += H[c, 0, i] * x
-                    out[1, first + i] += H[c, 1, i] * y
-                    out[2, first + i] += H[c, 2, i] * z
-                    out[3, first + i] += root * (H[c, 0, i] * y + H[c, 1, i] * x)
-                    out[4, first + i] += root * (H[c, 0, i] * z + H[c, 2, i] * x)
-                    out[5, first + i] += root * (H[c, 1, i] * z + H[c, 2, i] * y)
+            x0, y0, z0 = H[0, 0, j], H[0, 1, j], H[0, 2, j]
+            x1, y1, z1 = H[1, 0, j], H[1, 1, j], H[1, 2, j]
+            x2, y2, z2 = H[2, 0, j], H[2, 1, j], H[2, 2, j]
+            for i in range(j + 1):
+                X0, Y0, Z0 = H[0, 0, i], H[0, 1, i], H[0, 2, i]
+                X1, Y1, Z1 = H[1, 0, i], H[1, 1, i], H[1, 2, i]
+                X2, Y2, Z2 = H[2, 0, i], H[2, 1, i], H[2, 2, i]
+                x, y, z = X0 * x0 + X1 * x1 + X2 * x2, Y0 * y0 + Y1 * y1 + Y2 * y2, Z0 * z0 + Z1 * z1 + Z2 * z2
+                out[0, first + i] = a * half * (X0 * y0 + X1 * y1 + X2 * y2 + Y0 * x0 + Y1 * x1 + Y2 * x2)
+                out[1, first + i] = a * half * (X0 * z0 + X1 * z1 + X2 * z2 + Z0 * x0 + Z1 * x1 + Z2 * x2)
+                out[2, first + i] = a * half * (Y0 * z0 + Y1 * z1 + Y2 * z2 + Z0 * y0 + Z1 * y1 + Z2 * y2)
+                out[3, first + i] = a * half * (x - y)
+                out[4, first + i] = a * sixth * (x + y - 2.0 * z)
+                out[5, first + i] = b * trace * (x + y + z)
 
 
 def reduce_energy(
@@ -146,14 +155,17 @@ def reduce_energy(
         part = slice(first, first + step)
         local = padded[cell_dofs[part]].reshape(-1, n_nodes, 3, r)
         gradients = np.einsum("cqaj,caim->cqijm", quadrature.gradients[part], local, optimize=True).reshape(-1, 3, 3, r)
+        # E:C:E = 2μ |dev E|² + (3λ + 2μ) |vol E|²; both are >= 0 but for the volumetric part alone of a negative Poisson's ratio.
+        lame_lambda, lame_mu = np.tile(quadrature.parameters, (len(local), 1)).T
+        weights = quadrature.weights[part].ravel()
+        shape, volume = 2 * lame_mu * weights, (3 * lame_lambda + 2 * lame_mu) * weights
         rows = np.empty((len(gradients), 6, width))
-        _strains(gradients, rows)
-        weights = quadrature.weights[part].reshape(-1, 1, 1)
-        lame_lambda, lame_mu = np.tile(quadrature.parameters, (len(local), 1)).T.reshape(2, -1, 1)
-        stress = 2 * lame_mu[..., None] * rows
-        stress[:, :3] += (lame_lambda * rows[:, :3].sum(axis=1))[:, None]
-        stress *= weights
-        gram += rows.reshape(-1, width).T @ stress.reshape(-1, width)
+        _strains(gradients, np.sqrt(shape), np.sqrt(np.abs(volume)), rows)
+        flat = rows.reshape(-1, width)
+        gram += flat.T @ flat
+        if (volume < 0).any():
+            wrong = rows[volume < 0, 5]
+            gram -= 2 * wrong.T @ wrong
         _watch(gradients.reshape(-1, 9, r), samples, first * n_points, least, where, watched)
     chosen = list(dict.fromkeys(where[np.argsort(least, kind="stable")].tolist()))[:MAX_SENTINELS]
     return _symmetric(gram, r), np.array([watched[number] for number in chosen]).reshape(-1, 9, r)
