@@ -24,11 +24,11 @@ Kratos
     told the smallest number of Newton steps that brings the reduced residual to the tolerance, found by untimed solves. It
     needs no step to see that it has converged, which favours Kratos.
 HROM
-    Kratos' hyper-reduced model: HROM_WEIGHT on the selected elements, and no others in the model part. Point loads keep the
-    weight 1, so that the reduced load is exact as in ours. With the cells and weights of our `hpod` (ECSW), and with those of
-    Kratos' own `EmpiricalCubatureMethod` (ECM). The latter gets our training matrix, its left singular vectors being cut at the
-    same relative tolerance, and the sum of weights constrained, as Kratos' own training does. "mor-bench, hpod, ECM
-    cells" is our model with these.
+    Kratos' hyper-reduced model: HROM_WEIGHT on the selected elements, and no others in the model part. Point loads are conditions,
+    which Kratos assembles anew in each step; they keep the weight 1, so that the reduced load is exact as in ours. With the cells
+    and weights of our `hpod` (ECSW), and with those of Kratos' own `EmpiricalCubatureMethod` (ECM). The latter gets our training
+    matrix, its singular vectors being cut at the same relative tolerance, and the sum of weights constrained, as Kratos' own
+    training does. "mor-bench, hpod, ECM cells" is our model with these.
 
 Steps are Newton steps in Kratos, and reduced back-solves in ours. A speed-up is over the faster POD of Kratos, each load's
 fastest round over the fastest, and the median over the loads.
