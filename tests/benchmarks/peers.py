@@ -235,45 +235,68 @@ def silent() -> Iterator[None]:
         os.close(nowhere)
 
 
+def kratos_modules() -> tuple[Any, Any]:
+    """KratosMultiphysics and its StructuralMechanicsApplication, without their banners."""
+    with silent():
+        km, sma = map(import_module, ("KratosMultiphysics", "KratosMultiphysics.StructuralMechanicsApplication"))
+    km.Logger.GetDefaultOutput().SetSeverity(km.Logger.Severity.WARNING)
+    return km, sma
+
+
+def kratos_solid(scene: Scene, cells: NDArray[np.int64], loaded: NDArray[np.int64]) -> tuple[Any, Any]:
+    """A Kratos model and its part with some cells of a scene, a point load on each of some nodes, and the nodes of both.
+
+    Numbers in Kratos are those of the scene plus one.
+    """
+    km, sma = kratos_modules()
+    material = common_material(scene)
+    model = km.Model()
+    part = model.CreateModelPart("solid")
+    part.ProcessInfo[km.DOMAIN_SIZE] = 3
+    for variable in (km.DISPLACEMENT, km.REACTION, km.VOLUME_ACCELERATION, sma.POINT_LOAD):
+        part.AddNodalSolutionStepVariable(variable)
+    nodes = np.union1d(scene.mesh.cells[cells], loaded)
+    for i, point in zip(nodes.tolist(), scene.mesh.points[nodes].tolist(), strict=True):
+        part.CreateNewNode(i + 1, *point)
+    properties = part.CreateNewProperties(1)
+    properties[km.YOUNG_MODULUS], properties[km.POISSON_RATIO] = material.young_pa, material.poisson
+    properties[km.CONSTITUTIVE_LAW] = sma.LinearElastic3DLaw()
+    for i, cell in zip(cells.tolist(), (scene.mesh.cells[cells] + 1).tolist(), strict=True):
+        part.CreateNewElement("TotalLagrangianElement3D8N", i + 1, cell, properties)
+    for i in loaded.tolist():
+        part.CreateNewCondition("PointLoadCondition3D1N", i + 1, [i + 1], properties)
+    for axis in "XYZ":
+        displacement = getattr(km, f"DISPLACEMENT_{axis}")
+        km.VariableUtils().AddDof(displacement, getattr(km, f"REACTION_{axis}"), part)
+        for node in np.intersect1d(scene.fixed_nodes, nodes).tolist():
+            part.GetNode(node + 1).Fix(displacement)
+    return model, part
+
+
+def kratos_newton(part: Any, criterion: Any, builder: Any) -> Any:
+    """Newton's method without line search, in Kratos."""
+    km, _ = kratos_modules()
+    scheme = km.ResidualBasedIncrementalUpdateStaticScheme()
+    reactions, new_dofs, move_mesh = False, False, True  # this element takes F from the moved mesh
+    strategy = km.ResidualBasedNewtonRaphsonStrategy(part, scheme, criterion, builder, MAX_STEPS, reactions, new_dofs, move_mesh)
+    for part_of_solver in (criterion, builder, strategy):
+        part_of_solver.SetEchoLevel(0)
+    strategy.Initialize()
+    strategy.Check()
+    return strategy
+
+
 class Kratos(Contender):
     """Kratos' Newton with one of its linear solvers."""
 
     def __init__(self, scene: Scene, name: str, linear_solver: dict[str, Any]) -> None:
-        with silent():
-            km, sma = map(import_module, ("KratosMultiphysics", "KratosMultiphysics.StructuralMechanicsApplication"))
-        km.Logger.GetDefaultOutput().SetSeverity(km.Logger.Severity.WARNING)
-
+        self._km, sma = kratos_modules()
+        km = self._km
         self.name = f"Kratos, {name}"
-        material = common_material(scene)
-        self._km, self._load_variable, self._utilities = km, sma.POINT_LOAD, km.VariableUtils()
-        self._model = km.Model()
-        self._part = part = self._model.CreateModelPart("solid")
-        part.ProcessInfo[km.DOMAIN_SIZE] = 3
-        for variable in (km.DISPLACEMENT, km.REACTION, km.VOLUME_ACCELERATION, sma.POINT_LOAD):
-            part.AddNodalSolutionStepVariable(variable)
-        for i, point in enumerate(scene.mesh.points.tolist(), 1):
-            part.CreateNewNode(i, *point)
-        properties = part.CreateNewProperties(1)
-        properties[km.YOUNG_MODULUS], properties[km.POISSON_RATIO] = material.young_pa, material.poisson
-        properties[km.CONSTITUTIVE_LAW] = sma.LinearElastic3DLaw()
-        for i, cell in enumerate((scene.mesh.cells + 1).tolist(), 1):
-            part.CreateNewElement("TotalLagrangianElement3D8N", i, cell, properties)
-        for i in range(1, scene.mesh.n_nodes + 1):
-            part.CreateNewCondition("PointLoadCondition3D1N", i, [i], properties)
-        for axis in "XYZ":
-            displacement = getattr(km, f"DISPLACEMENT_{axis}")
-            self._utilities.AddDof(displacement, getattr(km, f"REACTION_{axis}"), part)
-            for node in scene.fixed_nodes.tolist():
-                part.GetNode(node + 1).Fix(displacement)
+        self._load_variable, self._utilities = sma.POINT_LOAD, km.VariableUtils()
+        self._model, self._part = kratos_solid(scene, np.arange(scene.mesh.n_cells), np.arange(scene.mesh.n_nodes))
         solver = km.LinearSolverFactory().Create(km.Parameters(json.dumps(linear_solver)))
-        scheme, criterion = km.ResidualBasedIncrementalUpdateStaticScheme(), km.ResidualCriteria(TOLERANCE, 0.0)
-        builder = km.ResidualBasedBlockBuilderAndSolver(solver)
-        reactions, new_dofs, move_mesh = False, False, True  # this element takes F from the moved mesh
-        self._strategy = km.ResidualBasedNewtonRaphsonStrategy(part, scheme, criterion, builder, MAX_STEPS, reactions, new_dofs, move_mesh)
-        for part_of_solver in (criterion, builder, self._strategy):
-            part_of_solver.SetEchoLevel(0)
-        self._strategy.Initialize()
-        self._strategy.Check()
+        self._strategy = kratos_newton(self._part, km.ResidualCriteria(TOLERANCE, 0.0), km.ResidualBasedBlockBuilderAndSolver(solver))
 
     def prepare(self, forces: Array) -> None:
         for node, force in zip(self._part.Nodes, forces.tolist(), strict=True):
@@ -305,10 +328,10 @@ class Entry:
     @property
     def missing(self) -> list[str]:
         """Distributions that are not installed."""
-        return [name for name in self.needs if not _installed(name)]
+        return [name for name in self.needs if not installed(name)]
 
 
-def _installed(distribution: str) -> bool:
+def installed(distribution: str) -> bool:
     try:
         version(distribution)
     except PackageNotFoundError:
@@ -365,7 +388,7 @@ class Row:
         return np.median(self.times_ms, axis=1)
 
 
-def _timed(contender: Contender, forces: Array) -> tuple[float, int]:
+def timed(contender: Contender, forces: Array) -> tuple[float, int]:
     contender.prepare(forces)
     gc.disable()
     try:
@@ -401,7 +424,7 @@ def compare(scene: Scene, forces: Array, contenders: Sequence[Contender], rounds
     model, free = FullOrderModel(scene), scene.free_dofs
     rows = [Row(contender.name) for contender in contenders]
     for contender in contenders:
-        _timed(contender, forces[0])
+        timed(contender, forces[0])
     for load in forces:
         target = load.ravel()[free]
         reference = model.solve(target, options=NewtonOptions(REFERENCE_TOLERANCE)).displacement
@@ -410,7 +433,7 @@ def compare(scene: Scene, forces: Array, contenders: Sequence[Contender], rounds
         for turn in range(rounds):
             for i in np.roll(np.arange(len(rows)), -turn).tolist():
                 contender, row = contenders[i], rows[i]
-                time_ms, steps = _timed(contender, load)
+                time_ms, steps = timed(contender, load)
                 row.times_ms[-1].append(time_ms)
                 if turn == 0:
                     row.steps.append(steps)
@@ -442,6 +465,13 @@ def print_rows(console: Console, rows: Sequence[Row]) -> None:
     console.print(times, ratios)
 
 
+def pin_threads(module: str, threads: int) -> None:
+    """Start the running module anew with this many threads in every library, unless it has been."""
+    pinned = dict.fromkeys(THREAD_VARIABLES, str(threads))
+    if any(os.environ.get(name) != value for name, value in pinned.items()):  # libraries read them when they are loaded
+        os.execve(sys.executable, [sys.executable, "-m", module, *sys.argv[1:]], {**os.environ, **pinned})
+
+
 def main(
     dataset: Annotated[list[str] | None, typer.Option(help="Repeat for more; by default beam-coarse and beam-fine.", show_default=False)] = None,
     loads: Annotated[int, typer.Option(min=1, help="Loads of each dataset.")] = 5,
@@ -451,9 +481,7 @@ def main(
     as_json: Annotated[Path | None, typer.Option("--json", help="Also write everything to this file.")] = None,
 ) -> None:
     """Time the full-order model beside other finite-element codes."""
-    pinned = dict.fromkeys(THREAD_VARIABLES, str(threads))
-    if any(os.environ.get(name) != value for name, value in pinned.items()):  # libraries read them when they are loaded
-        os.execve(sys.executable, [sys.executable, "-m", "tests.benchmarks.peers", *sys.argv[1:]], {**os.environ, **pinned})
+    pin_threads("tests.benchmarks.peers", threads)
     console = Console()
     unknown = set(solver or ()) - set(SOLVERS)
     if unknown:
