@@ -91,7 +91,7 @@ def pod(
         reach = None
         if n_modes is not None and n_modes <= most:
             # More of them will be asked for where decompositions are remembered.
-            reach = n_modes if _remembered is None else min(2 * n_modes, most)
+            reach = n_modes if _remembered is None else min(max(2 * n_modes, FIRST_DIRECTIONS), most)
             found = _randomised(lambda: [snapshots], reach, None, inner_product)
         elif most > FIRST_DIRECTIONS and energy_tolerance is not None and energy_tolerance >= LEAST_STREAMED_TOLERANCE:
             found = _randomised(lambda: [snapshots], None, energy_tolerance, inner_product, most)
@@ -261,6 +261,8 @@ def _randomised(
             images.append(block @ weighted)
             if energy is None:
                 squares += float(np.vdot(block, block if inner_product is None else (inner_product @ block.T).T))
+        if not images:
+            raise InvalidInputError("`blocks` gave snapshots at first and none later; it must begin anew every time.")
         q = qr(np.concatenate(images), mode="economic", overwrite_a=True, check_finite=False)[0]
         del images, directions, weighted, drawn
         if energy is None:
@@ -306,7 +308,7 @@ class _Remembered:
     def key(snapshots: NDArray[np.float64], inner_product: Any) -> bytes:
         digest = hashlib.blake2b(repr((snapshots.shape, snapshots.dtype.str)).encode())
         for array in (snapshots, *(() if inner_product is None else (inner_product.data,))):
-            digest.update(np.ascontiguousarray(array))
+            digest.update(np.ascontiguousarray(array).data)
         return digest.digest()
 
     def of(self, key: bytes, n_modes: int | None) -> _Decomposition | None:

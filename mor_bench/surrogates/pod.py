@@ -20,8 +20,6 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
 
-DEFAULT_MODES = 20
-
 
 def predict_reduced(
     scene: Scene, problem: GalerkinProblem, modes: NDArray[np.float64], batch: NDArray[np.float64], tolerance: float
@@ -48,21 +46,24 @@ class PODGalerkin(Surrogate):
 
     Parameters
     ----------
-    n_modes : int or "auto", optional
+    n_modes : int, "auto" or "energy"
         Size r of the basis; capped at the snapshots' rank with a warning. "auto": as few as meet the scene's need, see
-        `mor_bench.reduction.sizing`. `DEFAULT_MODES` if `energy_tolerance` is not given either.
+        `mor_bench.reduction.sizing`. "energy": by `energy_tolerance`, which must be given then and only then.
     tolerance : float or "auto"
         Norm of the reduced residual relative to that of the reduced load.
     energy_tolerance : float, optional
-        In place of `n_modes`: as few modes n as leave √(Σ_{j>n} sⱼ² / Σ sⱼ²) at or below this, with s the singular values.
+        As few modes n as leave √(Σ_{j>n} sⱼ² / Σ sⱼ²) at or below this, with s the singular values.
     inner_product : {"euclidean", "stiffness"}
         In which the modes are orthonormal and the snapshots approximated best: that of the displacements at the free dofs, or
-        uᵀK₀v with the stiffness at rest, which is the strain energy of linear elasticity.
+        uᵀK₀v with the stiffness at rest, which is twice the strain energy of linear elasticity. It does not pay off: with 20
+        and 40 modes the median relative l2 is 0.0107 and 0.0068 on beam-coarse, against 0.0133 and 0.0065 without, and 0.0035
+        and 0.0021 on l-shape (1,024 samples) either way, and the errors in its own norm are within 4 % too; with 5 modes it
+        loses.
     """
 
     def __init__(
         self,
-        n_modes: Annotated[int, Field(ge=1)] | Auto | None = None,
+        n_modes: Annotated[int, Field(ge=1)] | Literal["auto", "energy"] = 20,
         tolerance: Annotated[float, Field(gt=0, le=1)] | Auto = 1e-8,
         energy_tolerance: Annotated[float, Field(gt=0, lt=1)] | None = None,
         inner_product: Literal["euclidean", "stiffness"] = "euclidean",
@@ -77,12 +78,14 @@ class PODGalerkin(Surrogate):
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
-            if self.n_modes is not None and self.energy_tolerance is not None:
-                raise InvalidInputError("PODGalerkin takes `n_modes` or `energy_tolerance`, not both.")
+            if (self.n_modes == "energy") != (self.energy_tolerance is not None):
+                raise InvalidInputError(
+                    f'`energy_tolerance` of PODGalerkin must be given with `n_modes` = "energy", and not otherwise; got '
+                    f"{self.energy_tolerance} with {self.n_modes!r}."
+                )
             known = self._checked_snapshots(snapshots)
-            n_modes = size_to_needs(self, scene, known, {"n_modes": MODES, "tolerance": TOLERANCES})["n_modes"]
-            if n_modes is None and self.energy_tolerance is None:
-                n_modes = DEFAULT_MODES
+            chosen = size_to_needs(self, scene, known, {"n_modes": MODES, "tolerance": TOLERANCES})["n_modes"]
+            n_modes = None if chosen == "energy" else chosen
             product = stiffness_at_rest(FullOrderModel(scene)) if self.inner_product == "stiffness" else None
             basis = pod(known.free_displacements, n_modes, energy_tolerance=self.energy_tolerance, inner_product=product)
             self._restore({"modes": basis.modes})
