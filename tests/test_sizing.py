@@ -181,10 +181,10 @@ def test_what_was_chosen_is_saved_and_loaded(tiny: Dataset, tmp_path: Path) -> N
     np.testing.assert_array_equal(plain.predict(tiny.test.forces[:3]), fitted.predict(tiny.test.forces[:3]))
 
 
-@pytest.mark.parametrize("forgery", [{"size.tolerance": None}, {"size.tolerance": np.array([7.0])}, {"size.inner_product": np.array([1.0])}])
+@pytest.mark.parametrize("forgery", [{"size.tolerance": None}, {"size.tolerance": np.array([7.0])}, {"size.n_modes": np.array([3])}])
 def test_forged_sizes_are_refused(forgery: dict[str, Any], tiny: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "model.safetensors"
-    PODGalerkin(5, "auto").fit(tiny.scene, tiny.train).save(path)
+    PODGalerkin(5, "auto").fit(needing(tiny.scene, 0.5), tiny.train).save(path)
     with safe_open(str(path), framework="numpy") as file:
         header, arrays = file.metadata(), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     arrays = {name: array for name, array in {**arrays, **forgery}.items() if array is not None}

@@ -159,7 +159,7 @@ BAD_METHODS = [
     ("[sweep]\nn_modes = [1, 0]", r"`n_modes` must be greater than or equal to 1 or 'auto' or 'energy'; got 0"),
     ("[sweep]\nn_modes = []", r"the sweep of `n_modes` is empty"),
     ("[profiles.quik]", r"`profiles.quik"),
-    ("[profiles.full.parameters]\ntolerance = -1.0", r"\(full\): `tolerance` must be greater than 0; got -1"),
+    ("[profiles.full.parameters]\ntolerance = -1.0", r"\(full\): `tolerance` must be greater than 0 or 'auto'; got -1"),
     ("sweeps = 1", r"unknown key `sweeps`; did you mean 'sweep'\?"),
     ("x = [", r"not valid TOML"),
 ]
