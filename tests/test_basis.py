@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.errors import InvalidInputError
+from mor_bench.harness.stress.reduction import _faults
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction import basis
 from mor_bench.reduction.basis import Basis, pod, pod_streamed, remembering
@@ -113,11 +114,13 @@ def test_a_dataset_is_decomposed_as_it_is_read(cache: Path) -> None:
 
 
 def test_streaming_never_holds_the_matrix() -> None:
-    n_samples, n, rank = 12_000, 1_500, 30
+    n_samples, n, rank, passes = 12_000, 1_500, 50, 0
     rng = np.random.default_rng(0)
     left, right = rng.normal(size=(n_samples, rank)) * 0.7 ** np.arange(rank), rng.normal(size=(rank, n))
 
     def blocks() -> Iterator[Array]:
+        nonlocal passes
+        passes += 1
         for start in range(0, n_samples, 500):
             yield left[start : start + 500] @ right
 
@@ -127,6 +130,7 @@ def test_streaming_never_holds_the_matrix() -> None:
     peak = tracemalloc.get_traced_memory()[1] - before
     tracemalloc.stop()
     assert peak < 0.15 * 8 * n_samples * n
+    assert passes == 7  # one to see how many columns there are
     assert off_identity(modes) <= 1e-12
 
 
@@ -226,6 +230,7 @@ def test_the_inner_product_of_a_basis_does_not_change_what_its_span_answers(coar
     few, forces = coarse.train[:12], coarse.train.forces[:12]
     plain, weighted = (PODGalerkin(12, 1e-12, inner_product=product).fit(coarse.scene, few) for product in ("euclidean", "stiffness"))
     assert np.abs(plain.predict(forces) - weighted.predict(forces)).max() <= 1e-8 * np.abs(few.displacements).max()
+    assert _faults(weighted, few, said=True) == []
     tangent = weighted.problem_.rest_tangent
     assert np.abs(tangent - np.eye(12)).max() <= 1e-9
     # Unknowns as large as the body, in either basis.

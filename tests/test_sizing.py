@@ -151,7 +151,7 @@ def test_a_method_without_any_fit_says_so(tiny: Dataset, monkeypatch: pytest.Mon
         raise InvalidInputError("nothing fits.")
 
     monkeypatch.setattr("mor_bench.surrogates.pod.pod", failing)
-    with pytest.raises(InvalidInputError, match="no n_modes could be chosen"):
+    with pytest.raises(InvalidInputError, match="no n_modes could be chosen: nothing fits"):
         PODGalerkin("auto").fit(tiny.scene, tiny.train)
 
 

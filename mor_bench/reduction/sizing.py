@@ -113,6 +113,8 @@ class Trials:
         self._method, self._scene, self._snapshots = method, scene, snapshots
         self._folds = validation_folds(snapshots)
         self.scores: dict[tuple[tuple[str, Any], ...], Score] = {}
+        self.refusal: MorBenchError | None = None
+        """Why a candidate could not be fitted, of the last one."""
 
     def whole_score(self, knobs: Mapping[str, Any]) -> Score:
         """On all folds, however far from the need."""
@@ -134,7 +136,8 @@ class Trials:
                     with uncounted(), warnings.catch_warnings():
                         warnings.simplefilter("ignore")  # what concerns the fit to all samples is said there
                         candidate.fit(self._scene, self._snapshots[fitted])
-                except MorBenchError:
+                except MorBenchError as error:
+                    self.refusal = error
                     return Score(np.inf, np.inf)
                 errors += _relative_errors(candidate, self._snapshots[held])
                 if np.median(errors) > hopeless * self._scene.spec.needs.error:
@@ -240,7 +243,8 @@ def size_to_needs(method: Sizeable, scene: Scene, snapshots: Snapshots, rungs: M
         best = dict(min(trials.scores.items(), key=lambda item: item[1].error)[0])
         reached = trials.whole_score(best).error
         if not np.isfinite(reached):
-            raise InvalidInputError(f"no {', '.join(open_rungs)} could be chosen: no candidate predicts half of the samples held out.")
+            why = trials.refusal or "no candidate predicts half of the samples held out."
+            raise InvalidInputError(f"no {', '.join(open_rungs)} could be chosen: {why}")
         said = ", ".join(f"{name} = {value}" for name, value in best.items())
         warnings.warn(
             f"{scene.name} needs a relative l2 of {need:g} (median); the most accurate candidate, {said}, reaches {reached:.3g} on the "
