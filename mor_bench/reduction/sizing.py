@@ -189,7 +189,9 @@ def size_to_needs(method: Sizeable, scene: Scene, snapshots: Snapshots, rungs: M
     that ended, and is given up where it takes more work than the best found.
 
     What is held out meets the need; a test set does so nearly: on beam-coarse, which needs 0.01, 27 modes of `pod` have an
-    error of 0.0094 on what is held out and of 0.0102 on the test set.
+    error of 0.0094 on what is held out and of 0.0102 on the test set, on beam-fine (6,720 samples) 19 modes 0.0088 and 0.0114,
+    and on l-shape (1,280 samples) 12 modes 0.0077 and 0.0065. It costs some ten candidates, each of five fits and 200
+    predictions: seconds on beam-coarse, minutes on beam-fine.
 
     Parameters
     ----------
