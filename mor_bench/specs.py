@@ -665,6 +665,10 @@ def _one_line(error: ValidationError, model: type[BaseModel], where: str) -> str
     if problem["type"] == "missing":
         return f"{where}: key `{key}` is missing."
     message = problem["msg"].removeprefix("Value error, ").removeprefix("Input should be ").rstrip(".")
+    alternatives = [p for p in problems if p["loc"][:1] == location[:1] and p["msg"].startswith("Input should be ")]
+    if len(location) == 2 and len(alternatives) > 1 and not list(_models_within(model.model_fields[str(location[0])].annotation)):
+        # A knob of several types: each alternative has a problem, and a step of its own in the location.
+        key, message = str(location[0]), " or ".join(p["msg"].removeprefix("Input should be ") for p in alternatives)
     came = "" if problem["type"] == "value_error" and not key else f"; got {problem['input']!r}"
     return f"{where}: `{key}` must be {message}{came}." if problem["msg"].startswith("Input should") else f"{where}: `{key}`: {message}{came}."
 

@@ -32,6 +32,9 @@ MAX_FORCE_N = 1e30
 RANGE = "range."
 """Beginning of the names of the arrays that hold the range of the training loads; `_state` has none such."""
 
+SIZE = "size."
+"""Beginning of the names of the arrays that hold the values chosen for knobs set to "auto"; `_state` has none such."""
+
 
 class Surrogate(ABC):
     """A map from nodal forces to nodal displacements of one scene.
@@ -45,6 +48,8 @@ class Surrogate(ABC):
     scene_: Scene
     range_: LoadRange
     _indicator: tuple[Scene, ErrorIndicator]
+    sizes_: dict[str, Any]
+    """Values chosen for the knobs set to "auto"; missing where there are none."""
 
     needs_snapshots: ClassVar[bool] = True
     """Whether `fit` learns from snapshots; their cost is charged only to methods that do."""
@@ -191,7 +196,8 @@ class Surrogate(ABC):
             "scene": self.scene_.spec.model_dump_json(),
         }
         known = {RANGE + name: array for name, array in self.range_.arrays().items()} if hasattr(self, "range_") else {}
-        arrays = {name: np.ascontiguousarray(array) for name, array in {**self._state(), **known}.items()}
+        sizes = {SIZE + name: np.array([value]) for name, value in getattr(self, "sizes_", {}).items()}
+        arrays = {name: np.ascontiguousarray(array) for name, array in {**self._state(), **known, **sizes}.items()}
         header["sha256"] = _digest(header, arrays)
         write_atomically(Path(path), serialise(arrays, metadata=header))
 
@@ -202,6 +208,13 @@ class Surrogate(ABC):
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Become fitted from the arrays of `_state`; ``scene_`` is already set."""
         raise MorBenchError(f"{type(self).__name__} does not support loading.")
+
+    def _sized(self, name: str) -> Any:
+        """The value of a knob, or what was chosen for it if it is set to "auto"."""
+        value = getattr(self, "sizes_", {}).get(name, getattr(self, name))
+        if value == "auto":
+            raise InvalidInputError(f"no value was chosen for `{name}`.")
+        return value
 
     @contextmanager
     def _fitting(self, scene: Scene) -> Iterator[None]:
@@ -342,6 +355,12 @@ def _fitted(path: str | Path, surrogate: type[Any], scene: Scene | None, header:
         method = make_surrogate(surrogate, json.loads(header["parameters"]))
         method.scene_ = scene or load_scene(json.loads(header["scene"]))
         ranges = {name.removeprefix(RANGE): state.pop(name) for name in list(state) if name.startswith(RANGE)}
+        sizes = {name.removeprefix(SIZE): state.pop(name).item() for name in list(state) if name.startswith(SIZE)}
+        if any(method.parameters.get(name) != "auto" for name in sizes):
+            raise InvalidInputError(f"it holds values for {', '.join(sorted(sizes))}, of which not all are to be chosen.")
+        if sizes:
+            check_parameters(surrogate, {**method.parameters, **sizes})
+            method.sizes_ = sizes
         method._restore(state)
         if ranges:
             method.range_ = LoadRange.from_arrays(ranges, method.scene_.mesh.n_nodes)

@@ -153,13 +153,13 @@ surrogate = "mor_bench.surrogates.pod:PODGalerkin"
 """
 
 BAD_METHODS = [
-    ("[parameters]\nn_mode = 3", r"unknown key `n_mode`; did you mean 'n_modes'\? Allowed here: n_modes, tolerance"),
-    ("[parameters]\nn_modes = 0", r"`n_modes` must be greater than or equal to 1; got 0"),
-    ("[parameters]\nn_modes = 3.5", r"`n_modes` must be a valid integer; got 3.5"),
-    ("[sweep]\nn_modes = [1, 0]", r"`n_modes` must be greater than or equal to 1; got 0"),
+    ("[parameters]\nn_mode = 3", r"unknown key `n_mode`; did you mean 'n_modes'\? Allowed here: energy_tolerance, inner_product, n_modes, tolerance"),
+    ("[parameters]\nn_modes = 0", r"`n_modes` must be greater than or equal to 1 or 'auto' or 'energy'; got 0"),
+    ("[parameters]\nn_modes = 3.5", r"`n_modes` must be a valid integer or 'auto' or 'energy'; got 3.5"),
+    ("[sweep]\nn_modes = [1, 0]", r"`n_modes` must be greater than or equal to 1 or 'auto' or 'energy'; got 0"),
     ("[sweep]\nn_modes = []", r"the sweep of `n_modes` is empty"),
     ("[profiles.quik]", r"`profiles.quik"),
-    ("[profiles.full.parameters]\ntolerance = -1.0", r"\(full\): `tolerance` must be greater than 0; got -1"),
+    ("[profiles.full.parameters]\ntolerance = -1.0", r"\(full\): `tolerance` must be greater than 0 or 'auto'; got -1"),
     ("sweeps = 1", r"unknown key `sweeps`; did you mean 'sweep'\?"),
     ("x = [", r"not valid TOML"),
 ]
@@ -202,7 +202,7 @@ def test_unknown_names_give_the_nearest() -> None:
 
 def test_load_method_takes_parameters_and_checks_them() -> None:
     assert mor_bench.load_method("pod", n_modes=7).parameters["n_modes"] == 7
-    with pytest.raises(SpecError, match=r"PODGalerkin: `n_modes` must be greater than or equal to 1; got 0"):
+    with pytest.raises(SpecError, match=r"PODGalerkin: `n_modes` must be greater than or equal to 1 or 'auto' or 'energy'; got 0"):
         mor_bench.load_method("pod", n_modes=0)
 
 

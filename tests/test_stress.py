@@ -278,7 +278,7 @@ def answered(*_: Any, **__: Any) -> Solution:
     return Solution(np.array([-0.5]), 0.5, 1, 0)
 
 
-def silently(snapshots: NDArray[np.float64], n_modes: int | None = None) -> Basis:
+def silently(snapshots: NDArray[np.float64], n_modes: int | None = None, **_: Any) -> Basis:
     basis = pod(snapshots)
     return Basis(basis.modes[:, :n_modes], basis.singular_values)
 

@@ -225,6 +225,8 @@ class Entry:
             "machine": place.machine,
             "threads": place.fit_threads,
         }
+        if "auto" in job.parameters.values():  # a size that is chosen by what the scene needs
+            parts["needs"] = material.scene.spec.needs.error
         self.key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:20]
         self.folder = place.cache / "fits" / f"{job.method.name}-{self.key}"
 

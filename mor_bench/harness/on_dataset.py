@@ -223,7 +223,7 @@ class DatasetRun:
         data = self.data
         return {
             "dataset": self.spec.name, "split": self.settings.split or self.spec.split.by, "method": job.method.name, "label": job.label,
-            "parameters": job.parameters, "status": "", "reason": None, "n_train": len(data.train), "n_test": len(data.test),
+            "parameters": job.parameters, "sizes": {}, "status": "", "reason": None, "n_train": len(data.train), "n_test": len(data.test),
             "n_unused": data.n_unused, "n_failed": None, "n_dofs": data.scene.mesh.n_dofs, "threads": self.settings.threads,
             "error": None, "latency_ms": None, "all_threads_ms": None, "throughput": None, "offline_s": None, "memory_bytes": None,
             "model_bytes": None, "cost": None, "indicator": None, "sets": {}, "hidden": None, "seeds": None, **self.discretisation, "warnings": [],
@@ -243,6 +243,7 @@ class DatasetRun:
             "offline_s": {"data": self.data_seconds if fit["needs_snapshots"] else 0.0, "fit": fit["fit_s"]},
             "memory_bytes": {"fit": fit["fit_memory_bytes"], "predict": None},
             "model_bytes": fit["model_bytes"],
+            "sizes": fit.get("sizes", {}),
             "cost": outcome.cost,
             "indicator": indicator_summary(main),
             "sets": {name: set_summary(score) for name, score in scores.items()},

@@ -165,6 +165,7 @@ class Session:
             "model_bytes": model.stat().st_size if saved else None,
             "needs_snapshots": method.needs_snapshots,
             "parameters": method.parameters,
+            "sizes": getattr(method, "sizes_", {}),
         }
 
     def load(self, surrogate: str, model: Path) -> dict[str, Any]:

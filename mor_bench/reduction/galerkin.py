@@ -77,7 +77,8 @@ class GalerkinProblem:
         self.modes = np.ascontiguousarray(modes)
         self.n_unknowns = modes.shape[1]
         self.accelerator = None
-        self.extent = assembler.extent_m * float(np.sqrt(len(modes)))
+        # Of an orthonormal basis the largest mode has norm 1, of one that is so in another inner product any.
+        self.extent = assembler.extent_m * float(np.sqrt(len(modes)) / (np.linalg.norm(modes, axis=0).max() or 1.0))
 
     @cached_property
     def rest_tangent(self) -> NDArray[np.float64]:

@@ -14,11 +14,15 @@ from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.cubature import ecsw_system, sparse_nnls
 from mor_bench.reduction.galerkin import GalerkinProblem
+from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto, size_to_needs
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.specs import NO_EQUATIONS
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates.pod import predict_reduced
+
+CUBATURE_TOLERANCES = (3e-2, 1e-2, 3e-3, 1e-3)
+"""To choose from."""
 
 
 class HyperReducedPOD(Surrogate):
@@ -29,22 +33,23 @@ class HyperReducedPOD(Surrogate):
 
     Parameters
     ----------
-    n_modes : int
-        Size r of the basis; capped at the snapshots' rank with a warning.
-    cubature_tolerance : float
+    n_modes : int or "auto"
+        Size r of the basis; capped at the snapshots' rank with a warning. "auto", here and of the tolerances: as little work as
+        meets the scene's need, see `mor_bench.reduction.sizing`.
+    cubature_tolerance : float or "auto"
         Relative residual of the reduced forces. Smaller keeps more cells: slower and closer to plain POD.
     n_cubature_snapshots : int
         Training snapshots whose reduced forces are matched, spread evenly over the training set.
-    tolerance : float
+    tolerance : float or "auto"
         Norm of the reduced residual relative to that of the reduced load.
     """
 
     def __init__(
         self,
-        n_modes: Annotated[int, Field(ge=1)] = 20,
-        cubature_tolerance: Annotated[float, Field(ge=0, lt=1)] = 1e-3,
+        n_modes: Annotated[int, Field(ge=1)] | Auto = 20,
+        cubature_tolerance: Annotated[float, Field(ge=0, lt=1)] | Auto = 1e-3,
         n_cubature_snapshots: Annotated[int, Field(ge=1)] = 300,
-        tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8,
+        tolerance: Annotated[float, Field(gt=0, le=1)] | Auto = 1e-8,
     ) -> None:
         self.n_modes = n_modes
         self.cubature_tolerance = cubature_tolerance
@@ -56,28 +61,32 @@ class HyperReducedPOD(Surrogate):
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
-            displacements = self._checked_snapshots(snapshots).free_displacements
-            modes = pod(displacements, self.n_modes).modes
+            known = self._checked_snapshots(snapshots)
+            rungs = {"n_modes": MODES, "cubature_tolerance": CUBATURE_TOLERANCES, "tolerance": TOLERANCES}
+            knobs = size_to_needs(self, scene, known, rungs)
+            displacements = known.free_displacements
+            modes = pod(displacements, knobs["n_modes"]).modes
             model = FullOrderModel(scene)
-            if self.cubature_tolerance == 0:
+            if knobs["cubature_tolerance"] == 0:
                 weights = np.ones(scene.mesh.n_cells)
             else:
                 chosen = np.unique(np.linspace(0, len(displacements) - 1, self.n_cubature_snapshots).astype(int))
                 system = ecsw_system(model.assembler, model.cell_dofs, modes, displacements[chosen] @ modes)
-                weights = sparse_nnls(system, system.sum(axis=1), self.cubature_tolerance).weights
+                weights = sparse_nnls(system, system.sum(axis=1), knobs["cubature_tolerance"]).weights
             cells = np.flatnonzero(weights)
             self._restore({"modes": modes, "cells": cells, "weights": weights[cells]})
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
-        return predict_reduced(self.scene_, self.problem_, self.modes_, batch, self.tolerance).reshape(np.shape(forces))
+        return predict_reduced(self.scene_, self.problem_, self.modes_, batch, self.tolerance_).reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
         return {"modes": self.modes_, "cells": self.cells_, "weights": self.weights_}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         self.modes_, self.cells_, self.weights_ = state["modes"], state["cells"], state["weights"]
+        self.tolerance_ = self._sized("tolerance")
         scene = self.scene_
         if scene.material is None:
             raise UnsupportedSceneError(NO_EQUATIONS)

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import MorBenchError
 from mor_bench.harness.stress.case import Case, Outcome, Subject, answers, judged, learner, with_samples
+from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.cubature import CubatureError, SparseWeights, sparse_nnls
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates.hpod import HyperReducedPOD
-from mor_bench.surrogates.pod import PODGalerkin
+from mor_bench.surrogates.pod import PODGalerkin, stiffness_at_rest
 
 Array = NDArray[np.float64]
 
@@ -68,7 +69,9 @@ def _faults(method: Surrogate, snapshots: Snapshots, said: bool) -> list[str]:
         faults.append(f"{max(asked)} modes asked for of rank {rank}, and no warning")
     modes = getattr(method, "modes_", None)
     if isinstance(modes, np.ndarray):
-        off = float(np.linalg.norm(modes.T @ modes - np.eye(modes.shape[1])))
+        by_stiffness = getattr(method, "inner_product", "euclidean") == "stiffness"
+        images = stiffness_at_rest(FullOrderModel(method.scene_)) @ modes if by_stiffness else modes
+        off = float(np.linalg.norm(modes.T @ images - np.eye(modes.shape[1])))
         if not off <= 1e-12:
             faults.append(f"basis off orthonormal by {off:.1e}")
         if modes.shape[1] > rank:
