@@ -69,6 +69,13 @@ def test_two_stopping_rules_are_refused(coarse: Dataset) -> None:
         Hybrid(steps=1, tolerance=1e-2).fit(coarse.scene, coarse.train)
 
 
+def test_sizes_chosen_for_the_start_are_saved_with_it(coarse: Dataset, tmp_path: Path) -> None:
+    method = Hybrid("pod-tensor", {"n_modes": 8, "tolerance": "auto"}, steps=1).fit(coarse.scene, coarse.train)
+    method.save(tmp_path / "model.safetensors")
+    again = mor_bench.load_surrogate(tmp_path / "model.safetensors")
+    np.testing.assert_array_equal(again.predict(coarse.test.forces[:2]), method.predict(coarse.test.forces[:2]))
+
+
 def test_knobs_of_the_start_are_checked(coarse: Dataset) -> None:
     with pytest.raises(SpecError, match="n_mode"):
         Hybrid(start_parameters={"n_mode": 3}, steps=1).fit(coarse.scene, coarse.train)

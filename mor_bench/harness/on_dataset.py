@@ -15,6 +15,7 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mor_bench.errors import MissingDependencyError, MorBenchError, SolverError, UnsupportedSceneError
 from mor_bench.harness.clock import PROTOCOLS, Opener, Queries, Timing, check_answers, measure, probe_s, summary_of_timing
@@ -44,6 +45,9 @@ from mor_bench.specs import (
 
 MOST_QUERIES = 400
 """Loads of the test set from which a timing's queries are drawn."""
+
+SINGULAR_VALUES = 400
+"""Of the snapshots that a figure shows, where computing all of them would take minutes."""
 
 EXTRA_SEEDS = 2
 """Trainings with other seeds in a full comparison, beside that of the method's file."""
@@ -405,10 +409,16 @@ def _discretisation(spec: AnyDatasetSpec, cache: Path | None, suite: Path | None
     return {"discretisation_error_m": record.get("error_m"), "discretisation_rel_l2": record.get("relative_l2_median")}
 
 
+def _singular_values(displacements: NDArray[np.float64]) -> NDArray[np.float64]:
+    """All of them, or the first of a large matrix."""
+    n = min(displacements.shape)
+    return pod(displacements, None if n <= SINGULAR_VALUES * 5 else SINGULAR_VALUES).singular_values
+
+
 def record_dataset(comparison: Comparison, spec: AnyDatasetSpec, data: Dataset) -> None:
     """Record what every figure of a dataset needs."""
     arrays = {
-        "singular_values": pod(data.train.free_displacements).singular_values,
+        "singular_values": _singular_values(data.train.free_displacements),
         "points": data.scene.mesh.points,
         "cells": data.scene.mesh.cells,
         "test_regions": data.test.loads.patches,

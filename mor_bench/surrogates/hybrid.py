@@ -15,7 +15,7 @@ from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogate import Surrogate, load_method
+from mor_bench.surrogate import SIZE, Surrogate, load_method
 
 START = "start."
 """Beginning of the names of the arrays that belong to the start's model."""
@@ -121,12 +121,15 @@ class Hybrid(Surrogate):
         _ = self.model_.rest_factor
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        return {START + name: array for name, array in self.start_._state().items()}
+        sizes = {SIZE + name: np.array([value]) for name, value in getattr(self.start_, "sizes_", {}).items()}
+        return {START + name: array for name, array in {**self.start_._state(), **sizes}.items()}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         start = self._unfitted()
         start.scene_ = _all_outputs(self.scene_)
-        start._restore({name.removeprefix(START): array for name, array in state.items()})
+        arrays = {name.removeprefix(START): array for name, array in state.items()}
+        start.sizes_ = {name.removeprefix(SIZE): arrays.pop(name).item() for name in list(arrays) if name.startswith(SIZE)}
+        start._restore(arrays)
         self._become(start)
 
 

@@ -12,12 +12,16 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.basis import pod
+from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto, size_to_needs
 from mor_bench.reduction.subspace import Subspace
 from mor_bench.reduction.tensors import ReducedTensors, TensorProblem, reduce_energy
 from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
+
+MOST_MODES = 100
+"""The polynomial of more would take a gigabyte."""
 
 N_WATCHED = 300
 """Training samples, spread evenly, that tell where det F is to be watched."""
@@ -32,13 +36,18 @@ class TensorPOD(Surrogate):
 
     Parameters
     ----------
-    n_modes : int
-        Size r of the basis; capped at the snapshots' rank with a warning. Memory and time of a query grow as r⁴.
-    tolerance : float
+    n_modes : int or "auto"
+        Size r of the basis; capped at the snapshots' rank with a warning. Memory and time of a query grow as r⁴. "auto", here
+        and of the tolerance: as little work as meets the scene's need, see `mor_bench.reduction.sizing`.
+    tolerance : float or "auto"
         Norm of the reduced residual relative to that of the reduced load.
     """
 
-    def __init__(self, n_modes: Annotated[int, Field(ge=1, le=100)] = 20, tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8) -> None:
+    def __init__(
+        self,
+        n_modes: Annotated[int, Field(ge=1, le=MOST_MODES)] | Auto = 20,
+        tolerance: Annotated[float, Field(gt=0, le=1)] | Auto = 1e-8,
+    ) -> None:
         self.n_modes = n_modes
         self.tolerance = tolerance
 
@@ -49,8 +58,10 @@ class TensorPOD(Surrogate):
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
-            displacements = self._checked_snapshots(snapshots).free_displacements
-            modes = pod(displacements, self.n_modes).modes
+            known = self._checked_snapshots(snapshots)
+            rungs = {"n_modes": [r for r in MODES if r <= MOST_MODES], "tolerance": TOLERANCES}
+            displacements, knobs = known.free_displacements, size_to_needs(self, scene, known, rungs)
+            modes = pod(displacements, knobs["n_modes"]).modes
             chosen = np.unique(np.linspace(0, len(displacements) - 1, N_WATCHED).astype(int))
             mesh, model = scene.mesh, FullOrderModel(scene)
             assert isinstance(scene.material, SaintVenantKirchhoff)
@@ -65,9 +76,9 @@ class TensorPOD(Surrogate):
         out = np.empty((len(batch), self.scene_.mesh.n_dofs))
         for row, load in zip(out, batch.reshape(out.shape), strict=True):
             reduced = self._subspace.project(load)
-            q = self.problem_.quick(reduced, self.tolerance)
+            q = self.problem_.quick(reduced, self.tolerance_)
             if q is None:
-                q = solve_equilibrium(self.problem_, reduced, options=NewtonOptions(self.tolerance)).displacement
+                q = solve_equilibrium(self.problem_, reduced, options=NewtonOptions(self.tolerance_)).displacement
             self._subspace.expand(q, row)
         return out.reshape(batch.shape).reshape(np.shape(forces))
 
@@ -79,7 +90,7 @@ class TensorPOD(Surrogate):
         shape = len(self.scene_.free_dofs), tensors.n_modes
         if modes.shape != shape or not np.isfinite(modes).all():
             raise InvalidInputError(f"`modes` must be a finite array of shape {shape}; got shape {modes.shape}.")
-        self.modes_ = modes
+        self.modes_, self.tolerance_ = modes, self._sized("tolerance")
         extent = float(np.ptp(self.scene_.mesh.points, axis=0).max() * np.sqrt(len(modes)))
         self.problem_ = TensorProblem(tensors, state["sentinels"], extent)
         self._subspace = Subspace(self.scene_, modes)
