@@ -31,10 +31,10 @@ class LinearModes:
     amplitudes_m: NDArray[np.float64]
 
 
-def linear_modes(scene: Scene, model: FullOrderModel, n_modes: int) -> LinearModes:
+def linear_modes(scene: Scene, model: FullOrderModel, n_modes: int | None = None) -> LinearModes:
     """The n_modes leading modes of the linear responses to a force along each axis on each load patch.
 
-    At most as many as there are such forces, or as their rank; capped with a warning.
+    At most the rank of the responses, to which it is capped with a warning; all of it by default.
     """
     free = scene.free_dofs
     on_nodes = scene.patch_weights.toarray()
@@ -85,9 +85,9 @@ def derivative_basis(scene: Scene, model: FullOrderModel, n_linear: int, n_modes
     All enter one singular value decomposition with the size that they have in the second-order expansion of a response,
     u = Σ qᵢφᵢ + ½ Σ qᵢqⱼψᵢⱼ, at the coordinates' root mean square.
     """
-    linear = linear_modes(scene, model, max(n_linear, n_modes))
+    linear = linear_modes(scene, model)
     n_linear = min(n_linear, linear.modes.shape[1])
     first, second = pairs(n_linear)
     sizes = np.where(first == second, 0.5, 1.0) * linear.amplitudes_m[first] * linear.amplitudes_m[second]
     bent = modal_derivatives(model, linear.modes[:, :n_linear]) * sizes
-    return pod(np.vstack([(linear.modes * linear.amplitudes_m).T, bent.T]), n_modes).modes
+    return pod(np.vstack([(linear.modes * linear.amplitudes_m).T[: max(n_linear, n_modes)], bent.T]), n_modes).modes

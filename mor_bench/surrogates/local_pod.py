@@ -75,7 +75,8 @@ class LocalPOD(Surrogate):
             bases = []
             for cluster in range(len(centroids)):
                 own, others = np.flatnonzero(labels == cluster), np.flatnonzero(labels != cluster)
-                near = others[np.argsort(distances[others, cluster], kind="stable")[: round(OVERLAP * len(own))]]
+                n_near = max(round(OVERLAP * len(own)), self.n_modes - len(own))  # a small cluster still fills its basis
+                near = others[np.argsort(distances[others, cluster], kind="stable")[:n_near]]
                 bases.append(pod(both[np.append(own, near)].reshape(-1, both.shape[2]), self.n_modes).modes)
             self._restore(
                 {

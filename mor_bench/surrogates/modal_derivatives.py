@@ -26,7 +26,7 @@ class ModalDerivatives(Surrogate):
     Parameters
     ----------
     n_linear : int
-        Linear modes whose n (n + 1) / 2 modal derivatives are computed; capped at the number of linear modes with a warning.
+        Linear modes whose n (n + 1) / 2 modal derivatives are computed; at most as many as the linear responses span.
     n_modes : int
         Size of the basis that is kept; capped at the rank with a warning.
     tolerance : float
