@@ -20,6 +20,7 @@ from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import load_generated_spec
 from mor_bench.surrogates.local_pod import LocalPOD
+from mor_bench.surrogates.quadratic_manifold import QuadraticManifoldGalerkin
 
 LAWS: dict[str, dict[str, Any]] = {
     "saint-venant-kirchhoff": {"young_pa": 500.0, "poisson": 0.4},
@@ -80,7 +81,7 @@ def test_force_and_tangent_on_the_manifold_are_derivatives_of_its_energy(law: st
     linear = linear_modes(scene, model, 4)
     manifold = QuadraticManifold(linear.modes, modal_derivatives(model, linear.modes))
     rng = np.random.default_rng(0)
-    problem = ManifoldProblem(GalerkinProblem(model.assembler, linear.modes), manifold, 1e-3 * rng.normal(size=model.n_unknowns))
+    problem = ManifoldProblem(GalerkinProblem(model.assembler, linear.modes), manifold, manifold.curvature(1e-3 * rng.normal(size=model.n_unknowns)))
     q, direction = 0.5 * linear.amplitudes_m * rng.normal(size=4), linear.amplitudes_m * rng.normal(size=4)
     state, tangent = problem.linearise(q)
     np.testing.assert_allclose(state.force, problem.force(q).force, rtol=1e-10, atol=1e-14)
@@ -116,7 +117,7 @@ def test_the_quadratic_manifold_is_exact_to_second_order(tiny: Dataset) -> None:
     for size in (2e-2, 1e-2):
         exact = model.solve(size * stretched, options=options).displacement
         for name, manifold in (("flat", flat), ("bent", bent)):
-            problem = ManifoldProblem(linear, manifold, size * stretched)
+            problem = ManifoldProblem(linear, manifold, manifold.curvature(size * stretched))
             q = solve_equilibrium(problem, size * modes.T @ stretched, options=options).displacement
             errors[name].append(float(np.linalg.norm(manifold.at(q)[0] - exact)))
     assert 3.7 <= errors["flat"][0] / errors["flat"][1] <= 4.3
@@ -193,6 +194,23 @@ class _Recording:
         if name == "modes":
             self._asked.append(self._number)
         return getattr(self._problem, name)
+
+
+def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_answers(cache: Path) -> None:
+    """Also at a loose tolerance small loads get the linear response, since the correction is of the sampled stiffness."""
+    scene = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache).scene
+    forces = draw_loads(scene, 0, 30).nodal_forces(scene.patch_weights)
+    whole = mor_bench.load_method("quadratic-manifold", n_modes=4, cubature_tolerance=0.0).fit(scene, None)
+    sampled = QuadraticManifoldGalerkin(4, 1e-3, 1e-4).fit(scene, None)
+    assert len(sampled.cells_) < 0.3 * scene.mesh.n_cells
+    assert (sampled.weights_ > 0).all()
+    expected, found = whole.predict(forces), sampled.predict(forces)
+    apart = np.linalg.norm(found - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
+    assert np.median(apart) <= 1e-3
+    loose = QuadraticManifoldGalerkin(4, 0.1, 1e-8).fit(scene, None)
+    assert len(loose.cells_) < len(sampled.cells_)
+    linear = mor_bench.load_method("linear-fem").fit(scene, None).predict(1e-5 * forces)
+    np.testing.assert_allclose(loose.predict(1e-5 * forces), linear, rtol=0, atol=1e-4 * np.abs(linear).max())
 
 
 def test_the_autoencoder_learns_what_linear_elasticity_lacks(cache: Path) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import qr
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.assembly import State
+from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.linear import Factor
 from mor_bench.reduction.galerkin import GalerkinProblem, _symmetric_product
 from mor_bench.reduction.modal_derivatives import pairs
@@ -35,17 +36,19 @@ class QuadraticManifold:
         first, second = pairs(r)
         if derivatives.shape != (n, len(first)) or not np.isfinite(derivatives).all():
             raise InvalidInputError(f"`derivatives` must be a finite array of shape ({n}, {len(first)}); got shape {derivatives.shape}.")
-        self.modes = np.ascontiguousarray(modes)
+        # One memory order, fitted or loaded: BLAS rounds differently in another.
+        self.modes, self.derivatives = np.ascontiguousarray(modes), np.ascontiguousarray(derivatives)
         self._bend = np.empty((n, r, r))
         self._bend[:, first, second] = derivatives
         self._bend[:, second, first] = derivatives
 
     def at(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The displacement u(q), and what the tangent space T(q) has beyond Φ, (n, r)."""
+        """The displacement u(q), (n,), and the tangent space T(q), (n, r)."""
         if counting.running is not None:
             counting.running.add(multiply_adds=self._bend.size + self.modes.size)
         bent: NDArray[np.float64] = (self._bend.reshape(-1, len(q)) @ q).reshape(self.modes.shape)
-        return self.modes @ q + 0.5 * (bent @ q), bent
+        tangents = self.modes + bent
+        return 0.5 * ((self.modes + tangents) @ q), tangents
 
     def curvature(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
         """Σₐ fₐ ∂²uₐ/∂q², (r, r): the part of a tangent that comes of the manifold's own curvature."""
@@ -55,57 +58,82 @@ class QuadraticManifold:
         return (force @ self._bend.reshape(-1, r * r)).reshape(r, r)
 
 
+def manifold_system(
+    assembler: Assembler, cell_dofs: NDArray[np.int64], manifold: QuadraticManifold, states: list[NDArray[np.float64]]
+) -> NDArray[np.float64]:  # fmt: skip
+    """The ECSW training matrix on a manifold, compressed by QR as in `cubature.ecsw_system`.
+
+    G[(s, i), e] = T(q_s)ᵢᵀ f_e(u(q_s)); the target is G·1. Jain, Tiso: Hyper-reduction over nonlinear manifolds for large
+    nonlinear mechanical systems, J. Comput. Nonlinear Dynam. 14 (2019).
+
+    Parameters
+    ----------
+    assembler : Assembler
+        Over all cells.
+    cell_dofs : (n_cells, 24 or 12) int
+        Row of each cell's dofs; ``n_dofs`` for supports.
+    manifold : QuadraticManifold
+    states : list of (r,) float64
+        Coordinates q_s.
+    """
+    rows = []
+    for q in states:
+        u, tangents = manifold.at(q)
+        local = np.vstack([tangents, np.zeros(len(q))])[cell_dofs]
+        rows.append(np.einsum("eir,ei->re", local, assembler.cell_forces(u)))
+    return np.asarray(qr(np.concatenate(rows), mode="r", check_finite=False)[0][: assembler.n_cells])
+
+
 class ManifoldProblem:
     """The potential W(u(q)) - f·u(q) as a problem for the nonlinear solve, under the constant reduced load Φᵀf.
 
-    The rest of the load's work, f·(u(q) - Φq), counts as stored energy: force and tangent are exact derivatives of one
-    potential, so that all checks and safeguards of the solve hold, and a solution has no direction of negative curvature
+    The rest of the load's work, f·(u(q) - Φq) = ½ q·Bq, counts as stored energy: force and tangent are exact derivatives of
+    one potential, so that all checks and safeguards of the solve hold, and a solution has no direction of negative curvature
     on the manifold.
 
     Parameters
     ----------
     linear : GalerkinProblem
-        Over all cells, on Φ, the manifold's tangent space at rest.
+        On Φ, the manifold's tangent space at rest; over all cells or over weighted ones.
     manifold : QuadraticManifold
-    load : (n_free,) float64
-        f, N.
+        Of the dofs that the assembler sees.
+    bending_load : (r, r) float64
+        B = Σₐ fₐ ∂²uₐ/∂q² over all dofs, N/m.
     """
 
-    def __init__(self, linear: GalerkinProblem, manifold: QuadraticManifold, load: NDArray[np.float64]) -> None:
-        self._linear, self._manifold, self._load = linear, manifold, load
+    def __init__(self, linear: GalerkinProblem, manifold: QuadraticManifold, bending_load: NDArray[np.float64]) -> None:
+        self._linear, self._manifold, self._bending_load = linear, manifold, bending_load
         self.n_unknowns, self.extent, self.accelerator = linear.n_unknowns, linear.extent, None
 
     @property
     def rest_tangent(self) -> NDArray[np.float64]:
-        # The manifold's curvature times the load is left out: this is the stiffness at rest without a load.
+        # Without the load's part: it only scales shifts towards the rest and the first step from there.
         return self._linear.rest_tangent
 
     @property
     def rest_factor(self) -> Factor:
         return self._linear.rest_factor
 
-    def _state(self, q: NDArray[np.float64], state: State, bent: NDArray[np.float64]) -> State:
+    def _state(self, q: NDArray[np.float64], state: State, tangents: NDArray[np.float64]) -> State:
         if counting.running is not None:
-            counting.running.add(multiply_adds=2 * bent.size)
-        modes = self._linear.modes
-        # f·(u - Φq) = ½ f·(bent q)
-        stored = state.energy_j - 0.5 * float((self._load @ bent) @ q)
-        return State(modes.T @ state.force + bent.T @ (state.force - self._load), stored, state.min_det_f)
+            counting.running.add(multiply_adds=tangents.size)
+        done = self._bending_load @ q
+        return State(tangents.T @ state.force - done, state.energy_j - 0.5 * float(done @ q), state.min_det_f)
 
     def force(self, q: NDArray[np.float64]) -> State:
-        u, bent = self._manifold.at(q)
-        return self._state(q, self._linear.assembler.force(u), bent)
+        u, tangents = self._manifold.at(q)
+        return self._state(q, self._linear.assembler.force(u), tangents)
 
     def linearise(self, q: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
-        u, bent = self._manifold.at(q)
+        u, tangents = self._manifold.at(q)
         state, values = self._linear.assembler.force_and_tangent(u)
-        tangents = self._linear.modes + bent
         if counting.running is not None:  # KT with the K of which one triangle is stored, TᵀKT
             n, r = tangents.shape
             counting.running.add(multiply_adds=(2 * len(values) - n) * r + n * r**2)
         pattern, product = self._linear.assembler.pattern, np.zeros_like(tangents)
         _symmetric_product(pattern.indptr, pattern.indices, values, tangents, product)
-        return self._state(q, state, bent), tangents.T @ product + self._manifold.curvature(state.force - self._load)
+        bending = self._manifold.curvature(state.force) - self._bending_load
+        return self._state(q, state, tangents), tangents.T @ product + bending
 
     def step(
         self, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64], tolerance: float
