@@ -47,7 +47,10 @@ class Autoencoder(Surrogate):
     networks work between principal coordinates; there the latent coordinates are found by solving the equations, here by R.
     No load gives exactly no displacement.
 
-    DOCSTRING
+    Galerkin projection on the decoder's manifold was tried first and left out: with 5 latent coordinates (60 POD coordinates
+    of the whole displacement, 4,000 iterations, one hidden layer) it erred by a median of 9.2 % on the coarse beam and 1.3 %
+    on the L, against 9.6 % and 2.1 % of POD with 5 modes, at two to four times the cost; `quadratic-manifold` with 5 modes
+    erred by 0.13 % and 0.03 %. A plain network from z to c, without a latent space, was as good as this one or worse.
 
     Parameters
     ----------
@@ -93,9 +96,10 @@ class Autoencoder(Surrogate):
             weights = typical / np.maximum(sizes, SMALLEST * typical)
             inputs, outputs, each = (torch.from_numpy(a.astype(np.float32)) for a in (linear @ axes, targets / scale, weights[:, None]))
             regression, decoder = self._train(inputs, outputs, each)
-            state = {"axes": axes, "modes": modes * scale}
+            state = {"axes": axes, "modes": modes}
             for name, network in (("regression", regression), ("decoder", decoder)):
                 state.update({f"{name}.{layer}": weight.detach().numpy().astype(np.float64) for layer, weight in zip(LAYERS, network, strict=True)})
+            state["decoder.last"] *= scale
             self._restore(state)
         return self
 

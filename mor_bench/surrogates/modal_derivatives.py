@@ -20,8 +20,9 @@ from mor_bench.surrogate import Surrogate
 class ModalDerivatives(Surrogate):
     """A basis from the equations alone: principal linear responses to the scene's loads, and how they bend.
 
-    What the basis lacks of the linear response is added (`mor_bench.reduction.static_correction`); without that the
-    basis of 20 modes errs by DOCSTRING
+    What the basis lacks of the linear response is added (`mor_bench.reduction.static_correction`), which matters more than
+    the derivatives: without it, 20 modes (of 5 linear ones) erred by a median of 2.9 % on the coarse beam and 0.8 % on the L,
+    with it by 0.17 % and 0.08 %. The basis knows where the loads of the scene act; others get a linear response beyond it.
 
     Parameters
     ----------
