@@ -40,8 +40,8 @@ class LocalPOD(Surrogate):
     Clusters pay where bases are small; the static correction does most, see `static_correction`. Median relative l2 errors on
     the coarse beam (1,200 samples, split by region) with 5, 10 and 20 modes: 9.3, 3.0, 1.2 % of plain POD; 1.0, 0.32, 0.10 %
     with the correction and one cluster; 0.69, 0.22, 0.10 % with 32. Without the correction 8 clusters of 10 modes gained a
-    quarter, and 32 of 20 modes lost as much: too few samples each. Clusters of the coordinates themselves, sizes included,
-    gained less than clusters of directions. A basis of 20 modes enriched per query by the linear response, in place of the
+    fifth, and 32 of 20 modes lost two fifths: too few samples each. With it, clusters of the coordinates themselves, sizes
+    included, gained less than clusters of directions. A basis of 20 modes enriched per query by the linear response, in place of the
     correction, erred by 0.06 % instead of 0.10 %, and took half as long again: one of 40 with the correction is as good.
 
     Parameters
