@@ -96,6 +96,10 @@ RACES = (
     Race("l-shape", "hpod", ECSW, "pod", 1.5, 0.1, {"n_modes": 10}),  # 3.5, 0.02
     Race("beam-fine", "pod-tensor", {"n_modes": 20}, "pod", 100.0, 1e-3, {"n_modes": 20}),  # 450, 1e-5
     Race("beam-fine", "hybrid", {"steps": 1}, "fem", 2.0, 0.05),  # 6, 0.01
+    Race("l-shape", "autoencoder", {"n_latent": 10, "iterations": 300}, "fem", 2.0, 0.05),  # 9, 0.002
+    Race("l-shape", "local-pod", {"n_clusters": 8, "n_modes": 10}, "fem", 2.0, 0.1, {"solver": "cholesky"}),  # 8, 8e-4
+    Race("l-shape", "modal-derivatives", {"n_linear": 5, "n_modes": 20}, "fem", 2.0, 0.1, {"solver": "cholesky"}),  # 5, 0.001
+    Race("l-shape", "quadratic-manifold", {"n_modes": 5}, "pod", 1.3, 0.1, {"n_modes": 10}),  # 2.7, 0.006
     Race("l-shape", "pca-regression", {"n_input_modes": 10}, "fem", 2.0, 0.05),  # 8, 0.002
     Race("l-shape", "pca-regression-force", {"n_input_modes": 20, "n_output_modes": 20}, "fem", 5.0, 0.95),  # 54, 0.78 on so few samples
     Race("l-shape", "umesh", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 66, 0.56 after so short a training

@@ -1,0 +1,93 @@
+"""Bases that need no snapshots: the linear responses to a scene's loads, and how they bend as the body deforms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.reduction.basis import pod
+from mor_bench.scene.scene import Scene
+
+DIFFERENCE = 1e-3
+"""Largest displacement of the differences, relative to the body: truncation is of second order, round-off of minus second."""
+
+
+@dataclass(frozen=True)
+class LinearModes:
+    """Principal linear responses to a scene's loads.
+
+    Attributes
+    ----------
+    modes : (n_free, r) float64
+        Orthonormal.
+    amplitudes_m : (r,) float64
+        Root mean square coordinate over all patches under forces of the largest magnitude in every direction.
+    """
+
+    modes: NDArray[np.float64]
+    amplitudes_m: NDArray[np.float64]
+
+
+def linear_modes(scene: Scene, model: FullOrderModel, n_modes: int | None = None) -> LinearModes:
+    """The n_modes leading modes of the linear responses to a force along each axis on each load patch.
+
+    At most the rank of the responses, to which it is capped with a warning; all of it by default.
+    """
+    free = scene.free_dofs
+    on_nodes = scene.patch_weights.toarray()
+    forces = np.zeros((3, *on_nodes.shape, 3))
+    for axis in range(3):
+        forces[axis, :, :, axis] = on_nodes
+    responses = model.rest_factor.solve(forces.reshape(3 * len(on_nodes), -1)[:, free].T).T
+    basis = pod(responses, n_modes)
+    # A direction drawn evenly from the sphere has a mean square of 1/3 along each axis: the sum over axes, over patches.
+    size = scene.generated.loads.magnitude_n[1] / np.sqrt(3 * len(on_nodes))
+    return LinearModes(basis.modes, size * basis.singular_values[: basis.modes.shape[1]])
+
+
+def pairs(r: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The first and second numbers of all pairs i <= j < r."""
+    first, second = np.triu_indices(r)
+    return first.astype(np.int64), second.astype(np.int64)
+
+
+def modal_derivatives(model: FullOrderModel, modes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Static modal derivatives at rest, ψᵢⱼ = -K₀⁻¹ (∂K/∂qⱼ) φᵢ = -K₀⁻¹ f″[φᵢ, φⱼ], (n_free, r (r + 1) / 2) for `pairs`.
+
+    Idelsohn, Cardona: A reduction method for nonlinear structural dynamic analysis, CMAME 49 (1985); Barbič, James:
+    Real-time subspace integration for St. Venant-Kirchhoff deformable models, SIGGRAPH 2005, equation 14. They are symmetric
+    in i and j, since f″ is the third derivative of an energy.
+
+    The second derivative follows from forces alone: the even part e(x) = (f(x) + f(-x)) / 2 is f″[x, x] / 2 and terms of
+    fourth order, so that f″[a, b] = e(a + b) - e(a) - e(b). The force of Saint Venant-Kirchhoff is cubic and has no such
+    terms: there the formula is exact; for other laws its relative error is of the order of the squared strain of the step.
+    """
+    scales = DIFFERENCE * model.extent / np.abs(modes).max(axis=0)
+    steps = (modes * scales).T
+
+    def even(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return 0.5 * (model.force(x).force + model.force(-x).force)
+
+    own = [even(step) for step in steps]
+    products = [
+        (2.0 * own[i] if i == j else even(steps[i] + steps[j]) - own[i] - own[j]) / (scales[i] * scales[j])
+        for i, j in zip(*pairs(modes.shape[1]), strict=True)
+    ]  # fmt: skip
+    return -model.rest_factor.solve(np.array(products).T)
+
+
+def derivative_basis(scene: Scene, model: FullOrderModel, n_linear: int, n_modes: int) -> NDArray[np.float64]:
+    """An orthonormal basis of linear modes and the modal derivatives of the first n_linear, (n_free, n_modes).
+
+    All enter one singular value decomposition with the size that they have in the second-order expansion of a response,
+    u = Σ qᵢφᵢ + ½ Σ qᵢqⱼψᵢⱼ, at the coordinates' root mean square.
+    """
+    linear = linear_modes(scene, model)
+    n_linear = min(n_linear, linear.modes.shape[1])
+    first, second = pairs(n_linear)
+    sizes = np.where(first == second, 0.5, 1.0) * linear.amplitudes_m[first] * linear.amplitudes_m[second]
+    bent = modal_derivatives(model, linear.modes[:, :n_linear]) * sizes
+    return pod(np.vstack([(linear.modes * linear.amplitudes_m).T[: max(n_linear, n_modes)], bent.T]), n_modes).modes
