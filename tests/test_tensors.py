@@ -16,7 +16,6 @@ from mor_bench.errors import InvalidInputError, SolverError, UnsupportedSceneErr
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.tensors import ReducedTensors, TensorProblem, _pairs, reduce_energy
-from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.pod import PODGalerkin
@@ -43,13 +42,9 @@ def problems(scene: Scene, r: int = 6) -> tuple[GalerkinProblem, TensorProblem]:
     """The same reduced model by quadrature and by its polynomial, on a random basis."""
     model = FullOrderModel(scene)
     modes = np.linalg.qr(np.random.default_rng(1).normal(size=(model.n_unknowns, r)))[0]
-    assert isinstance(scene.material, SaintVenantKirchhoff)
     samples = 0.1 * np.random.default_rng(2).normal(size=(40, r))
-    tensors, sentinels = reduce_energy(
-        scene.mesh.points, scene.mesh.cells, model.cell_dofs, modes, scene.material, scene.selective, samples
-    )  # fmt: skip
     galerkin = GalerkinProblem(model.assembler, modes)
-    return galerkin, TensorProblem(tensors, sentinels, galerkin.extent)
+    return galerkin, TensorProblem.of_modes(model, modes, samples)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -77,12 +72,11 @@ def test_derivatives_are_symmetric_in_all_indices() -> None:
 
 
 def test_leading_modes_have_the_leading_part_of_the_arrays() -> None:
-    large, small = problems(scene_of("H8"), 6)[1].tensors, None
+    large = problems(scene_of("H8"), 6)[1].tensors
     scene = scene_of("H8")
     model = FullOrderModel(scene)
     modes = np.linalg.qr(np.random.default_rng(1).normal(size=(model.n_unknowns, 6)))[0][:, :3]
-    assert isinstance(scene.material, SaintVenantKirchhoff)
-    small = reduce_energy(scene.mesh.points, scene.mesh.cells, model.cell_dofs, modes, scene.material, False, np.zeros((1, 3)))[0]
+    small = reduce_energy(model, modes)
     np.testing.assert_allclose(small.quartic, large.quartic[:6, :6], rtol=0, atol=1e-12 * np.abs(small.quartic).max())
 
 

@@ -10,6 +10,7 @@ Pairs (i <= j) are numbered j (j + 1) / 2 + i, so that the leading modes' own po
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -24,9 +25,11 @@ from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.assembly import State, quadrature_of
 from mor_bench.mechanics.linear import Factor
-from mor_bench.mechanics.newton import HOPELESS
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import HOPELESS, NewtonOptions, solve_equilibrium
 from mor_bench.reduction.galerkin import dense_factor
 from mor_bench.scene.materials import SaintVenantKirchhoff
+from mor_bench.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -35,6 +38,9 @@ CHUNK_BYTES = 64e6
 
 MAX_SENTINELS = 64
 """Quadrature points at which det F is watched."""
+
+MOST_MODES = 100
+"""The polynomial of more would take a gigabyte."""
 
 QUICK_ITERATIONS = 15
 """Newton steps before the safeguarded solve takes over; 3 to 6 are usual."""
@@ -110,55 +116,39 @@ def _strains(gradients: Any, shape_scale: Any, volume_scale: Any, rows: Any) -> 
                 out[5, first + i] = b * trace * (x + y + z)
 
 
-def reduce_energy(
-    points: Array,
-    cells: NDArray[np.int64],
-    cell_dofs: NDArray[np.int64],
-    modes: Array,
-    material: SaintVenantKirchhoff,
-    selective: bool,
-    samples: Array,
-) -> tuple[ReducedTensors, Array]:
-    """Sum the reduced energy over a mesh, and find the points where det F is to be watched.
+class _Gradients:
+    """Gradients of the modes at the quadrature points of a mesh, a few cells at a time."""
 
-    Parameters
-    ----------
-    points : (n_nodes, 3) float64
-        m.
-    cells : (n_cells, n_cell_nodes) int
-    cell_dofs : (n_cells, 3 n_cell_nodes) int
-        Row of Φ of each cell's dofs; the number of rows for supports.
-    modes : (n_dofs, r) float64
-        Φ.
-    material : SaintVenantKirchhoff
-    selective : bool
-        As of `Assembler`.
-    samples : (n_samples, r) float64
-        Reduced coordinates of typical displacements.
+    def __init__(self, model: FullOrderModel, modes: Array, chunk_bytes_per_point: int) -> None:
+        mesh, scene = model.scene.mesh, model.scene
+        assert scene.material is not None
+        self.quadrature = quadrature_of(mesh.points, mesh.cells, scene.material, scene.selective)
+        self.n_modes = modes.shape[1]
+        self._local = np.vstack([modes, np.zeros(self.n_modes)])
+        self._cell_dofs = model.cell_dofs
+        self._step = max(1, int(CHUNK_BYTES / (chunk_bytes_per_point * self.quadrature.gradients.shape[1])))
 
-    Returns
-    -------
-    tensors : ReducedTensors
-    sentinels : (n, 9, r) float64
-        Gradients of the modes at those points, at most `MAX_SENTINELS`, where the samples have their smallest det F.
-    """
-    quadrature = quadrature_of(points, cells, material, selective)
-    n_cells, n_points, n_nodes, _ = quadrature.gradients.shape
+    def __iter__(self) -> Iterator[tuple[slice, Array]]:
+        """Cells, and Hᵢ at their points (n, 3, 3, r)."""
+        n_cells, _, n_nodes, _ = self.quadrature.gradients.shape
+        for first in range(0, n_cells, self._step):
+            part = slice(first, first + self._step)
+            local = self._local[self._cell_dofs[part]].reshape(-1, n_nodes, 3, self.n_modes)
+            gradients = np.einsum("cqaj,caim->cqijm", self.quadrature.gradients[part], local, optimize=True)
+            yield part, gradients.reshape(-1, 3, 3, self.n_modes)
+
+
+def reduce_energy(model: FullOrderModel, modes: Array) -> ReducedTensors:
+    """Sum the reduced energy of Saint Venant-Kirchhoff over a mesh, for modes (n_free, r)."""
     r = modes.shape[1]
     width = r + n_pairs(r)
-    padded = np.vstack([modes, np.zeros(r)])
     gram = np.zeros((width, width))
-    step = max(1, int(CHUNK_BYTES / (8 * 6 * width * n_points)))
-    least, where = np.full(len(samples), np.inf), np.zeros(len(samples), dtype=np.int64)
-    watched: dict[int, Array] = {}
-    for first in range(0, n_cells, step):
-        part = slice(first, first + step)
-        local = padded[cell_dofs[part]].reshape(-1, n_nodes, 3, r)
-        gradients = np.einsum("cqaj,caim->cqijm", quadrature.gradients[part], local, optimize=True).reshape(-1, 3, 3, r)
+    points = _Gradients(model, modes, 8 * 6 * width)
+    for part, gradients in points:
         # E:C:E = 2μ |dev E|² + (3λ + 2μ) |vol E|²; both are >= 0 but for the volumetric part alone of a negative Poisson's ratio.
-        lame_lambda, lame_mu = np.tile(quadrature.parameters, (len(local), 1)).T
-        weights = quadrature.weights[part].ravel()
-        shape, volume = 2 * lame_mu * weights, (3 * lame_lambda + 2 * lame_mu) * weights
+        weights = points.quadrature.weights[part]
+        lame_lambda, lame_mu = np.tile(points.quadrature.parameters, (len(weights), 1)).T
+        shape, volume = 2 * lame_mu * weights.ravel(), (3 * lame_lambda + 2 * lame_mu) * weights.ravel()
         rows = np.empty((len(gradients), 6, width))
         _strains(gradients, np.sqrt(shape), np.sqrt(np.abs(volume)), rows)
         flat = rows.reshape(-1, width)
@@ -166,26 +156,30 @@ def reduce_energy(
         if (volume < 0).any():
             wrong = rows[volume < 0, 5]
             gram -= 2 * wrong.T @ wrong
-        _watch(gradients.reshape(-1, 9, r), samples, first * n_points, least, where, watched)
-    chosen = list(dict.fromkeys(where[np.argsort(least, kind="stable")].tolist()))[:MAX_SENTINELS]
-    return _symmetric(gram, r), np.array([watched[number] for number in chosen]).reshape(-1, 9, r)
+    return _symmetric(gram, r)
 
 
-def _watch(gradients: Array, samples: Array, first: int, least: Array, where: NDArray[np.int64], watched: dict[int, Array]) -> None:
-    """Note each sample's smallest det F so far and its point, whose gradients (9, r) are kept."""
-    for start in range(0, len(samples), 32):
-        part = slice(start, start + 32)
-        F = (gradients.reshape(-1, gradients.shape[2]) @ samples[part].T).reshape(-1, 9, len(samples[part])) + np.eye(3).reshape(1, 9, 1)
-        det = (
-            F[:, 0] * (F[:, 4] * F[:, 8] - F[:, 5] * F[:, 7])
-            - F[:, 1] * (F[:, 3] * F[:, 8] - F[:, 5] * F[:, 6])
-            + F[:, 2] * (F[:, 3] * F[:, 7] - F[:, 4] * F[:, 6])
-        )
+def sentinels_of(model: FullOrderModel, modes: Array, samples: Array) -> Array:
+    """Gradients of the modes (n, 9, r) at those points where typical states have their smallest det F.
+
+    Parameters
+    ----------
+    model : FullOrderModel
+    modes : (n_free, r) float64
+    samples : (n_samples, r) float64
+        Reduced coordinates of the states; at most `MAX_SENTINELS` points are kept, of the smallest det F.
+    """
+    least, watched = np.full(len(samples), np.inf), np.zeros((len(samples), 9, modes.shape[1]))
+    for _, gradients in _Gradients(model, modes, 8 * 9 * (modes.shape[1] + len(samples))):
+        H = gradients.reshape(-1, 9, modes.shape[1])
+        F = (H.reshape(-1, H.shape[2]) @ samples.T).reshape(-1, 9, len(samples)) + np.eye(3).reshape(1, 9, 1)
+        det = np.linalg.det(np.moveaxis(F, 1, 2).reshape(-1, 3, 3)).reshape(-1, len(samples))
         lowest = det.argmin(axis=0)
-        smaller = np.flatnonzero(det.min(axis=0) < least[part])
-        for s in smaller:
-            least[start + s], where[start + s] = det[lowest[s], s], first + lowest[s]
-            watched[first + int(lowest[s])] = gradients[lowest[s]].copy()
+        lower = np.flatnonzero(det.min(axis=0) < least)
+        least[lower], watched[lower] = det[lowest[lower], lower], H[lowest[lower]]
+    points = watched[np.argsort(least, kind="stable")]
+    first = np.unique(points, axis=0, return_index=True)[1]  # many samples share a point
+    return points[np.sort(first)[:MAX_SENTINELS]]
 
 
 def _symmetric(gram: Array, r: int) -> ReducedTensors:
@@ -307,6 +301,16 @@ def _min_det_f(sentinels, q):  # type: ignore[no-untyped-def]
     return least
 
 
+def has_polynomial(scene: Scene) -> bool:
+    """Whether the scene's energy is a polynomial of the displacement."""
+    return isinstance(scene.material, SaintVenantKirchhoff)
+
+
+def extent_of(scene: Scene) -> float:
+    """Coordinates of orthonormal modes that are displacements of the size of the body."""
+    return float(np.ptp(scene.mesh.points, axis=0).max() * np.sqrt(len(scene.free_dofs)))
+
+
 class TensorProblem:
     """A reduced model of Saint Venant-Kirchhoff by its polynomial.
 
@@ -341,6 +345,27 @@ class TensorProblem:
             self._rest = np.ascontiguousarray(cholesky(tensors.quadratic, lower=True))
         except LinAlgError:
             raise InvalidInputError("`quadratic`, the reduced stiffness at rest, must be positive definite.") from None
+
+    @classmethod
+    def of_modes(cls, model: FullOrderModel, modes: Array, samples: Array) -> TensorProblem:
+        """Of modes (n_free, r) of a mesh; det F is watched where states with coordinates ``samples`` (n, r) have their smallest."""
+        return cls(reduce_energy(model, modes), sentinels_of(model, modes, samples), extent_of(model.scene))
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """What `of_arrays` makes it from."""
+        return {**vars(self.tensors), "sentinels": self.sentinels}
+
+    @classmethod
+    def of_arrays(cls, scene: Scene, arrays: Mapping[str, Array]) -> TensorProblem:
+        """From arrays that were saved; raises `InvalidInputError`, or KeyError, where they make none."""
+        tensors = ReducedTensors(*(arrays[name] for name in ("quadratic", "cubic", "quartic")))
+        return cls(tensors, arrays["sentinels"], extent_of(scene))
+
+    def solve(self, load: Array, tolerance: float) -> Array:
+        """Reduced coordinates (r,) at the equilibrium under a load Φᵀf; raises `SolverError` where there is none."""
+        q = self.quick(load, tolerance)
+        return solve_equilibrium(self, load, options=NewtonOptions(tolerance)).displacement if q is None else q
 
     def quick(self, load: Array, tolerance: float) -> Array | None:
         """The equilibrium (r,) by full Newton steps, or None where they lead to none that is stable with det F > 0."""

@@ -10,18 +10,13 @@ from pydantic import Field
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
-from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto, size_to_needs
 from mor_bench.reduction.subspace import Subspace
-from mor_bench.reduction.tensors import ReducedTensors, TensorProblem, reduce_energy
-from mor_bench.scene.materials import SaintVenantKirchhoff
+from mor_bench.reduction.tensors import MOST_MODES, TensorProblem, has_polynomial
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
-
-MOST_MODES = 100
-"""The polynomial of more would take a gigabyte."""
 
 N_WATCHED = 300
 """Training samples, spread evenly, that tell where det F is to be watched."""
@@ -52,7 +47,7 @@ class TensorPOD(Surrogate):
         self.tolerance = tolerance
 
     def supports(self, scene: Scene) -> str | None:
-        if scene.material is not None and not isinstance(scene.material, SaintVenantKirchhoff):
+        if scene.material is not None and not has_polynomial(scene):
             return f"only the energy of saint-venant-kirchhoff is a polynomial of the displacement; this law is {scene.generated.material.law}"
         return unknown_equations(scene)
 
@@ -63,34 +58,24 @@ class TensorPOD(Surrogate):
             displacements, knobs = known.free_displacements, size_to_needs(self, scene, known, rungs)
             modes = pod(displacements, knobs["n_modes"]).modes
             chosen = np.unique(np.linspace(0, len(displacements) - 1, N_WATCHED).astype(int))
-            mesh, model = scene.mesh, FullOrderModel(scene)
-            assert isinstance(scene.material, SaintVenantKirchhoff)
-            tensors, sentinels = reduce_energy(
-                mesh.points, mesh.cells, model.cell_dofs, modes, scene.material, scene.selective, displacements[chosen] @ modes
-            )
-            self._restore({"modes": modes, **vars(tensors), "sentinels": sentinels})
+            problem = TensorProblem.of_modes(FullOrderModel(scene), modes, displacements[chosen] @ modes)
+            self._restore({"modes": modes, **problem.arrays})
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
         out = np.empty((len(batch), self.scene_.mesh.n_dofs))
         for row, load in zip(out, batch.reshape(out.shape), strict=True):
-            reduced = self._subspace.project(load)
-            q = self.problem_.quick(reduced, self.tolerance_)
-            if q is None:
-                q = solve_equilibrium(self.problem_, reduced, options=NewtonOptions(self.tolerance_)).displacement
-            self._subspace.expand(q, row)
+            self._subspace.expand(self.problem_.solve(self._subspace.project(load), self.tolerance_), row)
         return out.reshape(batch.shape).reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        return {"modes": self.modes_, **vars(self.problem_.tensors), "sentinels": self.problem_.sentinels}
+        return {"modes": self.modes_, **self.problem_.arrays}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        modes, tensors = state["modes"], ReducedTensors(state["quadratic"], state["cubic"], state["quartic"])
-        shape = len(self.scene_.free_dofs), tensors.n_modes
+        modes, self.problem_ = state["modes"], TensorProblem.of_arrays(self.scene_, state)
+        shape = len(self.scene_.free_dofs), self.problem_.n_unknowns
         if modes.shape != shape or not np.isfinite(modes).all():
             raise InvalidInputError(f"`modes` must be a finite array of shape {shape}; got shape {modes.shape}.")
         self.modes_, self.tolerance_ = modes, self._sized("tolerance")
-        extent = float(np.ptp(self.scene_.mesh.points, axis=0).max() * np.sqrt(len(modes)))
-        self.problem_ = TensorProblem(tensors, state["sentinels"], extent)
         self._subspace = Subspace(self.scene_, modes)
