@@ -156,13 +156,16 @@ def test_a_load_is_answered_from_the_basis_of_its_direction(tiny: Dataset) -> No
     """Scaling a load changes no cluster; one cluster is a global basis, and clusters beyond the directions are not made."""
     method = LocalPOD(n_clusters=4, n_modes=3).fit(tiny.scene, tiny.train)
     assert len(method.problems_) == 4
-    asked: list[int] = []
-    method.problems_ = [_Recording(problem, number, asked) for number, problem in enumerate(method.problems_)]  # type: ignore[misc]
-    for force in tiny.test.forces[:8]:
-        for size in (1.0, 0.01):
-            method.predict(size * force)
-    assert asked[::2] == asked[1::2]
+    loads = tiny.test.forces[:8].reshape(8, -1)[:, tiny.scene.free_dofs]
+    asked = [method._nearest(load) for load in loads]
+    assert asked == [method._nearest(0.01 * load) for load in loads]
     assert len(set(asked)) > 1
+    first, other = (asked.index(number) for number in sorted(set(asked))[:2])
+    before = method.predict(tiny.test.forces[[first, other]])
+    method.problems_[asked[first]], method.bases_[asked[first]] = method.problems_[asked[other]], method.bases_[asked[other]]
+    after = method.predict(tiny.test.forces[[first, other]])
+    assert (after[0] != before[0]).any()
+    assert (after[1] == before[1]).all()
     assert len(LocalPOD(n_clusters=500, n_modes=1).fit(tiny.scene, tiny.train[:6]).problems_) == 6
 
 
@@ -182,18 +185,6 @@ def test_of_clusters_of_like_loads_each_does_better_than_one_basis(cache: Path) 
         found = LocalPOD(n_clusters, 5, 1e-4).fit(data.scene, data.train).predict(data.test.forces)
         medians.append(np.median(np.linalg.norm(found - data.test.displacements, axis=(1, 2)) / np.linalg.norm(data.test.displacements, axis=(1, 2))))
     assert medians[1] < 0.85 * medians[0]
-
-
-class _Recording:
-    """A problem that notes when it is solved."""
-
-    def __init__(self, problem: GalerkinProblem, number: int, asked: list[int]) -> None:
-        self._problem, self._number, self._asked = problem, number, asked
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "modes":
-            self._asked.append(self._number)
-        return getattr(self._problem, name)
 
 
 def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_answers(cache: Path) -> None:

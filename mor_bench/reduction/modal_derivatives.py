@@ -31,20 +31,24 @@ class LinearModes:
     amplitudes_m: NDArray[np.float64]
 
 
+def patch_responses(scene: Scene, model: FullOrderModel) -> NDArray[np.float64]:
+    """Linear responses (3 n_patches, n_free), m/N, to a force of one newton along each axis on each load patch."""
+    on_nodes = scene.patch_weights.toarray()
+    forces = np.zeros((3, *on_nodes.shape, 3))
+    for axis in range(3):
+        forces[axis, :, :, axis] = on_nodes
+    return model.rest_factor.solve(forces.reshape(3 * len(on_nodes), -1)[:, scene.free_dofs].T).T
+
+
 def linear_modes(scene: Scene, model: FullOrderModel, n_modes: int | None = None) -> LinearModes:
     """The n_modes leading modes of the linear responses to a force along each axis on each load patch.
 
     At most the rank of the responses, to which it is capped with a warning; all of it by default.
     """
-    free = scene.free_dofs
-    on_nodes = scene.patch_weights.toarray()
-    forces = np.zeros((3, *on_nodes.shape, 3))
-    for axis in range(3):
-        forces[axis, :, :, axis] = on_nodes
-    responses = model.rest_factor.solve(forces.reshape(3 * len(on_nodes), -1)[:, free].T).T
+    responses = patch_responses(scene, model)
     basis = pod(responses, n_modes)
     # A direction drawn evenly from the sphere has a mean square of 1/3 along each axis: the sum over axes, over patches.
-    size = scene.generated.loads.magnitude_n[1] / np.sqrt(3 * len(on_nodes))
+    size = scene.generated.loads.magnitude_n[1] / np.sqrt(len(responses))
     return LinearModes(basis.modes, size * basis.singular_values[: basis.modes.shape[1]])
 
 

@@ -14,6 +14,7 @@ from mor_bench import counting
 from mor_bench.mechanics.linear import Factor
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.galerkin import GalerkinProblem
+from mor_bench.reduction.tensors import TensorProblem
 
 
 def static_correction(rest_factor: Factor, reduced_factor: Factor, modes: NDArray[np.float64], load: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -45,16 +46,20 @@ def static_correction(rest_factor: Factor, reduced_factor: Factor, modes: NDArra
 
 
 def predict_corrected(
-    problem: GalerkinProblem, rest_factor: Factor, loads: NDArray[np.float64], tolerance: float
-) -> NDArray[np.float64]:  # fmt: skip
+    problem: GalerkinProblem | TensorProblem, modes: NDArray[np.float64], rest_factor: Factor, loads: NDArray[np.float64], tolerance: float
+) -> NDArray[np.float64]:
     """Reduced equilibria under loads (n, n_free), N, with their static corrections, (n, n_free) m.
 
-    The basis must hold all free dofs. Raises `SolverError` if the reduced model has no valid equilibrium.
+    The modes are those of the problem on all free dofs. Raises `SolverError` if the reduced model has no valid equilibrium.
     """
-    modes, out = problem.modes, np.empty(loads.shape)
+    out = np.empty(loads.shape)
     if counting.running is not None:
         counting.running.add(multiply_adds=2 * modes.size * len(loads))
     for row, load in zip(out, loads, strict=True):
-        q = solve_equilibrium(problem, modes.T @ load, options=NewtonOptions(tolerance)).displacement
-        row[:] = modes @ q + static_correction(rest_factor, problem.rest_factor, modes, load)
+        reduced = modes.T @ load
+        if isinstance(problem, TensorProblem):
+            q = problem.solve(reduced, tolerance)
+        else:
+            q = solve_equilibrium(problem, reduced, options=NewtonOptions(tolerance)).displacement
+        row[:] = rest_factor.solve(load) + modes @ (q - problem.rest_factor.solve(reduced))
     return out

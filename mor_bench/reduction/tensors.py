@@ -306,6 +306,11 @@ def has_polynomial(scene: Scene) -> bool:
     return isinstance(scene.material, SaintVenantKirchhoff)
 
 
+def exact_polynomial(scene: Scene, modes: Array) -> bool:
+    """Whether a model reduced to these modes is best solved by its polynomial."""
+    return has_polynomial(scene) and modes.shape[1] <= MOST_MODES
+
+
 def extent_of(scene: Scene) -> float:
     """Coordinates of orthonormal modes that are displacements of the size of the body."""
     return float(np.ptp(scene.mesh.points, axis=0).max() * np.sqrt(len(scene.free_dofs)))

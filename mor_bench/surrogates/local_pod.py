@@ -15,6 +15,7 @@ from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.static_correction import predict_corrected
+from mor_bench.reduction.tensors import TensorProblem, exact_polynomial
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
@@ -24,6 +25,9 @@ N_COORDINATES = 12
 
 OVERLAP = 0.5
 """Samples of other clusters, nearest first, that a basis learns from too, as a fraction of its own."""
+
+N_WATCHED = 300
+"""Samples of a cluster that tell where det F is to be watched."""
 
 LINEAR_WEIGHT = 0.2
 """Weight of the linear responses among the snapshots: the static correction gives them, but they must be able to turn and bend."""
@@ -87,8 +91,15 @@ class LocalPOD(Surrogate):
                 n_near = max(round(OVERLAP * len(own)), self.n_modes - len(own))  # a small cluster still fills its basis
                 near = others[np.argsort(distances[others, cluster], kind="stable")[:n_near]]
                 bases.append(pod(both[np.append(own, near)].reshape(-1, both.shape[2]), self.n_modes).modes)
+            polynomials: dict[str, NDArray[np.float64]] = {}
+            for cluster, basis in enumerate(bases):
+                if exact_polynomial(scene, basis):
+                    own = snapshots.free_displacements[labels == cluster][:N_WATCHED]
+                    problem = TensorProblem.of_modes(model, basis, own @ basis)
+                    polynomials |= {f"{name}.{cluster}": array for name, array in problem.arrays.items()}
             self._restore(
                 {
+                    **polynomials,
                     "to_coordinates": model.rest_factor.solve(axes),
                     "centroids": centroids,
                     "sizes": np.array([basis.shape[1] for basis in bases]),
@@ -104,15 +115,29 @@ class LocalPOD(Surrogate):
         if counting.running is not None:
             counting.running.add(multiply_adds=len(batch) * (self.to_coordinates_.size + self.centroids_.size))
         for row, load in zip(out, batch.reshape(out.shape)[:, free], strict=True):
-            direction = _directions((load @ self.to_coordinates_)[None])
-            nearest = int(((direction - self.centroids_) ** 2).sum(axis=1).argmin())
-            row[free] = predict_corrected(self.problems_[nearest], self.model_.rest_factor, load[None], self.tolerance)[0]
+            nearest = self._nearest(load)
+            row[free] = predict_corrected(self.problems_[nearest], self.bases_[nearest], self.model_.rest_factor, load[None], self.tolerance)[0]
         return out.reshape(np.shape(forces))
 
+    def _nearest(self, load: NDArray[np.float64]) -> int:
+        """The cluster whose directions are nearest to that of a load (n_free,)."""
+        direction = _directions((load @ self.to_coordinates_)[None])
+        return int(((direction - self.centroids_) ** 2).sum(axis=1).argmin())
+
     def _state(self) -> dict[str, NDArray[Any]]:
-        sizes = np.array([problem.n_unknowns for problem in self.problems_])
-        modes = np.hstack([problem.modes for problem in self.problems_])
-        return {"to_coordinates": self.to_coordinates_, "centroids": self.centroids_, "sizes": sizes, "modes": modes}
+        polynomials = {
+            f"{name}.{cluster}": array
+            for cluster, problem in enumerate(self.problems_)
+            if isinstance(problem, TensorProblem)
+            for name, array in problem.arrays.items()
+        }
+        return {
+            **polynomials,
+            "to_coordinates": self.to_coordinates_,
+            "centroids": self.centroids_,
+            "sizes": np.array([basis.shape[1] for basis in self.bases_]),
+            "modes": np.hstack(self.bases_),
+        }
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         state = {name: np.ascontiguousarray(array) for name, array in state.items()}
@@ -129,9 +154,17 @@ class LocalPOD(Surrogate):
             raise InvalidInputError(f"`sizes` must be {n_clusters} positive integers.")
         self.to_coordinates_, self.centroids_ = state["to_coordinates"], state["centroids"]
         self.model_ = FullOrderModel(self.scene_)
-        bases = np.split(state["modes"], np.cumsum(sizes)[:-1], axis=1)
-        self.problems_ = [GalerkinProblem(self.model_.assembler, basis) for basis in bases]
+        self.bases_ = [np.ascontiguousarray(basis) for basis in np.split(state["modes"], np.cumsum(sizes)[:-1], axis=1)]
+        self.problems_ = [self._problem(cluster, basis, state) for cluster, basis in enumerate(self.bases_)]
         _ = self.model_.rest_factor, [problem.rest_factor for problem in self.problems_]
+
+    def _problem(
+        self, cluster: int, basis: NDArray[np.float64], state: dict[str, NDArray[Any]]
+    ) -> GalerkinProblem | TensorProblem:  # fmt: skip
+        if not exact_polynomial(self.scene_, basis):
+            return GalerkinProblem(self.model_.assembler, basis)
+        own = {name.removesuffix(f".{cluster}"): array for name, array in state.items() if name.endswith(f".{cluster}")}
+        return TensorProblem.of_arrays(self.scene_, own)
 
 
 def _directions(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,11 +10,15 @@ from pydantic import Field
 
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.galerkin import GalerkinProblem
-from mor_bench.reduction.modal_derivatives import derivative_basis
+from mor_bench.reduction.modal_derivatives import derivative_basis, patch_responses
 from mor_bench.reduction.static_correction import predict_corrected
+from mor_bench.reduction.tensors import TensorProblem, exact_polynomial
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
+
+N_WATCHED = 300
+"""Linear responses to the largest loads that tell where det F is to be watched."""
 
 
 class ModalDerivatives(Surrogate):
@@ -52,21 +56,32 @@ class ModalDerivatives(Surrogate):
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         """Compute the basis; snapshots are not looked at."""
         with self._fitting(scene):
-            self._restore({"modes": derivative_basis(scene, FullOrderModel(scene), self.n_linear, self.n_modes)})
+            model = FullOrderModel(scene)
+            modes = derivative_basis(scene, model, self.n_linear, self.n_modes)
+            state = {"modes": modes}
+            if exact_polynomial(scene, modes):
+                largest = scene.generated.loads.magnitude_n[1] * patch_responses(scene, model) @ modes
+                chosen = np.unique(np.linspace(0, len(largest) - 1, N_WATCHED // 2).astype(int))
+                state |= TensorProblem.of_modes(model, modes, np.vstack([largest[chosen], -largest[chosen]])).arrays
+            self._restore(state)
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
         out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
         free = self.scene_.free_dofs
-        out[:, free] = predict_corrected(self.problem_, self.model_.rest_factor, batch.reshape(out.shape)[:, free], self.tolerance)
+        out[:, free] = predict_corrected(self.problem_, self.modes_, self.model_.rest_factor, batch.reshape(out.shape)[:, free], self.tolerance)
         return out.reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        return {"modes": self.modes_}
+        return {"modes": self.modes_, **(self.problem_.arrays if isinstance(self.problem_, TensorProblem) else {})}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         self.modes_ = state["modes"]
         self.model_ = FullOrderModel(self.scene_)
-        self.problem_ = GalerkinProblem(self.model_.assembler, self.modes_)
+        self.problem_: GalerkinProblem | TensorProblem = (
+            TensorProblem.of_arrays(self.scene_, state)
+            if exact_polynomial(self.scene_, self.modes_)
+            else GalerkinProblem(self.model_.assembler, self.modes_)
+        )
         _ = self.problem_.rest_factor, self.model_.rest_factor
