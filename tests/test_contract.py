@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,10 +20,11 @@ from mor_bench.surrogate import Surrogate
 from mor_bench.surrogate import _digest as file_digest
 
 CHEAP_UMESH = {"channels": 8, "steps": 1, "iterations": 150, "batch_size": 16, "learning_rate": 3e-3}
-CHEAP = {"umesh": CHEAP_UMESH, "umesh-small": CHEAP_UMESH}
+CHEAP_PGD = {"n_terms": 20, "position_degree": 2}
+CHEAP: dict[str, dict[str, Any]] = {"umesh": CHEAP_UMESH, "umesh-small": CHEAP_UMESH, "pgd": CHEAP_PGD, "pgd-force": CHEAP_PGD}
 """Parameters that keep a costly method's battery short."""
 
-NEEDS_NO_SNAPSHOTS = ("fem", "fem-coarse", "fem-jacobi-pcg", "fem-pardiso", "linear-fem")
+NEEDS_NO_SNAPSHOTS = ("explicit-dynamics", "fem", "fem-coarse", "fem-jacobi-pcg", "fem-pardiso", "linear-fem")
 
 FAR_BETTER = {"UMesh": 0.9, "CoarseFEM": 0.3}
 """Bounds, by class, on the mean error over that of no prediction: a short training, and a mesh of 3 cells."""

@@ -37,6 +37,7 @@ def test_every_shipped_dataset_is_pinned_to_its_counts() -> None:
 CONFIGURATIONS = {
     "fem": 4, "fem-coarse": 4, "fem-jacobi-pcg": 1, "fem-pardiso": 1, "fem-warm": 8, "hpod": 6, "linear-fem": 1,
     "pca-regression": 3, "pca-regression-force": 1, "pod": 7, "umesh": 1, "umesh-small": 2,
+    "explicit-dynamics": 6, "pgd": 6, "pgd-force": 3,
 }  # fmt: skip
 
 
