@@ -95,7 +95,7 @@ def test_an_inverted_body_is_never_an_answer() -> None:
     assert len(refused) < 12
 
 
-def test_a_body_that_came_to_rest_inverted_is_let_go_slowly() -> None:
+def test_a_body_that_came_to_rest_inverted_is_let_go_once_more() -> None:
     full = model("mooney-rivlin")
     relaxed = DynamicRelaxation(full)
     for load in loads(full, [20, 27, 38], 20.0):

@@ -249,11 +249,10 @@ def internal_force_and_tangent(u, dofs, gradients, w_lam, w_mu, slots, force, va
 RUNNING, MET, DIVERGED = range(3)
 """How a step of dynamic relaxation ended."""
 
-TARGET, STEP, LOWEST, SHARE, RAMP, LIMIT = range(6)
-"""Places in `advance`'s control: squares of the residual to reach, of the step times highest frequency 1, and of the lowest frequency; share of
-the load and its growth per step; square of the residual that is divergence."""
+TARGET, STEP, LOWEST, LIMIT = range(4)
+"""Places in `advance`'s control: squares of the residual to reach, of the step, of the lowest frequency, and of the residual that is divergence."""
 
-ADVANCE_MULTIPLY_ADDS = 8
+ADVANCE_MULTIPLY_ADDS = 7
 """Of `advance` for each unknown."""
 
 MOST_CURVATURE = 3.8
@@ -283,7 +282,8 @@ def advance(u, v, force, before, load, mass, control):
         Internal force before the last step, N.
     load, mass : (n_dofs,) float64
         N, and N/m: eigenvalues of M⁻¹K are pure numbers.
-    control : (6,) float64
+    control : (4,) float64
+        The step's square may become less.
 
     Returns
     -------
@@ -296,7 +296,7 @@ def advance(u, v, force, before, load, mass, control):
         residual += r * r
         curvature += v[i] * (force[i] - before[i])
         inertia += mass[i] * v[i] * v[i]
-    if control[SHARE] == 1.0 and residual <= control[TARGET]:
+    if residual <= control[TARGET]:
         return MET
     if not residual <= control[LIMIT]:
         return DIVERGED
@@ -308,14 +308,13 @@ def advance(u, v, force, before, load, mass, control):
             control[STEP] *= shorter * shorter
         lowest = min(lowest, max(quotient, LEAST_LOWEST * lowest))
     c = min(2.0 * sqrt(lowest * control[STEP]), 1.9)
-    keep, push, share = shorter * (2.0 - c) / (2.0 + c), 2.0 * control[STEP] / (2.0 + c), control[SHARE]
+    keep, push = shorter * (2.0 - c) / (2.0 + c), 2.0 * control[STEP] / (2.0 + c)
     for i in range(len(load)):
-        v[i] = keep * v[i] + push * (share * load[i] - force[i]) / mass[i]
+        v[i] = keep * v[i] + push * (load[i] - force[i]) / mass[i]
         u[i] += v[i]
         before[i] = force[i]
         force[i] = 0.0
     force[len(load)] = 0.0
-    control[SHARE] = min(1.0, share + control[RAMP])
     return RUNNING
 
 

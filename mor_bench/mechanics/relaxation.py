@@ -33,11 +33,8 @@ POWER_ITERATIONS = 60
 GROWN = 1e6
 """A residual this many times the load is divergence."""
 
-RAMP_PERIODS = 2.0
-"""Periods of the lowest mode at rest over which the load grows in the second attempt."""
-
-RAMP_STEP = 0.25
-"""Square of the step of the second attempt over that of the first."""
+SECOND_STEP = 0.25
+"""Square of the step of the second attempt over that of the first; to let the load grow slowly as well saved no more loads."""
 
 
 def _symmetric_product(model: FullOrderModel, x: Array) -> Array:
@@ -89,7 +86,7 @@ class DynamicRelaxation:
     def solve(self, load: Array, tolerance: float, max_steps: int, start: Array | None = None) -> Solution:
         """Let the body come to rest under a load (n_unknowns,), N.
 
-        A body that diverges, or comes to rest inverted, is let go once more, with half the step and the load growing slowly.
+        A body that diverges, or comes to rest inverted, is let go once more, with half the step.
 
         Parameters
         ----------
@@ -112,9 +109,8 @@ class DynamicRelaxation:
         if size == 0.0:
             return Solution(np.zeros_like(load), 1.0, 0, 0)
         for attempt, first in enumerate((start, None)):
-            step = 4.0 / MARGIN * (RAMP_STEP if attempt else 1.0)
-            ramp = np.sqrt(self.lowest * step) / (2 * np.pi * RAMP_PERIODS) if attempt else 1.0
-            control = np.array([(tolerance * size) ** 2, step, self.lowest, ramp, ramp, (GROWN * size) ** 2])
+            step = 4.0 / MARGIN * (SECOND_STEP if attempt else 1.0)
+            control = np.array([(tolerance * size) ** 2, step, self.lowest, (GROWN * size) ** 2])
             u = np.zeros_like(load) if first is None else first.copy()
             steps, status, min_det = self.model.assembler.relax(u, load, self.mass, control, max_steps)
             done += steps
