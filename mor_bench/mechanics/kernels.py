@@ -322,7 +322,7 @@ def advance(u, v, force, before, load, mass, control):
 def relax(u, v, before, load, mass, control, n_steps, dofs, gradients, w_lam, w_mu):
     """Steps of `advance` with `internal_force`, at most ``n_steps``; returns their number, how the last ended, and min det F there.
 
-    One loop here, since two calls from Python for each step made the coarse beam's 15 % slower.
+    One loop here, since two calls from Python for each step made the coarse beam's 13 % slower.
     """
     force, status, min_det = np.zeros(len(u)), RUNNING, np.inf
     for step in range(1, n_steps + 1):
