@@ -20,10 +20,15 @@ from mor_bench.surrogate import Surrogate
 from mor_bench.surrogate import _digest as file_digest
 
 CHEAP_UMESH = {"channels": 8, "steps": 1, "iterations": 150, "batch_size": 16, "learning_rate": 3e-3}
-CHEAP: dict[str, dict[str, Any]] = {"umesh": CHEAP_UMESH, "umesh-small": CHEAP_UMESH, "autoencoder": {"iterations": 100}}
+CHEAP_PGD = {"n_terms": 20, "position_degree": 2}
+CHEAP: dict[str, dict[str, Any]] = {
+    "autoencoder": {"iterations": 100}, "pgd": CHEAP_PGD, "pgd-force": CHEAP_PGD, "umesh": CHEAP_UMESH, "umesh-small": CHEAP_UMESH,
+}  # fmt: skip
 """Parameters that keep a costly method's battery short."""
 
-NEEDS_NO_SNAPSHOTS = ("fem", "fem-coarse", "fem-jacobi-pcg", "fem-pardiso", "linear-fem", "modal-derivatives", "quadratic-manifold")
+NEEDS_NO_SNAPSHOTS = (
+    "explicit-dynamics", "fem", "fem-coarse", "fem-jacobi-pcg", "fem-pardiso", "linear-fem", "modal-derivatives", "quadratic-manifold",
+)  # fmt: skip
 
 FAR_BETTER = {"UMesh": 0.9, "CoarseFEM": 0.3}
 """Bounds, by class, on the mean error over that of no prediction: a short training, and a mesh of 3 cells."""

@@ -397,6 +397,9 @@ SMALL: dict[str, dict[str, Any]] = {
     "pca-regression": {"n_input_modes": 4},
     "pca-regression-force": {"n_input_modes": 4},
     "umesh": {"channels": 2, "steps": 1, "iterations": 1},
+    "explicit-dynamics": {"tolerance": 1e-2},
+    "pgd": {"n_terms": 5},
+    "pgd-force": {"n_terms": 5},
 }
 
 

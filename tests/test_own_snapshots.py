@@ -30,7 +30,7 @@ Arrays = dict[str, NDArray[Any]]
 
 TOML = 'title = "Mine"\nsource = "SOFA"\n[snapshots]\nfile = "mine.npz"\n[needs]\nerror = 0.01\nlatency_ms = 3.0\n'
 
-COMPETE = {"pca-regression-force", "umesh", "umesh-small"}
+COMPETE = {"pca-regression-force", "pgd-force", "umesh", "umesh-small"}
 CHEAP = {name: {"channels": 4, "steps": 1, "iterations": 5} for name in ("umesh", "umesh-small")}
 
 

@@ -102,6 +102,9 @@ RACES = (
     Race("l-shape", "quadratic-manifold", {"n_modes": 5}, "pod", 1.3, 0.1, {"n_modes": 10}),  # 2.7, 0.006
     Race("l-shape", "pca-regression", {"n_input_modes": 10}, "fem", 2.0, 0.05),  # 8, 0.002
     Race("l-shape", "pca-regression-force", {"n_input_modes": 20, "n_output_modes": 20}, "fem", 5.0, 0.95),  # 54, 0.78 on so few samples
+    Race("l-shape", "explicit-dynamics", {"tolerance": 1e-2}, "fem-jacobi-pcg", 0.8, 0.1),  # 2.7, 0.04
+    Race("l-shape", "pgd", {"n_terms": 20, "position_degree": 2}, "fem", 2.0, 0.01),  # 5, 0.001
+    Race("l-shape", "pgd-force", {"n_terms": 20, "position_degree": 2}, "fem", 5.0, 0.1),  # 18, 0.009
     Race("l-shape", "umesh", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 66, 0.56 after so short a training
     Race("l-shape", "umesh-small", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 83, 0.55
 )

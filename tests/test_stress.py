@@ -79,6 +79,9 @@ CONCERNED = {
     "pca-regression": ANY | LEARNERS,
     "pca-regression-force": ANY | LEARNERS,
     "umesh": ANY | LEARNERS,
+    "explicit-dynamics": ANY,
+    "pgd": ANY | LEARNERS,
+    "pgd-force": ANY | LEARNERS,
     "umesh-small": ANY | LEARNERS,
 }
 

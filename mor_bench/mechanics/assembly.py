@@ -11,7 +11,17 @@ from numpy.typing import NDArray
 
 from mor_bench import counting
 from mor_bench.mechanics.elements import H8, element_of, shape_gradients
-from mor_bench.mechanics.kernels import FORCE_MULTIPLY_ADDS, LANES, TANGENT_MULTIPLY_ADDS, internal_force, internal_force_and_tangent
+from mor_bench.mechanics.kernels import (
+    ADVANCE_MULTIPLY_ADDS,
+    FORCE_MULTIPLY_ADDS,
+    LANES,
+    RUNNING,
+    TANGENT_MULTIPLY_ADDS,
+    advance,
+    internal_force,
+    internal_force_and_tangent,
+    relax,
+)
 from mor_bench.mechanics.laws import general_force, general_multiply_adds
 from mor_bench.scene.materials import Material, SaintVenantKirchhoff
 
@@ -225,3 +235,26 @@ class Assembler:
         self._sum(np.append(np.append(u, 0.0)[self._dofs].ravel(), 0.0), local, force, np.zeros(0))
         own = force[:-1].reshape(self._dofs.shape)
         return np.moveaxis(own, 2, 1).reshape(-1, 24)[: self.n_cells] if self._vectorised else own
+
+    def relax(self, u: Array, load: Array, mass: Array, control: Array, n_steps: int) -> tuple[int, int, float]:
+        """Steps of dynamic relaxation from u (n_dofs,), m, which they change, with no velocity; see `kernels.advance`.
+
+        Returns their number, how the last ended, and min det F there.
+        """
+        padded, v, before = np.append(u, 0.0), np.zeros(self.n_dofs), np.zeros(self.n_dofs)
+        done, status, min_det = 0, RUNNING, np.inf
+        if self._vectorised:
+            cells = self._dofs, self._gradients, self._w_lam, self._w_mu
+            done, status, min_det = relax(padded, v, before, load, mass, control, n_steps, *cells)
+            if counting.running is not None:
+                counting.running.add(element_evaluations=done * self.n_cells, multiply_adds=done * self._multiply_adds[0])
+        else:
+            force, none = np.zeros(self.n_dofs + 1), np.zeros(0)
+            while done < n_steps and status == RUNNING:
+                min_det = self._sum(padded, self._dofs, force, none)[1]
+                status = advance(padded, v, force, before, load, mass, control)
+                done += 1
+        if counting.running is not None:
+            counting.running.add(multiply_adds=done * ADVANCE_MULTIPLY_ADDS * self.n_dofs)
+        u[:] = padded[:-1]
+        return done, status, min_det

@@ -35,6 +35,9 @@ METHODS: dict[str, dict[str, Any]] = {
     "quadratic-manifold": {"n_modes": 5},
     "pca-regression": {"n_input_modes": 10},
     "pca-regression-force": {"n_input_modes": 20, "n_output_modes": 20},
+    "explicit-dynamics": {"tolerance": 1e-2},
+    "pgd": {"n_terms": 60, "position_degree": 3},
+    "pgd-force": {"n_terms": 60, "position_degree": 3},
     "umesh": {"channels": 8, "steps": 2, "iterations": 200, "batch_size": 16, "learning_rate": 3e-3},
     "umesh-small": {"channels": 8, "iterations": 200},
 }

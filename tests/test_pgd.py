@@ -1,0 +1,145 @@
+"""Separated representations, on functions that are separable, and of displacements under one load patch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mor_bench
+from mor_bench.harness.metrics import sample_errors
+from mor_bench.reduction.separated import Separation, separate
+from mor_bench.snapshots.dataset import Dataset
+from mor_bench.surrogates.pgd import SeparatedLoad, _coordinates
+
+Array = NDArray[np.float64]
+
+
+def functions(x: Array, kind: str) -> list[list[Array]]:
+    """Two families of factors of x (n, 3): polynomials of the first two coordinates, even and odd powers of the last."""
+    first = np.stack([np.ones(len(x)), x[:, 0], x[:, 0] ** 2], axis=1)
+    second = np.stack([np.ones(len(x)), x[:, 1], x[:, 1] ** 2, x[:, 1] ** 3], axis=1)
+    even, odd = np.stack([x[:, 2] ** 2, x[:, 2] ** 4], axis=1), x[:, 2:] ** 3
+    return [[first, second, even], [first, second, odd]] if kind == "both" else [[first, second, even]]
+
+
+def values(separation: Separation, families: list[list[Array]]) -> Array:
+    terms = [np.prod([f @ c for f, c in zip(families[t.family], t.coefficients, strict=True)], axis=0) for t in separation.terms]
+    return np.stack(terms, axis=1) @ separation.vectors
+
+
+def separable(x: Array) -> Array:
+    """(n, 6), a sum of three products, two even in the last coordinate and one odd."""
+    vectors = np.random.default_rng(1).normal(size=(3, 6))
+    products = [
+        (1 + x[:, 0]) * (x[:, 1] ** 2 - 0.3) * (x[:, 2] ** 2 - 0.5 * x[:, 2] ** 4),
+        3 * (x[:, 0] ** 2 - 0.2) * x[:, 1] * x[:, 2] ** 4,
+        0.5 * (2 - x[:, 0]) * (1 + x[:, 1] ** 3) * x[:, 2] ** 3,
+    ]
+    return np.stack(products, axis=1) @ vectors
+
+
+def test_a_sum_of_products_is_found_and_holds_elsewhere() -> None:
+    x, new = np.random.default_rng(0).uniform(-1, 1, (2, 400, 3))
+    found = separate(separable(x), functions(x, "both"), 40, 0.0)
+    assert found.residuals[-1] <= 1e-6
+    assert {term.family for term in found.terms} == {0, 1}
+    difference = values(found, functions(new, "both")) - separable(new)
+    assert np.linalg.norm(difference) <= 1e-5 * np.linalg.norm(separable(new))
+    without_odd = separate(separable(x), functions(x, "even"), 40, 0.0)
+    assert without_odd.residuals[-1] > 0.05
+
+
+def test_one_product_takes_one_term() -> None:
+    x = np.random.default_rng(0).uniform(-1, 1, (300, 3))
+    target = ((1 + x[:, 0]) * (0.4 + x[:, 1] ** 2) * (x[:, 2] ** 2 + x[:, 2] ** 4))[:, None] * np.arange(1.0, 5.0)
+    assert separate(target, functions(x, "both"), 1, 0.0).residuals[0] <= 1e-2
+    # What a term leaves is what its alternation left.
+    assert separate(target, functions(x, "both"), 4, 0.0).residuals[-1] <= 1e-4
+
+
+def test_what_is_left_falls_with_every_term_and_is_what_is_left(tiny: Dataset) -> None:
+    x = np.random.default_rng(0).uniform(-1, 1, (200, 3))
+    target = np.exp(x @ np.random.default_rng(2).normal(size=(3, 5))) * x[:, 2:] ** 2
+    found = separate(target, functions(x, "both"), 12, 1e-12)
+    assert (np.diff(found.residuals) < 0).all()
+    left = np.linalg.norm(values(found, functions(x, "both")) - target) / np.linalg.norm(target)
+    assert found.residuals[-1] == pytest.approx(left, rel=1e-6)
+    assert found.residuals[-1] < 0.3 * found.residuals[0]
+
+
+def test_coordinates_are_the_patchs_own(tiny: Dataset) -> None:
+    """The centroid of a patch's area, by its surface points, and the force that the plan has drawn."""
+    scene, forces = tiny.scene, tiny.train.forces
+    points, shares = scene.patch_points(np.arange(len(scene.patch_nodes)))
+    centroids = shares @ points
+    positions, vectors = _coordinates(scene.mesh.points, forces)
+    np.testing.assert_allclose(positions, centroids[tiny.train.regions], atol=1e-9)
+    np.testing.assert_allclose(vectors, tiny.train.loads.vectors[:, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("base", ["linear-response", "none"])
+def test_no_load_and_a_couple(base: str, tiny: Dataset) -> None:
+    method = SeparatedLoad(base, n_terms=10, position_degree=2).fit(tiny.scene, tiny.train)  # type: ignore[arg-type]
+    force = np.zeros((tiny.scene.mesh.n_nodes, 3))
+    assert not method.predict(force).any()
+    force[[-1, -2], 2] = 1.0, -1.0
+    linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None).predict(force)
+    np.testing.assert_allclose(method.predict(force), linear if base == "linear-response" else 0 * linear, rtol=0, atol=1e-12)
+
+
+def test_a_separable_solution_of_patch_loads_is_found_in_unseen_regions(tiny: Dataset) -> None:
+    """Of first, second and third degree in the force, with the positions of the patches in one factor."""
+    n_free = len(tiny.scene.free_dofs)
+    vectors = np.random.default_rng(3).normal(size=(3, n_free))
+
+    def displacements(forces: Array) -> Array:
+        positions, f = _coordinates(tiny.scene.mesh.points, forces)
+        x, y = positions[:, 0], positions[:, 1]
+        products = [(1 + x) * f[:, 2], (x - y**2) * f[:, 0] * f[:, 1], (0.5 + y) * f[:, 0] ** 2 * f[:, 2]]
+        return np.stack(products, axis=1) @ vectors
+
+    samples = replace(tiny.train, free_displacements=displacements(tiny.train.forces))
+    method = SeparatedLoad("none", n_terms=100, position_degree=2, n_output_modes=3, ridge=0.0).fit(tiny.scene, samples)
+    exact = displacements(tiny.test.forces)
+    found = method.predict(tiny.test.forces).reshape(len(exact), -1)[:, tiny.scene.free_dofs]
+    assert np.linalg.norm(found - exact) <= 2e-3 * np.linalg.norm(exact)
+
+
+def test_beside_the_linear_response_terms_are_of_second_degree_and_more(tiny: Dataset) -> None:
+    """Also where the samples' own first degree is another: small loads are answered by the linear response."""
+    samples = replace(tiny.train, free_displacements=1.5 * tiny.train.free_displacements)
+    method = SeparatedLoad(n_terms=30).fit(tiny.scene, samples)
+    linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
+    small, smaller = (
+        np.linalg.norm(method.predict(scale * tiny.test.forces) - linear.predict(scale * tiny.test.forces)) for scale in (1e-3, 1e-5)
+    )  # fmt: skip
+    assert 0.9e-4 * small <= smaller <= 1.1e-4 * small
+
+
+def test_on_unseen_load_regions_it_is_far_better_than_the_linear_response(tiny: Dataset) -> None:
+    method = SeparatedLoad(n_terms=20, position_degree=2).fit(tiny.scene, tiny.train)
+    linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
+    mine, theirs = (
+        np.median(sample_errors(one.predict(tiny.test.forces), tiny.test.displacements).relative_l2) for one in (method, linear)
+    )  # fmt: skip
+    assert mine <= 0.4 * theirs
+
+
+def test_outside_the_positions_of_training_it_answers_as_at_their_edge(tiny: Dataset) -> None:
+    method = SeparatedLoad("none", n_terms=20, position_degree=2).fit(tiny.scene, tiny.train)
+    assert method.ends_.shape == (2, 2)
+    far, vector = np.array([[50.0, -30.0, 1.0]]), np.ones((1, 3))
+    back = np.linalg.pinv(method.frame_[:3]).T
+    edge = np.clip(far @ method.frame_[:3] + method.frame_[3], *method.ends_)
+    near = (edge - method.frame_[3]) @ back.T
+    (position, _, _), (there, _, _) = method._functions(far, vector), method._functions(near, vector)
+    np.testing.assert_allclose(position, there, atol=1e-9)
+
+
+def test_several_forces_are_named_as_the_reason() -> None:
+    scene = mor_bench.load_scene("beam-coarse-3-forces")
+    assert SeparatedLoad().supports(scene) == "its coordinates are those of one load patch, and here several act at once"
+    assert SeparatedLoad().supports(mor_bench.load_scene("beam-tiny")) is None
