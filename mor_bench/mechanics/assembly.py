@@ -61,7 +61,7 @@ def _batched(values: NDArray[Any], fill: float) -> NDArray[Any]:
 
 
 @dataclass(frozen=True)
-class _Quadrature:
+class Quadrature:
     """Gradients, weights and law parameters at the quadrature points of every cell.
 
     Attributes
@@ -76,7 +76,7 @@ class _Quadrature:
     parameters: Array
 
 
-def _quadrature(points: Array, cells: NDArray[np.int64], material: Material, selective: bool) -> _Quadrature:
+def quadrature_of(points: Array, cells: NDArray[np.int64], material: Material, selective: bool) -> Quadrature:
     """Full integration, or selective: the volumetric part from each cell's mean gradient only, the rest at every point.
 
     Selective integration with mean gradients (Hughes, IJNME 15, 1980: B-bar) of an energy that is a sum of both parts
@@ -86,12 +86,12 @@ def _quadrature(points: Array, cells: NDArray[np.int64], material: Material, sel
     gradients, det_j = shape_gradients(points, cells, element.derivatives)
     weights = det_j * element.weights
     if not selective:
-        return _Quadrature(gradients, weights, np.array([material.parameters] * len(element.weights)))
+        return Quadrature(gradients, weights, np.array([material.parameters] * len(element.weights)))
     # The cell's mean gradient, not that at its centre, which fails the patch test on warped cells.
     volume = weights.sum(axis=1)
     mean = np.einsum("cq,cqaj->caj", weights, gradients) / volume[:, None, None]
     parameters = [material.shape_parameters] * len(element.weights) + [material.volume_parameters]
-    return _Quadrature(np.concatenate([gradients, mean[:, None]], axis=1), np.hstack([weights, volume[:, None]]), np.array(parameters))
+    return Quadrature(np.concatenate([gradients, mean[:, None]], axis=1), np.hstack([weights, volume[:, None]]), np.array(parameters))
 
 
 def _pattern(dof_of_node: NDArray[np.int64], cells: NDArray[np.int64], n_dofs: int) -> tuple[Pattern, NDArray[np.int32]]:
@@ -173,7 +173,7 @@ class Assembler:
         cell_weights: Array | None = None,
         selective: bool = False,
     ) -> None:
-        quadrature = _quadrature(points, cells, material, selective)
+        quadrature = quadrature_of(points, cells, material, selective)
         weights = quadrature.weights if cell_weights is None else quadrature.weights * cell_weights[:, None]
         n_cells, n_points, n_nodes, _ = quadrature.gradients.shape
         dofs = dof_of_node[cells].reshape(n_cells, 3 * n_nodes)

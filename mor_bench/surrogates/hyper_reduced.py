@@ -1,0 +1,159 @@
+"""What the hyper-reduced methods share: training snapshots, nodal modes, a model over chosen cells, loads to coordinates and back."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Annotated, Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from mor_bench import counting
+from mor_bench.errors import InvalidInputError, UnsupportedSceneError
+from mor_bench.mechanics.model import FullOrderModel, unknown_equations
+from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.reduction.basis import pod
+from mor_bench.reduction.cubature import ecsw_system
+from mor_bench.reduction.galerkin import CubatureProblem
+from mor_bench.reduction.points import ReducedPoints
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.specs import NO_EQUATIONS
+from mor_bench.surrogate import Surrogate
+
+Array = NDArray[np.float64]
+
+
+def projected(displacements: Array, modes: Array) -> Array:
+    """(n, r) coordinates of displacements (n, n_free) in a basis (n_free, r) with orthonormal columns."""
+    return displacements @ modes
+
+
+def training_coordinates(displacements: Array, modes: Array, n_snapshots: int) -> Array:
+    """Coordinates of at most ``n_snapshots`` snapshots, spread evenly over those that are not zero, (n, r)."""
+    moved = np.flatnonzero(displacements.any(axis=1))
+    chosen = np.unique(np.linspace(0, len(moved) - 1, n_snapshots).astype(int))
+    return projected(displacements[moved[chosen]], modes)
+
+
+def checked_indices(indices: NDArray[Any], name: str, size: int) -> NDArray[np.int64]:
+    """Different integers in [0, size), in one dimension, at least one."""
+    good = indices.dtype.kind == "i" and indices.ndim == 1 and len(indices) > 0
+    if not good or indices.min() < 0 or indices.max() >= size or len(np.unique(indices)) != len(indices):
+        raise InvalidInputError(f"`{name}` must be different integers in [0, {size - 1}].")
+    return indices.astype(np.int64)
+
+
+def checked_array(array: NDArray[Any], name: str, shape: tuple[int | None, ...]) -> Array:
+    """A finite float64 array of this shape; None leaves a length open."""
+    fits = array.ndim == len(shape) and all(n in (m, None) or m is None for n, m in zip(array.shape, shape, strict=True))
+    if array.dtype != np.float64 or not fits or 0 in array.shape or not np.isfinite(array).all():
+        raise InvalidInputError(f"`{name}` must be a finite float64 array of shape {shape}; got {array.dtype} of shape {array.shape}.")
+    return np.ascontiguousarray(array)
+
+
+def nodal(scene: Scene, rows: Array) -> Array:
+    """(n_nodes, 3, r) from a row for each free dof; zero at supports."""
+    full = np.zeros((scene.mesh.n_dofs, rows.shape[1]))
+    full[scene.free_dofs] = rows
+    return full.reshape(scene.mesh.n_nodes, 3, -1)
+
+
+def reduced_points(
+    scene: Scene, cells: NDArray[np.int64], weights: Array, modes: Array, test_modes: Array | None = None
+) -> ReducedPoints:  # fmt: skip
+    """The scene's law over some of its cells, with nodal modes and test modes (n_nodes, 3, r)."""
+    if scene.material is None:
+        raise UnsupportedSceneError(NO_EQUATIONS)
+    mesh = scene.mesh
+    return ReducedPoints(mesh.points, mesh.cells[cells], scene.material, scene.selective, weights, modes, test_modes)
+
+
+def body_extent(scene: Scene) -> float:
+    """Coordinates of this size are displacements of the size of the body."""
+    return float(np.ptp(scene.mesh.points, axis=0).max()) * float(np.sqrt(len(scene.free_dofs)))
+
+
+def answer(batch: Array, modes: Array, solve: Callable[[Array], Array]) -> Array:
+    """Displacements, m, of loads (n, n_nodes, 3), N, by a solve from reduced load to coordinates; modes are nodal.
+
+    Forces act on few nodes, so only their rows of the basis are read; the whole field is the only step whose cost grows with
+    the mesh.
+    """
+    flat = modes.reshape(-1, modes.shape[2])
+    out = np.empty((len(batch), len(flat)))
+    for row, load in zip(out, batch.reshape(-1, len(flat)), strict=True):
+        loaded = np.flatnonzero(load)
+        if counting.running is not None:
+            counting.running.add(multiply_adds=(len(loaded) + len(flat)) * flat.shape[1])
+        np.dot(flat, solve(load[loaded] @ flat[loaded]), out=row)
+    return out.reshape(batch.shape)
+
+
+class CubatureSurrogate(Surrogate):
+    """POD-Galerkin over weighted cells; a subclass says how cells and weights are trained.
+
+    Parameters
+    ----------
+    n_modes : int
+        Size r of the basis; capped at the snapshots' rank with a warning.
+    cubature_tolerance : float
+        What the cubature may miss; smaller keeps more cells: slower and closer to plain POD.
+    n_cubature_snapshots : int
+        Training snapshots whose reduced forces are matched, spread evenly over the training set.
+    tolerance : float
+        Norm of the reduced residual relative to that of the reduced load.
+    """
+
+    def __init__(
+        self,
+        n_modes: Annotated[int, Field(ge=1)] = 20,
+        cubature_tolerance: Annotated[float, Field(ge=0, lt=1)] = 1e-3,
+        n_cubature_snapshots: Annotated[int, Field(ge=1)] = 300,
+        tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8,
+    ) -> None:
+        self.n_modes = n_modes
+        self.cubature_tolerance = cubature_tolerance
+        self.n_cubature_snapshots = n_cubature_snapshots
+        self.tolerance = tolerance
+
+    def supports(self, scene: Scene) -> str | None:
+        return unknown_equations(scene)
+
+    @abstractmethod
+    def _train(self, system: Array) -> Array:
+        """Non-negative weights (n_cells,) from the training matrix of `ecsw_system`."""
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
+        with self._fitting(scene):
+            displacements = self._checked_snapshots(snapshots).free_displacements
+            modes = pod(displacements, self.n_modes).modes
+            if self.cubature_tolerance == 0:
+                weights = np.ones(scene.mesh.n_cells)
+            else:
+                model = FullOrderModel(scene)
+                q = training_coordinates(displacements, modes, self.n_cubature_snapshots)
+                weights = self._train(ecsw_system(model.assembler, model.cell_dofs, modes, q))
+            cells = np.flatnonzero(weights)
+            self._restore({"modes": modes, "cells": cells, "weights": weights[cells]})
+        return self
+
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+        batch = self._checked_forces(forces)
+        options = NewtonOptions(self.tolerance)
+        return answer(batch, self._nodal_modes, lambda load: self.problem_.solve(load, options).displacement).reshape(np.shape(forces))
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        return {"modes": self.modes_, "cells": self.cells_, "weights": self.weights_}
+
+    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
+        self.modes_ = checked_array(state["modes"], "modes", (len(self.scene_.free_dofs), None))
+        self.cells_ = checked_indices(state["cells"], "cells", self.scene_.mesh.n_cells)
+        self.weights_ = checked_array(state["weights"], "weights", self.cells_.shape)
+        if not (self.weights_ > 0).all():
+            raise InvalidInputError("`weights` must be positive.")
+        self._nodal_modes = nodal(self.scene_, self.modes_)
+        self.problem_ = CubatureProblem(reduced_points(self.scene_, self.cells_, self.weights_, self._nodal_modes), body_extent(self.scene_))
+        _ = self.problem_.rest_factor
