@@ -21,7 +21,7 @@ OPTIMAL = 1e-10
 LEAST_GRADIENT = 1e-14
 """A cosine below which a column promises no progress."""
 DRIFT = 1e-12
-"""Passive gradient, relative to the target, from which the updated factor is made anew."""
+"""Passive gradient, relative to the target or the scaled weights, from which the updated factor is made anew."""
 MAX_ENTRIES = 2**26
 """Entries of a training matrix that are kept before QR compresses them: 512 MB."""
 
@@ -213,7 +213,7 @@ def sparse_nnls(matrix: Array, target: Array, tolerance: float, max_iterations: 
     rejected = unusable.copy()
     while float(np.linalg.norm(residual)) > max(tolerance, LEAST_GRADIENT) * size and iterations < limit:
         gradient = columns.gradient(residual)
-        if np.abs(gradient[columns.chosen]).max(initial=0.0) > DRIFT * size:
+        if np.abs(gradient[columns.chosen]).max(initial=0.0) > DRIFT * max(size, float(x.sum())):
             columns.refactor()
             x, residual = _feasible(columns, x, residual)
             gradient = columns.gradient(residual)

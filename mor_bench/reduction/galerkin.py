@@ -13,7 +13,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from mor_bench import counting
 from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.assembly import Assembler, State
+from mor_bench.mechanics.assembly import Assembler, Pattern, State
 from mor_bench.mechanics.laws import SAINT_VENANT_KIRCHHOFF
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
 from mor_bench.mechanics.newton import MAX_LOAD_N, NewtonOptions, Solution, is_linear, solve_equilibrium
@@ -31,6 +31,13 @@ def _symmetric_product(indptr: Any, indices: Any, values: Any, modes: Any, produ
             if i != j:
                 for m in range(modes.shape[1]):
                     product[j, m] += value * modes[i, m]
+
+
+def stiffness_times(pattern: Pattern, values: NDArray[np.float64], modes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """K modes, (n, r), of a stiffness whose upper triangle is given."""
+    product = np.zeros_like(modes)
+    _symmetric_product(pattern.indptr, pattern.indices, values, modes, product)
+    return product
 
 
 class _DenseFactor:
@@ -115,9 +122,7 @@ class GalerkinProblem(_DenseProblem):
         if counting.running is not None:  # Φq, Φᵀf, KΦ with the K of which one triangle is stored, ΦᵀKΦ
             n, r = self.modes.shape
             counting.running.add(multiply_adds=2 * n * r + (2 * len(values) - n) * r + n * r**2)
-        pattern, product = self.assembler.pattern, np.zeros_like(self.modes)
-        _symmetric_product(pattern.indptr, pattern.indices, values, self.modes, product)
-        return self._project(state), self.modes.T @ product
+        return self._project(state), self.modes.T @ stiffness_times(self.assembler.pattern, values, self.modes)
 
 
 class CubatureProblem(_DenseProblem):
