@@ -36,6 +36,7 @@ def test_every_shipped_dataset_is_pinned_to_its_counts() -> None:
 
 CONFIGURATIONS = {
     "fem": 4, "fem-coarse": 4, "fem-jacobi-pcg": 1, "fem-pardiso": 1, "fem-warm": 8, "hpod": 6, "linear-fem": 1,
+    "deim": 6, "ecm": 6,
     "pca-regression": 3, "pca-regression-force": 1, "pod": 7, "umesh": 1, "umesh-small": 2,
 }  # fmt: skip
 

@@ -70,6 +70,8 @@ CONCERNED = {
     "fem-warm": ANY | LEARNERS,
     "pod": ANY | LEARNERS,
     "hpod": ANY | LEARNERS | CUBATURE,
+    "ecm": ANY | LEARNERS,
+    "deim": ANY | LEARNERS,
     "pca-regression": ANY | LEARNERS,
     "pca-regression-force": ANY | LEARNERS,
     "umesh": ANY | LEARNERS,

@@ -23,7 +23,7 @@ from mor_bench.scene.materials import Material
 
 Array = NDArray[np.float64]
 
-SVK_MULTIPLY_ADDS = 76, 246
+SVK_MULTIPLY_ADDS = 77, 162
 """Of Saint Venant-Kirchhoff's P, energy and det F from H at one point, and of A."""
 
 

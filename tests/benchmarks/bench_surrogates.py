@@ -27,6 +27,8 @@ METHODS: dict[str, dict[str, Any]] = {
     "linear-fem": {},
     "pod": {"n_modes": 20},
     "hpod": {"n_modes": 20, "cubature_tolerance": 1e-2},
+    "ecm": {"n_modes": 20, "cubature_tolerance": 1e-2},
+    "deim": {"n_modes": 20, "n_force_modes": 40},
     "pca-regression": {"n_input_modes": 10},
     "pca-regression-force": {"n_input_modes": 20, "n_output_modes": 20},
     "umesh": {"channels": 8, "steps": 2, "iterations": 200, "batch_size": 16, "learning_rate": 3e-3},
