@@ -14,7 +14,6 @@ from mor_bench import counting
 from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.assembly import Assembler, Pattern, State
-from mor_bench.mechanics.laws import SAINT_VENANT_KIRCHHOFF
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
 from mor_bench.mechanics.newton import MAX_LOAD_N, NewtonOptions, Solution, is_linear, solve_equilibrium
 from mor_bench.reduction.points import ReducedPoints
@@ -160,7 +159,7 @@ class CubatureProblem(_DenseProblem):
 
         With 9 cells and 3 modes the steps take TODO ms instead of TODO.
         """
-        if self.points.law == SAINT_VENANT_KIRCHHOFF and 0 < np.abs(load).max() <= MAX_LOAD_N:
+        if 0 < np.abs(load).max() <= MAX_LOAD_N:
             q = self.rest_factor.solve(load)
             if not is_linear(self, q):
                 found = self.points.full_steps(load, q, options.tolerance, self.extent)

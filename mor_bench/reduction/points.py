@@ -37,18 +37,18 @@ def tangent_multiply_adds(r: int, symmetric: bool) -> int:
     return 81 * 2 * -(-r // 2) + 9 * products
 
 
-def _batched(values: Array, fill: float) -> Array:
-    """(n_points, ...) → (n_batches, ..., LANES), padded with ``fill``."""
-    padded = np.full((-(-len(values) // LANES) * LANES, *values.shape[1:]), fill)
+def _batched(values: Array) -> Array:
+    """(n_points, ...) → (n_batches, ..., LANES), padded with zeros."""
+    padded = np.zeros((-(-len(values) // LANES) * LANES, *values.shape[1:]))
     padded[: len(values)] = values
     return np.ascontiguousarray(np.moveaxis(padded.reshape(-1, LANES, *values.shape[1:]), 1, -1))
 
 
-def _mode_gradients(shape_gradients: Array, cell_modes: Array) -> Array:
-    """(n_batches, r, 9 * LANES) gradients of modes at every point, from (n_cells, n_points, n_nodes, 3) and (n_cells, n_nodes, 3, r)."""
-    n_cells, n_points = shape_gradients.shape[:2]
+def _mode_gradients(shape_gradients: Array, cell_modes: Array, kept: NDArray[np.int64]) -> Array:
+    """(n_batches, r, 9 * LANES) gradients of modes at points, from (n_cells, n_points, n_nodes, 3) and (n_cells, n_nodes, 3, r)."""
     own = np.einsum("cqaj,caim->cqmij", shape_gradients, cell_modes, optimize=True)
-    return _batched(own.reshape(n_cells * n_points, -1, 9), 0.0).reshape(-1, own.shape[2], 9 * LANES)
+    r = own.shape[2]
+    return _batched(own.reshape(-1, r, 9)[kept]).reshape(-1, r, 9 * LANES)
 
 
 class ReducedPoints:
@@ -63,8 +63,8 @@ class ReducedPoints:
     material : Material
     selective : bool
         As for `Assembler`.
-    cell_weights : (n_cells,) float64
-        Cubature weights.
+    factors : (n_cells,) or (n_cells, n_cell_points) float64
+        Cubature weights, which multiply those of the quadrature; points with none are left out.
     modes : (n_nodes, 3, r) float64
         Displacement of each mode at every node; zero at supports. Only the rows of the cells' nodes are read.
     test_modes : (n_nodes, 3, r) float64, optional
@@ -81,20 +81,20 @@ class ReducedPoints:
         cells: NDArray[np.int64],
         material: Material,
         selective: bool,
-        cell_weights: Array,
+        factors: Array,
         modes: Array,
         test_modes: Array | None = None,
     ) -> None:
         rule = quadrature_of(points, cells, material, selective)
-        self.n_cells, per_cell, _, _ = rule.gradients.shape
-        self.n_points, self.n_unknowns = self.n_cells * per_cell, modes.shape[2]
-        self.trial = _mode_gradients(rule.gradients, modes[cells])
+        weights = (rule.weights * factors.reshape(len(cells), -1)).ravel()
+        kept = np.flatnonzero(weights)
+        self.n_cells, self.n_points, self.n_unknowns = len(cells), len(kept), modes.shape[2]
+        self.trial = _mode_gradients(rule.gradients, modes[cells], kept)
         self.symmetric = test_modes is None
-        self.test = self.trial if test_modes is None else _mode_gradients(rule.gradients, test_modes[cells])
-        self.weights = _batched((rule.weights * cell_weights[:, None]).ravel(), 0.0)
-        parameters = np.tile(rule.parameters, (self.n_cells, 1))
-        self.parameters = _batched(parameters, 0.0) if material.law == SAINT_VENANT_KIRCHHOFF else parameters
-        self.law = material.law
+        self.test = self.trial if test_modes is None else _mode_gradients(rule.gradients, test_modes[cells], kept)
+        self.weights = _batched(weights[kept])
+        self.law, self.parameters = material.law, np.tile(rule.parameters, (len(cells), 1))[kept]
+        self._lame = _batched(self.parameters) if self.law == SAINT_VENANT_KIRCHHOFF else None
         r = self.n_unknowns
         force, tangent = SVK_MULTIPLY_ADDS if self.law == SAINT_VENANT_KIRCHHOFF else point_multiply_adds(self.law, rule.parameters.shape[1])
         tangent += tangent_multiply_adds(r, self.symmetric)
@@ -109,8 +109,8 @@ class ReducedPoints:
     def _sum(self, q: Array, tangent: Array) -> State:
         force = np.zeros(self.n_unknowns)
         self.count(len(tangent) == 0, len(tangent) > 0)
-        if self.law == SAINT_VENANT_KIRCHHOFF:
-            return State(force, *integrate(q, self.trial, self.test, self.symmetric, self.weights, self.parameters, force, tangent))
+        if self._lame is not None:
+            return State(force, *integrate(q, self.trial, self.test, self.symmetric, self.weights, self._lame, force, tangent))
         H, P = np.empty((2, len(self.weights), 9 * LANES))
         A = np.empty((len(self.weights) if len(tangent) else 0, 81 * LANES))
         gradients(self.trial, q, H)
@@ -127,11 +127,21 @@ class ReducedPoints:
         tangent = np.zeros((self.n_unknowns, self.n_unknowns))
         return self._sum(q, tangent), tangent
 
+    def point_forces(self, q: Array) -> Array:
+        """What each point adds to the reduced force, (n_points, r): what their cubature is trained on."""
+        H, P = np.empty((2, len(self.weights), 9 * LANES))
+        gradients(self.trial, q, H)
+        point_stresses(H, self.weights, self.law, self.parameters, P, np.empty((0, 81 * LANES)))
+        own = np.einsum("bmcl,bcl->blm", self.test.reshape(len(P), -1, 9, LANES), P.reshape(len(P), 9, LANES))
+        return np.asarray(own.reshape(-1, self.n_unknowns)[: self.n_points])
+
     def full_steps(self, load: Array, start: Array, tolerance: float, extent: float) -> Solution | None:
-        """Newton's full steps for Saint Venant-Kirchhoff; None where they do not end in a stable state with det F > 0."""
+        """Newton's full steps; None for other laws than Saint Venant-Kirchhoff, or without a stable end with det F > 0."""
+        if self._lame is None:
+            return None
         q = start.copy()
         converged, min_det, iterations, tangents, forces, factors, solves = full_steps(
-            load, q, self.trial, self.weights, self.parameters, tolerance, HOPELESS, ROUND_OFF, extent, PLAIN_ITERATIONS
+            load, q, self.trial, self.weights, self._lame, tolerance, HOPELESS, ROUND_OFF, extent, PLAIN_ITERATIONS
         )
         self.count(forces, tangents)
         if counting.running is not None:

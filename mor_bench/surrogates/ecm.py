@@ -5,8 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.reduction.cubature import ecsw_system
 from mor_bench.reduction.empirical_cubature import empirical_cubature
 from mor_bench.surrogates.hyper_reduced import CubatureSurrogate
+
+Array = NDArray[np.float64]
 
 
 class EmpiricalCubaturePOD(CubatureSurrogate):
@@ -18,5 +22,7 @@ class EmpiricalCubaturePOD(CubatureSurrogate):
     The other parameters are those of `CubatureSurrogate`.
     """
 
-    def _train(self, system: NDArray[np.float64]) -> NDArray[np.float64]:
-        return empirical_cubature(system, self.cubature_tolerance).weights
+    def _train(self, model: FullOrderModel, modes: Array, q: Array) -> tuple[NDArray[np.int64], Array]:
+        weights = empirical_cubature(ecsw_system(model.assembler, model.cell_dofs, modes, q), self.cubature_tolerance).weights
+        cells = np.flatnonzero(weights)
+        return cells, weights[cells]

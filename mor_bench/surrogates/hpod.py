@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from mor_bench.reduction.cubature import sparse_nnls
-from mor_bench.surrogates.hyper_reduced import CubatureSurrogate
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.reduction.cubature import ecsw_system, sparse_nnls
+from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, nodal, reduced_points
+
+Array = NDArray[np.float64]
 
 
 class HyperReducedPOD(CubatureSurrogate):
@@ -16,8 +22,35 @@ class HyperReducedPOD(CubatureSurrogate):
     ``cubature_tolerance``, where 0 keeps every cell with weight 1 (Farhat et al. 2014). The sum of the weights is not the
     number of cells, and volume is not preserved. Weights that are not negative keep a potential: the tangent is symmetric.
 
-    The other parameters are those of `CubatureSurrogate`.
+    Parameters
+    ----------
+    sampling : {"cells", "points"}
+        With "points", a second cubature to the same tolerance, of the quadrature points of the cells that the first one chose,
+        leaves some of their points only, each with a weight of its own (as Yano & Patera 2019 choose points).
+    n_modes, cubature_tolerance, n_cubature_snapshots, tolerance
+        As for `CubatureSurrogate`.
     """
 
-    def _train(self, system: NDArray[np.float64]) -> NDArray[np.float64]:
-        return sparse_nnls(system, system.sum(axis=1), self.cubature_tolerance).weights
+    def __init__(
+        self,
+        n_modes: Annotated[int, Field(ge=1)] = 20,
+        cubature_tolerance: Annotated[float, Field(ge=0, lt=1)] = 1e-3,
+        n_cubature_snapshots: Annotated[int, Field(ge=1)] = 300,
+        tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8,
+        sampling: Literal["cells", "points"] = "cells",
+    ) -> None:
+        super().__init__(n_modes, cubature_tolerance, n_cubature_snapshots, tolerance)
+        self.sampling = sampling
+
+    def _train(self, model: FullOrderModel, modes: Array, q: Array) -> tuple[NDArray[np.int64], Array]:
+        system = ecsw_system(model.assembler, model.cell_dofs, modes, q)
+        weights = sparse_nnls(system, system.sum(axis=1), self.cubature_tolerance).weights
+        cells = np.flatnonzero(weights)
+        if self.sampling == "cells":
+            return cells, weights[cells]
+        points = reduced_points(model.scene, cells, np.ones(len(cells)), nodal(model.scene, modes))
+        own = np.concatenate([points.point_forces(coordinates).T for coordinates in q])
+        target = np.concatenate([modes.T @ model.force(modes @ coordinates).force for coordinates in q])
+        factors = sparse_nnls(own, target, self.cubature_tolerance).weights.reshape(len(cells), -1)
+        used = factors.any(axis=1)
+        return cells[used], factors[used]

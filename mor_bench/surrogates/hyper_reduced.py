@@ -15,7 +15,6 @@ from mor_bench.errors import InvalidInputError, UnsupportedSceneError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.reduction.basis import pod
-from mor_bench.reduction.cubature import ecsw_system
 from mor_bench.reduction.galerkin import CubatureProblem
 from mor_bench.reduction.points import ReducedPoints
 from mor_bench.scene.scene import Scene
@@ -123,21 +122,19 @@ class CubatureSurrogate(Surrogate):
         return unknown_equations(scene)
 
     @abstractmethod
-    def _train(self, system: Array) -> Array:
-        """Non-negative weights (n_cells,) from the training matrix of `ecsw_system`."""
+    def _train(self, model: FullOrderModel, modes: Array, q: Array) -> tuple[NDArray[np.int64], Array]:
+        """Cells, and their positive weights (n,) or those of their points (n, n_cell_points), from snapshots q in the basis."""
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             displacements = self._checked_snapshots(snapshots).free_displacements
             modes = pod(displacements, self.n_modes).modes
             if self.cubature_tolerance == 0:
-                weights = np.ones(scene.mesh.n_cells)
+                cells, weights = np.arange(scene.mesh.n_cells), np.ones(scene.mesh.n_cells)
             else:
-                model = FullOrderModel(scene)
                 q = training_coordinates(displacements, modes, self.n_cubature_snapshots)
-                weights = self._train(ecsw_system(model.assembler, model.cell_dofs, modes, q))
-            cells = np.flatnonzero(weights)
-            self._restore({"modes": modes, "cells": cells, "weights": weights[cells]})
+                cells, weights = self._train(FullOrderModel(scene), modes, q)
+            self._restore({"modes": modes, "cells": cells, "weights": weights})
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
@@ -151,9 +148,9 @@ class CubatureSurrogate(Surrogate):
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         self.modes_ = checked_array(state["modes"], "modes", (len(self.scene_.free_dofs), None))
         self.cells_ = checked_indices(state["cells"], "cells", self.scene_.mesh.n_cells)
-        self.weights_ = checked_array(state["weights"], "weights", self.cells_.shape)
-        if not (self.weights_ > 0).all():
-            raise InvalidInputError("`weights` must be positive.")
+        self.weights_ = checked_array(state["weights"], "weights", (len(self.cells_), None)[: state["weights"].ndim])
+        if not ((self.weights_ >= 0).all() and self.weights_.reshape(len(self.cells_), -1).any(axis=1).all()):
+            raise InvalidInputError("`weights` must be positive for a cell, or for some of its points.")
         self._nodal_modes = nodal(self.scene_, self.modes_)
         self.problem_ = CubatureProblem(reduced_points(self.scene_, self.cells_, self.weights_, self._nodal_modes), body_extent(self.scene_))
         _ = self.problem_.rest_factor
