@@ -89,10 +89,12 @@ def test_every_law_and_element(law: str, kind: tuple[str, bool]) -> None:
     size = np.abs(plain).max()
     assert np.abs(HyperReducedPOD(5, 0.0).fit(scene, train).predict(train.forces) - plain).max() <= 1e-10 * size
     assert np.abs(EmpiricalCubaturePOD(5, 0.0).fit(scene, train).predict(train.forces) - plain).max() <= 1e-10 * size
-    few = HyperReducedPOD(5, 1e-3).fit(scene, train)
+    few = HyperReducedPOD(5, 1e-3, sampling="cells").fit(scene, train)
+    fewer = HyperReducedPOD(5, 1e-3, sampling="points").fit(scene, train)
+    assert fewer.problem_.points.n_points < few.problem_.points.n_points or kind[0] == "tetrahedron"
     greedy = EmpiricalCubaturePOD(5, 1e-2).fit(scene, train)
     sampled = InterpolatedPOD(5, 8).fit(scene, train)
-    for method in (few, greedy, sampled):
+    for method in (few, fewer, greedy, sampled):
         assert len(method.cells_) < scene.mesh.n_cells
         assert np.abs(method.predict(train.forces) - plain).max() <= 0.03 * size
 
@@ -310,6 +312,20 @@ def test_deim_without_an_equilibrium_is_a_typed_error(tiny: Dataset) -> None:
         method.predict(1e4 * tiny.test.forces[0])
 
 
+@pytest.mark.parametrize("kind", [("hexahedron", False), ("hexahedron", True)])
+def test_points_keep_the_reduced_force_of_training(kind: tuple[str, bool]) -> None:
+    """Recomputed from the fitted model and from all cells, and over fewer points than cells have."""
+    scene = scene_of("neo-hookean", kind)
+    train = solved(scene, 40)
+    method = HyperReducedPOD(4, 1e-2).fit(scene, train)
+    model, q = FullOrderModel(scene), train.free_displacements @ method.modes_
+    own = np.array([method.problem_.force(coordinates).force for coordinates in q])
+    whole = np.array([model.force(method.modes_ @ coordinates).force @ method.modes_ for coordinates in q])
+    assert np.linalg.norm(own - whole) <= 1.0001e-2 * np.linalg.norm(whole)
+    assert method.problem_.points.n_points < 2 * len(method.cells_)
+    assert method.weights_.shape == (len(method.cells_), 9 if kind[1] else 8)
+
+
 @pytest.mark.parametrize("method", [HyperReducedPOD(4, 1e-2), EmpiricalCubaturePOD(4, 1e-2), InterpolatedPOD(4, 6)])
 @pytest.mark.parametrize("forged", [-1, 10**6, "twice", 0.5])
 def test_indices_of_a_file_are_checked(tiny: Dataset, method: Any, forged: Any) -> None:
@@ -358,7 +374,7 @@ def seconds(problem: CubatureProblem, loads: Array) -> float:
 def test_the_solve_does_not_depend_on_the_mesh(cache: Path) -> None:
     """As many cells of a mesh with twice as many: the same counted work to the last multiplication, and the same time."""
     data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
-    method = HyperReducedPOD(10, 1e-2).fit(data.scene, data.train)
+    method = HyperReducedPOD(10, 1e-2, sampling="cells").fit(data.scene, data.train)
     coarse, fine = method.problem_, on_twice_the_cells(method)
     loads = data.test.free_forces[:40] @ method.modes_
     same = []

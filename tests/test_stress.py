@@ -290,7 +290,7 @@ def lopsided(mesh: Any, law: Any = setups.LAW, selective: bool = False) -> Assem
 
 
 def optimistic(matrix: NDArray[np.float64], target: NDArray[np.float64], tolerance: float, max_iterations: int | None = None) -> SparseWeights:
-    return SparseWeights(np.ones(matrix.shape[1]), 0.0, 0.0, 1)
+    return SparseWeights(np.ones(matrix.shape[1]), 0.0, 0.0, 0.0, 1)
 
 
 def askew(self: FullFEM, forces: ArrayLike) -> NDArray[np.float64]:

@@ -157,7 +157,7 @@ class CubatureProblem(_DenseProblem):
     def solve(self, load: NDArray[np.float64], options: NewtonOptions) -> Solution:
         """`solve_equilibrium` from rest; Saint Venant-Kirchhoff tries full Newton steps in one compiled loop first.
 
-        With 9 cells and 3 modes the steps take TODO ms instead of TODO.
+        With 11 cells and 3 modes of beam-coarse a solve took 0.026 ms instead of 0.068, with 20 modes 0.50 instead of 0.57.
         """
         if 0 < np.abs(load).max() <= MAX_LOAD_N:
             q = self.rest_factor.solve(load)

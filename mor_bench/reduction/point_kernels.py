@@ -17,6 +17,7 @@ LANES = 32
 
 _COMPONENTS = 9 * LANES
 
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
 def _dot(a, b):
     total = 0.0

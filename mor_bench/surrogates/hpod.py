@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.reduction.cubature import ecsw_system, sparse_nnls
+from mor_bench.reduction.cubature import ecsw_system, sparse_nnls, triangle
 from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, nodal, reduced_points
 
 Array = NDArray[np.float64]
@@ -25,8 +25,10 @@ class HyperReducedPOD(CubatureSurrogate):
     Parameters
     ----------
     sampling : {"cells", "points"}
-        With "points", a second cubature to the same tolerance, of the quadrature points of the cells that the first one chose,
-        leaves some of their points only, each with a weight of its own (as Yano & Patera 2019 choose points).
+        With "cells" every point of a chosen cell is integrated, as published. With "points" a second cubature to the same
+        tolerance, of the points of the cells that the first one chose, leaves few of them, each with a weight of its own (Yano &
+        Patera 2019 choose points so): at equal error, 20 modes of the fine beam take 0.27 ms at 127 points instead of 1.1 ms at
+        848. Positive det F is checked at these points only.
     n_modes, cubature_tolerance, n_cubature_snapshots, tolerance
         As for `CubatureSurrogate`.
     """
@@ -37,7 +39,7 @@ class HyperReducedPOD(CubatureSurrogate):
         cubature_tolerance: Annotated[float, Field(ge=0, lt=1)] = 1e-3,
         n_cubature_snapshots: Annotated[int, Field(ge=1)] = 300,
         tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8,
-        sampling: Literal["cells", "points"] = "cells",
+        sampling: Literal["cells", "points"] = "points",
     ) -> None:
         super().__init__(n_modes, cubature_tolerance, n_cubature_snapshots, tolerance)
         self.sampling = sampling
@@ -51,6 +53,7 @@ class HyperReducedPOD(CubatureSurrogate):
         points = reduced_points(model.scene, cells, np.ones(len(cells)), nodal(model.scene, modes))
         own = np.concatenate([points.point_forces(coordinates).T for coordinates in q])
         target = np.concatenate([modes.T @ model.force(modes @ coordinates).force for coordinates in q])
-        factors = sparse_nnls(own, target, self.cubature_tolerance).weights.reshape(len(cells), -1)
+        both = triangle(np.column_stack([own, target]))
+        factors = sparse_nnls(np.ascontiguousarray(both[:, :-1]), both[:, -1], self.cubature_tolerance).weights.reshape(len(cells), -1)
         used = factors.any(axis=1)
         return cells[used], factors[used]
