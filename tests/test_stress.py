@@ -115,7 +115,9 @@ def test_errors_out_of_distribution_are_published_and_flagged(everything: Stress
     for row in everything.rows:
         if row.case == "out-of-distribution" and row.verdict != "not applicable":
             measured = row.measured
-            assert 0 <= measured["rel_l2_median"] <= measured["rel_l2_p95"] <= measured["rel_l2_max"]
+            worst = [np.inf if measured[key] is None else measured[key] for key in ("rel_l2_median", "rel_l2_p95", "rel_l2_max")]
+            assert 0 <= worst[0] <= worst[1] <= worst[2]
+            assert worst[2] < np.inf or row.method == "deim"  # which has no answer to a few loads, as its limits say
             assert measured["n"] >= 50
             assert ("flagged" in measured) == (CONCERNED[row.method] >= LEARNERS)
 
