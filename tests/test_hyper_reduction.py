@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import mor_bench
 from mor_bench.counting import Cost, counted
 from mor_bench.errors import InvalidInputError, SolverError
+from mor_bench.harness.stress.setups import LAW
 from mor_bench.mechanics.assembly import Assembler, quadrature_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
@@ -23,7 +24,9 @@ from mor_bench.reduction.cubature import ActiveColumns, CubatureError, SparseWei
 from mor_bench.reduction.empirical_cubature import cell_basis, empirical_cubature
 from mor_bench.reduction.galerkin import CubatureProblem, GalerkinProblem
 from mor_bench.reduction.interpolation import Selection, interpolation_rows
+from mor_bench.reduction.points import ReducedPoints
 from mor_bench.scene.interpolation import interpolation_matrix
+from mor_bench.scene.mesh import box_mesh
 from mor_bench.scene.scene import Scene, with_cells
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.sampling import draw_loads
@@ -392,3 +395,20 @@ def test_the_solve_does_not_depend_on_the_mesh(cache: Path) -> None:
         rounds = [(seconds(coarse, np.array(same)), seconds(fine, np.array(same))) for _ in range(9)]
         ratios.append(median(two for _, two in rounds) / median(one for one, _ in rounds))
     assert any(0.8 <= ratio <= 1.2 for ratio in ratios), ratios
+
+
+def test_compiled_steps_never_end_in_an_unstable_or_inverted_state() -> None:
+    """Under 0.9 of the limit load of a confined column the residual vanishes at two stretches, and at a third that is mirrored."""
+    mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
+    mode = np.zeros((mesh.n_nodes, 3, 1))
+    mode[mesh.points[:, 2] == 1.0, 2] = 1.0
+    points = ReducedPoints(mesh.points, mesh.cells, LAW, False, np.ones(1), mode)
+    roots = np.sort(np.roots([1.0, 0.0, -1.0, 0.9 * 2 / (3 * np.sqrt(3))]).real)
+    mirrored, unstable, stable = roots
+    load = points.force(np.array([stable - 1])).force
+    assert points.force(np.array([unstable - 1])).force == pytest.approx(load, rel=1e-9)
+    for start in (mirrored, unstable):
+        assert points.full_steps(load, np.array([start - 1]), 1e-6, 1.0) is None
+    found = points.full_steps(load, np.array([stable - 0.99]), 1e-10, 1.0)
+    assert found is not None
+    assert 1 + found.displacement[0] == pytest.approx(stable, abs=1e-9)

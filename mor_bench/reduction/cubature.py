@@ -70,7 +70,7 @@ class SparseWeights:
 
 def _inverse_norms(matrix: Array) -> Array:
     """1 / ‖aⱼ‖, and 0 for a column of zeros."""
-    norms: Array = np.linalg.norm(matrix, axis=0)
+    norms: Array = np.sqrt(np.einsum("ij,ij->j", matrix, matrix))  # without a copy of the matrix
     inverse: Array = np.zeros_like(norms)
     np.divide(1.0, norms, out=inverse, where=norms > 0)
     return inverse
