@@ -21,6 +21,8 @@ from mor_bench.mechanics import kernels, laws
 from mor_bench.mechanics.linear import BandedCholesky, MultigridFactor, Pardiso, SparseLU
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.rotated import BlockJacobi, conjugate_gradients
+from mor_bench.reduction import point_kernels
+from mor_bench.reduction.points import SVK_MULTIPLY_ADDS, tangent_multiply_adds
 from mor_bench.scene.scene import Scene, with_cells
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.specs import SolverName
@@ -331,30 +333,87 @@ def test_a_multigrid_cycle_of_two_levels() -> None:
     assert 3 * n_nonzeros(model) < one.multiply_adds < 5 * n_nonzeros(model)
 
 
-@pytest.mark.parametrize(("name", "knobs"), [("pod", {}), ("hpod", {"cubature_tolerance": 1e-2})])
-def test_reduced_models_evaluate_their_cells(tiny: Dataset, loads: np.ndarray, name: str, knobs: dict[str, Any]) -> None:
-    method: Any = mor_bench.load_method(name, n_modes=6, **knobs).fit(tiny.scene, tiny.train)
+def test_pod_evaluates_all_cells(tiny: Dataset, loads: np.ndarray) -> None:
+    method: Any = mor_bench.load_method("pod", n_modes=6).fit(tiny.scene, tiny.train)
     problem = method.problem_
-    n_cells = len(method.cells_) if name == "hpod" else 24
-    assert problem.assembler.n_cells == n_cells
-    assert n_cells < 24 or name == "pod"
-    per_force = n_cells * 8 * kernels.FORCE_MULTIPLY_ADDS
-    per_tangent = per_force + n_cells * 8 * kernels.TANGENT_MULTIPLY_ADDS
+    assert problem.assembler.n_cells == 24
+    per_force = 24 * 8 * kernels.FORCE_MULTIPLY_ADDS
+    per_tangent = per_force + 24 * 8 * kernels.TANGENT_MULTIPLY_ADDS
     n, r, stored = problem.assembler.n_dofs, 6, len(problem.assembler.pattern.indices)
     reduction = 2 * n * r + (2 * stored - n) * r + n * r * r
     q = np.zeros(r)
-    assert cost(lambda: problem.force(q)) == Cost(element_evaluations=n_cells, multiply_adds=per_force + 2 * n * r)
-    assert cost(lambda: problem.linearise(q)) == Cost(element_evaluations=n_cells, multiply_adds=per_tangent + reduction)
+    assert cost(lambda: problem.force(q)) == Cost(element_evaluations=24, multiply_adds=per_force + 2 * n * r)
+    assert cost(lambda: problem.linearise(q)) == Cost(element_evaluations=24, multiply_adds=per_tangent + reduction)
     found = cost(lambda: method.predict(loads[0]))
+    expected = newton(found, 24, r, per_force + 2 * n * r, per_tangent + reduction)
+    assert found.multiply_adds == expected + (np.count_nonzero(loads[0]) + tiny.scene.mesh.n_dofs) * r
+
+
+def newton(found: Cost, n_cells: int, r: int, per_force: int, per_tangent: int) -> int:
+    """Multiply-adds of full steps from the response at rest, each with a tangent, which is factorised."""
     steps, evaluations = found.factorisations, found.element_evaluations // n_cells
     assert found.element_evaluations % n_cells == 0
     assert found.reduced_factorisations == steps
     assert found.reduced_back_solves == found.back_solves == steps + 1  # the first with the factor at rest
     assert steps <= evaluations <= 2 * steps + 1
-    tangents = steps  # each is factorised; the other evaluations are of the force alone
     dense = steps * cholesky_multiply_adds(r, r - 1) + (steps + 1) * triangular_multiply_adds(r, r - 1)
-    expected = tangents * (per_tangent + reduction) + (evaluations - tangents) * (per_force + 2 * n * r) + dense
-    assert found.multiply_adds == expected + 2 * len(tiny.scene.free_dofs) * r
+    return steps * per_tangent + (evaluations - steps) * per_force + dense
+
+
+@pytest.mark.parametrize(("name", "knobs"), [("hpod", {}), ("hpod", {"sampling": "cells"}), ("ecm", {})])
+def test_cubature_evaluates_its_points(tiny: Dataset, loads: np.ndarray, name: str, knobs: dict[str, Any]) -> None:
+    method: Any = mor_bench.load_method(name, n_modes=6, cubature_tolerance=1e-2, **knobs).fit(tiny.scene, tiny.train)
+    problem, n_cells, r, q = method.problem_, len(method.cells_), 6, np.zeros(6)
+    n_points = int(np.count_nonzero(method.weights_)) if name == "hpod" and not knobs else 8 * n_cells
+    assert n_cells < 24
+    per_force = n_points * (SVK_MULTIPLY_ADDS[0] + 18 * r)
+    per_tangent = per_force + n_points * (SVK_MULTIPLY_ADDS[1] + tangent_multiply_adds(r, True))
+    assert cost(lambda: problem.force(q)) == Cost(element_evaluations=n_cells, multiply_adds=per_force)
+    assert cost(lambda: problem.linearise(q)) == Cost(element_evaluations=n_cells, multiply_adds=per_tangent)
+    found = cost(lambda: method.predict(loads[0]))
+    projection = (np.count_nonzero(loads[0]) + tiny.scene.mesh.n_dofs) * r
+    assert found.multiply_adds == newton(found, n_cells, r, per_force, per_tangent) + projection
+
+
+def test_deim_evaluates_the_points_of_the_cells_around_its_dofs(tiny: Dataset, loads: np.ndarray) -> None:
+    method: Any = mor_bench.load_method("deim", n_modes=6, n_force_modes=4).fit(tiny.scene, tiny.train)
+    n_cells, r = len(method.cells_), 6
+    assert n_cells < 24
+    per_tangent = n_cells * 8 * (sum(SVK_MULTIPLY_ADDS) + 18 * r + tangent_multiply_adds(r, False)) + r * r
+    assert cost(lambda: method.problem_.linearise(np.zeros(r))) == Cost(element_evaluations=n_cells, multiply_adds=per_tangent)
+    found = cost(lambda: method.predict(loads[0]))
+    tangents = found.element_evaluations // n_cells
+    assert found.factorisations == found.reduced_factorisations == found.back_solves == tangents + 1  # the first of the stiffness at rest
+    factors = (tangents + 1) * (sum(k + k * k for k in range(r)) + triangular_multiply_adds(r, r - 1))
+    projection = (np.count_nonzero(loads[0]) + tiny.scene.mesh.n_dofs) * r
+    assert found.multiply_adds == tangents * per_tangent + factors + projection
+
+
+@pytest.mark.parametrize("r", [1, 2, 3, 6, 9])
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_the_kernel_of_points_multiplies_as_often_as_is_said(r: int, symmetric: bool) -> None:
+    kernel, rng = interpreted(point_kernels), np.random.default_rng(0)
+    q, modes, one = counted_array(0.1 * rng.normal(size=r)), counted_array(0.3 * rng.normal(size=(1, r, 9))), counted_array(np.ones((1, 2, 1)))
+    counts = []
+    for n in (0, r):
+        Counted.total = 0
+        kernel["integrate"](q, modes, modes, symmetric, one[:, 0], one, counted_array(np.zeros(r)), counted_array(np.zeros((n, n))))
+        counts.append(Counted.total)
+    assert counts[0] == SVK_MULTIPLY_ADDS[0] + 18 * r
+    assert counts[1] - counts[0] == SVK_MULTIPLY_ADDS[1] + tangent_multiply_adds(r, symmetric)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_stresses_at_points_multiply_as_often_as_is_said(name: str) -> None:
+    law, parameters = LAWS[name]
+    kernel, gradient = interpreted(laws), counted_array(0.1 * np.random.default_rng(0).normal(size=(1, 9)))
+    counts = []
+    for n in (0, 1):
+        Counted.total = 0
+        stresses, tangents = counted_array(np.zeros((1, 9))), counted_array(np.zeros((n, 81)))
+        kernel["point_stresses"](gradient, counted_array(np.ones((1, 1))), law, counted_array([parameters]), stresses, tangents)
+        counts.append(Counted.total + (122 if law == laws.OGDEN else 0))
+    assert (counts[0], counts[1] - counts[0]) == laws.point_multiply_adds(law, len(parameters))
 
 
 def test_pca_regression_by_its_products(tiny: Dataset, loads: np.ndarray) -> None:
@@ -394,6 +453,8 @@ SMALL: dict[str, dict[str, Any]] = {
     "local-pod": {"n_clusters": 3, "n_modes": 4},
     "modal-derivatives": {"n_linear": 3, "n_modes": 6},
     "quadratic-manifold": {"n_modes": 3},
+    "ecm": {"n_modes": 6, "cubature_tolerance": 1e-2},
+    "deim": {"n_modes": 6, "n_force_modes": 4},
     "pca-regression": {"n_input_modes": 4},
     "pca-regression-force": {"n_input_modes": 4},
     "umesh": {"channels": 2, "steps": 1, "iterations": 1},

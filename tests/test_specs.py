@@ -39,6 +39,7 @@ CONFIGURATIONS = {
     "pca-regression": 3, "pca-regression-force": 1, "pod": 7, "pod-tensor": 5, "umesh": 1, "umesh-small": 2,
     "autoencoder": 2, "local-pod": 6, "modal-derivatives": 4, "quadratic-manifold": 6,
     "explicit-dynamics": 6, "pgd": 6, "pgd-force": 3,
+    "deim": 6, "ecm": 6,
 }  # fmt: skip
 
 
@@ -183,7 +184,7 @@ def test_a_bad_method_is_one_clear_line(tmp_path: Path, text: str, message: str)
         ("mor_bench.surrogates.pod:PODGalerkim", r"did you mean 'PODGalerkin'\?"),
         ("no_such_package.module:Thing", r"cannot be imported"),
         ("mor_bench.surrogates.pod", r"package.module:Class"),
-        ("mor_bench.surrogates.pod:predict_reduced", r"is not a class"),
+        ("mor_bench.surrogates.pod:stiffness_at_rest", r"is not a class"),
     ],
 )
 def test_a_surrogate_that_is_not_there(tmp_path: Path, surrogate: str, message: str) -> None:

@@ -76,6 +76,8 @@ CONCERNED = {
     "autoencoder": ANY | LEARNERS,
     "modal-derivatives": ANY,
     "quadratic-manifold": ANY,
+    "ecm": ANY | LEARNERS,
+    "deim": ANY | LEARNERS,
     "pca-regression": ANY | LEARNERS,
     "pca-regression-force": ANY | LEARNERS,
     "umesh": ANY | LEARNERS,
@@ -122,7 +124,9 @@ def test_errors_out_of_distribution_are_published_and_flagged(everything: Stress
     for row in everything.rows:
         if row.case == "out-of-distribution" and row.verdict != "not applicable":
             measured = row.measured
-            assert 0 <= measured["rel_l2_median"] <= measured["rel_l2_p95"] <= measured["rel_l2_max"]
+            worst = [np.inf if measured[key] is None else measured[key] for key in ("rel_l2_median", "rel_l2_p95", "rel_l2_max")]
+            assert 0 <= worst[0] <= worst[1] <= worst[2]
+            assert worst[2] < np.inf or row.method == "deim"  # which has no answer to a few loads, as its limits say
             assert measured["n"] >= 50
             assert ("flagged" in measured) == (CONCERNED[row.method] >= LEARNERS)
 
@@ -297,7 +301,7 @@ def lopsided(mesh: Any, law: Any = setups.LAW, selective: bool = False) -> Assem
 
 
 def optimistic(matrix: NDArray[np.float64], target: NDArray[np.float64], tolerance: float, max_iterations: int | None = None) -> SparseWeights:
-    return SparseWeights(np.ones(matrix.shape[1]), 0.0, 0.0, 1)
+    return SparseWeights(np.ones(matrix.shape[1]), 0.0, 0.0, 0.0, 1)
 
 
 def askew(self: FullFEM, forces: ArrayLike) -> NDArray[np.float64]:

@@ -115,7 +115,8 @@ def _exactly(connection: socket.socket, n: int) -> bytes:
 
 PRELOADED = (
     "sklearn.linear_model", "mor_bench.harness.cost", "mor_bench.harness.handover", "mor_bench.harness.timing", "mor_bench.surrogates.fem",
-    "mor_bench.surrogates.hpod", "mor_bench.surrogates.pca_regression", "mor_bench.surrogates.pod",
+    "mor_bench.surrogates.deim", "mor_bench.surrogates.ecm", "mor_bench.surrogates.hpod",
+    "mor_bench.surrogates.pca_regression", "mor_bench.surrogates.pod",
 )  # fmt: skip
 """What methods import: no fit's time holds an import. PyTorch is not among it, since few need it and it takes two seconds."""
 

@@ -26,6 +26,7 @@ _OGDEN_TERM_MULTIPLY_ADDS = 44
 
 _I = np.array([0, 1, 2, 0, 0, 1])
 _J = np.array([0, 1, 2, 1, 2, 2])
+_VOIGT = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -286,6 +287,79 @@ def general_force(u, dofs, gradients, weights, law, parameters, slots, force, va
             for p in range(slots.shape[1]):
                 values[slots[e, p]] += k_e[p]
     return energy, min_det
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def point_stresses(H, weights, law, parameters, P, A):
+    """Weighted first Piola-Kirchhoff stress P and, where ``A`` is not empty, its derivative A = dP/dF, point by point.
+
+    Parameters
+    ----------
+    H : (n_batches, 9 * n_lanes) float64
+        du/dX; point l of a batch has component (i, J) at (3i + J) * n_lanes + l.
+    weights : (n_batches, n_lanes) float64
+    law : int
+    parameters : (n_points, n_parameters) float64
+        Of each point; the last batch may have fewer points than lanes.
+    P : (n_batches, 9 * n_lanes) float64
+    A : (n_batches, 81 * n_lanes) or (0, 81 * n_lanes) float64
+        Component (i, J, k, L) at (9 (3i + J) + 3k + L) * n_lanes + l.
+
+    Returns
+    -------
+    (float, float)
+        Stored energy and the smallest det F; the energy is infinite where det F <= 0.
+    """
+    n_lanes = weights.shape[1]
+    F, C, S, D, DL = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((6, 6)), np.empty((6, 9))
+    energy, min_det = 0.0, np.inf
+    P[:] = 0.0
+    A[:] = 0.0
+    for point in range(len(parameters)):
+        b, l = point // n_lanes, point % n_lanes
+        h, w = H[b], weights[b, l]
+        for i in range(3):
+            for j in range(3):
+                F[i, j] = h[(3 * i + j) * n_lanes + l] + (1.0 if i == j else 0.0)
+        det = (
+            F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
+            - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
+            + F[0, 2] * (F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0])
+        )
+        min_det = min(min_det, det)
+        if not det > 0.0:
+            energy = np.inf
+            continue
+        for i in range(3):
+            for j in range(3):
+                C[i, j] = h[(3 * i + j) * n_lanes + l] + h[(3 * j + i) * n_lanes + l] + (1.0 if i == j else 0.0)
+                for k in range(3):
+                    C[i, j] += h[(3 * k + i) * n_lanes + l] * h[(3 * k + j) * n_lanes + l]
+        energy += w * evaluate(law, C, parameters[point], S, D)
+        for i in range(3):
+            for j in range(3):
+                P[b, (3 * i + j) * n_lanes + l] = w * (F[i, 0] * S[0, j] + F[i, 1] * S[1, j] + F[i, 2] * S[2, j])
+        if len(A) == 0:
+            continue
+        # dE = sym(Fᵀ dH): dH_iJ changes the strains that hold the index J, each by a component of row i of F.
+        for m in range(6):
+            for i in range(3):
+                for j in range(3):
+                    DL[m, 3 * i + j] = w * (D[m, _VOIGT[0, j]] * F[i, 0] + D[m, _VOIGT[1, j]] * F[i, 1] + D[m, _VOIGT[2, j]] * F[i, 2])
+        for i in range(3):
+            for j in range(3):
+                for d in range(9):
+                    a = F[i, 0] * DL[_VOIGT[0, j], d] + F[i, 1] * DL[_VOIGT[1, j], d] + F[i, 2] * DL[_VOIGT[2, j], d]
+                    if d // 3 == i:
+                        a += w * S[j, d % 3]
+                    A[b, (9 * (3 * i + j) + d) * n_lanes + l] = a
+    return energy, min_det
+
+
+def point_multiply_adds(law: int, n_parameters: int) -> tuple[int, int]:
+    """Of `point_stresses` at one point: of P, energy and det F, and what A adds."""
+    terms = n_parameters // 2 if law == OGDEN else 0
+    return 27 + 9 + 37 + _LAW_MULTIPLY_ADDS[law] + terms * _OGDEN_TERM_MULTIPLY_ADDS, 9 * 6 * 4 + 81 * 3 + 27
 
 
 def general_multiply_adds(law: int, n_parameters: int, n_nodes: int) -> tuple[int, int]:

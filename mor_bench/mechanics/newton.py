@@ -166,7 +166,8 @@ def _is_round_off(step: NDArray[np.float64], q: NDArray[np.float64], extent: flo
     return float(np.abs(step).max()) <= ROUND_OFF * max(float(np.abs(q).max()), extent)
 
 
-def _is_linear(problem: Problem, q: NDArray[np.float64]) -> bool:
+def is_linear(problem: Problem, q: NDArray[np.float64]) -> bool:
+    """Whether a response at rest is so small that it is the solution, to as many digits as there are."""
     return float(np.abs(q).max()) <= LINEAR * problem.extent
 
 
@@ -235,7 +236,7 @@ def _accelerated(
     memory, probes = Anderson(problem.n_unknowns), _Probes(problem)
     rotations = inverse.turned(start)
     q = (yield [(load, rotations)])[0] if start is None else start.copy()
-    if start is None and _is_linear(problem, q):
+    if start is None and is_linear(problem, q):
         return _Pass(problem.rest_factor.solve(load), 1.0, 1, converged=True)
     turning, min_det, before = True, -np.inf, np.inf
     for iteration in range(1, ACCELERATED_ITERATIONS + 1):
@@ -307,7 +308,7 @@ def _plain(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float6
     """Full Newton steps; from rest, the first one uses the rest-state factor that every solve shares."""
     load_norm = float(np.linalg.norm(load))
     q = problem.rest_factor.solve(load) if start is None else start.copy()
-    if start is None and _is_linear(problem, q):
+    if start is None and is_linear(problem, q):
         return _Pass(q, 1.0, 1, converged=True)
     min_det, before, near = -np.inf, np.inf, False
     for iteration in range(1, PLAIN_ITERATIONS + 1):

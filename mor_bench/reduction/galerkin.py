@@ -13,8 +13,10 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from mor_bench import counting
 from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.assembly import Assembler, State
+from mor_bench.mechanics.assembly import Assembler, Pattern, State
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
+from mor_bench.mechanics.newton import MAX_LOAD_N, NewtonOptions, Solution, is_linear, solve_equilibrium
+from mor_bench.reduction.points import ReducedPoints
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -28,6 +30,13 @@ def _symmetric_product(indptr: Any, indices: Any, values: Any, modes: Any, produ
             if i != j:
                 for m in range(modes.shape[1]):
                     product[j, m] += value * modes[i, m]
+
+
+def stiffness_times(pattern: Pattern, values: NDArray[np.float64], modes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """K modes, (n, r), of a stiffness whose upper triangle is given."""
+    product = np.zeros_like(modes)
+    _symmetric_product(pattern.indptr, pattern.indices, values, modes, product)
+    return product
 
 
 class _DenseFactor:
@@ -52,7 +61,24 @@ def dense_factor(tangent: NDArray[np.float64]) -> Factor:
     return _DenseFactor(cholesky)
 
 
-class GalerkinProblem:
+class DenseProblem:
+    """What reduced problems share: symmetric dense tangents, each step by a Cholesky factor."""
+
+    accelerator = None
+
+    def step(
+        self, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64], tolerance: float
+    ) -> NDArray[np.float64]:  # fmt: skip
+        return self.factor(tangent).solve(residual)
+
+    def certify(self, q: NDArray[np.float64]) -> None:
+        """Nothing to do: every step has a Cholesky factor."""
+
+    def factor(self, tangent: NDArray[np.float64]) -> Factor:
+        return dense_factor(tangent)
+
+
+class GalerkinProblem(DenseProblem):
     """A reduced model over all cells (plain POD) or over weighted ones (ECSW).
 
     The basis need only hold the rows of the dofs that the assembler sees, so that with few cells the cost of a Newton
@@ -76,7 +102,6 @@ class GalerkinProblem:
         self.assembler = assembler
         self.modes = np.ascontiguousarray(modes)
         self.n_unknowns = modes.shape[1]
-        self.accelerator = None
         # Of an orthonormal basis the largest mode has norm 1, of one that is so in another inner product any.
         self.extent = assembler.extent_m * float(np.sqrt(len(modes)) / (np.linalg.norm(modes, axis=0).max() or 1.0))
 
@@ -101,17 +126,48 @@ class GalerkinProblem:
         if counting.running is not None:  # Φq, Φᵀf, KΦ with the K of which one triangle is stored, ΦᵀKΦ
             n, r = self.modes.shape
             counting.running.add(multiply_adds=2 * n * r + (2 * len(values) - n) * r + n * r**2)
-        pattern, product = self.assembler.pattern, np.zeros_like(self.modes)
-        _symmetric_product(pattern.indptr, pattern.indices, values, self.modes, product)
-        return self._project(state), self.modes.T @ product
+        return self._project(state), self.modes.T @ stiffness_times(self.assembler.pattern, values, self.modes)
 
-    def step(
-        self, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64], tolerance: float
-    ) -> NDArray[np.float64]:  # fmt: skip
-        return self.factor(tangent).solve(residual)
 
-    def certify(self, q: NDArray[np.float64]) -> None:
-        """Nothing to do: every step has a Cholesky factor."""
+class CubatureProblem(DenseProblem):
+    """A reduced model over weighted quadrature points: neither work nor memory of a step depends on the mesh.
 
-    def factor(self, tangent: NDArray[np.float64]) -> Factor:
-        return dense_factor(tangent)
+    Parameters
+    ----------
+    points : ReducedPoints
+        Whose test functions are the modes.
+    extent : float
+        Coordinates of this size are displacements of the size of the body, see `Problem`.
+    """
+
+    def __init__(self, points: ReducedPoints, extent: float) -> None:
+        self.points = points
+        self.n_unknowns = points.n_unknowns
+        self.extent = extent
+
+    @cached_property
+    def rest_tangent(self) -> NDArray[np.float64]:
+        return self.linearise(np.zeros(self.n_unknowns))[1]
+
+    @cached_property
+    def rest_factor(self) -> Factor:
+        return self.factor(self.rest_tangent)
+
+    def force(self, q: NDArray[np.float64]) -> State:
+        return self.points.force(q)
+
+    def linearise(self, q: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
+        return self.points.force_and_tangent(q)
+
+    def solve(self, load: NDArray[np.float64], options: NewtonOptions) -> Solution:
+        """`solve_equilibrium` from rest; Saint Venant-Kirchhoff tries full Newton steps in one compiled loop first.
+
+        With 11 cells and 3 modes of beam-coarse a solve took 0.026 ms instead of 0.068, with 20 modes 0.50 instead of 0.57.
+        """
+        if 0 < np.abs(load).max() <= MAX_LOAD_N:
+            q = self.rest_factor.solve(load)
+            if not is_linear(self, q):
+                found = self.points.full_steps(load, q, options.tolerance, self.extent)
+                if found is not None:
+                    return found
+        return solve_equilibrium(self, load, options=options)

@@ -10,7 +10,7 @@ from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.linear import Factor
-from mor_bench.reduction.galerkin import GalerkinProblem, _symmetric_product
+from mor_bench.reduction.galerkin import GalerkinProblem, stiffness_times
 from mor_bench.reduction.modal_derivatives import pairs
 
 
@@ -130,8 +130,7 @@ class ManifoldProblem:
         if counting.running is not None:  # KT with the K of which one triangle is stored, TᵀKT
             n, r = tangents.shape
             counting.running.add(multiply_adds=(2 * len(values) - n) * r + n * r**2)
-        pattern, product = self._linear.assembler.pattern, np.zeros_like(tangents)
-        _symmetric_product(pattern.indptr, pattern.indices, values, tangents, product)
+        product = stiffness_times(self._linear.assembler.pattern, values, tangents)
         bending = self._manifold.curvature(state.force) - self._bending_load
         return self._state(q, state, tangents), tangents.T @ product + bending
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -23,6 +25,11 @@ def _project(modes, load, reduced):  # type: ignore[no-untyped-def]
             for i in range(modes.shape[1]):
                 reduced[i] += load[dof] * modes[dof, i]
     return loaded
+
+
+def extent_of(scene: Scene) -> float:
+    """Coordinates of orthonormal modes that are displacements of the size of the body."""
+    return float(np.ptp(scene.mesh.points, axis=0).max() * np.sqrt(len(scene.free_dofs)))
 
 
 class Subspace:
@@ -62,3 +69,10 @@ class Subspace:
         else:
             out[:] = np.nan
             out[self._wanted] = self._expanding @ q
+
+    def answer(self, batch: Array, solve: Callable[[Array], Array]) -> Array:
+        """Displacements of loads (n, n_nodes, 3), N, by a solve from Φᵀf to q, in the same shape, m."""
+        out = np.empty((len(batch), len(self._modes)))
+        for row, load in zip(out, batch.reshape(out.shape), strict=True):
+            self.expand(solve(self.project(load)), row)
+        return out.reshape(batch.shape)

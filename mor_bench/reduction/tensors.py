@@ -27,7 +27,8 @@ from mor_bench.mechanics.assembly import State, quadrature_of
 from mor_bench.mechanics.linear import Factor
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import HOPELESS, NewtonOptions, solve_equilibrium
-from mor_bench.reduction.galerkin import dense_factor
+from mor_bench.reduction.galerkin import DenseProblem, dense_factor
+from mor_bench.reduction.subspace import extent_of
 from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.scene import Scene
 
@@ -311,12 +312,7 @@ def exact_polynomial(scene: Scene, modes: Array) -> bool:
     return has_polynomial(scene) and modes.shape[1] <= MOST_MODES
 
 
-def extent_of(scene: Scene) -> float:
-    """Coordinates of orthonormal modes that are displacements of the size of the body."""
-    return float(np.ptp(scene.mesh.points, axis=0).max() * np.sqrt(len(scene.free_dofs)))
-
-
-class TensorProblem:
+class TensorProblem(DenseProblem):
     """A reduced model of Saint Venant-Kirchhoff by its polynomial.
 
     Parameters
@@ -332,8 +328,6 @@ class TensorProblem:
     InvalidInputError
         If an array has another shape than the others ask for, NaN or infinity: the kernels behind check no bounds.
     """
-
-    accelerator = None
 
     def __init__(self, tensors: ReducedTensors, sentinels: Array, extent: float) -> None:
         r = tensors.n_modes
@@ -407,12 +401,6 @@ class TensorProblem:
 
     def force(self, q: Array) -> State:
         return self.linearise(q)[0]
-
-    def step(self, q: Array, tangent: Array, residual: Array, tolerance: float) -> Array:
-        return dense_factor(tangent).solve(residual)
-
-    def certify(self, q: Array) -> None:
-        """Nothing to do: every step has a Cholesky factor."""
 
     @cached_property
     def rest_tangent(self) -> Array:

@@ -9,29 +9,16 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto, size_to_needs
+from mor_bench.reduction.subspace import Subspace
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
-
-
-def predict_reduced(
-    scene: Scene, problem: GalerkinProblem, modes: NDArray[np.float64], batch: NDArray[np.float64], tolerance: float
-) -> NDArray[np.float64]:  # fmt: skip
-    """Solve the reduced equilibrium for each load (n, n_nodes, 3), N, and expand to all nodes, m."""
-    out = np.zeros((len(batch), scene.mesh.n_dofs))
-    if counting.running is not None:
-        counting.running.add(multiply_adds=2 * modes.size * len(batch))
-    for row, load in zip(out, batch.reshape(-1, scene.mesh.n_dofs), strict=True):
-        solution = solve_equilibrium(problem, modes.T @ load[scene.free_dofs], options=NewtonOptions(tolerance))
-        row[scene.free_dofs] = modes @ solution.displacement
-    return out.reshape(batch.shape)
 
 
 def stiffness_at_rest(model: FullOrderModel) -> sp.csr_matrix:
@@ -93,12 +80,15 @@ class PODGalerkin(Surrogate):
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
-        return predict_reduced(self.scene_, self.problem_, self.modes_, batch, self.tolerance_).reshape(np.shape(forces))
+        options = NewtonOptions(self.tolerance_)
+        answers = self._subspace.answer(batch, lambda load: solve_equilibrium(self.problem_, load, options=options).displacement)
+        return answers.reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
         return {"modes": self.modes_}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         self.modes_, self.tolerance_ = state["modes"], self._sized("tolerance")
+        self._subspace = Subspace(self.scene_, self.modes_)
         self.problem_ = GalerkinProblem(FullOrderModel(self.scene_).assembler, self.modes_)
         _ = self.problem_.rest_factor

@@ -64,10 +64,7 @@ class TensorPOD(Surrogate):
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
-        out = np.empty((len(batch), self.scene_.mesh.n_dofs))
-        for row, load in zip(out, batch.reshape(out.shape), strict=True):
-            self._subspace.expand(self.problem_.solve(self._subspace.project(load), self.tolerance_), row)
-        return out.reshape(batch.shape).reshape(np.shape(forces))
+        return self._subspace.answer(batch, lambda load: self.problem_.solve(load, self.tolerance_)).reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
         return {"modes": self.modes_, **self.problem_.arrays}

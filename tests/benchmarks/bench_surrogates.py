@@ -33,6 +33,8 @@ METHODS: dict[str, dict[str, Any]] = {
     "local-pod": {"n_clusters": 8, "n_modes": 10},
     "modal-derivatives": {"n_linear": 5, "n_modes": 20},
     "quadratic-manifold": {"n_modes": 5},
+    "ecm": {"n_modes": 20, "cubature_tolerance": 1e-2},
+    "deim": {"n_modes": 20, "n_force_modes": 40},
     "pca-regression": {"n_input_modes": 10},
     "pca-regression-force": {"n_input_modes": 20, "n_output_modes": 20},
     "explicit-dynamics": {"tolerance": 1e-2},

@@ -1,0 +1,124 @@
+"""Empirical cubature (ECM): cells that integrate a basis of the reduced cell forces exactly, and their sum of weights."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr, svd
+
+from mor_bench.reduction.cubature import ActiveColumns, CubatureError, SparseWeights, check_finite
+
+Array = NDArray[np.float64]
+
+BLOCK = 64
+"""Directions that the range finder adds at a time."""
+EXACT = 1e-8
+"""Relative residual of the equations for the weights at which they pass for solved."""
+
+
+def cell_basis(matrix: Array, tolerance: float) -> Array:
+    """Leading right singular vectors of a matrix, as many as leave at most ``tolerance`` of its Frobenius norm.
+
+    The range is found block by block from random combinations of rows, with one step of subspace iteration (Halko, Martinsson,
+    Tropp, SIAM Review 53, 2011, algorithms 4.3 and 4.4), until what is left is small enough; the singular vectors are then
+    those of a small matrix. For 136 vectors of 2,000 rows of the fine beam this took
+    0.4 s, the full decomposition 6 s.
+
+    Parameters
+    ----------
+    matrix : (m, n) float64
+    tolerance : float
+
+    Returns
+    -------
+    (n, k) float64, orthonormal
+    """
+    rng = np.random.default_rng(0)
+    total = float(np.linalg.norm(matrix))
+    rows = np.zeros((0, matrix.shape[1]))
+    while True:
+        size = min(BLOCK, min(matrix.shape) - len(rows))
+        left = qr(matrix @ (matrix.T @ rng.normal(size=(len(matrix), size))), mode="economic")[0]
+        new = left.T @ matrix
+        for _ in range(2):
+            new -= (new @ rows.T) @ rows
+        rows = np.vstack([rows, qr(new.T, mode="economic")[0].T])
+        projected = matrix @ rows.T
+        rest = np.sqrt(max(total**2 - float(np.linalg.norm(projected)) ** 2, 0.0))
+        if rest <= 0.5 * tolerance * total or len(rows) == min(matrix.shape):
+            break
+    _, values, vt = svd(projected, full_matrices=False, check_finite=False)
+    tails = np.sqrt(np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0) + rest**2)
+    kept = int(np.argmax(tails <= max(tolerance, 1e-14) * total)) or 1
+    return np.ascontiguousarray((vt[:kept] @ rows).T)
+
+
+def empirical_cubature(matrix: Array, tolerance: float, max_iterations: int | None = None) -> SparseWeights:
+    """Cells and non-negative weights that integrate the leading singular vectors of the training matrix, and 1, exactly.
+
+    Hernández, Caicedo, Ferrer: Dimensional hyper-reduction of nonlinear finite element models via empirical cubature, CMAME 313
+    (2017), section 3, with the constraint on the sum of the weights as Kratos has it: the part of the constant that the basis
+    lacks becomes one more basis function. Cells enter greedily, the one whose basis values point most along the residual first;
+    whichever weights the least squares make negative leave. There are at most as many cells as basis functions.
+
+    Parameters
+    ----------
+    matrix : (m, n) float64
+        G of `ecsw_system`; the target is G·1.
+    tolerance : float
+        Share of the matrix' Frobenius norm that the basis may lack.
+    max_iterations : int, optional
+        Columns added or removed; 3 n by default.
+
+    Returns
+    -------
+    SparseWeights
+        For the equations of the weights, not for the training matrix; its relative residual is at most `EXACT`.
+
+    Raises
+    ------
+    InvalidInputError
+        If an entry is not finite.
+    CubatureError
+        If the equations are not solved within the iterations, or the matrix is zero.
+    """
+    ones = np.ones(matrix.shape[1])
+    check_finite(matrix, ones)
+    if not matrix.any():
+        raise CubatureError("cubature has nothing to integrate: the training matrix is zero.")
+    basis = cell_basis(matrix, tolerance)
+    constant = ones - basis @ (basis.T @ ones)
+    if np.linalg.norm(constant) > 1e-6 * np.linalg.norm(ones):
+        basis = np.column_stack([basis, constant / np.linalg.norm(constant)])
+    equations = np.ascontiguousarray(basis.T)
+    target = equations.sum(axis=1)
+    columns = ActiveColumns(equations, target)
+    size, limit = float(np.linalg.norm(target)), 3 * len(ones) if max_iterations is None else max_iterations
+    x, residual, iterations = np.zeros(0), target, 0
+    rejected = columns.scale == 0
+    while float(np.linalg.norm(residual)) > EXACT * size and iterations < limit:
+        gradient = columns.gradient(residual)
+        gradient[columns.chosen] = -np.inf
+        gradient[rejected] = -np.inf
+        entering = int(gradient.argmax())
+        if gradient[entering] <= 0:
+            break
+        iterations += 1
+        if not columns.append(entering):
+            rejected[entering] = True
+            continue
+        x = columns.coefficients()
+        while (x <= 0).any():
+            for column in [columns.chosen[i] for i in np.flatnonzero(x <= 0)]:
+                columns.remove(column)
+                rejected[column] |= column == entering
+            x, iterations = columns.coefficients(), iterations + 1
+        before, residual = float(np.linalg.norm(residual)), columns.residual(x)
+        if float(np.linalg.norm(residual)) < before:
+            rejected = columns.scale == 0
+        else:  # the exchange did not help: the cell that came would come and go for ever
+            rejected[entering] = True
+    found = SparseWeights.of(equations, target, columns.weights(x), iterations)
+    if found.relative_residual > EXACT * (1 + 1e-6):
+        raise CubatureError(f"cubature reached a relative residual of {found.relative_residual:.3g} in {iterations} iterations; {EXACT:g} is needed.")
+    return found

@@ -1,0 +1,153 @@
+"""Reduced internal force and tangent summed over quadrature points: no mesh, no nodes, no sparse matrix.
+
+At a quadrature point the gradient of mode m is a fixed 3x3 matrix G_m, so that with H = Σ_m q_m G_m, F = I + H and the weights w
+
+    f_m = Σ w G_m : P(F),      K_mk = Σ w G_m : A(F) : G_k,      A = dP/dF,
+
+whatever the element. Work and memory depend on the numbers of points and modes only. A basis of test functions other than that of
+the displacement makes the tangent unsymmetric; that is what DEIM needs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench import counting
+from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
+from mor_bench.mechanics.assembly import State, quadrature_of
+from mor_bench.mechanics.laws import SAINT_VENANT_KIRCHHOFF, point_multiply_adds, point_stresses
+from mor_bench.mechanics.newton import HOPELESS, PLAIN_ITERATIONS, ROUND_OFF, Solution
+from mor_bench.reduction.point_kernels import LANES, full_steps, gradients, integrate, project
+from mor_bench.scene.materials import Material
+
+Array = NDArray[np.float64]
+
+SVK_MULTIPLY_ADDS = 77, 162
+"""Of Saint Venant-Kirchhoff's P, energy and det F from H at one point, and of A."""
+
+
+def tangent_multiply_adds(r: int, symmetric: bool) -> int:
+    """Of A : G_k for all modes, taken in pairs, and their products with the test functions, at one point."""
+    products = 0
+    for k in range(0, r, 2):
+        pair = 2 if k + 1 < r else 1
+        n = min(k + 2, r) if symmetric else r
+        products += 2 * (n - n % 4) + pair * (n % 4)
+    return 81 * 2 * -(-r // 2) + 9 * products
+
+
+def _batched(values: Array) -> Array:
+    """(n_points, ...) → (n_batches, ..., LANES), padded with zeros."""
+    padded = np.zeros((-(-len(values) // LANES) * LANES, *values.shape[1:]))
+    padded[: len(values)] = values
+    return np.ascontiguousarray(np.moveaxis(padded.reshape(-1, LANES, *values.shape[1:]), 1, -1))
+
+
+def _mode_gradients(shape_gradients: Array, cell_modes: Array, kept: NDArray[np.int64]) -> Array:
+    """(n_batches, r, 9 * LANES) gradients of modes at points, from (n_cells, n_points, n_nodes, 3) and (n_cells, n_nodes, 3, r)."""
+    own = np.einsum("cqaj,caim->cqmij", shape_gradients, cell_modes, optimize=True)
+    r = own.shape[2]
+    return _batched(own.reshape(-1, r, 9)[kept]).reshape(-1, r, 9 * LANES)
+
+
+class ReducedPoints:
+    """Reduced internal force and tangent over the weighted quadrature points of some cells.
+
+    Parameters
+    ----------
+    points : (n_nodes, 3) float64
+        Reference positions, m.
+    cells : (n_cells, 8) or (n_cells, 4) int
+        The cells to sum over.
+    material : Material
+    selective : bool
+        As for `Assembler`.
+    factors : (n_cells,) or (n_cells, n_cell_points) float64
+        Cubature weights, which multiply those of the quadrature; points with none are left out.
+    modes : (n_nodes, 3, r) float64
+        Displacement of each mode at every node; zero at supports. Only the rows of the cells' nodes are read.
+    test_modes : (n_nodes, 3, r) float64, optional
+        What the force is projected on; the modes by default.
+
+    Attributes
+    ----------
+    n_cells, n_points, n_unknowns : int
+    """
+
+    def __init__(
+        self,
+        points: Array,
+        cells: NDArray[np.int64],
+        material: Material,
+        selective: bool,
+        factors: Array,
+        modes: Array,
+        test_modes: Array | None = None,
+    ) -> None:
+        rule = quadrature_of(points, cells, material, selective)
+        weights = (rule.weights * factors.reshape(len(cells), -1)).ravel()
+        kept = np.flatnonzero(weights)
+        self.n_cells, self.n_points, self.n_unknowns = len(cells), len(kept), modes.shape[2]
+        self.trial = _mode_gradients(rule.gradients, modes[cells], kept)
+        self.symmetric = test_modes is None
+        self.test = self.trial if test_modes is None else _mode_gradients(rule.gradients, test_modes[cells], kept)
+        self.weights = _batched(weights[kept])
+        self.law, self.parameters = material.law, np.tile(rule.parameters, (len(cells), 1))[kept]
+        self._lame = _batched(self.parameters) if self.law == SAINT_VENANT_KIRCHHOFF else None
+        r = self.n_unknowns
+        force, tangent = SVK_MULTIPLY_ADDS if self.law == SAINT_VENANT_KIRCHHOFF else point_multiply_adds(self.law, rule.parameters.shape[1])
+        tangent += tangent_multiply_adds(r, self.symmetric)
+        self._multiply_adds = self.n_points * (force + 18 * r), self.n_points * (force + 18 * r + tangent)
+
+    def count(self, forces: int, tangents: int) -> None:
+        """Count evaluations of the force alone, and of force and tangent."""
+        if counting.running is not None:
+            work = forces * self._multiply_adds[0] + tangents * self._multiply_adds[1]
+            counting.running.add(element_evaluations=(forces + tangents) * self.n_cells, multiply_adds=work)
+
+    def _sum(self, q: Array, tangent: Array) -> State:
+        force = np.zeros(self.n_unknowns)
+        self.count(len(tangent) == 0, len(tangent) > 0)
+        if self._lame is not None:
+            return State(force, *integrate(q, self.trial, self.test, self.symmetric, self.weights, self._lame, force, tangent))
+        H, P = np.empty((2, len(self.weights), 9 * LANES))
+        A = np.empty((len(self.weights) if len(tangent) else 0, 81 * LANES))
+        gradients(self.trial, q, H)
+        energy, min_det = point_stresses(H, self.weights, self.law, self.parameters, P, A)
+        project(P, A, self.trial, self.test, self.symmetric, force, tangent)
+        return State(force, energy, min_det)
+
+    def force(self, q: Array) -> State:
+        """Reduced internal force, stored energy, J, and min det F at coordinates ``q`` (r,)."""
+        return self._sum(q, np.empty((0, 0)))
+
+    def force_and_tangent(self, q: Array) -> tuple[State, Array]:
+        """`force`, and the reduced tangent (r, r)."""
+        tangent = np.zeros((self.n_unknowns, self.n_unknowns))
+        return self._sum(q, tangent), tangent
+
+    def point_forces(self, q: Array) -> Array:
+        """What each point adds to the reduced force, (n_points, r): what their cubature is trained on."""
+        H, P = np.empty((2, len(self.weights), 9 * LANES))
+        gradients(self.trial, q, H)
+        point_stresses(H, self.weights, self.law, self.parameters, P, np.empty((0, 81 * LANES)))
+        own = np.einsum("bmcl,bcl->blm", self.test.reshape(len(P), -1, 9, LANES), P.reshape(len(P), 9, LANES))
+        return np.asarray(own.reshape(-1, self.n_unknowns)[: self.n_points])
+
+    def full_steps(self, load: Array, start: Array, tolerance: float, extent: float) -> Solution | None:
+        """Newton's full steps; None for other laws than Saint Venant-Kirchhoff, or without a stable end with det F > 0."""
+        if self._lame is None:
+            return None
+        q = start.copy()
+        converged, min_det, iterations, tangents, forces, factors, solves = full_steps(
+            load, q, self.trial, self.weights, self._lame, tolerance, HOPELESS, ROUND_OFF, extent, PLAIN_ITERATIONS
+        )
+        self.count(forces, tangents)
+        if counting.running is not None:
+            r = self.n_unknowns
+            dense = factors * cholesky_multiply_adds(r, r - 1) + solves * triangular_multiply_adds(r, r - 1)
+            counting.running.add(
+                factorisations=factors, reduced_factorisations=factors, back_solves=solves, reduced_back_solves=solves, multiply_adds=dense
+            )
+        return Solution(q, min_det, iterations, 0) if converged and min_det > 0 else None

@@ -1,0 +1,28 @@
+"""Hyper-reduced POD by the empirical cubature method (ECM)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.reduction.cubature import ecsw_system
+from mor_bench.reduction.empirical_cubature import empirical_cubature
+from mor_bench.surrogates.hyper_reduced import CubatureSurrogate
+
+Array = NDArray[np.float64]
+
+
+class EmpiricalCubaturePOD(CubatureSurrogate):
+    """POD-Galerkin over a few weighted cells that integrate a basis of the reduced cell forces exactly, and their number.
+
+    ``cubature_tolerance`` is the share of the reduced cell forces, in the Frobenius norm over cells, snapshots and modes, that
+    the basis may lack; 0 keeps every cell with weight 1 (Hernández, Caicedo, Ferrer 2017). The weights sum to the number of cells.
+
+    The other parameters are those of `CubatureSurrogate`.
+    """
+
+    def _train(self, model: FullOrderModel, modes: Array, q: Array, tolerance: float) -> tuple[NDArray[np.int64], Array]:
+        weights = empirical_cubature(ecsw_system(model.assembler, model.cell_dofs, modes, q), tolerance).weights
+        cells = np.flatnonzero(weights)
+        return cells, weights[cells]
