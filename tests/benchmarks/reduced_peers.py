@@ -11,8 +11,9 @@ the nodal error over nodes and loads, m, and the median over the loads of the re
 
 mor-bench
     `predict` as it is, wholly: checks, projection of the forces, solve, expansion to all nodes. Methods of the suite by their
-    names, with their file's parameters but `n_modes` and `tolerance` as here. `pod` and `hpod` are the models that Kratos'
-    answers are compared with; `pod-tensor` claims the answers of `pod` and is held to them.
+    names, with their file's parameters but `n_modes` and `tolerance` as here. `hpod` integrates points of the cells that it keeps,
+    "hpod, whole cells" all of theirs, as Kratos does. This and `pod` are the models that Kratos' answers are compared with;
+    `pod-tensor` claims the answers of `pod` and is held to them.
 Kratos
     Release build of the package index, KratosRomApplication. `TotalLagrangianElement3D8N` with `LinearElastic3DLaw`, Φ as
     ROM_BASIS of the nodes, Galerkin projection by either of its builders: "global" (`GlobalROMBuilderAndSolver`, its default,
@@ -26,9 +27,9 @@ Kratos
 HROM
     Kratos' hyper-reduced model: HROM_WEIGHT on the selected elements, and no others in the model part. Point loads are conditions,
     which Kratos assembles anew in each step; they keep the weight 1, so that the reduced load is exact as in ours. With the cells
-    and weights of our `hpod` (ECSW), and with those of Kratos' own `EmpiricalCubatureMethod` (ECM). The latter gets our training
+    and weights of our "hpod, whole cells" (ECSW), and with those of Kratos' own `EmpiricalCubatureMethod` (ECM). The latter gets our training
     matrix, its singular vectors being cut at the same relative tolerance, and the sum of weights constrained, as Kratos' own
-    training does. "mor-bench, hpod, ECM cells" is our model with these.
+    training does; "hpod, ECM cells" is our model with these.
 
 Steps are Newton steps in Kratos, and reduced back-solves in ours. A speed-up is over the faster POD of Kratos, each load's
 fastest round over the fastest, and the median over the loads.
@@ -118,8 +119,9 @@ class Ours(Reduced):
 
     def __init__(self, name: str, method: Surrogate, twin: Twin | None) -> None:
         self.name, self.twin, self._method = f"mor-bench, {name}", twin, method
-        assembler = getattr(getattr(method, "problem_", None), "assembler", None)
-        self.n_cells = None if assembler is None else assembler.n_cells
+        problem = getattr(method, "problem_", None)
+        integrated = getattr(problem, "assembler", None) or getattr(problem, "points", None)
+        self.n_cells = None if integrated is None else integrated.n_cells
 
     def set_up(self, forces: Array) -> None:
         with counting.counted() as cost:
@@ -285,11 +287,12 @@ def make_contenders(
     ValueError
         If the scene is none that both sides can solve.
     """
-    fitted = own_methods(scene, snapshots, list(dict.fromkeys(("pod", "hpod", *methods))), n_modes, say)
-    pod, hpod = fitted["pod"], fitted["hpod"]
+    fitted = own_methods(scene, snapshots, list(dict.fromkeys(("pod", *methods))), n_modes, say)
+    pod, hpod = fitted["pod"], mor_bench.load_method("hpod", n_modes=n_modes, tolerance=TOLERANCE, sampling="cells").fit(scene, snapshots)
     assert isinstance(pod, PODGalerkin)
     assert isinstance(hpod, HyperReducedPOD)
     own: list[Reduced] = [Ours(name, fitted[name], pod if name in SAME_AS_POD else None) for name in methods if name in fitted]
+    own.append(Ours("hpod, whole cells", hpod, None))
     missing = [name for name in KRATOS_ROM if not installed(name)]
     if missing:
         say(f"Kratos: skipped, not installed: pip install {' '.join(missing)}")
