@@ -38,7 +38,7 @@ CONFIGURATIONS = {
     "fem": 4, "fem-coarse": 4, "fem-jacobi-pcg": 1, "fem-pardiso": 1, "fem-warm": 8, "hpod": 6, "hybrid": 3, "linear-fem": 1,
     "pca-regression": 3, "pca-regression-force": 1, "pod": 7, "pod-tensor": 5, "umesh": 1, "umesh-small": 2,
     "autoencoder": 2, "local-pod": 6, "modal-derivatives": 4, "quadratic-manifold": 6,
-    "explicit-dynamics": 6, "pgd": 6, "pgd-force": 3,
+    "explicit-dynamics": 4, "pgd": 6, "pgd-force": 3,
     "deim": 6, "ecm": 6,
 }  # fmt: skip
 
