@@ -143,7 +143,7 @@ class Surrogate(ABC):
         Parameters
         ----------
         forces, displacements : (n_nodes, 3) or (n, n_nodes, 3)
-            Loads, N, and what `predict` answered, m.
+            Loads, N, and what `predict` answered, m, at all nodes.
 
         Returns
         -------
@@ -153,7 +153,7 @@ class Surrogate(ABC):
         Raises
         ------
         InvalidInputError
-            On a wrong shape or dtype, or forces that are not finite.
+            On a wrong shape or dtype, forces that are not finite, or displacements that are only there where outputs are wanted.
         NotFittedError
             Before `fit`.
         UnsupportedSceneError
@@ -165,9 +165,13 @@ class Surrogate(ABC):
         predicted = np.asarray(displacements)
         if predicted.dtype.kind != "f" or predicted.shape != np.shape(forces):
             raise InvalidInputError(f"`displacements` must be floats of shape {np.shape(forces)}; got {predicted.dtype} of shape {predicted.shape}.")
+        predicted = predicted.reshape(batch.shape).astype(np.float64, copy=False)
+        left_out = np.delete(predicted, self.scene_.output_nodes, axis=1)
+        if np.isnan(left_out).any():
+            raise InvalidInputError("`displacements` must be given at all nodes; those that `needs.outputs` leaves out hold NaN.")
         if not hasattr(self, "_indicator") or self._indicator[0] is not self.scene_:
             self._indicator = self.scene_, ErrorIndicator(self.scene_)
-        return self._indicator[1](batch, predicted.reshape(batch.shape).astype(np.float64, copy=False))
+        return self._indicator[1](batch, predicted)
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -364,6 +368,6 @@ def _fitted(path: str | Path, surrogate: type[Any], scene: Scene | None, header:
         method._restore(state)
         if ranges:
             method.range_ = LoadRange.from_arrays(ranges, method.scene_.mesh.n_nodes)
-    except (MorBenchError, KeyError, ValueError, IndexError, TypeError, AttributeError) as error:
+    except (MorBenchError, ArithmeticError, KeyError, ValueError, IndexError, TypeError, AttributeError) as error:
         raise StoreError(f"{path}: its content does not make a {header['surrogate'].partition(':')[2]}: {error}") from None
     return method

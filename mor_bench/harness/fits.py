@@ -432,7 +432,7 @@ def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[
     parts: list[SampleErrors] = []
     flagged: list[bool] | None = []
     worst: tuple[float, int, NDArray[np.float64]] = (-1.0, 0, np.full(test.references.shape[1:], np.nan))
-    main = test is entry.material.sets["test"]
+    main = test is entry.material.sets.get("test")
     indicated = Indicated(entry.material.indicator if main else None, len(test.forces))
     until = monotonic() + limit_s
     with tempfile.TemporaryDirectory(dir=entry.material.scratch) as folder:

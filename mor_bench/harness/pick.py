@@ -25,7 +25,7 @@ from mor_bench.specs import AnyDatasetSpec, load_dataset_spec
 
 Row = Mapping[str, Any]
 
-RANKED_BY = "offline cost (data + fit, two digits), then latency, then memory"
+RANKED_BY = "offline cost (data + fit, to the second and two digits), then latency, then memory"
 RUNS = Path("reports") / "runs"
 
 

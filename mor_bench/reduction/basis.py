@@ -35,6 +35,7 @@ FIRST_DIRECTIONS = 64
 LEAST_STREAMED_TOLERANCE = 1e-6
 """What lies beyond the modes is a difference of squares there; a smaller share is lost to round-off."""
 SEED = 0
+EPS = float(np.finfo(np.float64).eps)
 
 Blocks = Callable[[], Iterable[NDArray[np.float64]]]
 
@@ -80,7 +81,9 @@ def pod(
         `energy_tolerance` are given, or one is out of range; if K has another shape or is not positive definite.
     """
     _check_wanted(n_modes, energy_tolerance)
-    if not (_checked(snapshots, inner_product).any()):
+    precision = float(np.finfo(snapshots.dtype).eps) if getattr(snapshots, "dtype", np.dtype(int)).kind == "f" else EPS
+    snapshots = _checked(snapshots, inner_product)
+    if not snapshots.any():
         raise InvalidInputError("the snapshots are all zero: they span no basis.")
     found, key = None, b""
     if _remembered is not None:
@@ -100,6 +103,7 @@ def pod(
             found, reach = _exact(snapshots, inner_product), None
         if _remembered is not None:
             _remembered.keep(key, found, reach)
+    found.precision = max(precision, EPS)
     return found.truncated(n_modes, energy_tolerance)
 
 
@@ -117,7 +121,7 @@ def pod_streamed(
     blocks : callable
         Gives an iterable of the snapshots' rows, (any number, n) float64 each, from the beginning and in the same order
         every time, e.g. ``lambda: (part.free_displacements for part in stream("beam-fine"))`` with
-        `mor_bench.snapshots.dataset.stream`.
+        `mor_bench.snapshots.dataset.stream`, which gives test samples too: no basis for a comparison.
     n_modes, energy_tolerance, inner_product
         As of `pod`; by neither of the first two, the rank is found.
 
@@ -156,7 +160,7 @@ def _checked(rows: NDArray[np.float64], inner_product: Any, n: int | None = None
         raise InvalidInputError(f"`inner_product` must have shape ({rows.shape[1]}, {rows.shape[1]}); got {inner_product.shape}.")
     if not np.isfinite(rows).all():
         raise InvalidInputError("the snapshots hold NaN or infinity.")
-    return rows
+    return rows.astype(np.float64, copy=False)
 
 
 class _Decomposition:
@@ -174,6 +178,9 @@ class _Decomposition:
     energy : float, optional
         Sum of the squares of all singular values, if these are not all of them.
     """
+
+    precision = EPS
+    """Of the numbers that the snapshots came in: what is relatively smaller than their round-off spans nothing."""
 
     def __init__(self, tall: NDArray[np.float64], inner_product: Any, n_samples: int, energy: float | None = None) -> None:
         (self._reflections, self._scales), r = qr(tall, mode="raw", check_finite=False)
@@ -209,7 +216,7 @@ class _Decomposition:
     @cached_property
     def rank(self) -> int:
         """Singular values that are no round-off."""
-        return int((self.values > self.values[0] * max(self.n_samples, self.n) * np.finfo(float).eps).sum())
+        return int((self.values > self.values[0] * max(self.n_samples, self.n) * self.precision).sum())
 
     def n_modes_of(self, energy_tolerance: float) -> int:
         """The least number of modes that leave no larger a share; one more than there are if none does."""
@@ -307,7 +314,8 @@ class _Remembered:
     @staticmethod
     def key(snapshots: NDArray[np.float64], inner_product: Any) -> bytes:
         digest = hashlib.blake2b(repr((snapshots.shape, snapshots.dtype.str)).encode())
-        for array in (snapshots, *(() if inner_product is None else (inner_product.data,))):
+        product = () if inner_product is None else (inner_product.data, inner_product.indices, inner_product.indptr)
+        for array in (snapshots, *product):
             digest.update(np.ascontiguousarray(array).data)
         return digest.digest()
 

@@ -40,16 +40,24 @@ def cell_basis(matrix: Array, tolerance: float) -> Array:
         size = min(BLOCK, min(matrix.shape) - len(rows))
         left = qr(matrix @ (matrix.T @ rng.normal(size=(len(matrix), size))), mode="economic")[0]
         new = left.T @ matrix
+        largest = float(np.linalg.norm(new, axis=1).max())
         for _ in range(2):
             new -= (new @ rows.T) @ rows
-        rows = np.vstack([rows, qr(new.T, mode="economic")[0].T])
+            new = new[np.linalg.norm(new, axis=1) > 1e-13 * largest]  # within the span of the others but for round-off
+        fresh, triangular = qr(new.T, mode="economic")
+        fresh = fresh[:, np.abs(np.diag(triangular)) > 1e-13 * largest]
+        fresh -= rows.T @ (rows @ fresh)
+        rows = np.vstack([rows, qr(fresh, mode="economic")[0].T])
         projected = matrix @ rows.T
-        rest = np.sqrt(max(total**2 - float(np.linalg.norm(projected)) ** 2, 0.0))
-        if rest <= 0.5 * tolerance * total or len(rows) == min(matrix.shape):
+        rest = float(np.linalg.norm(matrix - projected @ rows))
+        if rest <= max(0.5 * tolerance, 1e-13) * total or fresh.shape[1] == 0 or len(rows) == min(matrix.shape):
             break
     _, values, vt = svd(projected, full_matrices=False, check_finite=False)
     tails = np.sqrt(np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0) + rest**2)
-    kept = int(np.argmax(tails <= max(tolerance, 1e-14) * total)) or 1
+    enough = np.flatnonzero(tails <= max(tolerance, 1e-12) * total)
+    if not len(enough):
+        raise CubatureError(f"the basis of the cell forces leaves out {rest / total:.3g} of them; `cubature_tolerance` asks for {tolerance:.3g}.")
+    kept = int(enough[0]) or 1
     return np.ascontiguousarray((vt[:kept] @ rows).T)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +13,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 from mor_bench import counting
 from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
-from mor_bench.errors import InvalidInputError
+from mor_bench.errors import InvalidInputError, SolverError
 from mor_bench.mechanics.assembly import Assembler, Pattern, State
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
 from mor_bench.mechanics.newton import MAX_LOAD_N, NewtonOptions, Solution, is_linear, solve_equilibrium
@@ -61,17 +62,31 @@ def dense_factor(tangent: NDArray[np.float64]) -> Factor:
     return _DenseFactor(cholesky)
 
 
-class DenseProblem:
+class DenseProblem(ABC):
     """What reduced problems share: symmetric dense tangents, each step by a Cholesky factor."""
 
     accelerator = None
+
+    @property
+    @abstractmethod
+    def rest_tangent(self) -> NDArray[np.float64]: ...
+
+    @cached_property
+    def rest_factor(self) -> Factor:
+        """Raises `SolverError` where the reduced stiffness at rest is not positive definite."""
+        try:
+            return self.factor(self.rest_tangent)
+        except NotPositiveDefiniteError:
+            raise SolverError(
+                "the reduced stiffness at rest is not positive definite: its modes depend on each other, or too few cells or points are kept."
+            ) from None
 
     def step(
         self, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64], tolerance: float
     ) -> NDArray[np.float64]:  # fmt: skip
         return self.factor(tangent).solve(residual)
 
-    def certify(self, q: NDArray[np.float64]) -> None:
+    def certify(self, q: NDArray[np.float64]) -> None:  # noqa: B027 - not to be overridden
         """Nothing to do: every step has a Cholesky factor."""
 
     def factor(self, tangent: NDArray[np.float64]) -> Factor:
@@ -109,10 +124,6 @@ class GalerkinProblem(DenseProblem):
     def rest_tangent(self) -> NDArray[np.float64]:
         return self.linearise(np.zeros(self.n_unknowns))[1]
 
-    @cached_property
-    def rest_factor(self) -> Factor:
-        return self.factor(self.rest_tangent)
-
     def _project(self, state: State) -> State:
         return State(self.modes.T @ state.force, state.energy_j, state.min_det_f)
 
@@ -148,10 +159,6 @@ class CubatureProblem(DenseProblem):
     @cached_property
     def rest_tangent(self) -> NDArray[np.float64]:
         return self.linearise(np.zeros(self.n_unknowns))[1]
-
-    @cached_property
-    def rest_factor(self) -> Factor:
-        return self.factor(self.rest_tangent)
 
     def force(self, q: NDArray[np.float64]) -> State:
         return self.points.force(q)

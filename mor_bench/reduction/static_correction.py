@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench import counting
+from mor_bench.errors import InvertedElementError
 from mor_bench.mechanics.linear import Factor
+from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.tensors import TensorProblem
@@ -21,8 +23,7 @@ def static_correction(rest_factor: Factor, reduced_factor: Factor, modes: NDArra
     """What a reduced model lacks of the linear response, (K₀⁻¹ - Φ (ΦᵀK₀Φ)⁻¹ Φᵀ) f.
 
     Added to any reduced solution whose tangent space at rest is Φ, it makes the answer to a small load exact to first order,
-    whatever the basis. It is linear in the load and does not turn with the body, and the corrected state is not checked for
-    inverted elements.
+    whatever the basis. It is linear in the load and does not turn with the body, so that it may invert cells; `refuse_inverted` looks.
 
     Parameters
     ----------
@@ -46,11 +47,12 @@ def static_correction(rest_factor: Factor, reduced_factor: Factor, modes: NDArra
 
 
 def predict_corrected(
-    problem: GalerkinProblem | TensorProblem, modes: NDArray[np.float64], rest_factor: Factor, loads: NDArray[np.float64], tolerance: float
+    problem: GalerkinProblem | TensorProblem, modes: NDArray[np.float64], model: FullOrderModel, loads: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.float64]:
     """Reduced equilibria under loads (n, n_free), N, with their static corrections, (n, n_free) m.
 
-    The modes are those of the problem on all free dofs. Raises `SolverError` if the reduced model has no valid equilibrium.
+    The modes are those of the problem on all free dofs. Raises `SolverError` if the reduced model has no valid equilibrium, or
+    its correction inverts cells.
     """
     out = np.empty(loads.shape)
     if counting.running is not None:
@@ -61,5 +63,13 @@ def predict_corrected(
             q = problem.solve(reduced, tolerance)
         else:
             q = solve_equilibrium(problem, reduced, options=NewtonOptions(tolerance)).displacement
-        row[:] = rest_factor.solve(load) + modes @ (q - problem.rest_factor.solve(reduced))
+        row[:] = model.rest_factor.solve(load) + modes @ (q - problem.rest_factor.solve(reduced))
+        refuse_inverted(model, row)
     return out
+
+
+def refuse_inverted(model: FullOrderModel, u: NDArray[np.float64]) -> None:
+    """Raise `InvertedElementError` if cells are inverted at displacements u (n_free,), m."""
+    least = model.force(u).min_det_f
+    if not least > 0:
+        raise InvertedElementError(f"the reduced answer inverts elements: its least det F is {least:.3g}.")

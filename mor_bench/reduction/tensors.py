@@ -24,10 +24,9 @@ from mor_bench import counting
 from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.assembly import State, quadrature_of
-from mor_bench.mechanics.linear import Factor
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import HOPELESS, NewtonOptions, solve_equilibrium
-from mor_bench.reduction.galerkin import DenseProblem, dense_factor
+from mor_bench.reduction.galerkin import DenseProblem
 from mor_bench.reduction.subspace import extent_of
 from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.scene import Scene
@@ -42,6 +41,9 @@ MAX_SENTINELS = 64
 
 MOST_MODES = 100
 """The polynomial of more would take a gigabyte."""
+
+MOST_BYTES = 5e8
+"""Of all polynomials of a method that has several."""
 
 QUICK_ITERATIONS = 15
 """Newton steps before the safeguarded solve takes over; 3 to 6 are usual."""
@@ -307,9 +309,18 @@ def has_polynomial(scene: Scene) -> bool:
     return isinstance(scene.material, SaintVenantKirchhoff)
 
 
-def exact_polynomial(scene: Scene, modes: Array) -> bool:
-    """Whether a model reduced to these modes is best solved by its polynomial."""
-    return has_polynomial(scene) and modes.shape[1] <= MOST_MODES
+def polynomial_pays(model: FullOrderModel, n_modes: int, n_bases: int = 1) -> bool:
+    """Whether models reduced to so many modes are better solved by their polynomials than over the mesh.
+
+    A multiply-add of the polynomial, whose coefficients come from memory, takes about three times as long as one of the mesh: on
+    beam-coarse 60 modes took 3.5 ms by it and 1.9 over the mesh, 40 modes 0.5 and 1.4.
+    """
+    if not has_polynomial(model.scene) or 8 * n_bases * n_pairs(n_modes) ** 2 > MOST_BYTES:
+        return False
+    with counting.counted() as mesh:
+        model.assembler.force_and_tangent(np.zeros(model.n_unknowns))
+    products = 2 * len(model.assembler.pattern.indices) * n_modes + model.n_unknowns * n_modes**2
+    return 3 * n_pairs(n_modes) ** 2 <= mesh.multiply_adds + products
 
 
 class TensorProblem(DenseProblem):
@@ -320,6 +331,8 @@ class TensorProblem(DenseProblem):
     tensors : ReducedTensors
     sentinels : (n, 9, r) float64
         Gradients of the modes where det F is watched.
+    usual : (1,) float64
+        The least det F of typical states there: what goes below is unlike them.
     extent : float
         Reduced coordinates of this size are displacements of the size of the body.
 
@@ -329,15 +342,21 @@ class TensorProblem(DenseProblem):
         If an array has another shape than the others ask for, NaN or infinity: the kernels behind check no bounds.
     """
 
-    def __init__(self, tensors: ReducedTensors, sentinels: Array, extent: float) -> None:
+    def __init__(self, tensors: ReducedTensors, sentinels: Array, usual: Array, extent: float) -> None:
         r = tensors.n_modes
-        shapes = {"quadratic": (r, r), "cubic": (n_pairs(r), r), "quartic": (n_pairs(r), n_pairs(r)), "sentinels": (len(sentinels), 9, r)}
-        arrays = {**vars(tensors), "sentinels": sentinels}
+        shapes = {
+            "quadratic": (r, r),
+            "cubic": (n_pairs(r), r),
+            "quartic": (n_pairs(r), n_pairs(r)),
+            "sentinels": (len(sentinels), 9, r),
+            "usual": (1,),
+        }
+        arrays = {**vars(tensors), "sentinels": sentinels, "usual": usual}
         for name, shape in shapes.items():
             if arrays[name].dtype != np.float64 or arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
                 raise InvalidInputError(f"`{name}` must be finite float64 of shape {shape}; got {arrays[name].dtype} of shape {arrays[name].shape}.")
         self._arrays = tuple(np.ascontiguousarray(arrays[name]) for name in ("quadratic", "cubic", "quartic"))
-        self.tensors, self.sentinels = tensors, np.ascontiguousarray(sentinels)
+        self.tensors, self.sentinels, self.usual = tensors, np.ascontiguousarray(sentinels), usual
         self.n_unknowns = r
         self.extent = extent
         try:
@@ -348,23 +367,29 @@ class TensorProblem(DenseProblem):
     @classmethod
     def of_modes(cls, model: FullOrderModel, modes: Array, samples: Array) -> TensorProblem:
         """Of modes (n_free, r) of a mesh; det F is watched where states with coordinates ``samples`` (n, r) have their smallest."""
-        return cls(reduce_energy(model, modes), sentinels_of(model, modes, samples), extent_of(model.scene))
+        sentinels = np.ascontiguousarray(sentinels_of(model, modes, samples))
+        usual = min((float(_min_det_f(sentinels, q)) for q in samples), default=1.0)
+        return cls(reduce_energy(model, modes), sentinels, np.array([usual]), extent_of(model.scene))
 
     @property
     def arrays(self) -> dict[str, Array]:
         """What `of_arrays` makes it from."""
-        return {**vars(self.tensors), "sentinels": self.sentinels}
+        return {**vars(self.tensors), "sentinels": self.sentinels, "usual": self.usual}
 
     @classmethod
     def of_arrays(cls, scene: Scene, arrays: Mapping[str, Array]) -> TensorProblem:
         """From arrays that were saved; raises `InvalidInputError`, or KeyError, where they make none."""
         tensors = ReducedTensors(*(arrays[name] for name in ("quadratic", "cubic", "quartic")))
-        return cls(tensors, arrays["sentinels"], extent_of(scene))
+        return cls(tensors, arrays["sentinels"], arrays["usual"], extent_of(scene))
 
     def solve(self, load: Array, tolerance: float) -> Array:
         """Reduced coordinates (r,) at the equilibrium under a load Φᵀf; raises `SolverError` where there is none."""
         q = self.quick(load, tolerance)
         return solve_equilibrium(self, load, options=NewtonOptions(tolerance)).displacement if q is None else q
+
+    def unlike(self, q: Array) -> bool:
+        """Whether cells are squeezed more than in typical states, where the watched points may not be the worst."""
+        return self.min_det_f(q) < float(self.usual[0])
 
     def quick(self, load: Array, tolerance: float) -> Array | None:
         """The equilibrium (r,) by full Newton steps, or None where they lead to none that is stable with det F > 0."""
@@ -405,7 +430,3 @@ class TensorProblem(DenseProblem):
     @cached_property
     def rest_tangent(self) -> Array:
         return self._arrays[0]
-
-    @cached_property
-    def rest_factor(self) -> Factor:
-        return dense_factor(self.rest_tangent)

@@ -32,8 +32,10 @@ def weighted_cells(scene: Scene, cells: NDArray[np.int64], weights: NDArray[np.f
     n_cells = scene.mesh.n_cells
     if cells.dtype.kind != "i" or cells.shape != weights.shape or not ((cells >= 0) & (cells < n_cells)).all():
         raise InvalidInputError(f"`cells` must be integers in [0, {n_cells - 1}], as many as there are weights.")
-    if not np.isfinite(weights).all():
-        raise InvalidInputError("`weights` must be finite; got NaN or infinity.")
+    if len(np.unique(cells)) != len(cells):
+        raise InvalidInputError("`cells` must be different integers.")
+    if not (np.isfinite(weights).all() and (weights > 0).all()):
+        raise InvalidInputError("`weights` must be positive and finite.")
     nodes = scene.mesh.cells[cells]
     touched = np.zeros((scene.mesh.n_nodes, 3), dtype=bool)
     touched[nodes] = True

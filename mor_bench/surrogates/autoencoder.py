@@ -138,6 +138,7 @@ class Autoencoder(Surrogate):
             counting.running.add(multiply_adds=len(batch) * (self.axes_.size + networks + self.modes_.size))
         linear = self.model_.rest_factor.solve(batch[:, free].T).T
         out[:, free] = linear + (self._decoded(linear @ self.axes_) - self._at_rest) @ self.modes_.T
+        out[~batch.any(axis=1)] = 0.0  # in a batch the network at rest is rounded otherwise
         return out.reshape(np.shape(forces))
 
     def _decoded(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -78,6 +78,7 @@ class Hybrid(Surrogate):
             start = self._unfitted()
             if start.needs_snapshots:
                 self._checked_snapshots(snapshots)
+            start.time_limit_s = self.time_limit_s
             self._become(start.fit(_all_outputs(scene), snapshots))
         return self
 

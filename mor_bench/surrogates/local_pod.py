@@ -15,7 +15,7 @@ from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.static_correction import predict_corrected
-from mor_bench.reduction.tensors import TensorProblem, exact_polynomial
+from mor_bench.reduction.tensors import TensorProblem, polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
@@ -93,7 +93,7 @@ class LocalPOD(Surrogate):
                 bases.append(pod(both[np.append(own, near)].reshape(-1, both.shape[2]), self.n_modes).modes)
             polynomials: dict[str, NDArray[np.float64]] = {}
             for cluster, basis in enumerate(bases):
-                if exact_polynomial(scene, basis):
+                if polynomial_pays(model, basis.shape[1], len(bases)):
                     own = snapshots.free_displacements[labels == cluster][:N_WATCHED]
                     problem = TensorProblem.of_modes(model, basis, own @ basis)
                     polynomials |= {f"{name}.{cluster}": array for name, array in problem.arrays.items()}
@@ -116,7 +116,7 @@ class LocalPOD(Surrogate):
             counting.running.add(multiply_adds=len(batch) * (self.to_coordinates_.size + self.centroids_.size))
         for row, load in zip(out, batch.reshape(out.shape)[:, free], strict=True):
             nearest = self._nearest(load)
-            row[free] = predict_corrected(self.problems_[nearest], self.bases_[nearest], self.model_.rest_factor, load[None], self.tolerance)[0]
+            row[free] = predict_corrected(self.problems_[nearest], self.bases_[nearest], self.model_, load[None], self.tolerance)[0]
         return out.reshape(np.shape(forces))
 
     def _nearest(self, load: NDArray[np.float64]) -> int:
@@ -161,10 +161,13 @@ class LocalPOD(Surrogate):
     def _problem(
         self, cluster: int, basis: NDArray[np.float64], state: dict[str, NDArray[Any]]
     ) -> GalerkinProblem | TensorProblem:  # fmt: skip
-        if not exact_polynomial(self.scene_, basis):
+        if not polynomial_pays(self.model_, basis.shape[1], len(self.bases_)):
             return GalerkinProblem(self.model_.assembler, basis)
         own = {name.removesuffix(f".{cluster}"): array for name, array in state.items() if name.endswith(f".{cluster}")}
-        return TensorProblem.of_arrays(self.scene_, own)
+        problem = TensorProblem.of_arrays(self.scene_, own)
+        if problem.n_unknowns != basis.shape[1]:
+            raise InvalidInputError(f"the polynomial must be that of {basis.shape[1]} modes; got {problem.n_unknowns}.")
+        return problem
 
 
 def _directions(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:

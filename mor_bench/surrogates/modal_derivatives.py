@@ -8,14 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
+from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.modal_derivatives import derivative_basis, patch_responses
 from mor_bench.reduction.static_correction import predict_corrected
-from mor_bench.reduction.tensors import TensorProblem, exact_polynomial
+from mor_bench.reduction.tensors import TensorProblem, polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
+from mor_bench.surrogates.hyper_reduced import checked_array
 
 N_WATCHED = 300
 """Linear responses to the largest loads that tell where det F is to be watched."""
@@ -59,7 +61,7 @@ class ModalDerivatives(Surrogate):
             model = FullOrderModel(scene)
             modes = derivative_basis(scene, model, self.n_linear, self.n_modes)
             state = {"modes": modes}
-            if exact_polynomial(scene, modes):
+            if polynomial_pays(model, modes.shape[1]):
                 largest = scene.generated.loads.magnitude_n[1] * patch_responses(scene, model) @ modes
                 chosen = np.unique(np.linspace(0, len(largest) - 1, N_WATCHED // 2).astype(int))
                 state |= TensorProblem.of_modes(model, modes, np.vstack([largest[chosen], -largest[chosen]])).arrays
@@ -70,18 +72,20 @@ class ModalDerivatives(Surrogate):
         batch = self._checked_forces(forces)
         out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
         free = self.scene_.free_dofs
-        out[:, free] = predict_corrected(self.problem_, self.modes_, self.model_.rest_factor, batch.reshape(out.shape)[:, free], self.tolerance)
+        out[:, free] = predict_corrected(self.problem_, self.modes_, self.model_, batch.reshape(out.shape)[:, free], self.tolerance)
         return out.reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
         return {"modes": self.modes_, **(self.problem_.arrays if isinstance(self.problem_, TensorProblem) else {})}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        self.modes_ = state["modes"]
-        self.model_ = FullOrderModel(self.scene_)
-        self.problem_: GalerkinProblem | TensorProblem = (
-            TensorProblem.of_arrays(self.scene_, state)
-            if exact_polynomial(self.scene_, self.modes_)
-            else GalerkinProblem(self.model_.assembler, self.modes_)
-        )
+        self.modes_ = checked_array(state["modes"], "modes", (len(self.scene_.free_dofs), None))
+        self.model_, r = FullOrderModel(self.scene_), self.modes_.shape[1]
+        self.problem_: GalerkinProblem | TensorProblem
+        if polynomial_pays(self.model_, r):
+            self.problem_ = TensorProblem.of_arrays(self.scene_, state)
+            if self.problem_.n_unknowns != r:
+                raise InvalidInputError(f"the polynomial must be that of {r} modes; got {self.problem_.n_unknowns}.")
+        else:
+            self.problem_ = GalerkinProblem(self.model_.assembler, self.modes_)
         _ = self.problem_.rest_factor, self.model_.rest_factor

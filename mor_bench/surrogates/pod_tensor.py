@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -10,7 +11,9 @@ from pydantic import Field
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
+from mor_bench.mechanics.newton import MAX_LOAD_N, NewtonOptions, solve_equilibrium
 from mor_bench.reduction.basis import pod
+from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto, size_to_needs
 from mor_bench.reduction.subspace import Subspace
 from mor_bench.reduction.tensors import MOST_MODES, TensorProblem, has_polynomial
@@ -26,8 +29,9 @@ class TensorPOD(Surrogate):
     """POD-Galerkin without a mesh: Newton's method on the quartic polynomial that the reduced energy is.
 
     The answers are those of plain POD (Barbič and James 2005); only the wanted outputs are expanded. The polynomial knows no
-    det F: it is watched at the few quadrature points where the training samples had their smallest, and an answer that is
-    inverted there, or unstable, is sought again by safeguarded increments and refused if none is found.
+    det F: it is watched at the few quadrature points where the training samples had their smallest. Where a state goes below
+    what they showed there, the whole mesh is looked at; one that is inverted, or unstable, is sought again by plain POD with its
+    safeguarded increments, and refused if none is found.
 
     Parameters
     ----------
@@ -64,7 +68,19 @@ class TensorPOD(Surrogate):
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
-        return self._subspace.answer(batch, lambda load: self.problem_.solve(load, self.tolerance_)).reshape(np.shape(forces))
+        return self._subspace.answer(batch, self._solve).reshape(np.shape(forces))
+
+    def _solve(self, load: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Reduced coordinates under a reduced load."""
+        q = self.problem_.quick(load, self.tolerance_) if 0 < np.abs(load).max() <= MAX_LOAD_N else None
+        if q is not None and not (self.problem_.unlike(q) and self._plain.force(q).min_det_f <= 0):
+            return q
+        return solve_equilibrium(self._plain, load, options=NewtonOptions(self.tolerance_)).displacement
+
+    @cached_property
+    def _plain(self) -> GalerkinProblem:
+        """The same equations over the mesh."""
+        return GalerkinProblem(FullOrderModel(self.scene_).assembler, self.modes_)
 
     def _state(self) -> dict[str, NDArray[Any]]:
         return {"modes": self.modes_, **self.problem_.arrays}
@@ -75,4 +91,5 @@ class TensorPOD(Surrogate):
         if modes.shape != shape or not np.isfinite(modes).all():
             raise InvalidInputError(f"`modes` must be a finite array of shape {shape}; got shape {modes.shape}.")
         self.modes_, self.tolerance_ = modes, self._sized("tolerance")
+        vars(self).pop("_plain", None)
         self._subspace = Subspace(self.scene_, modes)

@@ -16,7 +16,7 @@ from mor_bench.reduction.cubature import sparse_nnls
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.manifold import ManifoldProblem, QuadraticManifold, manifold_system
 from mor_bench.reduction.modal_derivatives import linear_modes, modal_derivatives
-from mor_bench.reduction.static_correction import static_correction
+from mor_bench.reduction.static_correction import refuse_inverted, static_correction
 from mor_bench.reduction.weighted_cells import weighted_cells
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -110,7 +110,9 @@ class QuadraticManifoldGalerkin(Surrogate):
                 counting.running.add(multiply_adds=modes.size)
             q = solve_equilibrium(problem, modes.T @ load, options=NewtonOptions(self.tolerance)).displacement
             # With the stiffness of the sampled cells: what these err at small strains is corrected, too.
-            row[free] = self.manifold_.at(q)[0] + static_correction(self.rest_factor_, self.linear_.rest_factor, modes, load)
+            correction = static_correction(self.model_.rest_factor, self.linear_.rest_factor, modes, load)
+            row[free] = self.manifold_.at(q)[0] + correction
+            refuse_inverted(self.model_, row[free])
         return out.reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
@@ -125,5 +127,5 @@ class QuadraticManifoldGalerkin(Surrogate):
         assembler, rows = weighted_cells(scene, self.cells_, self.weights_)
         self.linear_ = GalerkinProblem(assembler, self.manifold_.modes[rows])
         self._sampled = QuadraticManifold(self.manifold_.modes[rows], self.manifold_.derivatives[rows])
-        self.rest_factor_ = FullOrderModel(scene).rest_factor
-        _ = self.linear_.rest_factor
+        self.model_ = FullOrderModel(scene)
+        _ = self.model_.rest_factor, self.linear_.rest_factor

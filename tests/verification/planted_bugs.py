@@ -75,7 +75,13 @@ BUGS = (
     Bug("general kernel: sign of the force", LAWS, "f_e[a, i] += F[i, 0] * Sg[a, 0]", "f_e[a, i] -= F[i, 0] * Sg[a, 0]", STATES),
     Bug("general kernel: F transposed", LAWS, "+= u_e[a, i] * g[a, j]", "+= u_e[a, j] * g[a, i]", STATES),
     Bug("general kernel: geometric stiffness dropped", LAWS, "k_ab = geometric if i == j else 0.0", "k_ab = 0.0"),
-    Bug("general kernel: min det F not kept", LAWS, "min_det = min(min_det, det)", "min_det = det", "kernel or confined or alone or huge or rigid"),
+    Bug(
+        "general kernel: min det F not kept",
+        LAWS,
+        "    " * 3 + "min_det = min(min_det, det)",
+        "    " * 3 + "min_det = det",
+        "kernel or confined or alone or huge or rigid",
+    ),
     # laws
     Bug("Saint Venant-Kirchhoff: λ and μ swapped", LAWS, "lam, mu = p[0], p[1]\n    trace", "lam, mu = p[1], p[0]\n    trace", STATES),
     Bug("Saint Venant-Kirchhoff: sign of the stress", LAWS, "S[i, j] = 2.0 * mu * e", "S[i, j] = -2.0 * mu * e", STATES),
