@@ -244,3 +244,12 @@ def test_modes_of_a_method_by_energy(coarse: Dataset) -> None:
     for wrong in (PODGalerkin("energy"), PODGalerkin(5, energy_tolerance=1e-2)):
         with pytest.raises(InvalidInputError, match="`energy_tolerance` of PODGalerkin must be given with"):
             wrong.fit(coarse.scene, coarse.train)
+
+
+def test_snapshots_in_single_precision_have_the_rank_of_single_precision(coarse: Dataset) -> None:
+    snapshots = coarse.train.free_displacements.astype(np.float32)
+    modes = pod(snapshots, 40).modes
+    assert modes.dtype == np.float64
+    assert np.linalg.norm(modes.T @ modes - np.eye(40)) <= 1e-12
+    with pytest.warns(UserWarning, match="rank 4"):
+        assert pod(np.repeat(snapshots[:4], 5, axis=0), 20).modes.shape[1] == 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -109,3 +110,21 @@ def test_indication_at_an_equilibrium_and_at_none(coarse: Dataset) -> None:
     assert (rest.relative_correction == 0).all()
     with pytest.raises(InvalidInputError, match="`displacements` must be floats"):
         fem.indicate_error(force, np.zeros((3, 3)))
+
+
+def test_moved_supports_are_errors_and_missing_nodes_are_refused(coarse: Dataset) -> None:
+    fem = mor_bench.load_method("fem").fit(coarse.scene, None)
+    force = coarse.test.forces[:1]
+    moved = fem.predict(force)
+    moved[:, coarse.scene.fixed_nodes] = 0.5
+    assert fem.indicate_error(force, moved).relative_correction[0] > 1.0
+    needs = coarse.scene.spec.needs.model_copy(update={"outputs": "x-max"})
+    scene = replace(coarse.scene, spec=coarse.scene.spec.model_copy(update={"needs": needs}))
+    part = mor_bench.load_method("pod-tensor", n_modes=5).fit(scene, coarse.train)
+    with pytest.raises(InvalidInputError, match="at all nodes"):
+        part.indicate_error(force, part.predict(force))
+
+
+def test_no_loads_have_no_indications(coarse: Dataset) -> None:
+    fem = mor_bench.load_method("fem").fit(coarse.scene, None)
+    assert fem.indicate_error(coarse.test.forces[:0], coarse.test.forces[:0]).relative_correction.shape == (0,)

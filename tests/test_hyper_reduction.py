@@ -472,3 +472,18 @@ def test_compiled_steps_never_end_in_an_unstable_or_inverted_state() -> None:
     found = points.full_steps(load, np.array([stable - 0.99]), 1e-10, 1.0)
     assert found is not None
     assert 1 + found.displacement[0] == pytest.approx(stable, abs=1e-9)
+
+
+def test_too_few_points_for_the_modes_are_a_typed_error(tiny: Dataset) -> None:
+    with pytest.raises(SolverError, match="too few cells or points"):
+        HyperReducedPOD(20, 0.9).fit(tiny.scene, tiny.train)
+
+
+@pytest.mark.parametrize("rank", [30, 100])
+def test_the_cell_basis_of_a_matrix_of_low_rank_is_whole_and_orthonormal(rank: int) -> None:
+    rng = np.random.default_rng(0)
+    matrix = rng.normal(size=(900, rank)) @ rng.normal(size=(rank, 300))
+    basis = cell_basis(matrix, 1e-9)
+    assert basis.shape[1] == rank
+    assert np.linalg.norm(basis.T @ basis - np.eye(rank)) <= 1e-12
+    assert np.linalg.norm(matrix - matrix @ basis @ basis.T) <= 1e-9 * np.linalg.norm(matrix)

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 import mor_bench
+from mor_bench.errors import InvalidInputError, SolverError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction import modal_derivatives as derivatives_module
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.manifold import ManifoldProblem, QuadraticManifold
 from mor_bench.reduction.modal_derivatives import derivative_basis, linear_modes, modal_derivatives, pairs
+from mor_bench.reduction.tensors import polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.sampling import draw_loads
@@ -213,3 +215,45 @@ def test_the_autoencoder_learns_what_linear_elasticity_lacks(cache: Path) -> Non
         medians[name] = np.median(np.linalg.norm(method.predict(data.test.forces) - data.test.displacements, axis=(1, 2)) / sizes)
         assert not method.predict(np.zeros((data.scene.mesh.n_nodes, 3))).any()
     assert medians["autoencoder"] <= 0.7 * medians["linear-fem"]
+
+
+@pytest.mark.parametrize("spoil", ["nan", "columns", "integers"])
+def test_modes_of_a_damaged_model_are_refused(spoil: str, tiny: Dataset) -> None:
+    method = mor_bench.load_method("modal-derivatives", n_linear=3, n_modes=6).fit(tiny.scene, None)
+    state = method._state()
+    modes = state["modes"]
+    state["modes"] = {"nan": modes * np.nan, "columns": modes[:, 1:], "integers": modes.astype(np.int64)}[spoil]
+    with pytest.raises(InvalidInputError):
+        method._restore(state)
+
+
+@pytest.mark.parametrize(("name", "knobs"), [*NO_SNAPSHOTS, ("local-pod", {"n_clusters": 2, "n_modes": 4})])
+def test_what_the_static_correction_inverts_is_refused(name: str, knobs: dict[str, Any], tiny: Dataset) -> None:
+    method = mor_bench.load_method(name, **knobs).fit(tiny.scene, tiny.train)
+    model, free, refused = FullOrderModel(tiny.scene), tiny.scene.free_dofs, 0
+    for force in 100.0 * tiny.test.forces[:30]:
+        try:
+            u = method.predict(force)
+        except SolverError:
+            refused += 1
+            continue
+        assert model.force(u.ravel()[free]).min_det_f > 0
+    assert refused > 0
+
+
+def test_the_polynomial_is_used_where_it_pays(tiny: Dataset) -> None:
+    coarse, fine = (FullOrderModel(mor_bench.load_scene(name)) for name in ("beam-coarse", "beam-fine"))
+    assert polynomial_pays(coarse, 40)
+    assert not polynomial_pays(coarse, 60)
+    assert polynomial_pays(fine, 80)
+    assert not polynomial_pays(fine, 80, 32)
+    assert not polynomial_pays(FullOrderModel(tiny_of("neo-hookean")), 4)
+
+
+def test_no_load_in_a_batch_gives_exactly_no_displacement_of_the_autoencoder(tiny: Dataset) -> None:
+    method = mor_bench.load_method("autoencoder", iterations=20).fit(tiny.scene, tiny.train)
+    forces = tiny.test.forces[:5].copy()
+    forces[[0, 3]] = 0.0
+    found = method.predict(forces)
+    assert (found[[0, 3]] == 0).all()
+    assert found[1].any()

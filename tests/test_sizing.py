@@ -234,3 +234,12 @@ def test_a_method_that_needs_no_equations_is_sized_on_imported_samples(tiny: Dat
     method.n_output_modes = "auto"
     chosen = size_to_needs(method, needing(scene, 1.5), imported, {"n_output_modes": MODES})
     assert chosen["n_output_modes"] in MODES
+
+
+def test_errors_of_the_wanted_nodes_decide(tiny: Dataset) -> None:
+    """Elsewhere a reduced method answers nothing, which is no error."""
+    needs = tiny.scene.spec.needs.model_copy(update={"outputs": "x-max", "error": 0.1})
+    scene = replace(tiny.scene, spec=tiny.scene.spec.model_copy(update={"needs": needs}))
+    method = PODGalerkin("auto", 1e-4).fit(scene, replace(tiny.train, scene=scene))
+    everywhere = PODGalerkin("auto", 1e-4).fit(needing(tiny.scene, 0.1), tiny.train)
+    assert 1 <= method.sizes_["n_modes"] < everywhere.sizes_["n_modes"]  # the loaded end moves as a whole
