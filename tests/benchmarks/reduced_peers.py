@@ -31,6 +31,7 @@ HROM
     matrix, its singular vectors being cut at the same relative tolerance, and the sum of weights constrained, as Kratos' own
     training does; "hpod, ECM cells" is our model with these.
 
+Whoever takes less than 10 ms solves again and again in its turn, as in a running simulation, and the median counts.
 Steps are Newton steps in Kratos, and reduced back-solves in ours. A speed-up is over the faster POD of Kratos, each load's
 fastest round over the fastest, and the median over the loads.
 """
@@ -91,6 +92,8 @@ SAME_AS_POD = ("pod-tensor",)
 BUILDERS = {"global": "GlobalROMBuilderAndSolver", "elemental": "ROMBuilderAndSolver"}
 UNKNOWNS = ["DISPLACEMENT_X", "DISPLACEMENT_Y", "DISPLACEMENT_Z"]
 MAX_RESIDUAL = 1.01 * TOLERANCE
+TURN_MS = 10.0
+"""A contender that is faster than this solves several times in its turn."""
 
 Twin = PODGalerkin | HyperReducedPOD
 
@@ -361,7 +364,7 @@ def compare(forces: Array, references: Array, contenders: Sequence[Reduced], rou
         for turn in range(rounds):
             for i in np.roll(np.arange(len(rows)), -turn).tolist():
                 contender, row = contenders[i], rows[i]
-                time_ms, steps = timed(contender, load)
+                time_ms, steps = _turn(contender, load)
                 row.times_ms[-1].append(time_ms)
                 u = contender.displacement()
                 if contender.twin is not None:
@@ -371,6 +374,14 @@ def compare(forces: Array, references: Array, contenders: Sequence[Reduced], rou
                     row.errors_m.append(float(np.linalg.norm(u - reference, axis=1).mean()))
                     row.relative_l2.append(float(sample_errors(u[None], reference[None]).relative_l2[0]))
     return rows
+
+
+def _turn(contender: Reduced, load: Array) -> tuple[float, int]:
+    """Time of a solve, ms: where it is short, the median of several after one that has the caches to itself again."""
+    time_ms, steps = timed(contender, load)
+    if time_ms >= TURN_MS:
+        return time_ms, steps
+    return float(np.median([timed(contender, load)[0] for _ in range(int(TURN_MS / time_ms) + 1)])), steps
 
 
 def _check(row: Row, twin: Twin, u: Array, load: Array) -> None:
