@@ -247,7 +247,7 @@ def test_modes_of_a_method_by_energy(coarse: Dataset) -> None:
 
 
 def test_snapshots_in_single_precision_have_the_rank_of_single_precision(coarse: Dataset) -> None:
-    snapshots = coarse.train.free_displacements.astype(np.float32)
+    snapshots: Any = coarse.train.free_displacements.astype(np.float32)
     modes = pod(snapshots, 40).modes
     assert modes.dtype == np.float64
     assert np.linalg.norm(modes.T @ modes - np.eye(40)) <= 1e-12

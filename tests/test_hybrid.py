@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import spearmanr
 
 import mor_bench
-from mor_bench.errors import InvalidInputError, SpecError
+from mor_bench.errors import InvalidInputError, SolverError, SpecError
 from mor_bench.harness.metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.snapshots.dataset import Dataset
@@ -128,3 +128,18 @@ def test_moved_supports_are_errors_and_missing_nodes_are_refused(coarse: Dataset
 def test_no_loads_have_no_indications(coarse: Dataset) -> None:
     fem = mor_bench.load_method("fem").fit(coarse.scene, None)
     assert fem.indicate_error(coarse.test.forces[:0], coarse.test.forces[:0]).relative_correction.shape == (0,)
+
+
+def test_inverted_answers_are_not_returned(coarse: Dataset) -> None:
+    """Under loads far beyond the range, where the start may be anywhere: seen at all quadrature points."""
+    method = Hybrid("linear-fem", steps=1).fit(coarse.scene, coarse.train)
+    model, free, answered = FullOrderModel(coarse.scene), coarse.scene.free_dofs, 0
+    for force in coarse.test.forces[:20]:
+        for size in (20.0, 200.0):
+            try:
+                u = method.predict(size * force)
+            except SolverError:
+                continue
+            assert model.force(u.ravel()[free]).min_det_f > 0
+            answered += 1
+    assert answered > 0
