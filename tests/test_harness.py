@@ -321,3 +321,14 @@ def test_a_region_of_outputs_without_nodes_is_an_error_of_the_dataset(tip_only: 
     path.write_text(tip_only.read_text().replace('"x-max"\nerror', "{ sphere_m = [[90.0, 0.0, 0.0], 1.0] }\nerror"))
     with pytest.raises(SpecError, match="holds no node"):
         mor_bench.load_scene(path)
+
+
+def test_a_method_without_an_answer_to_some_loads_is_timed_on_all(cache: Path, tmp_path: Path) -> None:
+    path = tmp_path / "sometimes.toml"
+    path.write_text('title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Broken"\n[parameters]\nhow = "sometimes"')
+    row = mor_bench.run(["beam-tiny"], [path], out=tmp_path / "run", cache=cache, threads=1).rows[0]
+    assert row["status"] == "ok"
+    assert 0 < row["n_failed"] < row["n_test"]
+    assert row["error"]["rel_l2_max"] == math.inf
+    assert row["latency_ms"]["median"] > 0
+    assert row["throughput"]["64"] is None

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import mor_bench
-from mor_bench.errors import MorBenchError
+from mor_bench.errors import MorBenchError, NoEquilibriumError
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.surrogates.fem import FullFEM
@@ -120,6 +120,8 @@ class Broken(Zero):
         batch = self._checked_forces(forces)
         if self.how == "crash":
             raise ZeroDivisionError("on purpose")
+        if self.how == "sometimes" and any(force[:, 0].sum() > 0 for force in batch):
+            raise NoEquilibriumError("on purpose")
         if self.how == "shape":
             return batch[:, :-1]
         if self.how == "batches-only" and np.ndim(forces) == 2:

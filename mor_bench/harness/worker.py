@@ -15,6 +15,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from queue import SimpleQueue
@@ -36,6 +37,9 @@ SETTLE_QUERIES = 3
 
 CHECKED_ANSWERS, CHECKED_SHARE = 4, 0.2
 """Answers of a turn that are kept at most, and the share of queries that are asked for it."""
+
+UNANSWERED = object()
+"""Stands for the answer to a query under which the method finds no equilibrium."""
 
 WARM_UP_QUERIES = 20
 WARM_UP_S = 2.0
@@ -209,6 +213,7 @@ class Session:
         """Take the queries, (n, n_nodes, 3), N, and answer some of them."""
         import numpy as np
 
+        from mor_bench.errors import SolverError
         from mor_bench.harness.timing import pinned_threads
 
         self.queries = forces
@@ -216,7 +221,8 @@ class Session:
         with pinned_threads(threads):
             start = perf_counter()
             for i in range(WARM_UP_QUERIES):
-                self.method.predict(self.queries[-1 - i % len(self.queries)].copy())
+                with suppress(SolverError):
+                    self.method.predict(self.queries[-1 - i % len(self.queries)].copy())
                 if perf_counter() - start > WARM_UP_S:
                     break
         return {"memory_bytes": peak_memory_bytes()}
@@ -226,17 +232,26 @@ class Session:
 
         Each load is one of the queries, drawn at random and made smaller by a random factor, so that none comes twice. A few
         are not made smaller, and what is answered to those is written to a file, to be compared with what was scored.
-        The garbage collector runs as it would for a user; its part of each query is told apart.
+        The garbage collector runs as it would for a user; its part of each query is told apart. A query that the method cannot
+        answer counts with the time until it says so.
         """
         import numpy as np
 
+        from mor_bench.errors import SolverError
         from mor_bench.harness.timing import pinned_threads
 
         times: list[float] = []
         collecting: list[float] = []
         kept: dict[int, Any] = {}
         clock = _CollectorClock()
-        predict, queries, draw = self.method.predict, self.queries, self.generator
+        queries, draw = self.queries, self.generator
+
+        def predict(query: NDArray[np.float64]) -> Any:
+            try:
+                return self.method.predict(query)
+            except SolverError:
+                return UNANSWERED
+
         begun, cpu, wall = process_time(), 0.0, 0.0
         with pinned_threads(threads):
             for _ in range(SETTLE_QUERIES):
@@ -254,7 +269,7 @@ class Session:
                     wall += after - before
                     times.append(1e3 * (after - before))
                     collecting.append(1e3 * clock.seconds)
-                    if check:
+                    if check and answer is not UNANSWERED:
                         kept[number] = np.array(answer, dtype=float)
                     if wall > most_s or (len(times) >= n and wall > floor_s):
                         break
@@ -270,9 +285,10 @@ class Session:
         }  # fmt: skip
 
     def throughput(self, sizes: list[int], floor_s: float, most_s: float, threads: int) -> dict[str, Any]:
-        """Queries per second in batches of some sizes; None where one batch would take longer than a time."""
+        """Queries per second in batches of some sizes; None where one batch would take longer than a time, or has no answer."""
         import numpy as np
 
+        from mor_bench.errors import SolverError
         from mor_bench.harness.timing import pinned_threads
 
         rates: dict[str, float | None] = {}
@@ -284,9 +300,13 @@ class Session:
                     rates[str(size)] = None
                     continue
                 start, n = perf_counter(), 0
-                while n == 0 or perf_counter() - start < floor_s:
-                    self.method.predict(batch)
-                    n += size
+                try:
+                    while n == 0 or perf_counter() - start < floor_s:
+                        self.method.predict(batch)
+                        n += size
+                except SolverError:
+                    rates[str(size)] = None
+                    continue
                 expected = (perf_counter() - start) / n
                 rates[str(size)] = 1 / expected
         return {"throughput": rates}
