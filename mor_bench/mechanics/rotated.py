@@ -181,7 +181,7 @@ class RotatedRest:
     def __init__(self, factor: SingleFactor, cell_nodes: NDArray[np.int32], centre_gradients: Array, volumes: Array) -> None:
         self._factor = factor
         self._place = np.ascontiguousarray(factor.place[::3] // 3)
-        self._cells = cell_nodes, centre_gradients, volumes
+        self.cells = cell_nodes, centre_gradients, volumes
         self._identity = np.tile(np.eye(3), (len(self._place) + 1, 1, 1))
 
     def turned(self, q: Array | None) -> Array:
@@ -189,9 +189,9 @@ class RotatedRest:
         if q is None:
             return self._identity
         rotations = np.empty_like(self._identity)
-        iterations = nodal_rotations(np.append(q, np.zeros(3)).reshape(-1, 3), *self._cells, rotations)
+        iterations = nodal_rotations(np.append(q, np.zeros(3)).reshape(-1, 3), *self.cells, rotations)
         if counting.running is not None:  # per component of a cell's nodes, per node, per iteration
-            counting.running.add(multiply_adds=4 * self._cells[1].size + 20 * len(self._place) + 40 * int(iterations))
+            counting.running.add(multiply_adds=4 * self.cells[1].size + 20 * len(self._place) + 40 * int(iterations))
         return rotations
 
     def solve_many(self, residuals: Sequence[Array], rotations: Sequence[Array]) -> Array:

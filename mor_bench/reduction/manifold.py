@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.linear import Factor
-from mor_bench.reduction.galerkin import GalerkinProblem, stiffness_times
+from mor_bench.reduction.cubature import triangle
+from mor_bench.reduction.galerkin import DenseProblem, GalerkinProblem, stiffness_times
 from mor_bench.reduction.modal_derivatives import pairs
 
 
@@ -81,10 +83,10 @@ def manifold_system(
         u, tangents = manifold.at(q)
         local = np.vstack([tangents, np.zeros(len(q))])[cell_dofs]
         rows.append(np.einsum("eir,ei->re", local, assembler.cell_forces(u)))
-    return np.asarray(qr(np.concatenate(rows), mode="r", check_finite=False)[0][: assembler.n_cells])
+    return triangle(np.concatenate(rows))
 
 
-class ManifoldProblem:
+class ManifoldProblem(DenseProblem):
     """The potential W(u(q)) - f·u(q) as a problem for the nonlinear solve, under the constant reduced load Φᵀf.
 
     The rest of the load's work, f·(u(q) - Φq) = ½ q·Bq, counts as stored energy: force and tangent are exact derivatives of
@@ -103,14 +105,14 @@ class ManifoldProblem:
 
     def __init__(self, linear: GalerkinProblem, manifold: QuadraticManifold, bending_load: NDArray[np.float64]) -> None:
         self._linear, self._manifold, self._bending_load = linear, manifold, bending_load
-        self.n_unknowns, self.extent, self.accelerator = linear.n_unknowns, linear.extent, None
+        self.n_unknowns, self.extent = linear.n_unknowns, linear.extent
 
     @property
     def rest_tangent(self) -> NDArray[np.float64]:
         # Without the load's part: it only scales shifts towards the rest and the first step from there.
         return self._linear.rest_tangent
 
-    @property
+    @cached_property
     def rest_factor(self) -> Factor:
         return self._linear.rest_factor
 
@@ -133,11 +135,3 @@ class ManifoldProblem:
         product = stiffness_times(self._linear.assembler.pattern, values, tangents)
         bending = self._manifold.curvature(state.force) - self._bending_load
         return self._state(q, state, tangents), tangents.T @ product + bending
-
-    def step(
-        self, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64], tolerance: float
-    ) -> NDArray[np.float64]:  # fmt: skip
-        return self._linear.factor(tangent).solve(residual)
-
-    def certify(self, q: NDArray[np.float64]) -> None:
-        """Nothing to do: every step has a Cholesky factor."""

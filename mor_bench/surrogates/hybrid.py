@@ -12,7 +12,6 @@ from pydantic import Field
 
 from mor_bench.errors import InvalidInputError, SolverError
 from mor_bench.mechanics.anderson import Anderson
-from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.scene import Scene
@@ -138,7 +137,7 @@ class Hybrid(Surrogate):
             correction = inverse.solve_many([residual], [inverse.turned(u)])[0]
             u = u + memory.advance(u, correction, residual)
         near = float(np.linalg.norm(u - guess)) <= NEAR * float(np.linalg.norm(u))
-        if near and _least_det_f(np.append(u, np.zeros(3)).reshape(-1, 3), *self._cells) >= SURE:
+        if near and _least_det_f(np.append(u, np.zeros(3)).reshape(-1, 3), *inverse.cells[:2]) >= SURE:
             return u
         state = self.model_.force(u)
         better = float(np.linalg.norm(load - state.force)) <= WORSE * float(np.linalg.norm(load))
@@ -147,10 +146,7 @@ class Hybrid(Surrogate):
     def _become(self, start: Surrogate) -> None:
         self.start_ = start
         self.model_ = FullOrderModel(self.scene_, "auto")
-        _ = self.model_.rest_factor
-        mesh = self.scene_.mesh
-        gradients = shape_gradients(mesh.points, mesh.cells, element_of(mesh.cells).centre[None])[0][:, 0]
-        self._cells = (self.model_.cell_dofs[:, ::3] // 3).astype(np.int32), np.ascontiguousarray(gradients)
+        _ = self.model_.turned_rest
 
     def _state(self) -> dict[str, NDArray[Any]]:
         sizes = {SIZE + name: np.array([value]) for name, value in getattr(self.start_, "sizes_", {}).items()}

@@ -161,7 +161,7 @@ class LocalPOD(Surrogate):
     def _problem(
         self, cluster: int, basis: NDArray[np.float64], state: dict[str, NDArray[Any]]
     ) -> GalerkinProblem | TensorProblem:  # fmt: skip
-        if not polynomial_pays(self.model_, basis.shape[1], len(self.bases_)):
+        if f"quartic.{cluster}" not in state:
             return GalerkinProblem(self.model_.assembler, basis)
         own = {name.removesuffix(f".{cluster}"): array for name, array in state.items() if name.endswith(f".{cluster}")}
         problem = TensorProblem.of_arrays(self.scene_, own)

@@ -82,7 +82,7 @@ class ModalDerivatives(Surrogate):
         self.modes_ = checked_array(state["modes"], "modes", (len(self.scene_.free_dofs), None))
         self.model_, r = FullOrderModel(self.scene_), self.modes_.shape[1]
         self.problem_: GalerkinProblem | TensorProblem
-        if polynomial_pays(self.model_, r):
+        if "quartic" in state:
             self.problem_ = TensorProblem.of_arrays(self.scene_, state)
             if self.problem_.n_unknowns != r:
                 raise InvalidInputError(f"the polynomial must be that of {r} modes; got {self.problem_.n_unknowns}.")
