@@ -6,7 +6,7 @@ import hashlib
 import inspect
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,12 +55,15 @@ class TrainingOptions:
         the same bits as one that was never stopped; it is removed at the end.
     start_from : Path or None
         A model saved by `Surrogate.save`, whose fitting weights the training starts from.
+    progress : callable or None
+        Called now and then with the iterations done, all, and the loss.
     """
 
     device: Literal["auto", "cpu", "cuda"] = "cpu"
     fit_seconds: float | None = None
     checkpoint: Path | None = None
     start_from: Path | None = None
+    progress: Callable[[int, int, float], None] | None = None
 
 
 class Surrogate(ABC):
