@@ -275,8 +275,7 @@ class _Course:
         self.total, self.n_summed = self.total + loss.detach(), self.n_summed + 1
         if self.n_summed == LOSS_INTERVAL or self.iteration == self.iterations:
             self.curve.append(float(self.total) / self.n_summed)
-            if not isfinite(self.curve[-1]):
-                raise MorBenchError(f"training diverged before iteration {self.iteration}: `learning_rate` {plan.learning_rate} is too high.")
+            self._check_finite(self.curve[-1])
             self.total, self.n_summed = torch.zeros((), device=self.device), 0
             if self.options.progress is not None:
                 self.options.progress(self.iteration, self.iterations, self.curve[-1])
@@ -294,8 +293,13 @@ class _Course:
             parts = [(len(rows), self.loss(rows.to(self.device))) for rows in torch.split(self.held, self.plan.batch_size)]
         self.network.train()
         self.validated.append(sum(n * float(part) for n, part in parts) / len(self.held))
+        self._check_finite(self.validated[-1])
         if self.validated[-1] <= min(self.validated):
             self.best = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
+
+    def _check_finite(self, loss: float) -> None:
+        if not isfinite(loss):
+            raise MorBenchError(f"training diverged before iteration {self.iteration}: `learning_rate` {self.plan.learning_rate} is too high.")
 
     def finish(self) -> None:
         """With the best weights, if samples were held out."""
