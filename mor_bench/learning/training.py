@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -89,7 +90,7 @@ class Training:
     validation_curve : (n_validations,) float64
         The loss of the samples held out, each ``validation_interval`` iterations.
     iterations : int
-        Done; fewer than planned after an early stop.
+        Planned, and not all done after an early stop: the number that repeats the training.
     """
 
     loss_curve: NDArray[np.float64]
@@ -109,6 +110,16 @@ def device_of(options: TrainingOptions) -> torch.device:
     if options.device == "cuda" and not torch.cuda.is_available():
         raise InvalidInputError("`device` is 'cuda', but PyTorch finds no CUDA device here; 'cpu' and 'auto' train on the processor.")
     return torch.device("cuda" if options.device != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def fingerprint_of(parts: Mapping[str, object], arrays: Mapping[str, Tensor]) -> str:
+    """SHA-256 of what decides a training: knobs and the like, which JSON can hold, and what is learned from."""
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode())
+    for name in sorted(arrays):
+        array = arrays[name].detach().cpu().contiguous().numpy()
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()
 
 
 def rate_factor(schedule: Schedule, iteration: int, iterations: int) -> float:
@@ -189,7 +200,7 @@ def train(
     course.finish()
     if options.checkpoint is not None:
         options.checkpoint.unlink(missing_ok=True)
-    return Training(np.array(course.curve), np.array(course.validated), course.validation_interval, course.iteration)
+    return Training(np.array(course.curve), np.array(course.validated), course.validation_interval, course.iterations)
 
 
 @dataclass
