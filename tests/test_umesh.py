@@ -130,17 +130,21 @@ def test_gradients_at_the_nodes_go_to_the_grid_points_around_them_and_none_to_pa
 
 
 @pytest.mark.parametrize("regular", [True, False])
-def test_the_loss_is_the_mean_square_over_the_components_of_all_nodes(regular: bool, data: Dataset, irregular: tuple[Snapshots, Snapshots]) -> None:
+@pytest.mark.parametrize("loss", ["absolute", "relative"])
+def test_the_loss_is_the_mean_square_over_the_components_of_all_nodes(
+    regular: bool, loss: str, data: Dataset, irregular: tuple[Snapshots, Snapshots]
+) -> None:
     """Before the first step, on one batch of all samples; values of the network at padding do not enter."""
     samples = data.train[:20] if regular else irregular[0][:20]
-    method = mor_bench.load_method("umesh", **{**SMALL, "iterations": 1, "batch_size": 20}).fit(samples.scene, samples)
+    method = mor_bench.load_method("umesh", **{**SMALL, "iterations": 1, "batch_size": 20, "loss": loss}).fit(samples.scene, samples)
     grid, network = padded_grid(grid_map(samples.scene.mesh), 1), new_network(8, 1, torch.Generator().manual_seed(0))
     with torch.inference_mode():
         inputs = grid.to_grid(torch.from_numpy((samples.forces / rms(samples.forces)).astype(np.float32)))
         flat = network(inputs).permute(0, 2, 3, 4, 1).reshape(20, -1, 3).numpy()
-    answers = np.einsum("ng,sgc->snc", grid.grid.weights.toarray(), flat)
-    expected = np.square(answers - samples.displacements / rms(samples.displacements)).mean()
-    assert method.loss_curve_[0] == pytest.approx(expected, rel=1e-5)  # type: ignore[attr-defined]
+    targets = samples.displacements / rms(samples.displacements)
+    errors = np.square(np.einsum("ng,sgc->snc", grid.grid.weights.toarray(), flat) - targets).mean(axis=(1, 2))
+    weights = np.ones(20) if loss == "absolute" else 1 / np.maximum(np.square(targets).mean(axis=(1, 2)), 0.1**2)
+    assert method.loss_curve_[0] == pytest.approx((weights / weights.mean() * errors).mean(), rel=1e-5)  # type: ignore[attr-defined]
 
 
 def rms(values: np.ndarray) -> float:

@@ -29,6 +29,10 @@ PREDICTION_CHUNK = 128
 """Samples per forward pass, so that a long batch needs 300 MB of activations at 128 channels, not gigabytes."""
 
 
+SMALLEST_SIZE = 0.1
+"""Errors of samples smaller than this, in root mean squares over all samples, count no more than of this size."""
+
+
 @final
 class UMesh(Surrogate):
     """A 3D U-Net from nodal forces to nodal displacements.
@@ -60,6 +64,9 @@ class UMesh(Surrogate):
         Take the network's answer to nothing off every answer, in training too: no force then gives no displacement.
     mirrored : bool
         Train on mirror images too, drawn at random, where the scene has planes of symmetry (`mor_bench.scene.symmetry`).
+    loss : {"absolute", "relative"}
+        The mean squared error, or each sample's part of it divided by the mean square of what is to be answered (or by that of
+        `SMALLEST_SIZE` of the root mean square over all samples, where that is larger).
     precision : {"float32", "bfloat16"}
         Of the products in training.
     validation_fraction : float
@@ -122,6 +129,7 @@ class UMesh(Surrogate):
         activation: Activation = "relu",
         zero_at_rest: bool = False,
         mirrored: bool = False,
+        loss: Literal["absolute", "relative"] = "absolute",
         precision: Precision = "float32",
         validation_fraction: Annotated[float, Field(ge=0, le=0.5)] = 0.0,
         seed: Annotated[int, Field(ge=0, lt=2**63)] = 0,
@@ -137,6 +145,7 @@ class UMesh(Surrogate):
         self.activation = activation
         self.zero_at_rest = zero_at_rest
         self.mirrored = mirrored
+        self.loss = loss
         self.precision = precision
         self.validation_fraction = validation_fraction
         self.seed = seed
@@ -162,6 +171,7 @@ class UMesh(Surrogate):
             targets = torch.from_numpy((wanted / self.output_scale_).astype(np.float32)).to(device)
             images = [Image.of(mirror, device) for mirror in (mirrors(scene) if self.mirrored else [])]
             zero = torch.zeros_like(inputs[:1])
+            weights = self._sample_weights(targets)
 
             def loss(rows: Tensor) -> Tensor:
                 x, y = inputs[rows], targets[rows]
@@ -169,7 +179,7 @@ class UMesh(Surrogate):
                     turned = torch.randint(2, (len(rows), 1, 1), generator=generator).bool().to(device)
                     x, y = torch.where(turned, image(x), x), torch.where(turned, image(y), y)
                 answer = self._answer(x) - self._answer(zero) if self.zero_at_rest else self._answer(x)
-                return (answer - y).square().sum() * (1.0 / y.numel())
+                return (answer - y).square().sum(dim=(1, 2)) @ weights[rows] * (1.0 / y.numel())
 
             plan = TrainingPlan(
                 self.iterations, self.batch_size, self.learning_rate, self.schedule, self.second_moment_decay,
@@ -220,6 +230,14 @@ class UMesh(Surrogate):
         """The network from nodes to nodes, (n, n_nodes, 3) float32, scaled."""
         on_grid = self.grid_.to_grid(given) if self.input == "force" else self.grid_.displacements_to_grid(given)
         return self.grid_.to_nodes(self.network_(on_grid).float())
+
+    def _sample_weights(self, targets: Tensor) -> Tensor:
+        """(n,) what each sample's squared error counts, 1 on average."""
+        if self.loss == "absolute":
+            return targets.new_ones(len(targets))
+        size = targets.square().mean(dim=(1, 2)).sqrt()  # the root mean square over all samples is 1
+        weights = size.clamp(min=SMALLEST_SIZE).pow(-2)
+        return weights / weights.mean()
 
     def _come_to_rest(self) -> None:
         """Remember what the network answers to nothing, if that is to be taken off."""
