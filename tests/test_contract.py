@@ -22,7 +22,8 @@ from mor_bench.surrogate import _digest as file_digest
 CHEAP_UMESH = {"channels": 8, "steps": 1, "iterations": 150, "batch_size": 16, "learning_rate": 3e-3}
 CHEAP_PGD = {"n_terms": 20, "position_degree": 2}
 CHEAP: dict[str, dict[str, Any]] = {
-    "autoencoder": {"iterations": 100}, "pgd": CHEAP_PGD, "pgd-force": CHEAP_PGD, "umesh": CHEAP_UMESH, "umesh-small": CHEAP_UMESH, "umesh-linear": CHEAP_UMESH,
+    "autoencoder": {"iterations": 100}, "pgd": CHEAP_PGD, "pgd-force": CHEAP_PGD, "umesh": CHEAP_UMESH, "umesh-small": CHEAP_UMESH,
+    "umesh-linear": CHEAP_UMESH,
 }  # fmt: skip
 """Parameters that keep a costly method's battery short."""
 
