@@ -418,3 +418,17 @@ def test_the_network_is_the_papers_with_its_skips() -> None:
         y = double(torch.cat([skips.pop(), functional.conv_transpose3d(y, weight, bias, stride=2)], dim=1))
     with torch.inference_mode():
         torch.testing.assert_close(network(x), functional.conv3d(y, *head), rtol=1e-5, atol=1e-5)
+
+
+def test_displacements_on_the_grid_are_means_of_the_nodes_around(irregular: tuple[Snapshots, Snapshots]) -> None:
+    """A constant field stays constant wherever there is body, and is zero beside it; a linear one keeps its values at nodes on points."""
+    grid = padded_grid(grid_map(irregular[0].scene.mesh), 1)
+    assert grid.places is None
+    n_nodes = irregular[0].scene.mesh.n_nodes
+    values = grid.displacements_to_grid(torch.ones(2, n_nodes, 3))
+    body = torch.from_numpy((grid.grid.weights.sum(axis=0) > 1e-2).reshape(grid.shape))
+    torch.testing.assert_close(values[:, :, body], torch.ones(2, 3, int(body.sum())))
+    assert not values[:, :, torch.from_numpy((grid.grid.weights.sum(axis=0) == 0).reshape(grid.shape))].any()
+    regular = padded_grid(grid_map(box_mesh((2.0, 1.0, 1.0), (6, 2, 2))), 1)
+    nodal = torch.randn(1, 63, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(regular.displacements_to_grid(nodal), regular.to_grid(nodal), rtol=0, atol=0)

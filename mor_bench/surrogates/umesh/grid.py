@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -59,8 +60,13 @@ class PaddedGrid:
         """
         if self.places is not None:
             return self.to_grid(displacements)
-        shares = torch.from_numpy(np.maximum(self.grid.weights.sum(axis=0), SMALLEST_SHARE).astype(np.float32)).to(displacements.device)
-        return self.to_grid(displacements) / shares.view(1, 1, *self.shape)
+        return self.to_grid(displacements) / self._shares.to(displacements.device)
+
+    @cached_property
+    def _shares(self) -> Tensor:
+        """(1, 1, x, y, z) sums of N over the nodes."""
+        sums = np.maximum(self.grid.weights.sum(axis=0), SMALLEST_SHARE).astype(np.float32)
+        return torch.from_numpy(sums).view(1, 1, *self.shape)
 
     def to_nodes(self, values: Tensor) -> Tensor:
         """N u: (n, 3, x, y, z) → (n, n_nodes, 3), differentiable."""
