@@ -110,6 +110,11 @@ RACES = (
     Race("l-shape", "pgd-force", {"n_terms": 20, "position_degree": 2}, "fem", 5.0, 0.1),  # 18, 0.009
     Race("l-shape", "umesh", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 66, 0.56 after so short a training
     Race("l-shape", "umesh-small", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 83, 0.55
+    Race("l-shape", "pca-ridge", {"n_input_modes": 20}, "fem", 10.0, 0.1),  # R1
+    Race("l-shape", "pca-kernel-ridge", {}, "fem", 10.0, 0.05),  # R2
+    Race("l-shape", "pca-gaussian-process", {"n_input_modes": 10}, "fem", 10.0, 0.05),  # R3
+    Race("l-shape", "pca-random-forest", {"n_trees": 10}, "fem", 10.0, 0.05),  # R4
+    Race("l-shape", "pca-extra-trees", {"n_trees": 10}, "fem", 10.0, 0.05),  # R5
 )
 """Every method of the suite against its baseline; a new one adds a line."""
 

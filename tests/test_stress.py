@@ -85,6 +85,11 @@ CONCERNED = {
     "pgd": ANY | LEARNERS,
     "pgd-force": ANY | LEARNERS,
     "umesh-small": ANY | LEARNERS,
+    "pca-ridge": ANY | LEARNERS,
+    "pca-kernel-ridge": ANY | LEARNERS,
+    "pca-gaussian-process": ANY | LEARNERS,
+    "pca-random-forest": ANY | LEARNERS,
+    "pca-extra-trees": ANY | LEARNERS,
 }
 
 

@@ -81,7 +81,7 @@ def project(matrix: Array, loads: Array) -> Array:
     (n, r) float64
     """
     out = np.empty((len(loads), matrix.shape[1]))
-    n_loaded = int(_project(matrix, loads, out))
+    n_loaded = int(_project(matrix, np.ascontiguousarray(loads), out))
     if counting.running is not None:
         counting.running.add(multiply_adds=n_loaded * matrix.shape[1])
     return out
@@ -137,6 +137,7 @@ class Compliance:
         (n, n_dofs) float64
             m, exactly zero at the supports.
         """
+        loads = np.ascontiguousarray(loads)  # of one memory order the kernel is compiled once
         out, used = np.empty(loads.shape), np.empty(len(loads), dtype=np.int64)
         _respond(self.columns, self._place, self._most, loads, out, used)
         others = used < 0

@@ -78,7 +78,8 @@ class CoordinateRegression(Surrogate):
             else:
                 inputs = snapshots.free_forces
             used = np.flatnonzero(inputs.any(axis=0))  # of forces only a few columns
-            modes = pod(inputs[:, used], self.n_input_modes or self.usual_inputs[self.input]).modes
+            usual = min(self.usual_inputs[self.input], *inputs[:, used].shape)
+            modes = pod(inputs[:, used], self.n_input_modes or usual).modes
             squares = ((inputs[:, used] @ modes) ** 2).mean(axis=0)
             # Half way between coordinates of their own size and of equal size, on a logarithmic scale.
             axes = np.zeros((inputs.shape[1], modes.shape[1]))
@@ -100,8 +101,7 @@ class CoordinateRegression(Surrogate):
         return whole
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        batch = self._checked_forces(forces)
-        loads = batch.reshape(len(batch), -1)
+        loads = self._checked_forces(forces).reshape(-1, self.scene_.mesh.n_dofs)
         coefficients = self._coefficients(project(self._from_forces, loads))
         if counting.running is not None:
             counting.running.add(multiply_adds=len(loads) * self.modes_.size)

@@ -46,6 +46,7 @@ class WarmFEM(Surrogate):
     """
 
     model_: FullOrderModel
+    compliance_: Compliance
 
     def __init__(
         self,

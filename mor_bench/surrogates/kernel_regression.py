@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.optimize import minimize
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
@@ -16,8 +17,14 @@ from mor_bench.surrogates.coordinate_regression import CoordinateRegression
 
 Array = NDArray[np.float64]
 
+LENGTH_SCALES = {"linear-response": 8.0, "force": 100.0}
+"""Of kernel ridge regression, by input."""
 LENGTHS = (1e-2, 1e3)
 """Bounds on a Gaussian process' length scales; inputs are of the order of one."""
+N_LEADING, MAX_ITERATIONS = 5, 30
+"""Outputs that they are chosen by, the first and largest ones, and steps of L-BFGS-B; each takes a second with all 40 outputs."""
+LARGEST = 1e50
+"""Of the points over the length scales: their squares, and their products with any load's, stay finite."""
 LEAST_NOISE = 1e-10
 """Of the variance of the targets; what is added at the origin, where the value is known."""
 
@@ -40,10 +47,10 @@ class _GaussianSums(CoordinateRegression):
         if not (self.lengths_ > 0).all():
             raise InvalidInputError("`lengths` must be greater than zero.")
         scaled = self.points_ / self.lengths_
+        if not (np.abs(scaled) < LARGEST).all():
+            raise InvalidInputError("`points` must be of moderate size against `lengths`.")
         # [z, 1, -|z|²/2] times these are the exponents, never much above zero.
         self._exponents = np.vstack([scaled.T / self.lengths_[:, None], -0.5 * (scaled**2).sum(axis=1), np.ones(len(scaled))])
-        if not np.isfinite(self._exponents).all():
-            raise InvalidInputError("`points` must be of moderate size against `lengths`.")
 
     def _learned(self) -> dict[str, NDArray[Any]]:
         return {"points": self.points_, "weights": self.weights_, "lengths": self.lengths_}
@@ -72,17 +79,20 @@ class PCAKernelRidge(_GaussianSums):
     input : {"linear-response", "force"}
         What the coordinates z are taken of.
     n_input_modes : int, optional
-        Length of z, by default 20 of the linear response and 60 of the force; capped at the rank of the input with a warning.
+        Length of z, by default 20 of the linear response and at most 200 of the force; capped at the rank of the input with a warning.
     n_output_modes : int
         Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a warning.
     n_points : int
         Training samples at most that are learned from, the first ones, which cover the load regions evenly: each is kept and
         compared with in every query, and the fit solves with a dense matrix of that size.
-    length_scale : float
-        Of the kernel, where the coordinates together have a root mean square of the order of one.
+    length_scale : float, optional
+        Of the kernel, where the coordinates have root mean squares from a few to less than one; by default 8 for the linear
+        response and 100 for the force, whose effect is all but linear over such lengths.
     ridge : float
         Tikhonov weight, relative to the kernel's largest value.
     """
+
+    usual_inputs = {"linear-response": 20, "force": 200}  # noqa: RUF012
 
     def __init__(
         self,
@@ -90,7 +100,7 @@ class PCAKernelRidge(_GaussianSums):
         n_input_modes: Annotated[int, Field(ge=1)] | None = None,
         n_output_modes: Annotated[int, Field(ge=1)] = 40,
         n_points: Annotated[int, Field(ge=1, le=20_000)] = 2000,
-        length_scale: Annotated[float, Field(gt=0)] = 4.0,
+        length_scale: Annotated[float, Field(gt=0)] | None = None,
         ridge: Annotated[float, Field(ge=1e-14)] = 1e-8,
     ) -> None:
         self.input = input
@@ -105,15 +115,22 @@ class PCAKernelRidge(_GaussianSums):
 
         z, targets = z[: self.n_points], targets[: self.n_points]
         origin = np.zeros((1, z.shape[1]))
-        scaled = z / self.length_scale
+        length = float(self.length_scale or LENGTH_SCALES[self.input])
+        scaled = z / length
         to_origin = gaussian_kernel(scaled, origin)
         kernel = gaussian_kernel(scaled, scaled) - to_origin @ to_origin.T
         weights = KernelRidge(alpha=self.ridge, kernel="precomputed").fit(kernel, targets).dual_coef_
         return {
             "points": np.vstack([z, origin]),
             "weights": np.vstack([weights, -to_origin.T @ weights]),
-            "lengths": np.full(z.shape[1], float(self.length_scale)),
+            "lengths": np.full(z.shape[1], length),
         }
+
+
+def _optimised(objective: Callable[[Array], tuple[float, Array]], start: Array, bounds: Array) -> tuple[Array, float]:
+    """Where the negative likelihood is least, and its value there."""
+    found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": MAX_ITERATIONS})
+    return found.x, float(found.fun)
 
 
 class PCAGaussianProcess(_GaussianSums):
@@ -121,7 +138,8 @@ class PCAGaussianProcess(_GaussianSums):
 
     The prior covariance is a Gaussian kernel with a length scale for each input, the same for all outputs, and g(0) = 0 is an
     observation without noise. Length scales, variance and noise maximise the likelihood of the first `n_optimised` samples
-    (L-BFGS-B from one start, as in scikit-learn); with them the mean is conditioned on the first `n_points`, and alone is kept.
+    and the first `N_LEADING` outputs (at most `MAX_ITERATIONS` steps of L-BFGS-B from one start); with them the mean is conditioned
+    on the first `n_points`, and alone is kept.
 
     Parameters
     ----------
@@ -158,11 +176,12 @@ class PCAGaussianProcess(_GaussianSums):
 
         z, targets = z[: self.n_points], targets[: self.n_points]
         scale = float(np.sqrt((targets**2).mean(axis=0).max()))
-        kernel = ConstantKernel(1.0, (1e-4, 1e8)) * RBF(np.full(z.shape[1], 3.0), LENGTHS) + WhiteKernel(1e-4, (LEAST_NOISE, 1e1))
-        chosen = GaussianProcessRegressor(kernel, alpha=0.0)
+        start = np.full(z.shape[1], LENGTH_SCALES[self.input])
+        kernel = ConstantKernel(100.0, (1e-4, 1e8)) * RBF(start, LENGTHS) + WhiteKernel(1e-5, (LEAST_NOISE, 1e1))
+        chosen = GaussianProcessRegressor(kernel, alpha=0.0, optimizer=_optimised)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # an input that says nothing has its length at the upper bound
-            chosen.fit(z[: self.n_optimised], targets[: self.n_optimised] / scale)
+            warnings.simplefilter("ignore", ConvergenceWarning)  # of an input that says nothing the length is at its upper bound
+            chosen.fit(z[: self.n_optimised], targets[: self.n_optimised, :N_LEADING] / scale)
         variance, lengths = chosen.kernel_.k1.k1.constant_value, np.atleast_1d(chosen.kernel_.k1.k2.length_scale)
         noise = np.append(np.full(len(z), chosen.kernel_.k2.noise_level), LEAST_NOISE) / variance
         points = np.vstack([z, np.zeros((1, z.shape[1]))])

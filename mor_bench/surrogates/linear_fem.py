@@ -33,7 +33,7 @@ class LinearFEM(Surrogate):
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
-        return self.compliance_.respond(batch.reshape(len(batch), -1)).reshape(np.shape(forces))
+        return self.compliance_.respond(batch.reshape(-1, self.scene_.mesh.n_dofs)).reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
         return {}

@@ -111,4 +111,4 @@ class PCARegression(CoordinateRegression):
     def _coefficients(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         if counting.running is not None:
             counting.running.add(multiply_adds=len(z) * (self._monomials.n_products + self.weights_.size))
-        return self._monomials(z) @ self.weights_.T
+        return np.asarray(self._monomials(z) @ self.weights_.T)
