@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -127,10 +127,10 @@ class PCAKernelRidge(_GaussianSums):
         }
 
 
-def _optimised(objective: Callable[[Array], tuple[float, Array]], start: Array, bounds: Array) -> tuple[Array, float]:
+def _optimised(objective: Any, start: Any, bounds: Any) -> tuple[Array, float]:
     """Where the negative likelihood is least, and its value there."""
     found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": MAX_ITERATIONS})
-    return found.x, float(found.fun)
+    return np.asarray(found.x), float(found.fun)
 
 
 class PCAGaussianProcess(_GaussianSums):
@@ -160,7 +160,7 @@ class PCAGaussianProcess(_GaussianSums):
         input: Literal["linear-response", "force"] = "linear-response",
         n_input_modes: Annotated[int, Field(ge=1)] | None = None,
         n_output_modes: Annotated[int, Field(ge=1)] = 40,
-        n_points: Annotated[int, Field(ge=1, le=20_000)] = 1000,
+        n_points: Annotated[int, Field(ge=1, le=20_000)] = 2000,
         n_optimised: Annotated[int, Field(ge=1, le=5000)] = 300,
     ) -> None:
         self.input = input
