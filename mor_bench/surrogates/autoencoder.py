@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError, MorBenchError
+from mor_bench.mechanics.compliance import Compliance, project
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import Scene
@@ -83,7 +84,8 @@ class Autoencoder(Surrogate):
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             snapshots = self._checked_snapshots(snapshots)
-            linear = FullOrderModel(scene).rest_factor.solve(snapshots.free_forces.T).T
+            self.compliance_ = Compliance(FullOrderModel(scene))
+            linear = self.compliance_.respond(snapshots.forces.reshape(len(snapshots), -1))[:, scene.free_dofs]
             axes = pod(linear, self.n_input_modes).modes
             coordinates = linear @ axes
             # Half way between coordinates of their own size and of equal size, on a logarithmic scale.
@@ -132,12 +134,11 @@ class Autoencoder(Surrogate):
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces).reshape(-1, self.scene_.mesh.n_dofs)
         free = self.scene_.free_dofs
-        out = np.zeros_like(batch)
         if counting.running is not None:  # each unit's nonlinearity as one
             networks = sum(weight.size for network in self._networks for weight in network)
-            counting.running.add(multiply_adds=len(batch) * (self.axes_.size + networks + self.modes_.size))
-        linear = self.model_.rest_factor.solve(batch[:, free].T).T
-        out[:, free] = linear + (self._decoded(linear @ self.axes_) - self._at_rest) @ self.modes_.T
+            counting.running.add(multiply_adds=len(batch) * (networks + self.modes_.size))
+        out = self.compliance_.respond(batch)
+        out[:, free] += (self._decoded(project(self._from_forces, batch)) - self._at_rest) @ self.modes_.T
         out[~batch.any(axis=1)] = 0.0  # in a batch the network at rest is rounded otherwise
         return out.reshape(np.shape(forces))
 
@@ -165,8 +166,9 @@ class Autoencoder(Surrogate):
         self.axes_, self.modes_ = state["axes"], state["modes"]
         self._networks = [[state[f"{name}.{layer}"] for layer in LAYERS] for name in ("regression", "decoder")]
         self._at_rest = self._decoded(np.zeros((1, n_inputs)))
-        self.model_ = FullOrderModel(self.scene_)
-        _ = self.model_.rest_factor
+        if not hasattr(self, "compliance_"):
+            self.compliance_ = Compliance(FullOrderModel(self.scene_))
+        self._from_forces = self.compliance_.to_coordinates(self.axes_)
 
 
 def _new_network(n_inputs: int, n_outputs: int, generator: torch.Generator) -> list[Tensor]:

@@ -16,6 +16,7 @@ from torch import Tensor
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.learning.training import Precision, Schedule, TrainingPlan, device_of, fingerprint_of, train
+from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.scene import Scene
@@ -214,17 +215,13 @@ class UMesh(Surrogate):
         """What the scene gives, before anything is learned."""
         self.grid_: PaddedGrid = padded_grid(grid_map(self.scene_.mesh, self.scene_.spec.grid_nodes), self.steps)
         if self.input == "linear-response":
-            self.model_ = FullOrderModel(self.scene_)
-            _ = self.model_.rest_factor
+            self.compliance_ = Compliance(FullOrderModel(self.scene_))
 
     def _given(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, n_nodes, 3) what the network is given: the forces, N, or the linear response to them, m."""
         if self.input == "force":
             return forces
-        response = np.zeros((len(forces), self.scene_.mesh.n_dofs))
-        free = self.scene_.free_dofs
-        response[:, free] = self.model_.rest_factor.solve(forces.reshape(len(forces), -1)[:, free].T).T
-        return response.reshape(forces.shape)
+        return self.compliance_.respond(forces.reshape(len(forces), self.scene_.mesh.n_dofs)).reshape(forces.shape)
 
     def _answer(self, given: Tensor) -> Tensor:
         """The network from nodes to nodes, (n, n_nodes, 3) float32, scaled."""
