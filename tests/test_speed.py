@@ -111,6 +111,10 @@ RACES = (
     Race("l-shape", "umesh", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 66, 0.56 after so short a training
     Race("l-shape", "umesh-small", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 83, 0.55
     Race("l-shape", "umesh-linear", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.05),
+    Race("l-shape", "pod-nn", {"iterations": 300}, "fem", 2.0, 0.05),
+    Race("l-shape", "pod-nn-derivative", {"iterations": 300}, "fem", 2.0, 0.05),
+    Race("l-shape", "sparse-polynomial", {}, "fem", 2.0, 0.05),
+    Race("l-shape", "sparse-polynomial-derivative", {}, "fem", 2.0, 0.05),
 )
 """Every method of the suite against its baseline; a new one adds a line."""
 

@@ -86,6 +86,10 @@ CONCERNED = {
     "pgd-force": ANY | LEARNERS,
     "umesh-small": ANY | LEARNERS,
     "umesh-linear": ANY | LEARNERS,
+    "pod-nn": ANY | LEARNERS,
+    "pod-nn-derivative": ANY | LEARNERS,
+    "sparse-polynomial": ANY | LEARNERS,
+    "sparse-polynomial-derivative": ANY | LEARNERS,
 }
 
 

@@ -44,6 +44,12 @@ class Perceptron(nn.Module):
             x = x * share
         return x @ last, directions @ last
 
+    def take(self, arrays: Sequence[Array]) -> None:
+        """Replace the weights by those of `arrays`."""
+        with torch.no_grad():
+            for weight, array in zip(self.weights, arrays, strict=True):
+                weight.copy_(torch.from_numpy(array))
+
     def arrays(self) -> list[Array]:
         """Weights and biases, from input to output, float64."""
         return [weight.detach().cpu().numpy().astype(np.float64) for weight in self.weights]

@@ -76,7 +76,8 @@ def sensitivities(model: FullOrderModel, snapshots: Snapshots, axes: Array, mode
 
     def unit_forces(patch: int) -> Array:
         on_nodes = scene.patch_weights[[patch]].toarray()[0]
-        return (largest * np.einsum("n,ab->anb", on_nodes, np.eye(3))).reshape(3, -1)[:, scene.free_dofs]
+        unit: Array = (largest * np.einsum("n,ab->anb", on_nodes, np.eye(3))).reshape(3, -1)[:, scene.free_dofs]
+        return unit
 
     for i, patches in enumerate(loads.patches):
         units = [unit_forces(patch) for patch in patches]

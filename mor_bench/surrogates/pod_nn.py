@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -15,14 +15,14 @@ from torch import Tensor
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.learning.perceptron import Perceptron, checked, evaluate, named, slope_at_rest
-from mor_bench.learning.training import TrainingPlan, device_of, train
+from mor_bench.learning.training import TrainingPlan, device_of, fingerprint_of, train
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.coordinates import error_weights, input_axes
 from mor_bench.reduction.sensitivity import sensitivities
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogate import Surrogate
+from mor_bench.surrogate import Surrogate, weights_to_start_from
 
 Array = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ class PODNN(Surrogate):
         n_output_modes: Annotated[int, Field(ge=1)] = 40,
         n_hidden: Annotated[int, Field(ge=1, le=4096)] = 128,
         derivatives: bool = False,
-        iterations: Annotated[int, Field(ge=1)] = 10_000,
+        iterations: Annotated[int, Field(ge=1)] = 6000,
         seed: Annotated[int, Field(ge=0, lt=2**63)] = 0,
     ) -> None:
         self.input = input
@@ -106,32 +106,44 @@ class PODNN(Surrogate):
             axes, modes = input_axes(inputs, self.n_input_modes, 0.5), pod(targets, self.n_output_modes).modes
             coordinates = targets @ modes
             scale = float(np.sqrt((coordinates**2).sum(axis=1).mean()))
-            arrays = [inputs @ axes, coordinates / scale, error_weights(snapshots.free_displacements)]
+            arrays = {"inputs": inputs @ axes, "outputs": coordinates / scale, "weights": error_weights(snapshots.free_displacements)}
             if model is not None and self.derivatives:
                 known = sensitivities(model, snapshots, axes, modes, of_force=not self._from_linear)
-                arrays += [known.inputs, known.outputs / scale]
+                arrays |= {"directions": known.inputs, "slopes": known.outputs / scale}
+            device = device_of(self.training)
+            data = {name: torch.from_numpy(array.astype(np.float32)).to(device) for name, array in arrays.items()}
             generator = torch.Generator().manual_seed(self.seed)
-            network = Perceptron(axes.shape[1], self.n_hidden, modes.shape[1], generator).to(device_of(self.training))
-            trained = train(
-                network, self._loss(network, arrays), len(snapshots), TrainingPlan(self.iterations, BATCH_SIZE, LEARNING_RATE), generator,
-                self.training, self.time_limit_s, fingerprint_of(self.parameters, arrays),
-            )  # fmt: skip
+            network = Perceptron(axes.shape[1], self.n_hidden, modes.shape[1], generator)
+            if self.training.start_from is not None:
+                network.take(self._weights_of(self.training.start_from, axes, modes, scale))
+            network.to(device)
+            plan = TrainingPlan(self.iterations, BATCH_SIZE, LEARNING_RATE)
+            fingerprint = fingerprint_of(self.parameters, {**data, **network.state_dict()}) if self.training.checkpoint else ""
+            trained = train(network, self._loss(network, data), len(snapshots), plan, generator, self.training, self.time_limit_s, fingerprint)
             weights = network.arrays()
             weights[-1] *= scale
             state = {"axes": axes, "modes": modes, "loss_curve": trained.loss_curve, "iterations": np.array([trained.iterations])}
             self._restore({**state, **named("network", weights)})
         return self
 
-    def _loss(self, network: Perceptron, arrays: list[Array]) -> Callable[[Tensor], Tensor]:
+    def _weights_of(self, path: Path, axes: Array, modes: Array, scale: float) -> list[Array]:
+        """The weights of a model of the same mesh, turned from its bases into others."""
+        state = weights_to_start_from(path, type(self))
+        sizes = state["axes"].shape[1], self.n_hidden, state["modes"].shape[1]
+        if (len(state["axes"]), state["network.second"].shape) != (len(axes), (self.n_hidden, self.n_hidden)):
+            raise InvalidInputError(f"{path}: `start_from` must be a model of {len(axes)} free dofs and {self.n_hidden} hidden units.")
+        first, *between, last = checked(state, "network", *sizes)
+        return [np.linalg.pinv(axes) @ state["axes"] @ first, *between, last @ state["modes"].T @ modes / scale]
+
+    def _loss(self, network: Perceptron, data: dict[str, Tensor]) -> Callable[[Tensor], Tensor]:
         """Mean squared errors of the coordinates, and of their derivatives if there are any."""
-        device = device_of(self.training)
-        z, wanted, weights, *known = (torch.from_numpy(array.astype(np.float32)).to(device) for array in arrays)
-        rest = torch.zeros(1, z.shape[1], device=device)
+        z, wanted, weights, known = data["inputs"], data["outputs"], data["weights"], data.get("directions")
+        rest = torch.zeros_like(z[:1])
 
         def loss(rows: Tensor) -> Tensor:
             directions = z[rows, None]
-            if known:
-                directions = torch.cat([directions, known[0][rows]], dim=1)
+            if known is not None:
+                directions = torch.cat([directions, known[rows]], dim=1)
             found, slopes = network.with_derivatives(z[rows], directions[:, 1:])
             if self._from_linear:
                 at_rest, first = network.with_derivatives(rest, directions.flatten(0, 1)[None])
@@ -141,8 +153,8 @@ class PODNN(Surrogate):
                 at_rest = network(rest)
             weight = weights[rows, None]
             total = (((found - at_rest - wanted[rows]) * weight) ** 2).sum(dim=1).mean()
-            if known:
-                wrong = (slopes - known[1][rows]) * weight[:, None]
+            if known is not None:
+                wrong = (slopes - data["slopes"][rows]) * weight[:, None]
                 total = total + DERIVATIVE_WEIGHT * (wrong**2).sum(dim=(1, 2)).mean()
             return total
 
@@ -186,11 +198,3 @@ class PODNN(Surrogate):
         if self._from_linear:
             self.model_ = FullOrderModel(self.scene_)
             _ = self.model_.rest_factor
-
-
-def fingerprint_of(parameters: dict[str, Any], arrays: Sequence[Array]) -> str:
-    """Tells trainings with other knobs or data apart."""
-    digest = hashlib.sha256(repr(sorted(parameters.items())).encode())
-    for array in arrays:
-        digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()

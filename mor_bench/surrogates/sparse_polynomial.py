@@ -241,7 +241,7 @@ def cheapest_terms(costs: Array, n_terms: int) -> list[Term]:
     repeating its last variable or by raising it by one; what a term is a product of comes before it.
     """
     found: list[Term] = []
-    heap = [(float(costs[0]), 1, (0,))]
+    heap: list[tuple[float, int, Term]] = [(float(costs[0]), 1, (0,))]
     while heap and len(found) < n_terms:
         cost, degree, term = heappop(heap)
         found.append(term)

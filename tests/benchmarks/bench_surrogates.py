@@ -43,6 +43,10 @@ METHODS: dict[str, dict[str, Any]] = {
     "umesh": {"channels": 8, "steps": 2, "iterations": 200, "batch_size": 16, "learning_rate": 3e-3},
     "umesh-small": {"channels": 8, "iterations": 200},
     "umesh-linear": {"channels": 8, "iterations": 200},
+    "pod-nn": {"iterations": 500},
+    "pod-nn-derivative": {"iterations": 500},
+    "sparse-polynomial": {"max_terms": 500},
+    "sparse-polynomial-derivative": {"max_terms": 500},
 }
 """Methods and their knobs. U-Mesh's latency does not depend on how long it was trained; the error of so short a training says little."""
 
