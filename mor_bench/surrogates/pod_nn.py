@@ -43,6 +43,10 @@ class PODNN(Surrogate):
     back-solves with K(u) at the samples' own solutions, see `mor_bench.reduction.sensitivity`; after O'Leary-Roseberry et al.:
     Derivative-informed neural operator, Journal of Computational Physics 496 (2024).
 
+    On beam-coarse (split by region, 160 training samples, 6,000 iterations) the median error was 0.22 % without derivatives and
+    0.12 % with them; with 5,100 samples and no derivatives 0.084 %. Subtracting the slope at rest took the latter, with 64
+    hidden units, from 0.16 to 0.10 %.
+
     Parameters
     ----------
     input : {"linear-response", "force"}

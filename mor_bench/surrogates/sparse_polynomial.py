@@ -46,7 +46,9 @@ class SparsePolynomial(Surrogate):
     fitted to; then all samples are fitted. No load gives exactly no displacement.
 
     With derivatives the polynomial also matches those of the displacement with respect to the load, see
-    `mor_bench.reduction.sensitivity`.
+    `mor_bench.reduction.sensitivity`. Median errors on beam-coarse (split by region) with 40, 160, 640 and 2,560 samples: 1.3,
+    0.39, 0.070 and 0.044 % without, 0.33, 0.093, 0.048 and 0.036 % with derivatives; 1.3, 1.1, 0.23 and 0.084 % of
+    `pca-regression` with as many coordinates, and 0.041 % against 0.061 % with all 5,100.
 
     Parameters
     ----------
