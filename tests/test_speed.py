@@ -116,6 +116,10 @@ RACES = (
     Race("l-shape", "pca-gaussian-process", {"n_input_modes": 10}, "fem", 4.0, 0.02),  # 17, 0.002
     Race("l-shape", "pca-random-forest", {"n_trees": 10}, "fem", 5.0, 0.05),  # 37, 0.01
     Race("l-shape", "pca-extra-trees", {"n_trees": 10}, "fem", 5.0, 0.05),  # 33, 0.005
+    Race("l-shape", "pod-nn", {"iterations": 300}, "fem", 2.0, 0.05),
+    Race("l-shape", "pod-nn-derivative", {"iterations": 300}, "fem", 2.0, 0.05),
+    Race("l-shape", "sparse-polynomial", {}, "fem", 2.0, 0.05),
+    Race("l-shape", "sparse-polynomial-derivative", {}, "fem", 2.0, 0.05),
 )
 """Every method of the suite against its baseline; a new one adds a line."""
 

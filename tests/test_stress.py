@@ -91,6 +91,10 @@ CONCERNED = {
     "pca-gaussian-process": ANY | LEARNERS,
     "pca-random-forest": ANY | LEARNERS,
     "pca-extra-trees": ANY | LEARNERS,
+    "pod-nn": ANY | LEARNERS,
+    "pod-nn-derivative": ANY | LEARNERS,
+    "sparse-polynomial": ANY | LEARNERS,
+    "sparse-polynomial-derivative": ANY | LEARNERS,
 }
 
 

@@ -40,10 +40,16 @@ def _monomials(z, parents, variables, out):  # type: ignore[no-untyped-def]
 
 
 class Monomials:
-    """All monomials of degree 1 to ``degree`` of some variables, those of low degree first."""
+    """Monomials of some variables, those of low degree first: the variables, and for each further degree what ``levels`` says.
 
-    def __init__(self, n_variables: int, degree: int) -> None:
-        levels = monomial_indices(n_variables, degree)
+    Parameters
+    ----------
+    n_variables : int
+    levels : list of two (n,) int64
+        As from `monomial_indices`, which gives all monomials up to a degree.
+    """
+
+    def __init__(self, n_variables: int, levels: Levels) -> None:
         starts = np.cumsum([0, n_variables, *(len(parents) for parents, _ in levels)])
         self._parents = np.concatenate([np.zeros(0, np.int64), *(start + parents for start, (parents, _) in zip(starts, levels, strict=False))])
         self._variables = np.concatenate([np.zeros(0, np.int64), *(variables for _, variables in levels)])
@@ -92,7 +98,7 @@ class PCARegression(CoordinateRegression):
     def _learn(self, z: NDArray[np.float64], targets: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
         from sklearn.linear_model import Ridge
 
-        features = Monomials(z.shape[1], self.degree)(z)
+        features = Monomials(z.shape[1], monomial_indices(z.shape[1], self.degree))(z)
         feature_scale = np.sqrt((features**2).mean(axis=0))
         regression = Ridge(alpha=self.ridge * len(features), fit_intercept=False, solver="cholesky")
         regression.fit(features / feature_scale, targets)
@@ -103,7 +109,8 @@ class PCARegression(CoordinateRegression):
 
     def _take(self, state: dict[str, NDArray[Any]]) -> None:
         self.weights_ = state["weights"]
-        self._monomials = Monomials(state["axes"].shape[1], self.degree)
+        n_variables = state["axes"].shape[1]
+        self._monomials = Monomials(n_variables, monomial_indices(n_variables, self.degree))
 
     def _learned(self) -> dict[str, NDArray[Any]]:
         return {"weights": self.weights_}

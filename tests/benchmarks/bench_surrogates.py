@@ -48,6 +48,10 @@ METHODS: dict[str, dict[str, Any]] = {
     "pca-gaussian-process": {"n_input_modes": 10},
     "pca-random-forest": {},
     "pca-extra-trees": {},
+    "pod-nn": {"iterations": 500},
+    "pod-nn-derivative": {"iterations": 500},
+    "sparse-polynomial": {"max_terms": 500},
+    "sparse-polynomial-derivative": {"max_terms": 500},
 }
 """Methods and their knobs. U-Mesh's latency does not depend on how long it was trained; the error of so short a training says little."""
 
