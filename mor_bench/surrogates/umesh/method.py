@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self, final
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, final
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
+from torch import Tensor
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
+from mor_bench.learning.inference import Backend, choose_inference, inference_or_eager
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -19,8 +21,14 @@ from mor_bench.surrogates.umesh.grid import PaddedGrid, padded_grid
 from mor_bench.surrogates.umesh.network import UNet, empty_network, new_network
 from mor_bench.surrogates.umesh.training import TrainingPlan, train
 
+if TYPE_CHECKING:
+    import onnx
+
 PREDICTION_CHUNK = 128
 """Samples per forward pass, so that a long batch needs 300 MB of activations at 128 channels, not gigabytes."""
+
+N_CHOOSING = 32
+"""Training samples, evenly spread, by which the back end of the predictions is chosen."""
 
 
 @final
@@ -28,7 +36,8 @@ class UMesh(Surrogate):
     """A 3D U-Net from nodal forces to nodal displacements.
 
     Mendizabal, Márquez-Neila, Cotin, "Simulation of hyperelastic materials in real-time using Deep Learning". Trained with
-    the mean squared error over the components of all nodes, and Adam. All is computed in float32.
+    the mean squared error over the components of all nodes, and Adam. All is computed in float32,
+    unless `inference` says otherwise.
 
     Parameters
     ----------
@@ -48,10 +57,16 @@ class UMesh(Surrogate):
         Adam's β₂.
     seed : int
         Of the initial weights and of the order of the samples.
+    inference : str
+        What computes the predictions, see `mor_bench.learning.inference`. "packed" differs from "eager" by rounding only.
+        "auto": the fastest that is exact enough, by single queries on one thread at the end of the fit; the choice is kept with
+        the model, and may be another one after another fit, where two are nearly as fast.
 
     Attributes
     ----------
     network_ : UNet
+    inference_ : Inference
+        The network as `predict` calls it.
     grid_ : PaddedGrid
     force_scale_, displacement_scale_ : float
         Root mean square of the training forces, N, and displacements, m.
@@ -97,6 +112,7 @@ class UMesh(Surrogate):
         schedule: Literal["constant", "one-cycle"] = "constant",
         second_moment_decay: Annotated[float, Field(gt=0, lt=1)] = 0.999,
         seed: Annotated[int, Field(ge=0, lt=2**63)] = 0,
+        inference: Backend | Literal["auto"] = "packed",
     ) -> None:
         self.channels = channels
         self.steps = steps
@@ -106,6 +122,7 @@ class UMesh(Surrogate):
         self.schedule = schedule
         self.second_moment_decay = second_moment_decay
         self.seed = seed
+        self.inference = inference
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
@@ -128,6 +145,7 @@ class UMesh(Surrogate):
                 self.time_limit_s,
             )
             self.network_.eval()
+            self._choose_inference(forces / self.force_scale_, displacements / self.displacement_scale_)
         return self
 
     @torch.inference_mode()
@@ -137,14 +155,32 @@ class UMesh(Surrogate):
             products = self.network_.multiply_adds(self.grid_.shape) + self.grid_.multiply_adds + 2 * self.scene_.mesh.n_dofs
             counting.running.add(multiply_adds=len(checked) * products)
         scaled = torch.from_numpy((checked / self.force_scale_).astype(np.float32))
-        answers = [self.grid_.to_nodes(self.network_(self.grid_.to_grid(chunk))) for chunk in torch.split(scaled, PREDICTION_CHUNK)]
+        answers = [self.grid_.to_nodes(self.inference_(self.grid_.to_grid(chunk))) for chunk in torch.split(scaled, PREDICTION_CHUNK)]
         displacements = torch.cat(answers).numpy().astype(np.float64) * self.displacement_scale_
         displacements[:, self.scene_.fixed_nodes] = 0.0
         return displacements.reshape(np.shape(forces))
 
+    def _choose_inference(self, forces: Tensor, displacements: Tensor) -> None:
+        """Set ``inference_``, by scaled training samples where it is to be chosen."""
+        if self.inference == "auto":
+            rows = torch.linspace(0, len(forces) - 1, min(N_CHOOSING, len(forces))).long()
+            choice = choose_inference(
+                self.network_, self.grid_.to_grid(forces[rows]), lambda output: self.grid_.to_nodes(output) - displacements[rows]
+            )  # fmt: skip
+            self.inference_ = choice.inference
+            self.sizes_ = {"inference": choice.inference.backend}
+            self.timings_ms_ = choice.milliseconds
+        else:
+            self.inference_ = inference_or_eager(self.network_, self.inference)
+
     def _padded_grid(self) -> PaddedGrid:
         """The scene's grid, of the shape that its file asks for."""
         return padded_grid(grid_map(self.scene_.mesh, self.scene_.spec.grid_nodes), self.steps)
+
+    def _onnx_model(self) -> onnx.ModelProto:
+        from mor_bench.surrogates.umesh.onnx_model import umesh_graph
+
+        return umesh_graph(self.scene_, self.grid_, self.network_, self.force_scale_, self.displacement_scale_)
 
     def _state(self) -> dict[str, NDArray[Any]]:
         weights = {f"network.{name}": value.numpy() for name, value in self.network_.state_dict().items()}
@@ -165,6 +201,8 @@ class UMesh(Surrogate):
         except RuntimeError as error:
             raise ValueError(f"the weights do not fit the network: {error}") from None
         self.network_ = network.eval()
+        chosen = getattr(self, "sizes_", {}).get("inference", self.inference)
+        self.inference_ = inference_or_eager(self.network_, "eager" if chosen == "auto" else chosen)
 
 
 def _rms(values: NDArray[np.float64]) -> float:
