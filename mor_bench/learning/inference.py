@@ -4,7 +4,7 @@ torch's own convolutions are slow where samples come one at a time: it copies th
 or does without oneDNN. Four ways of computing one network:
 
 - ``eager``: the network as it is.
-- ``packed``: a copy whose convolutions are oneDNN's, with weights packed once and the ReLU within. These are the
+- ``packed``: a copy whose convolutions are oneDNN's, with weights packed once and the activation within. These are the
   operations that torch.compile puts into frozen graphs; called directly, no compiler is needed, which a method that is
   being compared may not start. Every network with convolutions gains, without any description of its graph.
 - ``packed-bfloat16``: the same, weights and activations in bfloat16 with sums in float32.
@@ -52,6 +52,10 @@ TURNS, QUERIES = 5, 3
 
 SAME = 1e-4
 """Largest difference of a float32 back end, relative to the largest value, that rounding can explain."""
+
+
+FUSED: dict[type[nn.Module], str] = {nn.ReLU: "relu", nn.SiLU: "swish"}
+"""Activations that oneDNN applies within a convolution, and its names for them."""
 
 
 class Inference:
@@ -115,7 +119,7 @@ class Choice:
 
 
 @torch.inference_mode()
-def choose_inference(network: nn.Module, inputs: Tensor, errors: Callable[[Tensor], Tensor]) -> Choice:
+def choose_inference(network: nn.Module, inputs: Tensor, errors: Callable[[Inference], Tensor]) -> Choice:
     """Choose the fastest back end that is exact enough and clearly faster than plainer ones.
 
     Timed with single queries on one thread, where time differs between machines but hardly the order. A back end qualifies
@@ -126,20 +130,18 @@ def choose_inference(network: nn.Module, inputs: Tensor, errors: Callable[[Tenso
     ----------
     network : nn.Module
     inputs : (n, ...) float32
-        Samples.
+        Samples, each of which may be a timed query.
     errors : callable
-        From the network's output for these samples to its errors, of any shape; they must be differences, which are linear
-        in the output.
+        The errors of the network, computed by what it is given, on some samples: an array of any shape.
     """
     plain = Inference(network)
-    wanted = plain(inputs)
-    own = errors(wanted)
+    own = errors(plain)
     able: dict[Backend, Inference] = {"eager": plain}
     left_out: dict[str, str] = {}
     for backend in BACKENDS[1:]:
         try:
             candidate = Inference(network, backend)
-            added = _rms(errors(candidate(inputs)) - own) / max(_rms(own), 1e-30)
+            added = _rms(errors(candidate) - own) / max(_rms(own), 1e-30)
         except UnavailableBackendError as error:
             left_out[backend] = str(error)
             continue
@@ -182,14 +184,14 @@ def _rms(values: Tensor) -> float:
 
 
 class _PackedConvolution(nn.Module):
-    """oneDNN's convolution with weights in the layout that it prefers, and the ReLU that follows."""
+    """oneDNN's convolution with weights in the layout that it prefers, and the activation that follows."""
 
-    def __init__(self, layer: nn.Conv2d | nn.Conv3d, relu: bool) -> None:
+    def __init__(self, layer: nn.Conv2d | nn.Conv3d, activation: str | None) -> None:
         super().__init__()
         self.geometry = [list(layer.padding), list(layer.stride), list(layer.dilation), layer.groups]
         self.weight = torch.ops.mkldnn._reorder_convolution_weight(layer.weight.detach(), *self.geometry, None)
         self.bias = None if layer.bias is None else layer.bias.detach()
-        self.activation = "relu" if relu else "none"
+        self.activation = activation or "none"
 
     def forward(self, x: Tensor) -> Tensor:
         y: Tensor = torch.ops.mkldnn._convolution_pointwise(x, self.weight, self.bias, *self.geometry, self.activation, [], "")
@@ -243,15 +245,15 @@ def _packed_bfloat16(network: nn.Module) -> nn.Module:
 
 
 def _pack_layers(module: nn.Module) -> int:
-    """Replace the convolutions within a module, each with the ReLU behind it where one follows in an `nn.Sequential`; how many."""
+    """Replace the convolutions within a module, each with the activation behind it in an `nn.Sequential`; how many."""
     n_packed = 0
     children = list(module.named_children())
     following = [child for _, child in children[1:]] if isinstance(module, nn.Sequential) else []
     for i, (name, child) in enumerate(children):
         if isinstance(child, nn.Conv2d | nn.Conv3d) and child.padding_mode == "zeros" and not isinstance(child.padding, str):
-            relu = i < len(following) and isinstance(following[i], nn.ReLU)
-            setattr(module, name, _PackedConvolution(child, relu))
-            if relu:
+            activation = FUSED.get(type(following[i])) if i < len(following) else None
+            setattr(module, name, _PackedConvolution(child, activation))
+            if activation is not None:
                 setattr(module, children[i + 1][0], nn.Identity())
             n_packed += 1
         elif isinstance(child, nn.ConvTranspose2d | nn.ConvTranspose3d) and _is_upsampling(child):
@@ -281,7 +283,7 @@ def _reason_against_packing(dtype: torch.dtype) -> str | None:
         parameter.copy_(torch.randn(parameter.shape, generator=generator))
     expected = layer(x.float()).relu()
     try:
-        found = _PackedConvolution(layer.to(dtype), relu=True)(x)
+        found = _PackedConvolution(layer.to(dtype), "relu")(x)
     except (AttributeError, RuntimeError, TypeError) as error:  # torch's operations for its own compiler may change with its versions
         return f"torch {torch.__version__} does not offer oneDNN's convolutions as expected: {type(error).__name__}."
     allowed = SAME if dtype == torch.float32 else 2e-2

@@ -85,6 +85,8 @@ class GraphBuilder:
     def _layer(self, layer: nn.Module, x: str) -> str:
         if isinstance(layer, nn.ReLU):
             return self.add("Relu", x)
+        if isinstance(layer, nn.SiLU):
+            return self.add("Mul", x, self.add("Sigmoid", x))
         if isinstance(layer, nn.MaxPool3d):
             if layer.padding != 0 or layer.dilation != 1 or layer.ceil_mode:
                 raise UnavailableBackendError(f"{layer} has no translation to ONNX.")

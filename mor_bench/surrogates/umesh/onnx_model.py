@@ -8,28 +8,76 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from mor_bench.errors import UnavailableBackendError
 from mor_bench.learning.onnx_graph import GraphBuilder
+from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import Scene
-from mor_bench.surrogates.umesh.grid import PaddedGrid
+from mor_bench.surrogates.umesh.grid import SMALLEST_SHARE, PaddedGrid
 from mor_bench.surrogates.umesh.network import UNet
 
 if TYPE_CHECKING:
     import onnx
 
 
-def umesh_graph(scene: Scene, grid: PaddedGrid, network: UNet, force_scale: float, displacement_scale: float) -> onnx.ModelProto:
-    """N, network and N^T with the scales of both ends, all in float32; supports are zero."""
-    n_nodes, weights = scene.mesh.n_nodes, grid.grid.weights
+MAX_RESPONSE_DOFS = 4096
+"""Of a scene whose linear response is written, as a dense matrix: 64 MiB."""
+
+
+def umesh_graph(
+    scene: Scene,
+    grid: PaddedGrid,
+    network: UNet,
+    input_scale: float,
+    output_scale: float,
+    at_rest: NDArray[np.float32] | None,
+    response: FullOrderModel | None,
+) -> onnx.ModelProto:
+    """`UMesh.predict` in float32, scaling included; supports are zero.
+
+    Parameters
+    ----------
+    at_rest : (n_nodes, 3), optional
+        What is taken off every answer of the network, scaled.
+    response : FullOrderModel, optional
+        The network is given the linear response of this model and answers with the rest of the displacement.
+
+    Raises
+    ------
+    UnavailableBackendError
+        If the linear response is wanted of more than `MAX_RESPONSE_DOFS` unknowns.
+    """
+    n_nodes, n_dofs, weights = scene.mesh.n_nodes, scene.mesh.n_dofs, grid.grid.weights
     graph = GraphBuilder()
-    x = graph.add("Mul", "forces", graph.constant(np.array([1.0 / force_scale], dtype=np.float32)))
-    x = _sparse_product(graph, sp.csr_array(weights.T), x)  # (n, x y z, 3)
+    if response is None:
+        given, to_grid = "forces", sp.csr_array(weights.T)
+    else:
+        if n_dofs > MAX_RESPONSE_DOFS:
+            raise UnavailableBackendError(
+                f"the linear response of {scene.name} has {n_dofs:,} unknowns; ONNX has no sparse solve, and a dense matrix is written for at "
+                f"most {MAX_RESPONSE_DOFS:,}."
+            )
+        compliance = np.zeros((n_dofs, n_dofs), dtype=np.float32)
+        free = scene.free_dofs
+        compliance[np.ix_(free, free)] = response.rest_factor.solve(np.eye(len(free)))
+        flat = graph.add("Reshape", "forces", graph.constant(np.array([-1, n_dofs])))
+        solved = graph.add("MatMul", flat, graph.constant(compliance.T))
+        given = graph.add("Reshape", solved, graph.constant(np.array([-1, n_nodes, 3])))
+        shares = np.maximum(weights.sum(axis=0), SMALLEST_SHARE)
+        to_grid = sp.csr_array(sp.diags_array((1.0 / shares).astype(np.float32)) @ weights.T)
+    x = graph.add("Mul", given, graph.constant(np.array([1.0 / input_scale], dtype=np.float32)))
+    x = _sparse_product(graph, to_grid, x)  # (n, x y z, 3)
     x = graph.add("Reshape", x, graph.constant(np.array([-1, *grid.shape, 3])))
     x = graph.network(network, graph.add("Transpose", x, perm=[0, 4, 1, 2, 3]))
     x = graph.add("Transpose", x, perm=[0, 2, 3, 4, 1])
     x = _sparse_product(graph, weights, graph.add("Reshape", x, graph.constant(np.array([-1, weights.shape[1], 3]))))
-    free = np.full((n_nodes, 1), displacement_scale, dtype=np.float32)
-    free[scene.fixed_nodes] = 0.0
-    graph.add("Mul", x, graph.constant(free), name="displacements")
+    if at_rest is not None:
+        x = graph.add("Sub", x, graph.constant(at_rest))
+    if response is not None:
+        scaled = graph.add("Mul", x, graph.constant(np.array([output_scale], dtype=np.float32)))
+        x = graph.add("Add", scaled, given)
+    free_nodes = np.full((n_nodes, 1), output_scale if response is None else 1.0, dtype=np.float32)
+    free_nodes[scene.fixed_nodes] = 0.0
+    graph.add("Mul", x, graph.constant(free_nodes), name="displacements")
     described = {
         "scene": scene.name,
         "scene_spec": scene.spec.model_dump_json(),
