@@ -305,9 +305,11 @@ class UMesh(Surrogate):
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         network = empty_network(self.channels, self.steps, self.activation)
-        expected = {f"network.{name}": (tuple(value.shape), np.float32) for name, value in network.state_dict().items()}
-        n_curves = {name: (np.shape(state[name])[:1], np.float64) for name in ("loss_curve", "validation_curve")}
-        expected |= {"scales": ((2,), np.float64), **n_curves, "iterations": ((1,), np.int64)}
+        expected: dict[str, tuple[tuple[int, ...], type]] = {
+            f"network.{name}": (tuple(value.shape), np.float32) for name, value in network.state_dict().items()
+        }
+        expected |= {name: (np.shape(state[name])[:1], np.float64) for name in ("loss_curve", "validation_curve")}
+        expected |= {"scales": ((2,), np.float64), "iterations": ((1,), np.int64)}
         for name in sorted(expected.keys() | state.keys()):
             if name not in state or name not in expected:
                 raise InvalidInputError(f"the weights do not fit the network: `{name}` is {'missing' if name in expected else 'not expected'}.")
