@@ -66,7 +66,7 @@ def available(net: Any, backend: Any) -> Inference:
 
 @pytest.mark.parametrize("backend", list(EXACT))
 @pytest.mark.parametrize("activation", ["relu", "silu"])
-@torch.inference_mode()
+@torch.inference_mode()  # type: ignore[untyped-decorator]
 def test_a_back_end_answers_as_torch_and_a_batch_as_its_samples(backend: str, activation: Activation) -> None:
     net = network(activation)
     weights = {name: value.clone() for name, value in net.state_dict().items()}
@@ -86,7 +86,7 @@ def test_a_back_end_answers_as_torch_and_a_batch_as_its_samples(backend: str, ac
     assert all(torch.equal(value, weights[name]) for name, value in net.state_dict().items())
 
 
-@torch.inference_mode()
+@torch.inference_mode()  # type: ignore[untyped-decorator]
 def test_geometry_of_convolutions_is_kept() -> None:
     """Strides, dilations, groups, two dimensions, no bias; and a transposed one whose kernels overlap is left alone."""
     generator = torch.Generator().manual_seed(0)
@@ -99,8 +99,8 @@ def test_geometry_of_convolutions_is_kept() -> None:
     torch.testing.assert_close(available(layers, "packed")(x), layers(x), rtol=1e-4, atol=1e-5)
     with pytest.raises(UnavailableBackendError, match="no convolutions"):
         Inference(nn.Linear(3, 3), "packed")
-    with pytest.raises(UnavailableBackendError, match=r"Tanh|Conv2d"):
-        available(network(), "onnx")  # skips where onnx is missing
+    available(network(), "onnx")  # or skip
+    with pytest.raises(UnavailableBackendError, match="Conv2d has no translation"):
         Inference(layers, "onnx")
 
 
