@@ -134,10 +134,12 @@ class NetworkQuery(_Fitted):
         try:
             from mor_bench.learning.inference import Inference
 
-            self.surrogate: Any = mor_bench.load_surrogate(model_file(dataset, "umesh-small"))
-            self.surrogate.inference_ = Inference(self.surrogate.network_, method)  # type: ignore[arg-type]
+            surrogate: Any = mor_bench.load_surrogate(model_file(dataset, "umesh-small"))
+            backend: Any = method
+            surrogate.inference_ = Inference(surrogate.network_, backend)
         except (ImportError, MorBenchError) as error:  # the commit is from before, or the machine lacks it
             raise NotImplementedError(str(error)) from None
+        self.surrogate = surrogate
         self.force = load_limited(dataset).test.forces[0]
         self.surrogate.predict(self.force)
 
