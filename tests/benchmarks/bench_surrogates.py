@@ -10,7 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import mor_bench
-from mor_bench.errors import MissingDependencyError, SpecError, UnsupportedSceneError
+from mor_bench.errors import MissingDependencyError, MorBenchError, SpecError, UnsupportedSceneError
 
 if TYPE_CHECKING:
     from mor_bench.snapshots.dataset import Dataset
@@ -129,6 +129,30 @@ class Query(_Fitted):
         self.surrogate.predict(self.force)
 
     def peakmem_predict(self, dataset: str, method: str) -> None:
+        self.surrogate.predict(self.force)
+
+
+class NetworkQuery(_Fitted):
+    """U-Mesh's query by each of its back ends."""
+
+    params = (tuple(LIMITS), ("eager", "packed", "packed-bfloat16", "onnx"))
+    param_names = ("dataset", "backend")
+
+    def setup(self, dataset: str, method: str) -> None:
+        super().setup(dataset, "umesh-small")
+        try:
+            from mor_bench.learning.inference import Inference
+
+            surrogate: Any = mor_bench.load_surrogate(model_file(dataset, "umesh-small"))
+            backend: Any = method
+            surrogate.inference_ = Inference(surrogate.network_, backend)
+        except (ImportError, MorBenchError) as error:  # the commit is from before, or the machine lacks it
+            raise NotImplementedError(str(error)) from None
+        self.surrogate = surrogate
+        self.force = load_limited(dataset).test.forces[0]
+        self.surrogate.predict(self.force)
+
+    def time_predict(self, dataset: str, method: str) -> None:
         self.surrogate.predict(self.force)
 
 
