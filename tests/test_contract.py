@@ -23,6 +23,8 @@ CHEAP_UMESH = {"channels": 8, "steps": 1, "iterations": 150, "batch_size": 16, "
 CHEAP_PGD = {"n_terms": 20, "position_degree": 2}
 CHEAP: dict[str, dict[str, Any]] = {
     "autoencoder": {"iterations": 100}, "pgd": CHEAP_PGD, "pgd-force": CHEAP_PGD, "umesh": CHEAP_UMESH, "umesh-small": CHEAP_UMESH,
+    "deeponet": {"iterations": 20}, "pod-deeponet": {"iterations": 20},
+    "fno": {"channels": 4, "layers": 2, "iterations": 10}, "mesh-graph-net": {"width": 8, "steps": 2, "iterations": 10},
 }  # fmt: skip
 """Parameters that keep a costly method's battery short."""
 

@@ -40,6 +40,7 @@ CONFIGURATIONS = {
     "autoencoder": 2, "local-pod": 6, "modal-derivatives": 4, "quadratic-manifold": 6,
     "explicit-dynamics": 4, "pgd": 6, "pgd-force": 3,
     "deim": 6, "ecm": 6,
+    "deeponet": 2, "pod-deeponet": 2, "fno": 2, "mesh-graph-net": 2,
 }  # fmt: skip
 
 

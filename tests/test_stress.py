@@ -85,6 +85,10 @@ CONCERNED = {
     "pgd": ANY | LEARNERS,
     "pgd-force": ANY | LEARNERS,
     "umesh-small": ANY | LEARNERS,
+    "deeponet": ANY | LEARNERS,
+    "pod-deeponet": ANY | LEARNERS,
+    "fno": ANY | LEARNERS,
+    "mesh-graph-net": ANY | LEARNERS,
 }
 
 

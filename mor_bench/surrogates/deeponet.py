@@ -31,36 +31,40 @@ class DeepONetNetwork(FieldNetwork):
         Functions, and units and number of the hidden layers of branch and trunk.
     """
 
+    axes: Tensor
+    positions: Tensor
+    functions: Tensor | None
+
     def __init__(self, axes: Tensor, positions: Tensor, modes: Tensor | None, n_functions: int, width: int, depth: int) -> None:
         super().__init__()
         self.register_buffer("axes", axes, persistent=False)
         self.register_buffer("positions", positions, persistent=False)
-        self.register_buffer("modes", modes, persistent=False)
+        self.register_buffer("functions", None if modes is None else modes.T.contiguous(), persistent=False)
         self.branch = perceptron(axes.shape[1], *[width] * depth, n_functions)
         self.trunk = perceptron(3, *[width] * depth, 3 * n_functions) if modes is None else None
         self.n_functions = n_functions
 
     def basis(self) -> Tensor:
         """(n_functions, n_dofs) values of the functions at the nodes."""
-        if self.trunk is None:
-            return self.modes.T  # type: ignore[union-attr,operator,return-value]
+        if self.functions is not None:
+            return self.functions
+        assert self.trunk is not None
         values: Tensor = self.trunk(self.positions)  # (n_nodes, 3 n_functions)
-        return values.view(-1, 3, self.n_functions).flatten(0, 1).T * self.n_functions**-0.5
+        return values.view(-1, self.n_functions).T * self.n_functions**-0.5
 
     def encode(self, fields: Tensor) -> Tensor:
         return fields.flatten(1) @ self.axes
 
     def forward(self, features: Tensor) -> Tensor:
-        basis = self.basis() if self.modes is None else self.modes.T
-        answer: Tensor = self.branch(features) @ basis
+        answer: Tensor = self.branch(features) @ self.basis()
         return answer.view(len(features), -1, 3)
 
     def prepare(self) -> None:
-        self.modes = self.basis().T.contiguous()
+        self.functions = self.basis().contiguous()
 
     @property
     def multiply_adds(self) -> int:
-        return self.axes.numel() + n_products(self.branch) + self.modes.numel()
+        return self.axes.numel() + n_products(self.branch) + self.basis().numel()
 
 
 @final

@@ -6,6 +6,7 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -196,7 +197,7 @@ class FieldSurrogate(Surrogate):
 def perceptron(*widths: int) -> nn.Sequential:
     """Linear layers with SiLU between them, without values."""
     layers: list[nn.Module] = []
-    for n_in, n_out in zip(widths[:-1], widths[1:], strict=True):
+    for n_in, n_out in pairwise(widths):
         layers += [linear(n_in, n_out), nn.SiLU()]
     return nn.Sequential(*layers[:-1])
 

@@ -36,9 +36,16 @@ class SpectralConvolution(nn.Module):
     channels : int
     """
 
+    forward_0: Tensor
+    forward_1: Tensor
+    forward_2: Tensor
+    backward_0: Tensor
+    backward_1: Tensor
+    backward_2: Tensor
+
     def __init__(self, shape: tuple[int, int, int], modes: int, channels: int) -> None:
         super().__init__()
-        self.shape = shape
+        self.shape, self.channels = shape, channels
         kept = [wave_numbers(n, modes) for n in shape]
         # Along z half of them are enough: the others are conjugates, since values are real.
         half = kept[2][(2 * kept[2] >= 0) | (2 * kept[2] == -shape[2])]
@@ -55,7 +62,7 @@ class SpectralConvolution(nn.Module):
 
     def initialise(self, generator: torch.Generator) -> None:
         """Mean square 1 / channels for each wave number: what is kept of the signal keeps its size."""
-        nn.init.normal_(self.weight, std=(2 * self.weight.shape[1]) ** -0.5, generator=generator)
+        nn.init.normal_(self.weight, std=(2 * self.channels) ** -0.5, generator=generator)
 
     def forward(self, values: Tensor) -> Tensor:
         n, c = values.shape[3:]
@@ -71,7 +78,7 @@ class SpectralConvolution(nn.Module):
     @property
     def multiply_adds(self) -> int:
         """For one sample, four for each product of complex numbers."""
-        (nx, ny, nz), (kx, ky, kz), c = self.shape, self.counts, self.weight.shape[1]
+        (nx, ny, nz), (kx, ky, kz), c = self.shape, self.counts, self.channels
         transform = kx * nx * ny * nz + kx * ky * ny * nz + kx * ky * kz * nz
         return 4 * (2 * c * transform + kx * ky * kz * c * c)
 
@@ -97,18 +104,18 @@ class FNO(FieldNetwork):
     channels, modes, layers : int
     """
 
+    positions: Tensor
+    shares: Tensor | None
+
     def __init__(self, grid: PaddedGrid, spread: bool, channels: int, modes: int, layers: int) -> None:
         super().__init__()
         self.grid = grid
         nx, ny, nz = (n + -(-n // PADDING) for n in grid.shape)
         axes = [torch.linspace(-1.0, 1.0, n) for n in grid.shape]
         self.register_buffer("positions", torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).unsqueeze(3), persistent=False)
-        if spread:
-            self.shares = None
-        else:
-            sums = np.asarray(grid.grid.weights.sum(axis=0))
-            shares = (1.0 / np.where(sums == 0.0, 1.0, sums)).astype(np.float32)
-            self.register_buffer("shares", torch.from_numpy(shares).view(*grid.shape, 1), persistent=False)
+        sums = np.asarray(grid.grid.weights.sum(axis=0))
+        shares = torch.from_numpy((1.0 / np.where(sums == 0.0, 1.0, sums)).astype(np.float32)).view(*grid.shape, 1)
+        self.register_buffer("shares", None if spread else shares, persistent=False)
         self.lift = linear(6, channels)
         self.pointwise = nn.ModuleList(linear(channels, channels) for _ in range(layers))
         self.spectral = nn.ModuleList(SpectralConvolution((nx, ny, nz), modes, channels) for _ in range(layers))
@@ -134,7 +141,9 @@ class FNO(FieldNetwork):
     def multiply_adds(self) -> int:
         points = prod(self.grid.shape)
         padded = prod(n + -(-n // PADDING) for n in self.grid.shape)
-        layers = sum(padded * n_products(pointwise) + spectral.multiply_adds for pointwise, spectral in zip(self.pointwise, self.spectral, strict=True))
+        layers = sum(
+            padded * n_products(pointwise) + spectral.multiply_adds for pointwise, spectral in zip(self.pointwise, self.spectral, strict=True)
+        )
         return points * (n_products(self.lift) + n_products(self.project)) + layers + self.grid.multiply_adds
 
 

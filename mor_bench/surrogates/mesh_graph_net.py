@@ -32,6 +32,8 @@ class Graph(nn.Module):
 
     senders: Tensor
     receivers: Tensor
+    outgoing: Tensor
+    incoming: Tensor
 
     def __init__(self, mesh: Mesh) -> None:
         super().__init__()
@@ -142,6 +144,9 @@ class GraphNetwork(FieldNetwork):
     Node features are the input and whether the node is fixed, edge features the relative position and the length. After each
     step a node knows of nodes one edge further away, and of no others.
     """
+
+    fixed: Tensor
+    shapes: Tensor
 
     def __init__(self, mesh: Mesh, fixed_nodes: NDArray[np.int64], width: int, steps: int) -> None:
         super().__init__()
