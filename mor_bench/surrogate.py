@@ -367,6 +367,23 @@ def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surroga
     return _fitted(path, surrogate, scene, header, state)
 
 
+def weights_to_start_from(path: str | Path, surrogate: type[Any]) -> dict[str, NDArray[Any]]:
+    """The arrays of a saved model of the same class, on whatever scene it was trained.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing, damaged or of a newer schema.
+    InvalidInputError
+        If it is of another class.
+    """
+    header, state = _read_model(path)
+    expected = f"{surrogate.__module__}:{surrogate.__qualname__}"
+    if header.get("surrogate") != expected:
+        raise InvalidInputError(f"{path}: `start_from` must be a model of class {expected!r}; got one of {header.get('surrogate')!r}.")
+    return state
+
+
 def _read_model(path: str | Path) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:
     """Header and arrays of a model's file, checked."""
     from safetensors import SafetensorError, safe_open

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -16,11 +15,11 @@ from torch import Tensor, nn
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
-from mor_bench.learning.training import Training, TrainingPlan, device_of, train
+from mor_bench.learning.training import Training, TrainingPlan, device_of, fingerprint_of, train
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogate import Surrogate
+from mor_bench.surrogate import Surrogate, weights_to_start_from
 
 Input = Literal["force", "linear-response"]
 
@@ -107,6 +106,8 @@ class FieldSurrogate(Surrogate):
             network = self._network(self.constants_)
             generator = torch.Generator().manual_seed(self.seed)
             initialise(network, generator)
+            if self.training.start_from is not None:
+                self._start_from(network, self.training.start_from)
             done = self._train(network, _single(inputs), _single(targets), generator)
             self.loss_curve_, self.iterations_ = done.loss_curve, done.iterations
             self._finish(network.cpu())
@@ -116,8 +117,10 @@ class FieldSurrogate(Surrogate):
         device = device_of(self.training)
         with torch.no_grad():
             features = network.encode(torch.cat([fields, torch.zeros_like(fields[:1])])).to(device)
+        fingerprint = ""
+        if self.training.checkpoint is not None:
+            fingerprint = fingerprint_of(self.parameters, {"features": features, "targets": targets, **network.state_dict()})
         network.to(device)
-        fingerprint = self._fingerprint(fields, targets)
         targets = targets.to(device)
         free = torch.ones(targets.shape[1], 1)
         free[torch.from_numpy(self.scene_.fixed_nodes)] = 0.0
@@ -131,13 +134,14 @@ class FieldSurrogate(Surrogate):
         plan = TrainingPlan(self.iterations, self.batch_size, self.learning_rate, second_moment_decay=SECOND_MOMENT_DECAY)
         return train(network, loss, len(targets), plan, generator, self.training, self.time_limit_s, fingerprint)
 
-    def _fingerprint(self, fields: Tensor, targets: Tensor) -> str:
-        """Of all that a training depends on."""
-        known = [type(self).__qualname__, self.parameters, self.scene_.spec.model_dump(mode="json"), self.input_scale_, self.output_scale_]
-        digest = hashlib.sha256(json.dumps(known).encode())
-        for tensor in (fields, targets):
-            digest.update(tensor.numpy().tobytes())
-        return digest.hexdigest()
+    def _start_from(self, network: FieldNetwork, path: Path) -> None:
+        """Take the weights that fit of a model of this class, trained on this scene or another."""
+        own = network.state_dict()
+        found = _network_weights(weights_to_start_from(path, type(self)))
+        fitting = {name: value for name, value in found.items() if name in own and value.shape == own[name].shape}
+        if not fitting:
+            raise InvalidInputError(f"{path}: none of its weights fits the network of these knobs on {self.scene_.name}.")
+        network.load_state_dict({**own, **fitting})
 
     @torch.inference_mode()
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
@@ -171,19 +175,20 @@ class FieldSurrogate(Surrogate):
             **{f"constant.{name}": array for name, array in self.constants_.items()},
             "scales": np.array([self.input_scale_, self.output_scale_]),
             "loss_curve": self.loss_curve_,
+            "iterations": np.array([self.iterations_]),
         }
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         for name, array in state.items():
-            if array.dtype.kind != "f" or not np.isfinite(array).all():
-                raise InvalidInputError(f"`{name}` must be finite floats; got {array.dtype}, or NaN or infinity.")
+            if array.dtype.kind not in "fi" or not np.isfinite(array).all():
+                raise InvalidInputError(f"`{name}` must be finite numbers; got {array.dtype}, or NaN or infinity.")
         self.input_scale_, self.output_scale_ = (float(scale) for scale in state["scales"])
         if not min(self.input_scale_, self.output_scale_) > 0:
             raise InvalidInputError(f"`scales` must be greater than 0; got {state['scales']}.")
-        self.loss_curve_ = state["loss_curve"]
+        self.loss_curve_, self.iterations_ = state["loss_curve"], int(state["iterations"][0])
         self.constants_ = {name.removeprefix("constant."): array for name, array in state.items() if name.startswith("constant.")}
         network = self._network(self.constants_)
-        weights = {name.removeprefix("network."): torch.from_numpy(array) for name, array in state.items() if name.startswith("network.")}
+        weights = _network_weights(state)
         expected = {name: (value.shape, value.dtype) for name, value in network.state_dict().items()}
         if expected != {name: (value.shape, value.dtype) for name, value in weights.items()}:
             raise InvalidInputError("the weights do not fit the network.")
@@ -221,6 +226,10 @@ def initialise(network: nn.Module, generator: torch.Generator) -> None:
             nn.init.zeros_(layer.bias)
         elif layer is not network and hasattr(layer, "initialise"):
             layer.initialise(generator)
+
+
+def _network_weights(state: Arrays) -> dict[str, Tensor]:
+    return {name.removeprefix("network."): torch.from_numpy(array) for name, array in state.items() if name.startswith("network.")}
 
 
 def _single(fields: NDArray[np.float64]) -> Tensor:

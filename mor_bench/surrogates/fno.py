@@ -105,7 +105,6 @@ class FNO(FieldNetwork):
     """
 
     positions: Tensor
-    shares: Tensor | None
 
     def __init__(self, grid: PaddedGrid, spread: bool, channels: int, modes: int, layers: int) -> None:
         super().__init__()
@@ -113,17 +112,15 @@ class FNO(FieldNetwork):
         nx, ny, nz = (n + -(-n // PADDING) for n in grid.shape)
         axes = [torch.linspace(-1.0, 1.0, n) for n in grid.shape]
         self.register_buffer("positions", torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).unsqueeze(3), persistent=False)
-        sums = np.asarray(grid.grid.weights.sum(axis=0))
-        shares = torch.from_numpy((1.0 / np.where(sums == 0.0, 1.0, sums)).astype(np.float32)).view(*grid.shape, 1)
-        self.register_buffer("shares", None if spread else shares, persistent=False)
+        self.spread = spread
         self.lift = linear(6, channels)
         self.pointwise = nn.ModuleList(linear(channels, channels) for _ in range(layers))
         self.spectral = nn.ModuleList(SpectralConvolution((nx, ny, nz), modes, channels) for _ in range(layers))
         self.project = perceptron(channels, 2 * channels, 3)
 
     def encode(self, fields: Tensor) -> Tensor:
-        values = self.grid.to_grid(fields).permute(0, 2, 3, 4, 1)
-        return values if self.shares is None else values * self.shares
+        values = self.grid.to_grid(fields) if self.spread else self.grid.displacements_to_grid(fields)
+        return values.permute(0, 2, 3, 4, 1)
 
     def forward(self, features: Tensor) -> Tensor:
         values = features.permute(1, 2, 3, 0, 4)  # the points first, which the transforms like
