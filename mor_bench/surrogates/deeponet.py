@@ -69,6 +69,32 @@ class DeepONetNetwork(FieldNetwork):
 
 @final
 class DeepONet(FieldSurrogate):
+    """A branch network for the load, and functions of the position from a trunk network or from POD.
+
+    Lu, Jin, Pang, Zhang, Karniadakis, "Learning nonlinear operators via DeepONet", and for the POD trunk Lu et al., "A
+    comprehensive and fair comparison of two neural operators". Here the branch is given principal coordinates of the input
+    in the place of its values at sensors, and the trunk's functions are vector-valued, so that the three components share
+    the branch. The POD trunk is without the mean, which G(0) would take off. Once trained, the trunk is a matrix: what is
+    left for a query is that of a regression between principal coordinates by a network.
+
+    Parameters
+    ----------
+    input : {"force", "linear-response"}
+        What the network is given; see `FieldSurrogate`.
+    trunk : {"network", "pod"}
+        Where the functions tₖ come from. POD modes are those of the displacement, or of its nonlinear rest.
+    n_input_modes : int
+        Principal coordinates of the input, at most its rank. Those of forces are all of about one size: none can be left out.
+    n_functions : int
+        At most the rank with POD.
+    width, depth : int
+        Units and number of hidden layers in branch and trunk.
+    iterations : int
+        Adam steps; a number, not a time, so that the result does not depend on the load of the machine.
+    batch_size, learning_rate, seed
+        Samples per step, peak of the one-cycle schedule, and seed of the initial weights and of the order of the samples.
+    """
+
     def __init__(
         self,
         input: Input = "force",
@@ -113,15 +139,16 @@ class DeepONet(FieldSurrogate):
 
 
 def principal_axes(inputs: NDArray[np.float64], n_modes: int) -> NDArray[np.float64]:
-    """(n_dofs, at most n_modes) principal directions of inputs (n, n_dofs), scaled.
+    """(n_dofs, at most n_modes) principal directions of inputs (n, n_dofs), all scaled alike: coordinates keep their sizes.
 
-    Coordinates along them have sizes half way between their own and equal ones, on a logarithmic scale, with unit mean square.
+    Scaled to sizes half way to equal ones, 200 coordinates of the linear response were learned by heart: on the coarse beam,
+    split by region (1,280 samples, POD trunk, 1,000 iterations), the error was 5.8e-4 m, more than that of the linear
+    response alone, against 8.2e-5 m. With 20 coordinates either scaling does.
     """
     used = np.flatnonzero(inputs.any(axis=0))  # of forces only a few columns
     modes = pod(inputs[:, used]).modes[:, :n_modes]
-    sizes = np.sqrt(((inputs[:, used] @ modes) ** 2).mean(axis=0))
     axes = np.zeros((inputs.shape[1], modes.shape[1]))
-    axes[used] = modes / np.sqrt(sizes * np.sqrt((sizes**2).mean()))
+    axes[used] = modes / np.sqrt(((inputs[:, used] @ modes) ** 2).mean())
     return axes
 
 

@@ -146,6 +146,24 @@ class FNO(FieldNetwork):
 
 @final
 class FourierNeuralOperator(FieldSurrogate):
+    """A Fourier neural operator on the regular grid around the body; see `FNO`.
+
+    Forces go to the grid as in U-Mesh, with their sum; of the linear response each grid point takes the mean. Every layer
+    sees the whole grid, coarsely, which a load at one end of a body needs.
+
+    Parameters
+    ----------
+    input : {"force", "linear-response"}
+        What the network is given; see `FieldSurrogate`.
+    channels, layers : int
+    modes : int
+        Wave numbers per axis, 0 to modes - 1 and their negatives; axes with fewer keep what they have.
+    iterations : int
+        Adam steps; a number, not a time, so that the result does not depend on the load of the machine.
+    batch_size, learning_rate, seed
+        Samples per step, peak of the one-cycle schedule, and seed of the initial weights and of the order of the samples.
+    """
+
     def __init__(
         self,
         input: Input = "force",

@@ -188,6 +188,27 @@ class GraphNetwork(FieldNetwork):
 
 @final
 class MeshGraphNet(FieldSurrogate):
+    """Message passing along the edges of the mesh; see `GraphNetwork`.
+
+    Without time: the paper's network adds one step's velocity, this one answers with the displacement under a load. A node
+    sees as many edges far as there are steps. From the force alone it can therefore not know of loads, or of supports, that
+    lie further away, and a cantilever's tip hangs on both; the linear response carries that over the whole body. Nodes know
+    no position, only those of their neighbours relative to them.
+
+    Parameters
+    ----------
+    input : {"force", "linear-response"}
+        What the network is given; see `FieldSurrogate`.
+    width : int
+        Of the features of nodes and edges, and of the one hidden layer of each perceptron.
+    steps : int
+        Message-passing steps, each with weights of its own.
+    iterations : int
+        Adam steps; a number, not a time, so that the result does not depend on the load of the machine.
+    batch_size, learning_rate, seed
+        Samples per step, peak of the one-cycle schedule, and seed of the initial weights and of the order of the samples.
+    """
+
     def __init__(
         self,
         input: Input = "force",
