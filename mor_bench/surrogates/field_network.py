@@ -146,6 +146,8 @@ class FieldSurrogate(Surrogate):
     @torch.inference_mode()
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
+        if len(batch) == 0:
+            return np.zeros(np.shape(forces))
         if counting.running is not None:  # with one scaling of each input and each output
             counting.running.add(multiply_adds=len(batch) * (self.network_.multiply_adds + 2 * self.scene_.mesh.n_dofs))
         inputs = self._linear_response(batch) if self.input == "linear-response" else batch
