@@ -26,6 +26,8 @@ CHEAP: dict[str, dict[str, Any]] = {
     "umesh-linear": CHEAP_UMESH,
     "pca-gaussian-process": {"n_input_modes": 10, "n_optimised": 60}, "pca-random-forest": {"n_trees": 10}, "pca-extra-trees": {"n_trees": 10},
     "pod-nn": {"iterations": 300, "n_hidden": 16}, "pod-nn-derivative": {"iterations": 300, "n_hidden": 16},
+    "deeponet": {"iterations": 20}, "pod-deeponet": {"iterations": 20},
+    "fno": {"channels": 4, "layers": 2, "iterations": 10}, "mesh-graph-net": {"width": 8, "steps": 2, "iterations": 10},
 }  # fmt: skip
 """Parameters that keep a costly method's battery short."""
 

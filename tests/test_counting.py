@@ -475,12 +475,16 @@ SMALL: dict[str, dict[str, Any]] = {
     "pod-nn-derivative": {"iterations": 2, "n_input_modes": 4},
     "sparse-polynomial": {"n_input_modes": 4},
     "sparse-polynomial-derivative": {"n_input_modes": 4},
+    "deeponet": {"iterations": 1},
+    "pod-deeponet": {"iterations": 1},
+    "fno": {"channels": 2, "layers": 1, "iterations": 1},
+    "mesh-graph-net": {"width": 4, "steps": 1, "iterations": 1},
 }
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_a_batch_costs_what_its_samples_cost_and_counting_changes_nothing(tiny: Dataset, loads: np.ndarray, name: str) -> None:
-    if name in ("umesh", "autoencoder", "pod-nn", "pod-nn-derivative"):
+    if name in ("umesh", "autoencoder", "pod-nn", "pod-nn-derivative", "deeponet", "pod-deeponet", "fno", "mesh-graph-net"):
         pytest.importorskip("torch")
     method = mor_bench.load_method(name, **SMALL[name])
     method.fit(tiny.scene, tiny.train if method.needs_snapshots else None)

@@ -31,7 +31,10 @@ Arrays = dict[str, NDArray[Any]]
 TOML = 'title = "Mine"\nsource = "SOFA"\n[snapshots]\nfile = "mine.npz"\n[needs]\nerror = 0.01\nlatency_ms = 3.0\n'
 
 COMPETE = {"pca-regression-force", "pgd-force", "umesh", "umesh-small"}
+COMPETE |= {"deeponet", "pod-deeponet", "fno", "mesh-graph-net"}
 CHEAP = {name: {"channels": 4, "steps": 1, "iterations": 5} for name in ("umesh", "umesh-small")}
+CHEAP |= {"deeponet": {"iterations": 5}, "pod-deeponet": {"iterations": 5}}
+CHEAP |= {"fno": {"channels": 4, "layers": 2, "iterations": 5}, "mesh-graph-net": {"width": 8, "steps": 2, "iterations": 5}}
 
 
 @pytest.fixture(scope="module")

@@ -42,6 +42,7 @@ CONFIGURATIONS = {
     "deim": 6, "ecm": 6,
     "pca-ridge": 1, "pca-kernel-ridge": 2, "pca-gaussian-process": 2, "pca-random-forest": 2, "pca-extra-trees": 2,
     "pod-nn": 2, "pod-nn-derivative": 2, "sparse-polynomial": 3, "sparse-polynomial-derivative": 3,
+    "deeponet": 2, "pod-deeponet": 2, "fno": 2, "mesh-graph-net": 2,
 }  # fmt: skip
 
 

@@ -120,6 +120,10 @@ RACES = (
     Race("l-shape", "pod-nn-derivative", {"iterations": 300}, "fem", 2.0, 0.05),
     Race("l-shape", "sparse-polynomial", {}, "fem", 2.0, 0.05),
     Race("l-shape", "sparse-polynomial-derivative", {}, "fem", 2.0, 0.05),
+    Race("l-shape", "deeponet", {"input": "linear-response", "iterations": 200}, "fem", 1.5, 0.05),
+    Race("l-shape", "pod-deeponet", {"input": "linear-response", "iterations": 200}, "fem", 1.5, 0.05),
+    Race("l-shape", "fno", {"input": "linear-response", "iterations": 20}, "fem-jacobi-pcg", 5.0, 0.1),
+    Race("l-shape", "mesh-graph-net", {"input": "linear-response", "iterations": 10}, "fem-jacobi-pcg", 1.5, 0.1),
 )
 """Every method of the suite against its baseline; a new one adds a line."""
 

@@ -95,6 +95,10 @@ CONCERNED = {
     "pod-nn-derivative": ANY | LEARNERS,
     "sparse-polynomial": ANY | LEARNERS,
     "sparse-polynomial-derivative": ANY | LEARNERS,
+    "deeponet": ANY | LEARNERS,
+    "pod-deeponet": ANY | LEARNERS,
+    "fno": ANY | LEARNERS,
+    "mesh-graph-net": ANY | LEARNERS,
 }
 
 

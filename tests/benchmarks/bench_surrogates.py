@@ -52,6 +52,10 @@ METHODS: dict[str, dict[str, Any]] = {
     "pod-nn-derivative": {"iterations": 500},
     "sparse-polynomial": {"max_terms": 500},
     "sparse-polynomial-derivative": {"max_terms": 500},
+    "deeponet": {"input": "linear-response", "iterations": 500},
+    "pod-deeponet": {"input": "linear-response", "iterations": 500},
+    "fno": {"input": "linear-response", "iterations": 100},
+    "mesh-graph-net": {"input": "linear-response", "iterations": 30},
 }
 """Methods and their knobs. U-Mesh's latency does not depend on how long it was trained; the error of so short a training says little."""
 

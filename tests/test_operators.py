@@ -1,0 +1,311 @@
+"""DeepONet, FNO and message passing: each network is what its equation says, written out slowly, and all are zero at rest."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mor_bench
+from mor_bench.errors import InvalidInputError, StoreError
+from mor_bench.scene.grid import grid_map
+from mor_bench.scene.mesh import Mesh, box_mesh
+from mor_bench.scene.scene import load_scene
+from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.snapshots.sampling import draw_loads
+from mor_bench.specs import load_dataset_spec
+from mor_bench.surrogate import Surrogate, TrainingOptions
+from tests.irregular import irregular_box
+
+torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
+
+from mor_bench.surrogates.field_network import initialise  # noqa: E402 - after the check that torch is there
+from mor_bench.surrogates.fno import FNO, SpectralConvolution  # noqa: E402
+from mor_bench.surrogates.mesh_graph_net import Graph, GraphNetwork, MessagePassing  # noqa: E402
+from mor_bench.surrogates.umesh.grid import padded_grid  # noqa: E402
+
+SMALL: dict[str, dict[str, Any]] = {
+    "deeponet": {"width": 16, "depth": 2, "n_functions": 8},
+    "pod-deeponet": {"width": 16, "depth": 2, "n_functions": 8},
+    "fno": {"channels": 4, "modes": 3, "layers": 2, "batch_size": 8},
+    "mesh-graph-net": {"width": 8, "steps": 2, "batch_size": 8},
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Networks as small as these are no faster on two threads, and far slower where another process has a core."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def make(name: str, **knobs: Any) -> Surrogate:
+    return mor_bench.load_method(name, **{**SMALL[name], "iterations": 4, **knobs})
+
+
+def random(*shape: int, seed: int = 0) -> Any:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def tetrahedral() -> Mesh:
+    return irregular_box((2.0, 1.0, 1.0), (3, 2, 2), tetrahedra=True)
+
+
+@pytest.mark.parametrize(("shape", "modes"), [((6, 5, 4), 2), ((5, 4, 6), 3), ((4, 3, 5), 9)])
+def test_the_spectral_convolution_is_a_circular_convolution_with_a_real_kernel(shape: tuple[int, int, int], modes: int) -> None:
+    """The kernel from the weights by its defining sum over all wave numbers; the convolution as a sum over shifts."""
+    layer = SpectralConvolution(shape, modes, 2)
+    layer.initialise(torch.Generator().manual_seed(0))
+    kept = [[k for k in np.fft.fftfreq(n, 1 / n).astype(int) if abs(k) < modes] for n in shape]
+    last = sorted({abs(k) for k in kept[2]})
+    assert layer.counts == (len(kept[0]), len(kept[1]), len(last))
+    weights = torch.view_as_complex(layer.weight.detach()).numpy()
+    points = np.array(list(product(*map(range, shape))))
+    kernel = np.zeros((len(points), 2, 2))
+    for k, weight in zip(product(kept[0], kept[1], last), weights, strict=True):
+        twice = 1 if 2 * k[2] % shape[2] == 0 else 2
+        phase = np.exp(2j * np.pi * (points / shape) @ np.array(k))
+        kernel += twice * (phase[:, None, None] * weight).real / len(points)
+    values = random(*shape, 3, 2).numpy()
+    expected = np.zeros_like(values)
+    for shift, matrix in zip(points, kernel, strict=True):
+        expected += np.roll(values, shift, axis=(0, 1, 2)) @ matrix
+    with torch.no_grad():
+        found = layer(torch.from_numpy(values)).numpy()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
+
+
+def test_forces_are_spread_over_the_grid_and_displacements_averaged() -> None:
+    """As the grid does, whose own test says what that is."""
+    mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
+    grid = padded_grid(grid_map(mesh), 0)
+    fields = random(2, mesh.n_nodes, 3)
+    for spread, expected in ((True, grid.to_grid(fields)), (False, grid.displacements_to_grid(fields))):
+        torch.testing.assert_close(FNO(grid, spread, 2, 2, 1).encode(fields), expected.permute(0, 2, 3, 4, 1), rtol=0, atol=0)
+    assert not torch.equal(grid.to_grid(fields), grid.displacements_to_grid(fields))
+
+
+def test_the_padding_keeps_opposite_ends_apart() -> None:
+    """On a circle a force at one end would act on the other as on its neighbour; the padding lies between them."""
+    network = FNO(padded_grid(grid_map(box_mesh((2.0, 1.0, 1.0), (7, 2, 2))), 0), True, 3, 9, 1)
+    assert network.spectral[0].shape == (10, 4, 4)
+    initialise(network, torch.Generator().manual_seed(0))
+    fields = random(1, 8 * 3 * 3, 3)
+    with torch.no_grad():
+        values = network.lift(torch.cat([fields.view(8, 3, 3, 1, 3), network.positions], dim=-1))
+        padded = torch.zeros(10, 4, 4, 1, 3)
+        padded[:8, :3, :3] = values
+        padded = network.pointwise[0](padded) + network.spectral[0](padded)
+        expected = network.project(padded)[:8, :3, :3].reshape(1, -1, 3)
+        torch.testing.assert_close(network(network.encode(fields)), expected)
+
+
+@pytest.mark.parametrize("mesh", [box_mesh((2.0, 1.0, 1.0), (3, 2, 2)), tetrahedral()], ids=["hexahedra", "tetrahedra"])
+def test_message_passing_is_the_sum_over_edges_written_out(mesh: Mesh) -> None:
+    graph = Graph(mesh)
+    pairs = {(int(s), int(r)) for s, r in zip(graph.senders, graph.receivers, strict=True)}
+    assert len(pairs) == graph.n_edges
+    assert pairs == {(r, s) for s, r in pairs}
+    if mesh.cells.shape[1] == 8:
+        assert graph.n_edges == 2 * (3 * 3 * 3 + 4 * 2 * 3 + 4 * 3 * 2)
+        lengths = np.linalg.norm(mesh.points[graph.senders] - mesh.points[graph.receivers], axis=1)
+        np.testing.assert_allclose(np.unique(lengths.round(9)), [0.5, round(2 / 3, 9)])
+    else:  # each pair of nodes in a tetrahedron is an edge
+        assert pairs == {(int(a), int(b)) for cell in mesh.cells for a in cell for b in cell if a != b}
+    step = MessagePassing(5)
+    initialise(step, torch.Generator().manual_seed(0))
+    edges, nodes = random(graph.n_edges, 2, 5, seed=1), random(mesh.n_nodes, 2, 5, seed=2)
+    with torch.no_grad():
+        found_edges, found_nodes = step(edges, nodes, graph)
+        whole = torch.cat([step.edge.weight, step.sender.weight, step.receiver.weight], dim=1)
+        bias = step.edge.bias + step.sender.bias + step.receiver.bias
+        received: list[Any] = [torch.zeros(2, 5) for _ in range(mesh.n_nodes)]
+        for number, (s, r) in enumerate(zip(graph.senders, graph.receivers, strict=True)):
+            hidden = torch.nn.functional.silu(torch.cat([edges[number], nodes[s], nodes[r]], dim=1) @ whole.T + bias)
+            message = edges[number] + step.norms[0](step.message(hidden))
+            torch.testing.assert_close(found_edges[number], message)
+            received[int(r)] = received[int(r)] + message
+        for node in range(mesh.n_nodes):
+            expected = nodes[node] + step.norms[1](step.node(torch.cat([nodes[node], received[node]], dim=1)))
+            torch.testing.assert_close(found_nodes[node], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_gradients_through_the_graph_are_those_of_dense_matrices() -> None:
+    mesh = tetrahedral()
+    graph = Graph(mesh)
+    senders, receivers = (torch.nn.functional.one_hot(ends, mesh.n_nodes).float() for ends in (graph.senders, graph.receivers))
+    nodes, weight = random(mesh.n_nodes, 4).requires_grad_(), random(mesh.n_nodes, 4, seed=1)
+    own = (graph.to_receivers(graph.from_senders(nodes) * graph.from_receivers(nodes).tanh()) * weight).sum()
+    dense = ((receivers.T @ ((senders @ nodes) * (receivers @ nodes).tanh())) * weight).sum()
+    torch.testing.assert_close(own, dense)
+    torch.testing.assert_close(*(torch.autograd.grad(value, nodes)[0] for value in (own, dense)), rtol=1e-4, atol=1e-5)
+
+
+def test_a_graph_network_sees_as_many_edges_far_as_it_has_steps_and_no_numbers_or_places() -> None:
+    mesh = box_mesh((6.0, 1.0, 1.0), (6, 1, 1))  # nodes are numbered along x first
+    network = GraphNetwork(mesh, np.arange(4), 8, 2)
+    initialise(network, torch.Generator().manual_seed(0))
+    force = random(1, mesh.n_nodes, 3)
+    with torch.no_grad():
+        answer = network(force)
+        changed = force.clone()
+        changed[0, 4 * 6] += 1.0
+        moved = (network(changed) != answer).any(dim=2)[0]
+        distance = np.abs(mesh.points - mesh.points[24]).sum(axis=1)
+        np.testing.assert_array_equal(moved.numpy(), distance < 2.5)
+
+        order = np.random.default_rng(0).permutation(mesh.n_nodes)
+        place = np.argsort(order)
+        renumbered = replace(mesh, points=mesh.points[order] + [3.0, -1.0, 2.0], cells=place[mesh.cells])
+        other = GraphNetwork(renumbered, place[:4], 8, 2)
+        other.load_state_dict(network.state_dict())
+        torch.testing.assert_close(other(force[:, order]), answer[:, order], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["deeponet", "pod-deeponet"])
+def test_deeponet_is_the_branch_times_the_trunk(name: str, tiny: Dataset) -> None:
+    """Written out for each node and component, from the force to the displacement."""
+    method: Any = make(name).fit(tiny.scene, tiny.train)
+    force, network = tiny.test.forces[0], method.network_
+    n_nodes = tiny.scene.mesh.n_nodes
+    axes = method.constants_["axes"]
+    expected = np.zeros((n_nodes, 3))
+    with torch.no_grad():
+        inputs = torch.from_numpy((axes.T @ force.ravel() / method.input_scale_).astype(np.float32))
+        b = (network.branch(inputs[None]) - network.branch(torch.zeros(1, axes.shape[1])))[0]
+        for node, component in product(range(n_nodes), range(3)):
+            if name == "deeponet":
+                t = network.trunk(network.positions[node])[8 * component : 8 * component + 8] / 8**0.5
+            else:
+                t = torch.from_numpy(method.constants_["modes"][3 * node + component].astype(np.float32))
+            expected[node, component] = float(b @ t) * method.output_scale_
+    expected[tiny.scene.fixed_nodes] = 0.0
+    np.testing.assert_allclose(method.predict(force), expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+    assert np.abs(expected).max() > 0.01 * method.output_scale_
+    if name == "pod-deeponet":
+        rows = tiny.train.displacements.reshape(len(tiny.train), -1)
+        best = np.linalg.svd(rows, full_matrices=False)[2][:8]
+        modes = method.constants_["modes"]
+        np.testing.assert_allclose(best.T @ (best @ modes), modes, atol=1e-9 * np.abs(modes).max())
+
+
+@pytest.mark.parametrize("input", ["force", "linear-response"])
+@pytest.mark.parametrize("name", SMALL)
+def test_the_first_loss_is_that_of_the_network_less_its_answer_at_rest(name: str, input: str, tiny: Dataset) -> None:
+    """One step on all samples at a rate that changes nothing: the loss of the predictions is that of the training."""
+    samples = tiny.train[:20]
+    method: Any = make(name, input=input, iterations=1, batch_size=20, learning_rate=1e-30).fit(tiny.scene, samples)
+    error = (method.predict(samples.forces) - samples.displacements) / method.output_scale_
+    assert method.loss_curve_[0] == pytest.approx((error**2).mean(), rel=1e-4)
+    linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None).predict(samples.forces)
+    learned = samples.displacements - linear if input == "linear-response" else samples.displacements
+    assert method.output_scale_ == pytest.approx(np.sqrt((learned**2).mean()), rel=1e-9)
+
+
+@pytest.mark.parametrize("input", ["force", "linear-response"])
+@pytest.mark.parametrize("name", SMALL)
+def test_no_force_gives_no_displacement_alone_and_among_others(name: str, input: str, tiny: Dataset) -> None:
+    method = make(name, input=input).fit(tiny.scene, tiny.train)
+    forces = tiny.test.forces[:5].copy()
+    forces[3] = 0.0
+    answers = method.predict(forces)
+    assert not answers[3].any()
+    assert not method.predict(forces[3]).any()
+    assert answers[[0, 1, 2, 4]].any(axis=(1, 2)).all()
+    tiny_force = 1e-7 * forces[0]
+    assert np.abs(method.predict(tiny_force)).max() < 1e-3 * np.abs(answers[0]).max()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("name", SMALL)
+def test_a_second_fit_is_bit_identical_and_leaves_global_random_state_alone(name: str, threads: int, tiny: Dataset) -> None:
+    state, before = torch.get_rng_state(), torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        first, second = (make(name, iterations=2).fit(tiny.scene, tiny.train) for _ in range(2))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(torch.get_rng_state(), state)
+    for key, array in first._state().items():
+        np.testing.assert_array_equal(array, second._state()[key], err_msg=key)
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_training_lowers_the_error_of_the_linear_response(name: str, tiny: Dataset) -> None:
+    """Of the training loads, and for DeepONet, which sees the whole body at once, of loads in regions that it never saw."""
+    method: Any = make(name, input="linear-response", iterations=400, learning_rate=3e-3).fit(tiny.scene, tiny.train)
+    assert method.loss_curve_.shape == (8,)
+    linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
+    for part, factor in ((tiny.train, 0.95), (tiny.test, 0.8)) if "deeponet" in name else ((tiny.train, 0.95),):
+        own, without = (np.abs(m.predict(part.forces) - part.displacements).mean() for m in (method, linear))
+        assert own < factor * without
+
+
+@pytest.mark.parametrize("input", ["force", "linear-response"])
+@pytest.mark.parametrize("name", SMALL)
+def test_saved_and_loaded_is_the_same_model_and_other_knobs_are_refused(name: str, input: str, tiny: Dataset, tmp_path: Path) -> None:
+    method: Any = make(name, input=input).fit(tiny.scene, tiny.train)
+    path = tmp_path / "model.safetensors"
+    method.save(path)
+    loaded: Any = mor_bench.load_surrogate(path)
+    np.testing.assert_array_equal(loaded.predict(tiny.test.forces), method.predict(tiny.test.forces))
+    np.testing.assert_array_equal(loaded.loss_curve_, method.loss_curve_)
+    assert loaded.parameters == method.parameters
+    knob = {"fno": "channels"}.get(name, "width")
+    other = copy.copy(method)
+    setattr(other, knob, SMALL[name][knob] + 1)
+    other.save(path)
+    with pytest.raises(StoreError, match="weights do not fit"):
+        mor_bench.load_surrogate(path)
+    for key, forged, message in (
+        ("axes", np.zeros((5, 3)), "`axes` must have shape"),
+        ("axes", np.zeros((3 * tiny.scene.mesh.n_nodes, 0)), "`axes` must have shape"),
+    ):
+        if key in method.constants_:
+            other = copy.copy(method)
+            other.constants_ = {**method.constants_, key: forged}
+            other.save(path)
+            with pytest.raises(StoreError, match=message):
+                mor_bench.load_surrogate(path)
+
+
+@pytest.mark.parametrize("name", ["fno", "mesh-graph-net"])
+def test_a_mesh_that_lies_in_no_grid_is_learned(name: str) -> None:
+    spec = load_dataset_spec("beam-tiny").model_dump(mode="json", exclude_none=True)
+    scene = load_scene({**spec, "discretisation": {"element": "tetrahedron"}})
+    mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
+    scene = replace(scene, mesh=mesh, fixed_nodes=np.flatnonzero(mesh.points[:, 0] == 0))
+    assert scene.mesh.grid_index is None
+    loads = draw_loads(scene, 0, 60)
+    displacements = mor_bench.load_method("fem").fit(scene, None).predict(loads.nodal_forces(scene.patch_weights))
+    samples = Snapshots(scene, loads, displacements.reshape(60, -1)[:, scene.free_dofs], np.ones(60))
+    method = make(name, input="linear-response", iterations=300, learning_rate=3e-3).fit(scene, samples)
+    answer = method.predict(samples.forces)
+    linear = mor_bench.load_method("linear-fem").fit(scene, None).predict(samples.forces)
+    assert not answer[:, scene.fixed_nodes].any()
+    assert np.abs(answer - displacements).mean() < 0.95 * np.abs(linear - displacements).mean()
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_training_starts_from_the_weights_that_fit(name: str, tiny: Dataset, tmp_path: Path) -> None:
+    first: Any = make(name).fit(tiny.scene, tiny.train)
+    first.save(tmp_path / "first.safetensors")
+    second: Any = make(name, iterations=1, learning_rate=1e-30, seed=5)
+    second.training = TrainingOptions(start_from=tmp_path / "first.safetensors")
+    second.fit(tiny.scene, tiny.train)
+    for key, value in first.network_.state_dict().items():
+        torch.testing.assert_close(second.network_.state_dict()[key], value, rtol=0, atol=0)
+    unlike = make(name, seed=5).fit(tiny.scene, tiny.train)
+    assert not np.array_equal(unlike.predict(tiny.test.forces[0]), first.predict(tiny.test.forces[0]))
+    other = make("fno" if name != "fno" else "mesh-graph-net")
+    other.training = second.training
+    with pytest.raises(InvalidInputError, match="must be a model of class"):
+        other.fit(tiny.scene, tiny.train)
