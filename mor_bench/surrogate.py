@@ -8,8 +8,9 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +37,32 @@ SIZE = "size."
 """Beginning of the names of the arrays that hold the values chosen for knobs set to "auto"; `_state` has none such."""
 
 
+@dataclass(frozen=True)
+class TrainingOptions:
+    """How a method that trains does so; methods that do not train ignore it.
+
+    These are no knobs: a model's file does not hold them, and `predict` does not depend on them but through what was learned.
+
+    Attributes
+    ----------
+    device : str
+        Where the training computes; "auto" is a CUDA device if there is one.
+    fit_seconds : float or None
+        Seconds that the training is to fill: the number of iterations is chosen after the first ones and reported as ``iterations_``;
+        the knob ``iterations`` with that number gives the same model again. None: as many as the knob says.
+    checkpoint : Path or None
+        File that the training is written to now and then. If it is there at the start, the training goes on from it and ends with
+        the same bits as one that was never stopped; it is removed at the end.
+    start_from : Path or None
+        A model saved by `Surrogate.save`, whose fitting weights the training starts from.
+    """
+
+    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    fit_seconds: float | None = None
+    checkpoint: Path | None = None
+    start_from: Path | None = None
+
+
 class Surrogate(ABC):
     """A map from nodal forces to nodal displacements of one scene.
 
@@ -56,6 +83,9 @@ class Surrogate(ABC):
 
     time_limit_s: float | None = None
     """Seconds that a comparison leaves to `fit`; a method that sees early that they will not do raises `OutOfTimeError`."""
+
+    training: TrainingOptions = TrainingOptions()
+    """Device, seconds, checkpoint and starting weights of a training; set before `fit`, and no knob."""
 
     @abstractmethod
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
