@@ -6,7 +6,7 @@ import hashlib
 import inspect
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +37,9 @@ SIZE = "size."
 """Beginning of the names of the arrays that hold the values chosen for knobs set to "auto"; `_state` has none such."""
 
 
+Device = Literal["auto", "cpu", "cuda"]
+
+
 @dataclass(frozen=True)
 class TrainingOptions:
     """How a method that trains does so; methods that do not train ignore it.
@@ -55,12 +58,15 @@ class TrainingOptions:
         the same bits as one that was never stopped; it is removed at the end.
     start_from : Path or None
         A model saved by `Surrogate.save`, whose fitting weights the training starts from.
+    progress : callable or None
+        Called now and then with the iterations done, all, and the loss.
     """
 
-    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    device: Device = "cpu"
     fit_seconds: float | None = None
     checkpoint: Path | None = None
     start_from: Path | None = None
+    progress: Callable[[int, int, float], None] | None = None
 
 
 class Surrogate(ABC):
@@ -125,6 +131,11 @@ class Surrogate(ABC):
         SolverError
             If a method that solves equations finds no valid equilibrium.
         """
+
+    @classmethod
+    def trains(cls) -> bool:
+        """Whether `fit` heeds `training`. A method that does has the knobs ``iterations`` and ``seed``."""
+        return {"iterations", "seed"} <= inspect.signature(cls.__init__).parameters.keys()
 
     def supports(self, scene: Scene) -> str | None:
         """None, or the reason why the method cannot handle a scene."""
@@ -362,6 +373,11 @@ def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surroga
     if header.get("surrogate") != expected:
         raise StoreError(f"{path}: a model of class {header.get('surrogate')!r}; expected {expected!r}.")
     return _fitted(path, surrogate, scene, header, state)
+
+
+def class_of_model(path: str | Path) -> str:
+    """``module:Class`` of a model's file, which is checked as `load_surrogate` does; nothing is imported."""
+    return _read_model(path)[0].get("surrogate", "")
 
 
 def _read_model(path: str | Path) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:
