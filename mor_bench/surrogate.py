@@ -244,7 +244,7 @@ class Surrogate(ABC):
         sizes = {SIZE + name: np.array([value]) for name, value in getattr(self, "sizes_", {}).items()}
         arrays = {name: np.ascontiguousarray(array) for name, array in {**self._state(), **known, **sizes}.items()}
         header["sha256"] = _digest(header, arrays)
-        write_atomically(Path(path), serialise(arrays, metadata=header))
+        write_atomically(Path(path), _in_order(serialise(arrays, metadata=header)))
 
     def _state(self) -> dict[str, NDArray[Any]]:
         """The arrays that make up a fitted model."""
@@ -309,6 +309,16 @@ class Surrogate(ABC):
         if not (np.abs(array) <= MAX_FORCE_N).all():
             raise InvalidInputError(f"`forces` must be finite and at most {MAX_FORCE_N:g} N; got {np.abs(array).max():g}.")
         return array.astype(np.float64, copy=False).reshape(-1, n_nodes, 3)
+
+
+def _in_order(content: bytes) -> bytes:
+    """A safetensors file with its metadata sorted: safetensors writes them in an order that changes from call to call."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)  # the arrays stay aligned
+    return len(text).to_bytes(8, "little") + text + content[end:]
 
 
 def _digest(header: dict[str, str], arrays: dict[str, NDArray[Any]]) -> str:
