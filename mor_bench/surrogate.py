@@ -385,9 +385,21 @@ def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surroga
     return _fitted(path, surrogate, scene, header, state)
 
 
-def class_of_model(path: str | Path) -> str:
-    """``module:Class`` of a model's file, which is checked as `load_surrogate` does; nothing is imported."""
-    return _read_model(path)[0].get("surrogate", "")
+def weights_to_start_from(path: str | Path, surrogate: type[Any]) -> dict[str, NDArray[Any]]:
+    """The arrays of a saved model of the same class, on whatever scene it was trained.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing, damaged or of a newer schema.
+    InvalidInputError
+        If it is of another class.
+    """
+    header, state = _read_model(path)
+    expected = f"{surrogate.__module__}:{surrogate.__qualname__}"
+    if header.get("surrogate") != expected:
+        raise InvalidInputError(f"{path}: `start_from` must be a model of class {expected!r}; got one of {header.get('surrogate')!r}.")
+    return state
 
 
 def _read_model(path: str | Path) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:

@@ -80,7 +80,7 @@ def test_what_cannot_be_done_is_refused_before_anything_runs(tmp_path: Path) -> 
         (path, {}, {"fit_seconds": float("nan")}, InvalidInputError, "`fit_seconds` must be above 0"),
         (path, {}, {"threads": 0}, InvalidInputError, "`threads` must be an integer in"),
         (path, {}, {"device": "gpu"}, InvalidInputError, "`device` must be one of auto, cpu, cuda; got 'gpu'"),
-        (path, {}, {"start_from": other}, InvalidInputError, "LinearFEM'; a 'tests.third_party:Descent' can start from its own kind only"),
+        (path, {}, {"start_from": other}, InvalidInputError, "`start_from` must be a model of class 'tests.third_party:Descent'; got"),
         (path, {}, {"start_from": tmp_path / "text"}, MorBenchError, "not a readable safetensors file"),
         (path, {}, {"out": tmp_path / "nowhere" / "a.safetensors"}, InvalidInputError, "`out`: .* cannot be written: No such file"),
         (path, {}, {"out": tmp_path}, InvalidInputError, "is a folder"),

@@ -110,6 +110,7 @@ RACES = (
     Race("l-shape", "pgd-force", {"n_terms": 20, "position_degree": 2}, "fem", 5.0, 0.1),  # 18, 0.009
     Race("l-shape", "umesh", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 66, 0.56 after so short a training
     Race("l-shape", "umesh-small", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 83, 0.55
+    Race("l-shape", "umesh-linear", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.05),
 )
 """Every method of the suite against its baseline; a new one adds a line."""
 

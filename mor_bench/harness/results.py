@@ -176,7 +176,7 @@ class Comparison:
         `latency_ms`, `process`, `round` (n_queries,), the last two numbers of the fresh process and of the interleaved round
         that a query was timed in; `mean_dof_m`, `relative_l2`, `max_nodal_m`, `amplitude_m` (n_test,); of the sample
         with the largest finite e `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3); and of a training
-        `loss_curve`, `validation_curve` (n_intervals,), evenly spread over its iterations.
+        `loss_curve`, `validation_curve` (n_intervals,), evenly spread from its beginning to its end.
         """
         return read_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"))
 

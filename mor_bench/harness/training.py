@@ -23,7 +23,7 @@ from mor_bench.harness.timing import pinned_threads
 from mor_bench.snapshots.dataset import Snapshots, load_dataset
 from mor_bench.snapshots.store import remove_leftovers
 from mor_bench.specs import SplitBy, check_parameters, load_dataset_spec, load_method_spec
-from mor_bench.surrogate import Device, Surrogate, class_of_model, make_surrogate
+from mor_bench.surrogate import Device, Surrogate, make_surrogate, weights_to_start_from
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def fit(
     _check_options(unfitted, {"device": device != "cpu", "fit_seconds": fit_seconds, "checkpoint": checkpoint, "start_from": start_from})
     options = training_options(device, fit_seconds)
     if start_from is not None:
-        _check_start(unfitted, Path(start_from))
+        weights_to_start_from(start_from, type(unfitted))
         options = replace(options, start_from=Path(start_from))
     _check_writable("out", out)
     if unfitted.trains():
@@ -163,12 +163,6 @@ def _check_options(unfitted: Surrogate, given: Mapping[str, Any]) -> None:
     named = [f"`{name}`" for name, value in given.items() if value]
     if named and not unfitted.trains():
         raise InvalidInputError(f"{type(unfitted).__name__} has no training that {', '.join(named)} could act on.")
-
-
-def _check_start(unfitted: Surrogate, path: Path) -> None:
-    expected, found = f"{type(unfitted).__module__}:{type(unfitted).__qualname__}", class_of_model(path)
-    if found != expected:
-        raise InvalidInputError(f"`start_from`: {path} holds a model of class {found!r}; a {expected!r} can start from its own kind only.")
 
 
 def _check_writable(name: str, path: Path) -> None:

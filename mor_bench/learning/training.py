@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -89,7 +90,7 @@ class Training:
     validation_curve : (n_validations,) float64
         The loss of the samples held out, each ``validation_interval`` iterations.
     iterations : int
-        Done; fewer than planned after an early stop.
+        Planned, and not all done after an early stop: the number that repeats the training.
     """
 
     loss_curve: NDArray[np.float64]
@@ -109,6 +110,16 @@ def device_of(options: TrainingOptions) -> torch.device:
     if options.device == "cuda" and not torch.cuda.is_available():
         raise InvalidInputError("`device` is 'cuda', but PyTorch finds no CUDA device here; 'cpu' and 'auto' train on the processor.")
     return torch.device("cuda" if options.device != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def fingerprint_of(parts: Mapping[str, object], arrays: Mapping[str, Tensor]) -> str:
+    """SHA-256 of what decides a training: knobs and the like, which JSON can hold, and what is learned from."""
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode())
+    for name in sorted(arrays):
+        array = arrays[name].detach().cpu().contiguous().numpy()
+        digest.update(f"{name} {array.dtype} {array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()
 
 
 def rate_factor(schedule: Schedule, iteration: int, iterations: int) -> float:
@@ -189,7 +200,7 @@ def train(
     course.finish()
     if options.checkpoint is not None:
         options.checkpoint.unlink(missing_ok=True)
-    return Training(np.array(course.curve), np.array(course.validated), course.validation_interval, course.iteration)
+    return Training(np.array(course.curve), np.array(course.validated), course.validation_interval, course.iterations)
 
 
 @dataclass
@@ -275,8 +286,7 @@ class _Course:
         self.total, self.n_summed = self.total + loss.detach(), self.n_summed + 1
         if self.n_summed == LOSS_INTERVAL or self.iteration == self.iterations:
             self.curve.append(float(self.total) / self.n_summed)
-            if not isfinite(self.curve[-1]):
-                raise MorBenchError(f"training diverged before iteration {self.iteration}: `learning_rate` {plan.learning_rate} is too high.")
+            self._check_finite(self.curve[-1])
             self.total, self.n_summed = torch.zeros((), device=self.device), 0
             if self.options.progress is not None:
                 self.options.progress(self.iteration, self.iterations, self.curve[-1])
@@ -294,8 +304,13 @@ class _Course:
             parts = [(len(rows), self.loss(rows.to(self.device))) for rows in torch.split(self.held, self.plan.batch_size)]
         self.network.train()
         self.validated.append(sum(n * float(part) for n, part in parts) / len(self.held))
+        self._check_finite(self.validated[-1])
         if self.validated[-1] <= min(self.validated):
             self.best = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
+
+    def _check_finite(self, loss: float) -> None:
+        if not isfinite(loss):
+            raise MorBenchError(f"training diverged before iteration {self.iteration}: `learning_rate` {self.plan.learning_rate} is too high.")
 
     def finish(self) -> None:
         """With the best weights, if samples were held out."""

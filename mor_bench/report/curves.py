@@ -59,17 +59,19 @@ def learning_curves(comparison: Comparison, dataset: str, styles: dict[str, Styl
 
 
 def loss_curves(comparison: Comparison, dataset: str, styles: dict[str, Style]) -> Drawn | None:
-    """Loss over the iterations of the training, a panel per method and a colour per configuration; None where nothing was trained.
+    """Loss over the course of the training, a panel per method and a colour per configuration; None where nothing was trained.
 
     Validation is dashed. What the losses of different methods measure differs, so that each has its own axis.
     """
-    curves: dict[str, list[tuple[str, float, dict[str, Any]]]] = {}
+    curves: dict[str, list[tuple[str, dict[str, Any]]]] = {}
     for row in comparison.rows:
         if row["dataset"] == dataset and row["status"] == "ok" and row.get("training"):
             samples = comparison.samples(row)
             if len(samples.get("loss_curve", ())):
-                iterations = float(row["training"].get("iterations") or len(samples["loss_curve"]))
-                curves.setdefault(row["method"], []).append((row["label"], iterations, samples))
+                swept = row["label"].removeprefix(row["method"]).strip() or row["method"]
+                iterations = row["training"].get("iterations")
+                name = swept if iterations is None else f"{swept}, {iterations:,} iterations"
+                curves.setdefault(row["method"], []).append((name, samples))
     if not curves:
         return None
     n_columns = min(2, len(curves))
@@ -81,23 +83,22 @@ def loss_curves(comparison: Comparison, dataset: str, styles: dict[str, Style]) 
     validated = False
     for axes, (method, trained) in zip(panels, curves.items(), strict=False):
         dress(axes)
-        for i, (label, iterations, samples) in enumerate(trained):
+        for i, (label, samples) in enumerate(trained):
             colour = COLOURS[i % len(COLOURS)]
             for name, line in (("loss_curve", "-"), ("validation_curve", "--")):
                 losses = np.asarray(samples.get(name, ()), dtype=float)
                 shown = np.isfinite(losses) & (losses > 0)
-                x = iterations * np.arange(1, len(losses) + 1) / max(len(losses), 1)
-                swept = label.removeprefix(method).strip() or method
-                axes.plot(x[shown], losses[shown], line, color=colour, linewidth=1.3, label=plain(shortened(swept, 40)) if line == "-" else None)
+                x = 100 * np.arange(1, len(losses) + 1) / max(len(losses), 1)
+                axes.plot(x[shown], losses[shown], line, color=colour, linewidth=1.3, label=plain(shortened(label, 50)) if line == "-" else None)
                 validated |= name == "validation_curve" and bool(shown.any())
         axes.set_yscale("log")
-        axes.set_xlabel("iteration")
+        axes.set_xlabel("part of the training (%)")
         axes.set_ylabel("loss")
         axes.set_title(plain(method), loc="left", fontsize=11, color=INK)
         axes.legend(fontsize=8, frameon=False)
     figure.suptitle(plain(f"Loss curves – {dataset}"), x=0.01, ha="left", fontsize=13, color=INK)
     path = save(figure, comparison, dataset, "loss-curves")
-    caption = "Training loss over the iterations, in the method's own units, which no other method shares."
+    caption = "Training loss from the beginning to where the training ended, in the method's own units, which no other method shares."
     return Drawn(dataset, path, "Loss curves", caption + (" Dashed: of the samples that were held out of the training." if validated else ""))
 
 
