@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -12,10 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 
 import mor_bench
 from mor_bench.cli import _knobs
 from mor_bench.errors import InvalidInputError, MorBenchError, SpecError
+from mor_bench.harness.on_dataset import Listener
 from mor_bench.snapshots.dataset import load_dataset
 
 LIMIT = 60
@@ -63,6 +66,42 @@ def test_a_killed_fit_goes_on_and_ends_with_the_same_bytes(cache: Path, tmp_path
     assert f"ē {whole.error['mean_dof_m']:.2e} m" in last.stdout
     other = mor_bench.fit("beam-tiny", path, {"iterations": 400, "seed": 4}, out=tmp_path / "b.safetensors", limit=LIMIT, cache=cache, threads=1)
     assert other.out.read_bytes() != whole.out.read_bytes()
+
+
+def test_a_killed_training_of_u_mesh_goes_on_too(cache: Path, tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    load_dataset("beam-tiny", LIMIT, cache=cache, workers=1)
+    knobs = {"channels": 1, "steps": 1, "iterations": 300, "batch_size": 4}
+    out, checkpoint = tmp_path / "model.safetensors", tmp_path / "kept"
+    options = ["--limit", str(LIMIT), "--cache", str(cache), "--threads", "1", "--out", str(out), "--checkpoint", str(checkpoint)]
+    often = "import mor_bench.learning.training as t; t.CHECKPOINT_EVERY_S = 0.0; from mor_bench.cli import app; app()"
+    command = [sys.executable, "-c", often, "fit", "beam-tiny", "-m", "umesh-small", *options]
+    command += [f"--set={name}={value}" for name, value in knobs.items()]
+
+    def iteration() -> int:
+        if not checkpoint.exists():
+            return 0
+        with safe_open(str(checkpoint), framework="numpy") as file:
+            return int(json.loads(file.metadata()["numbers"])["iteration"])
+
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        wait_for(lambda: iteration() > 60, process)
+        process.kill()
+        process.communicate()
+    assert 60 < iteration() < 300
+    told: list[int] = []
+    listener = Listener(training=lambda done, total, loss: told.append(done))
+    arguments: dict[str, Any] = {"limit": LIMIT, "cache": cache, "threads": 1}
+    with pytest.raises(InvalidInputError, match="the checkpoint of another training"):
+        mor_bench.fit("beam-tiny", "umesh-small", {**knobs, "seed": 1}, out=out, checkpoint=checkpoint, **arguments)
+    mor_bench.fit("beam-tiny", "umesh-small", knobs, out=out, checkpoint=checkpoint, listener=listener, **arguments)
+    assert told[0] >= 100
+    assert told[-1] == 300
+    whole = mor_bench.fit("beam-tiny", "umesh-small", knobs, out=tmp_path / "whole.safetensors", **arguments)
+    assert out.read_bytes() == whole.out.read_bytes()
+    with pytest.raises(InvalidInputError, match="its network does not fit 2 channels and 1 steps"):
+        mor_bench.fit("beam-tiny", "umesh-small", {**knobs, "channels": 2}, out=tmp_path / "b.safetensors", start_from=out, **arguments)
+    assert not (tmp_path / "b.safetensors").exists()
 
 
 def test_what_cannot_be_done_is_refused_before_anything_runs(tmp_path: Path) -> None:
