@@ -167,6 +167,29 @@ def test_options_of_trainings_are_checked_and_planned(folder: Path, cache: Path,
     assert three.seconds - one.seconds == pytest.approx(100.0, abs=5.0)  # generation is estimated by solving
 
 
+def test_of_a_sealed_cache_only_the_folder_of_the_own_checkpoint_is_open(tmp_path: Path) -> None:
+    own = tmp_path / "fits" / "mine" / "training"
+    own.mkdir(parents=True)
+    (own.parent / "score.h5").write_text("errors")
+    (own / "link").symlink_to(own.parent / "score.h5")
+    code = f"""
+from pathlib import Path
+from mor_bench.harness.worker import seal
+from mor_bench.snapshots.store import write_atomically
+own = Path({str(own)!r})
+seal([{str(tmp_path / "fits")!r}], str(own))
+write_atomically(own / "checkpoint", b"weights")
+print((own / "checkpoint").read_bytes())
+for path in (own.parent / "score.h5", own / ".." / "score.h5", own / "link", Path(str(own) + "-of-another")):
+    try:
+        path.read_bytes()
+    except PermissionError:
+        print("refused")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.split() == ["b'weights'", *["refused"] * 4], done.stderr
+
+
 def test_the_recall_of_flags_by_hand() -> None:
     usual = {"relative_l2": np.linspace(0.01, 0.2, 20), "flagged": np.arange(20) == 3}
     far = {"relative_l2": np.array([0.3, 0.25, 0.1, inf, 0.195]), "flagged": np.array([True, False, True, True, True])}

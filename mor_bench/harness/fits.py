@@ -36,6 +36,7 @@ from mor_bench.harness.isolation import MethodFailedError, Worker
 from mor_bench.harness.metrics import SampleErrors, sample_errors
 from mor_bench.harness.nursery import Nursery
 from mor_bench.harness.results import read_arrays, write_arrays
+from mor_bench.harness.timing import gpu_name
 from mor_bench.mechanics.indicator import ErrorIndicator
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -243,7 +244,8 @@ class Entry:
             parts["needs"] = material.scene.spec.needs.error
         if job.training not in (None, TrainingOptions()):
             assert job.training is not None
-            parts["training"] = {"device": job.training.device, "fit_seconds": job.training.fit_seconds}
+            device = gpu_name() if job.training.device == "cuda" else job.training.device
+            parts["training"] = {"device": device, "fit_seconds": job.training.fit_seconds}
         self.key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:20]
         self.folder = place.cache / "fits" / f"{job.method.name}-{self.key}"
 

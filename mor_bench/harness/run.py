@@ -20,7 +20,7 @@ from mor_bench.harness.isolation import default_memory_limit_bytes
 from mor_bench.harness.nursery import CAN_FORK, Nursery
 from mor_bench.harness.on_dataset import SEEDS, DatasetRun, Listener, Settings, StopRunError
 from mor_bench.harness.results import Comparison
-from mor_bench.harness.timing import describe_machine
+from mor_bench.harness.timing import describe_machine, gpu_name
 from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import default_cache
 from mor_bench.specs import (
@@ -223,7 +223,8 @@ def _open_run(out: Path, specs: Sequence[AnyDatasetSpec], methods: Sequence[Meth
         if comparison.settings != said or any(datasets.get(name) != spec for name, spec in comparison.datasets.items()):
             raise InvalidInputError(f"{out} holds a run with other settings or datasets; choose another folder or remove it.")
     else:
-        comparison = Comparison(out, describe_machine(), settings=said)
+        gpu = {"gpu": gpu_name()} if settings.training.device == "cuda" else {}
+        comparison = Comparison(out, {**describe_machine(), **gpu}, settings=said)
     comparison.methods |= {method.name: method.model_dump(mode="json", exclude={"folder"}) for method in methods}
     try:
         comparison.write()
