@@ -45,6 +45,8 @@ def test_seconds_come_to_iterations_that_can_be_repeated(comparison: Comparison,
     row = comparison.rows[0]
     assert row["training"].items() >= {"device": "cpu", "fit_seconds": 0.7, "iterations": 70}.items()
     assert comparison.settings["fit_seconds"] == 0.7
+    kept = [json.loads(path.read_bytes())["parameters"] for path in cache.glob("fits/descent-*/fit.json")]
+    assert {knobs["iterations"] for knobs in kept if knobs["seed"] == 2 and knobs["fails"] == 1} == {70}  # the other seeds are not timed
     path = folder / "again.toml"
     path.write_text((folder / "descent.toml").read_text().partition("[sweep]")[0] + "iterations = 70\n")
     again = mor_bench.run(["beam-tiny"], [path, "linear-fem"], out=folder / "again", cache=cache, limit=LIMIT)
