@@ -19,10 +19,16 @@ from rich.console import Console
 
 import mor_bench
 from mor_bench.errors import InvalidInputError
+from mor_bench.harness import fits
+from mor_bench.harness.fits import Entry, Job, Material, fit
+from mor_bench.harness.isolation import MethodFailedError
+from mor_bench.harness.on_dataset import place_of
 from mor_bench.harness.out_of_range import flags_of
 from mor_bench.harness.plan import plan
 from mor_bench.harness.results import Comparison
 from mor_bench.report import print_tables, render
+from mor_bench.specs import load_method_spec
+from mor_bench.surrogate import TrainingOptions
 from tests.test_fit_command import LIMIT, descent_file, wait_for
 
 
@@ -149,6 +155,29 @@ def test_a_killed_comparison_goes_on_in_the_middle_of_a_training(folder: Path, c
     whole = mor_bench.fit("beam-tiny", path, out=tmp_path / "whole.safetensors", cache=cache, limit=LIMIT, threads=1)
     assert whole.error["mean_dof_m"] == pytest.approx(resumed["error"]["mean_dof_m"], rel=1e-12)
     assert (left.parents[1] / "model.safetensors").read_bytes() == whole.out.read_bytes()
+
+
+def test_a_damaged_checkpoint_is_left_and_the_time_before_a_stop_counts(folder: Path, cache: Path, tmp_path: Path) -> None:
+    data = mor_bench.load_dataset("beam-tiny", LIMIT, cache=cache, workers=1)
+    material = Material(data.scene, data.train, {"test": fits.TestSet.of(data.test)}, tmp_path)
+    spec, place = load_method_spec(folder / "descent.toml"), place_of(tmp_path, [tmp_path / "fits"], 1, 1, float("inf"))
+
+    def entry(seed: int) -> Entry:
+        made = Entry(Job(spec, {"iterations": 20, "seed": seed, "fails": -1}, "descent", TrainingOptions()), material, place)
+        made.begin_training()
+        made.checkpoint.write_bytes(b"damaged")
+        return made
+
+    damaged = entry(0)
+    assert fit(damaged, 100.0)["warnings"] == []
+    assert not damaged.checkpoint.exists()
+    stopped = entry(1)
+    began = stopped.checkpoint.stat().st_mtime - 100.0
+    (stopped.folder / "training.json").write_text(json.dumps({"taken_s": 30.0, "began": began}))
+    with pytest.raises(MethodFailedError, match="fitting took longer than the limit of 120 s: 130 s until it was stopped"):
+        fit(stopped, 120.0)
+    assert stopped.checkpoint.exists()
+    assert fit(stopped, 200.0)["fit_s"] < 70.0  # the checkpoint was damaged, and with it went the time that it had taken
 
 
 def test_options_of_trainings_are_checked_and_planned(folder: Path, cache: Path, tmp_path: Path) -> None:

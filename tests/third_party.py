@@ -17,11 +17,12 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
+from safetensors import SafetensorError
 from safetensors.numpy import load_file
 from safetensors.numpy import save as serialise
 
 import mor_bench
-from mor_bench.errors import MorBenchError, NoEquilibriumError, OutOfTimeError
+from mor_bench.errors import MorBenchError, NoEquilibriumError, OutOfTimeError, StoreError
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.store import write_atomically
@@ -262,7 +263,10 @@ class Descent(mor_bench.Surrogate):
             seconds, checkpoint = self.training.fit_seconds, self.training.checkpoint
             iterations = self.iterations if seconds is None else int(100 * seconds)
             if checkpoint is not None and checkpoint.exists():
-                kept = load_file(checkpoint)
+                try:
+                    kept = load_file(checkpoint)
+                except SafetensorError as error:
+                    raise StoreError(f"{checkpoint}: {error}") from None
                 weights, losses, first, iterations = kept["weights"], kept["losses"], int(kept["numbers"][0]), int(kept["numbers"][1])
                 warnings.warn(f"goes on from iteration {first} of {iterations}", stacklevel=2)
             rate = 0.5 / np.linalg.norm(forces, 2) ** 2
