@@ -89,7 +89,9 @@ def loss_curves(comparison: Comparison, dataset: str, styles: dict[str, Style]) 
                 losses = np.asarray(samples.get(name, ()), dtype=float)
                 shown = np.isfinite(losses) & (losses > 0)
                 x = 100 * np.arange(1, len(losses) + 1) / max(len(losses), 1)
-                axes.plot(x[shown], losses[shown], line, color=colour, linewidth=1.3, label=plain(shortened(label, 50)) if line == "-" else None)
+                alone = "o" if shown.sum() == 1 else ""
+                named = plain(shortened(label, 50)) if line == "-" else None
+                axes.plot(x[shown], losses[shown], line, marker=alone, color=colour, linewidth=1.3, label=named)
                 validated |= name == "validation_curve" and bool(shown.any())
         axes.set_yscale("log")
         axes.set_xlabel("part of the training (%)")

@@ -33,9 +33,9 @@ def out_of_range(entries: Sequence[Entry]) -> Grid | None:
 def _recall_cell(record: Mapping[str, Any], median: float | None = None) -> str:
     """Error, flagged and recall on a test set, in lines."""
     n = record["n_unusual"]
-    recall = "none beyond the usual" if record["recall"] is None else f"recall {percent(record['recall'])} % of {n}"
+    recall = "none beyond" if record["recall"] is None else f"recall {percent(record['recall'])} % of {n}"
     error = record["rel_l2_median"] if median is None else median
-    return f"{percent(error)} %\nflagged {percent(record['n_flagged'] / record['n'])} % of {record['n']}\n{recall}"
+    return f"{percent(error)} %\nflagged {percent(record['n_flagged'] / record['n'])} %\n{recall}"
 
 
 def training(entries: Sequence[Entry]) -> Grid | None:
