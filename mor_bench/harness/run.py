@@ -184,7 +184,9 @@ def _device_here(options: TrainingOptions) -> Device:
     try:
         from mor_bench.learning.training import device_of
     except ImportError:
-        raise MissingDependencyError("`device`: training elsewhere than on the processor needs PyTorch: pip install 'mor-bench[learn]'.") from None
+        if options.device == "auto":
+            return "cpu"
+        raise MissingDependencyError("`device`: training on a graphics processor needs PyTorch: pip install 'mor-bench[learn]'.") from None
     return "cuda" if device_of(options).type == "cuda" else "cpu"
 
 

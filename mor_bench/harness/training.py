@@ -131,7 +131,7 @@ def fit(
     cores = os.cpu_count() or 1
     if threads is not None and not 1 <= threads <= cores:
         raise InvalidInputError(f"`threads` must be an integer in [1, {cores}]; got {threads}.")
-    _check_options(unfitted, {"device": device != "cpu", "fit_seconds": fit_seconds, "checkpoint": checkpoint, "start_from": start_from})
+    _check_options(unfitted, {"device": device == "cuda", "fit_seconds": fit_seconds, "checkpoint": checkpoint, "start_from": start_from})
     options = training_options(device, fit_seconds)
     if start_from is not None:
         weights_to_start_from(start_from, type(unfitted))
