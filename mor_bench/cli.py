@@ -446,6 +446,21 @@ def export_numpy(
             print(path)
 
 
+@export_app.command(name="onnx")
+def export_onnx(
+    model: Annotated[Path, typer.Argument(help="File of a fitted model that has a network.")],
+    out: Annotated[Path, typer.Option(help="The .onnx file to write.")],
+) -> None:
+    """Write a fitted network, from nodal forces (N) to nodal displacements (m), as ONNX."""
+    with _clear_errors():
+        from mor_bench.harness.export import export_onnx as write
+
+        path, difference = write(model, out)
+        print(path)
+        compared = "not compared: onnxruntime is not installed" if difference is None else f"ONNX Runtime's answers agree to {difference:.1e}"
+        typer.echo(compared, err=True)
+
+
 @export_app.command(name="asv")
 def export_asv(
     folder: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="Folder of a run.")],

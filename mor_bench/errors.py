@@ -67,6 +67,10 @@ class MissingDependencyError(MorBenchError, ImportError):
     """An extra is needed that is not installed; the message names it."""
 
 
+class UnavailableBackendError(MorBenchError, RuntimeError):
+    """A network cannot be computed in some way, on this machine or at all; the message says why."""
+
+
 class IllConditionedWarning(UserWarning):
     """The stiffness at rest has so large a condition number that answers lose most of their digits."""
 
@@ -77,3 +81,7 @@ class DamagedFileWarning(UserWarning):
 
 class LockingWarning(UserWarning):
     """A discretisation is too stiff for a nearly incompressible material: its displacements are too small."""
+
+
+class FallbackWarning(UserWarning):
+    """Something faster is not available, and the plain way is taken."""

@@ -23,6 +23,8 @@ from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import check_parameters, list_suite, load_class, load_method_spec
 
 if TYPE_CHECKING:
+    import onnx
+
     from mor_bench.mechanics.indicator import ErrorIndicator, Indication
 
 SCHEMA_VERSION = 1
@@ -69,6 +71,21 @@ class TrainingOptions:
     progress: Callable[[int, int, float], None] | None = None
 
 
+TIMING = "timing."
+"""Beginning of the names of the arrays that hold times measured in a fit; `_state` has none such."""
+
+
+def size_arrays(sizes: dict[str, Any]) -> dict[str, NDArray[Any]]:
+    """Values chosen for knobs, as arrays that a file can hold: words as the bytes of their letters."""
+    return {SIZE + name: np.frombuffer(value.encode(), np.uint8) if isinstance(value, str) else np.array([value]) for name, value in sizes.items()}
+
+
+def take_sizes(state: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    """The values that `size_arrays` wrote, which are taken out of a model's arrays."""
+    found = {name.removeprefix(SIZE): state.pop(name) for name in list(state) if name.startswith(SIZE)}
+    return {name: array.tobytes().decode() if array.dtype == np.uint8 else array.item() for name, array in found.items()}
+
+
 class Surrogate(ABC):
     """A map from nodal forces to nodal displacements of one scene.
 
@@ -83,6 +100,9 @@ class Surrogate(ABC):
     _indicator: tuple[Scene, ErrorIndicator]
     sizes_: dict[str, Any]
     """Values chosen for the knobs set to "auto"; missing where there are none."""
+
+    timings_ms_: dict[str, float]
+    """Times by which the fit chose between ways to the same answer, where it did; they hold on the machine of the fit."""
 
     needs_snapshots: ClassVar[bool] = True
     """Whether `fit` learns from snapshots; their cost is charged only to methods that do."""
@@ -241,8 +261,9 @@ class Surrogate(ABC):
             "scene": self.scene_.spec.model_dump_json(),
         }
         known = {RANGE + name: array for name, array in self.range_.arrays().items()} if hasattr(self, "range_") else {}
-        sizes = {SIZE + name: np.array([value]) for name, value in getattr(self, "sizes_", {}).items()}
-        arrays = {name: np.ascontiguousarray(array) for name, array in {**self._state(), **known, **sizes}.items()}
+        sizes = size_arrays(getattr(self, "sizes_", {}))
+        timings = {TIMING + name: np.array([value]) for name, value in getattr(self, "timings_ms_", {}).items()}
+        arrays = {name: np.ascontiguousarray(array) for name, array in {**self._state(), **known, **sizes, **timings}.items()}
         header["sha256"] = _digest(header, arrays)
         write_atomically(Path(path), _in_order(serialise(arrays, metadata=header)))
 
@@ -253,6 +274,10 @@ class Surrogate(ABC):
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Become fitted from the arrays of `_state`; ``scene_`` is already set."""
         raise MorBenchError(f"{type(self).__name__} does not support loading.")
+
+    def _onnx_model(self) -> onnx.ModelProto:
+        """The fitted map as an ONNX graph from `forces` to `displacements`, (n, n_nodes, 3) float32 each; see `export_onnx`."""
+        raise MorBenchError(f"{type(self).__name__} has no network that could be written as ONNX.")
 
     def _sized(self, name: str) -> Any:
         """The value of a knob, or what was chosen for it if it is set to "auto"."""
@@ -427,7 +452,12 @@ def _fitted(path: str | Path, surrogate: type[Any], scene: Scene | None, header:
         method = make_surrogate(surrogate, json.loads(header["parameters"]))
         method.scene_ = scene or load_scene(json.loads(header["scene"]))
         ranges = {name.removeprefix(RANGE): state.pop(name) for name in list(state) if name.startswith(RANGE)}
-        sizes = {name.removeprefix(SIZE): state.pop(name).item() for name in list(state) if name.startswith(SIZE)}
+        sizes = take_sizes(state)
+        timings = {name.removeprefix(TIMING): state.pop(name).item() for name in list(state) if name.startswith(TIMING)}
+        if not all(isinstance(value, float) and value > 0 for value in timings.values()):
+            raise InvalidInputError(f"its times must be positive numbers; got {timings}.")
+        if timings:
+            method.timings_ms_ = timings
         if any(method.parameters.get(name) != "auto" for name in sizes):
             raise InvalidInputError(f"it holds values for {', '.join(sorted(sizes))}, of which not all are to be chosen.")
         if sizes:
@@ -436,6 +466,6 @@ def _fitted(path: str | Path, surrogate: type[Any], scene: Scene | None, header:
         method._restore(state)
         if ranges:
             method.range_ = LoadRange.from_arrays(ranges, method.scene_.mesh.n_nodes)
-    except (MorBenchError, ArithmeticError, KeyError, ValueError, IndexError, TypeError, AttributeError) as error:
+    except (MorBenchError, ArithmeticError, KeyError, ValueError, IndexError, TypeError, AttributeError, RecursionError) as error:
         raise StoreError(f"{path}: its content does not make a {header['surrogate'].partition(':')[2]}: {error}") from None
     return method

@@ -86,6 +86,15 @@ CONCERNED = {
     "pgd-force": ANY | LEARNERS,
     "umesh-small": ANY | LEARNERS,
     "umesh-linear": ANY | LEARNERS,
+    "pca-ridge": ANY | LEARNERS,
+    "pca-kernel-ridge": ANY | LEARNERS,
+    "pca-gaussian-process": ANY | LEARNERS,
+    "pca-random-forest": ANY | LEARNERS,
+    "pca-extra-trees": ANY | LEARNERS,
+    "pod-nn": ANY | LEARNERS,
+    "pod-nn-derivative": ANY | LEARNERS,
+    "sparse-polynomial": ANY | LEARNERS,
+    "sparse-polynomial-derivative": ANY | LEARNERS,
 }
 
 

@@ -1,4 +1,4 @@
-"""Datasets for other programs: single samples as VTU for ParaView, whole datasets as NumPy arrays."""
+"""For other programs: single samples as VTU for ParaView, whole datasets as NumPy arrays, networks as ONNX."""
 
 from __future__ import annotations
 
@@ -12,17 +12,21 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import InvalidInputError
+from mor_bench.errors import InvalidInputError, MorBenchError
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.imported import NodalLoads
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.snapshots.test_sets import SET_NAMES, SetName
-from mor_bench.surrogate import load_surrogate
+from mor_bench.surrogate import Surrogate, load_surrogate, make_surrogate
 
 Part = Literal["train", "test"] | SetName
 
 PARTS: tuple[Part, ...] = ("train", "test", *SET_NAMES)
+
+
+ONNX_AGREES = 1e-5
+"""Largest difference between a written network and the method's own predictions, relative to the largest displacement."""
 
 
 def export_vtu(data: Dataset, sample: int, out: str | Path, *, part: Part = "test", models: Sequence[str | Path] = ()) -> list[Path]:
@@ -163,3 +167,68 @@ by = "file"
 error = {spec.needs.error!r}
 latency_ms = {spec.needs.latency_ms!r}
 """
+
+
+def export_onnx(model: str | Path, out: str | Path) -> tuple[Path, float | None]:
+    """Write the network of a fitted model, with its scaling at both ends, as an ONNX file of float32.
+
+    Input `forces`, (n, n_nodes, 3), N; output `displacements` of the same shape, m; any n. Weights lie within the file, and all
+    operations are standard ones. Scene and units stand in the metadata. Where ONNX Runtime is installed, its answers to some
+    random loads are compared with the method's own in float32 before anything is written.
+
+    Parameters
+    ----------
+    model : path
+        A fitted model, see `Surrogate.save`.
+    out : path
+        The file; one that is there is not overwritten.
+
+    Returns
+    -------
+    Path
+    float or None
+        The largest difference, relative to the largest displacement; None if nothing was compared.
+
+    Raises
+    ------
+    InvalidInputError
+        If the file's name does not end in .onnx, or it is there already.
+    StoreError
+        If the model is damaged.
+    UnavailableBackendError
+        If onnx is not installed, or cannot hold the network.
+    MorBenchError
+        If the method has no network, or the answers differ by more than `ONNX_AGREES`.
+    """
+    out = Path(out)
+    if out.suffix != ".onnx":
+        raise InvalidInputError(f"`out` must end in .onnx; got {str(out)!r}.")
+    if out.exists():
+        raise InvalidInputError(f"`out`: {out} exists and is not overwritten; remove it or choose another name.")
+    surrogate = load_surrogate(model)
+    written = surrogate._onnx_model().SerializeToString()
+    difference = _onnx_difference(surrogate, written)
+    if difference is not None and not difference <= ONNX_AGREES:
+        raise MorBenchError(f"{model}: ONNX Runtime's answers differ from the method's by {difference:.1e} of the largest; nothing was written.")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(out, written)
+    return out, difference
+
+
+def _onnx_difference(surrogate: Surrogate, written: bytes) -> float | None:
+    try:
+        import onnxruntime
+    except ImportError:
+        return None
+    if surrogate.parameters.get("inference", "eager") != "eager":
+        plain = make_surrogate(type(surrogate), {**surrogate.parameters, "inference": "eager"})
+        plain.scene_ = surrogate.scene_
+        plain._restore(surrogate._state())
+        surrogate = plain
+    shape = (3, surrogate.scene_.mesh.n_nodes, 3)
+    forces = np.random.default_rng(0).normal(scale=1.0, size=shape).astype(np.float32)
+    forces[0] = 0.0
+    session = onnxruntime.InferenceSession(written, providers=["CPUExecutionProvider"])
+    (found,) = session.run(["displacements"], {"forces": forces})
+    expected = surrogate.predict(forces)
+    return float(np.abs(found - expected).max() / np.abs(expected).max())

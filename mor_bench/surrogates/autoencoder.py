@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from math import cos, isfinite, pi
+from collections.abc import Callable
 from typing import Annotated, Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
 from mor_bench import counting
-from mor_bench.errors import InvalidInputError, MorBenchError
+from mor_bench.errors import InvalidInputError
+from mor_bench.learning.perceptron import Perceptron, checked, evaluate, named
+from mor_bench.learning.training import TrainingPlan, device_of, fingerprint_of, train
+from mor_bench.mechanics.compliance import Compliance, project
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
+from mor_bench.reduction.coordinates import error_weights, input_axes
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
@@ -25,17 +29,11 @@ N_HIDDEN = 64
 """Units in each of the two hidden layers of encoder, decoder and regression."""
 BATCH_SIZE = 64
 LEARNING_RATE = 3e-3
-WARM_UP = 200
-"""Iterations during which the learning rate rises; then it falls to zero along half a cosine."""
-SMALLEST = 0.2
-"""Errors count relative to the displacement, or to this share of the root mean square displacement where that is larger."""
 LATENT_WEIGHT = 0.01
 """Of the squared distance between the encoder's latent coordinates and the regression's in the loss.
 
 At 1 in its place the median error on the coarse beam, with 20 latent coordinates and 5,100 samples, was 0.54 %, not 0.21 %.
 """
-
-LAYERS = ("first", "first_bias", "second", "second_bias", "last")
 
 
 class Autoencoder(Surrogate):
@@ -63,7 +61,16 @@ class Autoencoder(Surrogate):
         Adam steps of batches of `BATCH_SIZE` samples.
     seed : int
         Of the initial weights and of the order of the samples.
+
+    Attributes
+    ----------
+    loss_curve_ : (n_intervals,) float64
+    iterations_ : int
+        Steps that the training took.
     """
+
+    loss_curve_: NDArray[np.float64]
+    iterations_: int
 
     def __init__(
         self,
@@ -87,105 +94,80 @@ class Autoencoder(Surrogate):
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             snapshots = self._checked_snapshots(snapshots)
-            linear = FullOrderModel(scene).rest_factor.solve(snapshots.free_forces.T).T
-            axes = pod(linear, self.n_input_modes).modes
-            coordinates = linear @ axes
-            # Half way between coordinates of their own size and of equal size, on a logarithmic scale.
-            axes = axes / np.sqrt(np.sqrt((coordinates**2).mean(axis=0)) * np.sqrt((coordinates**2).mean()))
+            self.compliance_ = Compliance(FullOrderModel(scene))
+            linear = self.compliance_.respond(snapshots.forces.reshape(len(snapshots), -1))[:, scene.free_dofs]
+            axes = input_axes(linear, self.n_input_modes, 0.5)
             rest = snapshots.free_displacements - linear
             modes = pod(rest).modes[:, :N_OUTPUT_MODES]
             targets = rest @ modes
             scale = float(np.sqrt((targets**2).sum(axis=1).mean()))
-            sizes = np.linalg.norm(snapshots.free_displacements, axis=1)
-            typical = float(np.sqrt((sizes**2).mean()))
-            weights = typical / np.maximum(sizes, SMALLEST * typical)
-            inputs, outputs, each = (torch.from_numpy(a.astype(np.float32)) for a in (linear @ axes, targets / scale, weights[:, None]))
-            regression, decoder = self._train(inputs, outputs, each)
-            state = {"axes": axes, "modes": modes}
-            for name, network in (("regression", regression), ("decoder", decoder)):
-                state.update({f"{name}.{layer}": weight.detach().numpy().astype(np.float64) for layer, weight in zip(LAYERS, network, strict=True)})
-            state["decoder.last"] *= scale
-            self._restore(state)
+            device = device_of(self.training)
+            arrays = {"inputs": linear @ axes, "outputs": targets / scale, "weights": error_weights(snapshots.free_displacements)[:, None]}
+            data = {name: torch.from_numpy(array.astype(np.float32)).to(device) for name, array in arrays.items()}
+            generator = torch.Generator().manual_seed(self.seed)
+            n_inputs, n_outputs, m = axes.shape[1], modes.shape[1], self.n_latent
+            sizes = (n_outputs, m), (m, n_outputs), (n_inputs, m)
+            encoder, decoder, regression = networks = [Perceptron(n, N_HIDDEN, to, generator).to(device) for n, to in sizes]
+            plan = TrainingPlan(self.iterations, BATCH_SIZE, LEARNING_RATE)
+            fingerprint = fingerprint_of(self.parameters, data) if self.training.checkpoint else ""
+            loss = _loss(encoder, decoder, regression, data)
+            trained = train(nn.ModuleList(networks), loss, len(snapshots), plan, generator, self.training, self.time_limit_s, fingerprint)
+            to_latent, from_latent = regression.arrays(), decoder.arrays()
+            from_latent[-1] *= scale
+            known = {"axes": axes, "modes": modes, "loss_curve": trained.loss_curve, "iterations": np.array([trained.iterations])}
+            self._restore({**known, **named("regression", to_latent), **named("decoder", from_latent)})
         return self
-
-    def _train(self, inputs: Tensor, outputs: Tensor, weights: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """The weights of regression and decoder."""
-        generator = torch.Generator().manual_seed(self.seed)
-        n_inputs, n_outputs = inputs.shape[1], outputs.shape[1]
-        sizes = (n_outputs, self.n_latent), (self.n_latent, n_outputs), (n_inputs, self.n_latent)
-        encoder, decoder, regression = (_new_network(n, m, generator) for n, m in sizes)
-        optimiser = torch.optim.Adam([*encoder, *decoder, *regression], lr=LEARNING_RATE)
-        nothing = torch.zeros(1, n_inputs)
-        for iteration in range(self.iterations):
-            falling = 0.5 * (1.0 + cos(pi * iteration / self.iterations))
-            optimiser.param_groups[0]["lr"] = LEARNING_RATE * min(1.0, (iteration + 1) / WARM_UP) * falling
-            rows = torch.randint(len(inputs), (BATCH_SIZE,), generator=generator)
-            wanted, weight = outputs[rows], weights[rows]
-            from_load, encoded = _apply(regression, inputs[rows]), _apply(encoder, wanted)
-            at_rest = _apply(decoder, _apply(regression, nothing))
-            loss = ((from_load - encoded) ** 2).mean() * LATENT_WEIGHT
-            for latent in (from_load, encoded):
-                loss = loss + (((_apply(decoder, latent) - at_rest - wanted) * weight) ** 2).sum(dim=1).mean()
-            optimiser.zero_grad()
-            torch.autograd.backward(loss)
-            optimiser.step()
-        if not isfinite(float(loss.detach())):
-            raise MorBenchError("the training of the autoencoder diverged.")
-        return regression, decoder
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces).reshape(-1, self.scene_.mesh.n_dofs)
         free = self.scene_.free_dofs
-        out = np.zeros_like(batch)
         if counting.running is not None:  # each unit's nonlinearity as one
             networks = sum(weight.size for network in self._networks for weight in network)
-            counting.running.add(multiply_adds=len(batch) * (self.axes_.size + networks + self.modes_.size))
-        linear = self.model_.rest_factor.solve(batch[:, free].T).T
-        out[:, free] = linear + (self._decoded(linear @ self.axes_) - self._at_rest) @ self.modes_.T
+            counting.running.add(multiply_adds=len(batch) * (networks + self.modes_.size))
+        out = self.compliance_.respond(batch)
+        out[:, free] += (self._decoded(project(self._from_forces, batch)) - self._at_rest) @ self.modes_.T
         out[~batch.any(axis=1)] = 0.0  # in a batch the network at rest is rounded otherwise
         return out.reshape(np.shape(forces))
 
     def _decoded(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
-        for first, first_bias, second, second_bias, last in self._networks:
-            inputs = _silu(_silu(inputs @ first + first_bias) @ second + second_bias) @ last
+        for weights in self._networks:
+            inputs = evaluate(weights, inputs)
         return inputs
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        named = zip(("regression", "decoder"), self._networks, strict=True)
-        weights = {f"{name}.{layer}": weight for name, network in named for layer, weight in zip(LAYERS, network, strict=True)}
-        return {"axes": self.axes_, "modes": self.modes_, **weights}
+        regression, decoder = self._networks
+        known = {"axes": self.axes_, "modes": self.modes_, "loss_curve": self.loss_curve_, "iterations": np.array([self.iterations_])}
+        return {**known, **named("regression", regression), **named("decoder", decoder)}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         # One memory order, fitted or loaded: BLAS rounds differently in another.
         state = {name: np.ascontiguousarray(array) for name, array in state.items()}
         n_free, n_inputs, n_outputs = len(self.scene_.free_dofs), state["axes"].shape[1], state["modes"].shape[1]
-        shapes: dict[str, tuple[int, ...]] = {"axes": (n_free, n_inputs), "modes": (n_free, n_outputs)}
-        for name, n, m in (("regression", n_inputs, self.n_latent), ("decoder", self.n_latent, n_outputs)):
-            layers = (n, N_HIDDEN), (N_HIDDEN,), (N_HIDDEN, N_HIDDEN), (N_HIDDEN,), (N_HIDDEN, m)
-            shapes |= {f"{name}.{layer}": shape for layer, shape in zip(LAYERS, layers, strict=True)}
+        shapes = {"axes": (n_free, n_inputs), "modes": (n_free, n_outputs), "loss_curve": (state["loss_curve"].size,), "iterations": (1,)}
         for name, shape in shapes.items():
             if state[name].shape != shape or not np.isfinite(state[name]).all():
                 raise InvalidInputError(f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}.")
         self.axes_, self.modes_ = state["axes"], state["modes"]
-        self._networks = [[state[f"{name}.{layer}"] for layer in LAYERS] for name in ("regression", "decoder")]
+        self.loss_curve_, self.iterations_ = state["loss_curve"], int(state["iterations"][0])
+        regression = checked(state, "regression", n_inputs, N_HIDDEN, self.n_latent)
+        self._networks = [regression, checked(state, "decoder", self.n_latent, N_HIDDEN, n_outputs)]
         self._at_rest = self._decoded(np.zeros((1, n_inputs)))
-        self.model_ = FullOrderModel(self.scene_)
-        _ = self.model_.rest_factor
+        if not hasattr(self, "compliance_"):
+            self.compliance_ = Compliance(FullOrderModel(self.scene_))
+        self._from_forces = self.compliance_.to_coordinates(self.axes_)
 
 
-def _new_network(n_inputs: int, n_outputs: int, generator: torch.Generator) -> list[Tensor]:
-    """Weights (inputs, outputs) with variance 1 / inputs, and zero biases, in the order of `LAYERS`."""
-    shapes = (n_inputs, N_HIDDEN), (N_HIDDEN,), (N_HIDDEN, N_HIDDEN), (N_HIDDEN,), (N_HIDDEN, n_outputs)
-    drawn = [torch.randn(shape, generator=generator) / shape[0] ** 0.5 if len(shape) == 2 else torch.zeros(shape) for shape in shapes]
-    return [weight.requires_grad_() for weight in drawn]
+def _loss(encoder: nn.Module, decoder: nn.Module, regression: nn.Module, data: dict[str, Tensor]) -> Callable[[Tensor], Tensor]:
+    """The sum of the three squared errors."""
+    nothing = torch.zeros_like(data["inputs"][:1])
 
+    def loss(rows: Tensor) -> Tensor:
+        wanted, weight = data["outputs"][rows], data["weights"][rows]
+        from_load, encoded = regression(data["inputs"][rows]), encoder(wanted)
+        at_rest = decoder(regression(nothing))
+        total: Tensor = ((from_load - encoded) ** 2).mean() * LATENT_WEIGHT
+        for latent in (from_load, encoded):
+            total = total + (((decoder(latent) - at_rest - wanted) * weight) ** 2).sum(dim=1).mean()
+        return total
 
-def _apply(network: list[Tensor], inputs: Tensor) -> Tensor:
-    first, first_bias, second, second_bias, last = network
-    silu = torch.nn.functional.silu
-    return silu(silu(inputs @ first + first_bias) @ second + second_bias) @ last
-
-
-def _silu(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x / (1 + exp(-x)) without overflow."""
-    return 0.5 * x * (1.0 + np.tanh(0.5 * x))
+    return loss

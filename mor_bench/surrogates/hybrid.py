@@ -16,7 +16,7 @@ from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogate import SIZE, Surrogate, load_method
+from mor_bench.surrogate import Surrogate, load_method, size_arrays, take_sizes
 
 START = "start."
 """Beginning of the names of the arrays that belong to the start's model."""
@@ -149,14 +149,13 @@ class Hybrid(Surrogate):
         _ = self.model_.turned_rest
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        sizes = {SIZE + name: np.array([value]) for name, value in getattr(self.start_, "sizes_", {}).items()}
-        return {START + name: array for name, array in {**self.start_._state(), **sizes}.items()}
+        return {START + name: array for name, array in {**self.start_._state(), **size_arrays(getattr(self.start_, "sizes_", {}))}.items()}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         start = self._unfitted()
         start.scene_ = _all_outputs(self.scene_)
         arrays = {name.removeprefix(START): array for name, array in state.items()}
-        start.sizes_ = {name.removeprefix(SIZE): arrays.pop(name).item() for name in list(arrays) if name.startswith(SIZE)}
+        start.sizes_ = take_sizes(arrays)
         start._restore(arrays)
         self._become(start)
 

@@ -10,7 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import mor_bench
-from mor_bench.errors import MissingDependencyError, SpecError, UnsupportedSceneError
+from mor_bench.errors import MissingDependencyError, MorBenchError, SpecError, UnsupportedSceneError
 
 if TYPE_CHECKING:
     from mor_bench.snapshots.dataset import Dataset
@@ -43,6 +43,15 @@ METHODS: dict[str, dict[str, Any]] = {
     "umesh": {"channels": 8, "steps": 2, "iterations": 200, "batch_size": 16, "learning_rate": 3e-3},
     "umesh-small": {"channels": 8, "iterations": 200},
     "umesh-linear": {"channels": 8, "iterations": 200},
+    "pca-ridge": {},
+    "pca-kernel-ridge": {},
+    "pca-gaussian-process": {"n_input_modes": 10},
+    "pca-random-forest": {},
+    "pca-extra-trees": {},
+    "pod-nn": {"iterations": 500},
+    "pod-nn-derivative": {"iterations": 500},
+    "sparse-polynomial": {"max_terms": 500},
+    "sparse-polynomial-derivative": {"max_terms": 500},
 }
 """Methods and their knobs. U-Mesh's latency does not depend on how long it was trained; the error of so short a training says little."""
 
@@ -120,6 +129,30 @@ class Query(_Fitted):
         self.surrogate.predict(self.force)
 
     def peakmem_predict(self, dataset: str, method: str) -> None:
+        self.surrogate.predict(self.force)
+
+
+class NetworkQuery(_Fitted):
+    """U-Mesh's query by each of its back ends."""
+
+    params = (tuple(LIMITS), ("eager", "packed", "packed-bfloat16", "onnx"))
+    param_names = ("dataset", "backend")
+
+    def setup(self, dataset: str, method: str) -> None:
+        super().setup(dataset, "umesh-small")
+        try:
+            from mor_bench.learning.inference import Inference
+
+            surrogate: Any = mor_bench.load_surrogate(model_file(dataset, "umesh-small"))
+            backend: Any = method
+            surrogate.inference_ = Inference(surrogate.network_, backend)
+        except (ImportError, MorBenchError) as error:  # the commit is from before, or the machine lacks it
+            raise NotImplementedError(str(error)) from None
+        self.surrogate = surrogate
+        self.force = load_limited(dataset).test.forces[0]
+        self.surrogate.predict(self.force)
+
+    def time_predict(self, dataset: str, method: str) -> None:
         self.surrogate.predict(self.force)
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, final
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, final
 
 import numpy as np
 import torch
@@ -15,7 +15,9 @@ from torch import Tensor
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
+from mor_bench.learning.inference import Backend, choose_inference, inference_or_eager
 from mor_bench.learning.training import Precision, Schedule, TrainingPlan, device_of, fingerprint_of, train
+from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.scene import Scene
@@ -25,8 +27,14 @@ from mor_bench.surrogate import Surrogate, weights_to_start_from
 from mor_bench.surrogates.umesh.grid import PaddedGrid, padded_grid
 from mor_bench.surrogates.umesh.network import Activation, UNet, empty_network, new_network
 
+if TYPE_CHECKING:
+    import onnx
+
 PREDICTION_CHUNK = 128
 """Samples per forward pass, so that a long batch needs 300 MB of activations at 128 channels, not gigabytes."""
+
+N_CHOOSING = 32
+"""Training samples, evenly spread, by which the back end of the predictions is chosen."""
 
 
 SMALLEST_SIZE = 0.1
@@ -38,7 +46,8 @@ class UMesh(Surrogate):
     """A 3D U-Net from nodal forces to nodal displacements.
 
     Mendizabal, Márquez-Neila, Cotin, "Simulation of hyperelastic materials in real-time using Deep Learning". Trained with
-    the mean squared error over the components of all nodes, and Adam. All is computed in float32.
+    the mean squared error over the components of all nodes, and Adam. All is computed in float32 unless `precision` or
+    `inference` says otherwise.
 
     Parameters
     ----------
@@ -73,10 +82,16 @@ class UMesh(Surrogate):
         Part of the training samples that are held out, to end the training when they gain nothing and keep the best weights.
     seed : int
         Of the initial weights and of the order of the samples.
+    inference : str
+        What computes the predictions, see `mor_bench.learning.inference`. "packed" differs from "eager" by rounding only.
+        "auto": the fastest that is exact enough, by single queries on one thread at the end of the fit; the choice is kept with
+        the model, and may be another one after another fit, where two are nearly as fast.
 
     Attributes
     ----------
     network_ : UNet
+    inference_ : Inference
+        The network as `predict` calls it.
     grid_ : PaddedGrid
     input_scale_, output_scale_ : float
         Root mean square of what the network is given in training, N or m, and of what it is to answer, m.
@@ -133,6 +148,7 @@ class UMesh(Surrogate):
         precision: Precision = "float32",
         validation_fraction: Annotated[float, Field(ge=0, le=0.5)] = 0.0,
         seed: Annotated[int, Field(ge=0, lt=2**63)] = 0,
+        inference: Backend | Literal["auto"] = "packed",
     ) -> None:
         self.channels = channels
         self.steps = steps
@@ -149,6 +165,7 @@ class UMesh(Surrogate):
         self.precision = precision
         self.validation_fraction = validation_fraction
         self.seed = seed
+        self.inference = inference
 
     def supports(self, scene: Scene) -> str | None:
         return unknown_equations(scene) if self.input == "linear-response" or self.mirrored else None
@@ -190,6 +207,7 @@ class UMesh(Surrogate):
             done = train(self.network_, loss, len(samples), plan, generator, self.training, self.time_limit_s, fingerprint)
             self.network_.cpu()
             self.loss_curve_, self.validation_curve_, self.iterations_ = done.loss_curve, done.validation_curve, done.iterations
+            self._choose_inference(inputs.cpu(), targets.cpu())
             self._come_to_rest()
         return self
 
@@ -201,7 +219,7 @@ class UMesh(Surrogate):
             counting.running.add(multiply_adds=len(checked) * products)
         given = self._given(checked)
         scaled = torch.from_numpy((given / self.input_scale_).astype(np.float32))
-        answers = torch.cat([self._answer(chunk) for chunk in torch.split(scaled, PREDICTION_CHUNK)]).numpy()
+        answers = torch.cat([self._answer(chunk, self.inference_) for chunk in torch.split(scaled, PREDICTION_CHUNK)]).numpy()
         displacements = (answers - self._at_rest).astype(np.float64) * self.output_scale_
         if self.input == "linear-response":
             displacements += given
@@ -214,22 +232,20 @@ class UMesh(Surrogate):
         """What the scene gives, before anything is learned."""
         self.grid_: PaddedGrid = padded_grid(grid_map(self.scene_.mesh, self.scene_.spec.grid_nodes), self.steps)
         if self.input == "linear-response":
-            self.model_ = FullOrderModel(self.scene_)
-            _ = self.model_.rest_factor
+            self.compliance_ = Compliance(FullOrderModel(self.scene_))
 
     def _given(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, n_nodes, 3) what the network is given: the forces, N, or the linear response to them, m."""
         if self.input == "force":
             return forces
-        response = np.zeros((len(forces), self.scene_.mesh.n_dofs))
-        free = self.scene_.free_dofs
-        response[:, free] = self.model_.rest_factor.solve(forces.reshape(len(forces), -1)[:, free].T).T
-        return response.reshape(forces.shape)
+        return self.compliance_.respond(forces.reshape(len(forces), self.scene_.mesh.n_dofs)).reshape(forces.shape)
 
-    def _answer(self, given: Tensor) -> Tensor:
-        """The network from nodes to nodes, (n, n_nodes, 3) float32, scaled."""
-        on_grid = self.grid_.to_grid(given) if self.input == "force" else self.grid_.displacements_to_grid(given)
-        return self.grid_.to_nodes(self.network_(on_grid).float())
+    def _answer(self, given: Tensor, network: Callable[[Tensor], Tensor] | None = None) -> Tensor:
+        """The network, or what computes it, from nodes to nodes, (n, n_nodes, 3) float32, scaled."""
+        return self.grid_.to_nodes((network or self.network_)(self._on_grid(given)).float())
+
+    def _on_grid(self, given: Tensor) -> Tensor:
+        return self.grid_.to_grid(given) if self.input == "force" else self.grid_.displacements_to_grid(given)
 
     def _sample_weights(self, targets: Tensor) -> Tensor:
         """(n,) what each sample's squared error counts, 1 on average."""
@@ -244,7 +260,24 @@ class UMesh(Surrogate):
         self._at_rest = np.zeros((1, self.scene_.mesh.n_nodes, 3), dtype=np.float32)
         if self.zero_at_rest:
             with torch.inference_mode():
-                self._at_rest = self._answer(torch.zeros(1, self.scene_.mesh.n_nodes, 3)).numpy()
+                self._at_rest = self._answer(torch.zeros(1, self.scene_.mesh.n_nodes, 3), self.inference_).numpy()
+
+    def _choose_inference(self, inputs: Tensor, targets: Tensor) -> None:
+        """Set ``inference_``, by training samples where it is to be chosen; both (n_samples, n_nodes, 3), scaled."""
+        self.network_.eval()
+        if self.inference != "auto":
+            self.inference_ = inference_or_eager(self.network_, self.inference)
+            return
+        rows = torch.linspace(0, len(inputs) - 1, min(N_CHOOSING, len(inputs))).long()
+
+        def errors(network: Callable[[Tensor], Tensor], given: Tensor) -> Tensor:
+            at_rest = self._answer(torch.zeros_like(given[:1]), network) if self.zero_at_rest else 0.0
+            return self._answer(given, network) - at_rest - targets[rows]
+
+        choice = choose_inference(self.network_, self._on_grid(inputs[rows]), lambda network: errors(network, inputs[rows]))
+        self.inference_ = choice.inference
+        self.sizes_ = {"inference": choice.inference.backend}
+        self.timings_ms_ = choice.milliseconds
 
     def _start_from(self, path: Path) -> None:
         """Take the weights of a network that was trained on this scene or another; grids of any size share them."""
@@ -253,6 +286,14 @@ class UMesh(Surrogate):
         except RuntimeError as error:
             raise InvalidInputError(f"{path}: its network does not fit {self.channels} channels and {self.steps} steps: {error}") from None
 
+    def _onnx_model(self) -> onnx.ModelProto:
+        from mor_bench.surrogates.umesh.onnx_model import umesh_graph
+
+        with torch.inference_mode():
+            at_rest = self._answer(torch.zeros(1, self.scene_.mesh.n_nodes, 3)).numpy()[0] if self.zero_at_rest else None
+        response = self.model_ if self.input == "linear-response" else None
+        return umesh_graph(self.scene_, self.grid_, self.network_, self.input_scale_, self.output_scale_, at_rest, response)
+
     def _state(self) -> dict[str, NDArray[Any]]:
         weights = {f"network.{name}": value.numpy() for name, value in self.network_.state_dict().items()}
         scales = np.array([self.input_scale_, self.output_scale_])
@@ -260,18 +301,30 @@ class UMesh(Surrogate):
         return {**weights, "scales": scales, **curves, "iterations": np.array([self.iterations_])}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        for name, array in state.items():
+        network = empty_network(self.channels, self.steps, self.activation)
+        expected: dict[str, tuple[tuple[int, ...], type]] = {
+            f"network.{name}": (tuple(value.shape), np.float32) for name, value in network.state_dict().items()
+        }
+        expected |= {name: (np.shape(state[name])[:1], np.float64) for name in ("loss_curve", "validation_curve")}
+        expected |= {"scales": ((2,), np.float64), "iterations": ((1,), np.int64)}
+        for name in sorted(expected.keys() | state.keys()):
+            if name not in state or name not in expected:
+                raise InvalidInputError(f"the weights do not fit the network: `{name}` is {'missing' if name in expected else 'not expected'}.")
+            array, (shape, dtype) = state[name], expected[name]
+            if array.shape != shape or array.dtype != dtype:
+                wanted = f"{np.dtype(dtype)} of shape {shape}"
+                raise InvalidInputError(f"the weights do not fit the network: `{name}` must be {wanted}; got {array.dtype} of shape {array.shape}.")
             if not np.isfinite(array).all():
                 raise InvalidInputError(f"`{name}` must be finite; got NaN or infinity.")
-        network = empty_network(self.channels, self.steps, self.activation)
-        try:
-            network.load_state_dict(_network_weights(state), assign=True)
-        except RuntimeError as error:
-            raise ValueError(f"the weights do not fit the network: {error}") from None
+        if not (state["scales"] > 0).all() or not state["iterations"][0] > 0:
+            raise InvalidInputError("`scales` and `iterations` must be positive.")
+        network.load_state_dict(_network_weights(state), assign=True)
         self.network_ = network.eval()
         self.input_scale_, self.output_scale_ = (float(scale) for scale in state["scales"])
         self.loss_curve_, self.validation_curve_ = state["loss_curve"], state["validation_curve"]
         self.iterations_ = int(state["iterations"][0])
+        chosen = getattr(self, "sizes_", {}).get("inference", self.inference)
+        self.inference_ = inference_or_eager(self.network_, "eager" if chosen == "auto" else chosen)
         self._prepare()
         self._come_to_rest()
 

@@ -1,0 +1,111 @@
+"""A multilayer perceptron: as a torch module that is trained, and by its arrays that answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mor_bench.errors import InvalidInputError
+
+Array = NDArray[np.float64]
+
+
+class Perceptron(nn.Module):
+    """x ↦ W₃ᵀ s(W₂ᵀ s(W₁ᵀ x + b₁) + b₂) with s(x) = x / (1 + exp(-x)): two hidden layers of equal width, and no bias at the end.
+
+    The weights are drawn with variance 1 / inputs, and the biases are zero, in the order of the parameters.
+    """
+
+    def __init__(self, n_inputs: int, n_hidden: int, n_outputs: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.weights = nn.ParameterList()
+        for shape in _shapes(n_inputs, n_hidden, n_outputs):
+            drawn = torch.randn(shape, generator=generator) / shape[0] ** 0.5 if len(shape) == 2 else torch.zeros(shape)
+            self.weights.append(nn.Parameter(drawn))
+
+    def forward(self, x: Tensor) -> Tensor:
+        first, first_bias, second, second_bias, last = self.weights
+        silu = nn.functional.silu
+        result: Tensor = silu(silu(x @ first + first_bias) @ second + second_bias) @ last
+        return result
+
+    def with_derivatives(self, x: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Values (n, n_outputs) at x (n, n_inputs), and derivatives (n, d, n_outputs) along directions (n, d, n_inputs)."""
+        first, first_bias, second, second_bias, last = self.weights
+        for weight, bias in ((first, first_bias), (second, second_bias)):
+            x = x @ weight + bias
+            share = torch.sigmoid(x)
+            directions = (directions @ weight) * (share * (1.0 + x * (1.0 - share)))[:, None]
+            x = x * share
+        return x @ last, directions @ last
+
+    def take(self, arrays: Sequence[Array]) -> None:
+        """Replace the weights by those of `arrays`."""
+        with torch.no_grad():
+            for weight, array in zip(self.weights, arrays, strict=True):
+                weight.copy_(torch.from_numpy(array))
+
+    def arrays(self) -> list[Array]:
+        """Weights and biases, from input to output, float64."""
+        return [weight.detach().cpu().numpy().astype(np.float64) for weight in self.weights]
+
+
+def evaluate(weights: Sequence[Array], x: Array) -> Array:
+    """What the network of some `Perceptron.arrays` answers at x (n, n_inputs)."""
+    first, first_bias, second, second_bias, last = weights
+    return _silu(_silu(x @ first + first_bias) @ second + second_bias) @ last
+
+
+def slope_at_rest(weights: Sequence[Array]) -> Array:
+    """The derivative at x = 0, (n_inputs, n_outputs)."""
+    first, first_bias, second, second_bias, last = weights
+    before = first_bias
+    slope = first * _silu_slope(before)
+    before = _silu(before) @ second + second_bias
+    return (slope @ second * _silu_slope(before)) @ last
+
+
+NAMES = ("first", "first_bias", "second", "second_bias", "last")
+
+
+def named(prefix: str, weights: Sequence[Array]) -> dict[str, Array]:
+    """Weights as arrays of a model."""
+    return {f"{prefix}.{name}": weight for name, weight in zip(NAMES, weights, strict=True)}
+
+
+def checked(state: dict[str, Array], prefix: str, n_inputs: int, n_hidden: int, n_outputs: int) -> list[Array]:
+    """The weights that `named` gave.
+
+    Raises
+    ------
+    InvalidInputError
+        If one has another shape or is not finite.
+    KeyError
+        If one is missing.
+    """
+    for name, shape in zip(NAMES, _shapes(n_inputs, n_hidden, n_outputs), strict=True):
+        array = state[f"{prefix}.{name}"]
+        if array.shape != shape or not np.isfinite(array).all():
+            raise InvalidInputError(f"`{prefix}.{name}` must be a finite array of shape {shape}; got shape {array.shape}.")
+    return [state[f"{prefix}.{name}"] for name in NAMES]
+
+
+def _shapes(n_inputs: int, n_hidden: int, n_outputs: int) -> list[tuple[int, ...]]:
+    """Of the weights (inputs, outputs) and biases."""
+    layers = pairwise((n_inputs, n_hidden, n_hidden, n_outputs))
+    return [shape for n, m in layers for shape in ((n, m), (m,))][:-1]
+
+
+def _silu(x: Array) -> Array:
+    """x / (1 + exp(-x)) without overflow."""
+    return 0.5 * x * (1.0 + np.tanh(0.5 * x))
+
+
+def _silu_slope(x: Array) -> Array:
+    share = 0.5 * (1.0 + np.tanh(0.5 * x))
+    return share * (1.0 + x * (1.0 - share))

@@ -1,0 +1,148 @@
+"""POD-NN, and the derivatives of displacements with respect to the load that it may learn from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mor_bench
+from mor_bench.errors import InvalidInputError, SolverError
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.reduction.coordinates import error_weights, input_axes
+from mor_bench.reduction.sensitivity import sensitivities
+from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.surrogate import TrainingOptions
+
+torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
+BRIEF: dict[str, Any] = {"n_hidden": 32, "iterations": 600}
+
+
+def relative_errors(method: mor_bench.Surrogate, samples: Snapshots) -> Any:
+    found = method.predict(samples.forces)
+    return np.linalg.norm(found - samples.displacements, axis=(1, 2)) / np.linalg.norm(samples.displacements, axis=(1, 2))
+
+
+@pytest.mark.parametrize("of_force", [False, True])
+def test_sensitivities_are_finite_differences_of_full_order_solves(of_force: bool, tiny: Dataset) -> None:
+    model, few = FullOrderModel(tiny.scene), tiny.train[np.array([3, 40])]
+    generator = np.random.default_rng(0)
+    axes, modes = generator.normal(size=(model.n_unknowns, 3)), generator.normal(size=(model.n_unknowns, 4))
+    known = sensitivities(model, few, axes, modes, of_force)
+    assert known.inputs.shape == (2, 3, 3)
+    assert known.outputs.shape == (2, 3, 4)
+    largest, step, options = np.linalg.norm(few.loads.vectors, axis=2).max(), 1e-4, NewtonOptions(tolerance=1e-12)
+    for i in range(2):
+        for axis in range(3):
+            unit = np.zeros((tiny.scene.mesh.n_nodes, 3))
+            unit[:, axis] = largest * tiny.scene.patch_weights.toarray()[few.loads.patches[i, 0]]
+            along = unit.ravel()[tiny.scene.free_dofs]
+            ahead, behind = (model.solve(few.free_forces[i] + sign * step * along, options=options).displacement for sign in (1, -1))
+            slope, linear = (ahead - behind) / (2 * step), model.rest_factor.solve(along)
+            wanted = (along, slope) if of_force else (linear, slope - linear)
+            for array, matrix, expected in zip((known.inputs, known.outputs), (axes, modes), wanted, strict=True):
+                scale = np.abs(slope @ modes).max() if matrix is modes else np.abs(expected @ matrix).max()
+                np.testing.assert_allclose(array[i, axis], expected @ matrix, rtol=0, atol=2e-5 * scale)
+
+
+def test_samples_without_a_stable_tangent_are_left_out(tiny: Dataset) -> None:
+    model, few = FullOrderModel(tiny.scene), tiny.train[:3]
+    axes = np.eye(model.n_unknowns)[:, :2]
+    squashed = few.free_displacements.copy()
+    points = tiny.scene.mesh.points
+    squashed[1] = (-0.9 * (points - points.min(axis=0))).ravel()[tiny.scene.free_dofs]
+    with pytest.warns(UserWarning, match="not positive definite at 1 of 3 training samples"):
+        known = sensitivities(model, replace(few, free_displacements=squashed), axes, axes)
+    assert not known.inputs[1].any()
+    assert not known.outputs[1].any()
+    whole = sensitivities(model, few, axes, axes)
+    np.testing.assert_array_equal(known.outputs[[0, 2]], whole.outputs[[0, 2]])
+    with pytest.raises(SolverError, match="at none of the 1 training samples"):
+        sensitivities(model, replace(few[1:2], free_displacements=squashed[1:2]), axes, axes)
+
+
+def test_the_network_of_torch_and_of_numpy_agree_with_their_slopes() -> None:
+    from mor_bench.learning.perceptron import Perceptron, evaluate, slope_at_rest
+
+    network = Perceptron(3, 8, 2, torch.Generator().manual_seed(0)).double()
+    generator = np.random.default_rng(0)
+    with torch.no_grad():
+        for weight in network.parameters():
+            weight.copy_(torch.from_numpy(generator.normal(size=tuple(weight.shape))))
+    x, directions = generator.normal(size=(5, 3)), generator.normal(size=(5, 4, 3))
+    weights = network.arrays()
+    values, slopes = (found.detach().numpy() for found in network.with_derivatives(torch.from_numpy(x), torch.from_numpy(directions)))
+    np.testing.assert_allclose(values, evaluate(weights, x), atol=1e-12)
+    np.testing.assert_allclose(network(torch.from_numpy(x)).detach().numpy(), values, atol=1e-12)
+    for k in range(4):
+        difference = evaluate(weights, x + 1e-5 * directions[:, k]) - evaluate(weights, x - 1e-5 * directions[:, k])
+        np.testing.assert_allclose(slopes[:, k], difference / 2e-5, atol=1e-7)
+    difference = evaluate(weights, 1e-5 * np.eye(3)) - evaluate(weights, -1e-5 * np.eye(3))
+    np.testing.assert_allclose(slope_at_rest(weights), difference / 2e-5, atol=1e-7)
+
+
+def test_derivatives_spare_samples(tiny: Dataset) -> None:
+    few = tiny.train[::6]
+    medians = [
+        np.median(relative_errors(mor_bench.load_method("pod-nn", derivatives=d, **BRIEF).fit(tiny.scene, few), tiny.test)) for d in (False, True)
+    ]
+    assert medians[1] <= 0.8 * medians[0]
+
+
+def test_what_is_learned_is_of_second_order_in_the_load(tiny: Dataset) -> None:
+    method = mor_bench.load_method("pod-nn", **BRIEF).fit(tiny.scene, tiny.train)
+    linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
+    forces = tiny.test.forces[:5].copy()
+    forces[2] = 0.0
+    learned = [np.abs(method.predict(size * forces) - linear.predict(size * forces)).max() for size in (1e-2, 1e-3)]
+    assert learned[0] > 0
+    assert learned[1] == pytest.approx(1e-2 * learned[0], rel=0.2)
+    assert not method.predict(forces)[2].any()
+
+
+def test_from_the_force_alone_training_loads_are_learned(tiny: Dataset) -> None:
+    method = mor_bench.load_method("pod-nn", input="force", n_input_modes=40, **BRIEF).fit(tiny.scene, tiny.train)
+    assert np.median(relative_errors(method, tiny.train)) < 0.6
+    forces = np.zeros((2, tiny.scene.mesh.n_nodes, 3))
+    forces[1] = tiny.test.forces[0]
+    assert not method.predict(forces)[0].any()
+
+
+def test_a_training_starts_from_a_saved_model_in_other_bases(tiny: Dataset, tmp_path: Path) -> None:
+    first = mor_bench.load_method("pod-nn", **BRIEF).fit(tiny.scene, tiny.train)
+    first.save(tmp_path / "model.safetensors")
+    medians = []
+    for start in (None, tmp_path / "model.safetensors"):
+        method = mor_bench.load_method("pod-nn", n_hidden=32, iterations=1)
+        method.training = TrainingOptions(start_from=start)
+        medians.append(np.median(relative_errors(method.fit(tiny.scene, tiny.train[::2]), tiny.test)))
+    own = np.median(relative_errors(first, tiny.test))
+    assert medians[1] <= 1.5 * own
+    assert medians[0] > 3 * own
+    method = mor_bench.load_method("pod-nn", n_hidden=16, iterations=1)
+    method.training = TrainingOptions(start_from=tmp_path / "model.safetensors")
+    with pytest.raises(InvalidInputError, match="16 hidden units"):
+        method.fit(tiny.scene, tiny.train)
+
+
+@pytest.mark.parametrize("name", ["axes", "network.first", "network.last", "loss_curve"])
+def test_a_damaged_model_is_refused(name: str, tiny: Dataset) -> None:
+    method = mor_bench.load_method("pod-nn", n_hidden=4, iterations=2).fit(tiny.scene, tiny.train)
+    for spoilt in (np.full_like(method._state()[name], np.nan), method._state()[name][None, :1]):
+        with pytest.raises(InvalidInputError, match=name):
+            method._restore({**method._state(), name: spoilt})
+
+
+def test_axes_and_weights_scale_as_they_say() -> None:
+    samples = np.random.default_rng(0).normal(size=(50, 6)) * 10.0 ** -np.arange(6)
+    for evenness in (0.0, 0.5, 1.0):
+        sizes = np.sqrt(((samples @ input_axes(samples, 4, evenness)) ** 2).mean(axis=0))
+        np.testing.assert_allclose(sizes[0] / sizes[3], 10.0 ** (3 * (1 - evenness)), rtol=0.5)
+        if evenness != 0.5:
+            assert np.mean(sizes**2) == pytest.approx(1)
+    weights = error_weights(np.array([[3.0, 0.0], [0.0, 1e-9]]))
+    np.testing.assert_allclose(weights, [np.sqrt(0.5), 5.0])
