@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from mor_bench.harness.pick import Pick, pick
     from mor_bench.harness.results import Comparison
     from mor_bench.harness.run import run
+    from mor_bench.harness.training import Fit, fit
     from mor_bench.scene.scene import Scene, load_scene
     from mor_bench.snapshots.dataset import Snapshots, load_dataset
     from mor_bench.surrogate import Surrogate, load_method, load_surrogate
@@ -26,11 +27,13 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Comparison",
+    "Fit",
     "MorBenchError",
     "Pick",
     "Scene",
     "Snapshots",
     "Surrogate",
+    "fit",
     "load_dataset",
     "load_method",
     "load_scene",
@@ -41,11 +44,13 @@ __all__ = [
 
 _HOMES = {
     "Comparison": "mor_bench.harness.results",
+    "Fit": "mor_bench.harness.training",
     "MorBenchError": "mor_bench.errors",
     "Pick": "mor_bench.harness.pick",
     "Scene": "mor_bench.scene.scene",
     "Snapshots": "mor_bench.snapshots.dataset",
     "Surrogate": "mor_bench.surrogate",
+    "fit": "mor_bench.harness.training",
     "load_dataset": "mor_bench.snapshots.dataset",
     "load_method": "mor_bench.surrogate",
     "load_scene": "mor_bench.scene.scene",

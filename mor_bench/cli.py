@@ -40,6 +40,14 @@ class ProfileName(StrEnum):
     full = "full"
 
 
+class DeviceName(StrEnum):
+    """Where trainings compute."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
 class SplitName(StrEnum):
     """How training and test are parted."""
 
@@ -52,6 +60,10 @@ Suite = Annotated[Path | None, typer.Option(help="Folder with datasets/ and meth
 Cache = Annotated[Path | None, typer.Option(help="Folder for generated datasets. [default: the user's cache folder]")]
 Limit = Annotated[int | None, typer.Option(min=1, help="Only the first samples; they cover the load regions evenly.")]
 Workers = Annotated[int | None, typer.Option(min=1, help="Processes for data generation. [default: all cores]")]
+TrainingDevice = Annotated[DeviceName, typer.Option(help="Of trainings; auto is a CUDA device if there is one.")]
+FitSeconds = Annotated[
+    float | None, typer.Option(metavar="SECONDS", help="That each training is sized to, in the place of its number of iterations.")
+]
 Cluster = Annotated[str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers generate instead: tcp://host:port.")]
 
 
@@ -69,7 +81,8 @@ def _clear_errors() -> Iterator[None]:
         typer.secho(f"mor-bench: {error.filename or ''}: {error.strerror or error}", fg="red", err=True)
         raise typer.Exit(2) from None
     except KeyboardInterrupt:
-        typer.secho("mor-bench: stopped; finished samples and rows are kept. A run goes on when it is given the same --out.", fg="yellow", err=True)
+        said = "finished samples and rows are kept. A run goes on when it is given the same --out, a training from its last checkpoint."
+        typer.secho(f"mor-bench: stopped; {said}", fg="yellow", err=True)
         raise typer.Exit(130) from None
 
 
@@ -83,7 +96,7 @@ def _console(stderr: bool = False) -> Console:
 
 @contextmanager
 def _progress(console: Console) -> Iterator[Listener]:
-    """A bar for generation, with its rate, and one for the configurations, and a line for each finished one."""
+    """A bar for generation, with its rate, one for the configurations, and a line for each finished one; a bar for a training, with its loss."""
     from time import perf_counter
 
     from rich.markup import escape
@@ -133,7 +146,17 @@ def _progress(console: Console) -> Iterator[Listener]:
                     bars.console.print(f"{dataset}: all fitted; timing them beside each other", highlight=False, markup=False)
             bars.update(tasks[name], completed=done)
 
-        yield Listener(generating, starting, fitted, timing)
+        def training(done: int, total: int, loss: float) -> None:
+            now = perf_counter()
+            if "training" not in tasks:
+                tasks["training"] = bars.add_task("training", total=total, completed=done, rate="")
+                said["training"] = done, now
+            bars.update(tasks["training"], completed=done, total=total, rate=f"loss {loss:.3g}")
+            if not console.is_terminal and now - said["training"][1] >= SAY_EVERY_S:
+                said["training"] = done, now
+                bars.console.print(f"training: {done:,} of {total:,} iterations, loss {loss:.3g}", highlight=False)
+
+        yield Listener(generating, starting, fitted, timing, training=training)
 
 
 @app.command()
@@ -153,6 +176,11 @@ def run(
     cluster: Annotated[str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers generate and fit: tcp://host:port.")] = None,
     test_seed: Annotated[
         str | None, typer.Option(metavar="N|fresh", help="Also score on a test set drawn after all fits, by this seed or one that no one knows.")
+    ] = None,
+    device: TrainingDevice = DeviceName.cpu,
+    fit_seconds: FitSeconds = None,
+    seeds: Annotated[
+        int | None, typer.Option(metavar="N", help="Trainings of each configuration of a method with a seed. [default: 1; full: 3]")
     ] = None,
     time_limit: Annotated[float | None, typer.Option(metavar="SECONDS", help="Of all fits of a method on a dataset together.")] = None,
     memory_limit: Annotated[float | None, typer.Option(metavar="GB", help="Of a method's process. [default: 3/4 of the memory]")] = None,
@@ -175,7 +203,7 @@ def run(
 
             planned = plan(
                 datasets or ["beam-coarse"], method or None, profile.value, limit=limit, split=split.value if split else None,
-                threads=threads, workers=workers, jobs=jobs, cache=cache, suite=suite,
+                threads=threads, workers=workers, jobs=jobs, device=device.value, fit_seconds=fit_seconds, seeds=seeds, cache=cache, suite=suite,
             )  # fmt: skip
             if as_json:
                 print(json.dumps(planned.as_dict(), indent=1))
@@ -185,7 +213,8 @@ def run(
         with _progress(console) as listener:
             comparison = mor_bench.run(
                 datasets or ["beam-coarse"], method or None, profile.value, out, limit=limit, split=split.value if split else None,
-                threads=threads, workers=workers, jobs=jobs, cluster=cluster, test_seed=seed, time_limit_s=time_limit,
+                threads=threads, workers=workers, jobs=jobs, cluster=cluster, test_seed=seed, device=device.value,
+                fit_seconds=fit_seconds, seeds=seeds, time_limit_s=time_limit,
                 memory_limit_bytes=memory_limit and 1e9 * memory_limit, retime=retime, fail_fast=fail_fast, cache=cache, suite=suite,
                 listener=listener,
             )  # fmt: skip
@@ -198,6 +227,65 @@ def run(
         failed = fail_fast and any(row["status"] == "failed" for row in comparison.rows)
         if failed or not any(row["status"] == "ok" for row in comparison.rows):
             raise typer.Exit(1)
+
+
+@app.command()
+def fit(
+    dataset: Annotated[str, typer.Argument(help="Name or TOML file.")],
+    method: Annotated[str, typer.Option("--method", "-m", help="Name or TOML file.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Safetensors file to write, or to write over.")],
+    knobs: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KNOB=VALUE", help="In the place of the file's; repeat for more. [default: as the file says]")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Of what the method draws at random; the same as --set seed=N.")] = None,
+    split: Annotated[SplitName | None, typer.Option(help="What the test part has that training has not. [default: as the dataset says]")] = None,
+    limit: Limit = None,
+    device: TrainingDevice = DeviceName.cpu,
+    fit_seconds: FitSeconds = None,
+    checkpoint: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="That a training that was stopped goes on from. [default: .NAME.checkpoint beside --out]")
+    ] = None,
+    start_from: Annotated[Path | None, typer.Option(metavar="FILE", help="Model of the same method whose weights the training starts from.")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="Of the fit. [default: all cores]")] = None,
+    workers: Workers = None,
+    cache: Cache = None,
+    suite: Suite = None,
+) -> None:
+    """Fit one configuration on a dataset's training part and save it; a training that was stopped goes on when given the same command."""
+    with _clear_errors():
+        import mor_bench
+
+        given = {**_knobs(knobs or []), **({} if seed is None else {"seed": seed})}
+        with _progress(_console(stderr=True)) as listener:
+            fitted = mor_bench.fit(
+                dataset, method, given, out=out, split=split.value if split else None, limit=limit, device=device.value,
+                fit_seconds=fit_seconds, checkpoint=checkpoint, start_from=start_from, threads=threads, workers=workers, cache=cache,
+                suite=suite, listener=listener,
+            )  # fmt: skip
+        error = fitted.error
+        iterations = "" if fitted.iterations is None else f", {fitted.iterations:,} iterations"
+        print(f"fit: {fitted.seconds:.3g} s{iterations}, {fitted.n_train:,} training samples")
+        relative = ", ".join(f"{name} {error[f'rel_l2_{name}']:.3%}" for name in ("median", "p95", "max"))
+        print(f"test error: ē {error['mean_dof_m']:.2e} m, relative l2 {relative} ({fitted.n_test:,} samples)")
+        print(fitted.out)
+
+
+def _knobs(given: Sequence[str]) -> dict[str, Any]:
+    """Values of ``knob=value`` as TOML has them; what is none of its values is text."""
+    import tomllib
+
+    from mor_bench.errors import InvalidInputError
+
+    knobs: dict[str, Any] = {}
+    for item in given:
+        name, equals, value = item.partition("=")
+        if not equals or not name.strip():
+            raise InvalidInputError(f"`--set` takes KNOB=VALUE; got {item!r}.")
+        try:
+            knobs[name.strip()] = tomllib.loads(f"value = {value}")["value"]
+        except tomllib.TOMLDecodeError:
+            knobs[name.strip()] = value.strip()
+    return knobs
 
 
 @app.command(name="list")

@@ -39,6 +39,9 @@ SIZE = "size."
 """Beginning of the names of the arrays that hold the values chosen for knobs set to "auto"; `_state` has none such."""
 
 
+Device = Literal["auto", "cpu", "cuda"]
+
+
 @dataclass(frozen=True)
 class TrainingOptions:
     """How a method that trains does so; methods that do not train ignore it.
@@ -61,7 +64,7 @@ class TrainingOptions:
         Called now and then with the iterations done, all, and the loss.
     """
 
-    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    device: Device = "cpu"
     fit_seconds: float | None = None
     checkpoint: Path | None = None
     start_from: Path | None = None
@@ -148,6 +151,11 @@ class Surrogate(ABC):
         SolverError
             If a method that solves equations finds no valid equilibrium.
         """
+
+    @classmethod
+    def trains(cls) -> bool:
+        """Whether `fit` heeds `training`. A method that does has the knobs ``iterations`` and ``seed``."""
+        return {"iterations", "seed"} <= inspect.signature(cls.__init__).parameters.keys()
 
     def supports(self, scene: Scene) -> str | None:
         """None, or the reason why the method cannot handle a scene."""
@@ -257,7 +265,7 @@ class Surrogate(ABC):
         timings = {TIMING + name: np.array([value]) for name, value in getattr(self, "timings_ms_", {}).items()}
         arrays = {name: np.ascontiguousarray(array) for name, array in {**self._state(), **known, **sizes, **timings}.items()}
         header["sha256"] = _digest(header, arrays)
-        write_atomically(Path(path), serialise(arrays, metadata=header))
+        write_atomically(Path(path), _in_order(serialise(arrays, metadata=header)))
 
     def _state(self) -> dict[str, NDArray[Any]]:
         """The arrays that make up a fitted model."""
@@ -326,6 +334,16 @@ class Surrogate(ABC):
         if not (np.abs(array) <= MAX_FORCE_N).all():
             raise InvalidInputError(f"`forces` must be finite and at most {MAX_FORCE_N:g} N; got {np.abs(array).max():g}.")
         return array.astype(np.float64, copy=False).reshape(-1, n_nodes, 3)
+
+
+def _in_order(content: bytes) -> bytes:
+    """A safetensors file with its metadata sorted: safetensors writes them in an order that changes from call to call."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)  # the arrays stay aligned
+    return len(text).to_bytes(8, "little") + text + content[end:]
 
 
 def _digest(header: dict[str, str], arrays: dict[str, NDArray[Any]]) -> str:

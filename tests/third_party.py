@@ -11,16 +11,21 @@ import sys
 import time
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+from safetensors.numpy import save as serialise
 
 import mor_bench
-from mor_bench.errors import MorBenchError, NoEquilibriumError
+from mor_bench.errors import MorBenchError, NoEquilibriumError, OutOfTimeError, StoreError
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.snapshots.store import write_atomically
 from mor_bench.surrogates.fem import FullFEM
 
 
@@ -227,3 +232,66 @@ class Peeker(Zero):
 def _known(folder: Path) -> list[str]:
     """Names that someone who knows this package can guess, without listing the folder."""
     return [line for line in os.environ.get("MOR_BENCH_TEST_SHARDS", "").split(os.pathsep) if line.startswith(str(folder))]
+
+
+class Descent(mor_bench.Surrogate):
+    """Displacements that are linear in the sum of the nodal forces, by gradient descent: a training that is stopped goes on from its checkpoint.
+
+    It says from which iteration it goes on in a warning. ``DESCENT_NAP_S`` in the environment slows its iterations down.
+    """
+
+    EACH = 10
+    """Iterations per point of the loss curve, and between two checkpoints."""
+
+    def __init__(self, iterations: Annotated[int, Field(ge=1)] = 40, seed: int = 0, channels: int = 1, steps: int = 1, fails: int = -1) -> None:
+        self.iterations = iterations
+        self.seed = seed
+        self.channels = channels
+        self.steps = steps
+        self.fails = fails
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Descent:
+        with self._fitting(scene):
+            samples = self._checked_snapshots(snapshots)
+            if self.seed == self.fails:
+                raise OutOfTimeError("all iterations would take 7 h; the limit is 9 s.")
+            if self.time_limit_s is not None and self.channels * self.steps * 60 > self.time_limit_s:
+                raise OutOfTimeError(f"all iterations would take {self.channels * self.steps / 60:.3g} h; the limit is {self.time_limit_s:.0f} s.")
+            forces, displacements = samples.forces.sum(axis=1), samples.displacements.reshape(len(samples), -1)
+            generator = np.random.default_rng(self.seed)
+            weights, losses, first = 1e-3 * generator.normal(size=(forces.shape[1], displacements.shape[1])), np.zeros(0), 0
+            seconds, checkpoint = self.training.fit_seconds, self.training.checkpoint
+            iterations = self.iterations if seconds is None else int(100 * seconds)
+            if checkpoint is not None and checkpoint.exists():
+                try:
+                    kept = load_file(checkpoint)
+                except SafetensorError as error:
+                    raise StoreError(f"{checkpoint}: {error}") from None
+                weights, losses, first, iterations = kept["weights"], kept["losses"], int(kept["numbers"][0]), int(kept["numbers"][1])
+                warnings.warn(f"goes on from iteration {first} of {iterations}", stacklevel=2)
+            rate = 0.5 / np.linalg.norm(forces, 2) ** 2
+            for iteration in range(first, iterations):
+                off = forces @ weights - displacements
+                weights = weights - rate * forces.T @ off
+                time.sleep(float(os.environ.get("DESCENT_NAP_S", "0")))
+                if (iteration + 1) % self.EACH == 0:
+                    losses = np.append(losses, np.square(off).mean())
+                    if checkpoint is not None:
+                        numbers = np.array([iteration + 1, iterations])
+                        write_atomically(checkpoint, serialise({"weights": weights, "losses": losses, "numbers": numbers}))
+                    if self.training.progress is not None:
+                        self.training.progress(iteration + 1, iterations, float(losses[-1]))
+            self.weights_, self.loss_curve_, self.validation_curve_, self.iterations_ = weights, losses, 1.5 * losses, iterations
+            if checkpoint is not None:
+                checkpoint.unlink(missing_ok=True)
+        return self
+
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+        batch = self._checked_forces(forces)
+        return np.asarray(batch.sum(axis=1) @ self.weights_).reshape(np.shape(forces))
+
+    def _state(self) -> dict[str, NDArray[Any]]:
+        return {"weights": self.weights_}
+
+    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
+        self.weights_ = state["weights"]

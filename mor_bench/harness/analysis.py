@@ -422,7 +422,8 @@ def _outside(row: Row, regime: Row, device: str) -> list[str]:
     missing = []
     for name, what in (("min_dofs", "degrees of freedom"), ("min_train", "training samples"), ("min_iterations", "iterations")):
         least = regime.get(name)
-        has = {"min_dofs": row.get("n_dofs"), "min_train": row.get("n_train"), "min_iterations": row["parameters"].get("iterations")}[name] or 0
+        iterations = (row.get("training") or {}).get("iterations") or row["parameters"].get("iterations")
+        has = {"min_dofs": row.get("n_dofs"), "min_train": row.get("n_train"), "min_iterations": iterations}[name] or 0
         if least and has < least:
             missing.append(f"{has:,} of {least:,} {what}")
     if regime.get("split") and row.get("split") != regime["split"]:

@@ -25,6 +25,7 @@ from mor_bench.specs import (
     load_dataset_spec,
     load_method_spec,
 )
+from mor_bench.surrogate import TrainingOptions
 
 CORE_METHODS = ("fem", "pod", "hpod", "pca-regression", "umesh")
 """What is compared when nothing else is asked for."""
@@ -44,14 +45,24 @@ class Budget:
 BUDGETS = {"quick": Budget(12, 1200.0), "full": Budget(16, 1800.0)}
 
 
-def jobs_of(methods: Sequence[MethodSpec], profile: str) -> list[Job]:
-    """Every configuration of every method."""
+def jobs_of(methods: Sequence[MethodSpec], profile: str, training: TrainingOptions = TrainingOptions()) -> list[Job]:
+    """Every configuration of every method; those that may train do so with the given device and seconds."""
     jobs = []
     for method in methods:
-        swept = method.swept_keys(profile)
+        swept, options = method.swept_keys(profile), training if may_train(method) else None
         for parameters in method.configurations(profile):
-            jobs.append(Job(method, parameters, label_of(method.name, {key: parameters[key] for key in swept})))
+            jobs.append(Job(method, parameters, label_of(method.name, {key: parameters[key] for key in swept}), options))
     return jobs
+
+
+def may_train(method: MethodSpec) -> bool:
+    """Whether a method trains; of a third party's, whose class is not imported here, nobody knows before it is fitted."""
+    if not method.surrogate.startswith("mor_bench."):
+        return True
+    try:
+        return bool(method.load_class().trains())
+    except MissingDependencyError:
+        return False
 
 
 def checked_specs(

@@ -1,7 +1,8 @@
 """Fits, scores and timings of configurations, each kept under a digest of all that it depends on.
 
 CACHE/fits/METHOD-KEY/
-    fit.json             seconds, memory, knobs, warnings, checksum of the model; written last
+    fit.json             seconds, memory, knobs, warnings, loss curves, checksum of the model; written last
+    training/checkpoint  of a training that was stopped; training.json says what it has taken so far
     model.safetensors    where the method can be saved
     score-SET.h5         per-sample errors on a test set, under the set's digest
     timing-KEY.h5        raw samples of a timing
@@ -18,15 +19,16 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from time import monotonic
+from time import monotonic, time
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, StoreError
 from mor_bench.harness.code import code_digest
 from mor_bench.harness.handover import arrays_of, write_snapshots
 from mor_bench.harness.indicated import Indicated
@@ -34,11 +36,13 @@ from mor_bench.harness.isolation import MethodFailedError, Worker
 from mor_bench.harness.metrics import SampleErrors, sample_errors
 from mor_bench.harness.nursery import Nursery
 from mor_bench.harness.results import read_arrays, write_arrays
+from mor_bench.harness.timing import gpu_name
 from mor_bench.mechanics.indicator import ErrorIndicator
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.snapshots.store import write_atomically
+from mor_bench.snapshots.store import remove_leftovers, write_atomically
 from mor_bench.specs import MethodSpec, list_suite, load_method_spec
+from mor_bench.surrogate import TrainingOptions
 
 N_COUNTED = 32
 """Test loads over which the cost of a query is averaged."""
@@ -54,11 +58,21 @@ LOAD_LIMIT_S = 300.0
 
 @dataclass(frozen=True)
 class Job:
-    """One configuration of one method on one dataset."""
+    """One configuration of one method on one dataset.
+
+    Attributes
+    ----------
+    method : MethodSpec
+    parameters : dict
+    label : str
+    training : TrainingOptions or None
+        Device and seconds of a method that may train; None of one that does not.
+    """
 
     method: MethodSpec
     parameters: dict[str, Any]
     label: str
+    training: TrainingOptions | None = None
 
 
 @dataclass(frozen=True)
@@ -212,11 +226,12 @@ class Outcome:
 
 
 class Entry:
-    """A configuration's folder in the cache."""
+    """A configuration's folder in the cache. `taken_s` are the seconds of a training in processes that were stopped."""
 
     def __init__(self, job: Job, material: Material, place: Place) -> None:
         self.job, self.material, self.place = job, material, place
         self._held: Worker | None = None
+        self.taken_s = 0.0
         parts = {
             "data": material.train_digest,
             "surrogate": job.method.surrogate,
@@ -227,12 +242,44 @@ class Entry:
         }
         if "auto" in job.parameters.values():  # a size that is chosen by what the scene needs
             parts["needs"] = material.scene.spec.needs.error
+        if job.training not in (None, TrainingOptions()):
+            assert job.training is not None
+            device = gpu_name() if job.training.device == "cuda" else job.training.device
+            parts["training"] = {"device": device, "fit_seconds": job.training.fit_seconds}
         self.key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:20]
         self.folder = place.cache / "fits" / f"{job.method.name}-{self.key}"
 
     @property
     def model(self) -> Path:
         return self.folder / "model.safetensors"
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.folder / "training" / "checkpoint"
+
+    @property
+    def settled(self) -> Job:
+        """The job with the number of iterations that its seconds came to, once it is fitted: another training is then no longer timed."""
+        job, iterations = self.job, ((self.fit or {}).get("training") or {}).get("iterations")
+        if job.training is None or job.training.fit_seconds is None or iterations is None or "iterations" not in (self.fit or {})["parameters"]:
+            return job
+        return replace(job, parameters={**job.parameters, "iterations": iterations}, training=replace(job.training, fit_seconds=None))
+
+    def begin_training(self) -> None:
+        """Make room for a checkpoint, and note the seconds that a stopped training took until it wrote the one that is there."""
+        record, taken = self.folder / "training.json", 0.0
+        self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(self.checkpoint.parent)
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            kept, written = json.loads(record.read_bytes()), self.checkpoint.stat().st_mtime
+            taken = float(kept["taken_s"]) + max(0.0, written - float(kept["began"]))
+        write_atomically(record, json.dumps({"taken_s": taken, "began": time()}).encode())
+        self.taken_s = taken
+
+    def end_training(self) -> None:
+        """Forget a checkpoint. The folder stays: another run may be writing to it."""
+        self.checkpoint.unlink(missing_ok=True)
+        (self.folder / "training.json").unlink(missing_ok=True)
 
     @cached_property
     def fit(self) -> dict[str, Any] | None:
@@ -271,18 +318,19 @@ class Entry:
         """Keep arrays."""
         write_arrays(self.folder / f"{name}.h5", {**arrays, "digest": np.array(digest_of(arrays).encode())})
 
-    def process(self, nursery: Nursery | None = None) -> Worker:
+    def process(self, nursery: Nursery | None = None, open_one: Path | None = None) -> Worker:
         """A fresh process for this method, without a model."""
-        return Worker(
-            self.material.scene, list(self.place.sealed), self.job.method.folder, self.place.memory_limit_bytes, nursery or self.place.nursery
-        )
+        sealed, own = list(self.place.sealed), self.job.method.folder
+        return Worker(self.material.scene, sealed, own, self.place.memory_limit_bytes, nursery or self.place.nursery, open_one)
 
-    def ask_fit(self, worker: Worker, limit_s: float) -> tuple[dict[str, Any], Path]:
-        """Let a process fit; its answer, and where the model is."""
+    def ask_fit(self, worker: Worker, limit_s: float, checkpoint: Path | None = None) -> tuple[dict[str, Any], Path]:
+        """Let a process fit, anew or going on from a checkpoint; its answer, and where the model is."""
         model = Path(tempfile.mkdtemp(dir=self.material.scratch)) / "model.safetensors"
+        job = self.settled
         answer = worker.ask(
-            "fit", limit_s, surrogate=self.job.method.surrogate, parameters=self.job.parameters, train=self.material.train_folder,
+            "fit", limit_s, surrogate=job.method.surrogate, parameters=job.parameters, train=self.material.train_folder,
             model=model, threads=self.place.fit_threads, limit_s=limit_s,
+            training=None if job.training is None else replace(job.training, checkpoint=checkpoint),
         )  # fmt: skip
         if answer["needs_snapshots"]:
             self.material.check_unchanged()
@@ -352,12 +400,25 @@ def fit(entry: Entry, limit_s: float, remote: RemoteFit | None = None) -> dict[s
         return entry.fit
     if remote is not None:
         return _keep_remote(entry, *remote(entry, limit_s))
-    worker = entry.process()
+    resumed = entry.checkpoint.exists()
+    worker = _fitting_process(entry)
     try:
-        answer, model = entry.ask_fit(worker, limit_s)
+        try:
+            answer, model = entry.ask_fit(worker, _left(limit_s, entry.taken_s), entry.checkpoint)
+        except (MethodFailedError, OutOfTimeError):
+            raise  # a later run with more time goes on from the checkpoint
+        except MorBenchError as error:
+            entry.end_training()
+            if not (resumed and isinstance(error, StoreError | InvalidInputError)):
+                raise
+            worker.end()  # the checkpoint was at fault
+            worker = _fitting_process(entry)
+            answer, model = entry.ask_fit(worker, limit_s, entry.checkpoint)
+        answer["fit_s"] += entry.taken_s
         saved = answer["model_bytes"] is not None
         record = entry.keep_fit(_record(entry, answer), model if saved else None)
         shutil.rmtree(model.parent, ignore_errors=True)
+        entry.end_training()
     except BaseException:
         worker.end()
         raise
@@ -366,6 +427,20 @@ def fit(entry: Entry, limit_s: float, remote: RemoteFit | None = None) -> dict[s
     else:
         entry.hold(worker)
     return record
+
+
+def _fitting_process(entry: Entry) -> Worker:
+    """A process for a fit; one that may train can open the folder of its checkpoint."""
+    if entry.job.training is None:
+        return entry.process()
+    entry.begin_training()
+    return entry.process(open_one=entry.checkpoint.parent)
+
+
+def _left(limit_s: float, taken_s: float) -> float:
+    if taken_s >= limit_s:
+        raise MethodFailedError(f"fitting took longer than the limit of {limit_s:g} s: {taken_s:.0f} s until it was stopped")
+    return limit_s - taken_s
 
 
 def score(entry: Entry, limit_s: float, *, count: bool = True) -> Outcome:
@@ -486,8 +561,9 @@ def _cost(entry: Entry, opened: Callable[[], Worker]) -> dict[str, float] | None
 
 
 def fit_elsewhere(
-    scene: Scene, arrays: dict[str, NDArray[Any]], surrogate: str, parameters: dict[str, Any], limits: tuple[float, float]
-) -> tuple[dict[str, Any], bytes | None]:
+    scene: Scene, arrays: dict[str, NDArray[Any]], surrogate: str, parameters: dict[str, Any], limits: tuple[float, float],
+    training: TrainingOptions | None = None,
+) -> tuple[dict[str, Any], bytes | None]:  # fmt: skip
     """A fit on another machine, in a process of its own there: its answer, and the model.
 
     Parameters
@@ -499,6 +575,8 @@ def fit_elsewhere(
         Of the method.
     limits : (seconds, bytes)
         Of time and memory.
+    training : TrainingOptions, optional
+        Of a method that may train.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -509,6 +587,6 @@ def fit_elsewhere(
             model = folder / "model.safetensors"
             answer = worker.ask(
                 "fit", limits[0], surrogate=surrogate, parameters=parameters, train=folder / "train", model=model,
-                threads=os.cpu_count() or 1, limit_s=limits[0],
+                threads=os.cpu_count() or 1, limit_s=limits[0], training=training,
             )  # fmt: skip
         return answer, model.read_bytes() if model.exists() else None

@@ -57,6 +57,8 @@ class Worker:
         Resident memory, of the process and its children, at which it is ended.
     nursery : Nursery, optional
         What the process is forked from; otherwise it is a new interpreter.
+    open_one : Path, optional
+        A folder within the sealed ones that stays open.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class Worker:
         folder: Path | None = None,
         memory_limit_bytes: float = float("inf"),
         nursery: Nursery | None = None,
+        open_one: Path | None = None,
     ) -> None:
         self._memory_limit = memory_limit_bytes
         self._said = tempfile.NamedTemporaryFile()  # noqa: SIM115 - closed by `end`
@@ -75,7 +78,8 @@ class Worker:
         Thread(target=self._listen, daemon=True).start()
         path = [str(folder), *sys.path] if folder else list(sys.path)
         try:
-            self.ask("begin", START_LIMIT_S, path=path, scene=scene, sealed=[str(item) for item in sealed])
+            within = None if open_one is None else str(open_one)
+            self.ask("begin", START_LIMIT_S, path=path, scene=scene, sealed=[str(item) for item in sealed], open_one=within)
         except BaseException:
             self.end()
             raise

@@ -27,9 +27,11 @@ from mor_bench.harness.indicated import indicator_summary
 from mor_bench.harness.isolation import MethodFailedError
 from mor_bench.harness.metrics import SampleErrors, summary
 from mor_bench.harness.nursery import Nursery
+from mor_bench.harness.out_of_range import flags_of
 from mor_bench.harness.results import Comparison
 from mor_bench.harness.statistics import intervals_of
 from mor_bench.harness.timing import describe_machine
+from mor_bench.harness.worker import CURVES
 from mor_bench.reduction.basis import pod
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.executors import Pool, cluster_pool
@@ -42,6 +44,7 @@ from mor_bench.specs import (
     ImportedDatasetSpec,
     SplitBy,
 )
+from mor_bench.surrogate import TrainingOptions
 
 MOST_QUERIES = 400
 """Loads of the test set from which a timing's queries are drawn."""
@@ -49,8 +52,11 @@ MOST_QUERIES = 400
 SINGULAR_VALUES = 400
 """Of the snapshots that a figure shows, where computing all of them would take minutes."""
 
-EXTRA_SEEDS = 2
-"""Trainings with other seeds in a full comparison, beside that of the method's file."""
+SEEDS = {"quick": 1, "full": 3}
+"""Trainings of a configuration unless another number is asked for: with the seed of the method's file, and those after it."""
+
+SPREAD = ("mean_dof_m", "rel_l2_median")
+"""Errors whose scatter over the seeds of a training is told."""
 
 LEARNING_STEP = 4
 LEAST_TRAINING = 20
@@ -73,6 +79,8 @@ class Listener:
         (dataset, turns done, turns in all)
     finished : callable
         (row)
+    training : callable
+        (iterations done, all, loss) of a single fit
     """
 
     generating: Callable[[str, int, int], None] = lambda *_: None
@@ -80,6 +88,7 @@ class Listener:
     fitted: Callable[[dict[str, Any]], None] = lambda *_: None
     timing: Callable[[str, int, int], None] = lambda *_: None
     finished: Callable[[dict[str, Any]], None] = lambda *_: None
+    training: Callable[[int, int, float], None] = lambda *_: None
 
 
 @dataclass(frozen=True)
@@ -97,6 +106,8 @@ class Settings:
     budget: Budget
     memory_limit_bytes: float
     test_seed: int | str | None
+    training: TrainingOptions
+    seeds: int
     retime: bool
     fail_fast: bool
     listener: Listener
@@ -125,7 +136,7 @@ class DatasetRun:
         """Fit and score all configurations, time them, and what a full comparison adds."""
         self._lay_out()
         entries = self._fit_all()
-        if self.settings.profile == "full":
+        if self.settings.seeds > 1:
             self._other_seeds(entries)
         self._time(entries)
         if self.settings.profile == "full":
@@ -193,7 +204,7 @@ class DatasetRun:
         try:
             spent = fit(entry, left, self._remote(pool, job))["fit_s"]
         except MorBenchError as error:
-            spent = monotonic() - began  # a fit that failed has cost its time, too
+            spent = monotonic() - began + entry.taken_s  # a fit that failed has cost its time, too
             return None, {**row, **_failure(error), "tuning_s": spent}
         finally:
             with self.lock:
@@ -206,7 +217,7 @@ class DatasetRun:
         if entry is None:
             return row, {}
         try:
-            found, samples = self._scored(score(entry, self.settings.budget.seconds))
+            found, samples = self._scored(entry.job, score(entry, self.settings.budget.seconds))
         except MorBenchError as error:
             return {**row, **_failure(error)}, {}
         return {**row, **found}, samples
@@ -219,7 +230,7 @@ class DatasetRun:
         def fit(entry: Entry, limit_s: float) -> tuple[dict[str, Any], bytes | None]:
             limits = (limit_s, self.place.memory_limit_bytes)
             arrays = arrays_of(self.data.train)
-            return pool.executor.submit(fit_elsewhere, self.data.scene, arrays, job.method.surrogate, job.parameters, limits).result()
+            return pool.executor.submit(fit_elsewhere, self.data.scene, arrays, job.method.surrogate, job.parameters, limits, job.training).result()
 
         return fit
 
@@ -230,16 +241,19 @@ class DatasetRun:
             "parameters": job.parameters, "sizes": {}, "status": "", "reason": None, "n_train": len(data.train), "n_test": len(data.test),
             "n_unused": data.n_unused, "n_failed": None, "n_dofs": data.scene.mesh.n_dofs, "threads": self.settings.threads,
             "error": None, "latency_ms": None, "all_threads_ms": None, "throughput": None, "offline_s": None, "memory_bytes": None,
-            "model_bytes": None, "cost": None, "indicator": None, "sets": {}, "hidden": None, "seeds": None, **self.discretisation, "warnings": [],
+            "model_bytes": None, "cost": None, "indicator": None, "sets": {}, "range": None, "hidden": None, "training": None, "seeds": None,
+            **self.discretisation, "warnings": [],
         }  # fmt: skip
 
-    def _scored(self, outcome: Outcome) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _scored(self, job: Job, outcome: Outcome) -> tuple[dict[str, Any], dict[str, Any]]:
         """What a fit and its scores put into a row, and the raw samples."""
         fit, scores = outcome.fit, dict(outcome.scores)
+        flags = flags_of(scores) if fit["needs_snapshots"] else None
         main = scores.pop("test")
         failed = int((~np.isfinite(main["mean_dof_m"])).sum())
         if failed == len(main["mean_dof_m"]):
             raise SolverError(f"no valid prediction on any of {failed} test samples")
+        told, unheeded = training_of(fit, job.training, self.settings.training.fit_seconds)
         return {
             "status": "ok",
             "n_failed": failed,
@@ -250,30 +264,39 @@ class DatasetRun:
             "sizes": fit.get("sizes", {}),
             "cost": outcome.cost,
             "indicator": indicator_summary(main),
-            "sets": {name: set_summary(score) for name, score in scores.items()},
-            "warnings": fit["warnings"],
-        }, main
+            "sets": {name: {**set_summary(score), **(flags.of(score) if flags else {})} for name, score in scores.items()},
+            "range": flags.as_dict(main) if flags else None,
+            "training": told and {key: value for key, value in told.items() if key not in CURVES},
+            "warnings": [*fit["warnings"], *([unheeded] if unheeded else [])],
+        }, {**main, **{name: np.array(told[name]) for name in CURVES if told}}
 
     def _other_seeds(self, entries: Mapping[str, Entry]) -> None:
-        """Train methods that draw random numbers again, and keep the errors beside those of the first seed."""
+        """Train methods that draw random numbers again, and keep the errors beside those of the first seed.
+
+        A training that fails has an infinite error, as a test sample without a prediction has.
+        """
         main = self.material.with_sets({"test": self.material.sets["test"]})
         for label, entry in entries.items():
             seed = (entry.fit or {})["parameters"].get("seed")
             if not isinstance(seed, int):
                 continue
-            errors, failed = [], []
-            for other in range(seed + 1, seed + 1 + EXTRA_SEEDS):
-                job = replace(entry.job, parameters={**entry.job.parameters, "seed": other})
+            row, errors, first = self._row(label), [], entry.settled
+            trainings = [{"seed": seed, "fit_s": row["offline_s"]["fit"], **{name: row["error"][name] for name in SPREAD}, "failed": None}]
+            for other in range(seed + 1, seed + self.settings.seeds):
+                job = replace(first, parameters={**first.parameters, "seed": other})
                 try:
                     outcome = evaluate(Entry(job, main, self.place), self.settings.budget.seconds)
-                    errors.append(outcome.scores["test"]["relative_l2"])
                 except MorBenchError as error:
-                    failed.append(f"seed {other}: {error}")
-            row = self._row(label)
-            row["seeds"] = {"n": 1 + len(errors), "failed": failed}
-            row["warnings"] = [*row["warnings"], *failed]
+                    trainings.append({"seed": other, "fit_s": None, **dict.fromkeys(SPREAD, float("inf")), "failed": _failure(error)["reason"]})
+                    continue
+                found = summary(_errors(outcome.scores["test"]))
+                errors.append(outcome.scores["test"]["relative_l2"])
+                trainings.append({"seed": other, "fit_s": outcome.fit["fit_s"], **{name: found[name] for name in SPREAD}, "failed": None})
+            row["seeds"] = seeds_summary(trainings)
+            row["warnings"] = [*row["warnings"], *row["seeds"]["failed"]]
             if errors:
                 self.comparison.add_samples(row, {"seeds_relative_l2": np.array(errors)})
+        self.comparison.write()
 
     def _row(self, label: str) -> dict[str, Any]:
         return next(row for row in self.comparison.rows if (row["dataset"], row["label"]) == (self.spec.name, label))
@@ -339,7 +362,7 @@ class DatasetRun:
         if n == self.material.n_train:
             return {**record, "fit_s": row["offline_s"]["fit"], "error": row["error"]}
         try:
-            outcome = evaluate(Entry(entry.job, self.material.first(n), self.place), self.settings.budget.seconds)
+            outcome = evaluate(Entry(entry.settled, self.material.first(n), self.place), self.settings.budget.seconds)
         except MorBenchError as error:
             return {**record, "status": "failed", "reason": str(error), "fit_s": None, "error": None}
         return {**record, "fit_s": outcome.fit["fit_s"], "error": summary(_errors(outcome.scores["test"]))}
@@ -381,6 +404,31 @@ def _failure(error: MorBenchError) -> dict[str, str]:
     if isinstance(error, MethodFailedError):
         return {"status": "failed", "reason": str(error)}
     return {"status": "failed", "reason": f"{type(error).__name__}: {error}"}
+
+
+def training_of(fit: Mapping[str, Any], options: TrainingOptions | None, asked_s: float | None) -> tuple[dict[str, Any] | None, str | None]:
+    """What a fit told of its training, with the curves; and a warning where the seconds that were asked for were not heeded."""
+    knob, told, options = fit["parameters"].get("iterations"), fit.get("training"), options or TrainingOptions()
+    unheeded = None
+    if asked_s is not None and knob is not None and (told or {}).get("iterations") is None:
+        unheeded = f"it does not size its training to seconds: its knob `iterations`, {knob:,}, counts"
+    if not told:
+        return None, unheeded
+    curves = {name: told[name] for name in CURVES}
+    iterations = knob if told["iterations"] is None else told["iterations"]
+    ends = {name: curve[-1] if curve else None for name, curve in zip(("loss", "validation_loss"), curves.values(), strict=True)}
+    return {"device": options.device, "fit_seconds": options.fit_seconds, "iterations": iterations, **ends, **curves}, unheeded
+
+
+def seeds_summary(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """How the errors of a configuration scatter over the seeds of its training; a training that failed counts with an infinite error."""
+    spread: dict[str, Any] = {}
+    for name in SPREAD:
+        values = np.array([training[name] for training in trainings])
+        deviation = float(values.std(ddof=1)) if len(values) > 1 and np.isfinite(values).all() else float("inf")
+        spread[name] = {"median": float(np.median(values)), "min": float(values.min()), "max": float(values.max()), "std": deviation}
+    failed = [f"seed {training['seed']}: {training['failed']}" for training in trainings if training["failed"]]
+    return {"n": len(trainings) - len(failed), "asked": len(trainings), "failed": failed, **spread, "trainings": list(trainings)}
 
 
 def _errors(score: Mapping[str, Any]) -> SampleErrors:

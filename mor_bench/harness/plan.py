@@ -16,13 +16,15 @@ from typing import Any
 from mor_bench.harness.clock import PROTOCOLS
 from mor_bench.harness.contestants import BUDGETS, checked_specs, jobs_of
 from mor_bench.harness.fits import Entry, Job, Material
-from mor_bench.harness.on_dataset import EXTRA_SEEDS, LEARNING_STEP, place_of
+from mor_bench.harness.on_dataset import LEARNING_STEP, place_of
+from mor_bench.harness.run import checked_seeds, training_options
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import load_dataset
 from mor_bench.snapshots.generate import SHARD_SIZE, dataset_folder, default_cache, n_samples_to_generate, shard_path
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import AnyDatasetSpec, DatasetSpec, SplitBy
+from mor_bench.surrogate import Device
 
 REFERENCE = ("beam-coarse", 768, 5120)
 """Where the `fit_s` of the method files were measured: dataset, dofs, training samples; on two cores."""
@@ -94,6 +96,9 @@ def plan(
     threads: int = 1,
     workers: int | None = None,
     jobs: int = 1,
+    device: Device = "cpu",
+    fit_seconds: float | None = None,
+    seeds: int | None = None,
     cache: Path | None = None,
     suite: Path | None = None,
 ) -> Plan:
@@ -111,7 +116,8 @@ def plan(
     root = Path(cache or default_cache())
     budget = BUDGETS[profile]
     allowed = budget.configurations
-    all_jobs = [job for method in method_specs for job in jobs_of([method], profile)[:allowed]]
+    training, n_seeds = training_options(device, fit_seconds, budget.seconds), checked_seeds(seeds, profile)
+    all_jobs = [job for method in method_specs for job in jobs_of([method], profile, training)[:allowed]]
     steps: list[Step] = []
     for spec in specs:
         data = _data_step(spec, limit, workers, root)
@@ -121,21 +127,26 @@ def plan(
         for job in all_jobs:
             seconds = _fit_s(job, profile, n_dofs, n_train, _earlier(root, job))
             steps.append(Step(spec.name, job.label, job.label in done, None if seconds is None else min(seconds, budget.seconds) / jobs))
-        if profile == "full":
-            steps += _extras(spec.name, all_jobs, steps[-len(all_jobs) :])
+        steps += _extras(spec.name, all_jobs, steps[-len(all_jobs) :], n_seeds - 1, profile == "full")
     protocol = PROTOCOLS[profile]
     turns = protocol.processes * (protocol.rounds + 2) * len(all_jobs) * len(specs)
     return Plan(steps, turns * TURN_S + protocol.processes * START_S * len(specs))
 
 
-def _extras(dataset: str, jobs: Sequence[Job], fits: Sequence[Step]) -> list[Step]:
-    """What a full comparison fits beside: other seeds of what is trained by iterations, and learning curves."""
+def _extras(dataset: str, jobs: Sequence[Job], fits: Sequence[Step], other_seeds: int, curves: bool) -> list[Step]:
+    """What is fitted beside: other seeds of what is trained by iterations, and in a full comparison learning curves."""
     extras = []
     for method in dict.fromkeys(job.method.name for job in jobs):
         mine = [(job, step.seconds or 0.0) for job, step in zip(jobs, fits, strict=True) if job.method.name == method]
         trained = "iterations" in mine[0][0].parameters
-        seconds = EXTRA_SEEDS * sum(s for _, s in mine) + LEARNING_POINTS * mine[-1][1] if trained else mine[-1][1] / (LEARNING_STEP - 1)
-        extras.append(Step(dataset, f"{method}: {'other seeds, ' if trained else ''}learning curve", False, seconds))
+        seconds = 0.0
+        if trained:
+            seconds += other_seeds * sum(s for _, s in mine)
+        if curves:
+            seconds += LEARNING_POINTS * mine[-1][1] if trained else mine[-1][1] / (LEARNING_STEP - 1)
+        named = [*(["other seeds"] if trained and other_seeds else []), *(["learning curve"] if curves else [])]
+        if named:
+            extras.append(Step(dataset, f"{method}: {', '.join(named)}", False, seconds))
     return extras
 
 
@@ -186,7 +197,9 @@ def _earlier(cache: Path, job: Job) -> list[dict[str, Any]]:
 
 
 def _fit_s(job: Job, profile: str, n_dofs: int, n_train: int, earlier: Sequence[Mapping[str, Any]]) -> float | None:
-    """Scaled from earlier fits or the method's file; iterations cost the same however many samples there are."""
+    """Scaled from earlier fits or the method's file; iterations cost the same however many samples there are, or what they are given."""
+    if job.training and job.training.fit_seconds and "iterations" in job.parameters:
+        return job.training.fit_seconds
     times: list[float] = []
     for record in earlier:
         with suppress(KeyError, TypeError, ZeroDivisionError):

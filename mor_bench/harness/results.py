@@ -59,9 +59,15 @@ def _with_numbers(row: dict[str, Any]) -> dict[str, Any]:
     """A row read from JSON with the `nan` and `inf` of its errors as numbers again."""
 
     def numbers(record: dict[str, Any]) -> dict[str, Any]:
-        return {name: float(value) if value in ("nan", "inf", "-inf") else value for name, value in record.items()}
+        return {name: float(value) if isinstance(value, str) and value in ("nan", "inf", "-inf") else value for name, value in record.items()}
 
-    read: dict[str, Any] = {key: row[key] and numbers(row[key]) for key in ("error", "hidden") if key in row}
+    def of_seeds(record: dict[str, Any]) -> dict[str, Any]:
+        spread = {name: numbers(value) for name, value in record.items() if isinstance(value, dict)}
+        return {**record, **spread, "trainings": [numbers(training) for training in record.get("trainings", [])]}
+
+    read: dict[str, Any] = {key: row[key] and numbers(row[key]) for key in ("error", "hidden", "range", "training") if key in row}
+    if row.get("seeds"):
+        read["seeds"] = of_seeds(row["seeds"])
     return {**row, **read, "sets": {name: numbers(record) for name, record in row.get("sets", {}).items()}}
 
 
@@ -102,8 +108,11 @@ class Comparison:
         with the interval `low`, `high` in which a repeated measurement's median is expected, the garbage collector's share
         `gc` and whether it was `stable`; `all_threads_ms`; `throughput` in queries per second by size of the batch;
         `offline_s`; `memory_bytes`, resident at most while fitting and while predicting; `model_bytes`; `cost` per query,
-        which no machine changes; `sets`, errors on the named test sets; `hidden`, on a test set of fresh draws; `seeds`, with how
-        many seeds it was trained, and which failed; `tuning_s`, what it took of the tuning budget. Of the
+        which no machine changes; `sets`, errors on the named test sets, and of the loads whose error is unusual how many
+        are flagged as out of range; `range`, what is usual, with the false alarms in range, see
+        `mor_bench.harness.out_of_range.Flags`; `hidden`, errors on a test set of fresh draws; `training`, its device, seconds,
+        iterations and last losses; `seeds`, with how many seeds it was trained (`n` of those `asked` for), which `failed`, and of
+        `mean_dof_m` and `rel_l2_median` median, min, max and std over all; `tuning_s`, what it took of the tuning budget. Of the
         dataset's own mesh against the limit of fine ones `discretisation_error_m` (mean e) and `discretisation_rel_l2`
         (median). None where not measured.
     datasets, methods : dict
@@ -165,8 +174,9 @@ class Comparison:
         """Raw samples of a row that ran.
 
         `latency_ms`, `process`, `round` (n_queries,), the last two numbers of the fresh process and of the interleaved round
-        that a query was timed in; `mean_dof_m`, `relative_l2`, `max_nodal_m`, `amplitude_m` (n_test,); and of the sample
-        with the largest finite e `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3).
+        that a query was timed in; `mean_dof_m`, `relative_l2`, `max_nodal_m`, `amplitude_m` (n_test,); of the sample
+        with the largest finite e `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3); and of a training
+        `loss_curve`, `validation_curve` (n_intervals,), evenly spread from its beginning to its end.
         """
         return read_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"))
 

@@ -9,18 +9,18 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import psutil
 
 from mor_bench import __version__
-from mor_bench.errors import InvalidInputError
+from mor_bench.errors import InvalidInputError, MissingDependencyError
 from mor_bench.harness.contestants import BUDGETS, checked_specs, jobs_of
 from mor_bench.harness.isolation import default_memory_limit_bytes
 from mor_bench.harness.nursery import CAN_FORK, Nursery
-from mor_bench.harness.on_dataset import EXTRA_SEEDS, DatasetRun, Listener, Settings, StopRunError
+from mor_bench.harness.on_dataset import SEEDS, DatasetRun, Listener, Settings, StopRunError
 from mor_bench.harness.results import Comparison
-from mor_bench.harness.timing import describe_machine
+from mor_bench.harness.timing import describe_machine, gpu_name
 from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import default_cache
 from mor_bench.specs import (
@@ -29,6 +29,9 @@ from mor_bench.specs import (
     MethodSpec,
     SplitBy,
 )
+from mor_bench.surrogate import Device, TrainingOptions
+
+MOST_SEEDS = 100
 
 
 def run(
@@ -44,6 +47,9 @@ def run(
     jobs: int = 1,
     cluster: str | None = None,
     test_seed: int | str | None = None,
+    device: Device = "cpu",
+    fit_seconds: float | None = None,
+    seeds: int | None = None,
     time_limit_s: float | None = None,
     memory_limit_bytes: float | None = None,
     retime: bool = False,
@@ -61,7 +67,7 @@ def run(
     `mor_bench.harness.discretisation.refine` left, and is not measured here.
 
     A full comparison also scores the dataset's named test sets (`mor_bench.snapshots.test_sets`), trains with other seeds,
-    and draws learning curves.
+    and draws learning curves. A training that was stopped goes on from its checkpoint in the cache, in this run or another.
 
     Parameters
     ----------
@@ -87,8 +93,15 @@ def run(
     test_seed : int or "fresh", optional
         Also score on a test set of the same distribution that this seed draws when all methods are fitted. A number can be
         repeated, and known to a method; "fresh" is drawn then, too, and recorded with the result.
+    device : {"cpu", "cuda", "auto"}
+        Of trainings; "auto" is a CUDA device if there is one. Queries are answered where they always are.
+    fit_seconds : float, optional
+        That each training is sized to, in the place of its knob `iterations`; the row says how many that came to. Other seeds and
+        the points of a learning curve train as many.
+    seeds : int, optional
+        Trainings of each configuration of a method with a knob `seed`: 1 in quick comparisons, 3 in full ones by default.
     time_limit_s : float, optional
-        Of all fits of a method on a dataset together: the tuning budget's seconds.
+        Of all fits of a method on a dataset together: the tuning budget's seconds. Other seeds are not counted.
     memory_limit_bytes : float, optional
         Of a method's process; three quarters of the machine's memory by default.
     retime : bool
@@ -117,14 +130,14 @@ def run(
     specs, method_specs = checked_specs(datasets, methods, profile, suite, cache, memory_limit_bytes)
     if test_seed is not None:
         _check_test_seed(test_seed, specs)
-    budget = BUDGETS[profile]
+    budget = replace(BUDGETS[profile], seconds=time_limit_s or BUDGETS[profile].seconds)
+    training = training_options(device, fit_seconds, budget.seconds)
     settings = Settings(
-        profile, limit, split, threads, workers, jobs, cluster, Path(cache or default_cache()),
-        replace(budget, seconds=time_limit_s or budget.seconds),
-        memory_limit_bytes or default_memory_limit_bytes(), test_seed, retime, fail_fast, listener,
+        profile, limit, split, threads, workers, jobs, cluster, Path(cache or default_cache()), budget,
+        memory_limit_bytes or default_memory_limit_bytes(), test_seed, training, checked_seeds(seeds, profile), retime, fail_fast, listener,
     )  # fmt: skip
     comparison = _open_run(Path(out) if out else _default_out([spec.name for spec in specs]), specs, method_specs, settings)
-    jobs_of_all = jobs_of(method_specs, profile)
+    jobs_of_all = jobs_of(method_specs, profile, training)
     with ExitStack() as stack:
         stack.enter_context(_alone(comparison.out))
         nursery = stack.enter_context(closing(Nursery(yielding=True))) if CAN_FORK else None
@@ -148,6 +161,42 @@ def _check(profile: str, threads: int, jobs: int, cores: int, time_limit_s: floa
         raise InvalidInputError(f"`memory_limit_bytes` must be at least 1e8, which a process takes without a method; got {memory_limit_bytes:g}.")
 
 
+def training_options(device: Device, fit_seconds: float | None, budget_s: float = float("inf")) -> TrainingOptions:
+    """Device and seconds of trainings, checked; "auto" is decided here, so that a fit's record says where it was trained.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no such device, or the seconds are not above 0 and below the budget of all fits of a method.
+    """
+    if device not in get_args(Device):
+        raise InvalidInputError(f"`device` must be one of {', '.join(get_args(Device))}; got {device!r}.")
+    if fit_seconds is not None and not 0 < fit_seconds < budget_s:
+        most = "" if budget_s == float("inf") else f" and below {budget_s:g}, the seconds of all fits of a method together"
+        raise InvalidInputError(f"`fit_seconds` must be above 0{most}; got {fit_seconds:g}.")
+    options = TrainingOptions(device, fit_seconds)
+    if device != "cpu":
+        options = replace(options, device=_device_here(options))
+    return options
+
+
+def _device_here(options: TrainingOptions) -> Device:
+    try:
+        from mor_bench.learning.training import device_of
+    except ImportError:
+        if options.device == "auto":
+            return "cpu"
+        raise MissingDependencyError("`device`: training on a graphics processor needs PyTorch: pip install 'mor-bench[learn]'.") from None
+    return "cuda" if device_of(options).type == "cuda" else "cpu"
+
+
+def checked_seeds(seeds: int | None, profile: str) -> int:
+    """How many trainings each configuration has."""
+    if seeds is not None and not 1 <= seeds <= MOST_SEEDS:
+        raise InvalidInputError(f"`seeds` must be an integer in [1, {MOST_SEEDS}]; got {seeds}.")
+    return seeds or SEEDS[profile]
+
+
 def _check_test_seed(test_seed: int | str, specs: Sequence[AnyDatasetSpec]) -> None:
     for spec in specs:
         if isinstance(spec, ImportedDatasetSpec):
@@ -168,14 +217,16 @@ def _open_run(out: Path, specs: Sequence[AnyDatasetSpec], methods: Sequence[Meth
     said = {
         "profile": settings.profile, "split": settings.split, "limit": settings.limit, "threads": settings.threads, "test_seed": settings.test_seed,
         "budget": {"configurations": settings.budget.configurations, "seconds": settings.budget.seconds},
-        "seeds": 1 + (EXTRA_SEEDS if settings.profile == "full" else 0), "device": "cpu", "version": __version__,
+        "seeds": settings.seeds, "device": settings.training.device, "version": __version__,
+        **({} if settings.training.fit_seconds is None else {"fit_seconds": settings.training.fit_seconds}),
     }  # fmt: skip
     if (out / "results.json").exists():
         comparison = Comparison.read(out)
         if comparison.settings != said or any(datasets.get(name) != spec for name, spec in comparison.datasets.items()):
             raise InvalidInputError(f"{out} holds a run with other settings or datasets; choose another folder or remove it.")
     else:
-        comparison = Comparison(out, describe_machine(), settings=said)
+        gpu = {"gpu": gpu_name()} if settings.training.device == "cuda" else {}
+        comparison = Comparison(out, {**describe_machine(), **gpu}, settings=said)
     comparison.methods |= {method.name: method.model_dump(mode="json", exclude={"folder"}) for method in methods}
     try:
         comparison.write()

@@ -37,6 +37,13 @@ def _processor() -> str:
         return platform.processor() or platform.machine()
 
 
+def gpu_name() -> str:
+    """Of the CUDA device that trains."""
+    import torch
+
+    return str(torch.cuda.get_device_name(0))
+
+
 def describe_machine() -> dict[str, Any]:
     """Processor, cores, memory, load over the last 1, 5 and 15 minutes, system and the versions that timings depend on."""
     versions = {}

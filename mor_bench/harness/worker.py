@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from mor_bench.harness.stress.case import Case, Subject
     from mor_bench.scene.scene import Scene
     from mor_bench.specs import MethodSpec
-    from mor_bench.surrogate import Surrogate
+    from mor_bench.surrogate import Surrogate, TrainingOptions
 
 SETTLE_QUERIES = 3
 """Untimed queries before each round, after which the caches are the method's own again."""
@@ -40,6 +40,9 @@ CHECKED_ANSWERS, CHECKED_SHARE = 4, 0.2
 
 UNANSWERED = object()
 """Stands for the answer to a query under which the method finds no equilibrium."""
+
+CURVES = ("loss_curve", "validation_curve")
+"""What a trained method tells of its training, with an underscore behind."""
 
 WARM_UP_QUERIES = 20
 WARM_UP_S = 2.0
@@ -52,16 +55,22 @@ FILE_EVENTS = (
 )  # fmt: skip
 
 
-def seal(folders: list[str]) -> None:
+def seal(folders: list[str], open_one: str | None = None) -> None:
     """Keep this process out of folders: those of datasets and results, which hold what the method must predict.
+
+    One folder within them may stay open: there a training keeps its checkpoint.
 
     It stops Python's usual ways to a file and the launching of programs: what a method does by mistake, or half by mistake.
     It does not stop one that attacks the machine.
     """
     prefixes = tuple(os.path.realpath(folder) + os.sep for folder in folders)
+    exempt = None if open_one is None else os.path.realpath(open_one) + os.sep
 
     def check(path: object) -> None:
-        if isinstance(path, str | bytes | os.PathLike) and (os.path.realpath(os.fsdecode(path)) + os.sep).startswith(prefixes):
+        if not isinstance(path, str | bytes | os.PathLike):
+            return
+        real = os.path.realpath(os.fsdecode(path)) + os.sep
+        if real.startswith(prefixes) and not (exempt and real.startswith(exempt)):
             raise PermissionError(f"{os.fsdecode(path)}: a method may not look at datasets and results while it is compared.")
 
     def refuse(event: str, arguments: tuple[Any, ...]) -> None:
@@ -109,10 +118,10 @@ class Session:
     subject: Subject
     concerning: list[tuple[Case, str | None]]
 
-    def begin(self, path: list[str], scene: Scene, sealed: list[str]) -> dict[str, Any]:
-        """Take over the parent's import path and keep out of some folders."""
+    def begin(self, path: list[str], scene: Scene, sealed: list[str], open_one: str | None) -> dict[str, Any]:
+        """Take over the parent's import path and keep out of some folders but for one within them."""
         self.scene = scene
-        seal(sealed)
+        seal(sealed, open_one)
         sys.path[:] = path
         return {}
 
@@ -142,7 +151,8 @@ class Session:
         return {"row": asdict(attempt(case, self.subject, missing))}
 
     def fit(
-        self, surrogate: str, parameters: dict[str, Any], train: Path, model: Path, threads: int, limit_s: float
+        self, surrogate: str, parameters: dict[str, Any], train: Path, model: Path, threads: int, limit_s: float,
+        training: TrainingOptions | None = None,
     ) -> dict[str, Any]:  # fmt: skip
         """Fit on the snapshots of a folder and save."""
         from mor_bench.harness.handover import read_snapshots
@@ -152,6 +162,8 @@ class Session:
 
         method = make_surrogate(load_class(surrogate), parameters)
         method.time_limit_s = limit_s
+        if training is not None:
+            method.training = training
         with pinned_threads(threads):
             snapshots = read_snapshots(train, self.scene) if method.needs_snapshots else None
             start = perf_counter()
@@ -170,6 +182,7 @@ class Session:
             "needs_snapshots": method.needs_snapshots,
             "parameters": method.parameters,
             "sizes": getattr(method, "sizes_", {}),
+            "training": _told_of_training(method),
         }
 
     def load(self, surrogate: str, model: Path) -> dict[str, Any]:
@@ -310,6 +323,17 @@ class Session:
                 expected = (perf_counter() - start) / n
                 rates[str(size)] = 1 / expected
         return {"throughput": rates}
+
+
+def _told_of_training(method: Surrogate) -> dict[str, Any] | None:
+    """The iterations and loss curves of a method that has trained; None of others, or where they are no numbers."""
+    try:
+        told: dict[str, Any] = {name: [float(loss) for loss in getattr(method, f"{name}_", ())] for name in CURVES}
+        iterations = getattr(method, "iterations_", None)
+        told["iterations"] = None if iterations is None else int(iterations)
+    except (TypeError, ValueError):
+        return None
+    return told if told["loss_curve"] or iterations is not None else None
 
 
 class _CollectorClock:

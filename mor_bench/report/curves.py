@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from mor_bench.harness.results import Comparison
-from mor_bench.report.canvas import INK, Drawn, Style, dress, new_figure, plain, save, shortened
+from mor_bench.report.canvas import COLOURS, INK, Drawn, Style, dress, new_figure, plain, save, shortened
 from mor_bench.report.details import profile_note
 
 ALL = "all datasets"
@@ -56,6 +56,52 @@ def learning_curves(comparison: Comparison, dataset: str, styles: dict[str, Styl
     if left_out:
         caption += f" {left_out} {'fit' if left_out == 1 else 'fits'} without a finite error cannot be shown."
     return Drawn(dataset, path, "Learning curves", caption)
+
+
+def loss_curves(comparison: Comparison, dataset: str, styles: dict[str, Style]) -> Drawn | None:
+    """Loss over the course of the training, a panel per method and a colour per configuration; None where nothing was trained.
+
+    Validation is dashed. What the losses of different methods measure differs, so that each has its own axis.
+    """
+    curves: dict[str, list[tuple[str, dict[str, Any]]]] = {}
+    for row in comparison.rows:
+        if row["dataset"] == dataset and row["status"] == "ok" and row.get("training"):
+            samples = comparison.samples(row)
+            if len(samples.get("loss_curve", ())):
+                swept = row["label"].removeprefix(row["method"]).strip() or row["method"]
+                iterations = row["training"].get("iterations")
+                name = swept if iterations is None else f"{swept}, {iterations:,} iterations"
+                curves.setdefault(row["method"], []).append((name, samples))
+    if not curves:
+        return None
+    n_columns = min(2, len(curves))
+    n_rows = -(-len(curves) // n_columns)
+    figure = new_figure(0.6 + 3.4 * n_rows)
+    panels = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
+    for axes in panels[len(curves) :]:
+        axes.set_visible(False)
+    validated = False
+    for axes, (method, trained) in zip(panels, curves.items(), strict=False):
+        dress(axes)
+        for i, (label, samples) in enumerate(trained):
+            colour = COLOURS[i % len(COLOURS)]
+            for name, line in (("loss_curve", "-"), ("validation_curve", "--")):
+                losses = np.asarray(samples.get(name, ()), dtype=float)
+                shown = np.isfinite(losses) & (losses > 0)
+                x = 100 * np.arange(1, len(losses) + 1) / max(len(losses), 1)
+                alone = "o" if shown.sum() == 1 else ""
+                named = plain(shortened(label, 50)) if line == "-" else None
+                axes.plot(x[shown], losses[shown], line, marker=alone, color=colour, linewidth=1.3, label=named)
+                validated |= name == "validation_curve" and bool(shown.any())
+        axes.set_yscale("log")
+        axes.set_xlabel("part of the training (%)")
+        axes.set_ylabel("loss")
+        axes.set_title(plain(method), loc="left", fontsize=11, color=INK)
+        axes.legend(fontsize=8, frameon=False)
+    figure.suptitle(plain(f"Loss curves – {dataset}"), x=0.01, ha="left", fontsize=13, color=INK)
+    path = save(figure, comparison, dataset, "loss-curves")
+    caption = "Training loss from the beginning to where the training ended, in the method's own units, which no other method shares."
+    return Drawn(dataset, path, "Loss curves", caption + (" Dashed: of the samples that were held out of the training." if validated else ""))
 
 
 def performance_profile(comparison: Comparison, analysis: Mapping[str, Any], styles: dict[str, Style]) -> Drawn | None:

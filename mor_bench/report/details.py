@@ -11,6 +11,7 @@ from mor_bench.harness.results import Comparison
 from mor_bench.report.paper import Grid, error_measures, same_error, same_time
 from mor_bench.report.summary import Entry, entries_of, metres, needs_of, number, percent, size_of, span
 from mor_bench.report.tables import PAIRWISE_LEGEND, pairwise_cells
+from mor_bench.report.trained import out_of_range, seeds, training
 
 FACTORS = (1.0, 1.5, 2.0, 5.0, 10.0, 100.0)
 """Columns of the performance profile's table."""
@@ -29,6 +30,9 @@ def dataset_details(comparison: Comparison, dataset: str, analysis: Mapping[str,
         resources(entries),
         indicated(entries),
         test_sets(entries),
+        out_of_range(entries),
+        training(entries),
+        seeds(entries),
         hidden(dataset, entries, analysis),
         tuning(dataset, analysis),
         error_measures(dataset, entries),

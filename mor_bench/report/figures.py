@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mor_bench.harness.results import Comparison
 from mor_bench.report.canvas import GREY, INK, LIGHT, Drawn, Note, Style, annotate, dress, new_figure, plain, save, shortened, styles_of
-from mor_bench.report.curves import learning_curves, performance_profile
+from mor_bench.report.curves import learning_curves, loss_curves, performance_profile
 from mor_bench.report.deformed import worst_samples
 from mor_bench.report.summary import Entry, best_per_method, dataset_names, entries_of, needs_of, number, percent, short_names_used, short_swept
 
@@ -45,7 +45,7 @@ def write_figures(comparison: Comparison, analysis: Mapping[str, Any]) -> list[D
     drawn: list[Drawn | None] = []
     for dataset in dataset_names(comparison):
         drawn.append(error_against_time(comparison, dataset, styles, analysis))
-        for draw in (learning_curves, error_against_amplitude, worst_samples, singular_values):
+        for draw in (learning_curves, loss_curves, error_against_amplitude, worst_samples, singular_values):
             drawn.append(draw(comparison, dataset, styles))
     drawn.append(performance_profile(comparison, analysis, styles))
     return [figure for figure in drawn if figure is not None]

@@ -18,6 +18,7 @@ from mor_bench.harness.results import Comparison
 from mor_bench.report.summary import (
     Entry,
     basis_of,
+    best_per_method,
     dataset_names,
     discretisation_error,
     entries_of,
@@ -32,6 +33,7 @@ from mor_bench.report.summary import (
     span,
     warnings_of,
 )
+from mor_bench.report.trained import out_of_range
 
 if TYPE_CHECKING:
     from mor_bench.harness.plan import Plan
@@ -81,6 +83,12 @@ def _latency(entry: Entry) -> str:
     return number(entry.figure("latency_ms", "median")) + ("~" if entry.unstable else "")
 
 
+def _over_seeds(entry: Entry, name: str, shown: Callable[[float | None], str]) -> str:
+    """Range over the seeds of the training; one that failed is infinite."""
+    spread = (entry.row.get("seeds") or {}).get(name)
+    return f"{shown(spread['min'])}–{shown(spread['max'])}" if spread else "–"
+
+
 def _megabytes(value: float | None) -> str:
     return number(None if value is None else value / 1e6)
 
@@ -97,6 +105,8 @@ COLUMNS = (
     Column("\np95", lambda e: number(e.figure("latency_ms", "p95")), 8),
     Column("\np99", lambda e: number(e.figure("latency_ms", "p99")), 5),
     Column("all\nthr", lambda e: number(e.figure("all_threads_ms", "median")), 3),
+    Column("seeds\nmed %", lambda e: _over_seeds(e, "rel_l2_median", percent), 7),
+    Column("seeds\nē m", lambda e: _over_seeds(e, "mean_dof_m", metres), 5),
     Column("q/s\nby 64", lambda e: number(e.figure("throughput", "64")), 4),
     Column("fit\ns", lambda e: number(e.figure("offline_s", "fit")), 6),
     Column("mem\nMB", lambda e: _megabytes(e.figure("memory_bytes", "predict")), 3),
@@ -255,6 +265,21 @@ def _pairwise_parts(comparison: Comparison, dataset: str, analysis: Analysis) ->
     return [Text(""), Text(f"Who is faster at {percent(error)} %, the error that is needed", style="bold"), table, Text(legend, style="dim")]
 
 
+def _out_of_range_parts(entries: Sequence[Entry]) -> list[RenderableType]:
+    """Errors, flags and their recall on the named test sets, of the best configuration of each method that learns."""
+    best = {entry.label for entry in best_per_method(entries)}
+    grid = out_of_range([entry for entry in entries if entry.label in best and entry.row.get("sets")])
+    if grid is None:
+        return []
+    table = Table(box=SIMPLE_HEAD, padding=0, show_edge=False)
+    for i, heading in enumerate(grid.headings):
+        table.add_column(heading, justify="right" if i else "left", overflow="fold")
+    for row in grid.rows:
+        table.add_row(*map(Text, row))
+    title = "Out of range: does the best configuration of each method that learns say so where its error is large?"
+    return [Text(""), Text(title, style="bold"), table, Text(grid.note, style="dim")]
+
+
 def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: Analysis) -> Group:
     entries, needs = entries_of(comparison, dataset, analysis), needs_of(comparison, dataset)
     title = str(comparison.datasets.get(dataset, {}).get("title", ""))
@@ -284,6 +309,7 @@ def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: A
     said = [basis_of(dataset, analysis), short_names_used(entries), "Nothing is extrapolated."]
     parts.append(Text("  ".join(filter(None, said)), style="dim"))
     parts += _pairwise_parts(comparison, dataset, analysis)
+    parts += _out_of_range_parts(entries)
     parts += [Text(""), Text(headline(comparison, dataset), style="bold"), Text("")]
     return Group(*parts)
 

@@ -88,9 +88,9 @@ def write_atomically(path: Path, content: bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files whose writers were killed; those of processes that live are left to them."""
-    for path in folder.glob(".*.tmp"):
+def remove_leftovers(folder: Path, of: str = "*") -> None:
+    """Remove temporary files, of all or of one name, whose writers were killed; those of processes that live are left to them."""
+    for path in folder.glob(f".{of}.*.tmp"):
         with suppress(FileNotFoundError):  # another process is tidying up too
             if _writer_is_dead(path) or time.time() - path.stat().st_mtime > STALE_AFTER_S:
                 path.unlink()

@@ -87,6 +87,10 @@ class Autoencoder(Surrogate):
     def supports(self, scene: Scene) -> str | None:
         return unknown_equations(scene)
 
+    @classmethod
+    def trains(cls) -> bool:
+        return False  # three small networks in a loop of their own, on the processor
+
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             snapshots = self._checked_snapshots(snapshots)
