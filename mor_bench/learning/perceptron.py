@@ -98,7 +98,8 @@ def checked(state: dict[str, Array], prefix: str, n_inputs: int, n_hidden: int, 
 def _shapes(n_inputs: int, n_hidden: int, n_outputs: int) -> list[tuple[int, ...]]:
     """Of the weights (inputs, outputs) and biases."""
     layers = pairwise((n_inputs, n_hidden, n_hidden, n_outputs))
-    return [shape for n, m in layers for shape in ((n, m), (m,))][:-1]
+    shapes: list[tuple[int, ...]] = [shape for n, m in layers for shape in ((n, m), (m,))]
+    return shapes[:-1]
 
 
 def _silu(x: Array) -> Array:

@@ -47,10 +47,12 @@ class DeepONetNetwork(FieldNetwork):
     def basis(self) -> Tensor:
         """(n_functions, n_dofs) values of the functions at the nodes."""
         if self.functions is not None:
-            return self.functions
+            functions: Tensor = self.functions
+            return functions
         assert self.trunk is not None
         values: Tensor = self.trunk(self.positions)  # (n_nodes, 3 n_functions)
-        return values.view(-1, self.n_functions).T * self.n_functions**-0.5
+        scaled: Tensor = values.view(-1, self.n_functions).T * self.n_functions**-0.5
+        return scaled
 
     def encode(self, fields: Tensor) -> Tensor:
         return fields.flatten(1) @ self.axes

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.learning.training import Training, TrainingPlan, device_of, fingerprint_of, train
+from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -95,7 +96,7 @@ class FieldSurrogate(Surrogate):
         with self._fitting(scene):
             samples = self._checked_snapshots(snapshots)
             if self.input == "linear-response":
-                self.model_ = FullOrderModel(scene)
+                self.compliance_ = Compliance(FullOrderModel(scene))
                 inputs = self._linear_response(samples.forces)
                 targets = samples.displacements - inputs
             else:
@@ -129,7 +130,8 @@ class FieldSurrogate(Surrogate):
         def loss(rows: Tensor) -> Tensor:
             at_rest = rows.new_full((1,), len(targets))
             answers = network(features[torch.cat([rows, at_rest])])
-            return ((answers[:-1] - answers[-1:]) * free - targets[rows]).square().mean()
+            errors: Tensor = (answers[:-1] - answers[-1:]) * free - targets[rows]
+            return errors.square().mean()
 
         plan = TrainingPlan(self.iterations, self.batch_size, self.learning_rate, second_moment_decay=SECOND_MOMENT_DECAY)
         return train(network, loss, len(targets), plan, generator, self.training, self.time_limit_s, fingerprint)
@@ -151,7 +153,7 @@ class FieldSurrogate(Surrogate):
         if counting.running is not None:  # with one scaling of each input and each output
             counting.running.add(multiply_adds=len(batch) * (self.network_.multiply_adds + 2 * self.scene_.mesh.n_dofs))
         inputs = self._linear_response(batch) if self.input == "linear-response" else batch
-        answers = [self.network_(self.network_.encode(chunk)) for chunk in _single(inputs / self.input_scale_).split(PREDICTION_CHUNK)]
+        answers = [self.network_(self.network_.encode(chunk)) for chunk in torch.split(_single(inputs / self.input_scale_), PREDICTION_CHUNK)]
         learned = (torch.cat(answers) - self._at_rest).to(torch.float64).numpy() * self.output_scale_
         out = inputs + learned if self.input == "linear-response" else learned
         out[:, self.scene_.fixed_nodes] = 0.0
@@ -160,10 +162,7 @@ class FieldSurrogate(Surrogate):
 
     def _linear_response(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """K₀⁻¹f, (n, n_nodes, 3) m of forces (n, n_nodes, 3) N."""
-        flat = np.zeros((len(forces), self.scene_.mesh.n_dofs))
-        free = self.scene_.free_dofs
-        flat[:, free] = self.model_.rest_factor.solve(forces.reshape(len(forces), -1)[:, free].T).T
-        return flat.reshape(forces.shape)
+        return self.compliance_.respond(forces.reshape(len(forces), self.scene_.mesh.n_dofs)).reshape(forces.shape)
 
     def _finish(self, network: FieldNetwork) -> None:
         self.network_ = network.eval().requires_grad_(False)
@@ -196,9 +195,16 @@ class FieldSurrogate(Surrogate):
             raise InvalidInputError("the weights do not fit the network.")
         network.load_state_dict(weights, assign=True)
         if self.input == "linear-response":
-            self.model_ = FullOrderModel(self.scene_)
-            _ = self.model_.rest_factor
+            self.compliance_ = Compliance(FullOrderModel(self.scene_))
         self._finish(network)
+
+
+class SelfInitialised(ABC, nn.Module):
+    """A layer that `initialise` knows nothing of."""
+
+    @abstractmethod
+    def initialise(self, generator: torch.Generator) -> None:
+        """Give all weights values, from the given generator only."""
 
 
 def perceptron(*widths: int) -> nn.Sequential:
@@ -226,7 +232,7 @@ def initialise(network: nn.Module, generator: torch.Generator) -> None:
         if isinstance(layer, nn.Linear):
             nn.init.normal_(layer.weight, std=layer.in_features**-0.5, generator=generator)
             nn.init.zeros_(layer.bias)
-        elif layer is not network and hasattr(layer, "initialise"):
+        elif isinstance(layer, SelfInitialised):
             layer.initialise(generator)
 
 

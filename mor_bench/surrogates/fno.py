@@ -13,14 +13,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mor_bench.scene.grid import grid_map
-from mor_bench.surrogates.field_network import Arrays, FieldNetwork, FieldSurrogate, Input, linear, n_products, perceptron
+from mor_bench.surrogates.field_network import Arrays, FieldNetwork, FieldSurrogate, Input, SelfInitialised, linear, n_products, perceptron
 from mor_bench.surrogates.umesh.grid import PaddedGrid, padded_grid
 
 PADDING = 4
 """A side of n points gets n / PADDING more, rounded up, so that the circular convolutions do not join opposite ends of the body."""
 
 
-class SpectralConvolution(nn.Module):
+class SpectralConvolution(SelfInitialised):
     """A matrix of channels for each of the lowest wave numbers: (x, y, z, n, c) → (x, y, z, n, c).
 
     A circular convolution with a smooth real kernel, by a discrete Fourier transform along one axis after another, each a
@@ -138,9 +138,7 @@ class FNO(FieldNetwork):
     def multiply_adds(self) -> int:
         points = prod(self.grid.shape)
         padded = prod(n + -(-n // PADDING) for n in self.grid.shape)
-        layers = sum(
-            padded * n_products(pointwise) + spectral.multiply_adds for pointwise, spectral in zip(self.pointwise, self.spectral, strict=True)
-        )
+        layers = padded * n_products(self.pointwise) + sum(layer.multiply_adds for layer in self.spectral if isinstance(layer, SpectralConvolution))
         return points * (n_products(self.lift) + n_products(self.project)) + layers + self.grid.multiply_adds
 
 

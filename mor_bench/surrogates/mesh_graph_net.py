@@ -182,7 +182,7 @@ class GraphNetwork(FieldNetwork):
     @property
     def multiply_adds(self) -> int:
         n_nodes, n_edges = len(self.fixed), self.graph.n_edges
-        steps = sum(step.multiply_adds(n_edges, n_nodes) for step in self.steps)
+        steps = sum(step.multiply_adds(n_edges, n_nodes) for step in self.steps if isinstance(step, MessagePassing))
         return n_nodes * (n_products(self.node_encoder) + n_products(self.decoder)) + steps
 
 

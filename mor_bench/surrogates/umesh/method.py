@@ -291,7 +291,7 @@ class UMesh(Surrogate):
 
         with torch.inference_mode():
             at_rest = self._answer(torch.zeros(1, self.scene_.mesh.n_nodes, 3)).numpy()[0] if self.zero_at_rest else None
-        response = self.model_ if self.input == "linear-response" else None
+        response = self.compliance_ if self.input == "linear-response" else None
         return umesh_graph(self.scene_, self.grid_, self.network_, self.input_scale_, self.output_scale_, at_rest, response)
 
     def _state(self) -> dict[str, NDArray[Any]]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import UnavailableBackendError
 from mor_bench.learning.onnx_graph import GraphBuilder
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.compliance import Compliance
 from mor_bench.scene.scene import Scene
 from mor_bench.surrogates.umesh.grid import SMALLEST_SHARE, PaddedGrid
 from mor_bench.surrogates.umesh.network import UNet
@@ -30,7 +30,7 @@ def umesh_graph(
     input_scale: float,
     output_scale: float,
     at_rest: NDArray[np.float32] | None,
-    response: FullOrderModel | None,
+    response: Compliance | None,
 ) -> onnx.ModelProto:
     """`UMesh.predict` in float32, scaling included; supports are zero.
 
@@ -38,8 +38,8 @@ def umesh_graph(
     ----------
     at_rest : (n_nodes, 3), optional
         What is taken off every answer of the network, scaled.
-    response : FullOrderModel, optional
-        The network is given the linear response of this model and answers with the rest of the displacement.
+    response : Compliance, optional
+        The network is given this linear response and answers with the rest of the displacement.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def umesh_graph(
             )
         compliance = np.zeros((n_dofs, n_dofs), dtype=np.float32)
         free = scene.free_dofs
-        compliance[np.ix_(free, free)] = response.rest_factor.solve(np.eye(len(free)))
+        compliance[np.ix_(free, free)] = response.solve(np.eye(len(free)))
         flat = graph.add("Reshape", "forces", graph.constant(np.array([-1, n_dofs])))
         solved = graph.add("MatMul", flat, graph.constant(compliance.T))
         given = graph.add("Reshape", solved, graph.constant(np.array([-1, n_nodes, 3])))
