@@ -17,6 +17,8 @@ several-forces    1         .995        .995      .976
 ================= ========= =========== ========= =================
 
 Of `2x` and `4x` exactly the loads larger than training's are flagged; the others are loads of the training distribution.
+In a scene with observed nodes their displacements, m, stand everywhere in the place of the forces.
+
 The strangeness of loads in range reaches 5.9, 8.7, 7.1 and 1.0, that of unseen regions is 94 to 100 everywhere, and that of
 unseen directions on the liver has the 5th percentile 10 and the median 44; `MOST_STRANGE` lies between. Smaller loads than
 training's, and pushing where training only pulled, are not seen.
@@ -145,7 +147,10 @@ class LoadRange:
 
 def _chunks(snapshots: Snapshots) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
     """Nodes (n_loaded,), and the forces on them (n, n_loaded, 3), N, of some samples after the other."""
-    loads = snapshots.loads
+    loads, observed = snapshots.loads, snapshots.scene.observed_nodes
+    if observed is not None:
+        yield observed, snapshots.inputs[:, observed]
+        return
     for start in range(0, len(loads), CHUNK):
         some = loads[start : start + CHUNK]
         if isinstance(some, PatchLoads):

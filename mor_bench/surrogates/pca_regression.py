@@ -11,7 +11,8 @@ from pydantic import Field
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.model import FullOrderModel, unknown_equations
+from mor_bench.mechanics.model import unknown_equations
+from mor_bench.mechanics.observed import forward_model
 from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -43,6 +44,9 @@ class PCARegression(Surrogate):
 
     With the linear response as input, u = K₀⁻¹f + Φ W p(z): z are coordinates of the linear response K₀⁻¹f, p their
     monomials, and only the nonlinear rest is learned; the response to any force is at least that of linear elasticity.
+    In a scene with observed nodes their displacements take the place of the force, and the linear extension of these that of
+    the linear response.
+
     With the force as input, u = Φ W p(z) with z the coordinates of the force itself: between load regions that share no
     training sample this learns nothing.
 
@@ -60,6 +64,8 @@ class PCARegression(Surrogate):
         Tikhonov weight relative to the mean squared feature, with features scaled to unit root mean square.
     """
 
+    takes_observations = True
+
     def __init__(
         self,
         input: Literal["linear-response", "force"] = "linear-response",
@@ -75,16 +81,16 @@ class PCARegression(Surrogate):
         self.ridge = ridge
 
     def supports(self, scene: Scene) -> str | None:
-        return unknown_equations(scene) if self.input == "linear-response" else None
+        return unknown_equations(scene, observed=True) if self.input == "linear-response" else None
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         from sklearn.linear_model import Ridge
 
         with self._fitting(scene):
             snapshots = self._checked_snapshots(snapshots)
-            forces, targets = snapshots.free_forces, snapshots.free_displacements
+            forces, targets = snapshots.free_inputs, snapshots.free_displacements
             if self.input == "linear-response":
-                inputs = FullOrderModel(scene).rest_factor.solve(forces.T).T
+                inputs = forward_model(scene).linear_response(forces)
                 targets = targets - inputs
             else:
                 inputs = forces
@@ -109,7 +115,7 @@ class PCARegression(Surrogate):
             monomial_products = self.weights_.shape[1] - self.axes_.shape[1]
             products = self.axes_.size + monomial_products + self.weights_.size + self.modes_.size
             counting.running.add(multiply_adds=len(batch) * products)
-        inputs = self.model_.rest_factor.solve(free.T).T if self.input == "linear-response" else free
+        inputs = self.model_.linear_response(free) if self.input == "linear-response" else free
         nonlinear = (monomials(inputs @ self.axes_, self._levels) @ self.weights_.T) @ self.modes_.T
         out[:, self.scene_.free_dofs] = inputs + nonlinear if self.input == "linear-response" else nonlinear
         return out.reshape(np.shape(forces))
@@ -128,5 +134,4 @@ class PCARegression(Surrogate):
         self.axes_, self.modes_, self.weights_ = state["axes"], state["modes"], state["weights"]
         self._levels = monomial_indices(n_axes, self.degree)
         if self.input == "linear-response":
-            self.model_ = FullOrderModel(self.scene_)
-            _ = self.model_.rest_factor
+            self.model_ = forward_model(self.scene_)
