@@ -163,13 +163,15 @@ class Surrogate(ABC):
             Before `fit`.
         UnknownRangeError
             If the method learns but its range is not known: its `fit` does not check its snapshots by `_checked_snapshots`,
-            or it was loaded from a file that was written before ranges were.
+            or it was loaded from a file that was written before ranges were; and where it is given displacements, not loads.
         """
         batch = self._checked_forces(forces)
         if not self.needs_snapshots:
             flags = np.zeros(len(batch), dtype=bool)
         elif hasattr(self, "range_"):
             flags = self.range_.excludes(batch)
+        elif self.scene_.observed_nodes is not None:
+            raise UnknownRangeError(f"{self.scene_.name}: which loads are like those of training cannot be told: {NO_FORCES}.")
         else:
             raise UnknownRangeError(
                 f"the loads that this {type(self).__name__} was trained on are not known: its `fit` does not check them by `_checked_snapshots`, "
@@ -291,7 +293,8 @@ class Surrogate(ABC):
             )
         if not np.isfinite(displacements).all() or not np.isfinite(vectors).all():
             raise InvalidInputError("the training snapshots hold NaN or infinity.")
-        self.range_ = LoadRange.of(snapshots)
+        if self.scene_.observed_nodes is None:
+            self.range_ = LoadRange.of(snapshots)
         return snapshots
 
     def _checked_forces(self, forces: ArrayLike) -> NDArray[np.float64]:

@@ -22,6 +22,7 @@ SHIPPED = {
     "beam-nearly-incompressible": (135, 256, 64, 3200),
     "block-compression": (216, 343, 49, 1960),
     "liver-hex": (726, 1118, 200, 2000),
+    "liver-hex-observed": (726, 1118, 200, 2000),
     "liver-tet": (4567, 1118, 200, 2000),
 }
 
@@ -40,6 +41,7 @@ CONFIGURATIONS = {
     "autoencoder": 2, "local-pod": 6, "modal-derivatives": 4, "quadratic-manifold": 6,
     "explicit-dynamics": 4, "pgd": 6, "pgd-force": 3,
     "deim": 6, "ecm": 6,
+    "gappy-pod": 6,
 }  # fmt: skip
 
 

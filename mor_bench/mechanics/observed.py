@@ -188,7 +188,7 @@ class ObservedModel:
             The tolerance is that of the forces left on hidden dofs, relative to those that hold the observed ones in the state
             that the solve starts from, the linear response.
         """
-        return [self._solved(response, options) for response in self.linear_response(observed)]
+        return [self._solved(self.linear_response(row[None])[0], options) for row in observed]
 
     def _solved(self, response: Array, options: NewtonOptions) -> Solution | SolverError:
         """From the linear response; where that fails, by and by from rest."""
