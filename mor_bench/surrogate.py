@@ -6,7 +6,7 @@ import hashlib
 import inspect
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,12 +55,15 @@ class TrainingOptions:
         the same bits as one that was never stopped; it is removed at the end.
     start_from : Path or None
         A model saved by `Surrogate.save`, whose fitting weights the training starts from.
+    progress : callable or None
+        Called now and then with the iterations done, all, and the loss.
     """
 
     device: Literal["auto", "cpu", "cuda"] = "cpu"
     fit_seconds: float | None = None
     checkpoint: Path | None = None
     start_from: Path | None = None
+    progress: Callable[[int, int, float], None] | None = None
 
 
 class Surrogate(ABC):
@@ -382,6 +385,23 @@ def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surroga
     if header.get("surrogate") != expected:
         raise StoreError(f"{path}: a model of class {header.get('surrogate')!r}; expected {expected!r}.")
     return _fitted(path, surrogate, scene, header, state)
+
+
+def weights_to_start_from(path: str | Path, surrogate: type[Any]) -> dict[str, NDArray[Any]]:
+    """The arrays of a saved model of the same class, on whatever scene it was trained.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing, damaged or of a newer schema.
+    InvalidInputError
+        If it is of another class.
+    """
+    header, state = _read_model(path)
+    expected = f"{surrogate.__module__}:{surrogate.__qualname__}"
+    if header.get("surrogate") != expected:
+        raise InvalidInputError(f"{path}: `start_from` must be a model of class {expected!r}; got one of {header.get('surrogate')!r}.")
+    return state
 
 
 def _read_model(path: str | Path) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:

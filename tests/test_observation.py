@@ -35,6 +35,7 @@ CAN = {
     "pca-regression": {"n_input_modes": 10},
     "pca-regression-force": {},
     "umesh": CHEAP["umesh"],
+    "umesh-linear": CHEAP["umesh-linear"],
     "umesh-small": CHEAP["umesh-small"],
 }
 """The methods that can be given displacements, with knobs that keep a costly one short."""

@@ -37,7 +37,7 @@ def test_every_shipped_dataset_is_pinned_to_its_counts() -> None:
 
 CONFIGURATIONS = {
     "fem": 4, "fem-coarse": 4, "fem-jacobi-pcg": 1, "fem-pardiso": 1, "fem-warm": 8, "hpod": 6, "hybrid": 6, "linear-fem": 1,
-    "pca-regression": 3, "pca-regression-force": 1, "pod": 7, "pod-tensor": 5, "umesh": 1, "umesh-small": 2,
+    "pca-regression": 3, "pca-regression-force": 1, "pod": 7, "pod-tensor": 5, "umesh": 1, "umesh-small": 2, "umesh-linear": 2,
     "autoencoder": 2, "local-pod": 6, "modal-derivatives": 4, "quadratic-manifold": 6,
     "explicit-dynamics": 4, "pgd": 6, "pgd-force": 3,
     "deim": 6, "ecm": 6,

@@ -111,6 +111,7 @@ RACES = (
     Race("liver-hex-observed", "gappy-pod", {"n_modes": 20}, "fem", 5.0, 0.3),  # MEASURE
     Race("l-shape", "umesh", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 66, 0.56 after so short a training
     Race("l-shape", "umesh-small", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 83, 0.55
+    Race("l-shape", "umesh-linear", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.05),
 )
 """Every method of the suite against its baseline; a new one adds a line."""
 

@@ -85,6 +85,7 @@ CONCERNED = {
     "pgd": ANY | LEARNERS,
     "pgd-force": ANY | LEARNERS,
     "umesh-small": ANY | LEARNERS,
+    "umesh-linear": ANY | LEARNERS,
     "gappy-pod": ANY | LEARNERS,
 }
 

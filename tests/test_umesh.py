@@ -19,14 +19,16 @@ from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import load_dataset_spec
-from mor_bench.surrogate import Surrogate
+from mor_bench.surrogate import Surrogate, TrainingOptions
 from tests.irregular import irregular_box
 
 torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
 
-from mor_bench.surrogates.umesh.grid import padded_grid  # noqa: E402 - after the check that torch is there
+from mor_bench.learning import training  # noqa: E402 - after the check that torch is there
+from mor_bench.learning.training import rate_factor  # noqa: E402
+from mor_bench.scene.symmetry import mirrors  # noqa: E402
+from mor_bench.surrogates.umesh.grid import padded_grid  # noqa: E402
 from mor_bench.surrogates.umesh.network import UNet, new_network  # noqa: E402
-from mor_bench.surrogates.umesh.training import TrainingPlan, rate_factor, train  # noqa: E402
 
 SMALL = {
     "channels": 8, "steps": 1, "iterations": 400, "batch_size": 16, "learning_rate": 3e-3, "schedule": "one-cycle", "second_moment_decay": 0.99,
@@ -127,18 +129,26 @@ def test_gradients_at_the_nodes_go_to_the_grid_points_around_them_and_none_to_pa
     assert 0 < int((own != 0).sum()) < own.numel()
 
 
-def test_the_loss_is_the_mean_square_over_the_components_of_all_nodes() -> None:
+@pytest.mark.parametrize("regular", [True, False])
+@pytest.mark.parametrize("loss", ["absolute", "relative"])
+def test_the_loss_is_the_mean_square_over_the_components_of_all_nodes(
+    regular: bool, loss: str, data: Dataset, irregular: tuple[Snapshots, Snapshots]
+) -> None:
     """Before the first step, on one batch of all samples; values of the network at padding do not enter."""
-    mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
-    for grid in (padded_grid(grid_map(mesh), 2), padded_grid(grid_map(box_mesh((2.0, 1.0, 1.0), (6, 2, 2))), 2)):
-        generator = torch.Generator().manual_seed(0)
-        inputs = grid.to_grid(torch.randn(8, mesh.n_nodes, 3, generator=generator))
-        goal = torch.randn(8, mesh.n_nodes, 3, generator=generator)
-        network = new_network(4, 2, generator)
-        with torch.inference_mode():
-            flat = network(inputs).permute(0, 2, 3, 4, 1).reshape(8, -1, 3).numpy()
-        expected = np.square(grid.grid.weights.toarray() @ flat - goal.numpy()).mean()
-        assert train(network, grid, inputs, goal, TrainingPlan(1, 8, 1e-3, "constant", 0.999), generator)[0] == pytest.approx(expected, rel=1e-5)
+    samples = data.train[:20] if regular else irregular[0][:20]
+    method = mor_bench.load_method("umesh", **{**SMALL, "iterations": 1, "batch_size": 20, "loss": loss}).fit(samples.scene, samples)
+    grid, network = padded_grid(grid_map(samples.scene.mesh), 1), new_network(8, 1, torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        inputs = grid.to_grid(torch.from_numpy((samples.forces / rms(samples.forces)).astype(np.float32)))
+        flat = network(inputs).permute(0, 2, 3, 4, 1).reshape(20, -1, 3).numpy()
+    targets = samples.displacements / rms(samples.displacements)
+    errors = np.square(np.einsum("ng,sgc->snc", grid.grid.weights.toarray(), flat) - targets).mean(axis=(1, 2))
+    weights = np.ones(20) if loss == "absolute" else 1 / np.maximum(np.square(targets).mean(axis=(1, 2)), 0.1**2)
+    assert method.loss_curve_[0] == pytest.approx((weights / weights.mean() * errors).mean(), rel=1e-5)  # type: ignore[attr-defined]
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def test_one_cycle_rises_falls_and_stays_in_range() -> None:
@@ -279,6 +289,100 @@ def test_saved_and_loaded_without_a_grid_is_the_same_model(
     np.testing.assert_array_equal(mor_bench.load_surrogate(path).predict(test.forces), fitted_irregular.predict(test.forces))
 
 
+IMPROVED = {**SMALL, "input": "linear-response", "activation": "silu", "zero_at_rest": True, "mirrored": True}
+
+
+@pytest.fixture(scope="module")
+def improved(data: Dataset) -> Surrogate:
+    return mor_bench.load_method("umesh", **IMPROVED).fit(data.scene, data.train)
+
+
+def test_the_linear_response_brings_most(improved: Surrogate, fitted: Surrogate, data: Dataset) -> None:
+    linear = mor_bench.load_method("linear-fem").fit(data.scene, None)
+    errors = [mean_dof_error(method.predict(data.test.forces), data.test.displacements) for method in (improved, linear, fitted)]
+    assert errors[0] < 0.8 * errors[1]
+    assert errors[0] < 0.2 * errors[2]
+
+
+def test_no_force_gives_exactly_no_displacement(improved: Surrogate, fitted: Surrogate, data: Dataset) -> None:
+    nothing = np.zeros((3, data.scene.mesh.n_nodes, 3))
+    assert not improved.predict(nothing).any()
+    assert fitted.predict(nothing).any(), "the paper's network has biases"
+    little = 1e-4 * data.test.forces[:5]
+    linear = mor_bench.load_method("linear-fem").fit(data.scene, None).predict(little)
+    assert np.abs(improved.predict(little) - linear).max() < 1e-4 * improved.output_scale_  # type: ignore[attr-defined]
+
+
+def test_saved_and_loaded_improved_is_the_same_model(improved: Surrogate, data: Dataset, tmp_path: Path) -> None:
+    improved.save(tmp_path / "umesh.safetensors")
+    loaded = mor_bench.load_surrogate(tmp_path / "umesh.safetensors")
+    np.testing.assert_array_equal(loaded.predict(data.test.forces[:5]), improved.predict(data.test.forces[:5]))
+
+
+def test_mirror_planes_are_those_of_mesh_supports_and_loads(data: Dataset) -> None:
+    """beam-tiny is held at an end and loaded on its top: only left and right are alike. A mirrored solution is a solution."""
+    (mirror,) = mirrors(data.scene)
+    assert mirror.axis == 1
+    np.testing.assert_array_equal(mirror.nodes[mirror.nodes], np.arange(data.scene.mesh.n_nodes))
+    fem = mor_bench.load_method("fem", tolerance=1e-10).fit(data.scene, None)
+    force = data.test.forces[0]
+    expected = mirror(fem.predict(force))
+    assert np.abs(expected - fem.predict(force)).max() > 1e-3 * np.abs(expected).max()
+    np.testing.assert_allclose(fem.predict(mirror(force)), expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    assert mirrors(load_scene("liver-hex")) == []
+
+
+def test_mirror_images_are_learned_from_one_half(data: Dataset) -> None:
+    """Trained on loads of one half, the mirrored half is predicted as well; without the images it is not."""
+    (mirror,) = mirrors(data.scene)
+    left = (data.train.forces[:, data.scene.mesh.points[:, 1] < 0.5] != 0).any(axis=(1, 2))
+    right = (data.train.forces[:, data.scene.mesh.points[:, 1] > 0.5] != 0).any(axis=(1, 2))
+    half = data.train[np.flatnonzero(left & ~right)]
+    assert len(half) > 50
+    errors = {}
+    for mirrored in (True, False):
+        method = mor_bench.load_method("umesh", **{**SMALL, "mirrored": mirrored}).fit(data.scene, half)
+        errors[mirrored] = mean_dof_error(method.predict(mirror(half.forces)), mirror(half.displacements))
+    assert errors[True] < 0.6 * errors[False]
+
+
+def test_a_training_that_was_stopped_resumes_to_the_same_bits(data: Dataset, improved: Surrogate, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY_S", 0.0)
+    method = mor_bench.load_method("umesh", **IMPROVED)
+    done: list[int] = []
+
+    def progress(iteration: int, iterations: int, loss: float) -> None:
+        if iteration == 200 and not done:
+            done.append(iteration)
+            raise KeyboardInterrupt
+
+    method.training = TrainingOptions(checkpoint=tmp_path / "checkpoint", progress=progress)
+    with pytest.raises(KeyboardInterrupt):
+        method.fit(data.scene, data.train)
+    other = mor_bench.load_method("umesh", **{**IMPROVED, "seed": 1})
+    other.training = method.training
+    with pytest.raises(InvalidInputError, match="another training"):
+        other.fit(data.scene, data.train)
+    method.fit(data.scene, data.train)
+    for name, array in improved._state().items():
+        np.testing.assert_array_equal(array, method._state()[name], err_msg=name)
+
+
+def test_transfer_starts_from_a_network_of_another_scene(improved: Surrogate, irregular: tuple[Snapshots, Snapshots], tmp_path: Path) -> None:
+    path, (train, test) = tmp_path / "umesh.safetensors", irregular
+    improved.save(path)
+    errors = []
+    for start in (None, path):
+        method = mor_bench.load_method("umesh", **{**IMPROVED, "iterations": 20, "learning_rate": 1e-4})
+        method.training = TrainingOptions(start_from=start)
+        errors.append(mean_dof_error(method.fit(train.scene, train).predict(test.forces), test.displacements))
+    assert errors[1] < 0.7 * errors[0]
+    wrong = mor_bench.load_method("umesh", **{**IMPROVED, "channels": 4})
+    wrong.training = TrainingOptions(start_from=path)
+    with pytest.raises(InvalidInputError, match="does not fit 4 channels"):
+        wrong.fit(train.scene, train)
+
+
 @pytest.mark.parametrize(("knob", "value"), [("channels", 0), ("steps", 0), ("schedule", "step"), ("learning_rate", 0.0), ("seed", -1)])
 def test_knobs_out_of_range(knob: str, value: object) -> None:
     with pytest.raises(SpecError, match=knob):
@@ -314,3 +418,17 @@ def test_the_network_is_the_papers_with_its_skips() -> None:
         y = double(torch.cat([skips.pop(), functional.conv_transpose3d(y, weight, bias, stride=2)], dim=1))
     with torch.inference_mode():
         torch.testing.assert_close(network(x), functional.conv3d(y, *head), rtol=1e-5, atol=1e-5)
+
+
+def test_displacements_on_the_grid_are_means_of_the_nodes_around(irregular: tuple[Snapshots, Snapshots]) -> None:
+    """A constant field stays constant wherever there is body, and is zero beside it; a linear one keeps its values at nodes on points."""
+    grid = padded_grid(grid_map(irregular[0].scene.mesh), 1)
+    assert grid.places is None
+    n_nodes = irregular[0].scene.mesh.n_nodes
+    values = grid.displacements_to_grid(torch.ones(2, n_nodes, 3))
+    body = torch.from_numpy((grid.grid.weights.sum(axis=0) > 1e-2).reshape(grid.shape))
+    torch.testing.assert_close(values[:, :, body], torch.ones(2, 3, int(body.sum())))
+    assert not values[:, :, torch.from_numpy((grid.grid.weights.sum(axis=0) == 0).reshape(grid.shape))].any()
+    regular = padded_grid(grid_map(box_mesh((2.0, 1.0, 1.0), (6, 2, 2))), 1)
+    nodal = torch.randn(1, 63, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(regular.displacements_to_grid(nodal), regular.to_grid(nodal), rtol=0, atol=0)

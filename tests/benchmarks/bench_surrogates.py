@@ -42,6 +42,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "pgd-force": {"n_terms": 60, "position_degree": 3},
     "umesh": {"channels": 8, "steps": 2, "iterations": 200, "batch_size": 16, "learning_rate": 3e-3},
     "umesh-small": {"channels": 8, "iterations": 200},
+    "umesh-linear": {"channels": 8, "iterations": 200},
     "gappy-pod": {"n_modes": 20},
 }
 """Methods and their knobs. U-Mesh's latency does not depend on how long it was trained; the error of so short a training says little."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,9 @@ import torch
 from torch import Tensor
 
 from mor_bench.scene.grid import GridMap
+
+SMALLEST_SHARE = 1e-3
+"""Grid points whose shape functions sum to less than this over all nodes lie beside the body: their means fade out."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +48,25 @@ class PaddedGrid:
     def to_grid(self, forces: Tensor) -> Tensor:
         """Nᵀ f: (n, n_nodes, 3) → (n, 3, x, y, z) with zeros at padding, channels-last in memory."""
         if self.places is None:
-            flat = torch.from_numpy(self.grid.forces_to_grid(forces.numpy()))
+            flat = torch.from_numpy(self.grid.forces_to_grid(forces.cpu().numpy())).to(forces.device)
         else:
-            flat = forces.new_zeros(len(forces), self.grid.weights.shape[1], 3).index_copy_(1, self.places, forces)
+            flat = forces.new_zeros(len(forces), self.grid.weights.shape[1], 3).index_copy_(1, self.places.to(forces.device), forces)
         return flat.view(-1, *self.shape, 3).permute(0, 4, 1, 2, 3)
+
+    def displacements_to_grid(self, displacements: Tensor) -> Tensor:
+        """(n, n_nodes, 3) → (n, 3, x, y, z): at each grid point the mean of the nodes around it, weighted by N; zeros at padding.
+
+        Where each node lies on a grid point of its own, these are its values.
+        """
+        if self.places is not None:
+            return self.to_grid(displacements)
+        return self.to_grid(displacements) / self._shares.to(displacements.device)
+
+    @cached_property
+    def _shares(self) -> Tensor:
+        """(1, 1, x, y, z) sums of N over the nodes."""
+        sums = np.maximum(self.grid.weights.sum(axis=0), SMALLEST_SHARE).astype(np.float32)
+        return torch.from_numpy(sums).view(1, 1, *self.shape)
 
     def to_nodes(self, values: Tensor) -> Tensor:
         """N u: (n, 3, x, y, z) → (n, n_nodes, 3), differentiable."""
@@ -66,8 +85,8 @@ class _ToNodes(torch.autograd.Function):
         ctx.padded = padded
         flat = values.detach().permute(0, 2, 3, 4, 1).reshape(len(values), padded.grid.weights.shape[1], 3)
         if padded.places is None:
-            return torch.from_numpy(padded.grid.displacements_to_nodes(flat.numpy()))
-        return flat.index_select(1, padded.places)
+            return torch.from_numpy(padded.grid.displacements_to_nodes(flat.cpu().numpy())).to(values.device)
+        return flat.index_select(1, padded.places.to(values.device))
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:

@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self, final
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
+from torch import Tensor
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
+from mor_bench.learning.training import Precision, Schedule, TrainingPlan, device_of, fingerprint_of, train
+from mor_bench.mechanics.model import unknown_equations
+from mor_bench.mechanics.observed import forward_model
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.scene import Scene
+from mor_bench.scene.symmetry import Mirror, mirrors
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogate import Surrogate
+from mor_bench.surrogate import Surrogate, weights_to_start_from
 from mor_bench.surrogates.umesh.grid import PaddedGrid, padded_grid
-from mor_bench.surrogates.umesh.network import UNet, empty_network, new_network
-from mor_bench.surrogates.umesh.training import TrainingPlan, train
+from mor_bench.surrogates.umesh.network import Activation, UNet, empty_network, new_network
 
 PREDICTION_CHUNK = 128
 """Samples per forward pass, so that a long batch needs 300 MB of activations at 128 channels, not gigabytes."""
+
+
+SMALLEST_SIZE = 0.1
+"""Errors of samples smaller than this, in root mean squares over all samples, count no more than of this size."""
 
 
 @final
@@ -46,6 +57,21 @@ class UMesh(Surrogate):
         "one-cycle" rises for the first tenth of the iterations and then falls to zero along half a cosine.
     second_moment_decay : float
         Adam's β₂.
+    input : {"force", "linear-response"}
+        What the network is given. With the linear response K₀⁻¹f it answers with the nonlinear rest, u = K₀⁻¹f + network.
+    activation : {"relu", "silu"}
+        Of the convolutions.
+    zero_at_rest : bool
+        Take the network's answer to nothing off every answer, in training too: no force then gives no displacement.
+    mirrored : bool
+        Train on mirror images too, drawn at random, where the scene has planes of symmetry (`mor_bench.scene.symmetry`).
+    loss : {"absolute", "relative"}
+        The mean squared error, or each sample's part of it divided by the mean square of what is to be answered (or by that of
+        `SMALLEST_SIZE` of the root mean square over all samples, where that is larger).
+    precision : {"float32", "bfloat16"}
+        Of the products in training.
+    validation_fraction : float
+        Part of the training samples that are held out, to end the training when they gain nothing and keep the best weights.
     seed : int
         Of the initial weights and of the order of the samples.
 
@@ -53,10 +79,14 @@ class UMesh(Surrogate):
     ----------
     network_ : UNet
     grid_ : PaddedGrid
-    force_scale_, displacement_scale_ : float
-        Root mean square of the training forces, N, and displacements, m.
+    input_scale_, output_scale_ : float
+        Root mean square of what the network is given in training, N or m, and of what it is to answer, m.
     loss_curve_ : (n_intervals,) float64
-        Training loss per `LOSS_INTERVAL` iterations, in units of ``displacement_scale_`` squared.
+        Training loss per `LOSS_INTERVAL` iterations, in units of ``output_scale_`` squared.
+    validation_curve_ : (n_validations,) float64
+        The same of the samples held out, a fiftieth of the iterations apart; empty without any.
+    iterations_ : int
+        The knob, or what it must be to repeat a training that was sized to seconds.
 
     Notes
     -----
@@ -76,7 +106,7 @@ class UMesh(Surrogate):
 
     A mesh that lies in no regular grid gets one (`mor_bench.scene.grid`): the network sees the forces Nᵀ f on the grid and
     answers with the grid's displacements u, and the loss is taken of N u at the nodes. In a scene with observed nodes the input is
-    their displacements in the place of the forces, zero elsewhere.
+    their displacements in the place of the forces, zero elsewhere, or the linear extension of these.
 
     Other choices changed little. In float32 (one-cycle to 2.5e-3, β₂ = 0.95), 4,000 iterations of batch 32 gave 9.1e-4 m, the
     same with forces scaled down five times more 9.0e-4 m, 2,450 of batch 64, at the same cost, 9.0e-4 m, and 5,000 of batch 32
@@ -97,8 +127,15 @@ class UMesh(Surrogate):
         iterations: Annotated[int, Field(ge=1)] = 100_000,
         batch_size: Annotated[int, Field(ge=1)] = 4,
         learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-4,
-        schedule: Literal["constant", "one-cycle"] = "constant",
+        schedule: Schedule = "constant",
         second_moment_decay: Annotated[float, Field(gt=0, lt=1)] = 0.999,
+        input: Literal["force", "linear-response"] = "force",
+        activation: Activation = "relu",
+        zero_at_rest: bool = False,
+        mirrored: bool = False,
+        loss: Literal["absolute", "relative"] = "absolute",
+        precision: Precision = "float32",
+        validation_fraction: Annotated[float, Field(ge=0, le=0.5)] = 0.0,
         seed: Annotated[int, Field(ge=0, lt=2**63)] = 0,
     ) -> None:
         self.channels = channels
@@ -108,29 +145,58 @@ class UMesh(Surrogate):
         self.learning_rate = learning_rate
         self.schedule = schedule
         self.second_moment_decay = second_moment_decay
+        self.input = input
+        self.activation = activation
+        self.zero_at_rest = zero_at_rest
+        self.mirrored = mirrored
+        self.loss = loss
+        self.precision = precision
+        self.validation_fraction = validation_fraction
         self.seed = seed
+
+    def supports(self, scene: Scene) -> str | None:
+        if self.mirrored and scene.observed_nodes is not None:
+            return "the mirror image of a node that is observed need not be"
+        return unknown_equations(scene, observed=True) if self.input == "linear-response" or self.mirrored else None
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             samples = self._checked_snapshots(snapshots)
-            self.grid_: PaddedGrid = self._padded_grid()
-            forces = torch.from_numpy(samples.inputs.astype(np.float32))
-            displacements = torch.from_numpy(samples.displacements.astype(np.float32))
-            self.force_scale_ = _rms(samples.inputs)
-            self.displacement_scale_ = _rms(samples.displacements)
+            self._prepare()
+            given, wanted = self._given(samples.inputs), samples.displacements
+            if self.input == "linear-response":
+                wanted = wanted - given
+            self.input_scale_, self.output_scale_ = _rms(given), _rms(wanted)
+            device = device_of(self.training)
             generator = torch.Generator().manual_seed(self.seed)
-            self.network_: UNet = new_network(self.channels, self.steps, generator)
-            plan = TrainingPlan(self.iterations, self.batch_size, self.learning_rate, self.schedule, self.second_moment_decay)
-            self.loss_curve_: NDArray[np.float64] = train(
-                self.network_,
-                self.grid_,
-                self.grid_.to_grid(forces / self.force_scale_),
-                displacements / self.displacement_scale_,
-                plan,
-                generator,
-                self.time_limit_s,
-            )
-            self.network_.eval()
+            self.network_: UNet = new_network(self.channels, self.steps, generator, self.activation)
+            if self.training.start_from is not None:
+                self._start_from(self.training.start_from)
+            self.network_.to(device)
+            inputs = torch.from_numpy((given / self.input_scale_).astype(np.float32)).to(device)
+            targets = torch.from_numpy((wanted / self.output_scale_).astype(np.float32)).to(device)
+            images = [Image.of(mirror, device) for mirror in (mirrors(scene) if self.mirrored else [])]
+            zero = torch.zeros_like(inputs[:1])
+            weights = self._sample_weights(targets)
+
+            def loss(rows: Tensor) -> Tensor:
+                x, y = inputs[rows], targets[rows]
+                for image in images if self.network_.training else []:
+                    turned = torch.randint(2, (len(rows), 1, 1), generator=generator).bool().to(device)
+                    x, y = torch.where(turned, image(x), x), torch.where(turned, image(y), y)
+                answer = self._answer(x) - self._answer(zero) if self.zero_at_rest else self._answer(x)
+                return (answer - y).square().sum(dim=(1, 2)) @ weights[rows] * (1.0 / y.numel())
+
+            plan = TrainingPlan(
+                self.iterations, self.batch_size, self.learning_rate, self.schedule, self.second_moment_decay,
+                precision=self.precision, validation_fraction=self.validation_fraction,
+            )  # fmt: skip
+            arrays = {"inputs": inputs, "targets": targets, **self.network_.state_dict()}
+            fingerprint = fingerprint_of(self.parameters, arrays) if self.training.checkpoint else ""
+            done = train(self.network_, loss, len(samples), plan, generator, self.training, self.time_limit_s, fingerprint)
+            self.network_.cpu()
+            self.loss_curve_, self.validation_curve_, self.iterations_ = done.loss_curve, done.validation_curve, done.iterations
+            self._come_to_rest()
         return self
 
     @torch.inference_mode()
@@ -139,35 +205,101 @@ class UMesh(Surrogate):
         if counting.running is not None:  # with one scaling of each input and each output
             products = self.network_.multiply_adds(self.grid_.shape) + self.grid_.multiply_adds + 2 * self.scene_.mesh.n_dofs
             counting.running.add(multiply_adds=len(checked) * products)
-        scaled = torch.from_numpy((checked / self.force_scale_).astype(np.float32))
-        answers = [self.grid_.to_nodes(self.network_(self.grid_.to_grid(chunk))) for chunk in torch.split(scaled, PREDICTION_CHUNK)]
-        displacements = torch.cat(answers).numpy().astype(np.float64) * self.displacement_scale_
+        given = self._given(checked)
+        scaled = torch.from_numpy((given / self.input_scale_).astype(np.float32))
+        answers = torch.cat([self._answer(chunk) for chunk in torch.split(scaled, PREDICTION_CHUNK)]).numpy()
+        displacements = (answers - self._at_rest).astype(np.float64) * self.output_scale_
+        if self.input == "linear-response":
+            displacements += given
         displacements[:, self.scene_.fixed_nodes] = 0.0
+        if self.zero_at_rest:
+            displacements[~checked.any(axis=(1, 2))] = 0.0  # in a batch the network at rest is rounded otherwise
         return displacements.reshape(np.shape(forces))
 
-    def _padded_grid(self) -> PaddedGrid:
-        """The scene's grid, of the shape that its file asks for."""
-        return padded_grid(grid_map(self.scene_.mesh, self.scene_.spec.grid_nodes), self.steps)
+    def _prepare(self) -> None:
+        """What the scene gives, before anything is learned."""
+        self.grid_: PaddedGrid = padded_grid(grid_map(self.scene_.mesh, self.scene_.spec.grid_nodes), self.steps)
+        if self.input == "linear-response":
+            self.model_ = forward_model(self.scene_)
+
+    def _given(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, n_nodes, 3) what the network is given: the forces, N, or displacements of observed nodes, m; or the linear response to them, m."""
+        if self.input == "force":
+            return forces
+        response = np.zeros((len(forces), self.scene_.mesh.n_dofs))
+        free = self.scene_.free_dofs
+        response[:, free] = self.model_.linear_response(forces.reshape(len(forces), -1)[:, free])
+        return response.reshape(forces.shape)
+
+    def _answer(self, given: Tensor) -> Tensor:
+        """The network from nodes to nodes, (n, n_nodes, 3) float32, scaled."""
+        forces = self.input == "force" and self.scene_.observed_nodes is None
+        on_grid = self.grid_.to_grid(given) if forces else self.grid_.displacements_to_grid(given)
+        return self.grid_.to_nodes(self.network_(on_grid).float())
+
+    def _sample_weights(self, targets: Tensor) -> Tensor:
+        """(n,) what each sample's squared error counts, 1 on average."""
+        if self.loss == "absolute":
+            return targets.new_ones(len(targets))
+        size = targets.square().mean(dim=(1, 2)).sqrt()  # the root mean square over all samples is 1
+        weights = size.clamp(min=SMALLEST_SIZE).pow(-2)
+        return weights / weights.mean()
+
+    def _come_to_rest(self) -> None:
+        """Remember what the network answers to nothing, if that is to be taken off."""
+        self._at_rest = np.zeros((1, self.scene_.mesh.n_nodes, 3), dtype=np.float32)
+        if self.zero_at_rest:
+            with torch.inference_mode():
+                self._at_rest = self._answer(torch.zeros(1, self.scene_.mesh.n_nodes, 3)).numpy()
+
+    def _start_from(self, path: Path) -> None:
+        """Take the weights of a network that was trained on this scene or another; grids of any size share them."""
+        try:
+            self.network_.load_state_dict(_network_weights(weights_to_start_from(path, type(self))))
+        except RuntimeError as error:
+            raise InvalidInputError(f"{path}: its network does not fit {self.channels} channels and {self.steps} steps: {error}") from None
 
     def _state(self) -> dict[str, NDArray[Any]]:
         weights = {f"network.{name}": value.numpy() for name, value in self.network_.state_dict().items()}
-        scales = np.array([self.force_scale_, self.displacement_scale_])
-        return {**weights, "scales": scales, "loss_curve": self.loss_curve_}
+        scales = np.array([self.input_scale_, self.output_scale_])
+        curves = {"loss_curve": self.loss_curve_, "validation_curve": self.validation_curve_}
+        return {**weights, "scales": scales, **curves, "iterations": np.array([self.iterations_])}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         for name, array in state.items():
             if not np.isfinite(array).all():
                 raise InvalidInputError(f"`{name}` must be finite; got NaN or infinity.")
-        self.grid_ = self._padded_grid()
-        self.force_scale_, self.displacement_scale_ = (float(scale) for scale in state["scales"])
-        self.loss_curve_ = state["loss_curve"]
-        weights = {name.removeprefix("network."): torch.from_numpy(array) for name, array in state.items() if name.startswith("network.")}
-        network = empty_network(self.channels, self.steps)
+        network = empty_network(self.channels, self.steps, self.activation)
         try:
-            network.load_state_dict(weights, assign=True)
+            network.load_state_dict(_network_weights(state), assign=True)
         except RuntimeError as error:
             raise ValueError(f"the weights do not fit the network: {error}") from None
         self.network_ = network.eval()
+        self.input_scale_, self.output_scale_ = (float(scale) for scale in state["scales"])
+        self.loss_curve_, self.validation_curve_ = state["loss_curve"], state["validation_curve"]
+        self.iterations_ = int(state["iterations"][0])
+        self._prepare()
+        self._come_to_rest()
+
+
+@dataclass(frozen=True)
+class Image:
+    """A mirror image of nodal vectors, on a device."""
+
+    nodes: Tensor
+    signs: Tensor
+
+    @classmethod
+    def of(cls, mirror: Mirror, device: torch.device) -> Image:
+        return cls(torch.from_numpy(mirror.nodes).to(device), torch.from_numpy(mirror.signs.astype(np.float32)).to(device))
+
+    def __call__(self, vectors: Tensor) -> Tensor:
+        """(n, n_nodes, 3) → the same shape."""
+        return vectors[:, self.nodes] * self.signs
+
+
+def _network_weights(state: Mapping[str, NDArray[Any]]) -> dict[str, Tensor]:
+    return {name.removeprefix("network."): torch.from_numpy(array) for name, array in state.items() if name.startswith("network.")}
 
 
 def _rms(values: NDArray[np.float64]) -> float:

@@ -1,0 +1,167 @@
+"""Training of networks: it repeats and resumes to the last bit, ends early, fills a time, and refuses what is not its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, StoreError
+from mor_bench.surrogate import TrainingOptions
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
+
+from mor_bench.learning import training  # noqa: E402 - after the check that torch is there
+from mor_bench.learning.training import Training, TrainingPlan, device_of, train  # noqa: E402
+
+PLAN = TrainingPlan(120, 8, 1e-2, second_moment_decay=0.9, weight_decay=1e-3, validation_fraction=0.2)
+
+
+@dataclass
+class Problem:
+    """A small regression whose loss also draws from the training's generator, as augmentation does."""
+
+    noise: float = 0.0
+    width: int = 16
+
+    def __post_init__(self) -> None:
+        self.generator = torch.Generator().manual_seed(3)
+        self.x = torch.randn(60, 4, generator=self.generator)
+        self.y = torch.sin(self.x @ torch.randn(4, 2, generator=self.generator)) + self.noise * torch.randn(60, 2, generator=self.generator)
+        self.network = torch.nn.Sequential(torch.nn.Linear(4, self.width), torch.nn.Tanh(), torch.nn.Linear(self.width, 2))
+        with torch.no_grad():
+            for parameter in self.network.parameters():
+                parameter.copy_(torch.randn(parameter.shape, generator=self.generator) / 2)
+        self.calls = 0
+
+    def loss(self, rows: Tensor) -> Tensor:
+        self.calls += 1
+        x = self.x[rows]
+        if self.network.training:
+            x = x + 0.05 * torch.randn(x.shape, generator=self.generator)
+        error: Tensor = self.network(x).float() - self.y[rows]
+        return error.square().mean()
+
+    def train(self, plan: TrainingPlan = PLAN, loss: Callable[[Tensor], Tensor] | None = None, **keywords: object) -> Training:
+        return train(self.network, loss or self.loss, len(self.x), plan, self.generator, **keywords)  # type: ignore[arg-type]
+
+    @property
+    def weights(self) -> np.ndarray:
+        return np.concatenate([parameter.detach().numpy().ravel() for parameter in self.network.parameters()])
+
+
+class KilledError(Exception):
+    """Stands for the end of the process."""
+
+
+@pytest.mark.parametrize("after", [1, 49, 50, 60])
+def test_a_training_that_was_stopped_ends_with_the_same_bits(after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, stopped, resumed = Problem(), Problem(), Problem()
+    expected = whole.train()
+    options = TrainingOptions(checkpoint=tmp_path / "checkpoint")
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY_S", 0.0)
+
+    def dying(rows: Tensor) -> Tensor:
+        if stopped.network.training:
+            dying.steps += 1  # type: ignore[attr-defined]
+        if dying.steps > after:  # type: ignore[attr-defined]
+            raise KilledError
+        return stopped.loss(rows)
+
+    dying.steps = 0  # type: ignore[attr-defined]
+    with pytest.raises(KilledError):
+        stopped.train(loss=dying, options=options, fingerprint="x")
+    done = resumed.train(options=options, fingerprint="x")
+    assert resumed.calls < whole.calls
+    np.testing.assert_array_equal(resumed.weights, whole.weights)
+    np.testing.assert_array_equal(done.loss_curve, expected.loss_curve)
+    np.testing.assert_array_equal(done.validation_curve, expected.validation_curve)
+    assert not (tmp_path / "checkpoint").exists(), "a finished training leaves none"
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Of a training of 120 iterations, in its middle."""
+    path = tmp_path / "checkpoint"
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY_S", 0.0)
+    problem = Problem()
+
+    def dying(rows: Tensor) -> Tensor:
+        if problem.calls > 60:
+            raise KilledError
+        return problem.loss(rows)
+
+    with pytest.raises(KilledError):
+        problem.train(loss=dying, options=TrainingOptions(checkpoint=path), fingerprint="x")
+    return path
+
+
+def test_a_checkpoint_of_another_training_is_refused_and_left(checkpoint: Path) -> None:
+    with pytest.raises(InvalidInputError, match="another training"):
+        Problem().train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="y")
+    assert checkpoint.exists()
+
+
+@pytest.mark.parametrize("damage", ["truncated", "empty", "foreign", "other network"])
+def test_a_damaged_checkpoint_is_refused(checkpoint: Path, damage: str) -> None:
+    content = checkpoint.read_bytes()
+    checkpoint.write_bytes({"truncated": content[:-7], "empty": b"", "foreign": b"\x80\x04K\x01.", "other network": content}[damage])
+    problem = Problem(width=5) if damage == "other network" else Problem()
+    with pytest.raises(StoreError, match="checkpoint"):
+        problem.train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="x")
+
+
+def test_it_ends_when_the_samples_held_out_gain_nothing_and_keeps_the_best_weights() -> None:
+    problem = Problem(noise=2.0, width=200)
+    done = problem.train(replace(PLAN, iterations=4000, schedule="constant", validation_fraction=0.5))
+    best = int(done.validation_curve.argmin())
+    assert done.iterations == 4000
+    assert len(done.loss_curve) < 4000 // training.LOSS_INTERVAL
+    assert len(done.validation_curve) == best + 1 + training.PATIENCE
+    rows = torch.randperm(60, generator=Problem(noise=2.0, width=200).generator)[:30]
+    assert not problem.network.training
+    with torch.no_grad():
+        loss = float(problem.loss(rows))
+    assert loss == pytest.approx(done.validation_curve[best], rel=1e-5)
+
+
+def test_a_training_that_fills_a_time_is_repeated_by_its_number_of_iterations() -> None:
+    filled, repeated = Problem(), Problem()
+    plan = replace(PLAN, validation_fraction=0.0)
+    start = perf_counter()
+    done = filled.train(plan, options=TrainingOptions(fit_seconds=0.5))
+    assert 0.1 < perf_counter() - start < 5.0
+    assert done.iterations > 50
+    assert repeated.train(replace(plan, iterations=done.iterations)).iterations == done.iterations
+    np.testing.assert_array_equal(repeated.weights, filled.weights)
+
+
+def test_bfloat16_trains_nearly_as_well() -> None:
+    exact, rounded = Problem(), Problem()
+    plan = replace(PLAN, iterations=400)
+    losses = [problem.train(replace(plan, precision=name)).loss_curve for problem, name in ((exact, "float32"), (rounded, "bfloat16"))]  # type: ignore[arg-type]
+    assert not np.array_equal(exact.weights, rounded.weights)
+    assert losses[1][-1] == pytest.approx(losses[0][-1], rel=0.2)
+    assert losses[1][-1] < 0.2 * losses[1][0]
+
+
+def test_too_little_time_and_divergence_are_errors() -> None:
+    with pytest.raises(OutOfTimeError, match="would take"):
+        Problem().train(replace(PLAN, iterations=10**9), time_limit_s=1.0)
+    with pytest.raises(MorBenchError, match="diverged"):
+        Problem().train(replace(PLAN, learning_rate=1e38))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_devices() -> None:
+    assert device_of(TrainingOptions(device="auto")).type == "cpu"
+    with pytest.raises(InvalidInputError, match="no CUDA device"):
+        device_of(TrainingOptions(device="cuda"))
