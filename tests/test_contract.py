@@ -24,6 +24,7 @@ CHEAP_PGD = {"n_terms": 20, "position_degree": 2}
 CHEAP: dict[str, dict[str, Any]] = {
     "autoencoder": {"iterations": 100}, "pgd": CHEAP_PGD, "pgd-force": CHEAP_PGD, "umesh": CHEAP_UMESH, "umesh-small": CHEAP_UMESH,
     "umesh-linear": CHEAP_UMESH,
+    "pca-gaussian-process": {"n_input_modes": 10, "n_optimised": 60}, "pca-random-forest": {"n_trees": 10}, "pca-extra-trees": {"n_trees": 10},
 }  # fmt: skip
 """Parameters that keep a costly method's battery short."""
 

@@ -32,7 +32,12 @@ CAN = {
     "fem-pardiso": {},
     "gappy-pod": {},
     "linear-fem": {},
+    "pca-extra-trees": {},
+    "pca-gaussian-process": {},
+    "pca-kernel-ridge": {},
+    "pca-random-forest": {},
     "pca-regression": {"n_input_modes": 10},
+    "pca-ridge": {},
     "pca-regression-force": {},
     "umesh": CHEAP["umesh"],
     "umesh-linear": CHEAP["umesh-linear"],
@@ -41,7 +46,7 @@ CAN = {
 """The methods that can be given displacements, with knobs that keep a costly one short."""
 
 BOUNDS = {"UMesh": 0.7, "FullFEM": 1e-6, "LinearFEM": 0.1, "GappyPOD": 0.5, "PCARegression": 0.3, "Autoencoder": 0.1}
-"""On the median relative l2, by class: beam-tiny turns far, and has few samples."""
+"""On the median relative l2, by class, others 0.1: beam-tiny turns far, and has few samples."""
 
 
 def written(folder: Path, observed: str, name: str = "beam-tiny-observed") -> Path:
@@ -154,8 +159,12 @@ def test_fem_finds_the_equilibrium_where_every_loaded_node_is_seen(region: str, 
 def test_the_linear_extension_is_linear_elasticity(tiny: Dataset) -> None:
     """Where all the force is seen, the extension of the linear response is the linear response."""
     scene = scene_of({"region": "z-max"})
-    response = FullOrderModel(tiny.scene).linear_response(tiny.test.free_forces[:5])
-    np.testing.assert_allclose(ObservedModel(scene).linear_response(response), response, rtol=0, atol=1e-10 * np.abs(response).max())
+    response = FullOrderModel(tiny.scene).rest_factor.solve(tiny.test.free_forces[:5].T).T
+    model = ObservedModel(scene)
+    np.testing.assert_allclose(model.linear_response(response), response, rtol=0, atol=1e-10 * np.abs(response).max())
+    axes = np.random.default_rng(0).normal(size=(len(scene.free_dofs), 4))
+    coordinates = response @ model.to_coordinates(axes)[scene.free_dofs]
+    np.testing.assert_allclose(coordinates, response @ axes, rtol=0, atol=1e-10 * np.abs(coordinates).max())
 
 
 def test_large_displacements_are_reached_by_and_by() -> None:
@@ -199,7 +208,7 @@ def test_regularisation_keeps_noise_out_of_gappy_pod(data: Dataset) -> None:
 def test_methods_that_can_complete_what_is_seen(fitted: Surrogate, data: Dataset) -> None:
     inputs, reference = data.test.inputs, data.test.displacements
     predicted = fitted.predict(inputs)
-    assert np.median(relative_l2(predicted, reference)) < BOUNDS.get(type(fitted).__name__, 0.05)
+    assert np.median(relative_l2(predicted, reference)) < BOUNDS.get(type(fitted).__name__, 0.1)
     single = np.stack([fitted.predict(seen) for seen in inputs[:5]])
     np.testing.assert_allclose(single, predicted[:5], rtol=0, atol=2e-6 * np.abs(single).max())
     assert (predicted[:, data.scene.fixed_nodes] == 0).all()

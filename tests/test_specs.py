@@ -41,6 +41,7 @@ CONFIGURATIONS = {
     "autoencoder": 2, "local-pod": 6, "modal-derivatives": 4, "quadratic-manifold": 6,
     "explicit-dynamics": 4, "pgd": 6, "pgd-force": 3,
     "deim": 6, "ecm": 6,
+    "pca-ridge": 1, "pca-kernel-ridge": 2, "pca-gaussian-process": 2, "pca-random-forest": 2, "pca-extra-trees": 2,
     "gappy-pod": 6,
 }  # fmt: skip
 

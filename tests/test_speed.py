@@ -91,7 +91,7 @@ RACES = (
     Race("l-shape", "fem", {}, "fem-jacobi-pcg", 6.0, 1e-6),  # 64, 1e-9
     Race("l-shape", "fem", {}, "fem-pardiso", 1.5, 1e-6),  # 8, 1e-9
     Race("l-shape", "fem-warm", {"start": "nearest", "tolerance": 1e-8}, "fem", 0.3, 1e-6),  # 1.0, 1e-9: no faster, see its limits
-    Race("l-shape", "linear-fem", {}, "fem", 3.0, 0.1),  # 10, 0.02
+    Race("l-shape", "linear-fem", {}, "fem", 8.0, 0.1),  # 57, 0.02
     Race("l-shape", "pod", {"n_modes": 10}, "fem", 2.0, 0.1, {"solver": "cholesky"}),  # 10, 0.006
     Race("beam-fine", "pod-tensor", {"n_modes": 20}, "pod", 100.0, 1e-3, {"n_modes": 20}),  # 220, 7e-15
     Race("beam-fine", "hybrid", {"steps": 1}, "fem", 2.0, 0.05),  # 4, 7e-4
@@ -103,15 +103,20 @@ RACES = (
     Race("beam-fine", "hpod", {"n_modes": 20, "cubature_tolerance": 1e-2}, "pod", 10.0, 0.1, {"n_modes": 20}),  # 80, 0.005; 22 on a busy machine
     Race("l-shape", "ecm", ECSW, "pod", 2.5, 0.1, {"n_modes": 10}),  # 5, 0.002
     Race("l-shape", "deim", {"n_modes": 10, "n_force_modes": 20}, "pod", 1.2, 0.1, {"n_modes": 10}),  # 2.8, 0.02
-    Race("l-shape", "pca-regression", {"n_input_modes": 10}, "fem", 2.0, 0.05),  # 8, 0.002
+    Race("l-shape", "pca-regression", {"n_input_modes": 10}, "fem", 5.0, 0.05),  # 31, 0.002
     Race("l-shape", "pca-regression-force", {"n_input_modes": 20, "n_output_modes": 20}, "fem", 5.0, 0.95),  # 54, 0.78 on so few samples
     Race("l-shape", "explicit-dynamics", {"tolerance": 1e-2}, "fem-jacobi-pcg", 0.8, 0.1),  # 2.7, 0.04
-    Race("l-shape", "pgd", {"n_terms": 20, "position_degree": 2}, "fem", 2.0, 0.01),  # 5, 0.001
+    Race("l-shape", "pgd", {"n_terms": 20, "position_degree": 2}, "fem", 3.0, 0.01),  # 19, 0.001
     Race("l-shape", "pgd-force", {"n_terms": 20, "position_degree": 2}, "fem", 5.0, 0.1),  # 18, 0.009
     Race("liver-hex-observed", "gappy-pod", {"n_modes": 20}, "fem", 5.0, 0.3),  # MEASURE
     Race("l-shape", "umesh", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 66, 0.56 after so short a training
     Race("l-shape", "umesh-small", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 83, 0.55
     Race("l-shape", "umesh-linear", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.05),
+    Race("l-shape", "pca-ridge", {"n_input_modes": 20}, "fem", 5.0, 0.1),  # 28, 0.02
+    Race("l-shape", "pca-kernel-ridge", {}, "fem", 5.0, 0.01),  # 29, 0.001
+    Race("l-shape", "pca-gaussian-process", {"n_input_modes": 10}, "fem", 4.0, 0.02),  # 17, 0.002
+    Race("l-shape", "pca-random-forest", {"n_trees": 10}, "fem", 5.0, 0.05),  # 37, 0.01
+    Race("l-shape", "pca-extra-trees", {"n_trees": 10}, "fem", 5.0, 0.05),  # 33, 0.005
 )
 """Every method of the suite against its baseline; a new one adds a line."""
 

@@ -86,6 +86,11 @@ CONCERNED = {
     "pgd-force": ANY | LEARNERS,
     "umesh-small": ANY | LEARNERS,
     "umesh-linear": ANY | LEARNERS,
+    "pca-ridge": ANY | LEARNERS,
+    "pca-kernel-ridge": ANY | LEARNERS,
+    "pca-gaussian-process": ANY | LEARNERS,
+    "pca-random-forest": ANY | LEARNERS,
+    "pca-extra-trees": ANY | LEARNERS,
     "gappy-pod": ANY | LEARNERS,
 }
 

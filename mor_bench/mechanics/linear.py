@@ -14,6 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from numba import njit
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpbtrf, dpbtrs
 from scipy.sparse import linalg as sp_linalg
 from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -30,6 +31,10 @@ CYCLE_TOLERANCE = 1e-12
 ACCEPTED_RESIDUAL = 1e-8
 """Relative residual that will do where round-off allows no less."""
 MAX_CYCLES = 300
+MANY, WIDE = 64, 256
+"""Right-hand sides, and entries of a column of the band, from which a banded factor serves all of them by blocks."""
+BLOCK = 96
+"""Rows of such a block."""
 
 
 class NotPositiveDefiniteError(ArithmeticError):
@@ -137,11 +142,42 @@ class BandedFactor:
         if counting.running is not None:
             (width, n), m = self._band.shape, _n_columns(rhs)
             counting.running.add(back_solves=m, multiply_adds=m * triangular_multiply_adds(n, width - 1))
+        solve = self._solve_many if _n_columns(rhs) >= MANY and len(self._band) >= WIDE else self._solve_few
         if self._order is None:
-            return np.asarray(dpbtrs(self._band, rhs)[0]).reshape(rhs.shape)
+            return solve(rhs)
         solution = np.empty_like(rhs)
-        solution[self._order] = np.asarray(dpbtrs(self._band, rhs[self._order])[0]).reshape(rhs.shape)
+        solution[self._order] = solve(rhs[self._order])
         return solution
+
+    def _solve_few(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(dpbtrs(self._band, rhs)[0]).reshape(rhs.shape)
+
+    def _solve_many(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """By blocks of rows of L for all right-hand sides at once; LAPACK takes one after the other, on beam-fine 4 times as long."""
+        width, n = self._band.shape
+        x, below = np.array(rhs, order="C"), np.zeros((BLOCK, width - 1 + BLOCK))
+        # Column j of the storage is row j of L, in which entry (j, i) stands at i - j + width - 1.
+        starts = range(0, n, BLOCK)
+
+        def rows_of(start: int) -> tuple[int, int, NDArray[np.float64], NDArray[np.float64]]:
+            """The block's end, its first column, its part left of the diagonal, and its triangle."""
+            end = min(start + BLOCK, n)
+            for j in range(start, end):
+                row = below[j - start]
+                row[:] = 0.0
+                row[j - start : j - start + width] = self._band[:, j]
+            first = max(0, start - (width - 1))
+            left = below[: end - start, first - start + width - 1 : width - 1]
+            return end, first, left, below[: end - start, width - 1 : width - 1 + end - start]
+
+        for start in starts:
+            end, first, left, triangle = rows_of(start)
+            x[start:end] = solve_triangular(triangle, x[start:end] - left @ x[first:start], lower=True, check_finite=False)
+        for start in reversed(starts):
+            end, first, left, triangle = rows_of(start)
+            x[start:end] = solve_triangular(triangle, x[start:end], lower=True, trans="T", check_finite=False)
+            x[first:start] -= left.T @ x[start:end]
+        return x
 
     def single_precision(self) -> SingleBandedFactor:
         """A copy in float32, which is solved with twice as fast."""

@@ -244,10 +244,6 @@ class FullOrderModel:
             return conjugate_gradients(pattern, tangent, self.turned_rest.at(q), residual, tolerance)[0]
         return self.factor(tangent).solve(residual)
 
-    def linear_response(self, loads: NDArray[np.float64]) -> NDArray[np.float64]:
-        """K₀⁻¹f: displacements of linear elasticity, m, under forces on the free dofs, N, both (n, n_free)."""
-        return self.rest_factor.solve(loads.T).T
-
     def solve(self, load: NDArray[np.float64], start: NDArray[np.float64] | None = None, options: NewtonOptions = NewtonOptions()) -> Solution:
         """Equilibrium under forces on the free dofs, (n_free,) N; see `solve_equilibrium`."""
         return solve_equilibrium(self, load, start, options)

@@ -11,7 +11,7 @@ import warnings
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
-from typing import Self
+from typing import Protocol, Self
 
 import numpy as np
 import scipy.sparse as sp
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mor_bench import counting
 from mor_bench.errors import LockingWarning, NoEquilibriumError, SolverError, UnsupportedSceneError
 from mor_bench.mechanics.assembly import State
+from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.linear import BandedFactor, MultigridFactor
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, Solution
@@ -124,7 +125,7 @@ class _HiddenModel(FullOrderModel):
 class ObservedModel:
     """Finite elements under given displacements of the observed nodes, over the free dofs of a scene.
 
-    It has the two ways of a `FullOrderModel` from what a method is given to displacements, `linear_response` and `solve_many`.
+    What `solve_many` is to a `FullOrderModel`, and `respond` and `to_coordinates` are to its `Compliance`.
 
     Parameters
     ----------
@@ -177,6 +178,31 @@ class ObservedModel:
         out[:, self._model.hidden] = -self._model.rest_factor.solve(np.asarray(self._coupling @ out[:, self._seen].T)).T
         return out
 
+    def respond(self, observed: Array) -> Array:
+        """As `linear_response`, on all dofs, (n, n_dofs), m; zero at the supports."""
+        out = np.zeros(observed.shape)
+        out[:, self.scene.free_dofs] = self.linear_response(observed[:, self.scene.free_dofs])
+        return out
+
+    def to_coordinates(self, axes: Array) -> Array:
+        """Eᵀ A on all dofs, zero where nothing is observed: its product with displacements u_o of the observed dofs is that of A with
+        their linear extension E u_o.
+
+        Parameters
+        ----------
+        axes : (n_free, r) float64
+            A.
+
+        Returns
+        -------
+        (n_dofs, r) float64
+        """
+        out = np.zeros((self.scene.mesh.n_dofs, axes.shape[1]))
+        with counting.uncounted():
+            hidden = self._model.rest_factor.solve(np.ascontiguousarray(axes[self._model.hidden]))
+        out[self.scene.free_dofs[self._seen]] = axes[self._seen] - self._coupling.T @ hidden
+        return out
+
     def solve_many(self, observed: Array, options: NewtonOptions = NewtonOptions()) -> list[Solution | SolverError]:
         """Equilibria of all free dofs under displacements of the observed ones, or the errors that there is none.
 
@@ -220,6 +246,18 @@ class ObservedModel:
         except SolverError as error:
             return error
         return replace(found, displacement=model.at(found.displacement))
+
+
+class LinearResponse(Protocol):
+    """What linear elasticity makes of what the methods of a scene are given: a `Compliance` or an `ObservedModel`."""
+
+    def respond(self, loads: Array, /) -> Array: ...
+    def to_coordinates(self, axes: Array) -> Array: ...
+
+
+def linear_response(scene: Scene) -> LinearResponse:
+    """To forces, or to displacements of a part of the surface, where these are given; made once, so that no query has to."""
+    return Compliance(FullOrderModel(scene)) if scene.observed_nodes is None else ObservedModel(scene)
 
 
 def forward_model(scene: Scene, solver: SolverName | None = None) -> FullOrderModel | ObservedModel:

@@ -28,7 +28,7 @@ def static_correction(rest_factor: Factor, reduced_factor: Factor, modes: NDArra
     Parameters
     ----------
     rest_factor : Factor
-        The factorised stiffness at rest K₀ of the full model.
+        Of the full model's stiffness at rest K₀: its factor, or its `Compliance`.
     reduced_factor : Factor
         That of ΦᵀK₀Φ.
     modes : (n_free, r) float64
@@ -47,12 +47,17 @@ def static_correction(rest_factor: Factor, reduced_factor: Factor, modes: NDArra
 
 
 def predict_corrected(
-    problem: GalerkinProblem | TensorProblem, modes: NDArray[np.float64], model: FullOrderModel, loads: NDArray[np.float64], tolerance: float
+    problem: GalerkinProblem | TensorProblem,
+    modes: NDArray[np.float64],
+    model: FullOrderModel,
+    rest_factor: Factor,
+    loads: NDArray[np.float64],
+    tolerance: float,
 ) -> NDArray[np.float64]:
     """Reduced equilibria under loads (n, n_free), N, with their static corrections, (n, n_free) m.
 
-    The modes are those of the problem on all free dofs. Raises `SolverError` if the reduced model has no valid equilibrium, or
-    its correction inverts cells.
+    The modes are those of the problem on all free dofs, the factor that of the model's stiffness at rest. Raises `SolverError`
+    if the reduced model has no valid equilibrium, or its correction inverts cells.
     """
     out = np.empty(loads.shape)
     if counting.running is not None:
@@ -63,7 +68,7 @@ def predict_corrected(
             q = problem.solve(reduced, tolerance)
         else:
             q = solve_equilibrium(problem, reduced, options=NewtonOptions(tolerance)).displacement
-        row[:] = model.rest_factor.solve(load) + modes @ (q - problem.rest_factor.solve(reduced))
+        row[:] = rest_factor.solve(load) + modes @ (q - problem.rest_factor.solve(reduced))
         refuse_inverted(model, row)
     return out
 

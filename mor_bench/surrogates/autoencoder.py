@@ -13,8 +13,9 @@ from torch import Tensor
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError, MorBenchError
+from mor_bench.mechanics.compliance import project
 from mor_bench.mechanics.model import unknown_equations
-from mor_bench.mechanics.observed import forward_model
+from mor_bench.mechanics.observed import linear_response
 from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -87,7 +88,8 @@ class Autoencoder(Surrogate):
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             snapshots = self._checked_snapshots(snapshots)
-            linear = forward_model(scene).linear_response(snapshots.free_inputs)
+            self.compliance_ = linear_response(scene)
+            linear = self.compliance_.respond(snapshots.inputs.reshape(len(snapshots), -1))[:, scene.free_dofs]
             axes = pod(linear, self.n_input_modes).modes
             coordinates = linear @ axes
             # Half way between coordinates of their own size and of equal size, on a logarithmic scale.
@@ -136,12 +138,11 @@ class Autoencoder(Surrogate):
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces).reshape(-1, self.scene_.mesh.n_dofs)
         free = self.scene_.free_dofs
-        out = np.zeros_like(batch)
         if counting.running is not None:  # each unit's nonlinearity as one
             networks = sum(weight.size for network in self._networks for weight in network)
-            counting.running.add(multiply_adds=len(batch) * (self.axes_.size + networks + self.modes_.size))
-        linear = self.model_.linear_response(batch[:, free])
-        out[:, free] = linear + (self._decoded(linear @ self.axes_) - self._at_rest) @ self.modes_.T
+            counting.running.add(multiply_adds=len(batch) * (networks + self.modes_.size))
+        out = self.compliance_.respond(batch)
+        out[:, free] += (self._decoded(project(self._from_forces, batch)) - self._at_rest) @ self.modes_.T
         out[~batch.any(axis=1)] = 0.0  # in a batch the network at rest is rounded otherwise
         return out.reshape(np.shape(forces))
 
@@ -169,7 +170,9 @@ class Autoencoder(Surrogate):
         self.axes_, self.modes_ = state["axes"], state["modes"]
         self._networks = [[state[f"{name}.{layer}"] for layer in LAYERS] for name in ("regression", "decoder")]
         self._at_rest = self._decoded(np.zeros((1, n_inputs)))
-        self.model_ = forward_model(self.scene_)
+        if not hasattr(self, "compliance_"):
+            self.compliance_ = linear_response(self.scene_)
+        self._from_forces = self.compliance_.to_coordinates(self.axes_)
 
 
 def _new_network(n_inputs: int, n_outputs: int, generator: torch.Generator) -> list[Tensor]:

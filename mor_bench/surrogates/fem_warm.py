@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
+from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.reduction.basis import pod
@@ -45,6 +46,7 @@ class WarmFEM(Surrogate):
     """
 
     model_: FullOrderModel
+    compliance_: Compliance
 
     def __init__(
         self,
@@ -85,7 +87,7 @@ class WarmFEM(Surrogate):
         free = self.scene_.free_dofs
         options = NewtonOptions(self.tolerance)
         for row, load in zip(out, batch.reshape(-1, self.scene_.mesh.n_dofs)[:, free], strict=True):
-            linear = self.model_.rest_factor.solve(load)
+            linear = self.compliance_.solve(load)
             row[free] = self.model_.solve(load, linear + self._shift(load, linear), options).displacement
             self._last = linear, row[free] - linear
         return out.reshape(np.shape(forces))
@@ -120,4 +122,4 @@ class WarmFEM(Surrogate):
             self.shifts_, self.to_coordinates_, self.coordinates_ = (np.ascontiguousarray(state[name]) for name in shapes)
             self._tree = cKDTree(self.coordinates_)
         self.model_ = FullOrderModel(self.scene_)
-        _ = self.model_.rest_factor
+        self.compliance_ = Compliance(self.model_)

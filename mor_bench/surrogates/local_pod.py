@@ -11,6 +11,7 @@ from pydantic import Field
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
+from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.galerkin import GalerkinProblem
@@ -116,7 +117,7 @@ class LocalPOD(Surrogate):
             counting.running.add(multiply_adds=len(batch) * (self.to_coordinates_.size + self.centroids_.size))
         for row, load in zip(out, batch.reshape(out.shape)[:, free], strict=True):
             nearest = self._nearest(load)
-            row[free] = predict_corrected(self.problems_[nearest], self.bases_[nearest], self.model_, load[None], self.tolerance)[0]
+            row[free] = predict_corrected(self.problems_[nearest], self.bases_[nearest], self.model_, self.compliance_, load[None], self.tolerance)[0]
         return out.reshape(np.shape(forces))
 
     def _nearest(self, load: NDArray[np.float64]) -> int:
@@ -156,7 +157,8 @@ class LocalPOD(Surrogate):
         self.model_ = FullOrderModel(self.scene_)
         self.bases_ = [np.ascontiguousarray(basis) for basis in np.split(state["modes"], np.cumsum(sizes)[:-1], axis=1)]
         self.problems_ = [self._problem(cluster, basis, state) for cluster, basis in enumerate(self.bases_)]
-        _ = self.model_.rest_factor, [problem.rest_factor for problem in self.problems_]
+        self.compliance_ = Compliance(self.model_)
+        _ = [problem.rest_factor for problem in self.problems_]
 
     def _problem(
         self, cluster: int, basis: NDArray[np.float64], state: dict[str, NDArray[Any]]

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from mor_bench.errors import InvalidInputError
+from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.modal_derivatives import derivative_basis, patch_responses
@@ -72,7 +73,8 @@ class ModalDerivatives(Surrogate):
         batch = self._checked_forces(forces)
         out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
         free = self.scene_.free_dofs
-        out[:, free] = predict_corrected(self.problem_, self.modes_, self.model_, batch.reshape(out.shape)[:, free], self.tolerance)
+        loads = batch.reshape(out.shape)[:, free]
+        out[:, free] = predict_corrected(self.problem_, self.modes_, self.model_, self.compliance_, loads, self.tolerance)
         return out.reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
@@ -88,4 +90,5 @@ class ModalDerivatives(Surrogate):
                 raise InvalidInputError(f"the polynomial must be that of {r} modes; got {self.problem_.n_unknowns}.")
         else:
             self.problem_ = GalerkinProblem(self.model_.assembler, self.modes_)
-        _ = self.problem_.rest_factor, self.model_.rest_factor
+        self.compliance_ = Compliance(self.model_)
+        _ = self.problem_.rest_factor

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import comb
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numba import njit
+from numpy.typing import NDArray
 from pydantic import Field
 
 from mor_bench import counting
-from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.model import unknown_equations
-from mor_bench.mechanics.observed import forward_model
-from mor_bench.reduction.basis import pod
-from mor_bench.scene.scene import Scene
-from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogate import Surrogate
+from mor_bench.surrogates.coordinate_regression import CoordinateRegression
+
+Levels = list[tuple[NDArray[np.int64], NDArray[np.int64]]]
 
 
-def monomial_indices(n_variables: int, degree: int) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def monomial_indices(n_variables: int, degree: int) -> Levels:
     """For each degree from 2 on: which monomial of the degree below, times which variable, gives each monomial."""
     levels = []
     last = np.arange(n_variables)
@@ -31,24 +29,37 @@ def monomial_indices(n_variables: int, degree: int) -> list[tuple[NDArray[np.int
     return levels
 
 
-def monomials(z: NDArray[np.float64], levels: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> NDArray[np.float64]:
-    """All monomials of degree 1 and more of the variables z (n, n_variables), (n, n_monomials)."""
-    powers = [z]
-    for parents, variables in levels:
-        powers.append(powers[-1][:, parents] * z[:, variables])
-    return np.concatenate(powers, axis=1)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _monomials(z, parents, variables, out):  # type: ignore[no-untyped-def]
+    n_variables = z.shape[1]
+    for i in range(len(z)):
+        row, values = z[i], out[i]
+        values[:n_variables] = row
+        for k in range(len(parents)):
+            values[n_variables + k] = values[parents[k]] * row[variables[k]]
 
 
-class PCARegression(Surrogate):
-    """Polynomial ridge regression between principal coordinates, without means: no force gives no displacement.
+class Monomials:
+    """All monomials of degree 1 to ``degree`` of some variables, those of low degree first."""
 
-    With the linear response as input, u = K₀⁻¹f + Φ W p(z): z are coordinates of the linear response K₀⁻¹f, p their
-    monomials, and only the nonlinear rest is learned; the response to any force is at least that of linear elasticity.
-    In a scene with observed nodes their displacements take the place of the force, and the linear extension of these that of
-    the linear response.
+    def __init__(self, n_variables: int, degree: int) -> None:
+        levels = monomial_indices(n_variables, degree)
+        starts = np.cumsum([0, n_variables, *(len(parents) for parents, _ in levels)])
+        self._parents = np.concatenate([np.zeros(0, np.int64), *(start + parents for start, (parents, _) in zip(starts, levels, strict=False))])
+        self._variables = np.concatenate([np.zeros(0, np.int64), *(variables for _, variables in levels)])
+        self.n_products = len(self._parents)
 
-    With the force as input, u = Φ W p(z) with z the coordinates of the force itself: between load regions that share no
-    training sample this learns nothing.
+    def __call__(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of variables (n, n_variables), (n, n_monomials)."""
+        out = np.empty((len(z), z.shape[1] + self.n_products))
+        _monomials(z, self._parents, self._variables, out)
+        return out
+
+
+class PCARegression(CoordinateRegression):
+    """Polynomial ridge regression between principal coordinates; see `CoordinateRegression` for what it shares with others.
+
+    g(z) = W p(z), with p the monomials of z.
 
     Parameters
     ----------
@@ -59,12 +70,10 @@ class PCARegression(Surrogate):
     n_output_modes : int
         Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a warning.
     degree : int
-        Highest degree of the monomials.
+        Highest degree of the monomials; 1 is plain ridge regression.
     ridge : float
         Tikhonov weight relative to the mean squared feature, with features scaled to unit root mean square.
     """
-
-    takes_observations = True
 
     def __init__(
         self,
@@ -80,58 +89,26 @@ class PCARegression(Surrogate):
         self.degree = degree
         self.ridge = ridge
 
-    def supports(self, scene: Scene) -> str | None:
-        return unknown_equations(scene, observed=True) if self.input == "linear-response" else None
-
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
+    def _learn(self, z: NDArray[np.float64], targets: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
         from sklearn.linear_model import Ridge
 
-        with self._fitting(scene):
-            snapshots = self._checked_snapshots(snapshots)
-            forces, targets = snapshots.free_inputs, snapshots.free_displacements
-            if self.input == "linear-response":
-                inputs = forward_model(scene).linear_response(forces)
-                targets = targets - inputs
-            else:
-                inputs = forces
-            used = np.flatnonzero(inputs.any(axis=0))  # of forces only a few columns
-            modes = pod(inputs[:, used], self.n_input_modes).modes
-            axes = np.zeros((inputs.shape[1], modes.shape[1]))
-            axes[used] = modes / np.sqrt(((inputs[:, used] @ modes) ** 2).mean(axis=0))
-            features = monomials(inputs @ axes, monomial_indices(axes.shape[1], self.degree))
-            feature_scale = np.sqrt((features**2).mean(axis=0))
-            modes = pod(targets, self.n_output_modes).modes
-            regression = Ridge(alpha=self.ridge * len(features), fit_intercept=False, solver="cholesky")
-            regression.fit(features / feature_scale, targets @ modes)
-            weights = np.atleast_2d(regression.coef_) / feature_scale
-            self._restore({"axes": axes, "modes": modes, "weights": weights})
-        return self
+        features = Monomials(z.shape[1], self.degree)(z)
+        feature_scale = np.sqrt((features**2).mean(axis=0))
+        regression = Ridge(alpha=self.ridge * len(features), fit_intercept=False, solver="cholesky")
+        regression.fit(features / feature_scale, targets)
+        return {"weights": np.atleast_2d(regression.coef_) / feature_scale}
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        batch = self._checked_forces(forces).reshape(-1, self.scene_.mesh.n_dofs)
-        free = batch[:, self.scene_.free_dofs]
-        out = np.zeros_like(batch)
+    def _shapes(self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, ...]]:
+        return {"weights": (n_outputs, sum(comb(n_inputs + d - 1, d) for d in range(1, self.degree + 1)))}
+
+    def _take(self, state: dict[str, NDArray[Any]]) -> None:
+        self.weights_ = state["weights"]
+        self._monomials = Monomials(state["axes"].shape[1], self.degree)
+
+    def _learned(self) -> dict[str, NDArray[Any]]:
+        return {"weights": self.weights_}
+
+    def _coefficients(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         if counting.running is not None:
-            monomial_products = self.weights_.shape[1] - self.axes_.shape[1]
-            products = self.axes_.size + monomial_products + self.weights_.size + self.modes_.size
-            counting.running.add(multiply_adds=len(batch) * products)
-        inputs = self.model_.linear_response(free) if self.input == "linear-response" else free
-        nonlinear = (monomials(inputs @ self.axes_, self._levels) @ self.weights_.T) @ self.modes_.T
-        out[:, self.scene_.free_dofs] = inputs + nonlinear if self.input == "linear-response" else nonlinear
-        return out.reshape(np.shape(forces))
-
-    def _state(self) -> dict[str, NDArray[Any]]:
-        return {"axes": self.axes_, "modes": self.modes_, "weights": self.weights_}
-
-    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        # One memory order, fitted or loaded: BLAS rounds differently in another.
-        state = {name: np.ascontiguousarray(array) for name, array in state.items()}
-        n_free, n_axes, n_modes = len(self.scene_.free_dofs), state["axes"].shape[1], state["modes"].shape[1]
-        n_features = sum(comb(n_axes + d - 1, d) for d in range(1, self.degree + 1))
-        for name, shape in {"axes": (n_free, n_axes), "modes": (n_free, n_modes), "weights": (n_modes, n_features)}.items():
-            if state[name].shape != shape or not np.isfinite(state[name]).all():
-                raise InvalidInputError(f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}.")
-        self.axes_, self.modes_, self.weights_ = state["axes"], state["modes"], state["weights"]
-        self._levels = monomial_indices(n_axes, self.degree)
-        if self.input == "linear-response":
-            self.model_ = forward_model(self.scene_)
+            counting.running.add(multiply_adds=len(z) * (self._monomials.n_products + self.weights_.size))
+        return np.asarray(self._monomials(z) @ self.weights_.T)

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
+from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.separated import Family, separate
@@ -100,7 +101,8 @@ class SeparatedLoad(Surrogate):
             snapshots = self._checked_snapshots(snapshots)
             targets = snapshots.free_displacements
             if self.base == "linear-response":
-                targets = targets - FullOrderModel(scene).rest_factor.solve(snapshots.free_forces.T).T
+                self.compliance_ = Compliance(FullOrderModel(scene))
+                targets = targets - self.compliance_.respond(snapshots.forces.reshape(len(snapshots), -1))[:, scene.free_dofs]
             positions, vectors = _coordinates(scene.mesh.points, snapshots.forces)
             frame, ends = _frame(positions[vectors.any(axis=1)], scene.mesh.points)
             largest = float(np.linalg.norm(vectors, axis=1).max())
@@ -141,7 +143,6 @@ class SeparatedLoad(Surrogate):
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
         scene = self.scene_
-        free = batch.reshape(-1, scene.mesh.n_dofs)[:, scene.free_dofs]
         position, directions, powers = self._functions(*_coordinates(scene.mesh.points, batch))
         direction = np.concatenate([directions[degree] for degree in self._degrees], axis=1)
         terms = (position @ self.by_position_) * (direction @ self.by_direction_) * (powers @ self.by_power_)
@@ -153,7 +154,7 @@ class SeparatedLoad(Surrogate):
         out = np.zeros((len(batch), scene.mesh.n_dofs))
         out[:, scene.free_dofs] = (terms @ self.vectors_) @ self.modes_.T
         if self.base == "linear-response":
-            out[:, scene.free_dofs] += self.model_.rest_factor.solve(free.T).T
+            out += self.compliance_.respond(batch.reshape(out.shape))
         return out.reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
@@ -182,9 +183,8 @@ class SeparatedLoad(Surrogate):
         self._take(state)
         self.modes_, self.vectors_ = state["modes"], state["vectors"]
         self.by_position_, self.by_direction_, self.by_power_ = state["by_position"], state["by_direction"], state["by_power"]
-        if self.base == "linear-response":
-            self.model_ = FullOrderModel(self.scene_)
-            _ = self.model_.rest_factor
+        if self.base == "linear-response" and not hasattr(self, "compliance_"):
+            self.compliance_ = Compliance(FullOrderModel(self.scene_))
 
 
 def _coordinates(points: Array, forces: Array) -> tuple[Array, Array]:

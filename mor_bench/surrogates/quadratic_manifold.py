@@ -10,6 +10,7 @@ from pydantic import Field
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError, SolverError
+from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.cubature import sparse_nnls
@@ -110,7 +111,7 @@ class QuadraticManifoldGalerkin(Surrogate):
                 counting.running.add(multiply_adds=modes.size)
             q = solve_equilibrium(problem, modes.T @ load, options=NewtonOptions(self.tolerance)).displacement
             # With the stiffness of the sampled cells: what these err at small strains is corrected, too.
-            correction = static_correction(self.model_.rest_factor, self.linear_.rest_factor, modes, load)
+            correction = static_correction(self.compliance_, self.linear_.rest_factor, modes, load)
             row[free] = self.manifold_.at(q)[0] + correction
             refuse_inverted(self.model_, row[free])
         return out.reshape(np.shape(forces))
@@ -128,4 +129,5 @@ class QuadraticManifoldGalerkin(Surrogate):
         self.linear_ = GalerkinProblem(assembler, self.manifold_.modes[rows])
         self._sampled = QuadraticManifold(self.manifold_.modes[rows], self.manifold_.derivatives[rows])
         self.model_ = FullOrderModel(scene)
-        _ = self.model_.rest_factor, self.linear_.rest_factor
+        self.compliance_ = Compliance(self.model_)
+        _ = self.linear_.rest_factor

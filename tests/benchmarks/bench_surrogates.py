@@ -43,6 +43,11 @@ METHODS: dict[str, dict[str, Any]] = {
     "umesh": {"channels": 8, "steps": 2, "iterations": 200, "batch_size": 16, "learning_rate": 3e-3},
     "umesh-small": {"channels": 8, "iterations": 200},
     "umesh-linear": {"channels": 8, "iterations": 200},
+    "pca-ridge": {},
+    "pca-kernel-ridge": {},
+    "pca-gaussian-process": {"n_input_modes": 10},
+    "pca-random-forest": {},
+    "pca-extra-trees": {},
     "gappy-pod": {"n_modes": 20},
 }
 """Methods and their knobs. U-Mesh's latency does not depend on how long it was trained; the error of so short a training says little."""

@@ -17,7 +17,7 @@ from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.learning.training import Precision, Schedule, TrainingPlan, device_of, fingerprint_of, train
 from mor_bench.mechanics.model import unknown_equations
-from mor_bench.mechanics.observed import forward_model
+from mor_bench.mechanics.observed import linear_response
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.scene import Scene
 from mor_bench.scene.symmetry import Mirror, mirrors
@@ -220,16 +220,13 @@ class UMesh(Surrogate):
         """What the scene gives, before anything is learned."""
         self.grid_: PaddedGrid = padded_grid(grid_map(self.scene_.mesh, self.scene_.spec.grid_nodes), self.steps)
         if self.input == "linear-response":
-            self.model_ = forward_model(self.scene_)
+            self.compliance_ = linear_response(self.scene_)
 
     def _given(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, n_nodes, 3) what the network is given: the forces, N, or displacements of observed nodes, m; or the linear response to them, m."""
         if self.input == "force":
             return forces
-        response = np.zeros((len(forces), self.scene_.mesh.n_dofs))
-        free = self.scene_.free_dofs
-        response[:, free] = self.model_.linear_response(forces.reshape(len(forces), -1)[:, free])
-        return response.reshape(forces.shape)
+        return self.compliance_.respond(forces.reshape(len(forces), self.scene_.mesh.n_dofs)).reshape(forces.shape)
 
     def _answer(self, given: Tensor) -> Tensor:
         """The network from nodes to nodes, (n, n_nodes, 3) float32, scaled."""
