@@ -410,6 +410,18 @@ class Needs(_Model):
     latency_ms: Positive
 
 
+class Observed(_Model):
+    """What is known of a scene whose forces are not: the displacements of a part of the surface.
+
+    Attributes
+    ----------
+    region : Region
+        Of its nodes those that lie on the surface and are free to move are observed.
+    """
+
+    region: Region
+
+
 Side = Annotated[int, Field(ge=2, le=1024)]
 
 
@@ -423,7 +435,8 @@ def _without_paths(value: Any) -> Any:
 class _AnyDataset(_Model):
     """What every dataset file has.
 
-    `grid_nodes` are the nodes per axis of the regular grid for methods that need one, where the mesh lies in none.
+    `grid_nodes` are the nodes per axis of the regular grid for methods that need one, where the mesh lies in none. With
+    `observed` methods are given displacements of some nodes in the place of forces; the samples stay the same.
     """
 
     name: str
@@ -431,6 +444,7 @@ class _AnyDataset(_Model):
     source: str
     needs: Needs
     grid_nodes: Annotated[tuple[Side, Side, Side], Field(strict=False)] | None = None
+    observed: Observed | None = Field(default=None, exclude_if=lambda value: value is None)
 
     def physics(self) -> dict[str, Any]:
         """All that decides the samples: two datasets with equal physics have equal snapshots."""
@@ -487,6 +501,7 @@ class ImportedDatasetSpec(_AnyDataset):
 AnyDatasetSpec = DatasetSpec | ImportedDatasetSpec
 
 NO_EQUATIONS = "its snapshots were imported, so its equations are not known"
+NO_FORCES = "its forces are not known, only the displacements of a part of its surface"
 
 
 def generated(spec: AnyDatasetSpec) -> DatasetSpec:

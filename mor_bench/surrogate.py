@@ -20,7 +20,7 @@ from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.load_range import LoadRange
 from mor_bench.snapshots.store import write_atomically
-from mor_bench.specs import check_parameters, list_suite, load_class, load_method_spec
+from mor_bench.specs import NO_FORCES, check_parameters, list_suite, load_class, load_method_spec
 
 if TYPE_CHECKING:
     import onnx
@@ -89,6 +89,9 @@ def take_sizes(state: dict[str, NDArray[Any]]) -> dict[str, Any]:
 class Surrogate(ABC):
     """A map from nodal forces to nodal displacements of one scene.
 
+    In a scene with observed nodes, `Scene.observed_nodes`, the displacements of these, m, stand everywhere in the place of the
+    forces: what other nodes hold is not looked at, and may be NaN. Only a class with `takes_observations` is given such a scene.
+
     A subclass stores its knobs in ``__init__`` under their own names and nothing else, annotates them (pydantic `Field`
     constraints give their range), fits inside ``with self._fitting(scene)``, takes its samples from `_checked_snapshots`, and
     begins `predict` with `_checked_forces`.
@@ -106,6 +109,9 @@ class Surrogate(ABC):
 
     needs_snapshots: ClassVar[bool] = True
     """Whether `fit` learns from snapshots; their cost is charged only to methods that do."""
+
+    takes_observations: ClassVar[bool] = False
+    """Whether it can be given displacements of a part of the surface in the place of forces, by `Snapshots.inputs`."""
 
     time_limit_s: float | None = None
     """Seconds that a comparison leaves to `fit`; a method that sees early that they will not do raises `OutOfTimeError`."""
@@ -135,7 +141,7 @@ class Surrogate(ABC):
         Parameters
         ----------
         forces : (n_nodes, 3) or (n, n_nodes, 3)
-            Nodal forces, N.
+            Nodal forces, N; in a scene with observed nodes, displacements of these, m.
 
         Returns
         -------
@@ -159,7 +165,11 @@ class Surrogate(ABC):
 
     def supports(self, scene: Scene) -> str | None:
         """None, or the reason why the method cannot handle a scene."""
-        return None
+        return self._needs_forces(scene)
+
+    def _needs_forces(self, scene: Scene) -> str | None:
+        """The reason why a method that is given forces cannot handle a scene where they are not known."""
+        return None if self.takes_observations or scene.observed_nodes is None else NO_FORCES
 
     def out_of_range(self, forces: ArrayLike) -> NDArray[np.bool_]:
         """Which loads lie out of the range of the training loads.
@@ -184,13 +194,15 @@ class Surrogate(ABC):
             Before `fit`.
         UnknownRangeError
             If the method learns but its range is not known: its `fit` does not check its snapshots by `_checked_snapshots`,
-            or it was loaded from a file that was written before ranges were.
+            or it was loaded from a file that was written before ranges were; and where it is given displacements, not loads.
         """
         batch = self._checked_forces(forces)
         if not self.needs_snapshots:
             flags = np.zeros(len(batch), dtype=bool)
         elif hasattr(self, "range_"):
             flags = self.range_.excludes(batch)
+        elif self.scene_.observed_nodes is not None:
+            raise UnknownRangeError(f"{self.scene_.name}: which loads are like those of training cannot be told: {NO_FORCES}.")
         else:
             raise UnknownRangeError(
                 f"the loads that this {type(self).__name__} was trained on are not known: its `fit` does not check them by `_checked_snapshots`, "
@@ -218,11 +230,13 @@ class Surrogate(ABC):
         NotFittedError
             Before `fit`.
         UnsupportedSceneError
-            If the scene's equations are not known.
+            If the scene's equations, or the forces, are not known.
         """
         from mor_bench.mechanics.indicator import ErrorIndicator
 
         batch = self._checked_forces(forces)
+        if self.scene_.observed_nodes is not None:
+            raise UnsupportedSceneError(f"{self.scene_.name}: no error can be indicated, for {NO_FORCES}.")
         predicted = np.asarray(displacements)
         if predicted.dtype.kind != "f" or predicted.shape != np.shape(forces):
             raise InvalidInputError(f"`displacements` must be floats of shape {np.shape(forces)}; got {predicted.dtype} of shape {predicted.shape}.")
@@ -290,7 +304,7 @@ class Surrogate(ABC):
     def _fitting(self, scene: Scene) -> Iterator[None]:
         """Check the knobs and the scene, forget an earlier fit, and stay unfitted if the body fails."""
         check_parameters(type(self), self.parameters)
-        reason = self.supports(scene)
+        reason = self.supports(scene) or self._needs_forces(scene)
         if reason is not None:
             raise UnsupportedSceneError(f"{type(self).__name__} cannot handle {scene.name}: {reason}")
         for name in [name for name in vars(self) if name.endswith("_")]:
@@ -315,11 +329,12 @@ class Surrogate(ABC):
             )
         if not np.isfinite(displacements).all() or not np.isfinite(vectors).all():
             raise InvalidInputError("the training snapshots hold NaN or infinity.")
-        self.range_ = LoadRange.of(snapshots)
+        if self.scene_.observed_nodes is None:
+            self.range_ = LoadRange.of(snapshots)
         return snapshots
 
     def _checked_forces(self, forces: ArrayLike) -> NDArray[np.float64]:
-        """Forces as (n, n_nodes, 3) float64; the first line of every `predict`."""
+        """Forces, or displacements of observed nodes and zeros elsewhere, as (n, n_nodes, 3) float64; the first line of every `predict`."""
         if not hasattr(self, "scene_"):
             raise NotFittedError(f"{type(self).__name__} must be fitted before it predicts.")
         try:
@@ -331,8 +346,13 @@ class Surrogate(ABC):
             raise InvalidInputError(f"`forces` must hold real numbers; got dtype {array.dtype}.")
         if array.ndim not in (2, 3) or array.shape[-2:] != (n_nodes, 3):
             raise InvalidInputError(f"`forces` must have shape ({n_nodes}, 3) or (n, {n_nodes}, 3); got {array.shape}.")
+        observed, unit = self.scene_.observed_nodes, "N"
+        if observed is not None:
+            seen, unit = np.zeros(array.shape, dtype=array.dtype), "m at the observed nodes"
+            seen[..., observed, :] = array[..., observed, :]
+            array = seen
         if not (np.abs(array) <= MAX_FORCE_N).all():
-            raise InvalidInputError(f"`forces` must be finite and at most {MAX_FORCE_N:g} N; got {np.abs(array).max():g}.")
+            raise InvalidInputError(f"`forces` must be finite and at most {MAX_FORCE_N:g} {unit}; got {np.abs(array).max():g}.")
         return array.astype(np.float64, copy=False).reshape(-1, n_nodes, 3)
 
 

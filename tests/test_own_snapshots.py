@@ -110,6 +110,9 @@ def test_every_method_competes_or_says_why_not(name: str, arrays: Arrays, tmp_pa
         method = mor_bench.load_method(name, **CHEAP.get(name, {}))
     except MissingDependencyError as error:
         pytest.skip(str(error))
+    if name == "gappy-pod":
+        assert method.supports(data.scene) == "it is given forces, and no displacements of a part of the surface to be completed"
+        return
     if name not in COMPETE:
         assert method.supports(data.scene) == "its snapshots were imported, so its equations are not known"
         with pytest.raises(UnsupportedSceneError, match="cannot handle mine: its snapshots were imported"):

@@ -22,6 +22,7 @@ SHIPPED = {
     "beam-nearly-incompressible": (135, 256, 64, 3200),
     "block-compression": (216, 343, 49, 1960),
     "liver-hex": (726, 1118, 200, 2000),
+    "liver-hex-observed": (726, 1118, 200, 2000),
     "liver-tet": (4567, 1118, 200, 2000),
 }
 
@@ -43,6 +44,7 @@ CONFIGURATIONS = {
     "pca-ridge": 1, "pca-kernel-ridge": 2, "pca-gaussian-process": 2, "pca-random-forest": 2, "pca-extra-trees": 2,
     "pod-nn": 2, "pod-nn-derivative": 2, "sparse-polynomial": 3, "sparse-polynomial-derivative": 3,
     "deeponet": 2, "pod-deeponet": 2, "fno": 2, "mesh-graph-net": 2,
+    "gappy-pod": 6,
 }  # fmt: skip
 
 

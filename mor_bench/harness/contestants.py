@@ -33,6 +33,9 @@ CORE_METHODS = ("fem", "pod", "hpod", "pca-regression", "umesh")
 DATA_METHODS = ("pca-regression-force", "umesh")
 """The same on imported snapshots, whose equations are not known."""
 
+OBSERVATION_METHODS = ("fem", "linear-fem", "gappy-pod", "pca-regression", "umesh")
+"""The same where displacements of a part of the surface are given in the place of forces."""
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -95,8 +98,14 @@ def _default_methods(specs: Sequence[AnyDatasetSpec], profile: str, suite: Path 
     own = list(list_suite("methods", suite)) if suite else []
     if profile == "full":
         return list(dict.fromkeys([*CORE_METHODS, *list_suite("methods"), *own]))
-    defaults = [DATA_METHODS if isinstance(spec, ImportedDatasetSpec) else CORE_METHODS for spec in specs]
+    defaults = [_defaults_of(spec) for spec in specs]
     return list(dict.fromkeys([*(name for names in defaults for name in names), *own]))
+
+
+def _defaults_of(spec: AnyDatasetSpec) -> tuple[str, ...]:
+    if spec.observed is None:
+        return DATA_METHODS if isinstance(spec, ImportedDatasetSpec) else CORE_METHODS
+    return ("gappy-pod", *DATA_METHODS) if isinstance(spec, ImportedDatasetSpec) else OBSERVATION_METHODS
 
 
 def _check_method(spec: MethodSpec, cache: Path, memory_limit_bytes: float | None) -> None:

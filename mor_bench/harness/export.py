@@ -72,13 +72,19 @@ def export_vtu(data: Dataset, sample: int, out: str | Path, *, part: Part = "tes
     fields = [{"displacement": reference, "force": force}]
     for path in models:
         model = load_surrogate(path)
-        if model.scene_.spec.physics() != data.scene.spec.physics():
+        if model.scene_.spec.physics() != data.scene.spec.physics() or _observed(model.scene_) != _observed(data.scene):
             raise InvalidInputError(f"{path}: the model was fitted to {model.scene_.name!r}, not to {data.scene.name!r} as it is.")
-        predicted = model.predict(force)
+        predicted = model.predict(samples.inputs[sample])
         fields.append({"displacement": predicted, "force": force, "error": predicted - reference})
     out.mkdir(parents=True, exist_ok=True)
     stems = [f"{data.scene.name}-{part}-{sample:05d}-{name}" for name in names]
     return [path for stem, found in zip(stems, fields, strict=True) for path in _write(data.scene, found, out, stem)]
+
+
+def _observed(scene: Scene) -> list[int] | None:
+    """The nodes whose displacements methods are given; None where they are given forces."""
+    nodes = scene.observed_nodes
+    return None if nodes is None else [int(node) for node in nodes]
 
 
 def _part(data: Dataset, part: Part) -> Snapshots:

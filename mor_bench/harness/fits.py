@@ -105,12 +105,12 @@ class Place:
 
 @dataclass(frozen=True)
 class TestSet:
-    """Forces that methods are asked for, and the displacements that answer them: both stay in this process until scoring.
+    """What methods are asked for, and the displacements that answer it: both stay in this process until scoring.
 
     Attributes
     ----------
     forces, references : (n, n_nodes, 3) float64
-        N and m.
+        N and m; displacements of observed nodes, m, in the place of forces that are not known.
     nodes : (n_output_nodes,) int64
         The nodes where answers count.
     digest : str
@@ -126,9 +126,9 @@ class TestSet:
     def of(cls, snapshots: Snapshots) -> TestSet:
         """A test set from snapshots."""
         nodes = snapshots.scene.output_nodes
-        arrays = {"f": snapshots.forces, "u": snapshots.displacements}
+        arrays = {"f": snapshots.inputs, "u": snapshots.displacements}
         return cls(
-            snapshots.forces,
+            snapshots.inputs,
             snapshots.displacements,
             nodes,
             digest_of(arrays if len(nodes) == snapshots.scene.mesh.n_nodes else {**arrays, "nodes": nodes}),
@@ -184,13 +184,16 @@ class Material:
         """Of the training snapshots and the scene."""
         spec = self.scene.spec
         asked = [] if spec.needs.outputs == "all" else [spec.needs.model_dump(mode="json", include={"outputs"})]
+        if self.scene.observed_nodes is not None:
+            asked.append({"observed": self.scene.observed_nodes.tolist()})
         scene = json.dumps([spec.physics(), spec.grid_nodes, *asked], sort_keys=True)
         return digest_of(arrays_of(self._train)) + hashlib.sha256(scene.encode()).hexdigest()
 
     @cached_property
     def indicator(self) -> ErrorIndicator | None:
-        """None where the equations are not known, or not all displacements are asked for."""
-        whole = self.scene.material is not None and len(self.scene.output_nodes) == self.scene.mesh.n_nodes
+        """None where equations or forces are not known, or not all displacements are asked for."""
+        known = self.scene.material is not None and self.scene.observed_nodes is None
+        whole = known and len(self.scene.output_nodes) == self.scene.mesh.n_nodes
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of the scene; methods say the same
             return ErrorIndicator(self.scene) if whole else None
@@ -529,7 +532,8 @@ def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[
         **indicated.arrays,
         "worst_prediction": worst[2],
         "worst_reference": test.references[worst[1]],
-        "worst_forces": test.forces[worst[1]],
+        # Nothing to draw an arrow from where methods are given displacements.
+        "worst_forces": test.forces[worst[1]] * (entry.material.scene.observed_nodes is None),
     }
 
 

@@ -36,7 +36,7 @@ from mor_bench.mechanics.locking import warn_of_locking
 from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibria, solve_equilibrium
 from mor_bench.mechanics.rotated import BlockJacobi, JacobiFactor, RotatedRest, condition_number, conjugate_gradients
 from mor_bench.scene.scene import Scene
-from mor_bench.specs import NO_EQUATIONS, SolverName
+from mor_bench.specs import NO_EQUATIONS, NO_FORCES, SolverName
 
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 """How equilibria are solved.
@@ -71,9 +71,18 @@ def missing_library(solver: SolverName) -> str | None:
     return None
 
 
-def unknown_equations(scene: Scene) -> str | None:
-    """The reason why a scene has no full-order model; None if it has one."""
-    return NO_EQUATIONS if scene.material is None else None
+def unknown_equations(scene: Scene, *, observed: bool = False) -> str | None:
+    """The reason why a scene has no equilibrium to be solved for; None if it has one.
+
+    Parameters
+    ----------
+    scene : Scene
+    observed : bool
+        Whether displacements of a part of the surface will do in the place of the forces, as to an `ObservedModel`.
+    """
+    if scene.material is None:
+        return NO_EQUATIONS
+    return None if observed or scene.observed_nodes is None else NO_FORCES
 
 
 def free_rigid_modes(scene: Scene) -> list[str]:
@@ -192,12 +201,18 @@ class FullOrderModel:
     @cached_property
     def turned_rest(self) -> RotatedRest:
         """An approximate inverse of all tangents, R K₀⁻¹ Rᵀ, where there is a factor of the stiffness at rest."""
-        mesh, factor = self.scene.mesh, self.rest_factor
+        factor = self.rest_factor
         assert isinstance(factor, BandedFactor | MultigridFactor)
+        return RotatedRest(factor.single_precision(), *self.turning_cells)
+
+    @property
+    def turning_cells(self) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
+        """What nodal rotations are found from: the cells' free nodes, and gradients and volumes at their centres; see `RotatedRest`."""
+        mesh = self.scene.mesh
         element = element_of(mesh.cells)
         gradients, det_j = shape_gradients(mesh.points, mesh.cells, element.centre[None])
         cell_nodes = (self.cell_dofs[:, ::3] // 3).astype(np.int32)
-        return RotatedRest(factor.single_precision(), cell_nodes, gradients[:, 0], det_j[:, 0] * element.weights.sum())
+        return cell_nodes, gradients[:, 0], det_j[:, 0] * element.weights.sum()
 
     @cached_property
     def _jacobi(self) -> BlockJacobi:

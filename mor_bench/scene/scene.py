@@ -94,6 +94,26 @@ class Scene:
         return np.arange(self.mesh.n_nodes) if outputs == "all" else region_points(self._cloud, outputs)
 
     @cached_property
+    def observed_nodes(self) -> NDArray[np.int64] | None:
+        """(n_observed,) the nodes whose displacements methods are given, sorted; None where they are given the forces.
+
+        Raises
+        ------
+        SpecError
+            If the region holds no node, none of the surface that is free to move, or every node that is.
+        """
+        if self.spec.observed is None:
+            return None
+        region = region_points(self._cloud, self.spec.observed.region)
+        free = np.setdiff1d(np.arange(self.mesh.n_nodes), self.fixed_nodes)
+        seen = np.intersect1d(np.intersect1d(region, self._cloud.on_surface), free)
+        if not len(seen):
+            raise SpecError("`observed.region` holds no node that lies on the surface and is free to move.")
+        if len(seen) == len(free):
+            raise SpecError("`observed.region` holds every node that is free to move: nothing is left to be found.")
+        return seen
+
+    @cached_property
     def surface(self) -> Facets:
         """What loads act on: the mesh's own boundary, or the embedded surface."""
         return self.embedded_surface or Facets(self.mesh.points, self.mesh.boundary_facets)
@@ -203,7 +223,9 @@ def load_scene(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> Scene
 
 def imported_scene(spec: ImportedDatasetSpec, arrays: ImportedArrays) -> Scene:
     """The scene of imported snapshots, of which the mesh and the supports are known and the equations are not."""
-    return Scene(spec, arrays.mesh, None, arrays.fixed_nodes)
+    scene = Scene(spec, arrays.mesh, None, arrays.fixed_nodes)
+    _ = scene.observed_nodes
+    return scene
 
 
 def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
@@ -313,5 +335,6 @@ def _check_element(spec: DatasetSpec, mesh: Mesh) -> None:
 
 def _build(spec: DatasetSpec) -> Scene:
     scene = _without_patches(spec)
-    _ = scene.patch_weights, scene.output_nodes  # an empty region is an error of the dataset: raised here, not at the first solve
+    # An empty region is an error of the dataset: raised here, not at the first solve.
+    _ = scene.patch_weights, scene.output_nodes, scene.observed_nodes
     return scene

@@ -64,6 +64,24 @@ class Snapshots:
             return self.loads.forces
         return read_only(self.loads.nodal_forces(self.scene.patch_weights))
 
+    @cached_property
+    def inputs(self) -> NDArray[np.float64]:
+        """(n_samples, n_nodes, 3) what methods are given: the forces, N, or, in a scene with observed nodes, the displacements of these, m.
+
+        Zero at all other nodes. `forces` stays what it is: the forces that the samples were made with.
+        """
+        nodes = self.scene.observed_nodes
+        if nodes is None:
+            return self.forces
+        seen = np.zeros_like(self.displacements)
+        seen[:, nodes] = self.displacements[:, nodes]
+        return read_only(seen)
+
+    @property
+    def free_inputs(self) -> NDArray[np.float64]:
+        """(n_samples, n_free) `inputs` at the free dofs."""
+        return self.inputs.reshape(len(self), -1)[:, self.scene.free_dofs]
+
     @property
     def free_forces(self) -> NDArray[np.float64]:
         """(n_samples, n_free) nodal forces at the free dofs, N."""

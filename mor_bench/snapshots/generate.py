@@ -15,7 +15,7 @@ import platformdirs
 from mor_bench.errors import DamagedFileWarning, NewerSchemaError, StoreError
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.executors import KEPT, check_pool, open_pool
-from mor_bench.snapshots.manifest import Manifest, keep_sources, update_manifest
+from mor_bench.snapshots.manifest import Manifest, keep_sources, read_manifest, update_manifest
 from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of
 from mor_bench.snapshots.solve import GENERATOR_VERSION, Solved, Task, pack, solve_task
 from mor_bench.snapshots.store import SCHEMA_VERSION, STATUSES, Shard, read_shard, remove_leftovers, write_atomically, write_shard
@@ -42,8 +42,10 @@ def dataset_key(spec: DatasetSpec) -> str:
 
 
 def dataset_folder(spec: DatasetSpec, cache: Path | None) -> Path:
-    """Where a dataset lies: its name and its key."""
-    return Path(cache or default_cache()) / "datasets" / f"{spec.name}-{dataset_key(spec)}"
+    """Where a dataset lies: its name and its key; or that of another name, if there is one with the same samples."""
+    parent = Path(cache or default_cache()) / "datasets"
+    own = parent / f"{spec.name}-{dataset_key(spec)}"
+    return own if own.exists() else min(parent.glob(f"*-{dataset_key(spec)}"), default=own)
 
 
 def shard_path(folder: Path, number: int) -> Path:
@@ -188,7 +190,7 @@ def generate(
     missing = [number for number in plan.numbers if not plan.has(number)]
     with _writing(folder):
         keep_sources(folder, spec)
-        update_manifest(folder, Manifest(spec, GENERATOR_VERSION, whole, SHARD_SIZE), solves=bool(missing))
+        update_manifest(folder, Manifest(_owner(folder, spec), GENERATOR_VERSION, whole, SHARD_SIZE), solves=bool(missing))
     count = _Count(plan, missing, progress)
     if missing and cluster is None:
         # Compiles the kernels, or reads them from numba's cache, here rather than in every worker at once.
@@ -197,6 +199,16 @@ def generate(
     if missing:
         _fill(plan, missing, count, workers if len(missing) > 1 else 1, cluster)
     return folder
+
+
+def _owner(folder: Path, spec: DatasetSpec) -> DatasetSpec:
+    """The specification that a folder's manifest is kept for: that of another dataset with the same samples, if it lies under its name."""
+    if folder.name != f"{spec.name}-{dataset_key(spec)}":
+        with suppress(StoreError, FileNotFoundError):
+            kept = read_manifest(folder).spec
+            if dataset_key(kept) == dataset_key(spec):
+                return kept
+    return spec
 
 
 class _Count:

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.compliance import Compliance, project
-from mor_bench.mechanics.model import FullOrderModel, unknown_equations
+from mor_bench.mechanics.compliance import project
+from mor_bench.mechanics.model import unknown_equations
+from mor_bench.mechanics.observed import LinearResponse, linear_response
 from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -29,14 +30,19 @@ class CoordinateRegression(Surrogate):
     is learned, and the answer to any force is at least that of linear elasticity. With the force as input nothing is known of
     load regions that training does not hold, and no equations are needed.
 
+    In a scene with observed nodes their displacements take the place of the force, and the linear extension of these that of the
+    linear response.
+
     A subclass has the knobs `input`, `n_input_modes` and `n_output_modes`, learns g in `_learn`, takes what was learned back
     in `_take`, whose shapes `_shapes` gives, and evaluates it in `_coefficients`.
     """
 
+    takes_observations = True
+
     input: Input
     n_input_modes: int | None
     n_output_modes: int
-    compliance_: Compliance
+    compliance_: LinearResponse
 
     usual_inputs: ClassVar[Mapping[Input, int]] = {"linear-response": 20, "force": 60}
     """Length of z where `n_input_modes` is None."""
@@ -45,7 +51,7 @@ class CoordinateRegression(Surrogate):
     """Names of the arrays that are int32; all others are float64."""
 
     def supports(self, scene: Scene) -> str | None:
-        return unknown_equations(scene) if self.input == "linear-response" else None
+        return unknown_equations(scene, observed=True) if self.input == "linear-response" else None
 
     @abstractmethod
     def _learn(self, z: Array, targets: Array) -> dict[str, NDArray[Any]]:
@@ -70,13 +76,13 @@ class CoordinateRegression(Surrogate):
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             snapshots = self._checked_snapshots(snapshots)
-            free, forces, targets = scene.free_dofs, snapshots.forces.reshape(len(snapshots), -1), snapshots.free_displacements
+            free, forces, targets = scene.free_dofs, snapshots.inputs.reshape(len(snapshots), -1), snapshots.free_displacements
             if self.input == "linear-response":
-                self.compliance_ = Compliance(FullOrderModel(scene))
+                self.compliance_ = linear_response(scene)
                 inputs = self.compliance_.respond(forces)[:, free]
                 targets = targets - inputs
             else:
-                inputs = snapshots.free_forces
+                inputs = snapshots.free_inputs
             used = np.flatnonzero(inputs.any(axis=0))  # of forces only a few columns
             usual = min(self.usual_inputs[self.input], *inputs[:, used].shape)
             modes = pod(inputs[:, used], self.n_input_modes or usual).modes
@@ -127,6 +133,6 @@ class CoordinateRegression(Surrogate):
         self._take(state)
         self.axes_, self.modes_ = state["axes"], state["modes"]
         if self.input == "linear-response" and not hasattr(self, "compliance_"):
-            self.compliance_ = Compliance(FullOrderModel(self.scene_))
+            self.compliance_ = linear_response(self.scene_)
         self._from_forces = self._to_coordinates(self.axes_)
         self._expanding = np.ascontiguousarray(self._on_all_dofs(self.modes_).T)

@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from mor_bench.errors import SolverError
-from mor_bench.mechanics.model import FullOrderModel, missing_library, unknown_equations
+from mor_bench.mechanics.model import missing_library, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.mechanics.observed import forward_model
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.specs import SolverName
@@ -19,6 +20,9 @@ from mor_bench.surrogate import Surrogate
 
 class FullFEM(Surrogate):
     """The nonlinear solve on the whole mesh.
+
+    Given displacements of a part of the surface it holds these and leaves all other nodes without a force: exact where
+    every loaded node is seen, see `mor_bench.mechanics.observed`.
 
     Parameters
     ----------
@@ -29,13 +33,14 @@ class FullFEM(Surrogate):
     """
 
     needs_snapshots = False
+    takes_observations = True
 
     def __init__(self, tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8, solver: SolverName | None = None) -> None:
         self.tolerance = tolerance
         self.solver = solver
 
     def supports(self, scene: Scene) -> str | None:
-        return unknown_equations(scene) or missing_library(self.solver or scene.generated.solver)
+        return unknown_equations(scene, observed=True) or missing_library(self.solver or scene.generated.solver)
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
         """Assemble and factorise the rest-state stiffness; snapshots are not used."""
@@ -58,5 +63,4 @@ class FullFEM(Surrogate):
         return {}
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        self.model_ = FullOrderModel(self.scene_, self.solver)
-        _ = self.model_.rest_factor
+        self.model_ = forward_model(self.scene_, self.solver)

@@ -56,6 +56,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "pod-deeponet": {"input": "linear-response", "iterations": 500},
     "fno": {"input": "linear-response", "iterations": 100},
     "mesh-graph-net": {"input": "linear-response", "iterations": 30},
+    "gappy-pod": {"n_modes": 20},
 }
 """Methods and their knobs. U-Mesh's latency does not depend on how long it was trained; the error of so short a training says little."""
 

@@ -1,0 +1,272 @@
+"""Equilibria of a body of which displacements of a part of the surface are known in the place of the forces.
+
+The observed nodes are held where they were seen, the supports at rest, and no force acts on all others, the hidden ones:
+f_int(u) = 0 there. That is exact where every loaded node is observed, and a modelling error otherwise: what is not seen is
+taken to be free of load.
+"""
+
+from __future__ import annotations
+
+import warnings
+from copy import copy
+from dataclasses import replace
+from functools import cached_property
+from typing import Protocol, Self
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from mor_bench import counting
+from mor_bench.errors import LockingWarning, NoEquilibriumError, SolverError, UnsupportedSceneError
+from mor_bench.mechanics.assembly import State
+from mor_bench.mechanics.compliance import Compliance
+from mor_bench.mechanics.linear import BandedFactor, MultigridFactor
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import NewtonOptions, Solution
+from mor_bench.mechanics.rotated import RotatedRest, SingleFactor, nodal_rotations
+from mor_bench.scene.scene import Scene
+from mor_bench.specs import SolverName
+
+Array = NDArray[np.float64]
+
+
+class _HiddenRest(RotatedRest):
+    """`RotatedRest` of the hidden nodes, which turn with the whole body.
+
+    Parameters
+    ----------
+    factor : SingleFactor
+        Of the hidden nodes' stiffness at rest.
+    whole : FullOrderModel
+    hidden : (n_hidden,) int64
+        Places of the hidden dofs among the free ones.
+    """
+
+    def __init__(self, factor: SingleFactor, whole: FullOrderModel, hidden: NDArray[np.int64]) -> None:
+        super().__init__(factor, *whole.turning_cells)
+        self._hidden, self._rows = hidden, np.append(hidden[::3] // 3, whole.n_unknowns // 3)
+        self._base = np.zeros(whole.n_unknowns)
+        _ = self._soft  # which copies share
+
+    def beside(self, base: Array) -> Self:
+        """For displacements q beside a state of the whole body, (n_free,), m."""
+        found = copy(self)
+        found._base = base
+        return found
+
+    def turned(self, q: Array | None) -> Array:
+        u = np.append(self._base, np.zeros(3))
+        if q is not None:
+            u[self._hidden] += q
+        rotations = np.empty((len(u) // 3, 3, 3))
+        iterations = nodal_rotations(u.reshape(-1, 3), *self.cells, rotations)
+        if counting.running is not None:
+            counting.running.add(multiply_adds=4 * self.cells[1].size + 20 * len(rotations) + 40 * int(iterations))
+        return np.asarray(rotations[self._rows])
+
+
+class _HiddenModel(FullOrderModel):
+    """The hidden nodes beside a state u₀ of the whole body: u = u₀ + q, with the force f(u₀ + q) - f(u₀) under the load -f(u₀)."""
+
+    _base: Array
+    _offset: Array
+
+    def __init__(self, whole: FullOrderModel, scene: Scene, solver: SolverName | None) -> None:
+        super().__init__(scene, solver)
+        self._whole = whole
+        self.hidden = np.searchsorted(whole.scene.free_dofs, scene.free_dofs)
+        inside = np.zeros(whole.n_unknowns, dtype=bool)
+        inside[self.hidden] = True
+        pattern = whole.assembler.pattern
+        self._kept = np.flatnonzero(inside[pattern.rows] & inside[pattern.indices])
+        self.beside_force = np.zeros(whole.n_unknowns)
+
+    def beside(self, base: Array) -> Self:
+        """The same model beside another state of the whole body, (n_free,), m."""
+        found = copy(self)
+        found._base, found.beside_force = base, self._whole.force(base).force
+        found._offset = found.beside_force[self.hidden]
+        if self._turns:
+            found.turned_rest = self.turned_rest.beside(base)
+        return found
+
+    @property
+    def _turns(self) -> bool:
+        return self.solver in ("auto", "rotated-pcg")
+
+    @cached_property
+    def turned_rest(self) -> _HiddenRest:
+        factor = self.rest_factor
+        assert isinstance(factor, BandedFactor | MultigridFactor)
+        return _HiddenRest(factor.single_precision(), self._whole, self.hidden)
+
+    def prepare(self) -> None:
+        """Factorise, so that no query has to."""
+        _ = self.turned_rest if self._turns else self.rest_factor
+
+    def at(self, q: Array) -> Array:
+        """Displacements of the whole body, (n_free,), m."""
+        u = self._base.copy()
+        u[self.hidden] += q
+        return np.asarray(u)
+
+    def _relative(self, state: State, q: Array) -> State:
+        return State(state.force[self.hidden] - self._offset, state.energy_j - float(self._offset @ q), state.min_det_f)
+
+    def force(self, q: Array) -> State:
+        return self._relative(self._whole.force(self.at(q)), q)
+
+    def linearise(self, q: Array) -> tuple[State, Array]:
+        state, values = self._whole.linearise(self.at(q))
+        return self._relative(state, q), values[self._kept]
+
+
+class ObservedModel:
+    """Finite elements under given displacements of the observed nodes, over the free dofs of a scene.
+
+    What `solve_many` is to a `FullOrderModel`, and `respond` and `to_coordinates` are to its `Compliance`.
+
+    Parameters
+    ----------
+    scene : Scene
+        With observed nodes.
+    solver : str, optional
+        As of `FullOrderModel`.
+
+    Raises
+    ------
+    UnsupportedSceneError
+        If the scene has no observed nodes, or its equations are not known.
+    UnconstrainedBodyError, MissingDependencyError
+        As by `FullOrderModel`.
+    """
+
+    def __init__(self, scene: Scene, solver: SolverName | None = None) -> None:
+        if scene.observed_nodes is None:
+            raise UnsupportedSceneError(f"{scene.name}: no displacements are observed.")
+        self.scene = scene
+        whole = FullOrderModel(scene, solver)
+        held = replace(scene, fixed_nodes=np.union1d(scene.fixed_nodes, scene.observed_nodes))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LockingWarning)  # the whole said it
+            self._model = _HiddenModel(whole, held, solver)
+        self._model.prepare()
+        self._seen = np.setdiff1d(np.arange(whole.n_unknowns), self._model.hidden)
+        pattern, n = whole.assembler.pattern, whole.n_unknowns
+        upper = sp.csr_array((whole.rest_tangent, pattern.indices, pattern.indptr), shape=(n, n))
+        stiffness = sp.csr_array(upper + sp.triu(upper, 1).T)
+        self._coupling = sp.csr_array(stiffness[self._model.hidden][:, self._seen])
+
+    def linear_response(self, observed: Array) -> Array:
+        """Linear elasticity: u_h = -K_hh⁻¹ K_ho u_o, with h the hidden and o the observed dofs.
+
+        Parameters
+        ----------
+        observed : (n, n_free) float64
+            Displacements, m; those of hidden dofs are not looked at.
+
+        Returns
+        -------
+        (n, n_free) float64
+            Of all free dofs, m.
+        """
+        out = np.empty(observed.shape)
+        out[:, self._seen] = observed[:, self._seen]
+        if counting.running is not None:
+            counting.running.add(multiply_adds=len(out) * self._coupling.nnz)
+        out[:, self._model.hidden] = -self._model.rest_factor.solve(np.asarray(self._coupling @ out[:, self._seen].T)).T
+        return out
+
+    def respond(self, observed: Array) -> Array:
+        """As `linear_response`, on all dofs, (n, n_dofs), m; zero at the supports."""
+        out = np.zeros(observed.shape)
+        out[:, self.scene.free_dofs] = self.linear_response(observed[:, self.scene.free_dofs])
+        return out
+
+    def to_coordinates(self, axes: Array) -> Array:
+        """Eᵀ A on all dofs, zero where nothing is observed: its product with displacements u_o of the observed dofs is that of A with
+        their linear extension E u_o.
+
+        Parameters
+        ----------
+        axes : (n_free, r) float64
+            A.
+
+        Returns
+        -------
+        (n_dofs, r) float64
+        """
+        out = np.zeros((self.scene.mesh.n_dofs, axes.shape[1]))
+        with counting.uncounted():
+            hidden = self._model.rest_factor.solve(np.ascontiguousarray(axes[self._model.hidden]))
+        out[self.scene.free_dofs[self._seen]] = axes[self._seen] - self._coupling.T @ hidden
+        return out
+
+    def solve_many(self, observed: Array, options: NewtonOptions = NewtonOptions()) -> list[Solution | SolverError]:
+        """Equilibria of all free dofs under displacements of the observed ones, or the errors that there is none.
+
+        Parameters
+        ----------
+        observed : (n, n_free) float64
+            Displacements, m; those of hidden dofs are not looked at.
+        options : NewtonOptions
+            The tolerance is that of the forces left on hidden dofs, relative to those that hold the observed ones in the state
+            that the solve starts from, the linear response.
+        """
+        return [self._solved(self.linear_response(row[None])[0], options) for row in observed]
+
+    def _solved(self, response: Array, options: NewtonOptions) -> Solution | SolverError:
+        """From the linear response; where that fails, by and by from rest."""
+        u, reached, increment, iterations, cuts = np.zeros(len(response)), 0.0, 1.0, 0, 0
+        while True:
+            target = min(1.0, reached + increment)
+            found = self._beside(u + (target - reached) * response, options.tolerance)
+            if isinstance(found, Solution):
+                iterations += found.iterations
+                if target == 1.0:
+                    return replace(found, iterations=iterations, cuts=cuts)
+                u, reached, increment = found.displacement, target, 2.0 * increment
+                continue
+            cuts += 1
+            increment *= 0.5
+            if cuts > options.max_cuts:
+                return NoEquilibriumError(f"no stable equilibrium found: stopped at {reached:.4g} of the observed displacement; {found}")
+
+    def _beside(self, base: Array, tolerance: float) -> Solution | SolverError:
+        """The equilibrium next to a state whose observed nodes are where they were seen."""
+        model = self._model.beside(base)
+        force, load = model.beside_force, -model.beside_force[model.hidden]
+        if not np.isfinite(force).all():
+            return NoEquilibriumError("the linear response inverts elements.")
+        size = float(np.linalg.norm(load))
+        allowed = min(1.0, tolerance * float(np.linalg.norm(force[self._seen])) / size) if size else 1.0
+        try:
+            found = model.solve(load, options=NewtonOptions(allowed, max_cuts=0))
+        except SolverError as error:
+            return error
+        return replace(found, displacement=model.at(found.displacement))
+
+
+class LinearResponse(Protocol):
+    """What linear elasticity makes of what the methods of a scene are given: a `Compliance` or an `ObservedModel`."""
+
+    def respond(self, loads: Array, /) -> Array: ...
+    def to_coordinates(self, axes: Array) -> Array: ...
+
+
+def linear_response(scene: Scene) -> LinearResponse:
+    """To forces, or to displacements of a part of the surface, where these are given; made once, so that no query has to."""
+    return Compliance(FullOrderModel(scene)) if scene.observed_nodes is None else ObservedModel(scene)
+
+
+def forward_model(scene: Scene, solver: SolverName | None = None) -> FullOrderModel | ObservedModel:
+    """What finds a scene's displacements from what its methods are given: forces, or displacements of a part of the surface.
+
+    Its factors are made, so that no query has to.
+    """
+    if scene.observed_nodes is not None:
+        return ObservedModel(scene, solver)
+    model = FullOrderModel(scene, solver)
+    _ = model.rest_factor
+    return model

@@ -1,0 +1,345 @@
+"""Scenes in which displacements of a part of the surface are known in the place of the forces."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mor_bench
+from mor_bench.errors import InvalidInputError, MissingDependencyError, NotFittedError, SpecError, UnknownRangeError, UnsupportedSceneError
+from mor_bench.harness.contestants import OBSERVATION_METHODS, checked_specs
+from mor_bench.harness.export import export_numpy, export_vtu
+from mor_bench.harness.fits import Material
+from mor_bench.harness.metrics import sample_errors
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.observed import ObservedModel
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.dataset import Dataset
+from mor_bench.snapshots.generate import dataset_folder
+from mor_bench.specs import NO_FORCES, list_suite, load_generated_spec
+from mor_bench.surrogate import Surrogate
+from tests.test_contract import CHEAP
+
+TOP = '[observed]\nregion = "z-max"\n'
+CAN = {
+    "autoencoder": {"iterations": 50},
+    "fem": {},
+    "fem-jacobi-pcg": {},
+    "fem-pardiso": {},
+    "gappy-pod": {},
+    "linear-fem": {},
+    "pca-extra-trees": {},
+    "pca-gaussian-process": {},
+    "pca-kernel-ridge": {},
+    "pca-random-forest": {},
+    "pca-regression": {"n_input_modes": 10},
+    "pca-ridge": {},
+    "pca-regression-force": {},
+    "umesh": CHEAP["umesh"],
+    "umesh-linear": CHEAP["umesh-linear"],
+    "umesh-small": CHEAP["umesh-small"],
+}
+"""The methods that can be given displacements, with knobs that keep a costly one short."""
+
+BOUNDS = {"UMesh": 0.7, "FullFEM": 1e-6, "LinearFEM": 0.1, "GappyPOD": 0.5, "PCARegression": 0.3, "Autoencoder": 0.1}
+"""On the median relative l2, by class, others 0.1: beam-tiny turns far, and has few samples."""
+
+
+def written(folder: Path, observed: str, name: str = "beam-tiny-observed") -> Path:
+    """beam-tiny with a table of what is observed."""
+    path = folder / f"{name}.toml"
+    path.write_text(list_suite("datasets")["beam-tiny"].read_text(encoding="utf-8") + observed, encoding="utf-8")
+    return path
+
+
+def scene_of(observed: Any, **changed: Any) -> Scene:
+    content = load_generated_spec("beam-tiny").model_dump(mode="json")
+    return mor_bench.load_scene({**content, "observed": observed, **changed})
+
+
+@pytest.fixture(scope="module")
+def data(tiny: Dataset, cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """beam-tiny, loaded on its top face, with the displacements of that face in the place of the forces."""
+    return mor_bench.load_dataset(written(tmp_path_factory.mktemp("observed"), TOP), cache=cache)
+
+
+@pytest.fixture(scope="module", params=sorted(CAN))
+def fitted(request: pytest.FixtureRequest, data: Dataset) -> Surrogate:
+    try:
+        method = mor_bench.load_method(request.param, **CAN[request.param])
+    except MissingDependencyError as error:
+        pytest.skip(str(error))
+    if request.param == "fem-pardiso" and method.supports(data.scene):
+        pytest.skip("pypardiso is not installed")
+    return method.fit(data.scene, data.train)
+
+
+def relative_l2(predicted: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    return sample_errors(predicted, reference).relative_l2
+
+
+def test_the_samples_are_those_of_the_scene_without_the_option(data: Dataset, tiny: Dataset, cache: Path) -> None:
+    assert data.scene.spec.digest() == tiny.scene.spec.digest()
+    assert not list((cache / "datasets").glob("beam-tiny-observed*"))
+    for part, plain in ((data.train, tiny.train), (data.test, tiny.test)):
+        np.testing.assert_array_equal(part.displacements, plain.displacements)
+        np.testing.assert_array_equal(part.forces, plain.forces)
+    nodes = data.scene.observed_nodes
+    assert nodes is not None
+    top = np.flatnonzero((data.scene.mesh.points[:, 2] == 1.0) & (data.scene.mesh.points[:, 0] > 0))
+    np.testing.assert_array_equal(nodes, top)
+    np.testing.assert_array_equal(data.test.inputs[:, nodes], data.test.displacements[:, nodes])
+    assert not np.delete(data.test.inputs, nodes, axis=1).any()
+    assert tiny.scene.observed_nodes is None
+    assert tiny.test.inputs is tiny.test.forces
+
+
+def test_the_manifest_of_shared_samples_stays_that_of_the_dataset_that_made_them(data: Dataset, tiny: Dataset, cache: Path) -> None:
+    assert isinstance(tiny.scene.spec, type(data.scene.generated))
+    folder = dataset_folder(data.scene.generated, cache)
+    assert folder == dataset_folder(tiny.scene.spec, cache)
+    spec = json.loads((folder / "manifest.json").read_bytes())["spec"]
+    assert spec["name"] == "beam-tiny"
+    assert "observed" not in spec
+
+
+def test_the_shipped_dataset_shares_the_samples_of_the_liver() -> None:
+    observed, plain = load_generated_spec("liver-hex-observed"), load_generated_spec("liver-hex")
+    assert observed.digest() == plain.digest()
+    assert (observed.split, observed.tests, observed.needs) == (plain.split, plain.tests, plain.needs)
+
+
+@pytest.mark.parametrize(
+    ("observed", "message"),
+    [
+        ({}, r"key `observed.region` is missing"),
+        ({"region": "top"}, r"`observed.region` must be"),
+        ({"regoin": "z-max"}, r"unknown key `observed.regoin`; did you mean 'region'\?"),
+        ({"region": {"sphere_m": [[9.0, 9.0, 9.0], 1.0]}}, "holds no node of the mesh"),
+        ({"region": "x-min"}, "no node that lies on the surface and is free to move"),
+        ({"region": {"sphere_m": [[1.0, 0.5, 0.5], 0.1]}}, "no node that lies on the surface and is free to move"),
+    ],
+)
+def test_a_table_that_observes_nothing_is_refused(observed: Any, message: str) -> None:
+    with pytest.raises(SpecError, match=message):
+        scene_of(observed)
+
+
+def test_a_scene_with_nothing_hidden_is_refused() -> None:
+    geometry = {"shape": "box", "size_m": [2.0, 1.0, 1.0], "cells": [6, 1, 1]}
+    with pytest.raises(SpecError, match="every node that is free to move: nothing is left to be found"):
+        scene_of({"region": "surface"}, geometry=geometry)
+
+
+@pytest.mark.parametrize("region", ["z-max", "surface"])
+@pytest.mark.parametrize("solver", [None, "rotated-pcg", "cholesky", "superlu", "jacobi-pcg"])
+def test_fem_finds_the_equilibrium_where_every_loaded_node_is_seen(region: str, solver: Any, tiny: Dataset) -> None:
+    scene = scene_of({"region": region})
+    model = ObservedModel(scene, solver)
+    largest = np.abs(tiny.test.free_displacements).max(axis=1).argsort()[-3:]
+    known = tiny.test.free_displacements[largest]
+    noise = np.random.default_rng(0).normal(size=known.shape)
+    nodes = scene.observed_nodes
+    assert nodes is not None
+    hidden = np.flatnonzero(~np.isin(scene.free_dofs // 3, nodes))
+    given = known.copy()
+    given[:, hidden] = noise[:, hidden]  # is not looked at
+    linear = model.linear_response(given)
+    for found, response, wanted in zip(model.solve_many(given), linear, known, strict=True):
+        assert not isinstance(found, Exception)
+        assert np.linalg.norm(response - wanted) > 1e-3 * np.linalg.norm(wanted)
+        assert np.linalg.norm(found.displacement - wanted) <= 1e-7 * np.linalg.norm(wanted)
+        assert found.min_det_f > 0
+
+
+def test_the_linear_extension_is_linear_elasticity(tiny: Dataset) -> None:
+    """Where all the force is seen, the extension of the linear response is the linear response."""
+    scene = scene_of({"region": "z-max"})
+    response = FullOrderModel(tiny.scene).rest_factor.solve(tiny.test.free_forces[:5].T).T
+    model = ObservedModel(scene)
+    np.testing.assert_allclose(model.linear_response(response), response, rtol=0, atol=1e-10 * np.abs(response).max())
+    axes = np.random.default_rng(0).normal(size=(len(scene.free_dofs), 4))
+    coordinates = response @ model.to_coordinates(axes)[scene.free_dofs]
+    np.testing.assert_allclose(coordinates, response @ axes, rtol=0, atol=1e-10 * np.abs(coordinates).max())
+
+
+def test_large_displacements_are_reached_by_and_by() -> None:
+    """A tip turned by half a circle: from the linear response no equilibrium is found, by steps one is."""
+    scene = scene_of({"region": "x-max"}, material={"law": "neo-hookean", "young_pa": 500.0, "poisson": 0.4})
+    x = scene.mesh.points
+    seen = np.zeros(x.shape)
+    angle, centre = np.pi, np.array([2.0, 0.5, 0.5])
+    turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    tip = x[:, 0] == 2.0
+    seen[tip] = (x[tip] - centre) @ (turn - np.eye(3)).T
+    model = ObservedModel(scene)
+    found = model.solve_many(seen.ravel()[scene.free_dofs][None])[0]
+    assert not isinstance(found, Exception)
+    assert found.cuts > 0
+    assert found.min_det_f > 0.5
+    force = FullOrderModel(scene).force(found.displacement).force.reshape(-1, 3)
+    held = tip[scene.free_dofs[::3] // 3]
+    assert np.linalg.norm(force[~held]) <= 1e-6 * np.linalg.norm(force[held])
+
+
+def test_gappy_pod_reproduces_what_its_modes_span(data: Dataset) -> None:
+    """Without regularisation as many modes as there are samples reproduce each of them from what is seen."""
+    few = data.train[:12]
+    method = mor_bench.load_method("gappy-pod", n_modes=12, regularisation=0.0).fit(data.scene, few)
+    mixed = np.tensordot([0.5, -1.0, 2.0], few.displacements[[1, 4, 9]], 1)
+    seen = np.full(mixed.shape, np.nan)
+    seen[data.scene.observed_nodes] = mixed[data.scene.observed_nodes]
+    np.testing.assert_allclose(method.predict(seen), mixed, atol=1e-8 * np.abs(mixed).max())
+
+
+def test_regularisation_keeps_noise_out_of_gappy_pod(data: Dataset) -> None:
+    noise = 0.01 * np.sqrt((data.test.displacements**2).mean()) * np.random.default_rng(0).normal(size=data.test.inputs.shape)
+    errors = {}
+    for regularisation in (0.0, 0.01):
+        method = mor_bench.load_method("gappy-pod", n_modes=80, regularisation=regularisation).fit(data.scene, data.train)
+        errors[regularisation] = np.median(relative_l2(method.predict(data.test.inputs + noise), data.test.displacements))
+    assert errors[0.01] < 0.5 * errors[0.0]
+
+
+def test_methods_that_can_complete_what_is_seen(fitted: Surrogate, data: Dataset) -> None:
+    inputs, reference = data.test.inputs, data.test.displacements
+    predicted = fitted.predict(inputs)
+    assert np.median(relative_l2(predicted, reference)) < BOUNDS.get(type(fitted).__name__, 0.1)
+    single = np.stack([fitted.predict(seen) for seen in inputs[:5]])
+    np.testing.assert_allclose(single, predicted[:5], rtol=0, atol=2e-6 * np.abs(single).max())
+    assert (predicted[:, data.scene.fixed_nodes] == 0).all()
+    if type(fitted).__name__ != "UMesh":
+        assert not fitted.predict(np.zeros_like(inputs[0])).any()
+    assert fitted.predict(inputs[:0]).shape == inputs[:0].shape
+
+
+def test_what_unobserved_nodes_hold_is_not_looked_at(fitted: Surrogate, data: Dataset) -> None:
+    nodes = data.scene.observed_nodes
+    assert nodes is not None
+    expected = fitted.predict(data.test.inputs[:2])
+    for hidden in (np.nan, np.inf, 3.0):
+        seen = np.full_like(data.test.inputs[:2], hidden)
+        seen[:, nodes] = data.test.inputs[:2, nodes]
+        before = seen.copy()
+        np.testing.assert_array_equal(fitted.predict(seen), expected)
+        np.testing.assert_array_equal(seen, before)
+    seen[1, nodes[3], 2] = np.nan
+    with pytest.raises(InvalidInputError, match=r"must be finite .* m at the observed nodes"):
+        fitted.predict(seen)
+
+
+def test_saved_models_know_what_they_are_given(fitted: Surrogate, data: Dataset, tmp_path: Path) -> None:
+    fitted.save(tmp_path / "model.safetensors")
+    loaded = mor_bench.load_surrogate(tmp_path / "model.safetensors")
+    np.testing.assert_array_equal(loaded.scene_.observed_nodes, data.scene.observed_nodes)
+    np.testing.assert_array_equal(loaded.predict(data.test.inputs[:3]), fitted.predict(data.test.inputs[:3]))
+
+
+@pytest.mark.parametrize("name", sorted(set(list_suite("methods")) - set(CAN)))
+def test_all_others_say_that_they_need_forces(name: str, data: Dataset) -> None:
+    try:
+        method = mor_bench.load_method(name)
+    except MissingDependencyError as error:
+        pytest.skip(str(error))
+    assert method.supports(data.scene) is not None
+    with pytest.raises(UnsupportedSceneError):
+        method.fit(data.scene, data.train)
+    with pytest.raises(NotFittedError):
+        method.predict(data.test.inputs[0])
+
+
+class Forgetful(Surrogate):
+    """Written before there were such scenes: it says that it supports everything."""
+
+    def supports(self, scene: Scene) -> str | None:
+        return None
+
+    def fit(self, scene: Scene, snapshots: Any) -> Forgetful:
+        with self._fitting(scene):
+            return self
+
+    def predict(self, forces: Any) -> np.ndarray:
+        return self._checked_forces(forces)
+
+
+def test_a_method_that_does_not_say_that_it_can_is_not_given_displacements(data: Dataset, tiny: Dataset) -> None:
+    with pytest.raises(UnsupportedSceneError, match=NO_FORCES):
+        Forgetful().fit(data.scene, data.train)
+    Forgetful().fit(tiny.scene, tiny.train)
+
+
+def test_gappy_pod_needs_something_to_complete(tiny: Dataset) -> None:
+    with pytest.raises(UnsupportedSceneError, match="it is given forces"):
+        mor_bench.load_method("gappy-pod").fit(tiny.scene, tiny.train)
+
+
+def test_no_error_is_indicated_where_forces_are_not_known(data: Dataset) -> None:
+    method = mor_bench.load_method("linear-fem").fit(data.scene, None)
+    with pytest.raises(UnsupportedSceneError, match="no error can be indicated"):
+        method.indicate_error(data.test.inputs[0], data.test.displacements[0])
+
+
+def test_a_range_of_loads_that_are_not_known_is_not_made_up(data: Dataset) -> None:
+    method = mor_bench.load_method("gappy-pod").fit(data.scene, data.train)
+    with pytest.raises(UnknownRangeError, match=NO_FORCES):
+        method.out_of_range(data.test.inputs)
+
+
+def test_a_run_has_rows_of_those_that_can_and_reasons_of_the_others(data: Dataset, cache: Path, tmp_path: Path) -> None:
+    path, pod = written(tmp_path, TOP), tmp_path / "pod.toml"
+    pod.write_text('title = "t"\nsource = "s"\nsurrogate = "mor_bench.surrogates.pod:PODGalerkin"\n')
+    comparison = mor_bench.run([path], ["linear-fem", "pca-regression-force", pod], out=tmp_path / "out", cache=cache)
+    rows = {row["label"]: row for row in comparison.rows}
+    assert set(rows) == {"linear-fem", "pca-regression-force", "pod"}
+    direct = mor_bench.load_method("pca-regression-force").fit(data.scene, data.train).predict(data.test.inputs)
+    assert rows["pca-regression-force"]["error"]["rel_l2_median"] == pytest.approx(np.median(relative_l2(direct, data.test.displacements)))
+    for label, row in rows.items():
+        assert row["status"] == ("skipped" if label == "pod" else "ok"), row["reason"]
+        if row["status"] == "skipped":
+            assert NO_FORCES in row["reason"]
+        else:
+            assert row["latency_ms"]["median"] > 0
+            assert row["indicator"] is None
+    assert comparison.datasets["beam-tiny-observed"]["observed"] == {"region": "z-max"}
+
+
+def test_a_model_of_other_observed_nodes_is_not_taken_from_the_cache(data: Dataset, tiny: Dataset, tmp_path: Path) -> None:
+    corner = scene_of({"region": {"nearest_m": [[2.0, 1.0, 1.0], 20]}})
+    digests = {Material(scene, tiny.train, {}, tmp_path).train_digest for scene in (tiny.scene, data.scene, corner)}
+    assert len(digests) == 3
+
+
+def test_by_default_the_methods_run_that_can(tmp_path: Path) -> None:
+    path = written(tmp_path, TOP)
+    chosen = [method.name for method in checked_specs([path], None, "quick", None)[1]]
+    assert chosen == list(OBSERVATION_METHODS)
+    assert set(chosen) <= set(CAN)
+
+
+def test_exported_answers_are_those_to_what_is_seen(data: Dataset, tiny: Dataset, tmp_path: Path) -> None:
+    import meshio
+
+    method = mor_bench.load_method("gappy-pod").fit(data.scene, data.train)
+    method.save(tmp_path / "gappy.safetensors")
+    paths = export_vtu(data, 2, tmp_path / "vtu", models=[tmp_path / "gappy.safetensors"])
+    found = meshio.read(paths[1]).point_data
+    np.testing.assert_array_equal(found["displacement"], method.predict(data.test.inputs[2]))
+    np.testing.assert_array_equal(found["force"], data.test.forces[2])
+    with pytest.raises(InvalidInputError, match="the model was fitted to"):
+        export_vtu(tiny, 2, tmp_path / "vtu", models=[tmp_path / "gappy.safetensors"])
+
+
+def test_imported_snapshots_can_be_completed(data: Dataset, tmp_path: Path) -> None:
+    _, path = export_numpy(data, tmp_path / "mine.npz")
+    path.write_text(path.read_text() + TOP)
+    mine = mor_bench.load_dataset(path)
+    own, first = (mor_bench.load_method("gappy-pod").fit(each.scene, each.train) for each in (mine, data))
+    np.testing.assert_allclose(own.predict(data.test.inputs), first.predict(data.test.inputs), atol=1e-9)
+    assert mor_bench.load_method("fem").supports(mine.scene) is not None
+    path.write_text(path.read_text().replace('"z-max"', '"x-min"'))
+    with pytest.raises(SpecError, match="free to move"):
+        mor_bench.load_dataset(path)
