@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import UnavailableBackendError
 from mor_bench.learning.onnx_graph import GraphBuilder
-from mor_bench.mechanics.compliance import Compliance
+from mor_bench.mechanics.observed import LinearResponse
 from mor_bench.scene.scene import Scene
 from mor_bench.surrogates.umesh.grid import SMALLEST_SHARE, PaddedGrid
 from mor_bench.surrogates.umesh.network import UNet
@@ -30,7 +30,7 @@ def umesh_graph(
     input_scale: float,
     output_scale: float,
     at_rest: NDArray[np.float32] | None,
-    response: Compliance | None,
+    response: LinearResponse | None,
 ) -> onnx.ModelProto:
     """`UMesh.predict` in float32, scaling included; supports are zero.
 
@@ -38,7 +38,7 @@ def umesh_graph(
     ----------
     at_rest : (n_nodes, 3), optional
         What is taken off every answer of the network, scaled.
-    response : Compliance, optional
+    response : LinearResponse, optional
         The network is given this linear response and answers with the rest of the displacement.
 
     Raises
@@ -48,20 +48,18 @@ def umesh_graph(
     """
     n_nodes, n_dofs, weights = scene.mesh.n_nodes, scene.mesh.n_dofs, grid.grid.weights
     graph = GraphBuilder()
-    if response is None:
-        given, to_grid = "forces", sp.csr_array(weights.T)
-    else:
+    given, to_grid = "forces", sp.csr_array(weights.T)
+    if response is not None:
         if n_dofs > MAX_RESPONSE_DOFS:
             raise UnavailableBackendError(
                 f"the linear response of {scene.name} has {n_dofs:,} unknowns; ONNX has no sparse solve, and a dense matrix is written for at "
                 f"most {MAX_RESPONSE_DOFS:,}."
             )
-        compliance = np.zeros((n_dofs, n_dofs), dtype=np.float32)
-        free = scene.free_dofs
-        compliance[np.ix_(free, free)] = response.solve(np.eye(len(free)))
+        compliance = response.respond(np.eye(n_dofs)).astype(np.float32)
         flat = graph.add("Reshape", "forces", graph.constant(np.array([-1, n_dofs])))
-        solved = graph.add("MatMul", flat, graph.constant(compliance.T))
+        solved = graph.add("MatMul", flat, graph.constant(compliance))
         given = graph.add("Reshape", solved, graph.constant(np.array([-1, n_nodes, 3])))
+    if response is not None or scene.observed_nodes is not None:
         shares = np.maximum(weights.sum(axis=0), SMALLEST_SHARE)
         to_grid = sp.csr_array(sp.diags_array((1.0 / shares).astype(np.float32)) @ weights.T)
     x = graph.add("Mul", given, graph.constant(np.array([1.0 / input_scale], dtype=np.float32)))
