@@ -108,7 +108,7 @@ RACES = (
     Race("l-shape", "explicit-dynamics", {"tolerance": 1e-2}, "fem-jacobi-pcg", 0.8, 0.1),  # 2.7, 0.04
     Race("l-shape", "pgd", {"n_terms": 20, "position_degree": 2}, "fem", 3.0, 0.01),  # 19, 0.001
     Race("l-shape", "pgd-force", {"n_terms": 20, "position_degree": 2}, "fem", 5.0, 0.1),  # 18, 0.009
-    Race("liver-hex-observed", "gappy-pod", {"n_modes": 20}, "fem", 5.0, 0.3),  # MEASURE
+    Race("liver-hex-observed", "gappy-pod", {"n_modes": 20}, "fem", 5.0, 0.2),  # 470 on a busy machine, 0.02
     Race("l-shape", "umesh", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 66, 0.56 after so short a training
     Race("l-shape", "umesh-small", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.9),  # 83, 0.55
     Race("l-shape", "umesh-linear", SMALL_UMESH, "fem-jacobi-pcg", 5.0, 0.05),
