@@ -151,6 +151,14 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
+def test_normalisation_divides_by_what_it_says(data: Dataset) -> None:
+    forces, displacements = data.train.forces, data.train.displacements
+    expected = {"rms": (rms(forces), rms(displacements)), "max": (np.abs(forces).max(), np.abs(displacements).max()), "none": (1.0, 1.0)}
+    for normalisation, scales in expected.items():
+        method: Any = mor_bench.load_method("umesh", channels=2, steps=1, iterations=1, normalisation=normalisation).fit(data.scene, data.train)
+        assert (method.input_scale_, method.output_scale_) == pytest.approx(scales)
+
+
 def test_one_cycle_rises_falls_and_stays_in_range() -> None:
     rates = np.array([rate_factor("one-cycle", i, 1000) for i in range(1000)])
     assert rates.argmax() == pytest.approx(100, abs=2)

@@ -65,6 +65,9 @@ class UMesh(Surrogate):
         "one-cycle" rises for the first tenth of the iterations and then falls to zero along half a cosine.
     second_moment_decay : float
         Adam's β₂.
+    normalisation : {"rms", "max", "none"}
+        What the network's inputs and answers are divided by: their root mean square over the training samples, nodes and components,
+        their largest magnitude, or 1 (N and m).
     input : {"force", "linear-response"}
         What the network is given. With the linear response K₀⁻¹f it answers with the nonlinear rest, u = K₀⁻¹f + network.
     activation : {"relu", "silu"}
@@ -94,7 +97,7 @@ class UMesh(Surrogate):
         The network as `predict` calls it.
     grid_ : PaddedGrid
     input_scale_, output_scale_ : float
-        Root mean square of what the network is given in training, N or m, and of what it is to answer, m.
+        By `normalisation`, of what the network is given in training, N or m, and of what it is to answer, m.
     loss_curve_ : (n_intervals,) float64
         Training loss per `LOSS_INTERVAL` iterations, in units of ``output_scale_`` squared.
     validation_curve_ : (n_validations,) float64
@@ -143,6 +146,7 @@ class UMesh(Surrogate):
         learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1e-4,
         schedule: Schedule = "constant",
         second_moment_decay: Annotated[float, Field(gt=0, lt=1)] = 0.999,
+        normalisation: Literal["rms", "max", "none"] = "rms",
         input: Literal["force", "linear-response"] = "force",
         activation: Activation = "relu",
         zero_at_rest: bool = False,
@@ -160,6 +164,7 @@ class UMesh(Surrogate):
         self.learning_rate = learning_rate
         self.schedule = schedule
         self.second_moment_decay = second_moment_decay
+        self.normalisation = normalisation
         self.input = input
         self.activation = activation
         self.zero_at_rest = zero_at_rest
@@ -182,7 +187,7 @@ class UMesh(Surrogate):
             given, wanted = self._given(samples.inputs), samples.displacements
             if self.input == "linear-response":
                 wanted = wanted - given
-            self.input_scale_, self.output_scale_ = _rms(given), _rms(wanted)
+            self.input_scale_, self.output_scale_ = (_scale(values, self.normalisation) for values in (given, wanted))
             device = device_of(self.training)
             generator = torch.Generator().manual_seed(self.seed)
             self.network_: UNet = new_network(self.channels, self.steps, generator, self.activation)
@@ -257,8 +262,8 @@ class UMesh(Surrogate):
         """(n,) what each sample's squared error counts, 1 on average."""
         if self.loss == "absolute":
             return targets.new_ones(len(targets))
-        size = targets.square().mean(dim=(1, 2)).sqrt()  # the root mean square over all samples is 1
-        weights = size.clamp(min=SMALLEST_SIZE).pow(-2)
+        size = targets.square().mean(dim=(1, 2))
+        weights = 1.0 / size.clamp(min=max(SMALLEST_SIZE**2 * float(size.mean()), torch.finfo(size.dtype).tiny))
         return weights / weights.mean()
 
     def _come_to_rest(self) -> None:
@@ -355,6 +360,8 @@ def _network_weights(state: Mapping[str, NDArray[Any]]) -> dict[str, Tensor]:
     return {name.removeprefix("network."): torch.from_numpy(array) for name, array in state.items() if name.startswith("network.")}
 
 
-def _rms(values: NDArray[np.float64]) -> float:
-    """Root of the mean square over all samples, nodes and components; 1 where all are zero."""
-    return float(np.sqrt(np.mean(np.square(values)))) or 1.0
+def _scale(values: NDArray[np.float64], normalisation: str) -> float:
+    """What values are divided by, over all samples, nodes and components; 1 where all are zero."""
+    if normalisation == "none":
+        return 1.0
+    return float(np.abs(values).max() if normalisation == "max" else np.sqrt(np.mean(np.square(values)))) or 1.0
