@@ -307,6 +307,12 @@ def test_a_run_has_rows_of_those_that_can_and_reasons_of_the_others(data: Datase
     assert comparison.datasets["beam-tiny-observed"]["observed"] == {"region": "z-max"}
 
 
+def test_the_fit_command_scores_answers_to_what_is_seen(data: Dataset, cache: Path, tmp_path: Path) -> None:
+    fitted = mor_bench.fit(written(tmp_path, TOP), "linear-fem", out=tmp_path / "model.safetensors", cache=cache)
+    predicted = fitted.method.predict(data.test.inputs)
+    assert fitted.error["rel_l2_median"] == pytest.approx(np.median(relative_l2(predicted, data.test.displacements)))
+
+
 def test_a_model_of_other_observed_nodes_is_not_taken_from_the_cache(data: Dataset, tiny: Dataset, tmp_path: Path) -> None:
     corner = scene_of({"region": {"nearest_m": [[2.0, 1.0, 1.0], 20]}})
     digests = {Material(scene, tiny.train, {}, tmp_path).train_digest for scene in (tiny.scene, data.scene, corner)}
