@@ -179,6 +179,8 @@ def test_an_onnx_file_answers_as_the_method(data: Dataset, tmp_path: Path, knobs
         expected = method.predict(forces)
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
         assert (found[:, data.scene.fixed_nodes] == 0).all()
+    (at_rest,) = session.run(["displacements"], {"forces": np.zeros((3, *forces.shape[1:]), np.float32)})
+    assert at_rest.any() != method.parameters["zero_at_rest"]
     with pytest.raises(InvalidInputError, match="not overwritten"):
         export_onnx(tmp_path / "model.safetensors", path)
 

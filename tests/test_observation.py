@@ -12,7 +12,7 @@ import pytest
 import mor_bench
 from mor_bench.errors import InvalidInputError, MissingDependencyError, NotFittedError, SpecError, UnknownRangeError, UnsupportedSceneError
 from mor_bench.harness.contestants import OBSERVATION_METHODS, checked_specs
-from mor_bench.harness.export import export_numpy, export_vtu
+from mor_bench.harness.export import export_numpy, export_onnx, export_vtu
 from mor_bench.harness.fits import Material
 from mor_bench.harness.metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
@@ -337,6 +337,23 @@ def test_exported_answers_are_those_to_what_is_seen(data: Dataset, tiny: Dataset
     np.testing.assert_array_equal(found["force"], data.test.forces[2])
     with pytest.raises(InvalidInputError, match="the model was fitted to"):
         export_vtu(tiny, 2, tmp_path / "vtu", models=[tmp_path / "gappy.safetensors"])
+
+
+@pytest.mark.parametrize("name", ["umesh-small", "umesh-linear"])
+def test_an_onnx_file_does_not_look_at_what_is_not_seen(name: str, data: Dataset, tmp_path: Path) -> None:
+    onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
+    pytest.importorskip("torch")
+    method = mor_bench.load_method(name, channels=2, steps=1, iterations=3).fit(data.scene, data.train)
+    method.save(tmp_path / "model.safetensors")
+    path, _ = export_onnx(tmp_path / "model.safetensors", tmp_path / "model.onnx")
+    assert "displacements of the observed nodes in m" in {entry.key: entry.value for entry in onnx.load(path).metadata_props}["units"]
+    observed = data.scene.observed_nodes
+    assert observed is not None
+    given = data.test.inputs[:3].astype(np.float32)
+    given[:, np.setdiff1d(np.arange(given.shape[1]), observed)] = np.nan
+    (found,) = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"]).run(None, {"forces": given})
+    expected = method.predict(data.test.inputs[:3])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
 
 
 def test_imported_snapshots_can_be_completed(data: Dataset, tmp_path: Path) -> None:
