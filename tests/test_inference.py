@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 import pickle
 from collections.abc import Iterator
 from pathlib import Path
@@ -249,6 +250,15 @@ def test_forged_json(parts: Any, tmp_path: Path, text: str) -> None:
     _, header, arrays = parts
     for key in ("parameters", "scene"):
         refused(tmp_path / "model.safetensors", forged({**header, key: text}, arrays))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with a name")
+def test_a_forged_scene_whose_file_never_ends(parts: Any, tmp_path: Path) -> None:
+    _, header, arrays = parts
+    os.mkfifo(tmp_path / "pipe")
+    for path in ("/dev/zero", str(tmp_path / "pipe")):
+        scene = {**json.loads(header["scene"]), "geometry": {"shape": "file", "file": {"path": path, "sha256": "0" * 64}}}
+        refused(tmp_path / "model.safetensors", forged({**header, "scene": json.dumps(scene)}, arrays))
 
 
 @pytest.mark.parametrize("name", ["../../evil:Evil", "/etc/passwd", "os:system", "mor_bench.surrogates.umesh.method:_rms", ""])
