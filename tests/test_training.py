@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -108,6 +109,29 @@ def test_a_checkpoint_of_another_training_is_refused_and_left(checkpoint: Path) 
     with pytest.raises(InvalidInputError, match="another training"):
         Problem().train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="y")
     assert checkpoint.exists()
+
+
+@pytest.mark.parametrize("name", ["network.0.weight", "best.2.bias", "optimiser.0.exp_avg", "generator", "rows", "order", "numbers"])
+def test_a_checkpoint_with_a_changed_bit_is_refused(checkpoint: Path, name: str) -> None:
+    content = bytearray(checkpoint.read_bytes())
+    length = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + length])
+    if name == "numbers":
+        content[content.index(b"iterations") + len(b'iterations\\": ')] ^= 2
+    else:
+        content[8 + length + header[name]["data_offsets"][0] + 2] ^= 1
+    checkpoint.write_bytes(content)
+    with pytest.raises(StoreError, match="the checksum does not match"):
+        Problem().train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="x")
+
+
+def test_a_checkpoint_of_other_seconds_or_samples_is_refused(checkpoint: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"another training .*seconds"):
+        Problem().train(options=TrainingOptions(checkpoint=checkpoint, fit_seconds=9.0), fingerprint="x")
+    samples = Problem()
+    samples.x, samples.y = samples.x[:30], samples.y[:30]  # fewer, and the caller's fingerprint does not tell
+    with pytest.raises(StoreError, match="not those of the training"):
+        samples.train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="x")
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "foreign", "other network"])

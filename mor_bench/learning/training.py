@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from mor_bench import __version__
 from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, StoreError
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.surrogate import TrainingOptions
@@ -165,7 +166,7 @@ def train(
     time_limit_s : float, optional
         Seconds that training may take; it is not begun in earnest when it would take longer.
     fingerprint : str
-        Tells trainings apart: a checkpoint is only resumed by the one that wrote it.
+        Tells trainings apart: a checkpoint is only resumed by the one that wrote it, with the same seconds and versions.
 
     Returns
     -------
@@ -184,6 +185,7 @@ def train(
     """
     options = options or TrainingOptions()
     course = _Course(network, loss, n_samples, plan, generator, options)
+    fingerprint = fingerprint_of({"caller": fingerprint, "fit_seconds": options.fit_seconds, "versions": [__version__, torch.__version__]}, {})
     if options.checkpoint is None or not course.resume(options.checkpoint, fingerprint):
         course.begin()
     start, first, written = perf_counter(), course.iteration, perf_counter()
@@ -331,6 +333,7 @@ class _Course:
             "iteration": self.iteration, "iterations": self.iterations, "n_summed": self.n_summed, "curve": self.curve, "validated": self.validated,
         }  # fmt: skip
         header = {"format": "mor-bench checkpoint", "fingerprint": fingerprint, "numbers": json.dumps(numbers)}
+        header["sha256"] = fingerprint_of(header, tensors)
         write_atomically(path, save({name: value.cpu().contiguous().clone() for name, value in tensors.items()}, header))
 
     def resume(self, path: Path, fingerprint: str) -> bool:
@@ -346,8 +349,12 @@ class _Course:
         except (SafetensorError, OSError) as error:
             raise StoreError(f"{path}: not a checkpoint, or damaged: {error}. Without it the training begins anew.") from None
         if header.get("format") != "mor-bench checkpoint" or header.get("fingerprint") != fingerprint:
-            raise InvalidInputError(f"{path}: the checkpoint of another training (knobs, samples or version); name another file, or delete it.")
+            raise InvalidInputError(
+                f"{path}: the checkpoint of another training (knobs, seconds, samples or version); name another file, or delete it."
+            )
         try:
+            if header.pop("sha256") != fingerprint_of(header, tensors):
+                raise ValueError("the checksum does not match")
             numbers = json.loads(header["numbers"])
             self.network.load_state_dict(_under("network.", tensors))
             self.best = _under("best.", tensors)
@@ -360,6 +367,9 @@ class _Course:
             self.total = tensors["total"].to(self.device)
             self.iteration, self.iterations, self.n_summed = (int(numbers[name]) for name in ("iteration", "iterations", "n_summed"))
             self.curve, self.validated = list(numbers["curve"]), list(numbers["validated"])
+            parts = torch.cat([self.rows, self.held]).sort().values
+            if not torch.equal(parts, torch.arange(self.n_samples)) or not torch.isin(self.order, self.rows).all():
+                raise ValueError("its samples are not those of the training")
         except (KeyError, ValueError, TypeError, RuntimeError) as error:
             raise StoreError(f"{path}: a damaged checkpoint: {error}. Without it the training begins anew.") from None
         return True
