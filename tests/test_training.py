@@ -160,12 +160,30 @@ def test_it_ends_when_the_samples_held_out_gain_nothing_and_keeps_the_best_weigh
 def test_a_training_that_fills_a_time_is_repeated_by_its_number_of_iterations() -> None:
     filled, repeated = Problem(), Problem()
     plan = replace(PLAN, validation_fraction=0.0)
+    Problem().train(replace(plan, iterations=1))  # torch imports what its optimisers need
     start = perf_counter()
     done = filled.train(plan, options=TrainingOptions(fit_seconds=0.5))
     assert 0.1 < perf_counter() - start < 5.0
     assert done.iterations > 50
     assert repeated.train(replace(plan, iterations=done.iterations)).iterations == done.iterations
     np.testing.assert_array_equal(repeated.weights, filled.weights)
+
+
+@pytest.mark.parametrize(("seconds", "each"), [(1.0, 2e-4), (1.0, 4e-3)])
+def test_a_time_holds_the_trial_and_the_looks_at_the_samples_held_out(seconds: float, each: float) -> None:
+    problem = Problem()
+    asked = 0.0
+
+    def slow(rows: Tensor) -> Tensor:
+        nonlocal asked
+        asked += each * len(rows)
+        return problem.loss(rows)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "perf_counter", lambda: asked)
+        patch.setattr(training, "PATIENCE", 10**9)
+        problem.train(replace(PLAN, validation_fraction=0.5), loss=slow, options=TrainingOptions(fit_seconds=seconds))
+    assert 0.8 * seconds < asked < 1.2 * seconds
 
 
 def test_bfloat16_trains_nearly_as_well() -> None:

@@ -42,8 +42,9 @@ VALIDATIONS, PATIENCE = 50, 15
 """How often the loss of the samples held out is taken during a whole training, and how many times in a row it may fail to
 fall before the training ends with the weights of its lowest."""
 
-TRIAL_ITERATIONS = 20
-"""Iterations, on a copy of the network, from whose time a training is sized to seconds."""
+TRIAL_ITERATIONS, TRIAL_SHARE = 20, 0.1
+"""Iterations from whose time a training is sized to seconds, which leave no trace; fewer, but three, where they take more than
+this part of the seconds."""
 
 CHECKPOINT_EVERY_S = 30.0
 
@@ -255,20 +256,32 @@ class _Course:
             self.iterations = self._that_fit(self.options.fit_seconds)
 
     def _that_fit(self, seconds: float) -> int:
-        """How many iterations take so long, by some on a copy, which leave no trace."""
+        """How many iterations take so long, with the looks at the samples held out, by some that leave no trace."""
         weights, drawn = deepcopy(self.network.state_dict()), self.generator.get_state()
         trial = _Course(self.network, self.loss, self.n_samples, self.plan, self.generator, TrainingOptions(device=self.options.device))
         trial.iterations, trial.rows = self.plan.iterations, self.rows
-        trial.step()
-        start = perf_counter()
-        for _ in range(TRIAL_ITERATIONS):
+        trial.step()  # makes what the others find
+        start = now = self._now()
+        done = 0
+        while done < 3 or (done < TRIAL_ITERATIONS and now - start < TRIAL_SHARE * seconds):
             trial.step()
-        if self.device.type == "cuda":
-            torch.cuda.synchronize()
-        each = (perf_counter() - start) / TRIAL_ITERATIONS
+            done, now = done + 1, self._now()
+        each, look = (now - start) / done, 0.0
+        if len(self.held):
+            trial.held = self.held
+            trial._validate()
+            look = self._now() - now
         self.network.load_state_dict(weights)
         self.generator.set_state(drawn)
-        return max(1, int(seconds / each))
+        left = seconds - (self._now() - start)
+        # As many looks as `VALIDATIONS`; one after every iteration where there are no more iterations than these.
+        return max(1, int((left - VALIDATIONS * look) / each) if left > VALIDATIONS * (look + each) else int(left / (look + each)))
+
+    def _now(self) -> float:
+        """Seconds of a clock, when all that was begun is done."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize()
+        return perf_counter()
 
     def step(self) -> None:
         """One iteration; now and then, a look at the losses."""
