@@ -148,7 +148,9 @@ def test_it_ends_when_the_samples_held_out_gain_nothing_and_keeps_the_best_weigh
     done = problem.train(replace(PLAN, iterations=4000, schedule="constant", validation_fraction=0.5))
     best = int(done.validation_curve.argmin())
     assert done.iterations == 4000
-    assert len(done.loss_curve) < 4000 // training.LOSS_INTERVAL
+    stopped = len(done.validation_curve) * (4000 // training.VALIDATIONS)
+    assert stopped < 4000
+    assert len(done.loss_curve) == -(-stopped // training.LOSS_INTERVAL), "the losses before an early end are kept"
     assert len(done.validation_curve) == best + 1 + training.PATIENCE
     rows = torch.randperm(60, generator=Problem(noise=2.0, width=200).generator)[:30]
     assert not problem.network.training

@@ -328,7 +328,10 @@ class _Course:
             raise MorBenchError(f"training diverged before iteration {self.iteration}: `learning_rate` {self.plan.learning_rate} is too high.")
 
     def finish(self) -> None:
-        """With the best weights, if samples were held out."""
+        """With the best weights, if samples were held out, and the losses since the last point of the curve, after an early end."""
+        if self.n_summed:
+            self.curve.append(float(self.total) / self.n_summed)
+            self._check_finite(self.curve[-1])
         if self.best:
             self.network.load_state_dict(self.best)
         self.network.eval()
