@@ -98,7 +98,7 @@ class SourceFile(_Model):
         Raises
         ------
         SpecError
-            If the file is missing or has changed.
+            If the file is missing, a device or pipe, or has changed.
         """
         if _sha256(Path(self.path)) != self.sha256:
             raise SpecError(f"{self.path}: the file has changed since the dataset was read.")
@@ -107,6 +107,8 @@ class SourceFile(_Model):
 
 def _sha256(path: Path) -> str:
     try:
+        if path.exists() and not path.is_file() and not path.is_dir():  # it might never end
+            raise SpecError(f"{path}: a device or pipe, not a file.")
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except FileNotFoundError:
         raise SpecError(f"{path}: no such file.") from None

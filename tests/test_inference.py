@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 import pickle
 from collections.abc import Iterator
 from pathlib import Path
@@ -179,6 +180,8 @@ def test_an_onnx_file_answers_as_the_method(data: Dataset, tmp_path: Path, knobs
         expected = method.predict(forces)
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
         assert (found[:, data.scene.fixed_nodes] == 0).all()
+    (at_rest,) = session.run(["displacements"], {"forces": np.zeros((3, *forces.shape[1:]), np.float32)})
+    assert at_rest.any() != method.parameters["zero_at_rest"]
     with pytest.raises(InvalidInputError, match="not overwritten"):
         export_onnx(tmp_path / "model.safetensors", path)
 
@@ -247,6 +250,15 @@ def test_forged_json(parts: Any, tmp_path: Path, text: str) -> None:
     _, header, arrays = parts
     for key in ("parameters", "scene"):
         refused(tmp_path / "model.safetensors", forged({**header, key: text}, arrays))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with a name")
+def test_a_forged_scene_whose_file_never_ends(parts: Any, tmp_path: Path) -> None:
+    _, header, arrays = parts
+    os.mkfifo(tmp_path / "pipe")
+    for path in ("/dev/zero", str(tmp_path / "pipe")):
+        scene = {**json.loads(header["scene"]), "geometry": {"shape": "file", "file": {"path": path, "sha256": "0" * 64}}}
+        refused(tmp_path / "model.safetensors", forged({**header, "scene": json.dumps(scene)}, arrays))
 
 
 @pytest.mark.parametrize("name", ["../../evil:Evil", "/etc/passwd", "os:system", "mor_bench.surrogates.umesh.method:_scale", ""])

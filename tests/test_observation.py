@@ -12,7 +12,7 @@ import pytest
 import mor_bench
 from mor_bench.errors import InvalidInputError, MissingDependencyError, NotFittedError, SpecError, UnknownRangeError, UnsupportedSceneError
 from mor_bench.harness.contestants import OBSERVATION_METHODS, checked_specs
-from mor_bench.harness.export import export_numpy, export_vtu
+from mor_bench.harness.export import export_numpy, export_onnx, export_vtu
 from mor_bench.harness.fits import Material
 from mor_bench.harness.metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
@@ -307,6 +307,12 @@ def test_a_run_has_rows_of_those_that_can_and_reasons_of_the_others(data: Datase
     assert comparison.datasets["beam-tiny-observed"]["observed"] == {"region": "z-max"}
 
 
+def test_the_fit_command_scores_answers_to_what_is_seen(data: Dataset, cache: Path, tmp_path: Path) -> None:
+    fitted = mor_bench.fit(written(tmp_path, TOP), "linear-fem", out=tmp_path / "model.safetensors", cache=cache)
+    predicted = fitted.method.predict(data.test.inputs)
+    assert fitted.error["rel_l2_median"] == pytest.approx(np.median(relative_l2(predicted, data.test.displacements)))
+
+
 def test_a_model_of_other_observed_nodes_is_not_taken_from_the_cache(data: Dataset, tiny: Dataset, tmp_path: Path) -> None:
     corner = scene_of({"region": {"nearest_m": [[2.0, 1.0, 1.0], 20]}})
     digests = {Material(scene, tiny.train, {}, tmp_path).train_digest for scene in (tiny.scene, data.scene, corner)}
@@ -331,6 +337,23 @@ def test_exported_answers_are_those_to_what_is_seen(data: Dataset, tiny: Dataset
     np.testing.assert_array_equal(found["force"], data.test.forces[2])
     with pytest.raises(InvalidInputError, match="the model was fitted to"):
         export_vtu(tiny, 2, tmp_path / "vtu", models=[tmp_path / "gappy.safetensors"])
+
+
+@pytest.mark.parametrize("name", ["umesh-small", "umesh-linear"])
+def test_an_onnx_file_does_not_look_at_what_is_not_seen(name: str, data: Dataset, tmp_path: Path) -> None:
+    onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
+    pytest.importorskip("torch")
+    method = mor_bench.load_method(name, channels=2, steps=1, iterations=3).fit(data.scene, data.train)
+    method.save(tmp_path / "model.safetensors")
+    path, _ = export_onnx(tmp_path / "model.safetensors", tmp_path / "model.onnx")
+    assert "displacements of the observed nodes in m" in {entry.key: entry.value for entry in onnx.load(path).metadata_props}["units"]
+    observed = data.scene.observed_nodes
+    assert observed is not None
+    given = data.test.inputs[:3].astype(np.float32)
+    given[:, np.setdiff1d(np.arange(given.shape[1]), observed)] = np.nan
+    (found,) = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"]).run(None, {"forces": given})
+    expected = method.predict(data.test.inputs[:3])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
 
 
 def test_imported_snapshots_can_be_completed(data: Dataset, tmp_path: Path) -> None:

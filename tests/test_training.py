@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -110,6 +111,29 @@ def test_a_checkpoint_of_another_training_is_refused_and_left(checkpoint: Path) 
     assert checkpoint.exists()
 
 
+@pytest.mark.parametrize("name", ["network.0.weight", "best.2.bias", "optimiser.0.exp_avg", "generator", "rows", "order", "numbers"])
+def test_a_checkpoint_with_a_changed_bit_is_refused(checkpoint: Path, name: str) -> None:
+    content = bytearray(checkpoint.read_bytes())
+    length = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + length])
+    if name == "numbers":
+        content[content.index(b"iterations") + len(b'iterations\\": ')] ^= 2
+    else:
+        content[8 + length + header[name]["data_offsets"][0] + 2] ^= 1
+    checkpoint.write_bytes(content)
+    with pytest.raises(StoreError, match="the checksum does not match"):
+        Problem().train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="x")
+
+
+def test_a_checkpoint_of_other_seconds_or_samples_is_refused(checkpoint: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"another training .*seconds"):
+        Problem().train(options=TrainingOptions(checkpoint=checkpoint, fit_seconds=9.0), fingerprint="x")
+    samples = Problem()
+    samples.x, samples.y = samples.x[:30], samples.y[:30]  # fewer, and the caller's fingerprint does not tell
+    with pytest.raises(StoreError, match="not those of the training"):
+        samples.train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="x")
+
+
 @pytest.mark.parametrize("damage", ["truncated", "empty", "foreign", "other network"])
 def test_a_damaged_checkpoint_is_refused(checkpoint: Path, damage: str) -> None:
     content = checkpoint.read_bytes()
@@ -124,7 +148,9 @@ def test_it_ends_when_the_samples_held_out_gain_nothing_and_keeps_the_best_weigh
     done = problem.train(replace(PLAN, iterations=4000, schedule="constant", validation_fraction=0.5))
     best = int(done.validation_curve.argmin())
     assert done.iterations == 4000
-    assert len(done.loss_curve) < 4000 // training.LOSS_INTERVAL
+    stopped = len(done.validation_curve) * (4000 // training.VALIDATIONS)
+    assert stopped < 4000
+    assert len(done.loss_curve) == -(-stopped // training.LOSS_INTERVAL), "the losses before an early end are kept"
     assert len(done.validation_curve) == best + 1 + training.PATIENCE
     rows = torch.randperm(60, generator=Problem(noise=2.0, width=200).generator)[:30]
     assert not problem.network.training
@@ -136,12 +162,30 @@ def test_it_ends_when_the_samples_held_out_gain_nothing_and_keeps_the_best_weigh
 def test_a_training_that_fills_a_time_is_repeated_by_its_number_of_iterations() -> None:
     filled, repeated = Problem(), Problem()
     plan = replace(PLAN, validation_fraction=0.0)
+    Problem().train(replace(plan, iterations=1))  # torch imports what its optimisers need
     start = perf_counter()
     done = filled.train(plan, options=TrainingOptions(fit_seconds=0.5))
     assert 0.1 < perf_counter() - start < 5.0
     assert done.iterations > 50
     assert repeated.train(replace(plan, iterations=done.iterations)).iterations == done.iterations
     np.testing.assert_array_equal(repeated.weights, filled.weights)
+
+
+@pytest.mark.parametrize(("seconds", "each"), [(1.0, 2e-4), (1.0, 4e-3)])
+def test_a_time_holds_the_trial_and_the_looks_at_the_samples_held_out(seconds: float, each: float) -> None:
+    problem = Problem()
+    asked = 0.0
+
+    def slow(rows: Tensor) -> Tensor:
+        nonlocal asked
+        asked += each * len(rows)
+        return problem.loss(rows)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "perf_counter", lambda: asked)
+        patch.setattr(training, "PATIENCE", 10**9)
+        problem.train(replace(PLAN, validation_fraction=0.5), loss=slow, options=TrainingOptions(fit_seconds=seconds))
+    assert 0.8 * seconds < asked < 1.2 * seconds
 
 
 def test_bfloat16_trains_nearly_as_well() -> None:

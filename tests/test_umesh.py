@@ -391,6 +391,24 @@ def test_transfer_starts_from_a_network_of_another_scene(improved: Surrogate, ir
         wrong.fit(train.scene, train)
 
 
+def test_losses_are_not_rounded_with_the_products(data: Dataset) -> None:
+    knobs = {**SMALL, "iterations": 3, "batch_size": 64, "precision": "bfloat16", "validation_fraction": 0.2}
+    curve: Any = mor_bench.load_method("umesh", **knobs).fit(data.scene, data.train)
+    losses = torch.from_numpy(curve.validation_curve_)
+    assert (losses.bfloat16().double() != losses).all()
+
+
+def test_weights_to_start_from_that_are_not_finite_are_refused(fitted: Surrogate, data: Dataset, tmp_path: Path) -> None:
+    other: Any = copy.deepcopy(fitted)
+    with torch.no_grad():
+        other.network_.head.bias[1] = float("nan")
+    other.save(tmp_path / "umesh.safetensors")
+    method = mor_bench.load_method("umesh", **SMALL)
+    method.training = TrainingOptions(start_from=tmp_path / "umesh.safetensors")
+    with pytest.raises(StoreError, match="NaN or infinity"):
+        method.fit(data.scene, data.train)
+
+
 @pytest.mark.parametrize(("knob", "value"), [("channels", 0), ("steps", 0), ("schedule", "step"), ("learning_rate", 0.0), ("seed", -1)])
 def test_knobs_out_of_range(knob: str, value: object) -> None:
     with pytest.raises(SpecError, match=knob):

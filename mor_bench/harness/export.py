@@ -178,7 +178,8 @@ latency_ms = {spec.needs.latency_ms!r}
 def export_onnx(model: str | Path, out: str | Path) -> tuple[Path, float | None]:
     """Write the network of a fitted model, with its scaling at both ends, as an ONNX file of float32.
 
-    Input `forces`, (n, n_nodes, 3), N; output `displacements` of the same shape, m; any n. Weights lie within the file, and all
+    Input `forces`, (n, n_nodes, 3), N, or in a scene with observed nodes displacements of these, m; output `displacements` of the same
+    shape, m; any n. Weights lie within the file, and all
     operations are standard ones. Scene and units stand in the metadata. Where ONNX Runtime is installed, its answers to some
     random loads are compared with the method's own in float32 before anything is written.
 

@@ -44,7 +44,7 @@ class GraphBuilder:
         self._constants: list[onnx.TensorProto] = []
 
     def constant(self, values: NDArray[Any]) -> str:
-        """The name of an array, float32 or int64."""
+        """The name of an array, float32, int64 or bool."""
         name = f"constant{len(self._constants)}"
         self._constants.append(self._onnx.numpy_helper.from_array(np.ascontiguousarray(values), name))
         return name

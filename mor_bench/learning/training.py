@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from mor_bench import __version__
 from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, StoreError
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.surrogate import TrainingOptions
@@ -41,8 +42,9 @@ VALIDATIONS, PATIENCE = 50, 15
 """How often the loss of the samples held out is taken during a whole training, and how many times in a row it may fail to
 fall before the training ends with the weights of its lowest."""
 
-TRIAL_ITERATIONS = 20
-"""Iterations, on a copy of the network, from whose time a training is sized to seconds."""
+TRIAL_ITERATIONS, TRIAL_SHARE = 20, 0.1
+"""Iterations from whose time a training is sized to seconds, which leave no trace; fewer, but three, where they take more than
+this part of the seconds."""
 
 CHECKPOINT_EVERY_S = 30.0
 
@@ -165,7 +167,7 @@ def train(
     time_limit_s : float, optional
         Seconds that training may take; it is not begun in earnest when it would take longer.
     fingerprint : str
-        Tells trainings apart: a checkpoint is only resumed by the one that wrote it.
+        Tells trainings apart: a checkpoint is only resumed by the one that wrote it, with the same seconds and versions.
 
     Returns
     -------
@@ -184,6 +186,7 @@ def train(
     """
     options = options or TrainingOptions()
     course = _Course(network, loss, n_samples, plan, generator, options)
+    fingerprint = fingerprint_of({"caller": fingerprint, "fit_seconds": options.fit_seconds, "versions": [__version__, torch.__version__]}, {})
     if options.checkpoint is None or not course.resume(options.checkpoint, fingerprint):
         course.begin()
     start, first, written = perf_counter(), course.iteration, perf_counter()
@@ -253,20 +256,32 @@ class _Course:
             self.iterations = self._that_fit(self.options.fit_seconds)
 
     def _that_fit(self, seconds: float) -> int:
-        """How many iterations take so long, by some on a copy, which leave no trace."""
+        """How many iterations take so long, with the looks at the samples held out, by some that leave no trace."""
         weights, drawn = deepcopy(self.network.state_dict()), self.generator.get_state()
         trial = _Course(self.network, self.loss, self.n_samples, self.plan, self.generator, TrainingOptions(device=self.options.device))
         trial.iterations, trial.rows = self.plan.iterations, self.rows
-        trial.step()
-        start = perf_counter()
-        for _ in range(TRIAL_ITERATIONS):
+        trial.step()  # makes what the others find
+        start = now = self._now()
+        done = 0
+        while done < 3 or (done < TRIAL_ITERATIONS and now - start < TRIAL_SHARE * seconds):
             trial.step()
-        if self.device.type == "cuda":
-            torch.cuda.synchronize()
-        each = (perf_counter() - start) / TRIAL_ITERATIONS
+            done, now = done + 1, self._now()
+        each, look = (now - start) / done, 0.0
+        if len(self.held):
+            trial.held = self.held
+            trial._validate()
+            look = self._now() - now
         self.network.load_state_dict(weights)
         self.generator.set_state(drawn)
-        return max(1, int(seconds / each))
+        left = seconds - (self._now() - start)
+        # As many looks as `VALIDATIONS`; one after every iteration where there are no more iterations than these.
+        return max(1, int((left - VALIDATIONS * look) / each) if left > VALIDATIONS * (look + each) else int(left / (look + each)))
+
+    def _now(self) -> float:
+        """Seconds of a clock, when all that was begun is done."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize()
+        return perf_counter()
 
     def step(self) -> None:
         """One iteration; now and then, a look at the losses."""
@@ -313,7 +328,10 @@ class _Course:
             raise MorBenchError(f"training diverged before iteration {self.iteration}: `learning_rate` {self.plan.learning_rate} is too high.")
 
     def finish(self) -> None:
-        """With the best weights, if samples were held out."""
+        """With the best weights, if samples were held out, and the losses since the last point of the curve, after an early end."""
+        if self.n_summed:
+            self.curve.append(float(self.total) / self.n_summed)
+            self._check_finite(self.curve[-1])
         if self.best:
             self.network.load_state_dict(self.best)
         self.network.eval()
@@ -331,6 +349,7 @@ class _Course:
             "iteration": self.iteration, "iterations": self.iterations, "n_summed": self.n_summed, "curve": self.curve, "validated": self.validated,
         }  # fmt: skip
         header = {"format": "mor-bench checkpoint", "fingerprint": fingerprint, "numbers": json.dumps(numbers)}
+        header["sha256"] = fingerprint_of(header, tensors)
         write_atomically(path, save({name: value.cpu().contiguous().clone() for name, value in tensors.items()}, header))
 
     def resume(self, path: Path, fingerprint: str) -> bool:
@@ -346,8 +365,12 @@ class _Course:
         except (SafetensorError, OSError) as error:
             raise StoreError(f"{path}: not a checkpoint, or damaged: {error}. Without it the training begins anew.") from None
         if header.get("format") != "mor-bench checkpoint" or header.get("fingerprint") != fingerprint:
-            raise InvalidInputError(f"{path}: the checkpoint of another training (knobs, samples or version); name another file, or delete it.")
+            raise InvalidInputError(
+                f"{path}: the checkpoint of another training (knobs, seconds, samples or version); name another file, or delete it."
+            )
         try:
+            if header.pop("sha256") != fingerprint_of(header, tensors):
+                raise ValueError("the checksum does not match")
             numbers = json.loads(header["numbers"])
             self.network.load_state_dict(_under("network.", tensors))
             self.best = _under("best.", tensors)
@@ -360,6 +383,9 @@ class _Course:
             self.total = tensors["total"].to(self.device)
             self.iteration, self.iterations, self.n_summed = (int(numbers[name]) for name in ("iteration", "iterations", "n_summed"))
             self.curve, self.validated = list(numbers["curve"]), list(numbers["validated"])
+            parts = torch.cat([self.rows, self.held]).sort().values
+            if not torch.equal(parts, torch.arange(self.n_samples)) or not torch.isin(self.order, self.rows).all():
+                raise ValueError("its samples are not those of the training")
         except (KeyError, ValueError, TypeError, RuntimeError) as error:
             raise StoreError(f"{path}: a damaged checkpoint: {error}. Without it the training begins anew.") from None
         return True

@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import Tensor
 
 from mor_bench import counting
-from mor_bench.errors import InvalidInputError
+from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.learning.inference import Backend, choose_inference, inference_or_eager
 from mor_bench.learning.training import Precision, Schedule, TrainingPlan, device_of, fingerprint_of, train
 from mor_bench.mechanics.model import unknown_equations
@@ -206,7 +206,8 @@ class UMesh(Surrogate):
                     turned = torch.randint(2, (len(rows), 1, 1), generator=generator).bool().to(device)
                     x, y = torch.where(turned, image(x), x), torch.where(turned, image(y), y)
                 answer = self._answer(x) - self._answer(zero) if self.zero_at_rest else self._answer(x)
-                return (answer - y).square().sum(dim=(1, 2)) @ weights[rows] * (1.0 / y.numel())
+                errors = (answer - y).square().sum(dim=(1, 2))
+                return (errors * weights[rows]).sum() * (1.0 / y.numel())  # autocast would round a product of vectors
 
             plan = TrainingPlan(
                 self.iterations, self.batch_size, self.learning_rate, self.schedule, self.second_moment_decay,
@@ -292,8 +293,11 @@ class UMesh(Surrogate):
 
     def _start_from(self, path: Path) -> None:
         """Take the weights of a network that was trained on this scene or another; grids of any size share them."""
+        weights = _network_weights(weights_to_start_from(path, type(self)))
+        if not all(weight.isfinite().all() for weight in weights.values()):
+            raise StoreError(f"{path}: the weights of its network hold NaN or infinity.")
         try:
-            self.network_.load_state_dict(_network_weights(weights_to_start_from(path, type(self))))
+            self.network_.load_state_dict(weights)
         except RuntimeError as error:
             raise InvalidInputError(f"{path}: its network does not fit {self.channels} channels and {self.steps} steps: {error}") from None
 

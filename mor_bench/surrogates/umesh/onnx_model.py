@@ -32,7 +32,9 @@ def umesh_graph(
     at_rest: NDArray[np.float32] | None,
     response: LinearResponse | None,
 ) -> onnx.ModelProto:
-    """`UMesh.predict` in float32, scaling included; supports are zero.
+    """`UMesh.predict` in float32, scaling included; supports are zero, and so is all where nothing is given if `at_rest` is.
+
+    In a scene with observed nodes, what the others hold is not looked at, and may be NaN.
 
     Parameters
     ----------
@@ -49,6 +51,11 @@ def umesh_graph(
     n_nodes, n_dofs, weights = scene.mesh.n_nodes, scene.mesh.n_dofs, grid.grid.weights
     graph = GraphBuilder()
     given, to_grid = "forces", sp.csr_array(weights.T)
+    if scene.observed_nodes is not None:
+        seen = np.zeros((n_nodes, 1), dtype=np.bool_)
+        seen[scene.observed_nodes] = True
+        given = graph.add("Where", graph.constant(seen), given, graph.constant(np.zeros(1, dtype=np.float32)))
+    loads = given
     if response is not None:
         if n_dofs > MAX_RESPONSE_DOFS:
             raise UnavailableBackendError(
@@ -56,7 +63,7 @@ def umesh_graph(
                 f"most {MAX_RESPONSE_DOFS:,}."
             )
         compliance = response.respond(np.eye(n_dofs)).astype(np.float32)
-        flat = graph.add("Reshape", "forces", graph.constant(np.array([-1, n_dofs])))
+        flat = graph.add("Reshape", loads, graph.constant(np.array([-1, n_dofs])))
         solved = graph.add("MatMul", flat, graph.constant(compliance))
         given = graph.add("Reshape", solved, graph.constant(np.array([-1, n_nodes, 3])))
     if response is not None or scene.observed_nodes is not None:
@@ -75,11 +82,15 @@ def umesh_graph(
         x = graph.add("Add", scaled, given)
     free_nodes = np.full((n_nodes, 1), output_scale if response is None else 1.0, dtype=np.float32)
     free_nodes[scene.fixed_nodes] = 0.0
+    if at_rest is not None:  # another runtime rounds the network at rest otherwise
+        loaded = graph.add("Sign", graph.add("ReduceMax", graph.add("Abs", loads), axes=[1, 2], keepdims=1))
+        x = graph.add("Mul", x, loaded)
     graph.add("Mul", x, graph.constant(free_nodes), name="displacements")
+    given_in = "forces in N" if scene.observed_nodes is None else "`forces` are displacements of the observed nodes in m"
     described = {
         "scene": scene.name,
         "scene_spec": scene.spec.model_dump_json(),
-        "units": "forces in N, displacements in m, one row per node of the scene's mesh",
+        "units": f"{given_in}, displacements in m, one row per node of the scene's mesh",
     }
     shape = ["n", n_nodes, 3]
     return graph.model(f"U-Mesh of {scene.name}", ("forces", shape), ("displacements", shape), described)
