@@ -27,11 +27,14 @@ from tests.test_contract import CHEAP
 TOP = '[observed]\nregion = "z-max"\n'
 CAN = {
     "autoencoder": {"iterations": 50},
+    "deeponet": {"input": "linear-response", "iterations": 50},
     "fem": {},
     "fem-jacobi-pcg": {},
     "fem-pardiso": {},
+    "fno": {"input": "linear-response", **CHEAP["fno"]},
     "gappy-pod": {},
     "linear-fem": {},
+    "mesh-graph-net": {"input": "linear-response", **CHEAP["mesh-graph-net"]},
     "pca-extra-trees": {},
     "pca-gaussian-process": {},
     "pca-kernel-ridge": {},
@@ -39,13 +42,16 @@ CAN = {
     "pca-regression": {"n_input_modes": 10},
     "pca-ridge": {},
     "pca-regression-force": {},
+    "pod-deeponet": {"iterations": 200},
+    "pod-nn": CHEAP["pod-nn"],
+    "sparse-polynomial": {},
     "umesh": CHEAP["umesh"],
     "umesh-linear": CHEAP["umesh-linear"],
     "umesh-small": CHEAP["umesh-small"],
 }
 """The methods that can be given displacements, with knobs that keep a costly one short."""
 
-BOUNDS = {"UMesh": 0.7, "FullFEM": 1e-6, "LinearFEM": 0.1, "GappyPOD": 0.5, "PCARegression": 0.3, "Autoencoder": 0.1}
+BOUNDS = {"UMesh": 0.7, "FullFEM": 1e-6, "LinearFEM": 0.1, "GappyPOD": 0.5, "PCARegression": 0.3, "DeepONet": 0.3}
 """On the median relative l2, by class, others 0.1: beam-tiny turns far, and has few samples."""
 
 

@@ -12,13 +12,13 @@ import pytest
 import mor_bench
 from mor_bench.errors import InvalidInputError
 from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.surrogates.coordinate_regression import CoordinateSamples
 from mor_bench.surrogates.pca_regression import Monomials
 from mor_bench.surrogates.sparse_polynomial import (
     MAX_DEGREE,
     SparsePolynomial,
     _as_array,
     _checked_terms,
-    _Samples,
     cheapest_terms,
     monomial_derivatives,
     sparse_levels,
@@ -55,7 +55,7 @@ def test_a_high_degree_in_one_coordinate_is_found_from_few_samples() -> None:
     z = generator.normal(size=(60, 6))
     values = (z[:, 0] ** 5 + z[:, 0] * z[:, 1] - z[:, 2])[:, None]
     method = SparsePolynomial(ridge=1e-12)
-    terms = method._chosen(_Samples(z, values, np.ones((60, 1))), smallness)
+    terms = method._chosen(CoordinateSamples(z, values, np.ones((60, 1))), smallness)
     assert {(0,) * 5, (0, 1), (2,)} <= set(terms)
     assert len(terms) < 60
 
@@ -81,7 +81,7 @@ def test_no_load_gives_no_displacement_and_the_force_alone_will_do(tiny: Dataset
 )
 def test_damaged_terms_are_refused(spoil: Any) -> None:
     with pytest.raises(InvalidInputError, match="`terms` must hold monomials of 3 variables"):
-        _checked_terms(np.array(spoil, dtype=np.int64), 3)
+        _checked_terms(np.array(spoil, dtype=np.int32), 3)
 
 
 def test_terms_come_back_as_they_were() -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-
-from mor_bench.errors import InvalidInputError
 
 Array = NDArray[np.float64]
 
@@ -78,20 +76,13 @@ def named(prefix: str, weights: Sequence[Array]) -> dict[str, Array]:
     return {f"{prefix}.{name}": weight for name, weight in zip(NAMES, weights, strict=True)}
 
 
-def checked(state: dict[str, Array], prefix: str, n_inputs: int, n_hidden: int, n_outputs: int) -> list[Array]:
-    """The weights that `named` gave.
+def named_shapes(prefix: str, n_inputs: int, n_hidden: int, n_outputs: int) -> dict[str, tuple[int, ...]]:
+    """Of the arrays of `named`."""
+    return {f"{prefix}.{name}": shape for name, shape in zip(NAMES, _shapes(n_inputs, n_hidden, n_outputs), strict=True)}
 
-    Raises
-    ------
-    InvalidInputError
-        If one has another shape or is not finite.
-    KeyError
-        If one is missing.
-    """
-    for name, shape in zip(NAMES, _shapes(n_inputs, n_hidden, n_outputs), strict=True):
-        array = state[f"{prefix}.{name}"]
-        if array.shape != shape or not np.isfinite(array).all():
-            raise InvalidInputError(f"`{prefix}.{name}` must be a finite array of shape {shape}; got shape {array.shape}.")
+
+def taken(state: Mapping[str, Array], prefix: str) -> list[Array]:
+    """The weights that `named` gave a name."""
     return [state[f"{prefix}.{name}"] for name in NAMES]
 
 

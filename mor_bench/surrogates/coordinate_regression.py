@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -12,15 +13,43 @@ from numpy.typing import ArrayLike, NDArray
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.compliance import project
-from mor_bench.mechanics.model import unknown_equations
+from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.observed import LinearResponse, linear_response
 from mor_bench.reduction.basis import pod
+from mor_bench.reduction.coordinates import error_weights, input_axes
+from mor_bench.reduction.sensitivity import sensitivities
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
 
 Array = NDArray[np.float64]
 Input = Literal["linear-response", "force"]
+
+
+@dataclass(frozen=True)
+class CoordinateSamples:
+    """Training samples as a regression between coordinates sees them.
+
+    Attributes
+    ----------
+    z : (n, n_inputs) float64
+    values : (n, n_outputs) float64
+        What g(z) is to be, m.
+    weights : (n, 1) float64
+        What errors are multiplied by where they are to count relative to the displacement.
+    directions, slopes : (n, d, n_inputs) and (n, d, n_outputs) float64, or None
+        Derivatives of z, and of the values, m, along d changes of the load.
+    """
+
+    z: Array
+    values: Array
+    weights: Array
+    directions: Array | None = None
+    slopes: Array | None = None
+
+    def __getitem__(self, rows: NDArray[np.bool_]) -> CoordinateSamples:
+        derived = (None if array is None else array[rows] for array in (self.directions, self.slopes))
+        return CoordinateSamples(self.z[rows], self.values[rows], self.weights[rows], *derived)
 
 
 class CoordinateRegression(Surrogate):
@@ -33,8 +62,8 @@ class CoordinateRegression(Surrogate):
     In a scene with observed nodes their displacements take the place of the force, and the linear extension of these that of the
     linear response.
 
-    A subclass has the knobs `input`, `n_input_modes` and `n_output_modes`, learns g in `_learn`, takes what was learned back
-    in `_take`, whose shapes `_shapes` gives, and evaluates it in `_coefficients`.
+    A subclass has the knobs `input`, `n_input_modes` and `n_output_modes`, and `derivatives` if it can learn from them; it learns
+    g in `_learn`, takes what was learned back in `_take`, whose shapes `_shapes` gives, and evaluates it in `_coefficients`.
     """
 
     takes_observations = True
@@ -42,20 +71,26 @@ class CoordinateRegression(Surrogate):
     input: Input
     n_input_modes: int | None
     n_output_modes: int
+    derivatives: bool = False
     compliance_: LinearResponse
 
     usual_inputs: ClassVar[Mapping[Input, int]] = {"linear-response": 20, "force": 60}
     """Length of z where `n_input_modes` is None."""
 
+    evenness: ClassVar[float] = 0.5
+    """Of the sizes of z, see `input_axes`."""
+
     integers: ClassVar[frozenset[str]] = frozenset()
     """Names of the arrays that are int32; all others are float64."""
 
     def supports(self, scene: Scene) -> str | None:
-        return unknown_equations(scene, observed=True) if self.input == "linear-response" else None
+        if self.input == "linear-response" or self.derivatives:
+            return unknown_equations(scene, observed=not self.derivatives)
+        return None
 
     @abstractmethod
-    def _learn(self, z: Array, targets: Array) -> dict[str, NDArray[Any]]:
-        """Fit g from inputs (n, n_inputs), whose root mean squares fall from a few to less than one, to outputs (n, n_outputs), m."""
+    def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
+        """Fit g; `axes_` and `modes_` are those of the samples' coordinates."""
 
     @abstractmethod
     def _shapes(self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, ...]]:
@@ -83,16 +118,16 @@ class CoordinateRegression(Surrogate):
                 targets = targets - inputs
             else:
                 inputs = snapshots.free_inputs
-            used = np.flatnonzero(inputs.any(axis=0))  # of forces only a few columns
-            usual = min(self.usual_inputs[self.input], *inputs[:, used].shape)
-            modes = pod(inputs[:, used], self.n_input_modes or usual).modes
-            squares = ((inputs[:, used] @ modes) ** 2).mean(axis=0)
-            # Half way between coordinates of their own size and of equal size, on a logarithmic scale.
-            axes = np.zeros((inputs.shape[1], modes.shape[1]))
-            axes[used] = modes / np.sqrt(np.sqrt(squares * squares.mean()))
+            usual = min(self.usual_inputs[self.input], *inputs[:, inputs.any(axis=0)].shape)
+            axes = input_axes(inputs, self.n_input_modes or usual, self.evenness)
             modes = pod(targets, self.n_output_modes).modes
-            learned = self._learn(project(self._to_coordinates(axes), forces), targets @ modes)
-            self._restore({"axes": axes, "modes": modes, **learned})
+            weights = error_weights(snapshots.free_displacements)[:, None]
+            samples = CoordinateSamples(project(self._to_coordinates(axes), forces), targets @ modes, weights)
+            if self.derivatives:
+                known = sensitivities(FullOrderModel(scene), snapshots, axes, modes, of_force=self.input == "force")
+                samples = replace(samples, directions=known.inputs, slopes=known.outputs)
+            self.axes_, self.modes_ = axes, modes
+            self._restore({"axes": axes, "modes": modes, **self._learn(samples)})
         return self
 
     def _to_coordinates(self, axes: Array) -> Array:

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.learning.training import Training, TrainingPlan, device_of, fingerprint_of, train
-from mor_bench.mechanics.compliance import Compliance
-from mor_bench.mechanics.model import FullOrderModel, unknown_equations
+from mor_bench.mechanics.model import unknown_equations
+from mor_bench.mechanics.observed import linear_response
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate, weights_to_start_from
@@ -61,7 +61,8 @@ class FieldSurrogate(Surrogate):
     """u = s (G(x) - G(0)) with x the scaled force, or u = K₀⁻¹f + s (G(x) - G(0)) with x the scaled linear response K₀⁻¹f.
 
     Trained with the mean squared error over the components of all nodes of the body, in float32. G(0) is subtracted in the
-    training too, so that no load gives exactly no displacement.
+    training too, so that no load gives exactly no displacement. In a scene with observed nodes their displacements take the
+    place of the force, and the linear extension of these that of the linear response.
 
     Attributes
     ----------
@@ -74,6 +75,8 @@ class FieldSurrogate(Surrogate):
     iterations_ : int
         Adam steps done.
     """
+
+    takes_observations = True
 
     input: Input
     iterations: int
@@ -90,17 +93,17 @@ class FieldSurrogate(Surrogate):
         """The network without values; raises InvalidInputError if the constants do not fit the scene and the knobs."""
 
     def supports(self, scene: Scene) -> str | None:
-        return unknown_equations(scene) if self.input == "linear-response" else None
+        return unknown_equations(scene, observed=True) if self.input == "linear-response" else None
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             samples = self._checked_snapshots(snapshots)
             if self.input == "linear-response":
-                self.compliance_ = Compliance(FullOrderModel(scene))
-                inputs = self._linear_response(samples.forces)
+                self.compliance_ = linear_response(scene)
+                inputs = self._linear_response(samples.inputs)
                 targets = samples.displacements - inputs
             else:
-                inputs, targets = samples.forces, samples.displacements
+                inputs, targets = samples.inputs, samples.displacements
             self.input_scale_, self.output_scale_ = _rms(inputs), _rms(targets)
             inputs, targets = inputs / self.input_scale_, targets / self.output_scale_
             self.constants_ = self._constants(inputs, targets)
@@ -161,7 +164,7 @@ class FieldSurrogate(Surrogate):
         return out.reshape(np.shape(forces))
 
     def _linear_response(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """K₀⁻¹f, (n, n_nodes, 3) m of forces (n, n_nodes, 3) N."""
+        """K₀⁻¹f, (n, n_nodes, 3) m of forces (n, n_nodes, 3) N, or the linear extension of observed displacements, m."""
         return self.compliance_.respond(forces.reshape(len(forces), self.scene_.mesh.n_dofs)).reshape(forces.shape)
 
     def _finish(self, network: FieldNetwork) -> None:
@@ -195,7 +198,7 @@ class FieldSurrogate(Surrogate):
             raise InvalidInputError("the weights do not fit the network.")
         network.load_state_dict(weights, assign=True)
         if self.input == "linear-response":
-            self.compliance_ = Compliance(FullOrderModel(self.scene_))
+            self.compliance_ = linear_response(self.scene_)
         self._finish(network)
 
 

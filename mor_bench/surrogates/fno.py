@@ -146,7 +146,7 @@ class FNO(FieldNetwork):
 class FourierNeuralOperator(FieldSurrogate):
     """A Fourier neural operator on the regular grid around the body; see `FNO`.
 
-    Forces go to the grid as in U-Mesh, with their sum; of the linear response each grid point takes the mean. Every layer
+    Forces go to the grid as in U-Mesh, with their sum; of displacements each grid point takes the mean. Every layer
     sees the whole grid, coarsely, which a load at one end of a body needs.
 
     Parameters
@@ -187,4 +187,4 @@ class FourierNeuralOperator(FieldSurrogate):
 
     def _network(self, constants: Arrays) -> FNO:
         grid = padded_grid(grid_map(self.scene_.mesh, self.scene_.spec.grid_nodes), 0)
-        return FNO(grid, self.input == "force", self.channels, self.modes, self.layers)
+        return FNO(grid, self.input == "force" and self.scene_.observed_nodes is None, self.channels, self.modes, self.layers)

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
-from mor_bench.surrogates.coordinate_regression import CoordinateRegression
+from mor_bench.surrogates.coordinate_regression import CoordinateRegression, CoordinateSamples
 
 Array = NDArray[np.float64]
 
@@ -110,10 +110,10 @@ class PCAKernelRidge(_GaussianSums):
         self.length_scale = length_scale
         self.ridge = ridge
 
-    def _learn(self, z: Array, targets: Array) -> dict[str, NDArray[Any]]:
+    def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         from sklearn.kernel_ridge import KernelRidge
 
-        z, targets = z[: self.n_points], targets[: self.n_points]
+        z, targets = samples.z[: self.n_points], samples.values[: self.n_points]
         origin = np.zeros((1, z.shape[1]))
         length = float(self.length_scale or LENGTH_SCALES[self.input])
         scaled = z / length
@@ -169,12 +169,12 @@ class PCAGaussianProcess(_GaussianSums):
         self.n_points = n_points
         self.n_optimised = n_optimised
 
-    def _learn(self, z: Array, targets: Array) -> dict[str, NDArray[Any]]:
+    def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.gaussian_process import GaussianProcessRegressor
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-        z, targets = z[: self.n_points], targets[: self.n_points]
+        z, targets = samples.z[: self.n_points], samples.values[: self.n_points]
         scale = float(np.sqrt((targets**2).mean(axis=0).max()))
         start = np.full(z.shape[1], LENGTH_SCALES[self.input])
         kernel = ConstantKernel(100.0, (1e-4, 1e8)) * RBF(start, LENGTHS) + WhiteKernel(1e-5, (LEAST_NOISE, 1e1))

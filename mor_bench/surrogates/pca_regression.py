@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mor_bench import counting
-from mor_bench.surrogates.coordinate_regression import CoordinateRegression
+from mor_bench.surrogates.coordinate_regression import CoordinateRegression, CoordinateSamples
 
 Levels = list[tuple[NDArray[np.int64], NDArray[np.int64]]]
 
@@ -95,13 +95,14 @@ class PCARegression(CoordinateRegression):
         self.degree = degree
         self.ridge = ridge
 
-    def _learn(self, z: NDArray[np.float64], targets: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+    def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         from sklearn.linear_model import Ridge
 
-        features = Monomials(z.shape[1], monomial_indices(z.shape[1], self.degree))(z)
+        n_variables = samples.z.shape[1]
+        features = Monomials(n_variables, monomial_indices(n_variables, self.degree))(samples.z)
         feature_scale = np.sqrt((features**2).mean(axis=0))
         regression = Ridge(alpha=self.ridge * len(features), fit_intercept=False, solver="cholesky")
-        regression.fit(features / feature_scale, targets)
+        regression.fit(features / feature_scale, samples.values)
         return {"weights": np.atleast_2d(regression.coef_) / feature_scale}
 
     def _shapes(self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, ...]]:

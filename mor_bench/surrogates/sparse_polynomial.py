@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
 from heapq import heappop, heappush
 from itertools import pairwise
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field
 from scipy.linalg import cholesky, solve_triangular
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.model import FullOrderModel, unknown_equations
-from mor_bench.reduction.basis import pod
-from mor_bench.reduction.coordinates import error_weights, input_axes
-from mor_bench.reduction.sensitivity import sensitivities
-from mor_bench.scene.scene import Scene
-from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogate import Surrogate
+from mor_bench.surrogates.coordinate_regression import CoordinateRegression, CoordinateSamples
 from mor_bench.surrogates.pca_regression import Levels, Monomials
 
 Array = NDArray[np.float64]
@@ -35,7 +29,7 @@ DERIVATIVE_WEIGHT = 0.1
 """Of the squared error of the derivatives beside that of the values."""
 
 
-class SparsePolynomial(Surrogate):
+class SparsePolynomial(CoordinateRegression):
     """u = K₀⁻¹f + Φ W p(z), z principal coordinates of the linear response, p a sparse set of monomials; or u = Φ W p(z), z those of the force.
 
     A term costs, for each factor zᵢ, log₁₀(σ₁ / σᵢ) with σᵢ the coordinate's root mean square, and a number of decades, the same
@@ -70,6 +64,9 @@ class SparsePolynomial(Surrogate):
         The monomials, each by its variables; the cheapest first.
     """
 
+    evenness = 1.0
+    integers = frozenset({"terms"})
+
     def __init__(
         self,
         input: Literal["linear-response", "force"] = "linear-response",
@@ -86,34 +83,13 @@ class SparsePolynomial(Surrogate):
         self.ridge = ridge
         self.derivatives = derivatives
 
-    def supports(self, scene: Scene) -> str | None:
-        return unknown_equations(scene) if self.derivatives or self._from_linear else None
+    def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
+        sizes = np.log10(np.linalg.norm(self.axes_, axis=0))  # the axes divide by the coordinates' root mean squares
+        terms = self._chosen(samples, sizes - sizes[0])
+        factor, right, scale = self._system(samples, terms)
+        return {"weights": solve_triangular(factor, right).T / scale, "terms": _as_array(terms)}
 
-    @property
-    def _from_linear(self) -> bool:
-        return self.input == "linear-response"
-
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
-        with self._fitting(scene):
-            snapshots = self._checked_snapshots(snapshots)
-            inputs, targets = snapshots.free_forces, snapshots.free_displacements
-            model = FullOrderModel(scene) if self.derivatives or self._from_linear else None
-            if model is not None and self._from_linear:
-                inputs = model.rest_factor.solve(inputs.T).T
-                targets = targets - inputs
-            axes, modes = input_axes(inputs, self.n_input_modes, 1.0), pod(targets, self.n_output_modes).modes
-            samples = _Samples(inputs @ axes, targets @ modes, error_weights(snapshots.free_displacements)[:, None])
-            if model is not None and self.derivatives:
-                known = sensitivities(model, snapshots, axes, modes, of_force=not self._from_linear)
-                samples = replace(samples, directions=known.inputs, slopes=known.outputs)
-            sizes = np.log10(np.linalg.norm(axes, axis=0))  # the axes divide by the coordinates' root mean squares
-            terms = self._chosen(samples, sizes - sizes[0])
-            factor, right, scale = self._system(samples, terms)
-            weights = solve_triangular(factor, right).T / scale
-            self._restore({"axes": axes, "modes": modes, "weights": weights, "terms": _as_array(terms)})
-        return self
-
-    def _chosen(self, samples: _Samples, smallness: Array) -> list[Term]:
+    def _chosen(self, samples: CoordinateSamples, smallness: Array) -> list[Term]:
         """The terms with the least error of samples that were held out.
 
         The triangular factor of all terms holds those of the first n for every n: as in Gram and Schmidt's process, each term
@@ -139,7 +115,7 @@ class SparsePolynomial(Surrogate):
                     least, best = error, terms[:number]
         return best
 
-    def _system(self, samples: _Samples, terms: list[Term]) -> tuple[Array, Array, Array]:
+    def _system(self, samples: CoordinateSamples, terms: list[Term]) -> tuple[Array, Array, Array]:
         """R with RᵀR the normal matrix, R⁻ᵀ times the right-hand sides, and what the features were divided by."""
         levels, places = sparse_levels(terms, samples.z.shape[1])
         features = Monomials(samples.z.shape[1], levels)(samples.z)[:, places] * samples.weights
@@ -158,75 +134,35 @@ class SparsePolynomial(Surrogate):
             raise InvalidInputError(f"`ridge` of {type(self).__name__} is too small for these samples; got {self.ridge:g}.") from None
         return factor, solve_triangular(factor, right, trans="T"), scale
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        batch = self._checked_forces(forces).reshape(-1, self.scene_.mesh.n_dofs)
-        free = batch[:, self.scene_.free_dofs]
-        out = np.zeros_like(batch)
-        if counting.running is not None:
-            monomial_products = self._weights.shape[1] - self.axes_.shape[1]
-            counting.running.add(multiply_adds=len(batch) * (self.axes_.size + monomial_products + self._weights.size + self.modes_.size))
-        inputs = self.model_.rest_factor.solve(free.T).T if self._from_linear else free
-        found = (self._monomials(inputs @ self.axes_) @ self._weights.T) @ self.modes_.T
-        out[:, self.scene_.free_dofs] = inputs + found if self._from_linear else found
-        return out.reshape(np.shape(forces))
+    def _shapes(self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, ...]]:
+        return {"weights": (n_outputs, len(state["terms"])), "terms": state["terms"].shape}
 
-    def _state(self) -> dict[str, NDArray[Any]]:
-        return {"axes": self.axes_, "modes": self.modes_, "weights": self.weights_, "terms": _as_array(self.terms_)}
-
-    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        # One memory order, fitted or loaded: BLAS rounds differently in another.
-        state = {name: np.ascontiguousarray(array) for name, array in state.items()}
-        n_free, n_axes, n_modes = len(self.scene_.free_dofs), state["axes"].shape[1], state["modes"].shape[1]
-        shapes = {"axes": (n_free, n_axes), "modes": (n_free, n_modes), "weights": (n_modes, len(state["terms"]))}
-        for name, shape in shapes.items():
-            if state[name].shape != shape or not np.isfinite(state[name]).all():
-                raise InvalidInputError(f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}.")
-        terms = _checked_terms(state["terms"], n_axes)
-        self.axes_, self.modes_, self.weights_, self.terms_ = state["axes"], state["modes"], state["weights"], terms
-        self._levels, places = sparse_levels(terms, n_axes)
-        self._monomials = Monomials(n_axes, self._levels)
-        n_monomials = n_axes + sum(len(variables) for _, variables in self._levels)
-        self._weights = np.zeros((n_modes, n_monomials))
+    def _take(self, state: dict[str, NDArray[Any]]) -> None:
+        n_variables = state["axes"].shape[1]
+        self.terms_, self.weights_ = _checked_terms(state["terms"], n_variables), state["weights"]
+        levels, places = sparse_levels(self.terms_, n_variables)
+        self._monomials = Monomials(n_variables, levels)
+        self._weights = np.zeros((len(self.weights_), n_variables + self._monomials.n_products))
         self._weights[:, places] = self.weights_
-        if self._from_linear:
-            self.model_ = FullOrderModel(self.scene_)
-            _ = self.model_.rest_factor
+
+    def _learned(self) -> dict[str, NDArray[Any]]:
+        return {"weights": self.weights_, "terms": _as_array(self.terms_)}
+
+    def _coefficients(self, z: Array) -> Array:
+        if counting.running is not None:
+            counting.running.add(multiply_adds=len(z) * (self._monomials.n_products + self._weights.size))
+        return np.asarray(self._monomials(z) @ self._weights.T)
 
 
-@dataclass(frozen=True)
-class _Samples:
-    """What is fitted: values at z, and slopes along directions if there are any.
-
-    Attributes
-    ----------
-    z : (n, n_variables) float64
-    values : (n, n_outputs) float64
-    weights : (n, 1) float64
-        What errors are multiplied by.
-    directions : (n, d, n_variables) float64, optional
-    slopes : (n, d, n_outputs) float64, optional
-    """
-
-    z: Array
-    values: Array
-    weights: Array
-    directions: Array | None = None
-    slopes: Array | None = None
-
-    def __getitem__(self, rows: NDArray[np.bool_]) -> _Samples:
-        derived = (None if array is None else array[rows] for array in (self.directions, self.slopes))
-        return _Samples(self.z[rows], self.values[rows], self.weights[rows], *derived)
-
-
-def _as_array(terms: list[Term]) -> NDArray[np.int64]:
+def _as_array(terms: list[Term]) -> NDArray[np.int32]:
     """(n_terms, degree) variables of each term, -1 where its degree is lower."""
     degree = max(map(len, terms))
-    return np.array([[*term, *[-1] * (degree - len(term))] for term in terms], dtype=np.int64)
+    return np.array([[*term, *[-1] * (degree - len(term))] for term in terms], dtype=np.int32)
 
 
 def _checked_terms(array: NDArray[Any], n_variables: int) -> list[Term]:
     """The terms of `_as_array`; raises `InvalidInputError` unless each is rising, there once and has its divisors among them."""
-    right = array.ndim == 2 and array.dtype == np.int64 and 1 <= array.shape[1] <= MAX_DEGREE and array.size > 0
+    right = array.ndim == 2 and array.dtype == np.int32 and 1 <= array.shape[1] <= MAX_DEGREE and array.size > 0
     terms = [tuple(int(v) for v in row if v >= 0) for row in array] if right else []
     known = set(terms)
     right = right and len(known) == len(terms) and np.array_equal(_as_array(terms), array)
@@ -255,7 +191,7 @@ def cheapest_terms(costs: Array, n_terms: int) -> list[Term]:
     return found
 
 
-def sparse_levels(terms: list[Term], n_variables: int) -> tuple[Levels, NDArray[np.int64]]:
+def sparse_levels(terms: list[Term], n_variables: int) -> tuple[Levels, NDArray[np.int32]]:
     """The recursion for `Monomials` that gives some terms and all variables, and the place of each term among what it gives."""
     by_degree: list[list[Term]] = [[] for _ in range(max(map(len, terms)))]
     for term in terms:

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
-from mor_bench.surrogates.coordinate_regression import CoordinateRegression
+from mor_bench.surrogates.coordinate_regression import CoordinateRegression, CoordinateSamples
 
 Array = NDArray[np.float64]
 
@@ -53,7 +53,8 @@ class _Trees(CoordinateRegression):
     def _ensemble(self) -> Any:
         """Of scikit-learn, not yet fitted."""
 
-    def _learn(self, z: Array, targets: Array) -> dict[str, NDArray[Any]]:
+    def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
+        z, targets = samples.z, samples.values
         trees = [estimator.tree_ for estimator in self._ensemble().fit(z, targets if targets.shape[1] > 1 else targets[:, 0]).estimators_]
         features = np.concatenate([tree.feature for tree in trees])
         roots = np.cumsum([0, *(tree.node_count for tree in trees)])[:-1]
