@@ -177,5 +177,5 @@ def _check_writable(name: str, path: Path) -> None:
 
 
 def _test_error(method: Surrogate, test: Snapshots) -> dict[str, float]:
-    predicted = [predict_all(method, test[start : start + SCORE_CHUNK].forces) for start in range(0, len(test), SCORE_CHUNK)]
+    predicted = [predict_all(method, test[start : start + SCORE_CHUNK].inputs) for start in range(0, len(test), SCORE_CHUNK)]
     return summary(sample_errors(np.concatenate(predicted), test.displacements, test.scene.output_nodes))
