@@ -17,10 +17,16 @@ from mor_bench.mechanics.observed import LinearResponse, linear_response
 from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.surrogate import Surrogate
 
 Array = NDArray[np.float64]
 Input = Literal["linear-response", "force"]
+
+
+def _mixed(snapshots: Snapshots) -> Snapshots:
+    """Imported snapshots in random order, the same each time: they may come load region by load region, and kernels see the first."""
+    return snapshots if isinstance(snapshots.loads, PatchLoads) else snapshots[np.random.default_rng(0).permutation(len(snapshots))]
 
 
 class CoordinateRegression(Surrogate):
@@ -75,7 +81,7 @@ class CoordinateRegression(Surrogate):
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
-            snapshots = self._checked_snapshots(snapshots)
+            snapshots = _mixed(self._checked_snapshots(snapshots))
             free, forces, targets = scene.free_dofs, snapshots.inputs.reshape(len(snapshots), -1), snapshots.free_displacements
             if self.input == "linear-response":
                 self.compliance_ = linear_response(scene)
