@@ -20,6 +20,7 @@ from mor_bench.cli import _knobs
 from mor_bench.errors import InvalidInputError, MorBenchError, SpecError
 from mor_bench.harness.on_dataset import Listener
 from mor_bench.snapshots.dataset import load_dataset
+from mor_bench.specs import load_generated_spec
 
 LIMIT = 60
 
@@ -150,6 +151,14 @@ def test_a_method_that_does_not_train_is_fitted_too_and_a_swept_knob_has_its_fir
     off = np.abs(again.predict(test.forces) - test.displacements).mean(axis=(1, 2))
     assert fitted.error["mean_dof_m"] == pytest.approx(off.mean())
     assert (fitted.n_train + fitted.n_test, fitted.iterations) == (LIMIT, None)
+
+
+def test_where_displacements_are_observed_the_error_is_that_of_answers_to_them(cache: Path, tmp_path: Path) -> None:
+    dataset = {**load_generated_spec("beam-tiny").model_dump(mode="json"), "observed": {"region": "z-max"}}
+    fitted = mor_bench.fit(dataset, "gappy-pod", out=tmp_path / "a.safetensors", limit=LIMIT, cache=cache)
+    test = load_dataset(dataset, LIMIT, cache=cache).test
+    off = np.abs(fitted.method.predict(test.inputs) - test.displacements).mean(axis=(1, 2))
+    assert fitted.error["mean_dof_m"] == pytest.approx(off.mean())
 
 
 def test_knobs_of_the_command_line() -> None:

@@ -25,7 +25,7 @@ from mor_bench.surrogate import Surrogate
 from tests.test_contract import CHEAP
 
 TOP = '[observed]\nregion = "z-max"\n'
-CAN = {
+CAN: dict[str, dict[str, Any]] = {
     "autoencoder": {"iterations": 50},
     "deeponet": {"input": "linear-response", "iterations": 50},
     "fem": {},

@@ -21,10 +21,12 @@ from mor_bench.mechanics.compliance import Compliance, project
 from mor_bench.mechanics.linear import BandedCholesky, BandedFactor
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.snapshots.dataset import Dataset
+from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.snapshots.imported import NodalLoads
 from mor_bench.specs import SolverName, load_generated_spec
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogate import _digest as file_digest
+from mor_bench.surrogates import pca_regression
 from mor_bench.surrogates.kernel_regression import LENGTH_SCALES
 
 INPUTS = ("linear-response", "force")
@@ -285,8 +287,41 @@ def test_inputs_too_large_for_single_precision_find_a_leaf(tiny: Dataset) -> Non
     assert np.isfinite(method.predict(1e29 * tiny.test.forces[:2])).all()
 
 
-def test_kernels_see_the_first_samples_only(tiny: Dataset) -> None:
-    for name in ("pca-kernel-ridge", "pca-gaussian-process"):
-        method: Any = mor_bench.load_method(name, **FAMILIES[name]).fit(tiny.scene, tiny.train)
-        assert len(method.points_) == 101
-        assert not method.points_[-1].any()
+@pytest.mark.parametrize("order", ["generated", "imported"])
+@pytest.mark.parametrize("name", ["pca-kernel-ridge", "pca-gaussian-process"])
+def test_the_samples_that_kernels_see_are_of_all_load_regions(tiny: Dataset, name: str, order: str) -> None:
+    """Imported snapshots may come region by region: the first hundred of these are of ten of them."""
+    train = tiny.train
+    if order == "imported":
+        train = train[np.argsort(train.regions, kind="stable")]
+        train = Snapshots(train.scene, NodalLoads(train.forces, train.loads.patches), train.free_displacements, train.min_det_f)
+    method: Any = mor_bench.load_method(name, input="force", **FAMILIES[name]).fit(tiny.scene, train)
+    assert len(method.points_) == 101
+    assert not method.points_[-1].any()
+    z = project(method._from_forces, train.forces.reshape(len(train), -1))
+    seen = [int(np.abs(z - point).max(axis=1).argmin()) for point in method.points_[:-1]]
+    assert len(set(seen)) == 100
+    np.testing.assert_array_equal(np.unique(train.regions[seen]), np.unique(train.regions))
+    assert (sorted(seen) == list(range(100))) == (order == "generated")
+
+
+@pytest.mark.parametrize(
+    ("name", "knobs", "message"),
+    [
+        ("pca-regression", {"ridge": np.inf}, "`ridge` must be a finite number; got inf"),
+        ("pca-kernel-ridge", {"ridge": np.inf}, "`ridge` must be a finite number; got inf"),
+        ("pca-kernel-ridge", {"length_scale": 1e-300}, "`length_scale` must be greater than or equal to 0.01; got 1e-300"),
+        ("pca-kernel-ridge", {"length_scale": np.inf}, "`length_scale` must be less than or equal to 1000; got inf"),
+    ],
+)
+def test_knobs_that_would_end_in_infinite_numbers_are_refused(name: str, knobs: dict[str, Any], message: str) -> None:
+    with pytest.raises(mor_bench.errors.SpecError, match=message):
+        mor_bench.load_method(name, **knobs)
+
+
+def test_more_monomials_than_fit_into_memory_are_refused(tiny: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    train = tiny.train[:40]
+    monkeypatch.setattr(pca_regression, "MAX_FEATURE_BYTES", 8 * 65 * 40)
+    mor_bench.load_method("pca-regression", n_input_modes=10, degree=2).fit(tiny.scene, train)
+    with pytest.raises(mor_bench.errors.InvalidInputError, match=r"`degree` 2 of 11 input modes gives 77 monomials, .* lower it or `n_input_modes`"):
+        mor_bench.load_method("pca-regression", n_input_modes=11, degree=2).fit(tiny.scene, train)

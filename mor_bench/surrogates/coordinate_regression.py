@@ -20,6 +20,7 @@ from mor_bench.reduction.coordinates import error_weights, input_axes
 from mor_bench.reduction.sensitivity import sensitivities
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.surrogate import Surrogate
 
 Array = NDArray[np.float64]
@@ -50,6 +51,11 @@ class CoordinateSamples:
     def __getitem__(self, rows: NDArray[np.bool_]) -> CoordinateSamples:
         derived = (None if array is None else array[rows] for array in (self.directions, self.slopes))
         return CoordinateSamples(self.z[rows], self.values[rows], self.weights[rows], *derived)
+
+
+def _mixed(snapshots: Snapshots) -> Snapshots:
+    """Imported snapshots in random order, the same each time: they may come load region by load region, and kernels see the first."""
+    return snapshots if isinstance(snapshots.loads, PatchLoads) else snapshots[np.random.default_rng(0).permutation(len(snapshots))]
 
 
 class CoordinateRegression(Surrogate):
@@ -110,7 +116,7 @@ class CoordinateRegression(Surrogate):
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
-            snapshots = self._checked_snapshots(snapshots)
+            snapshots = _mixed(self._checked_snapshots(snapshots))
             free, forces, targets = scene.free_dofs, snapshots.inputs.reshape(len(snapshots), -1), snapshots.free_displacements
             if self.input == "linear-response":
                 self.compliance_ = linear_response(scene)

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 LENGTH_SCALES = {"linear-response": 8.0, "force": 100.0}
 """Of kernel ridge regression, by input."""
 LENGTHS = (1e-2, 1e3)
-"""Bounds on a Gaussian process' length scales; inputs are of the order of one."""
+"""Bounds on length scales; inputs are of the order of one."""
 N_LEADING, MAX_ITERATIONS = 5, 30
 """Outputs that they are chosen by, the first and largest ones, and steps of L-BFGS-B; each takes a second with all 40 outputs."""
 LARGEST = 1e50
@@ -83,8 +83,8 @@ class PCAKernelRidge(_GaussianSums):
     n_output_modes : int
         Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a warning.
     n_points : int
-        Training samples at most that are learned from, the first ones, which cover the load regions evenly: each is kept and
-        compared with in every query, and the fit solves with a dense matrix of that size.
+        Training samples at most that are learned from, the first ones, which cover the load regions evenly (imported ones are
+        shuffled): each is kept and compared with in every query, and the fit solves with a dense matrix of that size.
     length_scale : float, optional
         Of the kernel, where the coordinates have root mean squares from a few to less than one; by default 8 for the linear
         response and 100 for the force, whose effect is all but linear over such lengths.
@@ -100,8 +100,8 @@ class PCAKernelRidge(_GaussianSums):
         n_input_modes: Annotated[int, Field(ge=1)] | None = None,
         n_output_modes: Annotated[int, Field(ge=1)] = 40,
         n_points: Annotated[int, Field(ge=1, le=20_000)] = 2000,
-        length_scale: Annotated[float, Field(gt=0)] | None = None,
-        ridge: Annotated[float, Field(ge=1e-14)] = 1e-8,
+        length_scale: Annotated[float, Field(ge=LENGTHS[0], le=LENGTHS[1])] | None = None,
+        ridge: Annotated[float, Field(ge=1e-14, allow_inf_nan=False)] = 1e-8,
     ) -> None:
         self.input = input
         self.n_input_modes = n_input_modes
@@ -150,7 +150,8 @@ class PCAGaussianProcess(_GaussianSums):
     n_output_modes : int
         Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a warning.
     n_points : int
-        Training samples at most that the mean is conditioned on, the first ones, which cover the load regions evenly.
+        Training samples at most that the mean is conditioned on, the first ones, which cover the load regions evenly (imported
+        ones are shuffled).
     n_optimised : int
         Of these, samples at most that the length scales, the variance and the noise are chosen by.
     """

@@ -12,9 +12,18 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mor_bench import counting
+from mor_bench.errors import InvalidInputError
 from mor_bench.surrogates.coordinate_regression import CoordinateRegression, CoordinateSamples
 
 Levels = list[tuple[NDArray[np.int64], NDArray[np.int64]]]
+
+MAX_FEATURE_BYTES = 2 * 2**30
+"""Of the monomials of all training samples, of which a fit holds some copies."""
+
+
+def n_monomials(n_variables: int, degree: int) -> int:
+    """Of degrees 1 to `degree`."""
+    return comb(n_variables + degree, degree) - 1
 
 
 def monomial_indices(n_variables: int, degree: int) -> Levels:
@@ -76,7 +85,7 @@ class PCARegression(CoordinateRegression):
     n_output_modes : int
         Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a warning.
     degree : int
-        Highest degree of the monomials; 1 is plain ridge regression.
+        Highest degree of the monomials; 1 is plain ridge regression. Refused where they need more than `MAX_FEATURE_BYTES`.
     ridge : float
         Tikhonov weight relative to the mean squared feature, with features scaled to unit root mean square.
     """
@@ -87,7 +96,7 @@ class PCARegression(CoordinateRegression):
         n_input_modes: Annotated[int, Field(ge=1)] = 20,
         n_output_modes: Annotated[int, Field(ge=1)] = 40,
         degree: Annotated[int, Field(ge=1, le=4)] = 3,
-        ridge: Annotated[float, Field(ge=0)] = 1e-6,
+        ridge: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1e-6,
     ) -> None:
         self.input = input
         self.n_input_modes = n_input_modes
@@ -99,6 +108,12 @@ class PCARegression(CoordinateRegression):
         from sklearn.linear_model import Ridge
 
         n_variables = samples.z.shape[1]
+        n = n_monomials(n_variables, self.degree)
+        if 8 * n * len(samples.z) > MAX_FEATURE_BYTES:
+            raise InvalidInputError(
+                f"`degree` {self.degree} of {n_variables} input modes gives {n:,} monomials, too many for {len(samples.z):,} samples: "
+                f"{8e-9 * n * len(samples.z):.1f} GB; lower it or `n_input_modes`."
+            )
         features = Monomials(n_variables, monomial_indices(n_variables, self.degree))(samples.z)
         feature_scale = np.sqrt((features**2).mean(axis=0))
         regression = Ridge(alpha=self.ridge * len(features), fit_intercept=False, solver="cholesky")
@@ -106,7 +121,7 @@ class PCARegression(CoordinateRegression):
         return {"weights": np.atleast_2d(regression.coef_) / feature_scale}
 
     def _shapes(self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, ...]]:
-        return {"weights": (n_outputs, sum(comb(n_inputs + d - 1, d) for d in range(1, self.degree + 1)))}
+        return {"weights": (n_outputs, n_monomials(n_inputs, self.degree))}
 
     def _take(self, state: dict[str, NDArray[Any]]) -> None:
         self.weights_ = state["weights"]
