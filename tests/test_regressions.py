@@ -325,3 +325,11 @@ def test_more_monomials_than_fit_into_memory_are_refused(tiny: Dataset, monkeypa
     mor_bench.load_method("pca-regression", n_input_modes=10, degree=2).fit(tiny.scene, train)
     with pytest.raises(mor_bench.errors.InvalidInputError, match=r"`degree` 2 of 11 input modes gives 77 monomials, .* lower it or `n_input_modes`"):
         mor_bench.load_method("pca-regression", n_input_modes=11, degree=2).fit(tiny.scene, train)
+
+
+def test_length_scales_too_short_to_divide_by_are_refused(tiny: Dataset) -> None:
+    """With points as near to the origin they passed for a model, whose answers were NaN."""
+    method: Any = mor_bench.load_method("pca-kernel-ridge", **FAMILIES["pca-kernel-ridge"]).fit(tiny.scene, tiny.train)
+    state = method._state()
+    with pytest.raises(mor_bench.errors.InvalidInputError, match="`lengths` must be at least 1e-06"):
+        method._restore({**state, "points": 1e-300 + 0 * state["points"], "lengths": 1e-300 + 0 * state["lengths"]})

@@ -23,6 +23,8 @@ LENGTHS = (1e-2, 1e3)
 """Bounds on length scales; inputs are of the order of one."""
 N_LEADING, MAX_ITERATIONS = 5, 30
 """Outputs that they are chosen by, the first and largest ones, and steps of L-BFGS-B; each takes a second with all 40 outputs."""
+SHORTEST = 1e-6
+"""Length that a file may hold; loads over it can be squared."""
 LARGEST = 1e50
 """Of the points over the length scales: their squares, and their products with any load's, stay finite."""
 LEAST_NOISE = 1e-10
@@ -44,8 +46,8 @@ class _GaussianSums(CoordinateRegression):
 
     def _take(self, state: dict[str, NDArray[Any]]) -> None:
         self.points_, self.weights_, self.lengths_ = state["points"], state["weights"], state["lengths"]
-        if not (self.lengths_ > 0).all():
-            raise InvalidInputError("`lengths` must be greater than zero.")
+        if not (self.lengths_ >= SHORTEST).all():
+            raise InvalidInputError(f"`lengths` must be at least {SHORTEST:g}.")
         scaled = self.points_ / self.lengths_
         if not (np.abs(scaled) < LARGEST).all():
             raise InvalidInputError("`points` must be of moderate size against `lengths`.")
