@@ -19,6 +19,9 @@ from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.surrogate import TrainingOptions
 
 torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
+
+from mor_bench.surrogates.pod_nn import DERIVATIVE_WEIGHT  # noqa: E402 - after the check that torch is there
+
 BRIEF: dict[str, Any] = {"n_hidden": 32, "iterations": 600}
 
 
@@ -83,6 +86,45 @@ def test_the_network_of_torch_and_of_numpy_agree_with_their_slopes() -> None:
         np.testing.assert_allclose(slopes[:, k], difference / 2e-5, atol=1e-7)
     difference = evaluate(weights, 1e-5 * np.eye(3)) - evaluate(weights, -1e-5 * np.eye(3))
     np.testing.assert_allclose(slope_at_rest(weights), difference / 2e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("derivatives", [False, True])
+@pytest.mark.parametrize("input", ["force", "linear-response"])
+def test_the_loss_of_the_training_is_that_of_the_predictions(input: str, derivatives: bool, tiny: Dataset, tmp_path: Path) -> None:
+    """One step on all samples, from a trained network, whose value and slope at rest are not zero."""
+    few, scene = tiny.train[:20], tiny.scene
+    methods: list[Any] = [
+        mor_bench.load_method("pod-nn", input=input, derivatives=derivatives, n_input_modes=8, n_output_modes=8, n_hidden=8, iterations=n)
+        for n in (200, 1)
+    ]
+    methods[0].fit(scene, few).save(tmp_path / "model.safetensors")
+    methods[1].training = TrainingOptions(start_from=tmp_path / "model.safetensors")
+    methods[1].fit(scene, few)
+    model, modes = FullOrderModel(scene), methods[0].modes_
+
+    def learned(displacements: Any, forces: Any) -> Any:
+        linear = model.rest_factor.solve(forces.T).T if input == "linear-response" else 0.0
+        return (displacements - linear) @ modes
+
+    def predicted(forces: Any) -> Any:
+        whole = np.zeros((len(forces), scene.mesh.n_dofs))
+        whole[:, scene.free_dofs] = forces
+        answers = methods[0].predict(whole.reshape(len(forces), -1, 3))
+        return learned(answers.reshape(len(forces), -1)[:, scene.free_dofs], forces)
+
+    weights = error_weights(few.free_displacements)[:, None]
+    wanted = learned(few.free_displacements, few.free_forces)
+    expected = (((predicted(few.free_forces) - wanted) * weights) ** 2).sum(axis=1).mean()
+    if derivatives:
+        known = sensitivities(model, few, methods[0].axes_, modes, of_force=input == "force")
+        largest, patches = np.linalg.norm(few.loads.vectors, axis=2).max(), scene.patch_weights.toarray()[few.loads.patches[:, 0]]
+        for axis in range(3):
+            unit = np.zeros((len(few), scene.mesh.n_nodes, 3))
+            unit[:, :, axis] = 1e-4 * largest * patches
+            step = unit.reshape(len(few), -1)[:, scene.free_dofs]
+            slopes = (predicted(few.free_forces + step) - predicted(few.free_forces - step)) / 2e-4
+            expected += DERIVATIVE_WEIGHT * (((slopes - known.outputs[:, axis]) * weights) ** 2).sum(axis=1).mean()
+    assert methods[1].loss_curve_[0] == pytest.approx(expected / (wanted**2).sum(axis=1).mean(), rel=1e-3)
 
 
 def test_derivatives_spare_samples(tiny: Dataset) -> None:
