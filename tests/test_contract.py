@@ -25,6 +25,7 @@ CHEAP: dict[str, dict[str, Any]] = {
     "autoencoder": {"iterations": 100}, "pgd": CHEAP_PGD, "pgd-force": CHEAP_PGD, "umesh": CHEAP_UMESH, "umesh-small": CHEAP_UMESH,
     "umesh-linear": CHEAP_UMESH,
     "pca-gaussian-process": {"n_input_modes": 10, "n_optimised": 60}, "pca-random-forest": {"n_trees": 10}, "pca-extra-trees": {"n_trees": 10},
+    "pod-nn-force": {"iterations": 300, "n_hidden": 16},
     "pod-nn": {"iterations": 300, "n_hidden": 16}, "pod-nn-derivative": {"iterations": 300, "n_hidden": 16},
     "deeponet": {"iterations": 20}, "pod-deeponet": {"iterations": 20},
     "fno": {"channels": 4, "layers": 2, "iterations": 10}, "mesh-graph-net": {"width": 8, "steps": 2, "iterations": 10},

@@ -471,6 +471,9 @@ SMALL: dict[str, dict[str, Any]] = {
     "explicit-dynamics": {"tolerance": 1e-2},
     "pgd": {"n_terms": 5},
     "pgd-force": {"n_terms": 5},
+    "pca-polynomial-force": {"n_input_modes": 4},
+    "pod-nn-force": {"n_input_modes": 4, "iterations": 2},
+    "sparse-polynomial-force": {"n_input_modes": 4},
     "pod-nn": {"iterations": 2},
     "pod-nn-derivative": {"iterations": 2, "n_input_modes": 4},
     "sparse-polynomial": {"n_input_modes": 4},
@@ -484,7 +487,7 @@ SMALL: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("name", SMALL)
 def test_a_batch_costs_what_its_samples_cost_and_counting_changes_nothing(tiny: Dataset, loads: np.ndarray, name: str) -> None:
-    if name in ("umesh", "autoencoder", "pod-nn", "pod-nn-derivative", "deeponet", "pod-deeponet", "fno", "mesh-graph-net"):
+    if name in ("umesh", "autoencoder", "pod-nn", "pod-nn-force", "pod-nn-derivative", "deeponet", "pod-deeponet", "fno", "mesh-graph-net"):
         pytest.importorskip("torch")
     method = mor_bench.load_method(name, **SMALL[name])
     method.fit(tiny.scene, tiny.train if method.needs_snapshots else None)

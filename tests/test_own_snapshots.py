@@ -30,7 +30,9 @@ Arrays = dict[str, NDArray[Any]]
 
 TOML = 'title = "Mine"\nsource = "SOFA"\n[snapshots]\nfile = "mine.npz"\n[needs]\nerror = 0.01\nlatency_ms = 3.0\n'
 
-COMPETE = {"pca-regression-force", "pgd-force", "umesh", "umesh-small"}
+COMPETE = {
+    "pca-regression-force", "pca-polynomial-force", "pod-nn-force", "sparse-polynomial-force", "pgd-force", "umesh", "umesh-small",
+}  # fmt: skip
 COMPETE |= {"deeponet", "pod-deeponet", "fno", "mesh-graph-net"}
 CHEAP = {name: {"channels": 4, "steps": 1, "iterations": 5} for name in ("umesh", "umesh-small")}
 CHEAP |= {"deeponet": {"iterations": 5}, "pod-deeponet": {"iterations": 5}}

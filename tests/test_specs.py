@@ -42,6 +42,7 @@ CONFIGURATIONS = {
     "explicit-dynamics": 4, "pgd": 6, "pgd-force": 3,
     "deim": 6, "ecm": 6,
     "pca-ridge": 1, "pca-kernel-ridge": 2, "pca-gaussian-process": 2, "pca-random-forest": 2, "pca-extra-trees": 2,
+    "pca-polynomial-force": 1, "pod-nn-force": 1, "sparse-polynomial-force": 1,
     "pod-nn": 2, "pod-nn-derivative": 2, "sparse-polynomial": 3, "sparse-polynomial-derivative": 3,
     "deeponet": 2, "pod-deeponet": 2, "fno": 2, "mesh-graph-net": 2,
     "gappy-pod": 6,

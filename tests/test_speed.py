@@ -117,6 +117,9 @@ RACES = (
     Race("l-shape", "pca-gaussian-process", {"n_input_modes": 10}, "fem", 4.0, 0.02),  # 17, 0.002
     Race("l-shape", "pca-random-forest", {"n_trees": 10}, "fem", 5.0, 0.05),  # 37, 0.01
     Race("l-shape", "pca-extra-trees", {"n_trees": 10}, "fem", 5.0, 0.05),  # 33, 0.005
+    Race("l-shape", "pca-polynomial-force", {"n_input_modes": 40}, "fem", 5.0, 0.95),
+    Race("l-shape", "pod-nn-force", {"iterations": 300}, "fem", 8.0, 0.95),
+    Race("l-shape", "sparse-polynomial-force", {}, "fem", 5.0, 0.95),
     Race("l-shape", "pod-nn", {"iterations": 300}, "fem", 8.0, 0.005),  # 24, 8e-4
     Race("l-shape", "pod-nn-derivative", {"iterations": 300}, "fem", 6.0, 0.005),  # 18, 7e-4
     Race("l-shape", "sparse-polynomial", {}, "fem", 9.0, 0.01),  # 28, 0.002
