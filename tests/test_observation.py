@@ -44,7 +44,7 @@ CAN: dict[str, dict[str, Any]] = {
     "pca-regression-force": {},
     "pod-deeponet": {"iterations": 200},
     "pca-polynomial-force": {"n_input_modes": 10},
-    "pod-nn-force": {**CHEAP["pod-nn-force"], "n_input_modes": 10},
+    "pod-nn-force": {"n_input_modes": 10, "iterations": 2000, "n_hidden": 32},
     "sparse-polynomial-force": {},
     "pod-nn": CHEAP["pod-nn"],
     "sparse-polynomial": {},
