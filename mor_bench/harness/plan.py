@@ -26,6 +26,9 @@ from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import AnyDatasetSpec, DatasetSpec, SplitBy
 from mor_bench.surrogate import Device
 
+SEES = 100
+"""Iterations after which a training that would take too long is ended, see `mor_bench.learning.training`."""
+
 REFERENCE = ("beam-coarse", 768, 5120)
 """Where the `fit_s` of the method files were measured: dataset, dofs, training samples; on two cores."""
 
@@ -124,13 +127,22 @@ def plan(
         steps.append(data)
         done = _fitted(spec, all_jobs, limit, split, threads, jobs, root) if data.done else set()
         n_dofs, n_train = _size(spec, limit)
+        left = {job.method.name: budget.seconds for job in all_jobs}
         for job in all_jobs:
-            seconds = _fit_s(job, profile, n_dofs, n_train, _earlier(root, job))
-            steps.append(Step(spec.name, job.label, job.label in done, None if seconds is None else min(seconds, budget.seconds) / jobs))
+            seconds = _within(_fit_s(job, profile, n_dofs, n_train, _earlier(root, job)), left[job.method.name], job.parameters.get("iterations"))
+            left[job.method.name] -= seconds or 0.0
+            steps.append(Step(spec.name, job.label, job.label in done, None if seconds is None else seconds / jobs))
         steps += _extras(spec.name, all_jobs, steps[-len(all_jobs) :], n_seeds - 1, profile == "full")
     protocol = PROTOCOLS[profile]
     turns = protocol.processes * (protocol.rounds + 2) * len(all_jobs) * len(specs)
     return Plan(steps, turns * TURN_S + protocol.processes * START_S * len(specs))
+
+
+def _within(seconds: float | None, left_s: float, iterations: int | None) -> float | None:
+    """What a fit takes of the seconds that its method has left; a training that sees that they will not do ends after `SEES` iterations."""
+    if seconds is None or seconds <= left_s:
+        return seconds
+    return left_s if iterations is None else min(left_s, seconds * SEES / max(iterations, SEES))
 
 
 def _extras(dataset: str, jobs: Sequence[Job], fits: Sequence[Step], other_seeds: int, curves: bool) -> list[Step]:
