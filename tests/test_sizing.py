@@ -214,7 +214,7 @@ def test_a_kept_fit_is_that_of_the_need(tmp_path: Path, tiny: Dataset) -> None:
     place: Any = SimpleNamespace(machine="here", fit_threads=1, cache=tmp_path)
 
     def key(need: float, **knobs: Any) -> str:
-        job: Any = SimpleNamespace(method=load_method_spec(tmp_path / "sized.toml"), parameters=knobs)
+        job: Any = SimpleNamespace(method=load_method_spec(tmp_path / "sized.toml"), parameters=knobs, training=None)
         return Entry(job, Material(needing(tiny.scene, need), tiny.train, {}, tmp_path), place).key
 
     assert key(0.1, n_modes="auto") != key(0.2, n_modes="auto")

@@ -148,7 +148,7 @@ def principal_axes(inputs: NDArray[np.float64], n_modes: int) -> NDArray[np.floa
     response alone, against 8.2e-5 m. With 20 coordinates either scaling does.
     """
     used = np.flatnonzero(inputs.any(axis=0))  # of forces only a few columns
-    modes = pod(inputs[:, used]).modes[:, :n_modes]
+    modes = pod(inputs[:, used], n_modes).modes
     axes = np.zeros((inputs.shape[1], modes.shape[1]))
     axes[used] = modes / np.sqrt(((inputs[:, used] @ modes) ** 2).mean())
     return axes

@@ -64,7 +64,7 @@ def _faults(method: Surrogate, snapshots: Snapshots, said: bool) -> list[str]:
     """What is wrong with a method that was fitted to poor snapshots; ``said`` is whether it warned of their rank."""
     faults = []
     rank = _rank(snapshots)
-    asked = [value for name, value in method.parameters.items() if name.endswith("modes") and isinstance(value, int)]
+    asked = [value for name, value in method.parameters.items() if name.startswith("n_") and name.endswith("modes") and isinstance(value, int)]
     if asked and max(asked) > rank and not said:
         faults.append(f"{max(asked)} modes asked for of rank {rank}, and no warning")
     modes = getattr(method, "modes_", None)
