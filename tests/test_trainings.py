@@ -192,7 +192,7 @@ def test_options_of_trainings_are_checked_and_planned(folder: Path, cache: Path,
             mor_bench.run(["beam-tiny"], ["linear-fem"], out=tmp_path / "out", cache=cache, **arguments)
     assert not list(tmp_path.iterdir())
     one, three = (plan(["beam-tiny"], ["umesh"], cache=tmp_path / "cache", limit=LIMIT, fit_seconds=50.0, seeds=seeds) for seeds in (1, 3))
-    assert [step.label for step in one.steps[1:]] == ["umesh"]
+    assert [step.label for step in one.steps[1:]] == ["umesh [channels=16, steps=2]"]
     assert [step.label for step in three.steps[2:]] == ["umesh: other seeds"]
     assert one.steps[1].seconds == 50.0
     assert three.seconds - one.seconds == pytest.approx(100.0, abs=5.0)  # generation is estimated by solving
