@@ -118,7 +118,8 @@ class UMesh(Surrogate):
       gain from a short memory.
     - Initial weights: He-normal, biases zero; torch's default gave 1.48e-3 m, He's 1.19e-3 m.
     - Normalisation: forces and displacements are divided by their root mean square over the training samples, all nodes and
-      components. No mean is subtracted, so that zero stays zero at padding and supports.
+      components. Their largest magnitude, or none, changed little: after 1,500 iterations 1.28e-3 and 1.37e-3 m, where the root mean
+      square gave 1.28e-3 to 1.33e-3 with three seeds. No mean is subtracted, so that zero stays zero at padding and supports.
     - Padding voxels carry no loss.
 
     A mesh that lies in no regular grid gets one (`mor_bench.scene.grid`): the network sees the forces Nᵀ f on the grid and
