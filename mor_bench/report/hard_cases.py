@@ -23,7 +23,8 @@ def ordered(found: Stress) -> list[Row]:
 def print_stress(found: Stress, console: Console) -> None:
     """Print all rows, then those that fell short once more by name, and the counts."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for heading, width in (("case", 19), ("method", 20), ("expected", 20), ("what happened", None), ("", 14)):
+    longest = max((len(row.method) for row in found.rows), default=0)
+    for heading, width in (("case", 19), ("method", max(20, longest)), ("expected", 20), ("what happened", None), ("", 14)):
         table.add_column(heading, width=width, overflow="fold")
     for _, group in groupby(ordered(found), key=lambda row: (row.case, row.part)):
         for number, row in enumerate(group):
