@@ -455,7 +455,7 @@ def _read_model(path: str | Path) -> tuple[dict[str, str], dict[str, NDArray[Any
         with safe_open(str(path), framework="numpy") as file:
             header = file.metadata() or {}
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, AttributeError, TypeError) as error:  # the last ones of a dtype that NumPy has not
         raise StoreError(f"{path}: not a readable safetensors file: {error}") from None
     if header.get("format") != "mor-bench surrogate":
         raise StoreError(f"{path}: not a surrogate of mor-bench.")

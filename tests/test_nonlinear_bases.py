@@ -21,6 +21,7 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import load_generated_spec
+from mor_bench.surrogate import TrainingOptions
 from mor_bench.surrogates.local_pod import LocalPOD
 from mor_bench.surrogates.quadratic_manifold import QuadraticManifoldGalerkin
 
@@ -248,6 +249,15 @@ def test_the_polynomial_is_used_where_it_pays(tiny: Dataset) -> None:
     assert polynomial_pays(fine, 80)
     assert not polynomial_pays(fine, 80, 32)
     assert not polynomial_pays(FullOrderModel(tiny_of("neo-hookean")), 4)
+
+
+def test_the_autoencoder_says_that_it_cannot_start_from_another(tiny: Dataset, tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
+    method = mor_bench.load_method("autoencoder", iterations=2).fit(tiny.scene, tiny.train)
+    method.save(tmp_path / "model.safetensors")
+    method.training = TrainingOptions(start_from=tmp_path / "model.safetensors")
+    with pytest.raises(InvalidInputError, match=r"`start_from`: .* lacks its encoder"):
+        method.fit(tiny.scene, tiny.train)
 
 
 def test_no_load_in_a_batch_gives_exactly_no_displacement_of_the_autoencoder(tiny: Dataset) -> None:

@@ -23,7 +23,7 @@ torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]
 from mor_bench.learning import training  # noqa: E402 - after the check that torch is there
 from mor_bench.learning.training import Training, TrainingPlan, device_of, train  # noqa: E402
 
-PLAN = TrainingPlan(120, 8, 1e-2, second_moment_decay=0.9, weight_decay=1e-3, validation_fraction=0.2)
+PLAN = TrainingPlan(120, 8, 1e-2, second_moment_decay=0.9, validation_fraction=0.2)
 
 
 @dataclass

@@ -74,8 +74,9 @@ def fit(
 ) -> Fit:
     """Fit a method on a dataset's training part, save the model, and score it on the test part.
 
-    A training that was killed goes on from its checkpoint when it is given the same arguments, and ends with the same model to
-    the last bit. It runs in this process: what `mor_bench.run` shields a comparison from is not held off here.
+    A training that was killed goes on from its checkpoint when it is given the same arguments, and ends with the same weights to
+    the last bit; only a back end that is chosen by its time may be another one. It runs in this process: what `mor_bench.run`
+    shields a comparison from is not held off here.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from math import cos, isfinite, pi
 from pathlib import Path
 from time import perf_counter
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -63,8 +63,6 @@ class TrainingPlan:
         See `rate_factor`.
     second_moment_decay : float
         Adam's β₂.
-    weight_decay : float
-        Decoupled, as in AdamW.
     precision : {"float32", "bfloat16"}
         Of the products in the forward and backward pass; weights and their updates are float32.
     validation_fraction : float
@@ -76,7 +74,6 @@ class TrainingPlan:
     learning_rate: float
     schedule: Schedule = "one-cycle"
     second_moment_decay: float = 0.999
-    weight_decay: float = 0.0
     precision: Precision = "float32"
     validation_fraction: float = 0.0
 
@@ -90,14 +87,13 @@ class Training:
     loss_curve : (n_intervals,) float64
         The loss, averaged over `LOSS_INTERVAL` iterations.
     validation_curve : (n_validations,) float64
-        The loss of the samples held out, each ``validation_interval`` iterations.
+        The loss of the samples held out, a part `1 / VALIDATIONS` of all iterations apart.
     iterations : int
         Planned, and not all done after an early stop: the number that repeats the training.
     """
 
     loss_curve: NDArray[np.float64]
     validation_curve: NDArray[np.float64]
-    validation_interval: int
     iterations: int
 
 
@@ -122,6 +118,11 @@ def fingerprint_of(parts: Mapping[str, object], arrays: Mapping[str, Tensor]) ->
         digest.update(f"{name} {array.dtype} {array.shape}".encode())
         digest.update(array.data)
     return digest.hexdigest()
+
+
+def network_weights(state: Mapping[str, NDArray[Any]]) -> dict[str, Tensor]:
+    """Of a model's arrays those of its network, by the names that they have there."""
+    return {name.removeprefix("network."): torch.from_numpy(array) for name, array in state.items() if name.startswith("network.")}
 
 
 def rate_factor(schedule: Schedule, iteration: int, iterations: int) -> float:
@@ -203,7 +204,7 @@ def train(
     course.finish()
     if options.checkpoint is not None:
         options.checkpoint.unlink(missing_ok=True)
-    return Training(np.array(course.curve), np.array(course.validated), course.validation_interval, course.iterations)
+    return Training(np.array(course.curve), np.array(course.validated), course.iterations)
 
 
 @dataclass
@@ -224,10 +225,8 @@ class _Course:
 
     def __post_init__(self) -> None:
         self.device = device_of(self.options)
-        self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), lr=self.plan.learning_rate, betas=(0.9, self.plan.second_moment_decay),
-            weight_decay=self.plan.weight_decay, fused=True,
-        )  # fmt: skip
+        betas = 0.9, self.plan.second_moment_decay
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=self.plan.learning_rate, betas=betas, fused=True)
         self.rows = torch.arange(self.n_samples)
         self.held = torch.empty(0, dtype=torch.int64)
         self.order = torch.empty(0, dtype=torch.int64)

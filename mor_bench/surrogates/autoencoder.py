@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor, nn
 
+from mor_bench.errors import InvalidInputError
 from mor_bench.learning.perceptron import Perceptron, evaluate, named
 from mor_bench.surrogates.coordinate_regression import CoordinateSamples
 from mor_bench.surrogates.network_regression import NetworkRegression
@@ -71,6 +72,8 @@ class Autoencoder(NetworkRegression):
         return {"regression": (n_inputs, N_HIDDEN, self.n_latent), "decoder": (self.n_latent, N_HIDDEN, n_outputs)}
 
     def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
+        if self.training.start_from is not None:
+            raise InvalidInputError("`start_from`: an autoencoder's file lacks its encoder, so that no training can start from it.")
         scale = float(np.sqrt((samples.values**2).sum(axis=1).mean()))
         data = self._on_device({"inputs": samples.z, "outputs": samples.values / scale, "weights": samples.weights})
         generator = torch.Generator().manual_seed(self.seed)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
-from mor_bench.learning.training import Training, TrainingPlan, device_of, fingerprint_of, train
+from mor_bench.learning.training import Training, TrainingPlan, device_of, fingerprint_of, network_weights, train
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.mechanics.observed import linear_response
 from mor_bench.scene.scene import Scene
@@ -142,7 +142,7 @@ class FieldSurrogate(Surrogate):
     def _start_from(self, network: FieldNetwork, path: Path) -> None:
         """Take the weights that fit of a model of this class, trained on this scene or another."""
         own = network.state_dict()
-        found = _network_weights(weights_to_start_from(path, type(self)))
+        found = network_weights(weights_to_start_from(path, type(self)))
         fitting = {name: value for name, value in found.items() if name in own and value.shape == own[name].shape}
         if not fitting:
             raise InvalidInputError(f"{path}: none of its weights fits the network of these knobs on {self.scene_.name}.")
@@ -192,7 +192,7 @@ class FieldSurrogate(Surrogate):
         self.loss_curve_, self.iterations_ = state["loss_curve"], int(state["iterations"][0])
         self.constants_ = {name.removeprefix("constant."): array for name, array in state.items() if name.startswith("constant.")}
         network = self._network(self.constants_)
-        weights = _network_weights(state)
+        weights = network_weights(state)
         expected = {name: (value.shape, value.dtype) for name, value in network.state_dict().items()}
         if expected != {name: (value.shape, value.dtype) for name, value in weights.items()}:
             raise InvalidInputError("the weights do not fit the network.")
@@ -237,10 +237,6 @@ def initialise(network: nn.Module, generator: torch.Generator) -> None:
             nn.init.zeros_(layer.bias)
         elif isinstance(layer, SelfInitialised):
             layer.initialise(generator)
-
-
-def _network_weights(state: Arrays) -> dict[str, Tensor]:
-    return {name.removeprefix("network."): torch.from_numpy(array) for name, array in state.items() if name.startswith("network.")}
 
 
 def _single(fields: NDArray[np.float64]) -> Tensor:

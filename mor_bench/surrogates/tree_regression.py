@@ -35,19 +35,45 @@ def _mean_of_leaves(features, thresholds, children, roots, values, z, out):  # t
             answer[k] /= len(roots)
 
 
-class _Trees(CoordinateRegression):
+class TreeRegression(CoordinateRegression):
     """g(z) = t(z) - t(0), with t the mean of the leaves that z falls to in each tree.
 
     Nodes of all trees stand in one list, every tree before the next and every node before its children. At an inner node
     `features` is the input that is compared with `thresholds`, in single precision as in scikit-learn, and `children` are the
     nodes for not more and for more; at a leaf `features` is -1, and `children` twice the row of `values`.
+
+    Parameters
+    ----------
+    input : {"linear-response", "force"}
+        What the coordinates z are taken of.
+    n_input_modes : int, optional
+        Length of z, by default 20 of the linear response and 60 of the force; capped at the rank of the input with a warning.
+    n_output_modes : int
+        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a warning.
+    n_trees : int
+    min_samples_leaf : int
+        Samples that each leaf holds at least; fewer leaves make a smaller model.
+    seed : int
+        Of what each tree draws at random: its samples, or its thresholds.
     """
 
-    n_trees: int
-    min_samples_leaf: int
-    seed: int
-
     integers = frozenset({"features", "children", "roots"})
+
+    def __init__(
+        self,
+        input: Literal["linear-response", "force"] = "linear-response",
+        n_input_modes: Annotated[int, Field(ge=1)] | None = None,
+        n_output_modes: Annotated[int, Field(ge=1)] = 20,
+        n_trees: Annotated[int, Field(ge=1, le=1000)] = 20,
+        min_samples_leaf: Annotated[int, Field(ge=1)] = 1,
+        seed: Annotated[int, Field(ge=0, lt=2**32)] = 0,
+    ) -> None:
+        self.input = input
+        self.n_input_modes = n_input_modes
+        self.n_output_modes = n_output_modes
+        self.n_trees = n_trees
+        self.min_samples_leaf = min_samples_leaf
+        self.seed = seed
 
     @abstractmethod
     def _ensemble(self) -> Any:
@@ -109,39 +135,8 @@ class _Trees(CoordinateRegression):
         return self._means(z) - self._at_rest
 
 
-class PCARandomForest(_Trees):
-    """A random forest between principal coordinates (Breiman, Machine Learning 45, 2001); see `CoordinateRegression`.
-
-    Parameters
-    ----------
-    input : {"linear-response", "force"}
-        What the coordinates z are taken of.
-    n_input_modes : int, optional
-        Length of z, by default 20 of the linear response and 60 of the force; capped at the rank of the input with a warning.
-    n_output_modes : int
-        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a warning.
-    n_trees : int
-    min_samples_leaf : int
-        Samples that each leaf holds at least; fewer leaves make a smaller model.
-    seed : int
-        Of the samples that each tree learns from.
-    """
-
-    def __init__(
-        self,
-        input: Literal["linear-response", "force"] = "linear-response",
-        n_input_modes: Annotated[int, Field(ge=1)] | None = None,
-        n_output_modes: Annotated[int, Field(ge=1)] = 20,
-        n_trees: Annotated[int, Field(ge=1, le=1000)] = 20,
-        min_samples_leaf: Annotated[int, Field(ge=1)] = 1,
-        seed: Annotated[int, Field(ge=0, lt=2**32)] = 0,
-    ) -> None:
-        self.input = input
-        self.n_input_modes = n_input_modes
-        self.n_output_modes = n_output_modes
-        self.n_trees = n_trees
-        self.min_samples_leaf = min_samples_leaf
-        self.seed = seed
+class PCARandomForest(TreeRegression):
+    """A random forest between principal coordinates (Breiman, Machine Learning 45, 2001); see `TreeRegression`."""
 
     def _ensemble(self) -> Any:
         from sklearn.ensemble import RandomForestRegressor
@@ -149,42 +144,12 @@ class PCARandomForest(_Trees):
         return RandomForestRegressor(self.n_trees, min_samples_leaf=self.min_samples_leaf, random_state=self.seed, n_jobs=1)
 
 
-class PCAExtraTrees(_Trees):
+class PCAExtraTrees(TreeRegression):
     """Extremely randomised trees between principal coordinates (Geurts, Ernst and Wehenkel, Machine Learning 63, 2006).
 
     Thresholds are drawn at random and the best of one for each input is taken; every tree learns from all samples. See
-    `CoordinateRegression` for what it shares with others.
-
-    Parameters
-    ----------
-    input : {"linear-response", "force"}
-        What the coordinates z are taken of.
-    n_input_modes : int, optional
-        Length of z, by default 20 of the linear response and 60 of the force; capped at the rank of the input with a warning.
-    n_output_modes : int
-        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a warning.
-    n_trees : int
-    min_samples_leaf : int
-        Samples that each leaf holds at least; fewer leaves make a smaller model.
-    seed : int
-        Of the thresholds.
+    `TreeRegression`.
     """
-
-    def __init__(
-        self,
-        input: Literal["linear-response", "force"] = "linear-response",
-        n_input_modes: Annotated[int, Field(ge=1)] | None = None,
-        n_output_modes: Annotated[int, Field(ge=1)] = 20,
-        n_trees: Annotated[int, Field(ge=1, le=1000)] = 20,
-        min_samples_leaf: Annotated[int, Field(ge=1)] = 1,
-        seed: Annotated[int, Field(ge=0, lt=2**32)] = 0,
-    ) -> None:
-        self.input = input
-        self.n_input_modes = n_input_modes
-        self.n_output_modes = n_output_modes
-        self.n_trees = n_trees
-        self.min_samples_leaf = min_samples_leaf
-        self.seed = seed
 
     def _ensemble(self) -> Any:
         from sklearn.ensemble import ExtraTreesRegressor

@@ -60,10 +60,10 @@ class PaddedGrid:
         """
         if self.places is not None:
             return self.to_grid(displacements)
-        return self.to_grid(displacements) / self._shares.to(displacements.device)
+        return self.to_grid(displacements) / self.shares.to(displacements.device)
 
     @cached_property
-    def _shares(self) -> Tensor:
+    def shares(self) -> Tensor:
         """(1, 1, x, y, z) sums of N over the nodes."""
         sums = np.maximum(self.grid.weights.sum(axis=0), SMALLEST_SHARE).astype(np.float32)
         return torch.from_numpy(sums).view(1, 1, *self.shape)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, final
@@ -16,7 +16,7 @@ from torch import Tensor
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.learning.inference import Backend, choose_inference, inference_or_eager
-from mor_bench.learning.training import Precision, Schedule, TrainingPlan, device_of, fingerprint_of, train
+from mor_bench.learning.training import Precision, Schedule, TrainingPlan, device_of, fingerprint_of, network_weights, train
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.mechanics.observed import linear_response
 from mor_bench.scene.grid import grid_map
@@ -282,19 +282,20 @@ class UMesh(Surrogate):
             self.inference_ = inference_or_eager(self.network_, self.inference)
             return
         rows = torch.linspace(0, len(inputs) - 1, min(N_CHOOSING, len(inputs))).long()
+        given, wanted = inputs[rows], targets[rows]
 
-        def errors(network: Callable[[Tensor], Tensor], given: Tensor) -> Tensor:
+        def errors(network: Callable[[Tensor], Tensor]) -> Tensor:
             at_rest = self._answer(torch.zeros_like(given[:1]), network) if self.zero_at_rest else 0.0
-            return self._answer(given, network) - at_rest - targets[rows]
+            return self._answer(given, network) - at_rest - wanted
 
-        choice = choose_inference(self.network_, self._on_grid(inputs[rows]), lambda network: errors(network, inputs[rows]))
+        choice = choose_inference(self.network_, self._on_grid(given), errors)
         self.inference_ = choice.inference
         self.sizes_ = {"inference": choice.inference.backend}
         self.timings_ms_ = choice.milliseconds
 
     def _start_from(self, path: Path) -> None:
         """Take the weights of a network that was trained on this scene or another; grids of any size share them."""
-        weights = _network_weights(weights_to_start_from(path, type(self)))
+        weights = network_weights(weights_to_start_from(path, type(self)))
         if not all(weight.isfinite().all() for weight in weights.values()):
             raise StoreError(f"{path}: the weights of its network hold NaN or infinity.")
         try:
@@ -334,7 +335,7 @@ class UMesh(Surrogate):
                 raise InvalidInputError(f"`{name}` must be finite; got NaN or infinity.")
         if not (state["scales"] > 0).all() or not state["iterations"][0] > 0:
             raise InvalidInputError("`scales` and `iterations` must be positive.")
-        network.load_state_dict(_network_weights(state), assign=True)
+        network.load_state_dict(network_weights(state), assign=True)
         self.network_ = network.eval()
         self.input_scale_, self.output_scale_ = (float(scale) for scale in state["scales"])
         self.loss_curve_, self.validation_curve_ = state["loss_curve"], state["validation_curve"]
@@ -359,10 +360,6 @@ class Image:
     def __call__(self, vectors: Tensor) -> Tensor:
         """(n, n_nodes, 3) → the same shape."""
         return vectors[:, self.nodes] * self.signs
-
-
-def _network_weights(state: Mapping[str, NDArray[Any]]) -> dict[str, Tensor]:
-    return {name.removeprefix("network."): torch.from_numpy(array) for name, array in state.items() if name.startswith("network.")}
 
 
 def _scale(values: NDArray[np.float64], normalisation: str) -> float:

@@ -12,7 +12,7 @@ from mor_bench.errors import UnavailableBackendError
 from mor_bench.learning.onnx_graph import GraphBuilder
 from mor_bench.mechanics.observed import LinearResponse
 from mor_bench.scene.scene import Scene
-from mor_bench.surrogates.umesh.grid import SMALLEST_SHARE, PaddedGrid
+from mor_bench.surrogates.umesh.grid import PaddedGrid
 from mor_bench.surrogates.umesh.network import UNet
 
 if TYPE_CHECKING:
@@ -67,8 +67,7 @@ def umesh_graph(
         solved = graph.add("MatMul", flat, graph.constant(compliance))
         given = graph.add("Reshape", solved, graph.constant(np.array([-1, n_nodes, 3])))
     if response is not None or scene.observed_nodes is not None:
-        shares = np.maximum(weights.sum(axis=0), SMALLEST_SHARE)
-        to_grid = sp.csr_array(sp.diags_array((1.0 / shares).astype(np.float32)) @ weights.T)
+        to_grid = sp.csr_array(sp.diags_array(1.0 / grid.shares.numpy().ravel()) @ weights.T)
     x = graph.add("Mul", given, graph.constant(np.array([1.0 / input_scale], dtype=np.float32)))
     x = _sparse_product(graph, to_grid, x)  # (n, x y z, 3)
     x = graph.add("Reshape", x, graph.constant(np.array([-1, *grid.shape, 3])))
