@@ -33,6 +33,12 @@ from tests.test_fit_command import LIMIT, descent_file, wait_for
 
 
 @pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of this module alone, since kept fits are counted."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """With a method that is swept over channels and steps, large ones of which are out of time, and whose seed 1 fails."""
     folder = tmp_path_factory.mktemp("descent")
