@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,10 @@ import mor_bench
 from mor_bench.cli import _knobs
 from mor_bench.errors import InvalidInputError, MorBenchError, SpecError
 from mor_bench.harness.on_dataset import Listener
-from mor_bench.snapshots.dataset import load_dataset
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.dataset import Snapshots, load_dataset
 from mor_bench.specs import load_generated_spec
+from tests.third_party import Descent
 
 LIMIT = 60
 
@@ -151,6 +154,24 @@ def test_a_method_that_does_not_train_is_fitted_too_and_a_swept_knob_has_its_fir
     off = np.abs(again.predict(test.forces) - test.displacements).mean(axis=(1, 2))
     assert fitted.error["mean_dof_m"] == pytest.approx(off.mean())
     assert (fitted.n_train + fitted.n_test, fitted.iterations) == (LIMIT, None)
+
+
+class Unheeding(Descent):
+    """Trains as many iterations as its knob says, whatever the seconds."""
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Unheeding:
+        self.training = replace(self.training, fit_seconds=None)
+        super().fit(scene, snapshots)
+        del self.iterations_
+        return self
+
+
+def test_seconds_that_were_not_heeded_are_told(cache: Path, tmp_path: Path) -> None:
+    path = tmp_path / "unheeding.toml"
+    path.write_text('title = "t"\nsource = "s"\nsurrogate = "tests.test_fit_command:Unheeding"\n')
+    with pytest.warns(UserWarning, match="Unheeding did not size its training to seconds: its knob `iterations` counted"):
+        fitted = mor_bench.fit("beam-tiny", path, out=tmp_path / "a.safetensors", fit_seconds=5.0, limit=LIMIT, cache=cache)
+    assert fitted.out.exists()
 
 
 def test_where_displacements_are_observed_the_error_is_that_of_answers_to_them(cache: Path, tmp_path: Path) -> None:

@@ -200,6 +200,8 @@ def test_options_of_trainings_are_checked_and_planned(folder: Path, cache: Path,
     one, three = (plan(["beam-tiny"], ["umesh"], cache=tmp_path / "cache", limit=LIMIT, fit_seconds=50.0, seeds=seeds) for seeds in (1, 3))
     assert [step.label for step in one.steps[1:]] == ["umesh [channels=16, steps=2]"]
     assert [step.label for step in three.steps[2:]] == ["umesh: other seeds"]
+    trees = plan(["beam-tiny"], ["pca-extra-trees", "pca-ridge"], cache=tmp_path / "cache", limit=LIMIT, seeds=3)
+    assert [step.label for step in trees.steps if "seeds" in step.label] == ["pca-extra-trees: other seeds"]
     assert one.steps[1].seconds == 50.0
     assert three.seconds - one.seconds == pytest.approx(100.0, abs=5.0)  # generation is estimated by solving
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,18 @@ def may_train(method: MethodSpec) -> bool:
         return True
     try:
         return bool(method.load_class().trains())
+    except MissingDependencyError:
+        return False
+
+
+def may_draw(job: Job) -> bool:
+    """Whether a fit draws random numbers; a third party's, whose class is not imported here, is taken to do so if its file has iterations."""
+    if "iterations" in job.parameters or "seed" in job.parameters:
+        return True
+    if not job.method.surrogate.startswith("mor_bench."):
+        return False
+    try:
+        return "seed" in signature(job.method.load_class()).parameters
     except MissingDependencyError:
         return False
 

@@ -14,7 +14,7 @@ from time import perf_counter
 from typing import Any
 
 from mor_bench.harness.clock import PROTOCOLS
-from mor_bench.harness.contestants import BUDGETS, checked_specs, jobs_of
+from mor_bench.harness.contestants import BUDGETS, checked_specs, jobs_of, may_draw
 from mor_bench.harness.fits import Entry, Job, Material
 from mor_bench.harness.on_dataset import LEARNING_STEP, place_of
 from mor_bench.harness.run import checked_seeds, training_options
@@ -146,17 +146,17 @@ def _within(seconds: float | None, left_s: float, iterations: int | None) -> flo
 
 
 def _extras(dataset: str, jobs: Sequence[Job], fits: Sequence[Step], other_seeds: int, curves: bool) -> list[Step]:
-    """What is fitted beside: other seeds of what is trained by iterations, and in a full comparison learning curves."""
+    """What is fitted beside: other seeds of what draws random numbers, and in a full comparison learning curves."""
     extras = []
     for method in dict.fromkeys(job.method.name for job in jobs):
         mine = [(job, step.seconds or 0.0) for job, step in zip(jobs, fits, strict=True) if job.method.name == method]
-        trained = "iterations" in mine[0][0].parameters
+        trained, draws = "iterations" in mine[0][0].parameters, bool(other_seeds) and may_draw(mine[0][0])
         seconds = 0.0
-        if trained:
+        if draws:
             seconds += other_seeds * sum(s for _, s in mine)
         if curves:
             seconds += LEARNING_POINTS * mine[-1][1] if trained else mine[-1][1] / (LEARNING_STEP - 1)
-        named = [*(["other seeds"] if trained and other_seeds else []), *(["learning curve"] if curves else [])]
+        named = [*(["other seeds"] if draws else []), *(["learning curve"] if curves else [])]
         if named:
             extras.append(Step(dataset, f"{method}: {', '.join(named)}", False, seconds))
     return extras

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -148,6 +149,8 @@ def fit(
         unfitted.fit(data.scene, data.train if unfitted.needs_snapshots else None)
         seconds = perf_counter() - start
         unfitted.save(out)
+        if fit_seconds is not None and getattr(unfitted, "iterations_", None) is None:
+            warnings.warn(f"{type(unfitted).__name__} did not size its training to seconds: its knob `iterations` counted.", stacklevel=2)
         error = _test_error(unfitted, data.test)
     return Fit(unfitted, out, error, seconds, getattr(unfitted, "iterations_", None), len(data.train), len(data.test))
 
