@@ -577,9 +577,9 @@ def test_a_cluster_that_loses_a_worker_half_way(tmp_path: Path, many: dict[str, 
             killed: list[str] = []
 
             def kill_one_at_work(done: int, total: int) -> None:
-                while done >= total // 2 and not killed:
+                if done >= total // 2 and not killed:  # what is in flight may be done when it is looked for: then after the next shard
                     busy = [names[address] for address, tasks in client.processing().items() if tasks]
-                    for name in busy[:1]:
+                    for name in busy[:1] or ["first"] * (done >= total - 2):
                         cluster.processes[name].kill()
                         killed.append(name)
 
