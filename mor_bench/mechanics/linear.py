@@ -6,6 +6,7 @@ whether the matrix was positive definite instead of going on with a meaningless 
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -303,6 +304,7 @@ class Pardiso:
 
         self._error: type[Exception] = PyPardisoError
         self._solver = PyPardisoSolver(mtype=2)
+        os.environ.setdefault("PYPARDISO_MKL_RT", self._solver.libmkl._name)  # without it, each solver searches all of Python's folders for MKL
         indices, indptr = pattern.indices.astype(np.int32), pattern.indptr.astype(np.int32)
         self._matrix = sp.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(pattern.n, pattern.n))
         self._phase(11, np.zeros(pattern.n))
