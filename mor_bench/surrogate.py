@@ -329,6 +329,8 @@ class Surrogate(ABC):
             )
         if not np.isfinite(displacements).all() or not np.isfinite(vectors).all():
             raise InvalidInputError("the training snapshots hold NaN or infinity.")
+        if not displacements.any() or not vectors.any():
+            raise InvalidInputError("the training snapshots are all zero: nothing can be learned from them.")
         if self.scene_.observed_nodes is None:
             self.range_ = LoadRange.of(snapshots)
         return snapshots
