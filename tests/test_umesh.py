@@ -28,7 +28,7 @@ from mor_bench.learning import training  # noqa: E402 - after the check that tor
 from mor_bench.learning.training import rate_factor  # noqa: E402
 from mor_bench.scene.symmetry import mirrors  # noqa: E402
 from mor_bench.surrogates.umesh.grid import padded_grid  # noqa: E402
-from mor_bench.surrogates.umesh.network import UNet, new_network  # noqa: E402
+from mor_bench.surrogates.umesh.network import DoubleConvolution, UNet, new_network  # noqa: E402
 
 SMALL = {
     "channels": 8, "steps": 1, "iterations": 400, "batch_size": 16, "learning_rate": 3e-3, "schedule": "one-cycle", "second_moment_decay": 0.99,
@@ -389,6 +389,23 @@ def test_transfer_starts_from_a_network_of_another_scene(improved: Surrogate, ir
     wrong.training = TrainingOptions(start_from=path)
     with pytest.raises(InvalidInputError, match="does not fit 4 channels"):
         wrong.fit(train.scene, train)
+
+
+@pytest.mark.parametrize("shape", [(2, 1, 1), (2, 2, 4), (4, 2, 2)])
+def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding(shape: tuple[int, int, int]) -> None:
+    generator = torch.Generator().manual_seed(0)
+    block = DoubleConvolution(3, 16, "relu")
+    for parameter in block.parameters():
+        torch.nn.init.normal_(parameter, std=0.1, generator=generator)
+    x = torch.randn(4, 3, *shape, generator=generator)
+    found = []
+    for precise in (True, False, False):
+        block.zero_grad()
+        with torch.autocast("cpu", torch.bfloat16, enabled=not precise):
+            block(x).float().square().mean().backward()
+        found.append(torch.cat([parameter.grad.ravel() for parameter in block.parameters() if parameter.grad is not None]))
+    assert torch.equal(found[1], found[2])
+    assert (found[1] - found[0]).norm() < 0.02 * found[0].norm()
 
 
 def test_losses_are_not_rounded_with_the_products(data: Dataset) -> None:
