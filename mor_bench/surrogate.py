@@ -6,7 +6,7 @@ import hashlib
 import inspect
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,7 +59,7 @@ class TrainingOptions:
         File that the training is written to now and then. If it is there at the start, the training goes on from it and ends with
         the same bits as one that was never stopped; it is removed at the end.
     start_from : Path or None
-        A model saved by `Surrogate.save`, whose fitting weights the training starts from.
+        A model of the same class and `Surrogate.architecture`, saved by `Surrogate.save`, whose weights the training starts from.
     progress : callable or None
         Called now and then with the iterations done, all, and the loss.
     """
@@ -112,6 +112,9 @@ class Surrogate(ABC):
 
     takes_observations: ClassVar[bool] = False
     """Whether it can be given displacements of a part of the surface in the place of forces, by `Snapshots.inputs`."""
+
+    architecture: ClassVar[tuple[str, ...]] = ()
+    """Knobs that decide names, shapes or meaning of the weights: a training starts only from a model that has the same."""
 
     time_limit_s: float | None = None
     """Seconds that a comparison leaves to `fit`; a method that sees early that they will not do raises `OutOfTimeError`."""
@@ -440,21 +443,54 @@ def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surroga
     return _fitted(path, surrogate, scene, header, state)
 
 
-def weights_to_start_from(path: str | Path, surrogate: type[Any]) -> dict[str, NDArray[Any]]:
-    """The arrays of a saved model of the same class, on whatever scene it was trained.
+def weights_to_start_from(path: str | Path, method: Surrogate) -> dict[str, NDArray[Any]]:
+    """The arrays of a saved model of a method's class and architecture, on whatever scene it was trained; see `fitting_arrays`.
 
     Raises
     ------
     StoreError
         If the file is missing, damaged or of a newer schema.
     InvalidInputError
-        If it is of another class.
+        If it is of another class or architecture.
     """
     header, state = _read_model(path)
+    surrogate = type(method)
     expected = f"{surrogate.__module__}:{surrogate.__qualname__}"
     if header.get("surrogate") != expected:
         raise InvalidInputError(f"{path}: `start_from` must be a model of class {expected!r}; got one of {header.get('surrogate')!r}.")
+    try:
+        saved = check_parameters(surrogate, json.loads(header["parameters"]))
+    except (MorBenchError, KeyError, ValueError, TypeError, RecursionError) as error:
+        raise StoreError(f"{path}: its knobs are not those of a {surrogate.__qualname__}: {error}") from None
+    unlike = [name for name in surrogate.architecture if saved[name] != method.parameters[name]]
+    if unlike:
+        wanted, got = (", ".join(f"`{name}` {knobs[name]!r}" for name in unlike) for knobs in (method.parameters, saved))
+        raise InvalidInputError(f"{path}: `start_from` must be a model with {wanted}; got one with {got}.")
     return state
+
+
+def fitting_arrays(
+    path: str | Path, state: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int | None, ...]], dtype: type[np.floating[Any]]
+) -> dict[str, NDArray[Any]]:  # fmt: skip
+    """Of the arrays of `weights_to_start_from` those of these names, which must be finite and of these shapes; None is any length but 0.
+
+    Raises
+    ------
+    StoreError
+        If one is missing, of another dtype, or not finite.
+    InvalidInputError
+        If one is of another shape.
+    """
+    for name, shape in shapes.items():
+        if name not in state or state[name].dtype != dtype:
+            got = f"got {state[name].dtype}" if name in state else "it is missing"
+            raise StoreError(f"{path}: `{name}` must be {np.dtype(dtype)}; {got}.")
+        array, wanted = state[name], ", ".join("at least 1" if length is None else str(length) for length in shape)
+        if array.ndim != len(shape) or 0 in array.shape or any(length not in (None, n) for n, length in zip(array.shape, shape, strict=True)):
+            raise InvalidInputError(f"{path}: to start from it here, `{name}` must be of shape ({wanted}); got {array.shape}.")
+        if not np.isfinite(array).all():
+            raise StoreError(f"{path}: `{name}` holds NaN or infinity.")
+    return {name: state[name] for name in shapes}
 
 
 def _read_model(path: str | Path) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:

@@ -103,7 +103,7 @@ def test_a_killed_training_of_u_mesh_goes_on_too(cache: Path, tmp_path: Path) ->
     assert told[-1] == 300
     whole = mor_bench.fit("beam-tiny", "umesh-small", knobs, out=tmp_path / "whole.safetensors", **arguments)
     assert out.read_bytes() == whole.out.read_bytes()
-    with pytest.raises(InvalidInputError, match="its network does not fit 2 channels and 1 steps"):
+    with pytest.raises(InvalidInputError, match="must be a model with `channels` 2; got one with `channels` 1"):
         mor_bench.fit("beam-tiny", "umesh-small", {**knobs, "channels": 2}, out=tmp_path / "b.safetensors", start_from=out, **arguments)
     assert not (tmp_path / "b.safetensors").exists()
 

@@ -167,7 +167,7 @@ def test_a_training_starts_from_a_saved_model_in_other_bases(tiny: Dataset, tmp_
     assert medians[0] > 3 * own
     method = mor_bench.load_method("pod-nn", n_hidden=16, iterations=1)
     method.training = TrainingOptions(start_from=tmp_path / "model.safetensors")
-    with pytest.raises(InvalidInputError, match="16 hidden units"):
+    with pytest.raises(InvalidInputError, match="`n_hidden` 16; got one with `n_hidden` 32"):
         method.fit(tiny.scene, tiny.train)
 
 

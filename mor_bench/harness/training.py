@@ -100,7 +100,7 @@ def fit(
     checkpoint : path, optional
         File that the training is written to now and then, and goes on from; ``.NAME.checkpoint`` beside ``out`` by default.
     start_from : path, optional
-        A model of the same method, whose weights the training starts from where they fit.
+        A model of the same class and architecture, whose weights the training starts from.
     threads : int, optional
         All cores by default. Another number may change the last bits.
     workers : int, optional
@@ -136,7 +136,7 @@ def fit(
     _check_options(unfitted, {"device": device == "cuda", "fit_seconds": fit_seconds, "checkpoint": checkpoint, "start_from": start_from})
     options = training_options(device, fit_seconds)
     if start_from is not None:
-        weights_to_start_from(start_from, type(unfitted))
+        weights_to_start_from(start_from, unfitted)
         options = replace(options, start_from=Path(start_from))
     _check_writable("out", out)
     if unfitted.trains():

@@ -27,6 +27,12 @@ def input_axes(inputs: Array, n_modes: int, evenness: float) -> Array:
     return axes
 
 
+def change_of_basis(old: Array, new: Array) -> Array:
+    """B (n_new, n_old) for bases (n, n_old) and (n, n_new): xᵀold = (xᵀnew) B for x in the span of new, and new B a nearest to old."""
+    change: Array = np.linalg.pinv(new) @ old
+    return change
+
+
 def error_weights(displacements: Array) -> Array:
     """(n_samples,) what errors are multiplied by so that they count relative to displacements (n_samples, n), see `SMALLEST`."""
     sizes = np.linalg.norm(displacements, axis=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, final
+from typing import Annotated, ClassVar, Literal, final
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.reduction.basis import pod
-from mor_bench.reduction.coordinates import input_axes
+from mor_bench.reduction.coordinates import change_of_basis, input_axes
 from mor_bench.scene.mesh import Mesh
 from mor_bench.surrogates.field_network import Arrays, FieldNetwork, FieldSurrogate, Input, n_products, perceptron
 
@@ -106,6 +106,8 @@ class DeepONet(FieldSurrogate):
         Samples per step, peak of the one-cycle schedule, and seed of the initial weights and of the order of the samples.
     """
 
+    architecture: ClassVar[tuple[str, ...]] = ("input", "trunk", "n_input_modes", "n_functions", "width", "depth")
+
     def __init__(
         self,
         input: Input = "force",
@@ -147,6 +149,18 @@ class DeepONet(FieldSurrogate):
         single = {name: torch.from_numpy(constants[name].astype(np.float32)) for name in names}
         n_functions = constants["modes"].shape[1] if "modes" in names else self.n_functions
         return DeepONetNetwork(single["axes"], scaled_positions(self.scene_.mesh), single.get("modes"), n_functions, self.width, self.depth)
+
+    def _turned(self, weights: dict[str, Tensor], constants: Arrays, scales: NDArray[np.float64]) -> dict[str, Tensor]:
+        """The branch from coordinates of a load, and to coefficients of a displacement, in their own units."""
+        inward = change_of_basis(constants["axes"] / scales[0], self.constants_["axes"] / self.input_scale_)
+        outward = np.eye(self.n_functions)
+        if self.trunk == "pod":
+            outward = change_of_basis(constants["modes"], self.constants_["modes"])
+        outward *= scales[1] / self.output_scale_
+        first, last = "branch.0.weight", f"branch.{2 * self.depth}"
+        turned = {first: weights[first].double() @ torch.from_numpy(inward.T)}
+        turned |= {name: torch.from_numpy(outward) @ weights[name].double() for name in (f"{last}.weight", f"{last}.bias")}
+        return weights | {name: value.float() for name, value in turned.items()}
 
 
 def scaled_positions(mesh: Mesh) -> Tensor:

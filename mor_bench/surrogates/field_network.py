@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from mor_bench import counting
-from mor_bench.errors import InvalidInputError
+from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.learning.training import Training, TrainingPlan, device_of, fingerprint_of, network_weights, train
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.mechanics.observed import linear_response
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogate import Surrogate, weights_to_start_from
+from mor_bench.surrogate import Surrogate, fitting_arrays, weights_to_start_from
 
 Input = Literal["force", "linear-response"]
 
@@ -140,13 +140,24 @@ class FieldSurrogate(Surrogate):
         return train(network, loss, len(targets), plan, generator, self.training, self.time_limit_s, fingerprint)
 
     def _start_from(self, network: FieldNetwork, path: Path) -> None:
-        """Take the weights that fit of a model of this class, trained on this scene or another."""
-        own = network.state_dict()
-        found = network_weights(weights_to_start_from(path, type(self)))
-        fitting = {name: value for name, value in found.items() if name in own and value.shape == own[name].shape}
-        if not fitting:
-            raise InvalidInputError(f"{path}: none of its weights fits the network of these knobs on {self.scene_.name}.")
-        network.load_state_dict({**own, **fitting})
+        """Take the weights of a model of this architecture, trained on this scene or another."""
+        state = weights_to_start_from(path, self)
+        known = fitting_arrays(path, state, {f"constant.{name}": (len(array), None) for name, array in self.constants_.items()}, np.float64)
+        constants = {name.removeprefix("constant."): array for name, array in known.items()}
+        try:
+            source = self._network(constants)
+        except InvalidInputError as error:
+            raise InvalidInputError(f"{path}: {error}") from None
+        shapes = {f"network.{name}": tuple(value.shape) for name, value in source.state_dict().items()}
+        weights = network_weights(fitting_arrays(path, state, shapes, np.float32))
+        scales = fitting_arrays(path, state, {"scales": (2,)}, np.float64)["scales"]
+        if not (scales > 0).all():
+            raise StoreError(f"{path}: `scales` must be greater than 0; got {scales}.")
+        network.load_state_dict(self._turned(weights, constants, scales))
+
+    def _turned(self, weights: dict[str, Tensor], constants: Arrays, scales: NDArray[np.float64]) -> dict[str, Tensor]:
+        """Weights of a model of other constants and scales, for this one's own."""
+        return weights
 
     @torch.inference_mode()
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:

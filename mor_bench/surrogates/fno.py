@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import prod
-from typing import Annotated, final
+from typing import Annotated, ClassVar, final
 
 import numpy as np
 import torch
@@ -161,6 +161,8 @@ class FourierNeuralOperator(FieldSurrogate):
     batch_size, learning_rate, seed
         Samples per step, peak of the one-cycle schedule, and seed of the initial weights and of the order of the samples.
     """
+
+    architecture: ClassVar[tuple[str, ...]] = ("input", "channels", "modes", "layers")
 
     def __init__(
         self,

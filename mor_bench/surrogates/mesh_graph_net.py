@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, final
+from typing import Annotated, Any, ClassVar, final
 
 import numpy as np
 import torch
@@ -208,6 +208,8 @@ class MeshGraphNet(FieldSurrogate):
     batch_size, learning_rate, seed
         Samples per step, peak of the one-cycle schedule, and seed of the initial weights and of the order of the samples.
     """
+
+    architecture: ClassVar[tuple[str, ...]] = ("input", "width", "steps")
 
     def __init__(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -13,9 +13,9 @@ from pydantic import Field
 from torch import Tensor
 
 from mor_bench import counting
-from mor_bench.errors import InvalidInputError
 from mor_bench.learning.perceptron import Perceptron, evaluate, named, named_shapes, slope_at_rest, taken
-from mor_bench.surrogate import weights_to_start_from
+from mor_bench.reduction.coordinates import change_of_basis
+from mor_bench.surrogate import fitting_arrays, weights_to_start_from
 from mor_bench.surrogates.coordinate_regression import CoordinateSamples
 from mor_bench.surrogates.network_regression import NetworkRegression
 
@@ -58,6 +58,8 @@ class PODNN(NetworkRegression):
         Of the initial weights and of the order of the samples.
     """
 
+    architecture: ClassVar[tuple[str, ...]] = ("input", "n_hidden")
+
     def __init__(
         self,
         input: Literal["linear-response", "force"] = "linear-response",
@@ -97,13 +99,11 @@ class PODNN(NetworkRegression):
 
     def _weights_of(self, path: Path, scale: float) -> list[Array]:
         """The weights of a model of the same mesh, turned from its bases into those of the samples."""
-        state = weights_to_start_from(path, type(self))
-        n_free, n_inputs, n_outputs = len(self.axes_), state["axes"].shape[1], state["modes"].shape[1]
-        shapes = {"axes": (n_free, n_inputs), "modes": (n_free, n_outputs), **named_shapes("network", n_inputs, self.n_hidden, n_outputs)}
-        if any(state[name].shape != shape for name, shape in shapes.items()):
-            raise InvalidInputError(f"{path}: `start_from` must be a model of {n_free} free dofs and {self.n_hidden} hidden units.")
-        first, *between, last = taken(state, "network")
-        return [np.linalg.pinv(self.axes_) @ state["axes"] @ first, *between, last @ state["modes"].T @ self.modes_ / scale]
+        state, n_free = weights_to_start_from(path, self), len(self.axes_)
+        axes, modes = fitting_arrays(path, state, {"axes": (n_free, None), "modes": (n_free, None)}, np.float64).values()
+        shapes = named_shapes("network", axes.shape[1], self.n_hidden, modes.shape[1])
+        first, *between, last = taken(fitting_arrays(path, state, shapes, np.float64), "network")
+        return [change_of_basis(axes, self.axes_) @ first, *between, last @ change_of_basis(modes, self.modes_).T / scale]
 
     def _loss(self, network: Perceptron, data: dict[str, Tensor]) -> Callable[[Tensor], Tensor]:
         """Mean squared errors of the coordinates, and of their derivatives if there are any."""

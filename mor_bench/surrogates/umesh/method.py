@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, final
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import Tensor
 
 from mor_bench import counting
-from mor_bench.errors import InvalidInputError, StoreError
+from mor_bench.errors import InvalidInputError
 from mor_bench.learning.inference import Backend, choose_inference, inference_or_eager
 from mor_bench.learning.training import Precision, Schedule, TrainingPlan, device_of, fingerprint_of, network_weights, train
 from mor_bench.mechanics.model import unknown_equations
@@ -23,7 +23,7 @@ from mor_bench.scene.grid import grid_map
 from mor_bench.scene.scene import Scene
 from mor_bench.scene.symmetry import Mirror, mirrors
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogate import Surrogate, weights_to_start_from
+from mor_bench.surrogate import Surrogate, fitting_arrays, weights_to_start_from
 from mor_bench.surrogates.umesh.grid import PaddedGrid, padded_grid
 from mor_bench.surrogates.umesh.network import Activation, UNet, empty_network, new_network
 
@@ -137,6 +137,7 @@ class UMesh(Surrogate):
     """
 
     takes_observations = True
+    architecture: ClassVar[tuple[str, ...]] = ("channels", "steps", "normalisation", "input", "activation", "zero_at_rest")
 
     def __init__(
         self,
@@ -295,13 +296,8 @@ class UMesh(Surrogate):
 
     def _start_from(self, path: Path) -> None:
         """Take the weights of a network that was trained on this scene or another; grids of any size share them."""
-        weights = network_weights(weights_to_start_from(path, type(self)))
-        if not all(weight.isfinite().all() for weight in weights.values()):
-            raise StoreError(f"{path}: the weights of its network hold NaN or infinity.")
-        try:
-            self.network_.load_state_dict(weights)
-        except RuntimeError as error:
-            raise InvalidInputError(f"{path}: its network does not fit {self.channels} channels and {self.steps} steps: {error}") from None
+        shapes = {f"network.{name}": tuple(value.shape) for name, value in self.network_.state_dict().items()}
+        self.network_.load_state_dict(network_weights(fitting_arrays(path, weights_to_start_from(path, self), shapes, np.float32)))
 
     def _onnx_model(self) -> onnx.ModelProto:
         from mor_bench.surrogates.umesh.onnx_model import umesh_graph

@@ -1,0 +1,168 @@
+"""Trainings that start from a saved model: it must be of the same class and architecture, whole, and in the new samples' bases."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mor_bench
+from mor_bench.errors import InvalidInputError, StoreError
+from mor_bench.scene.mesh import box_mesh
+from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.snapshots.sampling import draw_loads
+from mor_bench.specs import list_suite, load_method_spec
+from mor_bench.surrogate import Surrogate, TrainingOptions, weights_to_start_from
+
+pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
+
+from mor_bench.surrogates.autoencoder import Autoencoder
+
+SMALL: dict[str, dict[str, Any]] = {
+    "deeponet": {"width": 8, "depth": 2, "n_functions": 8, "n_input_modes": 8},
+    "pod-deeponet": {"width": 8, "depth": 2, "n_functions": 8, "n_input_modes": 8},
+    "fno": {"channels": 2, "modes": 2, "layers": 1},
+    "mesh-graph-net": {"width": 4, "steps": 1},
+    "pod-nn": {"n_hidden": 4, "n_input_modes": 8, "n_output_modes": 8, "input": "force"},
+    "umesh-small": {"channels": 2, "steps": 1, "validation_fraction": 0.0},
+}
+
+
+def make(name: str, **knobs: Any) -> Any:
+    return mor_bench.load_method(name, **{**SMALL[name], "iterations": 1, **knobs})
+
+
+def started(method: Surrogate, path: Path, samples: Snapshots) -> Surrogate:
+    method.training = TrainingOptions(start_from=path)
+    return method.fit(samples.scene, samples)
+
+
+def error(method: Surrogate, samples: Snapshots) -> float:
+    norms = (np.linalg.norm(values, axis=(1, 2)) for values in (method.predict(samples.forces) - samples.displacements, samples.displacements))
+    return float(np.median(np.divide(*norms)))
+
+
+@pytest.fixture(scope="module")
+def files(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A model of each method, trained for one step."""
+    folder = tmp_path_factory.mktemp("models")
+    for name in SMALL:
+        make(name).fit(tiny.scene, tiny.train[:12]).save(folder / f"{name}.safetensors")
+    return {name: folder / f"{name}.safetensors" for name in SMALL}
+
+
+@pytest.mark.filterwarnings("ignore:.* modes were asked for")
+@pytest.mark.parametrize("name", ["deeponet", "pod-deeponet"])
+def test_the_branch_is_turned_into_the_bases_of_other_samples(name: str, tiny: Dataset, tmp_path: Path) -> None:
+    knobs = {"width": 32, "depth": 2, "n_functions": 64, "n_input_modes": 200}
+    first, others = make(name, **knobs, iterations=300).fit(tiny.scene, tiny.train[:48:2]), tiny.train[1:48:2]
+    first.save(tmp_path / "model.safetensors")
+    second = make(name, **knobs, seed=3, learning_rate=1e-12)
+    random = error(second.fit(tiny.scene, others), others)
+    own = error(first, others)
+    assert own < 0.8 * random
+    assert error(started(second, tmp_path / "model.safetensors", others), others) == pytest.approx(own, rel=0.02)
+
+
+def test_all_that_train_name_their_architecture() -> None:
+    classes = {load_method_spec(file).load_class() for file in list_suite("methods").values()}
+    for surrogate in (item for item in classes if item.trains() and item is not Autoencoder):
+        assert surrogate.architecture
+        assert set(surrogate.architecture) <= surrogate().parameters.keys()
+
+
+@pytest.mark.parametrize(
+    ("name", "knob", "value"),
+    [
+        ("mesh-graph-net", "width", 8), ("mesh-graph-net", "steps", 2), ("mesh-graph-net", "input", "linear-response"),
+        ("fno", "channels", 4), ("fno", "modes", 3), ("fno", "layers", 2), ("fno", "input", "linear-response"),
+        ("deeponet", "trunk", "pod"), ("deeponet", "depth", 3), ("pod-deeponet", "trunk", "network"), ("pod-deeponet", "n_functions", 4),
+        ("pod-nn", "input", "linear-response"), ("pod-nn", "n_hidden", 8),
+        ("umesh-small", "input", "linear-response"), ("umesh-small", "activation", "silu"), ("umesh-small", "zero_at_rest", True),
+        ("umesh-small", "normalisation", "max"), ("umesh-small", "steps", 2),
+    ],
+)  # fmt: skip
+def test_another_architecture_is_refused(name: str, knob: str, value: Any, files: dict[str, Path], tiny: Dataset) -> None:
+    saved = getattr(make(name), knob)
+    with pytest.raises(InvalidInputError) as raised:
+        started(make(name, **{knob: value}), files[name], tiny.train[:12])
+    assert str(raised.value) == f"{files[name]}: `start_from` must be a model with `{knob}` {value!r}; got one with `{knob}` {saved!r}."
+
+
+def test_another_architecture_is_refused_before_anything_runs(files: dict[str, Path], tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"`activation` 'silu'.*; got one with .*`activation` 'relu'"):
+        mor_bench.fit(
+            "beam-tiny", "umesh-linear", {"channels": 2, "steps": 1}, out=tmp_path / "a", start_from=files["umesh-small"], cache=tmp_path / "cache"
+        )
+    assert not any(tmp_path.iterdir())
+
+
+def test_training_knobs_may_differ(files: dict[str, Path], tiny: Dataset) -> None:
+    for name, path in files.items():
+        started(make(name, iterations=2, seed=1), path, tiny.train[12:24])
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_on_another_mesh_weights_are_taken_where_they_have_the_same_meaning(name: str, files: dict[str, Path], tiny: Dataset, tmp_path: Path) -> None:
+    mesh = box_mesh((2.0, 1.0, 1.0), (3, 1, 1))
+    scene = replace(tiny.scene, mesh=mesh, fixed_nodes=np.flatnonzero(mesh.points[:, 0] == 0))
+    displacements = np.random.default_rng(0).normal(size=(8, len(scene.free_dofs)))
+    samples = Snapshots(scene, draw_loads(scene, 0, 8), displacements, np.ones(8))
+    if name in ("mesh-graph-net", "umesh-small", "fno"):
+        started(make(name), files[name], samples)
+    if name in ("mesh-graph-net", "umesh-small"):
+        return
+    knobs, path = {}, files[name]
+    if name == "fno":  # of a grid that has more wave numbers
+        knobs, path = {"modes": 4}, tmp_path / "fno.safetensors"
+        make(name, **knobs).fit(tiny.scene, tiny.train[:12]).save(path)
+    with pytest.raises(InvalidInputError, match=r"to start from it here, `\S+` must be of shape \(.*\); got \("):
+        started(make(name, **knobs), path, samples)
+
+
+def weight_of(name: str) -> str:
+    return {
+        "pod-nn": "network.second", "fno": "network.lift.weight", "mesh-graph-net": "network.decoder.0.weight", "umesh-small": "network.head.weight"
+    }.get(name, "network.branch.2.weight")  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_weights_that_are_not_whole_are_refused(name: str, files: dict[str, Path], tiny: Dataset, tmp_path: Path) -> None:
+    method, path = mor_bench.load_surrogate(files[name]), tmp_path / "forged.safetensors"
+    whole = method._state()
+    forgeries: list[tuple[dict[str, Any], str]] = [({}, "it is missing")]
+    arrays = [weight_of(name), *{"pod-nn": ["axes", "modes"], "deeponet": ["constant.axes"], "pod-deeponet": ["constant.modes"]}.get(name, [])]
+    for key in arrays:
+        array = whole[key]
+        forgeries += [
+            ({item: value for item, value in whole.items() if item != key}, f"`{key}` must be float.*; it is missing"),
+            ({**whole, key: array.astype(np.uint8)}, f"`{key}` must be float.*; got uint8"),
+            ({**whole, key: array > 0}, f"`{key}` must be float.*; got bool"),
+            ({**whole, key: np.full_like(array, np.nan)}, f"`{key}` holds NaN or infinity"),
+            ({**whole, key: array.ravel()}, f"`{key}` must be of shape"),
+            ({**whole, key: array[:0]}, f"`{key}` must be of shape"),
+        ]
+    if "scales" in whole and name != "umesh-small":
+        forgeries += [({**whole, "scales": np.array([1.0, 0.0])}, "`scales` must be greater than 0")]
+    for state, message in forgeries:
+        method._state = lambda state=state: state  # type: ignore[method-assign,misc]
+        method.save(path)
+        with pytest.raises((StoreError, InvalidInputError), match=message) as raised:
+            started(make(name), path, tiny.train[:12])
+        assert str(raised.value).startswith(f"{path}: ")
+        assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("knobs", ["nothing", "[1]", "{", '{"width": 0}', '{"depths": 3}'])
+def test_forged_knobs_are_refused(knobs: str, files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    method, path = mor_bench.load_surrogate(files["mesh-graph-net"]), tmp_path / "forged.safetensors"
+    with monkeypatch.context() as patch:
+        patch.setattr(json, "dumps", lambda value, dumps=json.dumps, **keywords: knobs if value == method.parameters else dumps(value, **keywords))
+        method.save(path)
+    with pytest.raises(StoreError, match="its knobs are not those of a MeshGraphNet") as raised:
+        weights_to_start_from(path, make("mesh-graph-net"))
+    assert "\n" not in str(raised.value)
