@@ -57,7 +57,8 @@ class TrainingOptions:
         the knob ``iterations`` with that number gives the same model again. None: as many as the knob says.
     checkpoint : Path or None
         File that the training is written to now and then. If it is there at the start, the training goes on from it and ends with
-        the same bits as one that was never stopped; it is removed at the end.
+        the same bits as one that was never stopped. It is written at the end too, and whoever has kept the model deletes it, as
+        `mor_bench.fit` and `mor_bench.run` do: what `fit` does after the training, and `save`, may be stopped as well.
     start_from : Path or None
         A model of the same class and `Surrogate.architecture`, saved by `Surrogate.save`, whose weights the training starts from.
     progress : callable or None

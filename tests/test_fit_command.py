@@ -108,6 +108,32 @@ def test_a_killed_training_of_u_mesh_goes_on_too(cache: Path, tmp_path: Path) ->
     assert not (tmp_path / "b.safetensors").exists()
 
 
+def test_a_fit_that_is_stopped_after_its_training_goes_on_after_it(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("torch")
+    from mor_bench.surrogates.umesh.method import UMesh
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    told: list[int] = []
+    listener = Listener(training=lambda done, total, loss: told.append(done))
+    arguments: dict[str, Any] = {"limit": LIMIT, "cache": cache, "threads": 1, "listener": listener}
+    knobs = {"channels": 1, "steps": 1, "iterations": 60, "batch_size": 4, "inference": "packed", "validation_fraction": 0.0}
+    out, checkpoint = tmp_path / "model.safetensors", tmp_path / ".model.safetensors.checkpoint"
+    for name in ("_choose_inference", "save"):
+        with monkeypatch.context() as patch:
+            patch.setattr(UMesh, name, stop)
+            with pytest.raises(KeyboardInterrupt):
+                mor_bench.fit("beam-tiny", "umesh-small", knobs, out=out, **arguments)
+        assert checkpoint.exists()
+    assert mor_bench.fit("beam-tiny", "umesh-small", knobs, out=out, **arguments).iterations == 60
+    assert told == [50, 60], "it trained once"
+    assert not checkpoint.exists()
+    whole = mor_bench.fit("beam-tiny", "umesh-small", knobs, out=tmp_path / "whole.safetensors", **arguments)
+    assert out.read_bytes() == whole.out.read_bytes()
+    assert {item.name for item in tmp_path.iterdir()} == {"model.safetensors", "whole.safetensors"}
+
+
 def test_what_cannot_be_done_is_refused_before_anything_runs(tmp_path: Path) -> None:
     path, cache = descent_file(tmp_path), tmp_path / "cache"
     other = tmp_path / "other.safetensors"
@@ -127,6 +153,7 @@ def test_what_cannot_be_done_is_refused_before_anything_runs(tmp_path: Path) -> 
         (path, {}, {"start_from": tmp_path / "text"}, MorBenchError, "not a readable safetensors file"),
         (path, {}, {"out": tmp_path / "nowhere" / "a.safetensors"}, InvalidInputError, "`out`: .* cannot be written: No such file"),
         (path, {}, {"out": tmp_path}, InvalidInputError, "is a folder"),
+        (path, {}, {"checkpoint": tmp_path / "a.safetensors"}, InvalidInputError, "`checkpoint` must be another file than `out`; got"),
         (path, {}, {"checkpoint": tmp_path / "nowhere" / "c"}, InvalidInputError, "`checkpoint`: .* cannot be written"),
     ]
     for method, knobs, options, kind, message in refused:

@@ -7,12 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
-from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, StoreError
+import mor_bench
+from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, SpecError, StoreError
 from mor_bench.surrogate import TrainingOptions
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
 
 from mor_bench.learning import training  # noqa: E402 - after the check that torch is there
-from mor_bench.learning.training import Training, TrainingPlan, device_of, train  # noqa: E402
+from mor_bench.learning.training import Training, TrainingPlan, device_of, fingerprint_of, train  # noqa: E402
 
 PLAN = TrainingPlan(120, 8, 1e-2, second_moment_decay=0.9, validation_fraction=0.2)
 
@@ -85,7 +86,32 @@ def test_a_training_that_was_stopped_ends_with_the_same_bits(after: int, tmp_pat
     np.testing.assert_array_equal(resumed.weights, whole.weights)
     np.testing.assert_array_equal(done.loss_curve, expected.loss_curve)
     np.testing.assert_array_equal(done.validation_curve, expected.validation_curve)
-    assert not (tmp_path / "checkpoint").exists(), "a finished training leaves none"
+
+
+@pytest.mark.parametrize(
+    ("problem", "changes", "seconds"),
+    [
+        ({}, {}, None),
+        ({}, {"iterations": 50, "validation_fraction": 0.0}, None),
+        ({}, {"iterations": 7, "batch_size": 60}, None),
+        ({}, {}, 0.3),
+        ({"noise": 2.0, "width": 200}, {"iterations": 4000, "schedule": "constant", "validation_fraction": 0.5}, None),
+    ],
+    ids=["with samples held out", "without", "one batch an epoch", "to seconds", "ended early"],
+)
+def test_a_finished_training_goes_on_after_its_last_iteration(
+    problem: dict[str, Any], changes: dict[str, Any], seconds: float | None, tmp_path: Path
+) -> None:
+    whole, resumed, plan = Problem(**problem), Problem(**problem), replace(PLAN, **changes)
+    options = TrainingOptions(checkpoint=tmp_path / "checkpoint", fit_seconds=seconds)
+    expected = whole.train(plan, options=options)
+    done = resumed.train(plan, options=options)
+    assert resumed.calls == 0
+    assert done.iterations == expected.iterations
+    np.testing.assert_array_equal(resumed.weights, whole.weights)
+    np.testing.assert_array_equal(done.loss_curve, expected.loss_curve)
+    np.testing.assert_array_equal(done.validation_curve, expected.validation_curve)
+    assert not resumed.network.training
 
 
 @pytest.fixture
@@ -130,7 +156,7 @@ def test_a_checkpoint_of_other_seconds_or_samples_is_refused(checkpoint: Path) -
         Problem().train(options=TrainingOptions(checkpoint=checkpoint, fit_seconds=9.0), fingerprint="x")
     samples = Problem()
     samples.x, samples.y = samples.x[:30], samples.y[:30]  # fewer, and the caller's fingerprint does not tell
-    with pytest.raises(StoreError, match="not those of the training"):
+    with pytest.raises(StoreError, match=r"`rows` must be .* of shape"):
         samples.train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="x")
 
 
@@ -141,6 +167,71 @@ def test_a_damaged_checkpoint_is_refused(checkpoint: Path, damage: str) -> None:
     problem = Problem(width=5) if damage == "other network" else Problem()
     with pytest.raises(StoreError, match="checkpoint"):
         problem.train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="x")
+
+
+def _number(name: str, value: object) -> Callable[..., object]:
+    return lambda numbers, tensors: numbers.update({name: value})
+
+
+def _tensor(name: str, change: Callable[[Tensor], Tensor]) -> Callable[..., object]:
+    return lambda numbers, tensors: tensors.update({name: change(tensors[name])})
+
+
+def _without(start: str) -> Callable[..., object]:
+    return lambda numbers, tensors: [tensors.pop(name) for name in list(tensors) if name.startswith(start)]
+
+
+FORGERIES: dict[str, tuple[Callable[..., object], str]] = {
+    "endless": (_number("iterations", float("inf")), "`iterations`: "),
+    "an infinite iteration": (_number("iteration", float("inf")), "`iteration`: "),
+    "a negative iteration": (_number("iteration", -50), "`iteration`: "),
+    "an iteration after the last": (_number("iteration", 10**6), "`iteration` must be 120"),
+    "iterations of another plan": (_number("iterations", 10**6), "`iterations` must be 120 .* got 1000000"),
+    "an iteration before": (_number("iteration", 30), "`n_summed` must be 30 at iteration 30 of 120; got"),
+    "a nested curve": (_number("curve", [[0.5]]), "`curve.0`: "),
+    "a curve of words": (_number("curve", ["a"]), "`curve.0`: "),
+    "a curve of NaN": (_number("curve", [float("nan")]), "`curve.0`: "),
+    "a long curve": (_number("curve", [0.5, 0.5]), "`curve` must be 0 at iteration 31 of 120; got 2"),
+    "validated words": (_number("validated", ["a"]), "`validated.0`: "),
+    "a validated dict": (_number("validated", {}), "`validated`: "),
+    "another number": (_number("n", 3), "`n`: "),
+    "totals": (_tensor("total", lambda x: x.repeat(3)), r"`total` must be .* of shape \(\); got torch.float32 of shape \(3,\)"),
+    "no moment": (_without("optimiser.1.exp_avg_sq"), "not those of the training: optimiser.1.exp_avg_sq"),
+    "no moments": (_without("optimiser."), "not those of the training: optimiser.0"),
+    "a moment of another shape": (_tensor("optimiser.0.exp_avg", lambda x: x.T.contiguous()), "`optimiser.0.exp_avg` must be"),
+    "a negative second moment": (_tensor("optimiser.0.exp_avg_sq", lambda x: x - 1.0), "`optimiser.0.exp_avg_sq` must not be negative"),
+    "a step of before": (_tensor("optimiser.0.step", lambda x: -x), r"`optimiser.0.step` must be in \[1, "),
+    "an order of floats": (_tensor("order", lambda x: x.double()), "`order` must be finite numbers, torch.int64"),
+    "an order of pairs": (_tensor("order", lambda x: x[:, None]), "`order` must be"),
+    "an order that repeats": (_tensor("order", lambda x: x[:1].repeat(len(x))), "samples are not those of the training"),
+    "a short order": (_tensor("order", lambda x: x[1:]), "`order` must be"),
+    "rows that repeat": (_tensor("rows", lambda x: x[:1].repeat(len(x))), "samples are not those of the training"),
+    "other best weights": (_tensor("best.0.weight", lambda x: x[:, :2].contiguous()), "`best.0.weight` must be"),
+    "best weights of NaN": (_tensor("best.0.weight", lambda x: x * float("nan")), "`best.0.weight` must be finite"),
+    "a best weight missing": (_without("best.0.weight"), "not those of the training: best.0.weight"),
+    "no best weights": (_without("best."), "not those of the training: best.0"),
+    "weights of doubles": (_tensor("network.0.weight", lambda x: x.double()), "`network.0.weight` must be"),
+    "no generator": (_without("generator"), "not those of the training: generator"),
+    "a generator of zeros": (_tensor("generator", lambda x: x * 0), "Invalid mt19937 state"),
+    "another tensor": (lambda numbers, tensors: tensors.update(other=tensors["order"] + 1), "not those of the training: other"),
+}
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_a_forged_checkpoint_is_refused_and_left(name: str, checkpoint: Path) -> None:
+    """With the fingerprint of the training, and a checksum that matches."""
+    from safetensors import safe_open
+    from safetensors.torch import save_file
+
+    with safe_open(str(checkpoint), framework="pt") as file:
+        header, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a mapping
+    numbers, (change, message) = json.loads(header["numbers"]), FORGERIES[name]
+    change(numbers, tensors)
+    header = {"format": header["format"], "fingerprint": header["fingerprint"], "numbers": json.dumps(numbers)}
+    save_file(tensors, checkpoint, header | {"sha256": fingerprint_of(header, tensors)})
+    with pytest.raises(StoreError, match=f"a damaged checkpoint: .*{message}"):
+        Problem().train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="x")
+    assert checkpoint.exists()
 
 
 def test_it_ends_when_the_samples_held_out_gain_nothing_and_keeps_the_best_weights() -> None:
@@ -200,8 +291,28 @@ def test_bfloat16_trains_nearly_as_well() -> None:
 def test_too_little_time_and_divergence_are_errors() -> None:
     with pytest.raises(OutOfTimeError, match="would take"):
         Problem().train(replace(PLAN, iterations=10**9), time_limit_s=1.0)
-    with pytest.raises(MorBenchError, match="diverged"):
+    with pytest.raises(
+        MorBenchError, match=r"diverged .* the loss is (nan|inf), with a learning rate of 1e\+38 and products in float32; a lower rate may"
+    ):
         Problem().train(replace(PLAN, learning_rate=1e38))
+    with pytest.raises(MorBenchError, match=r"products in bfloat16; a lower rate or float32 may help"):
+        Problem().train(replace(PLAN, learning_rate=1e38, precision="bfloat16"))
+
+
+def test_a_training_that_diverges_writes_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY_S", 0.0)
+    options = TrainingOptions(checkpoint=tmp_path / "checkpoint")
+    for _ in range(2):  # the second goes on from what was finite, and ends as the first
+        with pytest.raises(MorBenchError, match="diverged"):
+            Problem().train(replace(PLAN, learning_rate=1e38), options=options)
+
+
+@pytest.mark.parametrize("name", ["autoencoder", "deeponet", "fno", "mesh-graph-net", "pod-nn", "umesh"])
+def test_a_seed_that_the_generator_would_cut_is_refused(name: str) -> None:
+    for seed in (5, 2**32 - 1):
+        mor_bench.load_method(name, seed=seed)
+    with pytest.raises(SpecError, match="`seed` must be less than 4294967296; got 4294967296"):
+        mor_bench.load_method(name, seed=2**32)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

@@ -186,6 +186,51 @@ def test_a_damaged_checkpoint_is_left_and_the_time_before_a_stop_counts(folder: 
     assert fit(stopped, 200.0)["fit_s"] < 70.0  # the checkpoint was damaged, and with it went the time that it had taken
 
 
+STOPPED = """
+import os
+import warnings
+
+from mor_bench.surrogates.{module} import {base}
+
+
+class Stopped({base}):
+    def _trained(self, networks, loss, data, generator):
+        calls = []
+        known = super()._trained(networks, lambda rows: calls.append(1) or loss(rows), data, generator)
+        if "STOPPED" in os.environ:
+            raise RuntimeError("stopped")
+        warnings.warn(f"{{len(calls)}} steps")
+        return known
+"""
+
+
+@pytest.mark.parametrize(("module", "base"), [("pod_nn", "PODNN"), ("autoencoder", "Autoencoder")])
+def test_a_comparison_that_is_stopped_after_a_training_goes_on_after_it(
+    module: str, base: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("torch")
+    (tmp_path / "stopped.py").write_text(STOPPED.format(module=module, base=base))
+    (tmp_path / "stopped.toml").write_text('title = "t"\nsource = "s"\nsurrogate = "stopped:Stopped"\n')
+    data = mor_bench.load_dataset("beam-tiny", LIMIT, cache=cache, workers=1)
+    material = Material(data.scene, data.train, {"test": fits.TestSet.of(data.test)}, tmp_path)
+    spec = load_method_spec(tmp_path / "stopped.toml")
+
+    def entry(name: str) -> Entry:
+        place = place_of(tmp_path / name, [tmp_path / name / "fits"], 1, 1, float("inf"))
+        return Entry(Job(spec, {"iterations": 70}, "stopped", TrainingOptions()), material, place)
+
+    with monkeypatch.context() as patch:
+        patch.setenv("STOPPED", "")
+        with pytest.raises(MethodFailedError, match="crashed with RuntimeError: stopped"):
+            fit(entry("a"), 100.0)
+    assert entry("a").checkpoint.exists()
+    resumed, whole = fit(entry("a"), 100.0), fit(entry("b"), 100.0)
+    assert (resumed["warnings"], whole["warnings"]) == (["0 steps"], ["70 steps"])
+    assert resumed["training"] == whole["training"]
+    assert resumed["model_sha256"] == whole["model_sha256"] is not None
+    assert not list(tmp_path.glob("*/fits/*/training/*"))
+
+
 def test_options_of_trainings_are_checked_and_planned(folder: Path, cache: Path, tmp_path: Path) -> None:
     bad: list[tuple[dict[str, Any], str]] = [
         ({"seeds": 0}, "`seeds` must be an integer in"),

@@ -98,7 +98,8 @@ def fit(
     fit_seconds : float, optional
         That the training is sized to, in the place of the knob `iterations`.
     checkpoint : path, optional
-        File that the training is written to now and then, and goes on from; ``.NAME.checkpoint`` beside ``out`` by default.
+        File that the training is written to now and then, and goes on from, until the model is saved; ``.NAME.checkpoint`` beside
+        ``out`` by default.
     start_from : path, optional
         A model of the same class and architecture, whose weights the training starts from.
     threads : int, optional
@@ -120,7 +121,7 @@ def fit(
         If the dataset, the method or a knob is unknown, or a value out of range.
     InvalidInputError
         If the method does not train and an option of trainings is given, there is no such device, ``out`` or ``checkpoint`` cannot
-        be written, the checkpoint is of another training, or ``start_from`` is of another class or architecture.
+        be written or both are one file, the checkpoint is of another training, or ``start_from`` is of another class or architecture.
     StoreError
         If ``start_from`` or the checkpoint is damaged.
     MorBenchError
@@ -141,6 +142,8 @@ def fit(
     _check_writable("out", out)
     if unfitted.trains():
         _check_writable("checkpoint", kept)
+        if kept.resolve() == out.resolve():
+            raise InvalidInputError(f"`checkpoint` must be another file than `out`; got {kept} for both.")
         remove_leftovers(kept.parent, kept.name)
         unfitted.training = replace(options, checkpoint=kept, progress=listener.training)
     data = load_dataset(spec, limit, split=split, workers=workers, cache=cache, progress=partial(listener.generating, spec.name))
@@ -149,6 +152,8 @@ def fit(
         unfitted.fit(data.scene, data.train if unfitted.needs_snapshots else None)
         seconds = perf_counter() - start
         unfitted.save(out)
+        if unfitted.trains():
+            kept.unlink(missing_ok=True)
         if fit_seconds is not None and getattr(unfitted, "iterations_", None) is None:
             warnings.warn(f"{type(unfitted).__name__} did not size its training to seconds: its knob `iterations` counted.", stacklevel=2)
         error = _test_error(unfitted, data.test)

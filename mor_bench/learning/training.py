@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 from math import cos, isfinite, pi
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor, nn
 
 from mor_bench import __version__
@@ -164,7 +165,8 @@ def train(
     generator : torch.Generator
         Of the processor; draws the permutations, and whatever the loss draws from it. No global random state is read or changed.
     options : TrainingOptions, optional
-        Device, seconds that the training is sized to, and checkpoint; ``start_from`` is the caller's to heed.
+        Device, seconds that the training is sized to, and checkpoint, which is written at the end too: the caller deletes it when the
+        model is kept. ``start_from`` is the caller's to heed.
     time_limit_s : float, optional
         Seconds that training may take; it is not begun in earnest when it would take longer.
     fingerprint : str
@@ -201,10 +203,22 @@ def train(
         if options.checkpoint is not None and perf_counter() - written > CHECKPOINT_EVERY_S:
             course.write(options.checkpoint, fingerprint)
             written = perf_counter()
+    if options.checkpoint is not None and course.iteration > first:
+        course.write(options.checkpoint, fingerprint)
     course.finish()
-    if options.checkpoint is not None:
-        options.checkpoint.unlink(missing_ok=True)
     return Training(np.array(course.curve), np.array(course.validated), course.iterations)
+
+
+class _Numbers(BaseModel):
+    """What a checkpoint holds beside tensors."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+    iteration: Annotated[int, Field(ge=1)]
+    iterations: Annotated[int, Field(ge=1)]
+    n_summed: int
+    curve: list[float]
+    validated: list[float]
 
 
 @dataclass
@@ -235,6 +249,12 @@ class _Course:
         self.network.train()
 
     @property
+    def n_held(self) -> int:
+        """Samples that are held out."""
+        fraction = self.plan.validation_fraction
+        return max(1, round(fraction * self.n_samples)) if fraction > 0 and self.n_samples > 1 else 0
+
+    @property
     def validation_interval(self) -> int:
         """Iterations between two looks at the samples held out."""
         return max(1, self.iterations // VALIDATIONS)
@@ -246,10 +266,9 @@ class _Course:
 
     def begin(self) -> None:
         """From the first iteration."""
-        if self.plan.validation_fraction > 0 and self.n_samples > 1:
-            n_held = max(1, round(self.plan.validation_fraction * self.n_samples))
+        if self.n_held:
             order = torch.randperm(self.n_samples, generator=self.generator)
-            self.held, self.rows = order[:n_held].sort().values, order[n_held:].sort().values
+            self.held, self.rows = order[: self.n_held].sort().values, order[self.n_held :].sort().values
         self.iterations = self.plan.iterations
         if self.options.fit_seconds is not None:
             self.iterations = self._that_fit(self.options.fit_seconds)
@@ -297,7 +316,7 @@ class _Course:
         torch.autograd.backward(loss)
         self.optimiser.step()
         self.iteration += 1
-        self.total, self.n_summed = self.total + loss.detach(), self.n_summed + 1
+        self.total, self.n_summed = self.total + loss.detach().float(), self.n_summed + 1
         if self.n_summed == LOSS_INTERVAL or self.iteration == self.iterations:
             self.curve.append(float(self.total) / self.n_summed)
             self._check_finite(self.curve[-1])
@@ -324,7 +343,10 @@ class _Course:
 
     def _check_finite(self, loss: float) -> None:
         if not isfinite(loss):
-            raise MorBenchError(f"training diverged before iteration {self.iteration}: `learning_rate` {self.plan.learning_rate} is too high.")
+            raise MorBenchError(
+                f"training diverged before iteration {self.iteration}: the loss is {loss}, with a learning rate of {self.plan.learning_rate} and "
+                f"products in {self.plan.precision}; a lower rate{' or float32' * (self.plan.precision != 'float32')} may help."
+            )
 
     def finish(self) -> None:
         """With the best weights, if samples were held out, and the losses since the last point of the curve, after an early end."""
@@ -336,7 +358,7 @@ class _Course:
         self.network.eval()
 
     def write(self, path: Path, fingerprint: str) -> None:
-        """All that decides how the training goes on, to a file that is whole at any moment."""
+        """All that decides how the training goes on, to a file that is whole at any moment; not while it is diverging."""
         from safetensors.torch import save
 
         tensors = {f"network.{name}": value for name, value in self.network.state_dict().items()}
@@ -344,6 +366,8 @@ class _Course:
         for number, state in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{number}.{name}": value for name, value in state.items()}
         tensors |= {"generator": self.generator.get_state(), "order": self.order, "rows": self.rows, "held": self.held, "total": self.total}
+        if not all(value.isfinite().all() for value in tensors.values()):
+            return
         numbers = {
             "iteration": self.iteration, "iterations": self.iterations, "n_summed": self.n_summed, "curve": self.curve, "validated": self.validated,
         }  # fmt: skip
@@ -370,7 +394,10 @@ class _Course:
         try:
             if header.pop("sha256") != fingerprint_of(header, tensors):
                 raise ValueError("the checksum does not match")
-            numbers = json.loads(header["numbers"])
+            numbers = _Numbers.model_validate(json.loads(header["numbers"]))
+            self.iteration, self.iterations, self.n_summed = numbers.iteration, numbers.iterations, numbers.n_summed
+            self.curve, self.validated = numbers.curve, numbers.validated
+            self._check(tensors)
             self.network.load_state_dict(_under("network.", tensors))
             self.best = _under("best.", tensors)
             whole = self.optimiser.state_dict()
@@ -380,14 +407,56 @@ class _Course:
             self.generator.set_state(tensors["generator"])
             self.order, self.rows, self.held = tensors["order"], tensors["rows"], tensors["held"]
             self.total = tensors["total"].to(self.device)
-            self.iteration, self.iterations, self.n_summed = (int(numbers[name]) for name in ("iteration", "iterations", "n_summed"))
-            self.curve, self.validated = list(numbers["curve"]), list(numbers["validated"])
-            parts = torch.cat([self.rows, self.held]).sort().values
-            if not torch.equal(parts, torch.arange(self.n_samples)) or not torch.isin(self.order, self.rows).all():
-                raise ValueError("its samples are not those of the training")
         except (KeyError, ValueError, TypeError, RuntimeError) as error:
-            raise StoreError(f"{path}: a damaged checkpoint: {error}. Without it the training begins anew.") from None
+            first = error.errors()[0] if isinstance(error, ValidationError) else None
+            reason = f"`{'.'.join(map(str, first['loc']))}`: {first['msg']}" if first else error
+            raise StoreError(f"{path}: a damaged checkpoint: {reason}. Without it the training begins anew.") from None
         return True
+
+    def _check(self, tensors: Mapping[str, Tensor]) -> None:
+        """Raise `ValueError` unless the numbers and a checkpoint's tensors are some that the training can have come to."""
+        ended = self.iteration == self.iterations
+        n_points, n_looks = (
+            -(-self.iteration // interval) if ended else self.iteration // interval for interval in (LOSS_INTERVAL, self.validation_interval)
+        )
+        counts = {
+            "iterations": (self.iterations, self.iterations if self.options.fit_seconds is not None else self.plan.iterations),
+            "iteration": (self.iteration, min(self.iteration, self.iterations)),
+            "n_summed": (self.n_summed, 0 if ended else self.iteration % LOSS_INTERVAL),
+            "curve": (len(self.curve), n_points),
+            "validated": (len(self.validated), n_looks if self.n_held else 0),
+        }
+        for name, (came, due) in counts.items():
+            if came != due:
+                raise ValueError(f"`{name}` must be {due} at iteration {self.iteration} of {self.iterations}; got {came}")
+        due_tensors = self._tensors_due()
+        if tensors.keys() != due_tensors.keys():
+            raise ValueError(f"its tensors are not those of the training: {', '.join(sorted(tensors.keys() ^ due_tensors.keys()))}")
+        for name, like in due_tensors.items():
+            found = tensors[name]
+            if (found.dtype, found.shape) != (like.dtype, like.shape) or not found.isfinite().all():
+                raise ValueError(
+                    f"`{name}` must be finite numbers, {like.dtype} of shape {tuple(like.shape)}; got {found.dtype} of shape {tuple(found.shape)}"
+                )
+            if name.startswith("optimiser.") and name.endswith(".step") and not 1 <= found <= self.iteration:
+                raise ValueError(f"`{name}` must be in [1, {self.iteration}]; got {found}")
+            if name.startswith("optimiser.") and name.endswith(".exp_avg_sq") and (found < 0).any():
+                raise ValueError(f"`{name}` must not be negative")
+        rows, held, order = (tensors[name] for name in ("rows", "held", "order"))
+        parts = torch.cat([rows, held]).sort().values
+        if not torch.equal(parts, torch.arange(self.n_samples)) or not torch.isin(order, rows).all() or len(set(order.tolist())) < len(order):
+            raise ValueError("its samples are not those of the training")
+
+    def _tensors_due(self) -> dict[str, Tensor]:
+        """Tensors of the names, types and shapes that a checkpoint holds."""
+        network, n_rows = self.network.state_dict(), self.n_samples - self.n_held
+        batch_size = min(self.plan.batch_size, n_rows)
+        n_drawn = batch_size * ((self.iteration - 1) % (n_rows // batch_size) + 1)
+        due = {f"{part}.{name}": value for part in ("network", "best")[: 1 + bool(self.validated)] for name, value in network.items()}
+        for number, parameter in enumerate(self.optimiser.param_groups[0]["params"]):
+            due |= {f"optimiser.{number}.{name}": like for name, like in (("step", self.total), ("exp_avg", parameter), ("exp_avg_sq", parameter))}
+        samples = {"rows": n_rows, "held": self.n_held, "order": n_rows - n_drawn}
+        return due | {name: self.rows.new_empty(n) for name, n in samples.items()} | {"generator": self.generator.get_state(), "total": self.total}
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

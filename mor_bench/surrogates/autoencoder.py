@@ -61,7 +61,7 @@ class Autoencoder(NetworkRegression):
         n_latent: Annotated[int, Field(ge=1)] = 20,
         n_input_modes: Annotated[int, Field(ge=1)] = 20,
         iterations: Annotated[int, Field(ge=1)] = 6000,
-        seed: Annotated[int, Field(ge=0, lt=2**63)] = 0,
+        seed: Annotated[int, Field(ge=0, lt=2**32)] = 0,
     ) -> None:
         self.n_latent = n_latent
         self.n_input_modes = n_input_modes

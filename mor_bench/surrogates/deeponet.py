@@ -119,7 +119,7 @@ class DeepONet(FieldSurrogate):
         iterations: Annotated[int, Field(ge=1)] = 20_000,
         batch_size: Annotated[int, Field(ge=1)] = 64,
         learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 2e-3,
-        seed: Annotated[int, Field(ge=0, lt=2**63)] = 0,
+        seed: Annotated[int, Field(ge=0, lt=2**32)] = 0,
     ) -> None:
         self.input = input
         self.trunk = trunk

@@ -173,7 +173,7 @@ class FourierNeuralOperator(FieldSurrogate):
         iterations: Annotated[int, Field(ge=1)] = 2000,
         batch_size: Annotated[int, Field(ge=1)] = 32,
         learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3,
-        seed: Annotated[int, Field(ge=0, lt=2**63)] = 0,
+        seed: Annotated[int, Field(ge=0, lt=2**32)] = 0,
     ) -> None:
         self.input = input
         self.channels = channels

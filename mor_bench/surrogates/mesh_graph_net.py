@@ -219,7 +219,7 @@ class MeshGraphNet(FieldSurrogate):
         iterations: Annotated[int, Field(ge=1)] = 1000,
         batch_size: Annotated[int, Field(ge=1)] = 8,
         learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3,
-        seed: Annotated[int, Field(ge=0, lt=2**63)] = 0,
+        seed: Annotated[int, Field(ge=0, lt=2**32)] = 0,
     ) -> None:
         self.input = input
         self.width = width

@@ -68,7 +68,7 @@ class PODNN(NetworkRegression):
         n_hidden: Annotated[int, Field(ge=1, le=4096)] = 128,
         derivatives: bool = False,
         iterations: Annotated[int, Field(ge=1)] = 6000,
-        seed: Annotated[int, Field(ge=0, lt=2**63)] = 0,
+        seed: Annotated[int, Field(ge=0, lt=2**32)] = 0,
     ) -> None:
         self.input = input
         self.n_input_modes = n_input_modes

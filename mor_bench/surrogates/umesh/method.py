@@ -156,7 +156,7 @@ class UMesh(Surrogate):
         loss: Literal["absolute", "relative"] = "absolute",
         precision: Precision = "float32",
         validation_fraction: Annotated[float, Field(ge=0, le=0.5)] = 0.0,
-        seed: Annotated[int, Field(ge=0, lt=2**63)] = 0,
+        seed: Annotated[int, Field(ge=0, lt=2**32)] = 0,
         inference: Backend | Literal["auto"] = "packed",
     ) -> None:
         self.channels = channels
