@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,8 @@ def test_a_killed_fit_goes_on_and_ends_with_the_same_bytes(cache: Path, tmp_path
     slow = {**os.environ, "DESCENT_NAP_S": "0.02"}
     seen: float = 0.0
     for how in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT):
-        with subprocess.Popen(command, env=slow, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        heeding = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a job in the background of a shell ignores it, and so would its children
+        with subprocess.Popen(command, env=slow, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heeding) as process:
             wait_for(lambda seen=seen: checkpoint.exists() and checkpoint.stat().st_mtime > seen, process)
             process.send_signal(how)
             said = process.communicate()[1]
