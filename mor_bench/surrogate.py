@@ -361,14 +361,6 @@ class Surrogate(ABC):
             raise InvalidInputError(f"`forces` must be finite and at most {MAX_FORCE_N:g} {unit}; got {np.abs(array).max():g}.")
         return array.astype(np.float64, copy=False).reshape(-1, n_nodes, 3)
 
-    def _without_supports(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Forces (n, n_nodes, 3) without those on supports, which move nothing; a copy where there are any. Observed displacements as they are."""
-        fixed = self.scene_.fixed_nodes
-        if self.scene_.observed_nodes is None and forces[:, fixed].any():
-            forces = forces.copy()
-            forces[:, fixed] = 0.0
-        return forces
-
 
 def _in_order(content: bytes) -> bytes:
     """A safetensors file with its metadata sorted: safetensors writes them in an order that changes from call to call."""

@@ -103,7 +103,7 @@ class FieldSurrogate(Surrogate):
                 inputs = self._linear_response(samples.inputs)
                 targets = samples.displacements - inputs
             else:
-                inputs, targets = self._without_supports(samples.inputs), samples.displacements
+                inputs, targets = samples.inputs, samples.displacements
             self.input_scale_, self.output_scale_ = _rms(inputs), _rms(targets)
             inputs, targets = inputs / self.input_scale_, targets / self.output_scale_
             self.constants_ = self._constants(inputs, targets)
@@ -166,12 +166,12 @@ class FieldSurrogate(Surrogate):
             return np.zeros(np.shape(forces))
         if counting.running is not None:  # with one scaling of each input and each output
             counting.running.add(multiply_adds=len(batch) * (self.network_.multiply_adds + 2 * self.scene_.mesh.n_dofs))
-        inputs = self._linear_response(batch) if self.input == "linear-response" else self._without_supports(batch)
+        inputs = self._linear_response(batch) if self.input == "linear-response" else batch
         answers = [self.network_(self.network_.encode(chunk)) for chunk in torch.split(_single(inputs / self.input_scale_), PREDICTION_CHUNK)]
         learned = (torch.cat(answers) - self._at_rest).to(torch.float64).numpy() * self.output_scale_
         out = inputs + learned if self.input == "linear-response" else learned
         out[:, self.scene_.fixed_nodes] = 0.0
-        out[~inputs.any(axis=(1, 2))] = 0.0  # in a batch the network at rest is rounded otherwise
+        out[~batch.any(axis=(1, 2))] = 0.0  # in a batch the network at rest is rounded otherwise
         return out.reshape(np.shape(forces))
 
     def _linear_response(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -103,7 +103,7 @@ class SeparatedLoad(Surrogate):
             if self.base == "linear-response":
                 self.compliance_ = Compliance(FullOrderModel(scene))
                 targets = targets - self.compliance_.respond(snapshots.forces.reshape(len(snapshots), -1))[:, scene.free_dofs]
-            positions, vectors = _coordinates(scene.mesh.points, self._without_supports(snapshots.forces))
+            positions, vectors = _coordinates(scene.mesh.points, snapshots.forces)
             frame, ends = _frame(positions[vectors.any(axis=1)], scene.mesh.points)
             largest = float(np.linalg.norm(vectors, axis=1).max())
             state = {"frame": frame, "ends": ends, "largest": np.array([largest])}
@@ -141,7 +141,7 @@ class SeparatedLoad(Surrogate):
         return np.concatenate(by_position[: self.position_degree + 1], axis=1), by_direction, powers
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        batch = self._without_supports(self._checked_forces(forces))
+        batch = self._checked_forces(forces)
         scene = self.scene_
         position, directions, powers = self._functions(*_coordinates(scene.mesh.points, batch))
         direction = np.concatenate([directions[degree] for degree in self._degrees], axis=1)

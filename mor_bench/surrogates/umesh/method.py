@@ -238,7 +238,7 @@ class UMesh(Surrogate):
             displacements += given
         displacements[:, self.scene_.fixed_nodes] = 0.0
         if self.zero_at_rest:
-            displacements[~given.any(axis=(1, 2))] = 0.0  # in a batch the network at rest is rounded otherwise
+            displacements[~checked.any(axis=(1, 2))] = 0.0  # in a batch the network at rest is rounded otherwise
         return displacements.reshape(np.shape(forces))
 
     def _prepare(self) -> None:
@@ -250,7 +250,7 @@ class UMesh(Surrogate):
     def _given(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, n_nodes, 3) what the network is given: the forces, N, or displacements of observed nodes, m; or the linear response to them, m."""
         if self.input == "force":
-            return self._without_supports(forces)
+            return forces
         return self.compliance_.respond(forces.reshape(len(forces), self.scene_.mesh.n_dofs)).reshape(forces.shape)
 
     def _answer(self, given: Tensor, network: Callable[[Tensor], Tensor] | None = None) -> Tensor:

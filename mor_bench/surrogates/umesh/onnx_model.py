@@ -50,14 +50,12 @@ def umesh_graph(
     """
     n_nodes, n_dofs, weights = scene.mesh.n_nodes, scene.mesh.n_dofs, grid.grid.weights
     graph = GraphBuilder()
-    to_grid = sp.csr_array(weights.T)
+    given, to_grid = "forces", sp.csr_array(weights.T)
     if scene.observed_nodes is not None:
         seen = np.zeros((n_nodes, 1), dtype=np.bool_)
         seen[scene.observed_nodes] = True
-    else:  # forces on supports move nothing
-        seen = np.ones((n_nodes, 1), dtype=np.bool_)
-        seen[scene.fixed_nodes] = False
-    loads = given = graph.add("Where", graph.constant(seen), "forces", graph.constant(np.zeros(1, dtype=np.float32)))
+        given = graph.add("Where", graph.constant(seen), given, graph.constant(np.zeros(1, dtype=np.float32)))
+    loads = given
     if response is not None:
         if n_dofs > MAX_RESPONSE_DOFS:
             raise UnavailableBackendError(
