@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from inspect import signature
@@ -60,23 +60,23 @@ def jobs_of(methods: Sequence[MethodSpec], profile: str, training: TrainingOptio
 
 
 def may_train(method: MethodSpec) -> bool:
-    """Whether a method trains; of a third party's, whose class is not imported here, nobody knows before it is fitted."""
-    if not method.surrogate.startswith("mor_bench."):
-        return True
-    try:
-        return bool(method.load_class().trains())
-    except MissingDependencyError:
-        return False
+    """Whether a method trains; of a third party's nobody knows before it is fitted."""
+    return _of_class(method, lambda surrogate: bool(surrogate.trains()), of_others=True)
 
 
 def may_draw(job: Job) -> bool:
-    """Whether a fit draws random numbers; a third party's, whose class is not imported here, is taken to do so if its file has iterations."""
-    if "iterations" in job.parameters or "seed" in job.parameters:
-        return True
-    if not job.method.surrogate.startswith("mor_bench."):
-        return False
+    """Whether a fit draws random numbers; a third party's is taken to do so if its file has iterations or a seed."""
+    return _of_class(
+        job.method, lambda surrogate: "seed" in signature(surrogate).parameters, of_others=bool({"iterations", "seed"} & set(job.parameters))
+    )
+
+
+def _of_class(method: MethodSpec, question: Callable[[type[Any]], bool], of_others: bool) -> bool:
+    """The answer for a method's class; `of_others` for a third party's, which is not imported here, and no where a dependency is missing."""
+    if not method.surrogate.startswith("mor_bench."):
+        return of_others
     try:
-        return "seed" in signature(job.method.load_class()).parameters
+        return question(method.load_class())
     except MissingDependencyError:
         return False
 
