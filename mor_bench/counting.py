@@ -97,7 +97,9 @@ def uncounted() -> Iterator[None]:
 def cholesky_multiply_adds(n: int, bandwidth: int) -> int:
     """Of a Cholesky factorisation: (n, n) with ``bandwidth`` entries beside the diagonal, n - 1 for a dense matrix."""
     below = n * bandwidth - bandwidth * (bandwidth + 1) // 2
-    updates = (n - bandwidth) * bandwidth * (bandwidth + 1) // 2 + (bandwidth - 1) * bandwidth * (bandwidth + 1) // 6
+    updates = (n - bandwidth) * bandwidth * (bandwidth + 1) // 2 + (bandwidth - 1) * bandwidth * (
+        bandwidth + 1
+    ) // 6
     return n + below + updates
 
 

@@ -46,7 +46,10 @@ class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
-Cells = Annotated[tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], Field(strict=False)]
+Cells = Annotated[
+    tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]],
+    Field(strict=False),
+]
 Size = Annotated[tuple[Positive, Positive, Positive], Field(strict=False)]
 
 
@@ -69,12 +72,16 @@ class LShapeGeometry(BoxGeometry):
     """A box without the cells in its corner of highest x and highest z: an arm along x, and a column on its end."""
 
     shape: Literal["l-shape"]  # type: ignore[assignment]
-    cut_cells: Annotated[tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], Field(strict=False)]
+    cut_cells: Annotated[
+        tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]], Field(strict=False)
+    ]
 
     @model_validator(mode="after")
     def _leaves_an_l(self) -> LShapeGeometry:
         if self.cut_cells[0] >= self.cells[0] or self.cut_cells[1] >= self.cells[2]:
-            raise ValueError(f"`cut_cells` must be less than the {self.cells[0]} cells along x and the {self.cells[2]} along z; got {self.cut_cells}")
+            raise ValueError(
+                f"`cut_cells` must be less than the {self.cells[0]} cells along x and the {self.cells[2]} along z; got {self.cut_cells}"
+            )
         return self
 
 
@@ -174,7 +181,10 @@ class FileGeometry(_Model):
     unit_m: Positive = 1.0
 
 
-Geometry = Annotated[BoxGeometry | LShapeGeometry | VoxelsGeometry | TetrahedraGeometry | FileGeometry, Field(discriminator="shape")]
+Geometry = Annotated[
+    BoxGeometry | LShapeGeometry | VoxelsGeometry | TetrahedraGeometry | FileGeometry,
+    Field(discriminator="shape"),
+]
 
 
 class Discretisation(_Model):
@@ -186,7 +196,9 @@ class Discretisation(_Model):
     @model_validator(mode="after")
     def _has_points_to_spare(self) -> Discretisation:
         if self.element == "tetrahedron" and self.integration == "selective":
-            raise ValueError("`integration` of tetrahedra must be 'full', since they have one quadrature point; got 'selective'")
+            raise ValueError(
+                "`integration` of tetrahedra must be 'full', since they have one quadrature point; got 'selective'"
+            )
         return self
 
 
@@ -222,13 +234,19 @@ class OgdenMaterial(_Model):
     @model_validator(mode="after")
     def _stable_terms(self) -> OgdenMaterial:
         if len(self.mu_pa) != len(self.alpha):
-            raise ValueError(f"`mu_pa` and `alpha` must have equal lengths; got {len(self.mu_pa)} and {len(self.alpha)}")
+            raise ValueError(
+                f"`mu_pa` and `alpha` must have equal lengths; got {len(self.mu_pa)} and {len(self.alpha)}"
+            )
         if not all(mu * alpha > 0 for mu, alpha in zip(self.mu_pa, self.alpha, strict=True)):
-            raise ValueError(f"every product of `mu_pa` and `alpha` must be > 0; got {self.mu_pa} and {self.alpha}")
+            raise ValueError(
+                f"every product of `mu_pa` and `alpha` must be > 0; got {self.mu_pa} and {self.alpha}"
+            )
         return self
 
 
-MaterialSpec = Annotated[TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial, Field(discriminator="law")]
+MaterialSpec = Annotated[
+    TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial, Field(discriminator="law")
+]
 
 
 class BoxRegion(_Model):
@@ -266,8 +284,12 @@ class NearSurfaceRegion(_Model):
 NamedRegion = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max", "surface"]
 
 _REGIONS: dict[str, type[BaseModel]] = {
-    "box_m": BoxRegion, "sphere_m": SphereRegion, "nearest_m": NearestRegion, "point_set": PointSetRegion, "near_surface": NearSurfaceRegion,
-}  # fmt: skip
+    "box_m": BoxRegion,
+    "sphere_m": SphereRegion,
+    "nearest_m": NearestRegion,
+    "point_set": PointSetRegion,
+    "near_surface": NearSurfaceRegion,
+}
 
 
 def _kind_of_region(value: Any) -> str:
@@ -285,7 +307,9 @@ _Placed = (
     | Annotated[NearSurfaceRegion, Tag("by near_surface")]
 )
 Region = Annotated[Annotated[NamedRegion, Tag("name")] | _Placed, Discriminator(_kind_of_region)]
-Outputs = Annotated[Annotated[Literal["all"] | NamedRegion, Tag("name")] | _Placed, Discriminator(_kind_of_region)]
+Outputs = Annotated[
+    Annotated[Literal["all"] | NamedRegion, Tag("name")] | _Placed, Discriminator(_kind_of_region)
+]
 _BRANCHES = {
     "geometry": ("box", "l-shape", "voxels", "tetrahedra", "file"),
     "region": ("name", *(f"by {key}" for key in _REGIONS)),
@@ -343,7 +367,10 @@ class Loads(_Model):
     samples_per_patch: Annotated[int, Field(ge=1)] | None = None
     samples: Annotated[int, Field(ge=1)] | None = None
     magnitude_n: Annotated[
-        tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], Annotated[float, Field(ge=1e-12, le=1e12)]],
+        tuple[
+            Annotated[float, Field(ge=0, allow_inf_nan=False)],
+            Annotated[float, Field(ge=1e-12, le=1e12)],
+        ],
         Field(strict=False),
     ]
     sampling: Sampling = "random"
@@ -361,11 +388,17 @@ class Loads(_Model):
         if (self.samples_per_patch is None) == (self.samples is None):
             raise ValueError("exactly one of `samples_per_patch` and `samples` must be given")
         if self.simultaneous > 1 and self.samples is None:
-            raise ValueError("with `simultaneous` > 1 `samples` must be given, not `samples_per_patch`")
+            raise ValueError(
+                "with `simultaneous` > 1 `samples` must be given, not `samples_per_patch`"
+            )
         if (self.simultaneous > 1) != (self.min_distance_m is not None):
-            raise ValueError(f"`min_distance_m` must be given with `simultaneous` > 1 and only then; got `simultaneous` {self.simultaneous}")
+            raise ValueError(
+                f"`min_distance_m` must be given with `simultaneous` > 1 and only then; got `simultaneous` {self.simultaneous}"
+            )
         if self.kind == "normal" and self.magnitude_n[0] == self.magnitude_n[1]:
-            raise ValueError(f"`magnitude_n` of normal forces must be a range, or samples would repeat; got {self.magnitude_n}")
+            raise ValueError(
+                f"`magnitude_n` of normal forces must be a range, or samples would repeat; got {self.magnitude_n}"
+            )
         return self
 
 
@@ -430,7 +463,11 @@ Side = Annotated[int, Field(ge=2, le=1024)]
 def _without_paths(value: Any) -> Any:
     """A copy in which a file is known by its content, wherever it lies."""
     if isinstance(value, dict):
-        return {key: _without_paths(item) for key, item in value.items() if not (key == "path" and "sha256" in value)}
+        return {
+            key: _without_paths(item)
+            for key, item in value.items()
+            if not (key == "path" and "sha256" in value)
+        }
     return [_without_paths(item) for item in value] if isinstance(value, list) else value
 
 
@@ -470,7 +507,11 @@ class DatasetSpec(_AnyDataset):
     tests: ExtraTests = ExtraTests()
 
     def physics(self) -> dict[str, Any]:
-        dumped = self.model_dump(mode="json", include={"geometry", "discretisation", "material", "supports", "loads"}, exclude_none=True)
+        dumped = self.model_dump(
+            mode="json",
+            include={"geometry", "discretisation", "material", "supports", "loads"},
+            exclude_none=True,
+        )
         physics: dict[str, Any] = _without_paths(dumped)
         # Solvers agree to the tolerance only; the default one leaves no trace.
         return physics if self.solver == "auto" else {**physics, "solver": self.solver}
@@ -496,7 +537,9 @@ class ImportedDatasetSpec(_AnyDataset):
     split: ImportedSplit = ImportedSplit()
 
     def physics(self) -> dict[str, Any]:
-        physics: dict[str, Any] = _without_paths(self.model_dump(mode="json", include={"snapshots"}))
+        physics: dict[str, Any] = _without_paths(
+            self.model_dump(mode="json", include={"snapshots"})
+        )
         return physics
 
 
@@ -600,7 +643,10 @@ class MethodSpec(_Model):
     def configurations(self, profile: str) -> list[dict[str, Any]]:
         """The parameters of every swept configuration, first key slowest."""
         sweep = self._sweep_of(profile)
-        return [{**self.parameters_of(profile), **dict(zip(sweep, row, strict=True))} for row in itertools.product(*sweep.values())]
+        return [
+            {**self.parameters_of(profile), **dict(zip(sweep, row, strict=True))}
+            for row in itertools.product(*sweep.values())
+        ]
 
 
 def load_class(target: str, folder: Path | None = None) -> type[Any]:
@@ -620,10 +666,14 @@ def load_class(target: str, folder: Path | None = None) -> type[Any]:
         loaded = import_module(module)
     except ModuleNotFoundError as error:
         if error.name == "torch":
-            raise MissingDependencyError(f"{target} needs torch: pip install 'mor-bench[learn]'") from error
+            raise MissingDependencyError(
+                f"{target} needs torch: pip install 'mor-bench[learn]'"
+            ) from error
         raise SpecError(f"surrogate {target!r} cannot be imported: {error}") from error
     if not hasattr(loaded, name):
-        raise SpecError(f"surrogate {target!r}: module {module!r} has no class {name!r}{_nearest(name, dir(loaded))}")
+        raise SpecError(
+            f"surrogate {target!r}: module {module!r} has no class {name!r}{_nearest(name, dir(loaded))}"
+        )
     found = getattr(loaded, name)
     if not isinstance(found, type):
         raise SpecError(f"surrogate {target!r} is not a class.")
@@ -647,14 +697,22 @@ def _models_within(annotation: Any) -> Iterator[type[BaseModel]]:
 def _is_branch(model: type[BaseModel], step: int | str) -> bool:
     """Whether a step of an error's location is the alternative that a model stands for: a region's key, or a shape or law."""
     named = isinstance(step, str) and step.removeprefix("by ") in model.model_fields
-    return named or any(step in get_args(field.annotation) for field in model.model_fields.values() if get_origin(field.annotation) is Literal)
+    return named or any(
+        step in get_args(field.annotation)
+        for field in model.model_fields.values()
+        if get_origin(field.annotation) is Literal
+    )
 
 
 def _valid_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     """The keys that the table at a location may hold."""
     models = [model]
     for step in location:
-        fields = [m.model_fields[step].annotation for m in models if isinstance(step, str) and step in m.model_fields]
+        fields = [
+            m.model_fields[step].annotation
+            for m in models
+            if isinstance(step, str) and step in m.model_fields
+        ]
         within = [found for field in fields for found in _models_within(field)]
         models = within if fields else [m for m in models if _is_branch(m, step)] or models
     return sorted({key for m in models for key in m.model_fields if key != "name"})
@@ -666,7 +724,11 @@ def _one_line(error: ValidationError, model: type[BaseModel], where: str) -> str
     unknown = [p for p in problems if p["type"] == "extra_forbidden"]
     problem = (unknown or problems)[0]
     location = problem["loc"]
-    shown = [s for i, s in enumerate(location) if not (i and s in _BRANCHES.get(str(location[i - 1]), ()))]
+    shown = [
+        s
+        for i, s in enumerate(location)
+        if not (i and s in _BRANCHES.get(str(location[i - 1]), ()))
+    ]
     key = "".join(f"[{s}]" if isinstance(s, int) else f".{s}" for s in shown).lstrip(".")
     if problem["type"] == "extra_forbidden":
         valid = _valid_keys(model, problem["loc"][:-1])
@@ -681,16 +743,35 @@ def _one_line(error: ValidationError, model: type[BaseModel], where: str) -> str
         return f"{where}: key `{key}.{problem['ctx']['discriminator'].strip(chr(39))}` is missing."
     if problem["type"] == "missing":
         return f"{where}: key `{key}` is missing."
-    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input should be ").rstrip(".")
-    alternatives = [p for p in problems if p["loc"][:1] == location[:1] and p["msg"].startswith("Input should be ")]
-    if len(location) == 2 and len(alternatives) > 1 and not list(_models_within(model.model_fields[str(location[0])].annotation)):
+    message = (
+        problem["msg"].removeprefix("Value error, ").removeprefix("Input should be ").rstrip(".")
+    )
+    alternatives = [
+        p
+        for p in problems
+        if p["loc"][:1] == location[:1] and p["msg"].startswith("Input should be ")
+    ]
+    if (
+        len(location) == 2
+        and len(alternatives) > 1
+        and not list(_models_within(model.model_fields[str(location[0])].annotation))
+    ):
         # A knob of several types: each alternative has a problem, and a step of its own in the location.
-        key, message = str(location[0]), " or ".join(p["msg"].removeprefix("Input should be ") for p in alternatives)
+        key, message = (
+            str(location[0]),
+            " or ".join(p["msg"].removeprefix("Input should be ") for p in alternatives),
+        )
     came = "" if problem["type"] == "value_error" and not key else f"; got {problem['input']!r}"
-    return f"{where}: `{key}` must be {message}{came}." if problem["msg"].startswith("Input should") else f"{where}: `{key}`: {message}{came}."
+    return (
+        f"{where}: `{key}` must be {message}{came}."
+        if problem["msg"].startswith("Input should")
+        else f"{where}: `{key}`: {message}{came}."
+    )
 
 
-def _validated(model: type[_M], content: Mapping[str, Any], where: str, folder: Path | None = None) -> _M:
+def _validated(
+    model: type[_M], content: Mapping[str, Any], where: str, folder: Path | None = None
+) -> _M:
     try:
         return model.model_validate(dict(content), context=folder)
     except ValidationError as error:
@@ -726,7 +807,10 @@ def find_suite(suite: Path | None = None) -> Path:
 
 def list_suite(kind: Literal["datasets", "methods"], suite: Path | None = None) -> dict[str, Path]:
     """Names and files of the suite's datasets or methods, sorted by name."""
-    return {path.stem: path for path in sorted((find_suite(suite) / kind).glob("*.toml"), key=lambda path: path.stem)}
+    return {
+        path.stem: path
+        for path in sorted((find_suite(suite) / kind).glob("*.toml"), key=lambda path: path.stem)
+    }
 
 
 def _resolve(kind: Literal["datasets", "methods"], source: str | Path, suite: Path | None) -> Path:
@@ -736,17 +820,23 @@ def _resolve(kind: Literal["datasets", "methods"], source: str | Path, suite: Pa
     if source not in known and suite is not None:
         known = {**list_suite(kind), **known}
     if source not in known:
-        raise SpecError(f"unknown {kind[:-1]} {source!r}{_nearest(source, known)} Known: {', '.join(known)}.")
+        raise SpecError(
+            f"unknown {kind[:-1]} {source!r}{_nearest(source, known)} Known: {', '.join(known)}."
+        )
     return known[source]
 
 
-def load_dataset_spec(source: str | Path | Mapping[str, Any], suite: Path | None = None) -> AnyDatasetSpec:
+def load_dataset_spec(
+    source: str | Path | Mapping[str, Any], suite: Path | None = None
+) -> AnyDatasetSpec:
     """Read and validate a dataset: a name in the suite, the path of a TOML, or a dict with the same keys.
 
     One with a table `snapshots` is an imported one.
     """
     if not isinstance(source, str | Path | Mapping):
-        raise SpecError(f"a dataset must be a name, the path of a TOML or a dict; got {type(source).__name__}.")
+        raise SpecError(
+            f"a dataset must be a name, the path of a TOML or a dict; got {type(source).__name__}."
+        )
     if isinstance(source, Mapping):
         content = {"name": "scene", **source}
         return _validated_dataset({"title": content["name"], "source": "", **content}, "scene")
@@ -754,13 +844,17 @@ def load_dataset_spec(source: str | Path | Mapping[str, Any], suite: Path | None
     return _validated_dataset({**_read_toml(path), "name": path.stem}, str(path), path.parent)
 
 
-def _validated_dataset(content: Mapping[str, Any], where: str, folder: Path | None = None) -> AnyDatasetSpec:
+def _validated_dataset(
+    content: Mapping[str, Any], where: str, folder: Path | None = None
+) -> AnyDatasetSpec:
     if "snapshots" in content:
         return _validated(ImportedDatasetSpec, content, where, folder)
     return _validated(DatasetSpec, content, where, folder)
 
 
-def load_generated_spec(source: str | Path | Mapping[str, Any], suite: Path | None = None) -> DatasetSpec:
+def load_generated_spec(
+    source: str | Path | Mapping[str, Any], suite: Path | None = None
+) -> DatasetSpec:
     """As `load_dataset_spec`, of a dataset whose samples are generated here.
 
     Raises
@@ -782,11 +876,17 @@ def load_method_spec(source: str | Path, suite: Path | None = None) -> MethodSpe
     """Read and validate a method: a name in the suite or the path of a TOML."""
     path = _resolve("methods", source, suite)
     content = _read_toml(path)
-    folder = None if str(content.get("surrogate", "")).startswith("mor_bench.") else path.parent.resolve()
+    folder = (
+        None
+        if str(content.get("surrogate", "")).startswith("mor_bench.")
+        else path.parent.resolve()
+    )
     return _validated(MethodSpec, {**content, "name": path.stem, "folder": folder}, str(path))
 
 
-def check_parameters(surrogate: type[Any], parameters: Mapping[str, Any], where: str | None = None) -> dict[str, Any]:
+def check_parameters(
+    surrogate: type[Any], parameters: Mapping[str, Any], where: str | None = None
+) -> dict[str, Any]:
     """Check knobs against the annotations of a surrogate's ``__init__`` and fill in its defaults.
 
     The annotations may carry pydantic's `Field` constraints, e.g. ``Annotated[int, Field(ge=1)]``.
@@ -801,8 +901,16 @@ def check_parameters(surrogate: type[Any], parameters: Mapping[str, Any], where:
     else:
         hints = get_type_hints(surrogate.__init__, include_extras=True)
         knobs = list(inspect.signature(surrogate.__init__).parameters.values())[1:]
-        fields = {knob.name: (hints.get(knob.name, Any), ... if knob.default is knob.empty else knob.default) for knob in knobs}
-    model = create_model(surrogate.__name__, __config__=ConfigDict(extra="forbid", strict=True), **fields)
+        fields = {
+            knob.name: (
+                hints.get(knob.name, Any),
+                ... if knob.default is knob.empty else knob.default,
+            )
+            for knob in knobs
+        }
+    model = create_model(
+        surrogate.__name__, __config__=ConfigDict(extra="forbid", strict=True), **fields
+    )
     return _validated(model, parameters, where or surrogate.__name__).model_dump()
 
 

@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mor_bench.errors import InvalidInputError, MorBenchError, NotFittedError, StoreError, UnknownRangeError, UnsupportedSceneError
+from mor_bench.errors import (
+    InvalidInputError,
+    MorBenchError,
+    NotFittedError,
+    StoreError,
+    UnknownRangeError,
+    UnsupportedSceneError,
+)
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.load_range import LoadRange
@@ -78,13 +85,23 @@ TIMING = "timing."
 
 def size_arrays(sizes: dict[str, Any]) -> dict[str, NDArray[Any]]:
     """Values chosen for knobs, as arrays that a file can hold: words as the bytes of their letters."""
-    return {SIZE + name: np.frombuffer(value.encode(), np.uint8) if isinstance(value, str) else np.array([value]) for name, value in sizes.items()}
+    return {
+        SIZE + name: np.frombuffer(value.encode(), np.uint8)
+        if isinstance(value, str)
+        else np.array([value])
+        for name, value in sizes.items()
+    }
 
 
 def take_sizes(state: dict[str, NDArray[Any]]) -> dict[str, Any]:
     """The values that `size_arrays` wrote, which are taken out of a model's arrays."""
-    found = {name.removeprefix(SIZE): state.pop(name) for name in list(state) if name.startswith(SIZE)}
-    return {name: array.tobytes().decode() if array.dtype == np.uint8 else array.item() for name, array in found.items()}
+    found = {
+        name.removeprefix(SIZE): state.pop(name) for name in list(state) if name.startswith(SIZE)
+    }
+    return {
+        name: array.tobytes().decode() if array.dtype == np.uint8 else array.item()
+        for name, array in found.items()
+    }
 
 
 class Surrogate(ABC):
@@ -206,7 +223,9 @@ class Surrogate(ABC):
         elif hasattr(self, "range_"):
             flags = self.range_.excludes(batch)
         elif self.scene_.observed_nodes is not None:
-            raise UnknownRangeError(f"{self.scene_.name}: which loads are like those of training cannot be told: {NO_FORCES}.")
+            raise UnknownRangeError(
+                f"{self.scene_.name}: which loads are like those of training cannot be told: {NO_FORCES}."
+            )
         else:
             raise UnknownRangeError(
                 f"the loads that this {type(self).__name__} was trained on are not known: its `fit` does not check them by `_checked_snapshots`, "
@@ -240,14 +259,20 @@ class Surrogate(ABC):
 
         batch = self._checked_forces(forces)
         if self.scene_.observed_nodes is not None:
-            raise UnsupportedSceneError(f"{self.scene_.name}: no error can be indicated, for {NO_FORCES}.")
+            raise UnsupportedSceneError(
+                f"{self.scene_.name}: no error can be indicated, for {NO_FORCES}."
+            )
         predicted = np.asarray(displacements)
         if predicted.dtype.kind != "f" or predicted.shape != np.shape(forces):
-            raise InvalidInputError(f"`displacements` must be floats of shape {np.shape(forces)}; got {predicted.dtype} of shape {predicted.shape}.")
+            raise InvalidInputError(
+                f"`displacements` must be floats of shape {np.shape(forces)}; got {predicted.dtype} of shape {predicted.shape}."
+            )
         predicted = predicted.reshape(batch.shape).astype(np.float64, copy=False)
         left_out = np.delete(predicted, self.scene_.output_nodes, axis=1)
         if np.isnan(left_out).any():
-            raise InvalidInputError("`displacements` must be given at all nodes; those that `needs.outputs` leaves out hold NaN.")
+            raise InvalidInputError(
+                "`displacements` must be given at all nodes; those that `needs.outputs` leaves out hold NaN."
+            )
         if not hasattr(self, "_indicator") or self._indicator[0] is not self.scene_:
             self._indicator = self.scene_, ErrorIndicator(self.scene_)
         return self._indicator[1](batch, predicted)
@@ -257,7 +282,10 @@ class Surrogate(ABC):
         """The knobs and their values."""
         if type(self).__init__ is object.__init__:
             return {}
-        return {name: getattr(self, name) for name in list(inspect.signature(type(self).__init__).parameters)[1:]}
+        return {
+            name: getattr(self, name)
+            for name in list(inspect.signature(type(self).__init__).parameters)[1:]
+        }
 
     def save(self, path: str | Path) -> None:
         """Write the fitted model to one safetensors file: arrays, and a JSON header with class, knobs and scene.
@@ -278,10 +306,20 @@ class Surrogate(ABC):
             "parameters": json.dumps(self.parameters),
             "scene": self.scene_.spec.model_dump_json(),
         }
-        known = {RANGE + name: array for name, array in self.range_.arrays().items()} if hasattr(self, "range_") else {}
+        known = (
+            {RANGE + name: array for name, array in self.range_.arrays().items()}
+            if hasattr(self, "range_")
+            else {}
+        )
         sizes = size_arrays(getattr(self, "sizes_", {}))
-        timings = {TIMING + name: np.array([value]) for name, value in getattr(self, "timings_ms_", {}).items()}
-        arrays = {name: np.ascontiguousarray(array) for name, array in {**self._state(), **known, **sizes, **timings}.items()}
+        timings = {
+            TIMING + name: np.array([value])
+            for name, value in getattr(self, "timings_ms_", {}).items()
+        }
+        arrays = {
+            name: np.ascontiguousarray(array)
+            for name, array in {**self._state(), **known, **sizes, **timings}.items()
+        }
         header["sha256"] = _digest(header, arrays)
         write_atomically(Path(path), _in_order(serialise(arrays, metadata=header)))
 
@@ -310,7 +348,9 @@ class Surrogate(ABC):
         check_parameters(type(self), self.parameters)
         reason = self.supports(scene) or self._needs_forces(scene)
         if reason is not None:
-            raise UnsupportedSceneError(f"{type(self).__name__} cannot handle {scene.name}: {reason}")
+            raise UnsupportedSceneError(
+                f"{type(self).__name__} cannot handle {scene.name}: {reason}"
+            )
         for name in [name for name in vars(self) if name.endswith("_")]:
             delattr(self, name)
         self.scene_ = scene
@@ -323,10 +363,15 @@ class Surrogate(ABC):
     def _checked_snapshots(self, snapshots: Snapshots | None) -> Snapshots:
         """The training samples, which this method cannot do without; the range of their loads is remembered."""
         if snapshots is None or len(snapshots) == 0:
-            raise InvalidInputError(f"{type(self).__name__} needs at least one training sample; got none.")
+            raise InvalidInputError(
+                f"{type(self).__name__} needs at least one training sample; got none."
+            )
         displacements, vectors = snapshots.free_displacements, snapshots.loads.vectors
         shape = (len(snapshots), len(self.scene_.free_dofs))
-        if displacements.shape != shape or not {displacements.dtype.kind, vectors.dtype.kind} <= set("fiu"):
+        if displacements.shape != shape or not {
+            displacements.dtype.kind,
+            vectors.dtype.kind,
+        } <= set("fiu"):
             raise InvalidInputError(
                 f"the training samples must be real numbers, displacements of shape {shape}; got {displacements.dtype} of shape "
                 f"{displacements.shape} and forces in {vectors.dtype}."
@@ -334,7 +379,9 @@ class Surrogate(ABC):
         if not np.isfinite(displacements).all() or not np.isfinite(vectors).all():
             raise InvalidInputError("the training snapshots hold NaN or infinity.")
         if not displacements.any() or not vectors.any():
-            raise InvalidInputError("the training snapshots are all zero: nothing can be learned from them.")
+            raise InvalidInputError(
+                "the training snapshots are all zero: nothing can be learned from them."
+            )
         if self.scene_.observed_nodes is None:
             self.range_ = LoadRange.of(snapshots)
         return snapshots
@@ -351,14 +398,18 @@ class Surrogate(ABC):
         if array.dtype.kind not in "fiu":
             raise InvalidInputError(f"`forces` must hold real numbers; got dtype {array.dtype}.")
         if array.ndim not in (2, 3) or array.shape[-2:] != (n_nodes, 3):
-            raise InvalidInputError(f"`forces` must have shape ({n_nodes}, 3) or (n, {n_nodes}, 3); got {array.shape}.")
+            raise InvalidInputError(
+                f"`forces` must have shape ({n_nodes}, 3) or (n, {n_nodes}, 3); got {array.shape}."
+            )
         observed, unit = self.scene_.observed_nodes, "N"
         if observed is not None:
             seen, unit = np.zeros(array.shape, dtype=array.dtype), "m at the observed nodes"
             seen[..., observed, :] = array[..., observed, :]
             array = seen
         if not (np.abs(array) <= MAX_FORCE_N).all():
-            raise InvalidInputError(f"`forces` must be finite and at most {MAX_FORCE_N:g} {unit}; got {np.abs(array).max():g}.")
+            raise InvalidInputError(
+                f"`forces` must be finite and at most {MAX_FORCE_N:g} {unit}; got {np.abs(array).max():g}."
+            )
         return array.astype(np.float64, copy=False).reshape(-1, n_nodes, 3)
 
 
@@ -374,7 +425,9 @@ def _in_order(content: bytes) -> bytes:
 
 def _digest(header: dict[str, str], arrays: dict[str, NDArray[Any]]) -> str:
     """SHA-256 of all that a surrogate's file holds."""
-    digest = hashlib.sha256(json.dumps({key: header[key] for key in sorted(header) if key != "sha256"}).encode())
+    digest = hashlib.sha256(
+        json.dumps({key: header[key] for key in sorted(header) if key != "sha256"}).encode()
+    )
     for name in sorted(arrays):
         digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
         digest.update(np.ascontiguousarray(arrays[name]).tobytes())
@@ -406,7 +459,9 @@ def load_method(source: str | Path, **parameters: Any) -> Surrogate:
 def make_surrogate(surrogate: type[Any], parameters: dict[str, Any]) -> Surrogate:
     """Check the knobs and construct."""
     if not issubclass(surrogate, Surrogate):
-        raise MorBenchError(f"{surrogate.__module__}:{surrogate.__name__} is not a subclass of mor_bench.Surrogate.")
+        raise MorBenchError(
+            f"{surrogate.__module__}:{surrogate.__name__} is not a subclass of mor_bench.Surrogate."
+        )
     return surrogate(**check_parameters(surrogate, parameters))
 
 
@@ -423,7 +478,9 @@ def load_surrogate(path: str | Path) -> Surrogate:
     header, state = _read_model(path)
     known = {load_method_spec(file).surrogate for file in list_suite("methods").values()}
     if header.get("surrogate") not in known:
-        raise StoreError(f"{path}: class {header.get('surrogate')!r} is not named by any method of the suite.")
+        raise StoreError(
+            f"{path}: class {header.get('surrogate')!r} is not named by any method of the suite."
+        )
     return _fitted(path, load_class(header["surrogate"]), None, header, state)
 
 
@@ -432,7 +489,9 @@ def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surroga
     header, state = _read_model(path)
     expected = f"{surrogate.__module__}:{surrogate.__qualname__}"
     if header.get("surrogate") != expected:
-        raise StoreError(f"{path}: a model of class {header.get('surrogate')!r}; expected {expected!r}.")
+        raise StoreError(
+            f"{path}: a model of class {header.get('surrogate')!r}; expected {expected!r}."
+        )
     return _fitted(path, surrogate, scene, header, state)
 
 
@@ -450,21 +509,33 @@ def weights_to_start_from(path: str | Path, method: Surrogate) -> dict[str, NDAr
     surrogate = type(method)
     expected = f"{surrogate.__module__}:{surrogate.__qualname__}"
     if header.get("surrogate") != expected:
-        raise InvalidInputError(f"{path}: `start_from` must be a model of class {expected!r}; got one of {header.get('surrogate')!r}.")
+        raise InvalidInputError(
+            f"{path}: `start_from` must be a model of class {expected!r}; got one of {header.get('surrogate')!r}."
+        )
     try:
         saved = check_parameters(surrogate, json.loads(header["parameters"]))
     except (MorBenchError, KeyError, ValueError, TypeError, RecursionError) as error:
-        raise StoreError(f"{path}: its knobs are not those of a {surrogate.__qualname__}: {error}") from None
+        raise StoreError(
+            f"{path}: its knobs are not those of a {surrogate.__qualname__}: {error}"
+        ) from None
     unlike = [name for name in surrogate.architecture if saved[name] != method.parameters[name]]
     if unlike:
-        wanted, got = (", ".join(f"`{name}` {knobs[name]!r}" for name in unlike) for knobs in (method.parameters, saved))
-        raise InvalidInputError(f"{path}: `start_from` must be a model with {wanted}; got one with {got}.")
+        wanted, got = (
+            ", ".join(f"`{name}` {knobs[name]!r}" for name in unlike)
+            for knobs in (method.parameters, saved)
+        )
+        raise InvalidInputError(
+            f"{path}: `start_from` must be a model with {wanted}; got one with {got}."
+        )
     return state
 
 
 def fitting_arrays(
-    path: str | Path, state: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int | None, ...]], dtype: type[np.floating[Any]]
-) -> dict[str, NDArray[Any]]:  # fmt: skip
+    path: str | Path,
+    state: Mapping[str, NDArray[Any]],
+    shapes: Mapping[str, tuple[int | None, ...]],
+    dtype: type[np.floating[Any]],
+) -> dict[str, NDArray[Any]]:
     """Of the arrays of `weights_to_start_from` those of these names, which must be finite and of these shapes; None is any length but 0.
 
     Raises
@@ -478,9 +549,18 @@ def fitting_arrays(
         if name not in state or state[name].dtype != dtype:
             got = f"got {state[name].dtype}" if name in state else "it is missing"
             raise StoreError(f"{path}: `{name}` must be {np.dtype(dtype)}; {got}.")
-        array, wanted = state[name], ", ".join("at least 1" if length is None else str(length) for length in shape)
-        if array.ndim != len(shape) or 0 in array.shape or any(length not in (None, n) for n, length in zip(array.shape, shape, strict=True)):
-            raise InvalidInputError(f"{path}: to start from it here, `{name}` must be of shape ({wanted}); got {array.shape}.")
+        array, wanted = (
+            state[name],
+            ", ".join("at least 1" if length is None else str(length) for length in shape),
+        )
+        if (
+            array.ndim != len(shape)
+            or 0 in array.shape
+            or any(length not in (None, n) for n, length in zip(array.shape, shape, strict=True))
+        ):
+            raise InvalidInputError(
+                f"{path}: to start from it here, `{name}` must be of shape ({wanted}); got {array.shape}."
+            )
         if not np.isfinite(array).all():
             raise StoreError(f"{path}: `{name}` holds NaN or infinity.")
     return {name: state[name] for name in shapes}
@@ -494,37 +574,72 @@ def _read_model(path: str | Path) -> tuple[dict[str, str], dict[str, NDArray[Any
         with safe_open(str(path), framework="numpy") as file:
             header = file.metadata() or {}
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except (SafetensorError, OSError, ValueError, AttributeError, TypeError) as error:  # the last ones of a dtype that NumPy has not
+    except (
+        SafetensorError,
+        OSError,
+        ValueError,
+        AttributeError,
+        TypeError,
+    ) as error:  # the last ones of a dtype that NumPy has not
         raise StoreError(f"{path}: not a readable safetensors file: {error}") from None
     if header.get("format") != "mor-bench surrogate":
         raise StoreError(f"{path}: not a surrogate of mor-bench.")
     if header.get("schema_version") != str(SCHEMA_VERSION):
-        raise StoreError(f"{path}: schema version {header.get('schema_version')}; this version of mor-bench reads version {SCHEMA_VERSION}.")
+        raise StoreError(
+            f"{path}: schema version {header.get('schema_version')}; this version of mor-bench reads version {SCHEMA_VERSION}."
+        )
     if header.get("sha256") != _digest(header, state):
         raise StoreError(f"{path}: damaged: the checksum does not match.")
     return header, state
 
 
-def _fitted(path: str | Path, surrogate: type[Any], scene: Scene | None, header: dict[str, str], state: dict[str, NDArray[Any]]) -> Surrogate:
+def _fitted(
+    path: str | Path,
+    surrogate: type[Any],
+    scene: Scene | None,
+    header: dict[str, str],
+    state: dict[str, NDArray[Any]],
+) -> Surrogate:
     """The model that a file's content makes; without a scene at hand, of the scene in its header."""
     try:
         method = make_surrogate(surrogate, json.loads(header["parameters"]))
         method.scene_ = scene or load_scene(json.loads(header["scene"]))
-        ranges = {name.removeprefix(RANGE): state.pop(name) for name in list(state) if name.startswith(RANGE)}
+        ranges = {
+            name.removeprefix(RANGE): state.pop(name)
+            for name in list(state)
+            if name.startswith(RANGE)
+        }
         sizes = take_sizes(state)
-        timings = {name.removeprefix(TIMING): state.pop(name).item() for name in list(state) if name.startswith(TIMING)}
+        timings = {
+            name.removeprefix(TIMING): state.pop(name).item()
+            for name in list(state)
+            if name.startswith(TIMING)
+        }
         if not all(isinstance(value, float) and value > 0 for value in timings.values()):
             raise InvalidInputError(f"its times must be positive numbers; got {timings}.")
         if timings:
             method.timings_ms_ = timings
         if any(method.parameters.get(name) != "auto" for name in sizes):
-            raise InvalidInputError(f"it holds values for {', '.join(sorted(sizes))}, of which not all are to be chosen.")
+            raise InvalidInputError(
+                f"it holds values for {', '.join(sorted(sizes))}, of which not all are to be chosen."
+            )
         if sizes:
             check_parameters(surrogate, {**method.parameters, **sizes})
             method.sizes_ = sizes
         method._restore(state)
         if ranges:
             method.range_ = LoadRange.from_arrays(ranges, method.scene_.mesh.n_nodes)
-    except (MorBenchError, ArithmeticError, KeyError, ValueError, IndexError, TypeError, AttributeError, RecursionError) as error:
-        raise StoreError(f"{path}: its content does not make a {header['surrogate'].partition(':')[2]}: {error}") from None
+    except (
+        MorBenchError,
+        ArithmeticError,
+        KeyError,
+        ValueError,
+        IndexError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:
+        raise StoreError(
+            f"{path}: its content does not make a {header['surrogate'].partition(':')[2]}: {error}"
+        ) from None
     return method

@@ -31,7 +31,12 @@ class SlowFile:
     def __enter__(self) -> SlowFile:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self._file.close()
 
     def write(self, content: bytes) -> int:
@@ -55,12 +60,19 @@ class Generators:
         root = Path(__file__).parents[1]
         command = [sys.executable, "-m", "tests.generator_process", spec_json, str(shard_size)]
         pinned = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        self._process = subprocess.Popen(command, cwd=root, env=pinned, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._process = subprocess.Popen(
+            command, cwd=root, env=pinned, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
 
     def __enter__(self) -> Generators:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self._process.communicate()
 
     def _ask(self, *words: object) -> int:
@@ -85,7 +97,9 @@ def _serve(spec_json: str, shard_size: int) -> None:
 
     spec = DatasetSpec.model_validate_json(spec_json)
     module.SHARD_SIZE = shard_size
-    with tempfile.TemporaryDirectory() as folder:  # children inherit the model and the compiled kernels
+    with (
+        tempfile.TemporaryDirectory() as folder
+    ):  # children inherit the model and the compiled kernels
         module.generate(spec, limit=1, workers=1, cache=Path(folder))
     replaced: Any = store
     replaced.open = SlowFile

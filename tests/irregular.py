@@ -8,8 +8,12 @@ from mor_bench.scene.mesh import Mesh, box_mesh
 
 
 def irregular_box(
-    size_m: tuple[float, float, float], cells: tuple[int, int, int], tetrahedra: bool, jitter: float = 0.25, seed: int = 0
-) -> Mesh:  # fmt: skip
+    size_m: tuple[float, float, float],
+    cells: tuple[int, int, int],
+    tetrahedra: bool,
+    jitter: float = 0.25,
+    seed: int = 0,
+) -> Mesh:
     """A box whose nodes are moved by up to ``jitter`` of a cell and renumbered at random; those on faces stay on them."""
     generator = np.random.default_rng(seed)
     box = box_mesh(size_m, cells, tetrahedra)

@@ -49,12 +49,18 @@ def decaying(n_samples: int, n: int, rank: int, decades: float) -> Array:
 
 
 def off_identity(modes: Array, product: Any = None) -> float:
-    return float(np.linalg.norm(modes.T @ (modes if product is None else product @ modes) - np.eye(modes.shape[1])))
+    return float(
+        np.linalg.norm(
+            modes.T @ (modes if product is None else product @ modes) - np.eye(modes.shape[1])
+        )
+    )
 
 
 def left_over(snapshots: Array, modes: Array, product: Any = None) -> float:
     """What the modes leave of the snapshots, in the norm of the inner product; the modes are orthonormal in it."""
-    rest = snapshots - (snapshots if product is None else (product @ snapshots.T).T) @ modes @ modes.T
+    rest = (
+        snapshots - (snapshots if product is None else (product @ snapshots.T).T) @ modes @ modes.T
+    )
     return float(np.sqrt(np.vdot(rest, rest if product is None else (product @ rest.T).T)))
 
 
@@ -65,14 +71,23 @@ def test_200_modes_of_fast_decay_are_orthonormal(route: str, shape: tuple[int, i
 
 
 @pytest.mark.parametrize("route", ROUTES)
-def test_200_modes_are_orthonormal_in_the_stiffness_and_best_in_its_norm(route: str, coarse: Dataset, stiffness: Any) -> None:
+def test_200_modes_are_orthonormal_in_the_stiffness_and_best_in_its_norm(
+    route: str, coarse: Dataset, stiffness: Any
+) -> None:
     snapshots = coarse.train.free_displacements
-    assert off_identity(ROUTES[route](snapshots, 200, inner_product=stiffness).modes, stiffness) <= 1e-12
+    assert (
+        off_identity(ROUTES[route](snapshots, 200, inner_product=stiffness).modes, stiffness)
+        <= 1e-12
+    )
     found = ROUTES[route](snapshots, 10, inner_product=stiffness)
     # Singular values by another way: of the snapshots in coordinates in which the inner product is Euclidean.
     values = np.linalg.svd(snapshots @ np.linalg.cholesky(stiffness.toarray()), compute_uv=False)
-    np.testing.assert_allclose(found.singular_values[:10], values[:10], rtol=1e-3 if route == "streamed" else 1e-9)
-    assert left_over(snapshots, found.modes, stiffness) == pytest.approx(np.linalg.norm(values[10:]), rel=1e-3 if route == "streamed" else 1e-9)
+    np.testing.assert_allclose(
+        found.singular_values[:10], values[:10], rtol=1e-3 if route == "streamed" else 1e-9
+    )
+    assert left_over(snapshots, found.modes, stiffness) == pytest.approx(
+        np.linalg.norm(values[10:]), rel=1e-3 if route == "streamed" else 1e-9
+    )
 
 
 @pytest.mark.parametrize("route", ROUTES)
@@ -80,9 +95,16 @@ def test_200_modes_are_orthonormal_in_an_ill_conditioned_inner_product(route: st
     """Springs in a row, of stiffnesses that differ by eight decades: condition number 2e11."""
     n = 400
     springs = sp.diags_array(10.0 ** np.random.default_rng(0).uniform(-4, 4, n + 1))
-    stretches = sp.diags_array(np.array([np.ones(n), -np.ones(n)]), offsets=[0, -1], shape=(n + 1, n))
+    stretches = sp.diags_array(
+        np.array([np.ones(n), -np.ones(n)]), offsets=[0, -1], shape=(n + 1, n)
+    )
     product = sp.csr_array(stretches.T @ springs @ stretches)
-    assert off_identity(ROUTES[route](decaying(300, n, 250, 6), 200, inner_product=product).modes, product) <= 1e-12
+    assert (
+        off_identity(
+            ROUTES[route](decaying(300, n, 250, 6), 200, inner_product=product).modes, product
+        )
+        <= 1e-12
+    )
 
 
 def test_the_randomised_basis_is_nearly_the_exact_one(coarse: Dataset) -> None:
@@ -92,12 +114,16 @@ def test_the_randomised_basis_is_nearly_the_exact_one(coarse: Dataset) -> None:
         best = left_over(snapshots, exact.modes)
         assert best * (1 - 1e-9) <= left_over(snapshots, found.modes) <= best * (1 + 1e-4)
         np.testing.assert_allclose(found.singular_values, exact.singular_values[:r], rtol=2e-3)
-        np.testing.assert_allclose(found.singular_values[: r // 2], exact.singular_values[: r // 2], rtol=1e-6)
+        np.testing.assert_allclose(
+            found.singular_values[: r // 2], exact.singular_values[: r // 2], rtol=1e-6
+        )
         leading = exact.modes[:, : r // 2]
         assert np.linalg.norm(leading - found.modes @ (found.modes.T @ leading), 2) <= 1e-3
 
 
-def test_the_streamed_decomposition_is_the_same_in_every_run_and_however_it_is_cut(coarse: Dataset) -> None:
+def test_the_streamed_decomposition_is_the_same_in_every_run_and_however_it_is_cut(
+    coarse: Dataset,
+) -> None:
     snapshots = coarse.train.free_displacements
     first = in_blocks(snapshots, 20).modes
     np.testing.assert_array_equal(in_blocks(snapshots, 20).modes, first)
@@ -109,14 +135,21 @@ def test_a_dataset_is_decomposed_as_it_is_read(cache: Path) -> None:
     data = mor_bench.load_dataset("beam-tiny", cache=cache, workers=1)
     whole = np.vstack([part.free_displacements for part in stream("beam-tiny", cache=cache)])
     assert len(whole) == len(data.train) + len(data.test) + data.n_unused
-    found = pod_streamed(lambda: (part.free_displacements for part in stream("beam-tiny", cache=cache)), 5)
-    assert left_over(whole, found.modes) == pytest.approx(left_over(whole, pod(whole, 5).modes), rel=1e-4)
+    found = pod_streamed(
+        lambda: (part.free_displacements for part in stream("beam-tiny", cache=cache)), 5
+    )
+    assert left_over(whole, found.modes) == pytest.approx(
+        left_over(whole, pod(whole, 5).modes), rel=1e-4
+    )
 
 
 def test_streaming_never_holds_the_matrix() -> None:
     n_samples, n, rank, passes = 12_000, 1_500, 50, 0
     rng = np.random.default_rng(0)
-    left, right = rng.normal(size=(n_samples, rank)) * 0.7 ** np.arange(rank), rng.normal(size=(rank, n))
+    left, right = (
+        rng.normal(size=(n_samples, rank)) * 0.7 ** np.arange(rank),
+        rng.normal(size=(rank, n)),
+    )
 
     def blocks() -> Iterator[Array]:
         nonlocal passes
@@ -136,14 +169,20 @@ def test_streaming_never_holds_the_matrix() -> None:
 
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize(("tolerance", "decades"), [(0.3, 8), (1e-2, 8), (1e-4, 8), (0.6, 0.5)])
-def test_the_energy_left_out_decides_the_number_of_modes(route: str, tolerance: float, decades: float) -> None:
+def test_the_energy_left_out_decides_the_number_of_modes(
+    route: str, tolerance: float, decades: float
+) -> None:
     snapshots = decaying(400, 300, 200, decades)
     values = np.linalg.svd(snapshots, compute_uv=False)
     shares = np.sqrt(np.cumsum(values[::-1] ** 2)[::-1] / (values**2).sum())
-    assert ROUTES[route](snapshots, energy_tolerance=tolerance).modes.shape[1] == int((shares > tolerance).sum())
+    assert ROUTES[route](snapshots, energy_tolerance=tolerance).modes.shape[1] == int(
+        (shares > tolerance).sum()
+    )
 
 
-def test_a_large_matrix_is_decomposed_at_random_by_itself_and_falls_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_matrix_is_decomposed_at_random_by_itself_and_falls_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     snapshots = decaying(400, 700, 390, 6)
     exact = pod(snapshots)
     assert len(exact.singular_values) == 400
@@ -152,7 +191,9 @@ def test_a_large_matrix_is_decomposed_at_random_by_itself_and_falls_back(monkeyp
     assert len(pod(snapshots, 100).singular_values) == 100
     assert len(pod(snapshots, 101).singular_values) == 400  # too many of them to pay off
     assert len(pod(snapshots, energy_tolerance=0.5).singular_values) < 64
-    assert len(pod(snapshots, energy_tolerance=1e-3).singular_values) == 400  # so many that the search was given up
+    assert (
+        len(pod(snapshots, energy_tolerance=1e-3).singular_values) == 400
+    )  # so many that the search was given up
     assert pod(snapshots, energy_tolerance=1e-3).modes.shape[1] == _by_energy(exact, 1e-3)
 
 
@@ -161,20 +202,27 @@ def _by_energy(found: Basis, tolerance: float) -> int:
     return int((np.cumsum(squares[::-1])[::-1] > tolerance**2 * squares.sum()).sum())
 
 
-def test_a_remembered_decomposition_gives_what_a_fresh_one_gives(coarse: Dataset, stiffness: Any) -> None:
+def test_a_remembered_decomposition_gives_what_a_fresh_one_gives(
+    coarse: Dataset, stiffness: Any
+) -> None:
     snapshots = coarse.train.free_displacements
     with remembering():
         for r in (30, 10):
             np.testing.assert_array_equal(pod(snapshots.copy(), r).modes, pod(snapshots, r).modes)
         assert off_identity(pod(snapshots, 10, inner_product=stiffness).modes, stiffness) <= 1e-12
-        np.testing.assert_array_equal(pod(-2 * snapshots[:50], 10).singular_values, 2 * pod(snapshots[:50], 10).singular_values)
+        np.testing.assert_array_equal(
+            pod(-2 * snapshots[:50], 10).singular_values,
+            2 * pod(snapshots[:50], 10).singular_values,
+        )
     np.testing.assert_array_equal(pod(snapshots, 10).modes, pod(snapshots.copy(), 10).modes)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize("kind", ["duplicates", "one", "with zeros", "r above the rank"])
-def test_poor_snapshots_are_cut_to_their_rank(kind: str, route: str, weighted: bool, coarse: Dataset, stiffness: Any) -> None:
+def test_poor_snapshots_are_cut_to_their_rank(
+    kind: str, route: str, weighted: bool, coarse: Dataset, stiffness: Any
+) -> None:
     snapshots = coarse.train.free_displacements
     chosen, rank = {
         "duplicates": (np.repeat(snapshots[:4], 5, axis=0), 4),
@@ -183,7 +231,10 @@ def test_poor_snapshots_are_cut_to_their_rank(kind: str, route: str, weighted: b
         "r above the rank": (snapshots[:6], 6),
     }[kind]
     product = stiffness if weighted else None
-    with pytest.warns(UserWarning, match=f"20 modes were asked for, but the {len(chosen)} snapshots have rank {rank}"):
+    with pytest.warns(
+        UserWarning,
+        match=f"20 modes were asked for, but the {len(chosen)} snapshots have rank {rank}",
+    ):
         modes = ROUTES[route](chosen, 20, inner_product=product).modes
     assert modes.shape[1] == rank
     assert off_identity(modes, product) <= 1e-12
@@ -193,7 +244,13 @@ def test_poor_snapshots_are_cut_to_their_rank(kind: str, route: str, weighted: b
 @pytest.mark.parametrize("route", ROUTES)
 def test_bad_snapshots_are_refused(route: str, coarse: Dataset, stiffness: Any) -> None:
     good = coarse.train.free_displacements[:40]
-    bad = {"NaN": good.copy(), "infinity": good.copy(), "all zero": 0 * good, "shape": good[0][None, None], "real": good.astype(complex)}
+    bad = {
+        "NaN": good.copy(),
+        "infinity": good.copy(),
+        "all zero": 0 * good,
+        "shape": good[0][None, None],
+        "real": good.astype(complex),
+    }
     bad["NaN"][30, 3], bad["infinity"][30, 3] = np.nan, np.inf
     for said, snapshots in bad.items():
         with pytest.raises(InvalidInputError, match=said):
@@ -225,11 +282,19 @@ def test_blocks_that_disagree_are_refused(coarse: Dataset) -> None:
         pod_streamed(lambda: [good], energy_tolerance=1e-9)
 
 
-def test_the_inner_product_of_a_basis_does_not_change_what_its_span_answers(coarse: Dataset) -> None:
+def test_the_inner_product_of_a_basis_does_not_change_what_its_span_answers(
+    coarse: Dataset,
+) -> None:
     """With as many modes as samples both bases span the samples."""
     few, forces = coarse.train[:12], coarse.train.forces[:12]
-    plain, weighted = (PODGalerkin(12, 1e-12, inner_product=product).fit(coarse.scene, few) for product in ("euclidean", "stiffness"))
-    assert np.abs(plain.predict(forces) - weighted.predict(forces)).max() <= 1e-8 * np.abs(few.displacements).max()
+    plain, weighted = (
+        PODGalerkin(12, 1e-12, inner_product=product).fit(coarse.scene, few)
+        for product in ("euclidean", "stiffness")
+    )
+    assert (
+        np.abs(plain.predict(forces) - weighted.predict(forces)).max()
+        <= 1e-8 * np.abs(few.displacements).max()
+    )
     assert _faults(weighted, few, said=True) == []
     tangent = weighted.problem_.rest_tangent
     assert np.abs(tangent - np.eye(12)).max() <= 1e-9
@@ -242,7 +307,9 @@ def test_modes_of_a_method_by_energy(coarse: Dataset) -> None:
     fitted = PODGalerkin("energy", energy_tolerance=1e-2).fit(coarse.scene, coarse.train)
     assert fitted.modes_.shape[1] == _by_energy(pod(coarse.train.free_displacements), 1e-2)
     for wrong in (PODGalerkin("energy"), PODGalerkin(5, energy_tolerance=1e-2)):
-        with pytest.raises(InvalidInputError, match="`energy_tolerance` of PODGalerkin must be given with"):
+        with pytest.raises(
+            InvalidInputError, match="`energy_tolerance` of PODGalerkin must be given with"
+        ):
             wrong.fit(coarse.scene, coarse.train)
 
 

@@ -11,11 +11,27 @@ import pytest
 
 
 def mor_bench(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "mor_bench", *arguments], cwd=cwd, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-m", "mor_bench", *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def test_help_imports_nothing_heavy() -> None:
-    heavy = ["numpy", "scipy", "numba", "pandas", "torch", "matplotlib", "sklearn", "pydantic", "h5py"]
+    heavy = [
+        "numpy",
+        "scipy",
+        "numba",
+        "pandas",
+        "torch",
+        "matplotlib",
+        "sklearn",
+        "pydantic",
+        "h5py",
+    ]
     code = f"""
 import sys
 from typer.testing import CliRunner
@@ -34,7 +50,18 @@ def test_the_library_does_not_import_torch_unless_asked() -> None:
 
 
 def test_run_writes_everything_and_report_draws_it_again(tmp_path: Path, cache: Path) -> None:
-    options = ["-m", "linear-fem", "-m", "pod", "--cache", str(cache), "--out", "out", "--split", "sample"]
+    options = [
+        "-m",
+        "linear-fem",
+        "-m",
+        "pod",
+        "--cache",
+        str(cache),
+        "--out",
+        "out",
+        "--split",
+        "sample",
+    ]
     done = mor_bench("run", "beam-tiny", *options, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     results = json.loads(done.stdout)
@@ -57,7 +84,9 @@ def test_run_writes_everything_and_report_draws_it_again(tmp_path: Path, cache: 
 def test_list_and_check(tmp_path: Path) -> None:
     listed = json.loads(mor_bench("list", "--json", cwd=tmp_path).stdout)
     assert {"beam-coarse", "beam-tiny"} <= {entry["name"] for entry in listed["datasets"]}
-    assert {"fem", "pod", "hpod", "pca-regression", "umesh"} <= {entry["name"] for entry in listed["methods"]}
+    assert {"fem", "pod", "hpod", "pca-regression", "umesh"} <= {
+        entry["name"] for entry in listed["methods"]
+    }
     assert mor_bench("check", cwd=tmp_path).returncode == 0
     bad = tmp_path / "bad.toml"
     bad.write_text('title = "x"\nsurogate = "y"\n')
@@ -68,26 +97,68 @@ def test_list_and_check(tmp_path: Path) -> None:
 
 
 def test_refine_prints_and_keeps_its_record(tmp_path: Path) -> None:
-    done = mor_bench("refine", "beam-tiny", "--loads", "2", "--levels", "1", "--cache", "c", "--json", cwd=tmp_path)
+    done = mor_bench(
+        "refine",
+        "beam-tiny",
+        "--loads",
+        "2",
+        "--levels",
+        "1",
+        "--cache",
+        "c",
+        "--json",
+        cwd=tmp_path,
+    )
     assert done.returncode == 0, done.stderr
     (path,) = tmp_path.rglob("discretisation.json")
     assert json.loads(done.stdout) == json.loads(path.read_text())
-    again = mor_bench("refine", "beam-tiny", "--loads", "2", "--levels", "2", "--max-dofs", "1000", "--cache", "c", cwd=tmp_path)
+    again = mor_bench(
+        "refine",
+        "beam-tiny",
+        "--loads",
+        "2",
+        "--levels",
+        "2",
+        "--max-dofs",
+        "1000",
+        "--cache",
+        "c",
+        cwd=tmp_path,
+    )
     assert "left out for their size: 1,536 cells (6,075 dofs)" in again.stdout
     assert "discretisation error of beam-tiny: mean e " in again.stdout
 
 
 def test_generate_says_where(tmp_path: Path) -> None:
-    done = mor_bench("generate", "beam-tiny", "--limit", "100", "--workers", "1", "--cache", "c", cwd=tmp_path)
+    done = mor_bench(
+        "generate", "beam-tiny", "--limit", "100", "--workers", "1", "--cache", "c", cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     assert len(list((tmp_path / done.stdout.strip()).glob("shard-*.h5"))) == 1
 
 
 def test_generate_makes_the_test_sets_if_asked(tmp_path: Path) -> None:
-    done = mor_bench("generate", "beam-tiny", "--tests", "--limit", "5", "--workers", "1", "--cache", "c", cwd=tmp_path)
+    done = mor_bench(
+        "generate",
+        "beam-tiny",
+        "--tests",
+        "--limit",
+        "5",
+        "--workers",
+        "1",
+        "--cache",
+        "c",
+        cwd=tmp_path,
+    )
     assert done.returncode == 0, done.stderr
     folders = [Path(line) for line in done.stdout.splitlines()]
-    names = ["beam-tiny", *(f"beam-tiny--{name}" for name in ("in-range", "2x", "4x", "unseen-regions", "several-forces"))]
+    names = [
+        "beam-tiny",
+        *(
+            f"beam-tiny--{name}"
+            for name in ("in-range", "2x", "4x", "unseen-regions", "several-forces")
+        ),
+    ]
     assert [folder.name.rsplit("-", 2)[0] for folder in folders] == names
     assert all((tmp_path / folder / "shard-00000.h5").is_file() for folder in folders)
 
@@ -100,14 +171,37 @@ def test_generate_makes_the_test_sets_if_asked(tmp_path: Path) -> None:
         (["run", "--suite", "nowhere"], "nowhere: a suite must hold a folder"),
         (["report", "nowhere"], "no such file"),
         (["refine", "beam-tini"], "unknown dataset 'beam-tini'; did you mean 'beam-tiny'?"),
-        (["refine", "beam-tiny", "--levels", "0", "--cache", "."], "`levels` must be an integer in [1, 10]; got 0."),
-        (["refine", "beam-tiny", "--max-dofs", "900", "--cache", "."], "`max_dofs` must be at least 975"),
-        (["generate", "beam-tiny", "--workers", "2", "--cluster", "tcp://127.0.0.1:1", "--cache", "."], "`workers` and `cluster` exclude each other"),
-        (["generate", "beam-tiny", "--cluster", "host", "--cache", "."], "must be the address of a Dask scheduler, tcp://host:port; got 'host'"),
+        (
+            ["refine", "beam-tiny", "--levels", "0", "--cache", "."],
+            "`levels` must be an integer in [1, 10]; got 0.",
+        ),
+        (
+            ["refine", "beam-tiny", "--max-dofs", "900", "--cache", "."],
+            "`max_dofs` must be at least 975",
+        ),
+        (
+            [
+                "generate",
+                "beam-tiny",
+                "--workers",
+                "2",
+                "--cluster",
+                "tcp://127.0.0.1:1",
+                "--cache",
+                ".",
+            ],
+            "`workers` and `cluster` exclude each other",
+        ),
+        (
+            ["generate", "beam-tiny", "--cluster", "host", "--cache", "."],
+            "must be the address of a Dask scheduler, tcp://host:port; got 'host'",
+        ),
         (["run", "beam-tiny", "--threads", "100000"], "`threads` must be an integer in [1, "),
     ],
 )
-def test_errors_are_one_line_and_nothing_is_written(tmp_path: Path, arguments: list[str], message: str) -> None:
+def test_errors_are_one_line_and_nothing_is_written(
+    tmp_path: Path, arguments: list[str], message: str
+) -> None:
     done = mor_bench(*arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert message in done.stderr
@@ -115,8 +209,14 @@ def test_errors_are_one_line_and_nothing_is_written(tmp_path: Path, arguments: l
     assert not list(tmp_path.iterdir())
 
 
-def test_an_encoding_without_our_letters_stops_nothing(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONIOENCODING", "ascii")  # that of files and pipes on Windows lacks ē too
-    done = mor_bench("run", "beam-tiny", "-m", "linear-fem", "--out", "out", "--cache", str(cache), cwd=tmp_path)
+def test_an_encoding_without_our_letters_stops_nothing(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(
+        "PYTHONIOENCODING", "ascii"
+    )  # that of files and pipes on Windows lacks ē too
+    done = mor_bench(
+        "run", "beam-tiny", "-m", "linear-fem", "--out", "out", "--cache", str(cache), cwd=tmp_path
+    )
     assert done.returncode == 0, done.stderr
     assert "linear-fem" in done.stdout

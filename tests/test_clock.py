@@ -37,25 +37,40 @@ def timing(latencies: list[float], others: float = 0.0, own: float = 1.0) -> Tim
     times = np.repeat(np.resize(latencies, 10), 20).tolist()
     where = np.repeat(np.arange(10), 20)
     return Timing(
-        times, [0.01] * 200, (where // 5).tolist(), (where % 5).tolist(), [2.0] * 20, dict.fromkeys(map(str, BATCHES), 100.0), 10**8,
+        times,
+        [0.01] * 200,
+        (where // 5).tolist(),
+        (where % 5).tolist(),
+        [2.0] * 20,
+        dict.fromkeys(map(str, BATCHES), 100.0),
+        10**8,
         [(0.1, 0.1 * own, 0.1 * others)] * 10,
-    )  # fmt: skip
+    )
 
 
 def test_a_quiet_timing_is_stable_and_a_disturbed_one_is_not() -> None:
     assert why_unstable(timing([1.0, 1.01]), 1) == []
-    assert why_unstable(timing([1.0], others=1.0), 1) == ["other processes used about 1.0 cores meanwhile"]
+    assert why_unstable(timing([1.0], others=1.0), 1) == [
+        "other processes used about 1.0 cores meanwhile"
+    ]
     assert why_unstable(timing([1.0], own=0.5), 1) == ["its process had 50% of a core"]
     assert why_unstable(timing([1.0], own=0.5), 2) == []
     assert why_unstable(timing([1.0], own=1.9), 1) == ["it used 1.9 cores though pinned to one"]
     assert any("10 rounds spread" in reason for reason in why_unstable(timing([1.0, 1.5]), 1))
-    assert why_unstable(timing([1.0] * 5 + [1.5] * 5), 1)[-1] == "medians of 2 processes spread by 20%"
+    assert (
+        why_unstable(timing([1.0] * 5 + [1.5] * 5), 1)[-1] == "medians of 2 processes spread by 20%"
+    )
 
 
 def test_a_summary_says_all_of_it() -> None:
     latency = summary_of_timing(timing([1.0, 1.01]), (0.9, 1.1), 1)["latency_ms"]
     assert latency["low"] < latency["median"] < latency["high"]
-    assert (latency["n_queries"], latency["n_processes"], latency["stable"], latency["gc"]) == (200, 2, True, pytest.approx(0.01))
+    assert (latency["n_queries"], latency["n_processes"], latency["stable"], latency["gc"]) == (
+        200,
+        2,
+        True,
+        pytest.approx(0.01),
+    )
 
 
 def test_a_timing_comes_back_from_its_arrays() -> None:
@@ -78,16 +93,30 @@ def test_groups_fit_into_memory() -> None:
 
     half = 0.5 * virtual_memory().available
     openers = {
-        name: Opener(lambda nursery: pytest.fail("not opened"), size * half) for name, size in (("a", 0.3), ("b", 0.3), ("c", 0.9), ("d", 5.0))
+        name: Opener(lambda nursery: pytest.fail("not opened"), size * half)
+        for name, size in (("a", 0.3), ("b", 0.3), ("c", 0.9), ("d", 5.0))
     }
     assert _groups(openers) == [["a", "b"], ["c"], ["d"]]
 
 
-def opened(tiny: Dataset, surrogate: str, parameters: dict[str, object], folder: Path, nursery: Nursery | None) -> Worker:
+def opened(
+    tiny: Dataset,
+    surrogate: str,
+    parameters: dict[str, object],
+    folder: Path,
+    nursery: Nursery | None,
+) -> Worker:
     worker = Worker(tiny.scene, [], nursery=nursery)
     worker.ask(
-        "fit", 60.0, surrogate=surrogate, parameters=parameters, train=folder, model=folder / "model.safetensors", threads=1, limit_s=60.0
-    )  # fmt: skip
+        "fit",
+        60.0,
+        surrogate=surrogate,
+        parameters=parameters,
+        train=folder,
+        model=folder / "model.safetensors",
+        threads=1,
+        limit_s=60.0,
+    )
     return worker
 
 
@@ -98,18 +127,26 @@ def test_configurations_are_timed_in_turn_and_fail_alone(tiny: Dataset, tmp_path
     queries = Queries(tiny.test.forces, tiny.test.displacements, tiny.scene.output_nodes, tmp_path)
     openers = {
         "plain": Opener(partial(opened, tiny, "tests.third_party:Slowed", {}, tmp_path), 1e8),
-        "slow": Opener(partial(opened, tiny, "tests.third_party:Slowed", {"part": 4.0}, tmp_path), 1e8),
-        "broken": Opener(partial(opened, tiny, "tests.third_party:Broken", {"how": "crash"}, tmp_path), 1e8),
+        "slow": Opener(
+            partial(opened, tiny, "tests.third_party:Slowed", {"part": 4.0}, tmp_path), 1e8
+        ),
+        "broken": Opener(
+            partial(opened, tiny, "tests.third_party:Broken", {"how": "crash"}, tmp_path), 1e8
+        ),
         "dead": Opener(dead, 1e8),
     }
     turns: list[int] = []
-    timings = measure(openers, queries, PROTOCOLS["quick"], 1, lambda done, total: turns.append(done))
+    timings = measure(
+        openers, queries, PROTOCOLS["quick"], 1, lambda done, total: turns.append(done)
+    )
     assert timings["dead"].failed == "it does not open"
     assert "crashed with ZeroDivisionError" in str(timings["broken"].failed)
     for name in ("plain", "slow"):
         samples = timings[name].samples
         assert len(samples["latency_ms"]) >= LEAST_QUERIES or samples["used"][:, 0].max() > MOST_S
-        assert {tuple(pair) for pair in zip(samples["process"], samples["round"], strict=True)} == {(p, r) for p in range(2) for r in range(5)}
+        assert {tuple(pair) for pair in zip(samples["process"], samples["round"], strict=True)} == {
+            (p, r) for p in range(2) for r in range(5)
+        }
         assert samples["used"][:, 0].min() >= CHUNK_S
         assert len(samples["all_threads_ms"]) >= 2
         assert set(timings[name].throughput) == {"8", "64", "512"}
@@ -118,13 +155,22 @@ def test_configurations_are_timed_in_turn_and_fail_alone(tiny: Dataset, tmp_path
     assert turns == sorted(turns)
 
 
-def test_answers_that_are_worse_while_timed_than_when_scored_are_found(tiny: Dataset, tmp_path: Path) -> None:
+def test_answers_that_are_worse_while_timed_than_when_scored_are_found(
+    tiny: Dataset, tmp_path: Path
+) -> None:
     queries = Queries(tiny.test.forces, tiny.test.displacements, tiny.scene.output_nodes, tmp_path)
     honest = Opener(partial(opened, tiny, "tests.third_party:Slowed", {}, tmp_path), 1e8)
     zero = Opener(partial(opened, tiny, "tests.third_party:Zero", {}, tmp_path), 1e8)
-    timings = measure({"honest": honest, "zero": zero}, queries, PROTOCOLS["quick"], 1, single_only=True)
-    scored = sample_errors(Slowed().fit(tiny.scene, None).predict(queries.forces), queries.references).relative_l2
+    timings = measure(
+        {"honest": honest, "zero": zero}, queries, PROTOCOLS["quick"], 1, single_only=True
+    )
+    scored = sample_errors(
+        Slowed().fit(tiny.scene, None).predict(queries.forces), queries.references
+    ).relative_l2
     assert 0 < np.median(scored) < 1e-4
     check_answers(timings["honest"], scored)
-    with pytest.raises(MethodFailedError, match=r"median relative l2 error is 1 while it is timed, on loads on which it was scored with \S+e-"):
+    with pytest.raises(
+        MethodFailedError,
+        match=r"median relative l2 error is 1 while it is timed, on loads on which it was scored with \S+e-",
+    ):
         check_answers(timings["zero"], scored)

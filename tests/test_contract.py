@@ -19,22 +19,44 @@ from mor_bench.specs import list_suite
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogate import _digest as file_digest
 
-CHEAP_UMESH = {"channels": 8, "steps": 1, "iterations": 150, "batch_size": 16, "learning_rate": 3e-3}
+CHEAP_UMESH = {
+    "channels": 8,
+    "steps": 1,
+    "iterations": 150,
+    "batch_size": 16,
+    "learning_rate": 3e-3,
+}
 CHEAP_PGD = {"n_terms": 20, "position_degree": 2}
 CHEAP: dict[str, dict[str, Any]] = {
-    "autoencoder": {"iterations": 100}, "pgd": CHEAP_PGD, "pgd-force": CHEAP_PGD, "umesh": CHEAP_UMESH, "umesh-small": CHEAP_UMESH,
+    "autoencoder": {"iterations": 100},
+    "pgd": CHEAP_PGD,
+    "pgd-force": CHEAP_PGD,
+    "umesh": CHEAP_UMESH,
+    "umesh-small": CHEAP_UMESH,
     "umesh-linear": CHEAP_UMESH,
-    "pca-gaussian-process": {"n_input_modes": 10, "n_optimised": 60}, "pca-random-forest": {"n_trees": 10}, "pca-extra-trees": {"n_trees": 10},
+    "pca-gaussian-process": {"n_input_modes": 10, "n_optimised": 60},
+    "pca-random-forest": {"n_trees": 10},
+    "pca-extra-trees": {"n_trees": 10},
     "pod-nn-force": {"iterations": 300, "n_hidden": 16},
-    "pod-nn": {"iterations": 300, "n_hidden": 16}, "pod-nn-derivative": {"iterations": 300, "n_hidden": 16},
-    "deeponet": {"iterations": 20}, "pod-deeponet": {"iterations": 20},
-    "fno": {"channels": 4, "layers": 2, "iterations": 10}, "mesh-graph-net": {"width": 8, "steps": 2, "iterations": 10},
-}  # fmt: skip
+    "pod-nn": {"iterations": 300, "n_hidden": 16},
+    "pod-nn-derivative": {"iterations": 300, "n_hidden": 16},
+    "deeponet": {"iterations": 20},
+    "pod-deeponet": {"iterations": 20},
+    "fno": {"channels": 4, "layers": 2, "iterations": 10},
+    "mesh-graph-net": {"width": 8, "steps": 2, "iterations": 10},
+}
 """Parameters that keep a costly method's battery short."""
 
 NEEDS_NO_SNAPSHOTS = (
-    "explicit-dynamics", "fem", "fem-coarse", "fem-jacobi-pcg", "fem-pardiso", "linear-fem", "modal-derivatives", "quadratic-manifold",
-)  # fmt: skip
+    "explicit-dynamics",
+    "fem",
+    "fem-coarse",
+    "fem-jacobi-pcg",
+    "fem-pardiso",
+    "linear-fem",
+    "modal-derivatives",
+    "quadratic-manifold",
+)
 
 GIVEN_FORCES = sorted(set(list_suite("methods")) - {"gappy-pod"})
 """All but those that complete observed displacements only, for which see `test_observation`."""
@@ -75,14 +97,18 @@ def test_supports_do_not_move(fitted: Surrogate, tiny: Dataset) -> None:
 
 def test_zero_force(fitted: Surrogate, tiny: Dataset) -> None:
     if fitted.parameters.get("zero_at_rest") is False:
-        pytest.skip("the published U-Mesh has biases and answers no force with a small displacement")
+        pytest.skip(
+            "the published U-Mesh has biases and answers no force with a small displacement"
+        )
     rms = np.sqrt((tiny.train.displacements**2).mean())
     assert np.linalg.norm(fitted.predict(np.zeros((tiny.scene.mesh.n_nodes, 3)))) <= 1e-3 * rms
 
 
 def test_prediction_is_far_better_than_none(fitted: Surrogate, tiny: Dataset) -> None:
     if fitted.parameters.get("input") == "force":
-        pytest.skip("from the force alone nothing is known of unseen load regions; see the method's limits")
+        pytest.skip(
+            "from the force alone nothing is known of unseen load regions; see the method's limits"
+        )
     forces, reference = tiny.train.forces[:40], tiny.train.displacements[:40]
     own = sample_errors(fitted.predict(forces), reference).mean_dof_m.mean()
     none = sample_errors(np.zeros_like(reference), reference).mean_dof_m.mean()
@@ -113,18 +139,27 @@ def test_bad_forces_are_refused(fitted: Surrogate, tiny: Dataset, bad: str) -> N
     assert isinstance(force, np.ndarray)
     if bad in ("nan", "inf", "1e155"):
         force[3, 1] = float(bad)
-    force = {"shape": force[:-1], "flat": force.ravel(), "complex": force + 1j, "text": force.astype(str)}.get(bad, force)
+    force = {
+        "shape": force[:-1],
+        "flat": force.ravel(),
+        "complex": force + 1j,
+        "text": force.astype(str),
+    }.get(bad, force)
     with pytest.raises(InvalidInputError, match="forces"):
         fitted.predict(force)
 
 
-def test_saved_and_loaded_predicts_the_same(fitted: Surrogate, tiny: Dataset, tmp_path: Path) -> None:
+def test_saved_and_loaded_predicts_the_same(
+    fitted: Surrogate, tiny: Dataset, tmp_path: Path
+) -> None:
     path = tmp_path / "model.safetensors"
     fitted.save(path)
     loaded = mor_bench.load_surrogate(path)
     assert type(loaded) is type(fitted)
     assert loaded.parameters == fitted.parameters
-    np.testing.assert_array_equal(loaded.predict(tiny.test.forces[:3]), fitted.predict(tiny.test.forces[:3]))
+    np.testing.assert_array_equal(
+        loaded.predict(tiny.test.forces[:3]), fitted.predict(tiny.test.forces[:3])
+    )
 
 
 @pytest.mark.parametrize("damage", ["truncated", "foreign", "class", "version", "bit"])
@@ -147,7 +182,9 @@ def test_damaged_files_are_refused(fitted: Surrogate, tmp_path: Path, damage: st
 
 
 @pytest.mark.parametrize("forgery", ["fewer rows", "nan", "knobs", "scene", "missing"])
-def test_forged_files_with_a_valid_checksum_are_refused(fitted: Surrogate, tmp_path: Path, forgery: str) -> None:
+def test_forged_files_with_a_valid_checksum_are_refused(
+    fitted: Surrogate, tmp_path: Path, forgery: str
+) -> None:
     """Nothing reaches a kernel, which checks no bounds, before its shape is checked."""
     path = tmp_path / "model.safetensors"
     fitted.save(path)
@@ -156,9 +193,15 @@ def test_forged_files_with_a_valid_checksum_are_refused(fitted: Surrogate, tmp_p
     if not arrays and forgery in ("fewer rows", "nan", "missing"):
         assert fitted.needs_snapshots is False
         return
-    first = sorted(name for name, array in arrays.items() if array.dtype.kind == "f")[0] if arrays else ""
+    first = (
+        sorted(name for name, array in arrays.items() if array.dtype.kind == "f")[0]
+        if arrays
+        else ""
+    )
     if forgery == "fewer rows":
-        arrays = {name: np.ascontiguousarray(array[: len(array) // 2]) for name, array in arrays.items()}
+        arrays = {
+            name: np.ascontiguousarray(array[: len(array) // 2]) for name, array in arrays.items()
+        }
     elif forgery == "nan":
         arrays[first] = np.full_like(arrays[first], np.nan)
     elif forgery == "missing":

@@ -14,7 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 import mor_bench
 from mor_bench import counting
-from mor_bench.counting import Cost, cholesky_multiply_adds, counted, triangular_multiply_adds, uncounted
+from mor_bench.counting import (
+    Cost,
+    cholesky_multiply_adds,
+    counted,
+    triangular_multiply_adds,
+    uncounted,
+)
 from mor_bench.errors import SolverError
 from mor_bench.harness.cost import cost_of
 from mor_bench.mechanics import kernels, laws
@@ -42,10 +48,18 @@ class Counted:
         return Counted(value)
 
     def __mul__(self, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else self._times(self.value * float(other))
+        return (
+            NotImplemented
+            if isinstance(other, np.ndarray)
+            else self._times(self.value * float(other))
+        )
 
     def __truediv__(self, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else self._times(self.value / float(other))
+        return (
+            NotImplemented
+            if isinstance(other, np.ndarray)
+            else self._times(self.value / float(other))
+        )
 
     def __pow__(self, other: Any) -> Counted:
         return self._times(self.value ** float(other))
@@ -57,13 +71,17 @@ class Counted:
         return self._times(float(other) / self.value)
 
     def __add__(self, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else Counted(self.value + float(other))
+        return (
+            NotImplemented if isinstance(other, np.ndarray) else Counted(self.value + float(other))
+        )
 
     def __radd__(self, other: Any) -> Any:
         return self + other
 
     def __sub__(self, other: Any) -> Any:
-        return NotImplemented if isinstance(other, np.ndarray) else Counted(self.value - float(other))
+        return (
+            NotImplemented if isinstance(other, np.ndarray) else Counted(self.value - float(other))
+        )
 
     def __rsub__(self, other: Any) -> Counted:
         return Counted(float(other) - self.value)
@@ -121,14 +139,25 @@ class CountingNumpy:
 def interpreted(module: Any) -> dict[str, Any]:
     """The functions of a module of kernels, uncompiled, one element per batch, on arrays of `Counted`."""
     source = Path(module.__file__).read_text(encoding="utf-8")
-    for line in ("import numpy as np\n", "from numba import njit\n", "from math import log, sqrt\n"):
+    for line in (
+        "import numpy as np\n",
+        "from numba import njit\n",
+        "from math import log, sqrt\n",
+    ):
         source = source.replace(line, "")
-    source = source.replace("LANES = 32", "LANES = 1").replace("from __future__ import annotations\n", "")
+    source = source.replace("LANES = 32", "LANES = 1").replace(
+        "from __future__ import annotations\n", ""
+    )
 
     def njit(**_: Any) -> Callable[[Any], Any]:
         return lambda function: function
 
-    names = {"np": CountingNumpy, "njit": njit, "sqrt": Counted.sqrt, "log": lambda x: x._times(math.log(x.value))}
+    names = {
+        "np": CountingNumpy,
+        "njit": njit,
+        "sqrt": Counted.sqrt,
+        "log": lambda x: x._times(math.log(x.value)),
+    }
     exec(compile(source, module.__file__, "exec"), names)
     return names
 
@@ -137,19 +166,31 @@ def one_cell(n_points: int, n_nodes: int) -> tuple[np.ndarray, np.ndarray, np.nd
     """Displacements of a cell's nodes and the dummy, gradients (1, n_points, n_nodes, 3), and weights (1, n_points)."""
     rng = np.random.default_rng(0)
     gradients = 0.3 * rng.normal(size=(1, n_points, n_nodes, 3))
-    return counted_array(0.02 * rng.normal(size=3 * n_nodes + 1)), counted_array(gradients), counted_array(np.ones((1, n_points)))
+    return (
+        counted_array(0.02 * rng.normal(size=3 * n_nodes + 1)),
+        counted_array(gradients),
+        counted_array(np.ones((1, n_points))),
+    )
 
 
 def test_the_vectorised_kernel_multiplies_as_often_as_is_said() -> None:
     kernel = interpreted(kernels)
     u, gradients, w = one_cell(8, 8)
-    arguments = u, np.arange(24).reshape(1, 24, 1), gradients.reshape(1, 8, 24), w[:, :, None], w[:, :, None]
+    arguments = (
+        u,
+        np.arange(24).reshape(1, 24, 1),
+        gradients.reshape(1, 8, 24),
+        w[:, :, None],
+        w[:, :, None],
+    )
     force, values = counted_array(np.zeros(25)), counted_array(np.zeros(301))
     Counted.total = 0
     kernel["internal_force"](*arguments, force)
     assert Counted.total == 8 * kernels.FORCE_MULTIPLY_ADDS
     Counted.total = 0
-    kernel["internal_force_and_tangent"](*arguments, np.arange(300).reshape(1, 300, 1), force, values)
+    kernel["internal_force_and_tangent"](
+        *arguments, np.arange(300).reshape(1, 300, 1), force, values
+    )
     assert Counted.total == 8 * (kernels.FORCE_MULTIPLY_ADDS + kernels.TANGENT_MULTIPLY_ADDS)
 
 
@@ -172,11 +213,15 @@ def test_the_general_kernel_multiplies_as_often_as_is_said(name: str, n_nodes: i
     slots = np.arange(n_upper).reshape(1, n_upper)
     eigenvectors = 122 if law == laws.OGDEN else 0
     expected = laws.general_multiply_adds(law, len(parameters), n_nodes)
-    for values, said in zip((np.zeros(0), counted_array(np.zeros(n_upper + 1))), expected, strict=True):
+    for values, said in zip(
+        (np.zeros(0), counted_array(np.zeros(n_upper + 1))), expected, strict=True
+    ):
         Counted.total = 0
         force = counted_array(np.zeros(3 * n_nodes + 1))
         dofs = np.arange(3 * n_nodes).reshape(1, -1)
-        kernel["general_force"](u, dofs, gradients, weights, law, counted_array([parameters]), slots, force, values)
+        kernel["general_force"](
+            u, dofs, gradients, weights, law, counted_array([parameters]), slots, force, values
+        )
         assert Counted.total + eigenvectors == said
 
 
@@ -224,7 +269,9 @@ def loads(tiny: Dataset) -> np.ndarray:
     return tiny.test.forces[:8]
 
 
-def test_linear_fem_is_a_column_per_force_component_or_one_back_solve(tiny: Dataset, loads: np.ndarray) -> None:
+def test_linear_fem_is_a_column_per_force_component_or_one_back_solve(
+    tiny: Dataset, loads: np.ndarray
+) -> None:
     method = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
     n, b = 54 * 3, BandedCholesky(FullOrderModel(tiny.scene).assembler.pattern).bandwidth
     assert not loads[:, tiny.scene.fixed_nodes].any()
@@ -232,7 +279,9 @@ def test_linear_fem_is_a_column_per_force_component_or_one_back_solve(tiny: Data
     assert cost(lambda: method.predict(loads[0])) == Cost(multiply_adds=int(n_components[0]) * n)
     assert cost_of(method, loads) == {**asdict(Cost()), "multiply_adds": n_components.mean() * n}
     elsewhere = np.ones(loads[0].shape)
-    assert cost(lambda: method.predict(elsewhere)) == Cost(back_solves=1, multiply_adds=2 * (n * (b + 1) - b * (b + 1) // 2))
+    assert cost(lambda: method.predict(elsewhere)) == Cost(
+        back_solves=1, multiply_adds=2 * (n * (b + 1) - b * (b + 1) // 2)
+    )
     assert triangular_multiply_adds(n, b) == 2 * (n * (b + 1) - b * (b + 1) // 2)
 
 
@@ -288,8 +337,12 @@ def test_sparse_lu_by_elimination_of_its_pattern(tiny: Dataset) -> None:
     upper = np.zeros((pattern.n, pattern.n))
     upper[pattern.rows, pattern.indices] = 1.0
     by_factor, by_solve = dense_lu_structure(upper + upper.T, np.argsort(factor.lu.perm_c))
-    assert cost(lambda: solver.factor(model.rest_tangent)) == Cost(factorisations=1, multiply_adds=by_factor)
-    assert cost(lambda: factor.solve(np.ones((pattern.n, 3)))) == Cost(back_solves=3, multiply_adds=3 * by_solve)
+    assert cost(lambda: solver.factor(model.rest_tangent)) == Cost(
+        factorisations=1, multiply_adds=by_factor
+    )
+    assert cost(lambda: factor.solve(np.ones((pattern.n, 3)))) == Cost(
+        back_solves=3, multiply_adds=3 * by_solve
+    )
 
 
 def test_pardiso_lies_near_sparse_lu(tiny: Dataset) -> None:
@@ -297,11 +350,16 @@ def test_pardiso_lies_near_sparse_lu(tiny: Dataset) -> None:
     pytest.importorskip("pypardiso")
     model = FullOrderModel(tiny.scene, "pardiso")
     lu, pardiso = SparseLU(model.assembler.pattern), Pardiso(model.assembler.pattern)
-    by_lu, by_pardiso = (cost(lambda solver=solver: solver.factor(model.rest_tangent)) for solver in (lu, pardiso))  # type: ignore[misc]
+    by_lu, by_pardiso = (
+        cost(lambda solver=solver: solver.factor(model.rest_tangent)) for solver in (lu, pardiso)
+    )  # type: ignore[misc]
     assert by_pardiso.factorisations == 1
     assert 0.25 * by_lu.multiply_adds < by_pardiso.multiply_adds < 2.0 * by_lu.multiply_adds
     rhs = np.ones(model.n_unknowns)
-    by_lu, by_pardiso = cost(lambda: lu.factor(model.rest_tangent).solve(rhs)), cost(lambda: pardiso.solve(rhs))
+    by_lu, by_pardiso = (
+        cost(lambda: lu.factor(model.rest_tangent).solve(rhs)),
+        cost(lambda: pardiso.solve(rhs)),
+    )
     assert by_pardiso.back_solves == by_lu.back_solves == 1
 
 
@@ -311,7 +369,9 @@ def test_conjugate_gradients_per_iteration(tiny: Dataset) -> None:
     n, tangent = model.n_unknowns, model.rest_tangent
     assert cost(lambda: jacobi.take(tangent)) == Cost(multiply_adds=9 * n)
     with counted() as found:
-        _, iterations = conjugate_gradients(model.assembler.pattern, tangent, jacobi, np.ones(n), 1e-6)
+        _, iterations = conjugate_gradients(
+            model.assembler.pattern, tangent, jacobi, np.ones(n), 1e-6
+        )
     assert iterations > 5
     assert found == Cost(multiply_adds=iterations * (n_nonzeros(model) + 6 * n + 3 * n))
 
@@ -347,11 +407,17 @@ def test_pod_evaluates_all_cells(tiny: Dataset, loads: np.ndarray) -> None:
     n, r, stored = problem.assembler.n_dofs, 6, len(problem.assembler.pattern.indices)
     reduction = 2 * n * r + (2 * stored - n) * r + n * r * r
     q = np.zeros(r)
-    assert cost(lambda: problem.force(q)) == Cost(element_evaluations=24, multiply_adds=per_force + 2 * n * r)
-    assert cost(lambda: problem.linearise(q)) == Cost(element_evaluations=24, multiply_adds=per_tangent + reduction)
+    assert cost(lambda: problem.force(q)) == Cost(
+        element_evaluations=24, multiply_adds=per_force + 2 * n * r
+    )
+    assert cost(lambda: problem.linearise(q)) == Cost(
+        element_evaluations=24, multiply_adds=per_tangent + reduction
+    )
     found = cost(lambda: method.predict(loads[0]))
     expected = newton(found, 24, r, per_force + 2 * n * r, per_tangent + reduction)
-    assert found.multiply_adds == expected + (np.count_nonzero(loads[0]) + tiny.scene.mesh.n_dofs) * r
+    assert (
+        found.multiply_adds == expected + (np.count_nonzero(loads[0]) + tiny.scene.mesh.n_dofs) * r
+    )
 
 
 def newton(found: Cost, n_cells: int, r: int, per_force: int, per_tangent: int) -> int:
@@ -359,37 +425,65 @@ def newton(found: Cost, n_cells: int, r: int, per_force: int, per_tangent: int) 
     steps, evaluations = found.factorisations, found.element_evaluations // n_cells
     assert found.element_evaluations % n_cells == 0
     assert found.reduced_factorisations == steps
-    assert found.reduced_back_solves == found.back_solves == steps + 1  # the first with the factor at rest
+    assert (
+        found.reduced_back_solves == found.back_solves == steps + 1
+    )  # the first with the factor at rest
     assert steps <= evaluations <= 2 * steps + 1
-    dense = steps * cholesky_multiply_adds(r, r - 1) + (steps + 1) * triangular_multiply_adds(r, r - 1)
+    dense = steps * cholesky_multiply_adds(r, r - 1) + (steps + 1) * triangular_multiply_adds(
+        r, r - 1
+    )
     return steps * per_tangent + (evaluations - steps) * per_force + dense
 
 
-@pytest.mark.parametrize(("name", "knobs"), [("hpod", {}), ("hpod", {"sampling": "cells"}), ("ecm", {})])
-def test_cubature_evaluates_its_points(tiny: Dataset, loads: np.ndarray, name: str, knobs: dict[str, Any]) -> None:
-    method: Any = mor_bench.load_method(name, n_modes=6, cubature_tolerance=1e-2, **knobs).fit(tiny.scene, tiny.train)
+@pytest.mark.parametrize(
+    ("name", "knobs"), [("hpod", {}), ("hpod", {"sampling": "cells"}), ("ecm", {})]
+)
+def test_cubature_evaluates_its_points(
+    tiny: Dataset, loads: np.ndarray, name: str, knobs: dict[str, Any]
+) -> None:
+    method: Any = mor_bench.load_method(name, n_modes=6, cubature_tolerance=1e-2, **knobs).fit(
+        tiny.scene, tiny.train
+    )
     problem, n_cells, r, q = method.problem_, len(method.cells_), 6, np.zeros(6)
-    n_points = int(np.count_nonzero(method.weights_)) if name == "hpod" and not knobs else 8 * n_cells
+    n_points = (
+        int(np.count_nonzero(method.weights_)) if name == "hpod" and not knobs else 8 * n_cells
+    )
     assert n_cells < 24
     per_force = n_points * (SVK_MULTIPLY_ADDS[0] + 18 * r)
     per_tangent = per_force + n_points * (SVK_MULTIPLY_ADDS[1] + tangent_multiply_adds(r, True))
-    assert cost(lambda: problem.force(q)) == Cost(element_evaluations=n_cells, multiply_adds=per_force)
-    assert cost(lambda: problem.linearise(q)) == Cost(element_evaluations=n_cells, multiply_adds=per_tangent)
+    assert cost(lambda: problem.force(q)) == Cost(
+        element_evaluations=n_cells, multiply_adds=per_force
+    )
+    assert cost(lambda: problem.linearise(q)) == Cost(
+        element_evaluations=n_cells, multiply_adds=per_tangent
+    )
     found = cost(lambda: method.predict(loads[0]))
     projection = (np.count_nonzero(loads[0]) + tiny.scene.mesh.n_dofs) * r
     assert found.multiply_adds == newton(found, n_cells, r, per_force, per_tangent) + projection
 
 
-def test_deim_evaluates_the_points_of_the_cells_around_its_dofs(tiny: Dataset, loads: np.ndarray) -> None:
-    method: Any = mor_bench.load_method("deim", n_modes=6, n_force_modes=4).fit(tiny.scene, tiny.train)
+def test_deim_evaluates_the_points_of_the_cells_around_its_dofs(
+    tiny: Dataset, loads: np.ndarray
+) -> None:
+    method: Any = mor_bench.load_method("deim", n_modes=6, n_force_modes=4).fit(
+        tiny.scene, tiny.train
+    )
     n_cells, r = len(method.cells_), 6
     assert n_cells < 24
-    per_tangent = n_cells * 8 * (sum(SVK_MULTIPLY_ADDS) + 18 * r + tangent_multiply_adds(r, False)) + r * r
-    assert cost(lambda: method.problem_.linearise(np.zeros(r))) == Cost(element_evaluations=n_cells, multiply_adds=per_tangent)
+    per_tangent = (
+        n_cells * 8 * (sum(SVK_MULTIPLY_ADDS) + 18 * r + tangent_multiply_adds(r, False)) + r * r
+    )
+    assert cost(lambda: method.problem_.linearise(np.zeros(r))) == Cost(
+        element_evaluations=n_cells, multiply_adds=per_tangent
+    )
     found = cost(lambda: method.predict(loads[0]))
     tangents = found.element_evaluations // n_cells
-    assert found.factorisations == found.reduced_factorisations == found.back_solves == tangents + 1  # the first of the stiffness at rest
-    factors = (tangents + 1) * (sum(k + k * k for k in range(r)) + triangular_multiply_adds(r, r - 1))
+    assert (
+        found.factorisations == found.reduced_factorisations == found.back_solves == tangents + 1
+    )  # the first of the stiffness at rest
+    factors = (tangents + 1) * (
+        sum(k + k * k for k in range(r)) + triangular_multiply_adds(r, r - 1)
+    )
     projection = (np.count_nonzero(loads[0]) + tiny.scene.mesh.n_dofs) * r
     assert found.multiply_adds == tangents * per_tangent + factors + projection
 
@@ -398,11 +492,24 @@ def test_deim_evaluates_the_points_of_the_cells_around_its_dofs(tiny: Dataset, l
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_the_kernel_of_points_multiplies_as_often_as_is_said(r: int, symmetric: bool) -> None:
     kernel, rng = interpreted(point_kernels), np.random.default_rng(0)
-    q, modes, one = counted_array(0.1 * rng.normal(size=r)), counted_array(0.3 * rng.normal(size=(1, r, 9))), counted_array(np.ones((1, 2, 1)))
+    q, modes, one = (
+        counted_array(0.1 * rng.normal(size=r)),
+        counted_array(0.3 * rng.normal(size=(1, r, 9))),
+        counted_array(np.ones((1, 2, 1))),
+    )
     counts = []
     for n in (0, r):
         Counted.total = 0
-        kernel["integrate"](q, modes, modes, symmetric, one[:, 0], one, counted_array(np.zeros(r)), counted_array(np.zeros((n, n))))
+        kernel["integrate"](
+            q,
+            modes,
+            modes,
+            symmetric,
+            one[:, 0],
+            one,
+            counted_array(np.zeros(r)),
+            counted_array(np.zeros((n, n))),
+        )
         counts.append(Counted.total)
     assert counts[0] == SVK_MULTIPLY_ADDS[0] + 18 * r
     assert counts[1] - counts[0] == SVK_MULTIPLY_ADDS[1] + tangent_multiply_adds(r, symmetric)
@@ -411,34 +518,56 @@ def test_the_kernel_of_points_multiplies_as_often_as_is_said(r: int, symmetric: 
 @pytest.mark.parametrize("name", LAWS)
 def test_stresses_at_points_multiply_as_often_as_is_said(name: str) -> None:
     law, parameters = LAWS[name]
-    kernel, gradient = interpreted(laws), counted_array(0.1 * np.random.default_rng(0).normal(size=(1, 9)))
+    kernel, gradient = (
+        interpreted(laws),
+        counted_array(0.1 * np.random.default_rng(0).normal(size=(1, 9))),
+    )
     counts = []
     for n in (0, 1):
         Counted.total = 0
         stresses, tangents = counted_array(np.zeros((1, 9))), counted_array(np.zeros((n, 81)))
-        kernel["point_stresses"](gradient, counted_array(np.ones((1, 1))), law, counted_array([parameters]), stresses, tangents)
+        kernel["point_stresses"](
+            gradient,
+            counted_array(np.ones((1, 1))),
+            law,
+            counted_array([parameters]),
+            stresses,
+            tangents,
+        )
         counts.append(Counted.total + (122 if law == laws.OGDEN else 0))
     assert (counts[0], counts[1] - counts[0]) == laws.point_multiply_adds(law, len(parameters))
 
 
 def test_pca_regression_by_its_products(tiny: Dataset, loads: np.ndarray) -> None:
-    method = mor_bench.load_method("pca-regression", n_input_modes=4, n_output_modes=5, degree=3).fit(tiny.scene, tiny.train)
+    method = mor_bench.load_method(
+        "pca-regression", n_input_modes=4, n_output_modes=5, degree=3
+    ).fit(tiny.scene, tiny.train)
     n = len(tiny.scene.free_dofs)
     features = 4 + 10 + 20
     components = int(np.count_nonzero(loads[0]))
     assert not loads[0, tiny.scene.fixed_nodes].any()
-    assert cost(lambda: method.predict(loads[0])) == Cost(multiply_adds=components * (n + 4) + (10 + 20) + 5 * features + n * 5)
+    assert cost(lambda: method.predict(loads[0])) == Cost(
+        multiply_adds=components * (n + 4) + (10 + 20) + 5 * features + n * 5
+    )
 
 
 def test_u_mesh_by_its_layers_and_by_torch(tiny: Dataset, loads: np.ndarray) -> None:
     torch = pytest.importorskip("torch")
     from torch.utils.flop_counter import FlopCounterMode
 
-    method: Any = mor_bench.load_method("umesh", channels=4, steps=2, iterations=2, batch_size=4).fit(tiny.scene, tiny.train)
+    method: Any = mor_bench.load_method(
+        "umesh", channels=4, steps=2, iterations=2, batch_size=4
+    ).fit(tiny.scene, tiny.train)
     # 7 x 3 x 3 nodes are padded to 8 x 4 x 4 points.
     fine, middle, bottom = 128, 16, 2
-    convolutions = 27 * (fine * (3 * 4 + 4 * 4) + middle * (4 * 8 + 8 * 8) + bottom * (8 * 16 + 16 * 16))
-    convolutions += 8 * (bottom * 16 * 8 + middle * 8 * 4) + 27 * (middle * (16 * 8 + 8 * 8) + fine * (8 * 4 + 4 * 4)) + fine * 4 * 3
+    convolutions = 27 * (
+        fine * (3 * 4 + 4 * 4) + middle * (4 * 8 + 8 * 8) + bottom * (8 * 16 + 16 * 16)
+    )
+    convolutions += (
+        8 * (bottom * 16 * 8 + middle * 8 * 4)
+        + 27 * (middle * (16 * 8 + 8 * 8) + fine * (8 * 4 + 4 * 4))
+        + fine * 4 * 3
+    )
     found = cost(lambda: method.predict(loads[0]))
     assert found == Cost(multiply_adds=convolutions + 2 * tiny.scene.mesh.n_dofs)
     with FlopCounterMode(display=False) as flops, torch.no_grad():
@@ -486,8 +615,20 @@ SMALL: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_batch_costs_what_its_samples_cost_and_counting_changes_nothing(tiny: Dataset, loads: np.ndarray, name: str) -> None:
-    if name in ("umesh", "autoencoder", "pod-nn", "pod-nn-force", "pod-nn-derivative", "deeponet", "pod-deeponet", "fno", "mesh-graph-net"):
+def test_a_batch_costs_what_its_samples_cost_and_counting_changes_nothing(
+    tiny: Dataset, loads: np.ndarray, name: str
+) -> None:
+    if name in (
+        "umesh",
+        "autoencoder",
+        "pod-nn",
+        "pod-nn-force",
+        "pod-nn-derivative",
+        "deeponet",
+        "pod-deeponet",
+        "fno",
+        "mesh-graph-net",
+    ):
         pytest.importorskip("torch")
     method = mor_bench.load_method(name, **SMALL[name])
     method.fit(tiny.scene, tiny.train if method.needs_snapshots else None)

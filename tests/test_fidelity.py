@@ -11,7 +11,13 @@ import numpy as np
 import pytest
 
 import mor_bench
-from mor_bench.errors import InvalidInputError, OutsideMeshError, SpecError, StoreError, UnsupportedSceneError
+from mor_bench.errors import (
+    InvalidInputError,
+    OutsideMeshError,
+    SpecError,
+    StoreError,
+    UnsupportedSceneError,
+)
 from mor_bench.harness.discretisation import chosen_samples, limit_of, measured, refine
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.report.html import render
@@ -28,7 +34,9 @@ def distorted(tetrahedra: bool) -> Mesh:
     """A graded, sheared and bent box: no cell is a parallelepiped."""
     mesh = box_mesh((2.0, 1.0, 1.0), (7, 3, 4), tetrahedra)
     x, y, z = mesh.points.T
-    return replace(mesh, points=np.stack([x**2 + 0.2 * y * z, y + 0.1 * x * z, z + 0.15 * x * y], axis=1))
+    return replace(
+        mesh, points=np.stack([x**2 + 0.2 * y * z, y + 0.1 * x * z, z + 0.15 * x * y], axis=1)
+    )
 
 
 @pytest.mark.parametrize("tetrahedra", [False, True])
@@ -38,22 +46,31 @@ def test_interpolation_reproduces_linear_fields_and_the_nodes(tetrahedra: bool) 
     shares = generator.dirichlet(np.ones(mesh.cells.shape[1]), size=500)
     corners = mesh.points[mesh.cells[generator.integers(mesh.n_cells, size=500)]]
     if not tetrahedra:  # a convex combination of a bent hexahedron's corners may lie outside it
-        corners = corners.mean(axis=1, keepdims=True) + 0.5 * (corners - corners.mean(axis=1, keepdims=True))
+        corners = corners.mean(axis=1, keepdims=True) + 0.5 * (
+            corners - corners.mean(axis=1, keepdims=True)
+        )
     points = np.einsum("na,nai->ni", shares, corners)
     matrix = interpolation_matrix(mesh, points)
     np.testing.assert_allclose(matrix.sum(axis=1), 1, rtol=0, atol=1e-13)
     np.testing.assert_allclose(matrix @ mesh.points, points, rtol=0, atol=1e-12)
     assert matrix.toarray().min() > -1e-9
-    np.testing.assert_allclose(interpolation_matrix(mesh, mesh.points).toarray(), np.eye(mesh.n_nodes), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        interpolation_matrix(mesh, mesh.points).toarray(), np.eye(mesh.n_nodes), rtol=0, atol=1e-10
+    )
 
 
 @pytest.mark.parametrize("tetrahedra", [False, True])
-def test_points_outside_are_refused_and_those_outside_by_round_off_are_not(tetrahedra: bool) -> None:
+def test_points_outside_are_refused_and_those_outside_by_round_off_are_not(
+    tetrahedra: bool,
+) -> None:
     mesh = box_mesh((2.0, 1.0, 1.0), (4, 2, 2), tetrahedra)
     surface = mesh.points[np.unique(mesh.boundary_facets)]
     outwards = np.sign(surface - np.array([1.0, 0.5, 0.5]))
     interpolation_matrix(mesh, surface + 1e-13 * outwards)
-    with pytest.raises(OutsideMeshError, match=r"a point lies outside the mesh, .* the first is \[2.0, 0.5, 1.01\] m"):
+    with pytest.raises(
+        OutsideMeshError,
+        match=r"a point lies outside the mesh, .* the first is \[2.0, 0.5, 1.01\] m",
+    ):
         interpolation_matrix(mesh, np.array([[1.0, 0.5, 0.5], [2.0, 0.5, 1.01]]))
     with pytest.raises(OutsideMeshError, match="63 points lie outside"):
         interpolation_matrix(mesh, box_mesh((2.0, 1.0, 1.0), (6, 2, 2)).points + 10.0)
@@ -61,7 +78,11 @@ def test_points_outside_are_refused_and_those_outside_by_round_off_are_not(tetra
 
 def with_element(name: str, element: str) -> Scene:
     spec = load_generated_spec(name)
-    return load_scene(spec.model_copy(update={"discretisation": spec.discretisation.model_copy(update={"element": element})}))
+    return load_scene(
+        spec.model_copy(
+            update={"discretisation": spec.discretisation.model_copy(update={"element": element})}
+        )
+    )
 
 
 @pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
@@ -72,21 +93,34 @@ def test_forces_keep_their_sum_and_moment_on_the_coarse_mesh(element: str) -> No
     assert coarse.grid_shape == (9, 3, 3)
     forces = np.random.default_rng(1).normal(size=(scene.mesh.n_nodes, 3))
     carried = method.interpolation_.T @ forces  # type: ignore[attr-defined]
-    np.testing.assert_allclose(carried.sum(axis=0), forces.sum(axis=0), rtol=0, atol=1e-12 * np.abs(forces).sum())
-    moments = np.cross(scene.mesh.points, forces).sum(axis=0), np.cross(coarse.points, carried).sum(axis=0)
-    np.testing.assert_allclose(*moments, rtol=0, atol=1e-12 * np.abs(np.cross(scene.mesh.points, forces)).sum())
+    np.testing.assert_allclose(
+        carried.sum(axis=0), forces.sum(axis=0), rtol=0, atol=1e-12 * np.abs(forces).sum()
+    )
+    moments = (
+        np.cross(scene.mesh.points, forces).sum(axis=0),
+        np.cross(coarse.points, carried).sum(axis=0),
+    )
+    np.testing.assert_allclose(
+        *moments, rtol=0, atol=1e-12 * np.abs(np.cross(scene.mesh.points, forces)).sum()
+    )
 
 
 def test_coarse_fem_is_the_coarse_model_where_the_meshes_share_nodes(tiny: Dataset) -> None:
-    method = mor_bench.load_method("fem-coarse", coarsening=2, tolerance=1e-10).fit(tiny.scene, None)
+    method = mor_bench.load_method("fem-coarse", coarsening=2, tolerance=1e-10).fit(
+        tiny.scene, None
+    )
     mesh = with_cells(tiny.scene, (3, 1, 1))
     force = np.zeros((mesh.mesh.n_nodes, 3))
     force[-1] = [0.0, 0.1, -0.5]
-    at = np.array([int(np.linalg.norm(tiny.scene.mesh.points - x, axis=1).argmin()) for x in mesh.mesh.points])
+    at = np.array(
+        [int(np.linalg.norm(tiny.scene.mesh.points - x, axis=1).argmin()) for x in mesh.mesh.points]
+    )
     fine = np.zeros((tiny.scene.mesh.n_nodes, 3))
     fine[at] = force
     expected = np.zeros(mesh.mesh.n_dofs)
-    expected[mesh.free_dofs] = FullOrderModel(mesh).solve(force.ravel()[mesh.free_dofs]).displacement
+    expected[mesh.free_dofs] = (
+        FullOrderModel(mesh).solve(force.ravel()[mesh.free_dofs]).displacement
+    )
     np.testing.assert_allclose(method.predict(fine)[at], expected.reshape(-1, 3), rtol=0, atol=1e-9)
 
 
@@ -99,19 +133,32 @@ def test_scenes_without_a_coarser_mesh_are_refused_with_the_reason() -> None:
     one = box(geometry={"shape": "box", "size_m": [2.0, 1.0, 1.0], "cells": [1, 1, 1]})
     held = box(supports=[{"region": {"box_m": [[0.3, 0.0, 0.0], [0.4, 1.0, 1.0]]}}])
     method = mor_bench.load_method("fem-coarse")
-    for scene, reason in ((one, "one cell cannot be made coarser"), (held, "holds no node"), (not_a_box(held), "only the mesh of a box or an L")):
+    for scene, reason in (
+        (one, "one cell cannot be made coarser"),
+        (held, "holds no node"),
+        (not_a_box(held), "only the mesh of a box or an L"),
+    ):
         assert reason in (method.supports(scene) or "")
         with pytest.raises(UnsupportedSceneError, match=reason):
             method.fit(scene, None)
 
 
 def not_a_box(scene: Scene) -> Scene:
-    return replace(scene, spec=scene.spec.model_copy(update={"geometry": TetrahedraGeometry(shape="tetrahedra", surface="liver")}))
+    return replace(
+        scene,
+        spec=scene.spec.model_copy(
+            update={"geometry": TetrahedraGeometry(shape="tetrahedra", surface="liver")}
+        ),
+    )
 
 
 @pytest.mark.parametrize("start", ["nearest", "previous"])
-def test_warm_starts_end_at_the_equilibrium_of_the_full_order_model(tiny: Dataset, start: str) -> None:
-    method = mor_bench.load_method("fem-warm", start=start, tolerance=1e-8).fit(tiny.scene, tiny.train)
+def test_warm_starts_end_at_the_equilibrium_of_the_full_order_model(
+    tiny: Dataset, start: str
+) -> None:
+    method = mor_bench.load_method("fem-warm", start=start, tolerance=1e-8).fit(
+        tiny.scene, tiny.train
+    )
     predicted = method.predict(tiny.test.forces)
     backwards = method.predict(tiny.test.forces[::-1])[::-1]
     for found in (predicted, backwards):
@@ -122,7 +169,9 @@ def test_warm_starts_end_at_the_equilibrium_of_the_full_order_model(tiny: Datase
 
 
 @pytest.mark.parametrize(("start", "needed"), [("nearest", True), ("previous", False)])
-def test_a_known_solution_is_found_again_without_a_step(tiny: Dataset, start: str, needed: bool) -> None:
+def test_a_known_solution_is_found_again_without_a_step(
+    tiny: Dataset, start: str, needed: bool
+) -> None:
     method = mor_bench.load_method("fem-warm", start=start, tolerance=1e-6)
     assert method.needs_snapshots is needed
     method.fit(tiny.scene, tiny.train if needed else None)
@@ -144,7 +193,9 @@ def test_a_known_solution_is_found_again_without_a_step(tiny: Dataset, start: st
 def test_the_limit_of_a_series_with_a_known_order() -> None:
     exact, error = np.random.default_rng(2).normal(size=(2, 5, 3))
     for order in (1.0, 1.6, 2.0):
-        found, seen, kind = limit_of([exact + error * 2.0 ** (-order * level) for level in range(3)])
+        found, seen, kind = limit_of(
+            [exact + error * 2.0 ** (-order * level) for level in range(3)]
+        )
         np.testing.assert_allclose(found, exact, rtol=0, atol=1e-12)
         assert seen == pytest.approx(order)
         assert kind == "extrapolated"
@@ -166,7 +217,9 @@ def tip_deflection(scene: Scene, cells: tuple[int, int, int]) -> np.ndarray[Any,
     load = np.zeros((mesh.mesh.n_nodes, 3))
     load[tip, 2] = -weights / weights.sum()
     displacement = np.zeros(mesh.mesh.n_dofs)
-    displacement[mesh.free_dofs] = FullOrderModel(mesh).solve(load.ravel()[mesh.free_dofs]).displacement
+    displacement[mesh.free_dofs] = (
+        FullOrderModel(mesh).solve(load.ravel()[mesh.free_dofs]).displacement
+    )
     return np.array([-weights @ displacement.reshape(-1, 3)[tip, 2] / weights.sum()])
 
 
@@ -174,7 +227,9 @@ def test_the_tip_of_the_coarse_beam_tends_to_its_independent_limit() -> None:
     """An independent study gives 0.417 m on 8 x 2 x 2 cells and 0.518 m in the limit."""
     scene = load_scene("beam-coarse")
     assert tip_deflection(scene, (8, 2, 2))[0] == pytest.approx(0.417, rel=2e-3)
-    limit, order, kind = limit_of([tip_deflection(scene, (15 * k, 3 * k, 3 * k)) for k in (1, 2, 4)])
+    limit, order, kind = limit_of(
+        [tip_deflection(scene, (15 * k, 3 * k, 3 * k)) for k in (1, 2, 4)]
+    )
     assert kind == "extrapolated"
     assert order is not None
     assert limit[0] == pytest.approx(0.518, rel=0.02)
@@ -191,7 +246,9 @@ def test_every_mesh_carries_the_same_force_and_moment(changes: dict[str, str]) -
         np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=0, atol=1e-12)
         np.testing.assert_allclose(weights @ mesh.points, shares @ points, rtol=0, atol=1e-12)
         if factor == 1:
-            np.testing.assert_allclose(weights.toarray(), scene.patch_weights[patches].toarray(), rtol=0, atol=1e-12)
+            np.testing.assert_allclose(
+                weights.toarray(), scene.patch_weights[patches].toarray(), rtol=0, atol=1e-12
+            )
 
 
 def test_samples_are_those_of_the_dataset_and_spread_over_its_patches(tiny: Dataset) -> None:
@@ -205,10 +262,14 @@ def test_samples_are_those_of_the_dataset_and_spread_over_its_patches(tiny: Data
 def changed() -> DatasetSpec:
     """beam-tiny with another stiffness: its physics has no shipped record."""
     spec = load_generated_spec("beam-tiny")
-    return spec.model_copy(update={"material": spec.material.model_copy(update={"young_pa": 600.0})})
+    return spec.model_copy(
+        update={"material": spec.material.model_copy(update={"young_pa": 600.0})}
+    )
 
 
-@pytest.mark.parametrize("discretisation", [{}, {"element": "tetrahedron"}, {"integration": "selective"}])
+@pytest.mark.parametrize(
+    "discretisation", [{}, {"element": "tetrahedron"}, {"integration": "selective"}]
+)
 def test_refinement_of_every_element(discretisation: dict[str, str], tmp_path: Path) -> None:
     record = refine(box(discretisation=discretisation).generated, 2, 1, cache=tmp_path)
     n = 144 if "element" in discretisation else 24
@@ -217,16 +278,24 @@ def test_refinement_of_every_element(discretisation: dict[str, str], tmp_path: P
     assert 0.02 < record["relative_l2"] < 0.7
 
 
-def test_a_record_holds_what_it_is_made_of_and_serves_only_its_physics(changed: DatasetSpec, tmp_path: Path) -> None:
+def test_a_record_holds_what_it_is_made_of_and_serves_only_its_physics(
+    changed: DatasetSpec, tmp_path: Path
+) -> None:
     assert measured(changed, tmp_path) is None
     record = refine(changed, 3, 3, max_dofs=7000, cache=tmp_path)
     assert [mesh["n_dofs"] for mesh in record["meshes"]] == [189, 975, 6075]
     assert [mesh["n_dofs"] for mesh in record["left_out"]] == [42483]
-    assert record["error_m"] == pytest.approx(np.mean([load["error_m"] for load in record["loads"]]))
-    assert record["relative_l2_median"] == pytest.approx(np.median([load["relative_l2"] for load in record["loads"]]))
+    assert record["error_m"] == pytest.approx(
+        np.mean([load["error_m"] for load in record["loads"]])
+    )
+    assert record["relative_l2_median"] == pytest.approx(
+        np.median([load["relative_l2"] for load in record["loads"]])
+    )
     assert record["command"].endswith("beam-tiny --loads 3 --levels 3 --max-dofs 7000")
     assert measured(changed, tmp_path) == json.loads(json.dumps(record))
-    stiffer = changed.model_copy(update={"material": changed.material.model_copy(update={"young_pa": 601.0})})
+    stiffer = changed.model_copy(
+        update={"material": changed.material.model_copy(update={"young_pa": 601.0})}
+    )
     assert measured(stiffer, tmp_path) is None
 
 
@@ -243,7 +312,9 @@ def test_the_measured_error_arrives_in_every_row_and_page(cache: Path, tmp_path:
     spec = load_generated_spec("beam-tiny")
     record = measured(spec, tmp_path)
     assert record is not None
-    run = mor_bench.run(["beam-tiny"], ["linear-fem", "fem-coarse"], out=tmp_path / "out", cache=cache)
+    run = mor_bench.run(
+        ["beam-tiny"], ["linear-fem", "fem-coarse"], out=tmp_path / "out", cache=cache
+    )
     assert {row["discretisation_error_m"] for row in run.rows} == {record["error_m"]}
     assert {row["discretisation_rel_l2"] for row in run.rows} == {record["relative_l2_median"]}
     stored = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
@@ -255,16 +326,34 @@ def test_the_measured_error_arrives_in_every_row_and_page(cache: Path, tmp_path:
     assert "not against the body" in page
 
 
-def test_a_changed_dataset_shows_none_until_it_is_measured(changed: DatasetSpec, tmp_path: Path) -> None:
+def test_a_changed_dataset_shows_none_until_it_is_measured(
+    changed: DatasetSpec, tmp_path: Path
+) -> None:
     content = changed.model_dump(mode="json")
-    arguments: dict[str, Any] = {"methods": ["linear-fem"], "cache": tmp_path / "cache", "workers": 1, "out": tmp_path / "out"}
+    arguments: dict[str, Any] = {
+        "methods": ["linear-fem"],
+        "cache": tmp_path / "cache",
+        "workers": 1,
+        "out": tmp_path / "out",
+    }
     assert mor_bench.run([content], **arguments).rows[0]["discretisation_error_m"] is None
     record = refine(content, 2, 1, cache=tmp_path / "cache")
-    assert [row["discretisation_error_m"] for row in mor_bench.run([content], **arguments).rows] == [record["error_m"]]
-    assert [row["discretisation_error_m"] for row in mor_bench.Comparison.read(tmp_path / "out").rows] == [record["error_m"]]
+    assert [
+        row["discretisation_error_m"] for row in mor_bench.run([content], **arguments).rows
+    ] == [record["error_m"]]
+    assert [
+        row["discretisation_error_m"] for row in mor_bench.Comparison.read(tmp_path / "out").rows
+    ] == [record["error_m"]]
 
 
-@pytest.mark.parametrize("damage", ["", "{}", '{"format": "mor-bench discretisation error", "schema_version": 1, "digest": "x", "error_m": "nan"}'])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "",
+        "{}",
+        '{"format": "mor-bench discretisation error", "schema_version": 1, "digest": "x", "error_m": "nan"}',
+    ],
+)
 def test_a_damaged_record_is_named(changed: DatasetSpec, tmp_path: Path, damage: str) -> None:
     refine(changed, 1, 1, cache=tmp_path)
     path = next(tmp_path.rglob("discretisation.json"))
@@ -276,9 +365,15 @@ def test_a_damaged_record_is_named(changed: DatasetSpec, tmp_path: Path, damage:
 def test_bad_arguments_are_one_clear_line(tmp_path: Path) -> None:
     for arguments, message in (
         ({"levels": 0}, r"`levels` must be an integer in \[1, 10\]; got 0\."),
-        ({"n_loads": 0}, r"`loads` must be an integer in \[1, 21\], the load patches of beam-tiny; got 0\."),
+        (
+            {"n_loads": 0},
+            r"`loads` must be an integer in \[1, 21\], the load patches of beam-tiny; got 0\.",
+        ),
         ({"n_loads": 22}, r"got 22\."),
-        ({"max_dofs": 974}, r"`max_dofs` must be at least 975, the unknowns of the first refinement of beam-tiny; got 974\."),
+        (
+            {"max_dofs": 974},
+            r"`max_dofs` must be at least 975, the unknowns of the first refinement of beam-tiny; got 974\.",
+        ),
     ):
         with pytest.raises(InvalidInputError, match=message):
             refine("beam-tiny", cache=tmp_path, **arguments)  # type: ignore[arg-type]

@@ -21,7 +21,9 @@ def beam(request: pytest.FixtureRequest, cache: Path) -> Dataset:
 def mean_error(name: str, data: Dataset, **parameters: object) -> float:
     """The paper's ē, m."""
     method = mor_bench.load_method(name, **parameters).fit(data.scene, data.train)
-    return float(sample_errors(method.predict(data.test.forces), data.test.displacements).mean_dof_m.mean())
+    return float(
+        sample_errors(method.predict(data.test.forces), data.test.displacements).mean_dof_m.mean()
+    )
 
 
 def test_sizes_of_the_split(beam: Dataset) -> None:
@@ -45,7 +47,9 @@ def test_pod_improves_with_its_rank_and_ecsw_stays_within_a_fifth(beam: Dataset)
     for r in (3, 10, 40):
         plain[r] = mean_error("pod", beam, n_modes=r)
         for tolerance in tolerances:
-            assert mean_error("hpod", beam, n_modes=r, cubature_tolerance=tolerance) <= 1.2 * plain[r]
+            assert (
+                mean_error("hpod", beam, n_modes=r, cubature_tolerance=tolerance) <= 1.2 * plain[r]
+            )
     assert plain[40] < plain[10] < plain[3]
 
 

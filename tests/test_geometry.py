@@ -32,7 +32,11 @@ def sphere_level(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def boundary(mesh: Mesh) -> Surface:
     """The surface of a mesh, its quadrilaterals cut in two."""
     facets = mesh.boundary_facets
-    triangles = facets if facets.shape[1] == 3 else np.concatenate([facets[:, [0, 1, 2]], facets[:, [0, 2, 3]]])
+    triangles = (
+        facets
+        if facets.shape[1] == 3
+        else np.concatenate([facets[:, [0, 1, 2]], facets[:, [0, 2, 3]]])
+    )
     used, number = np.unique(triangles, return_inverse=True)
     return Surface(mesh.points[used], number.reshape(-1, 3))
 
@@ -46,18 +50,28 @@ def on_surface(surface: Surface, rng: np.random.Generator) -> NDArray[np.float64
     corners = surface.points[surface.triangles]
     shares = rng.dirichlet([1, 1, 1], size=len(corners))
     share = rng.random((len(corners), 1))
-    return np.concatenate([surface.points, share * corners[:, 0] + (1 - share) * corners[:, 1], np.einsum("ni,nid->nd", shares, corners)])
+    return np.concatenate(
+        [
+            surface.points,
+            share * corners[:, 0] + (1 - share) * corners[:, 1],
+            np.einsum("ni,nid->nd", shares, corners),
+        ]
+    )
 
 
 def edge_uses(triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """How many triangles use each edge, and each edge in its direction."""
     edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    return np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1], np.unique(edges, axis=0, return_counts=True)[1]
+    return np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1], np.unique(
+        edges, axis=0, return_counts=True
+    )[1]
 
 
 def write_stl(path: Path, corners: NDArray[np.float64]) -> Path:
     text = "".join(
-        "facet normal 0 0 0\nouter loop\n" + "".join("vertex {:.17g} {:.17g} {:.17g}\n".format(*p) for p in triangle) + "endloop\nendfacet\n"
+        "facet normal 0 0 0\nouter loop\n"
+        + "".join("vertex {:.17g} {:.17g} {:.17g}\n".format(*p) for p in triangle)
+        + "endloop\nendfacet\n"
         for triangle in corners
     )
     path.write_text(f"solid body\n{text}endsolid body\n")
@@ -65,7 +79,9 @@ def write_stl(path: Path, corners: NDArray[np.float64]) -> Path:
 
 
 def write_obj(path: Path, points: NDArray[np.float64], faces: NDArray[np.int64]) -> Path:
-    lines = ["v {:.17g} {:.17g} {:.17g}".format(*p) for p in points] + ["f " + " ".join(str(n + 1) for n in face) for face in faces]
+    lines = ["v {:.17g} {:.17g} {:.17g}".format(*p) for p in points] + [
+        "f " + " ".join(str(n + 1) for n in face) for face in faces
+    ]
     path.write_text("\n".join([*lines, ""]))
     return path
 
@@ -78,16 +94,26 @@ CUBE_TRIANGLES = boundary(CUBE).triangles
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_an_stl_has_its_volume_its_vertices_once_and_is_turned_outwards(tmp_path: Path, turned: bool) -> None:
+def test_an_stl_has_its_volume_its_vertices_once_and_is_turned_outwards(
+    tmp_path: Path, turned: bool
+) -> None:
     corners = CUBE.points[CUBE_TRIANGLES]
-    surface = read_surface(write_stl(tmp_path / "cube.stl", corners[:, ::-1] if turned else corners), unit_m=0.01)
+    surface = read_surface(
+        write_stl(tmp_path / "cube.stl", corners[:, ::-1] if turned else corners), unit_m=0.01
+    )
     assert surface.volume_m3 == pytest.approx(24e-6, rel=1e-12)
     assert (len(surface.points), len(surface.triangles)) == (8, 12)
-    np.testing.assert_allclose(surface.bounds, np.array([[0, 0, 0], [0.02, 0.03, 0.04]]), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        surface.bounds, np.array([[0, 0, 0], [0.02, 0.03, 0.04]]), rtol=0, atol=1e-15
+    )
 
 
 def test_polygons_and_unused_vertices_of_an_obj(tmp_path: Path) -> None:
-    path = write_obj(tmp_path / "cube.OBJ", np.concatenate([[[9.0, 9.0, 9.0]], CUBE.points]), CUBE.boundary_facets + 1)
+    path = write_obj(
+        tmp_path / "cube.OBJ",
+        np.concatenate([[[9.0, 9.0, 9.0]], CUBE.points]),
+        CUBE.boundary_facets + 1,
+    )
     surface = read_surface(path)
     assert surface.volume_m3 == pytest.approx(24, rel=1e-12)
     assert (len(surface.points), len(surface.triangles)) == (8, 12)
@@ -113,18 +139,50 @@ TETRAHEDRON = PLUS + "f 1 3 2\nf 1 2 4\nf 2 3 4\n"
         ("a.obj", "", r"a surface must hold triangles; got none\.$"),
         ("a.stl", "", r"a surface must hold triangles; got none\.$"),
         ("a.obj", PLUS + "l 1 2\n", r"a surface must hold triangles; got none\.$"),
-        ("a.obj", PLUS + "f 1 2 2\nf 1 1 3\n", r"a surface must hold triangles; got only points and lines\.$"),
-        ("a.obj", "v 0 0 zero\n", r"meshio cannot read it \(could not convert string to float: 'zero'\)\.$"),
+        (
+            "a.obj",
+            PLUS + "f 1 2 2\nf 1 1 3\n",
+            r"a surface must hold triangles; got only points and lines\.$",
+        ),
+        (
+            "a.obj",
+            "v 0 0 zero\n",
+            r"meshio cannot read it \(could not convert string to float: 'zero'\)\.$",
+        ),
         ("a.stl", "solid\nvertex 0 0\n", r"meshio cannot read it \(\S.*\)\.$"),
-        ("a.obj", TETRAHEDRON + "f 1 4 5\n", r"triangles must have points in \[1, 4\]; got 1 to 5\.$"),
-        ("a.obj", TETRAHEDRON + "f 1 4 -2\n", r"triangles must have points in \[1, 4\]; got -2 to 4\.$"),
-        ("a.obj", TETRAHEDRON.replace("v 1 0", "v nan 0") + "f 1 4 3\n", r"positions must be finite\.$"),
-        ("a.obj", TETRAHEDRON, r"the surface is not closed: 3 of its 6 edges are not shared by exactly two triangles\.$"),
+        (
+            "a.obj",
+            TETRAHEDRON + "f 1 4 5\n",
+            r"triangles must have points in \[1, 4\]; got 1 to 5\.$",
+        ),
+        (
+            "a.obj",
+            TETRAHEDRON + "f 1 4 -2\n",
+            r"triangles must have points in \[1, 4\]; got -2 to 4\.$",
+        ),
+        (
+            "a.obj",
+            TETRAHEDRON.replace("v 1 0", "v nan 0") + "f 1 4 3\n",
+            r"positions must be finite\.$",
+        ),
+        (
+            "a.obj",
+            TETRAHEDRON,
+            r"the surface is not closed: 3 of its 6 edges are not shared by exactly two triangles\.$",
+        ),
         ("a.obj", TETRAHEDRON + "f 1 4 3\nf 1 4 3\n", r"is not closed: 3 of its 6 edges"),
-        ("a.obj", TETRAHEDRON + "f 1 3 4\n", r"the triangles are not consistently oriented: across 3 of 6 edges they turn over\.$"),
-        ("a.obj", TETRAHEDRON.replace("v 0 0 1", "v 1 1 0") + "f 1 4 3\n", r"the surface encloses no volume\.$"),
+        (
+            "a.obj",
+            TETRAHEDRON + "f 1 3 4\n",
+            r"the triangles are not consistently oriented: across 3 of 6 edges they turn over\.$",
+        ),
+        (
+            "a.obj",
+            TETRAHEDRON.replace("v 0 0 1", "v 1 1 0") + "f 1 4 3\n",
+            r"the surface encloses no volume\.$",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_bad_surface_is_refused_in_one_line_that_names_the_file(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str, text: str, message: str
 ) -> None:
@@ -164,7 +222,9 @@ def test_the_winding_number_is_whole_however_near_an_edge_or_a_corner() -> None:
     for depth in (1e-3, 1e-6, 1e-9):
         for nearby, winding in [(-depth, 1), (depth, 0)]:
             points = np.concatenate([on_edges, CUBE.points])
-            np.testing.assert_allclose(winding_numbers(corners, points + nearby * (points - centre)), winding, atol=1e-6)
+            np.testing.assert_allclose(
+                winding_numbers(corners, points + nearby * (points - centre)), winding, atol=1e-6
+            )
     in_plane = np.array([[-1.0, 0.0, 0.0], [5.0, 3.0, 4.0], [2.0, 7.0, 2.0], [1.0, 1.5, 9.0]])
     assert not inside(Surface(CUBE.points, CUBE_TRIANGLES), in_plane).any()
 
@@ -172,9 +232,15 @@ def test_the_winding_number_is_whole_however_near_an_edge_or_a_corner() -> None:
 def test_a_cavity_is_outside() -> None:
     outer = boundary(box_mesh((3.0, 3.0, 3.0), (1, 1, 1)))
     inner = boundary(box_mesh((1.0, 1.0, 1.0), (1, 1, 1)))
-    body = Surface(np.concatenate([outer.points, inner.points + 1]), np.concatenate([outer.triangles, inner.triangles[:, ::-1] + 8]))
+    body = Surface(
+        np.concatenate([outer.points, inner.points + 1]),
+        np.concatenate([outer.triangles, inner.triangles[:, ::-1] + 8]),
+    )
     assert body.volume_m3 == pytest.approx(26)
-    np.testing.assert_array_equal(inside(body, np.array([[1.5, 1.5, 1.5], [0.5, 1.5, 1.5], [3.5, 1.5, 1.5]])), [False, True, False])
+    np.testing.assert_array_equal(
+        inside(body, np.array([[1.5, 1.5, 1.5], [0.5, 1.5, 1.5], [3.5, 1.5, 1.5]])),
+        [False, True, False],
+    )
     assert voxel_mesh(body, (3, 3, 3)).n_cells == 26
 
 
@@ -184,9 +250,15 @@ def test_a_cavity_is_outside() -> None:
 def clipped(polygon: NDArray[np.float64], low: NDArray[np.float64]) -> NDArray[np.float64]:
     """The part of a polygon (n, 3) in the unit cube at `low` (Sutherland & Hodgman 1974)."""
     for axis, sign in [(axis, sign) for axis in range(3) for sign in (1, -1)]:
-        depth = sign * (polygon[:, axis] - low[axis]) if sign == 1 else 1 - (polygon[:, axis] - low[axis])
+        depth = (
+            sign * (polygon[:, axis] - low[axis])
+            if sign == 1
+            else 1 - (polygon[:, axis] - low[axis])
+        )
         kept = []
-        for p, q, dp, dq in zip(polygon, np.roll(polygon, -1, axis=0), depth, np.roll(depth, -1), strict=True):
+        for p, q, dp, dq in zip(
+            polygon, np.roll(polygon, -1, axis=0), depth, np.roll(depth, -1), strict=True
+        ):
             kept += [p] if dp >= 0 else []
             kept += [p + dp / (dp - dq) * (q - p)] if dp * dq < 0 else []
         if not kept:
@@ -197,13 +269,19 @@ def clipped(polygon: NDArray[np.float64], low: NDArray[np.float64]) -> NDArray[n
 
 def test_a_triangle_meets_the_cells_in_which_clipping_leaves_something_of_it() -> None:
     rng = np.random.default_rng(0)
-    corners = rng.uniform(-0.5, 3.5, size=(60, 1, 3)) + rng.uniform(-1.5, 1.5, size=(60, 3, 3)) * rng.choice([0.1, 1.0, 5.0], size=(60, 1, 1))
+    corners = rng.uniform(-0.5, 3.5, size=(60, 1, 3)) + rng.uniform(
+        -1.5, 1.5, size=(60, 3, 3)
+    ) * rng.choice([0.1, 1.0, 5.0], size=(60, 1, 1))
     for triangle in corners:
-        expected = [len(clipped(triangle, np.array(low, dtype=float))) > 0 for low in np.ndindex(3, 3, 3)]
+        expected = [
+            len(clipped(triangle, np.array(low, dtype=float))) > 0 for low in np.ndindex(3, 3, 3)
+        ]
         np.testing.assert_array_equal(met_cells(triangle[None], (3, 3, 3), 0.5).ravel(), expected)
 
 
-@pytest.mark.parametrize("mesh", [box_mesh((0.3, 0.5, 0.7), (3, 4, 7)), l_mesh((0.3, 0.5, 0.7), (3, 4, 7), (1, 3))])
+@pytest.mark.parametrize(
+    "mesh", [box_mesh((0.3, 0.5, 0.7), (3, 4, 7)), l_mesh((0.3, 0.5, 0.7), (3, 4, 7), (1, 3))]
+)
 def test_the_voxels_of_a_body_of_whole_cells_are_its_cells(mesh: Mesh) -> None:
     offset = np.array([0.1, -7.0, 3.3])
     surface = boundary(mesh)
@@ -215,8 +293,13 @@ def test_the_voxels_of_a_body_of_whole_cells_are_its_cells(mesh: Mesh) -> None:
 
 
 @pytest.mark.parametrize("cells", [(1, 1, 1), (4, 9, 7), (12, 12, 12)])
-@pytest.mark.parametrize("make", [liver_surface, lambda: sphere(0.02), lambda: Surface(CUBE.points + 0.1, CUBE_TRIANGLES)])
-def test_every_point_of_a_surface_lies_in_a_cell(make: Callable[[], Surface], cells: tuple[int, int, int]) -> None:
+@pytest.mark.parametrize(
+    "make",
+    [liver_surface, lambda: sphere(0.02), lambda: Surface(CUBE.points + 0.1, CUBE_TRIANGLES)],
+)
+def test_every_point_of_a_surface_lies_in_a_cell(
+    make: Callable[[], Surface], cells: tuple[int, int, int]
+) -> None:
     surface = make()
     mesh = voxel_mesh(surface, cells)
     points = on_surface(surface, np.random.default_rng(0))
@@ -226,7 +309,10 @@ def test_every_point_of_a_surface_lies_in_a_cell(make: Callable[[], Surface], ce
 
 def test_a_body_thinner_than_a_cell_is_in_the_cells_that_it_passes() -> None:
     """No centre of a cell lies in the needle along the diagonal."""
-    needle = Surface(np.array([[0.0, 0, 0], [1, 1, 1], [0.5, 0.52, 0.5], [0.5, 0.5, 0.53]]), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))
+    needle = Surface(
+        np.array([[0.0, 0, 0], [1, 1, 1], [0.5, 0.52, 0.5], [0.5, 0.5, 0.53]]),
+        np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]),
+    )
     needle = needle if needle.volume_m3 > 0 else Surface(needle.points, needle.triangles[:, ::-1])
     mesh = voxel_mesh(needle, (5, 4, 3))
     assert mesh.n_cells < 60
@@ -234,7 +320,9 @@ def test_a_body_thinner_than_a_cell_is_in_the_cells_that_it_passes() -> None:
 
 
 @pytest.mark.parametrize(("depth", "n_cells"), [(-1e-6, 3), (0.0, 3), (1e-12, 3), (1e-6, 4)])
-def test_a_cell_that_a_body_enters_however_little_is_kept_and_one_that_it_touches_is_not(depth: float, n_cells: int) -> None:
+def test_a_cell_that_a_body_enters_however_little_is_kept_and_one_that_it_touches_is_not(
+    depth: float, n_cells: int
+) -> None:
     surface = boundary(l_mesh((2.0, 1.0, 2.0), (2, 1, 2), (1, 1)))
     points = surface.points + depth * (surface.points == 1) * [1, 0, 0]
     assert voxel_mesh(Surface(points, surface.triangles), (2, 1, 2)).n_cells == n_cells
@@ -242,9 +330,13 @@ def test_a_cell_that_a_body_enters_however_little_is_kept_and_one_that_it_touche
 
 def test_cells_that_only_an_edge_joins_are_refused() -> None:
     part = boundary(box_mesh((1.0, 1.0, 1.0), (1, 1, 1)))
-    both = Surface(np.concatenate([part.points, part.points + np.array([1, 1, 0])]), np.concatenate([part.triangles, part.triangles + 8]))
+    both = Surface(
+        np.concatenate([part.points, part.points + np.array([1, 1, 0])]),
+        np.concatenate([part.triangles, part.triangles + 8]),
+    )
     with pytest.raises(
-        SpecError, match=r"^the 16 cells that the body has in a grid of 4 x 4 x 2 fall into 2 parts that no face joins; use more cells\.$"
+        SpecError,
+        match=r"^the 16 cells that the body has in a grid of 4 x 4 x 2 fall into 2 parts that no face joins; use more cells\.$",
     ):
         voxel_mesh(both, (4, 4, 2))
 
@@ -262,8 +354,12 @@ def dihedral_angles(mesh: Mesh) -> NDArray[np.float64]:
     corners, angles = mesh.points[mesh.cells], []
     for i, j in combinations(range(4), 2):
         k, l = (n for n in range(4) if n not in (i, j))
-        u, v = (np.cross(corners[:, j] - corners[:, i], corners[:, n] - corners[:, i]) for n in (k, l))
-        angles.append(np.degrees(np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), (u * v).sum(axis=1))))
+        u, v = (
+            np.cross(corners[:, j] - corners[:, i], corners[:, n] - corners[:, i]) for n in (k, l)
+        )
+        angles.append(
+            np.degrees(np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), (u * v).sum(axis=1)))
+        )
     return np.array(angles)
 
 
@@ -287,7 +383,9 @@ def test_tetrahedra_of_a_sphere_are_well_shaped_and_end_on_it(spacing_m: float) 
     check_tetrahedra(mesh)
     on_boundary = mesh.points[np.unique(mesh.boundary_facets)]
     np.testing.assert_allclose(np.linalg.norm(on_boundary - CENTRE, axis=1), RADIUS, rtol=1e-12)
-    assert volumes(mesh).sum() == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.5 * (spacing_m / RADIUS) ** 2)
+    assert volumes(mesh).sum() == pytest.approx(
+        4 / 3 * np.pi * RADIUS**3, rel=0.5 * (spacing_m / RADIUS) ** 2
+    )
     assert (np.diff(mesh.points[:, 0]) >= 0).all()
 
 
@@ -297,21 +395,31 @@ def test_tetrahedra_of_bumpy_bodies_are_well_shaped(seed: int) -> None:
     rng = np.random.default_rng(seed)
     waves, phases = rng.normal(size=(6, 3)) * 60, rng.uniform(0, 6, size=6)
     mesh = tetrahedral_mesh(
-        lambda x: sphere_level(x) + 6e-4 * np.sin(x @ waves.T + phases).sum(axis=1), ALL_AROUND + np.array([[-0.04], [0.04]]), 0.012
+        lambda x: sphere_level(x) + 6e-4 * np.sin(x @ waves.T + phases).sum(axis=1),
+        ALL_AROUND + np.array([[-0.04], [0.04]]),
+        0.012,
     )
     check_tetrahedra(mesh)
 
 
 def test_nodes_are_numbered_along_the_longest_axis() -> None:
-    mesh = tetrahedral_mesh(lambda x: (x**2 / [1, 4, 1]).sum(axis=1) - 1, np.array([[-1.0, -2, -1], [1, 2, 1]]), 0.4)
+    mesh = tetrahedral_mesh(
+        lambda x: (x**2 / [1, 4, 1]).sum(axis=1) - 1, np.array([[-1.0, -2, -1], [1, 2, 1]]), 0.4
+    )
     assert (np.diff(mesh.points[:, 1]) >= 0).all()
     assert np.ptp(mesh.cells, axis=1).max() < mesh.n_nodes / 3
 
 
 def test_a_body_that_the_lattice_misses_or_that_reaches_out_of_it_is_refused() -> None:
-    with pytest.raises(SpecError, match=r"^no point of a lattice of 1 m lies in the body; use a smaller spacing\.$"):
-        tetrahedral_mesh(lambda x: sphere_level(x + CENTRE + 0.25), np.array([[-1.0] * 3, [1.0] * 3]), 1.0)
-    with pytest.raises(SpecError, match=r"^the body reaches out of its bounds, \[.*\] to \[.*\] m\.$"):
+    with pytest.raises(
+        SpecError, match=r"^no point of a lattice of 1 m lies in the body; use a smaller spacing\.$"
+    ):
+        tetrahedral_mesh(
+            lambda x: sphere_level(x + CENTRE + 0.25), np.array([[-1.0] * 3, [1.0] * 3]), 1.0
+        )
+    with pytest.raises(
+        SpecError, match=r"^the body reaches out of its bounds, \[.*\] to \[.*\] m\.$"
+    ):
         tetrahedral_mesh(sphere_level, ALL_AROUND + np.array([[0.08], [0.0]]), 0.01)
 
 
@@ -321,7 +429,10 @@ def test_a_body_that_is_a_hinge_is_refused() -> None:
     def quadrants(x: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.where(np.abs(x).max(axis=1) > 2.2, 1.0, -x[:, 0] * x[:, 1])
 
-    with pytest.raises(SpecError, match=r"^with a spacing of 1 m parts of the body touch along \d+ edges only; use a smaller one\.$"):
+    with pytest.raises(
+        SpecError,
+        match=r"^with a spacing of 1 m parts of the body touch along \d+ edges only; use a smaller one\.$",
+    ):
         tetrahedral_mesh(quadrants, np.array([[-3.0] * 3, [3.0] * 3]), 1.0)
 
 
@@ -333,7 +444,9 @@ def test_the_liver_is_a_closed_surface_of_its_length_on_its_level_set() -> None:
     shared, directed = edge_uses(surface.triangles)
     assert (shared == 2).all()
     assert (directed == 1).all()
-    assert len(surface.points) - len(shared) + len(surface.triangles) == 2  # Euler's formula: one part, no handle
+    assert (
+        len(surface.points) - len(shared) + len(surface.triangles) == 2
+    )  # Euler's formula: one part, no handle
     assert surface.volume_m3 > 0
     size = np.ptp(surface.bounds, axis=0)
     assert size[0] == size.max() == pytest.approx(0.2, abs=1e-4)
@@ -356,12 +469,16 @@ def test_the_liver_is_held_in_the_notch_between_its_lobes() -> None:
     assert abs(liver_level(np.array([BETWEEN_LOBES]))[0]) < 1e-3
     # A notch is hollow: the chord between the lobes' surfaces on its two sides leaves the body.
     rng = np.random.default_rng(0)
-    near = liver_surface().points[np.linalg.norm(liver_surface().points - BETWEEN_LOBES, axis=1) < 0.04]
+    near = liver_surface().points[
+        np.linalg.norm(liver_surface().points - BETWEEN_LOBES, axis=1) < 0.04
+    ]
     chords = near[rng.integers(len(near), size=(2000, 2))].mean(axis=1)
     assert (liver_level(chords) > 0.02).any()
 
 
-def test_the_liver_of_tetrahedra_is_about_as_fine_as_the_papers_and_has_the_volume_of_its_surface() -> None:
+def test_the_liver_of_tetrahedra_is_about_as_fine_as_the_papers_and_has_the_volume_of_its_surface() -> (
+    None
+):
     mesh = liver_tetrahedra()
     check_tetrahedra(mesh)
     assert (mesh.n_cells, mesh.n_nodes) == (4567, 1118)

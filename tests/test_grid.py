@@ -40,36 +40,68 @@ def irregular(draw: st.DrawFn) -> Mesh:
 
 @settings(max_examples=60, deadline=None)
 @given(irregular(), st.none() | SHAPES, st.integers(0, 99))
-def test_forces_keep_their_sum_and_moment(mesh: Mesh, shape: tuple[int, int, int] | None, seed: int) -> None:
+def test_forces_keep_their_sum_and_moment(
+    mesh: Mesh, shape: tuple[int, int, int] | None, seed: int
+) -> None:
     generator = np.random.default_rng(seed)
-    forces, about = generator.standard_normal((3, mesh.n_nodes, 3)), mesh.points[generator.integers(mesh.n_nodes)]
+    forces, about = (
+        generator.standard_normal((3, mesh.n_nodes, 3)),
+        mesh.points[generator.integers(mesh.n_nodes)],
+    )
     grid = grid_map(mesh, shape)
     carried = grid.forces_to_grid(forces)
     assert carried.shape == (3, prod(grid.shape), 3)
-    np.testing.assert_allclose(carried.sum(axis=1), forces.sum(axis=1), rtol=0, atol=1e-12 * np.abs(forces).sum())
-    moment, expected = np.cross(grid_points(mesh, grid.shape) - about, carried), np.cross(mesh.points - about, forces)
+    np.testing.assert_allclose(
+        carried.sum(axis=1), forces.sum(axis=1), rtol=0, atol=1e-12 * np.abs(forces).sum()
+    )
+    moment, expected = (
+        np.cross(grid_points(mesh, grid.shape) - about, carried),
+        np.cross(mesh.points - about, forces),
+    )
     scale = np.abs(forces).sum() * np.linalg.norm(mesh.points, axis=1).max()
     np.testing.assert_allclose(moment.sum(axis=1), expected.sum(axis=1), rtol=0, atol=1e-12 * scale)
 
 
 @settings(max_examples=30, deadline=None)
 @given(irregular(), st.none() | SHAPES)
-def test_a_linear_displacement_of_the_grid_is_one_of_the_nodes(mesh: Mesh, shape: tuple[int, int, int] | None) -> None:
-    gradient, constant = np.random.default_rng(0).standard_normal((3, 3)), np.array([0.1, -0.2, 0.3])
+def test_a_linear_displacement_of_the_grid_is_one_of_the_nodes(
+    mesh: Mesh, shape: tuple[int, int, int] | None
+) -> None:
+    gradient, constant = (
+        np.random.default_rng(0).standard_normal((3, 3)),
+        np.array([0.1, -0.2, 0.3]),
+    )
     grid = grid_map(mesh, shape)
-    at_nodes = grid.displacements_to_nodes((grid_points(mesh, grid.shape) @ gradient + constant)[None])
+    at_nodes = grid.displacements_to_nodes(
+        (grid_points(mesh, grid.shape) @ gradient + constant)[None]
+    )
     scale = 1 + np.abs(mesh.points).max()
-    np.testing.assert_allclose(at_nodes[0], mesh.points @ gradient + constant, rtol=0, atol=1e-12 * scale)
+    np.testing.assert_allclose(
+        at_nodes[0], mesh.points @ gradient + constant, rtol=0, atol=1e-12 * scale
+    )
 
 
 @settings(max_examples=30, deadline=None)
 @given(irregular(), st.none() | SHAPES)
-def test_the_two_directions_are_adjoint_so_that_work_is_kept(mesh: Mesh, shape: tuple[int, int, int] | None) -> None:
+def test_the_two_directions_are_adjoint_so_that_work_is_kept(
+    mesh: Mesh, shape: tuple[int, int, int] | None
+) -> None:
     generator = np.random.default_rng(0)
     grid = grid_map(mesh, shape)
-    forces, displacements = generator.standard_normal((2, mesh.n_nodes, 3)), generator.standard_normal((2, prod(grid.shape), 3))
-    on_grid, at_nodes = grid.forces_to_grid(forces) * displacements, forces * grid.displacements_to_nodes(displacements)
-    np.testing.assert_allclose(on_grid.sum(axis=(1, 2)), at_nodes.sum(axis=(1, 2)), rtol=0, atol=1e-12 * np.abs(at_nodes).sum())
+    forces, displacements = (
+        generator.standard_normal((2, mesh.n_nodes, 3)),
+        generator.standard_normal((2, prod(grid.shape), 3)),
+    )
+    on_grid, at_nodes = (
+        grid.forces_to_grid(forces) * displacements,
+        forces * grid.displacements_to_nodes(displacements),
+    )
+    np.testing.assert_allclose(
+        on_grid.sum(axis=(1, 2)),
+        at_nodes.sum(axis=(1, 2)),
+        rtol=0,
+        atol=1e-12 * np.abs(at_nodes).sum(),
+    )
 
 
 def test_weights_are_the_product_of_three_linear_ones() -> None:
@@ -84,7 +116,10 @@ def test_weights_are_the_product_of_three_linear_ones() -> None:
 
 @pytest.mark.parametrize("tetrahedra", [False, True])
 def test_a_meshs_own_grid_changes_no_bit(tetrahedra: bool) -> None:
-    box, ell = box_mesh((2.0, 1.0, 1.0), (6, 2, 3), tetrahedra), l_mesh((2.0, 0.7, 1.1), (4, 2, 3), (2, 1), tetrahedra)
+    box, ell = (
+        box_mesh((2.0, 1.0, 1.0), (6, 2, 3), tetrahedra),
+        l_mesh((2.0, 0.7, 1.1), (4, 2, 3), (2, 1), tetrahedra),
+    )
     for mesh in (box, ell):
         assert mesh.grid_shape is not None
         assert mesh.grid_index is not None
@@ -96,13 +131,17 @@ def test_a_meshs_own_grid_changes_no_bit(tetrahedra: bool) -> None:
         assert np.count_nonzero(carried) == forces.size
         np.testing.assert_array_equal(grid.displacements_to_nodes(carried), forces)
     assert grid_map(ell).weights.shape == (ell.n_nodes, 60)
-    np.testing.assert_array_equal(grid_map(ell, ell.grid_shape).weights.toarray(), grid_map(ell).weights.toarray())
+    np.testing.assert_array_equal(
+        grid_map(ell, ell.grid_shape).weights.toarray(), grid_map(ell).weights.toarray()
+    )
 
 
 def test_a_regular_mesh_on_a_grid_of_another_shape() -> None:
     """On a grid of every second point the nodes between have two weights of a half."""
     mesh = box_mesh((4.0, 1.0, 1.0), (4, 1, 1))
-    weights = grid_map(mesh, (3, 2, 2)).weights.toarray().reshape(5, 2, 2, 3, 2, 2)[:, 0, 1, :, 0, 1]
+    weights = (
+        grid_map(mesh, (3, 2, 2)).weights.toarray().reshape(5, 2, 2, 3, 2, 2)[:, 0, 1, :, 0, 1]
+    )
     expected = np.array([[1, 0, 0], [0.5, 0.5, 0], [0, 1, 0], [0, 0.5, 0.5], [0, 0, 1]])
     np.testing.assert_allclose(weights, expected, rtol=0, atol=1e-14)
 
@@ -116,11 +155,20 @@ def test_nodes_on_the_bounding_box_are_inside_whatever_the_round_off() -> None:
 
 
 @pytest.mark.parametrize("tetrahedra", [False, True])
-@pytest.mark.parametrize(("size_m", "cells"), [((4.0, 1.0, 1.0), (15, 3, 3)), ((2.0, 1.0, 0.1), (12, 6, 1)), ((3.0, 3.0, 3.0), (5, 5, 5))])
-def test_the_default_grid_is_as_dense_as_the_nodes(size_m: tuple[float, float, float], cells: tuple[int, int, int], tetrahedra: bool) -> None:
+@pytest.mark.parametrize(
+    ("size_m", "cells"),
+    [((4.0, 1.0, 1.0), (15, 3, 3)), ((2.0, 1.0, 0.1), (12, 6, 1)), ((3.0, 3.0, 3.0), (5, 5, 5))],
+)
+def test_the_default_grid_is_as_dense_as_the_nodes(
+    size_m: tuple[float, float, float], cells: tuple[int, int, int], tetrahedra: bool
+) -> None:
     mesh = irregular_box(size_m, cells, tetrahedra)
     spacing = (prod(size_m) / mesh.n_nodes) ** (1 / 3)
-    assert default_shape(mesh) == grid_map(mesh).shape == tuple(max(2, round(length / spacing)) for length in size_m)
+    assert (
+        default_shape(mesh)
+        == grid_map(mesh).shape
+        == tuple(max(2, round(length / spacing)) for length in size_m)
+    )
 
 
 def test_the_default_grid_of_half_a_bounding_box_counts_the_body_only() -> None:
@@ -128,9 +176,14 @@ def test_the_default_grid_of_half_a_bounding_box_counts_the_body_only() -> None:
     assert prod(default_shape(ell)) == pytest.approx(ell.n_nodes * 4 / 3, rel=0.1)
 
 
-@pytest.mark.parametrize("shape", [(1, 4, 4), (4, 0, 4), (4, 4, -3), (101, 100, 100), (2, 2, MAX_POINTS // 4 + 1)])
+@pytest.mark.parametrize(
+    "shape", [(1, 4, 4), (4, 0, 4), (4, 4, -3), (101, 100, 100), (2, 2, MAX_POINTS // 4 + 1)]
+)
 def test_shapes_out_of_range_are_refused(shape: tuple[int, int, int]) -> None:
-    with pytest.raises(SpecError, match=f"at least 2 points per axis and at most 1,000,000 .* got {' x '.join(map(str, shape))}"):
+    with pytest.raises(
+        SpecError,
+        match=f"at least 2 points per axis and at most 1,000,000 .* got {' x '.join(map(str, shape))}",
+    ):
         grid_map(irregular_box((1.0, 1.0, 1.0), (2, 2, 2), tetrahedra=True), shape)
 
 

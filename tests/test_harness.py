@@ -50,11 +50,19 @@ def test_a_missing_prediction_is_an_infinite_error() -> None:
     predicted = reference.copy()
     predicted[7, 2, 1] = np.nan
     row = summary(sample_errors(predicted, reference))
-    assert row["mean_dof_m"] == row["max_dof_m"] == row["rel_l2_max"] == row["std_dof_m"] == math.inf
+    assert (
+        row["mean_dof_m"] == row["max_dof_m"] == row["rel_l2_max"] == row["std_dof_m"] == math.inf
+    )
     assert row["rel_l2_median"] == 0.0
 
 
-POINTS = [Point(1.0, 0.1, "a"), Point(10.0, 0.01, "b"), Point(5.0, 0.2, "dominated"), Point(100.0, 0.001, "c"), Point(0.5, math.inf, "failed")]
+POINTS = [
+    Point(1.0, 0.1, "a"),
+    Point(10.0, 0.01, "b"),
+    Point(5.0, 0.2, "dominated"),
+    Point(100.0, 0.001, "c"),
+    Point(0.5, math.inf, "failed"),
+]
 
 
 def test_frontier_interpolates_in_log_log_and_never_extrapolates() -> None:
@@ -71,21 +79,37 @@ def test_frontier_interpolates_in_log_log_and_never_extrapolates() -> None:
 
 
 @example([(1.0, 1.0000000000000002e-06), (2.0, 1e-06)], 1e-06, 1.0)
-@given(st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-6, 1.0)), min_size=1, max_size=12), st.floats(1e-6, 1.0), st.floats(1e-3, 1e3))
-def test_frontier_stays_between_its_points(points: list[tuple[float, float]], error: float, time: float) -> None:
+@given(
+    st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-6, 1.0)), min_size=1, max_size=12),
+    st.floats(1e-6, 1.0),
+    st.floats(1e-3, 1e3),
+)
+def test_frontier_stays_between_its_points(
+    points: list[tuple[float, float]], error: float, time: float
+) -> None:
     cloud = [Point(t, e, str(i)) for i, (t, e) in enumerate(points)]
     front = non_dominated(cloud)
-    assert all(any(q.latency_ms <= p.latency_ms and q.error <= p.error for q in front) for p in cloud)
+    assert all(
+        any(q.latency_ms <= p.latency_ms and q.error <= p.error for q in front) for p in cloud
+    )
     at_error = time_at_error(cloud, error)
     if at_error["best"] is None:
         assert min(p.error for p in cloud) > error
     else:
-        assert front[0].latency_ms * (1 - 1e-9) <= at_error["latency_ms"] <= at_error["best"]["latency_ms"] * (1 + 1e-9)
+        assert (
+            front[0].latency_ms * (1 - 1e-9)
+            <= at_error["latency_ms"]
+            <= at_error["best"]["latency_ms"] * (1 + 1e-9)
+        )
     at_time = error_at_time(cloud, time)
     if at_time["best"] is None:
         assert min(p.latency_ms for p in cloud) > time
     else:
-        assert front[-1].error * (1 - 1e-9) <= at_time["error"] <= at_time["best"]["error"] * (1 + 1e-9)
+        assert (
+            front[-1].error * (1 - 1e-9)
+            <= at_time["error"]
+            <= at_time["best"]["error"] * (1 + 1e-9)
+        )
 
 
 def test_threads_are_pinned_and_given_back() -> None:
@@ -98,13 +122,23 @@ def test_threads_are_pinned_and_given_back() -> None:
 
 
 @pytest.mark.parametrize("spoil", ["test", "train", "exit"])
-def test_a_method_trains_on_the_training_set_and_spoils_only_its_own_row(spoil: str, cache: Path, tmp_path: Path) -> None:
+def test_a_method_trains_on_the_training_set_and_spoils_only_its_own_row(
+    spoil: str, cache: Path, tmp_path: Path
+) -> None:
     path, notes = tmp_path / "recorder.toml", tmp_path / "notes.json"
     knobs = f'spoil = "{spoil}"\nnotes = "{notes.as_posix()}"'
-    path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Recorder"\n[parameters]\n{knobs}')
-    comparison = mor_bench.run(["beam-tiny"], [path, "linear-fem"], out=tmp_path / "out", cache=cache)
-    alone = mor_bench.run(["beam-tiny"], ["linear-fem"], out=tmp_path / "alone", cache=tmp_path / "another")
-    assert comparison.rows[0]["status"] == ("ok" if spoil == "test" else "failed"), comparison.rows[0]["reason"]
+    path.write_text(
+        f'title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Recorder"\n[parameters]\n{knobs}'
+    )
+    comparison = mor_bench.run(
+        ["beam-tiny"], [path, "linear-fem"], out=tmp_path / "out", cache=cache
+    )
+    alone = mor_bench.run(
+        ["beam-tiny"], ["linear-fem"], out=tmp_path / "alone", cache=tmp_path / "another"
+    )
+    assert comparison.rows[0]["status"] == ("ok" if spoil == "test" else "failed"), comparison.rows[
+        0
+    ]["reason"]
     assert comparison.rows[1]["error"] == alone.rows[0]["error"]
     data = mor_bench.load_dataset("beam-tiny", cache=cache)
     seen = json.loads(notes.read_text())
@@ -112,15 +146,23 @@ def test_a_method_trains_on_the_training_set_and_spoils_only_its_own_row(spoil: 
     assert not set(seen["regions"]) & set(data.test.regions)
 
 
-def test_data_costs_what_its_generation_took_and_only_those_who_learn_from_it(cache: Path, tmp_path: Path) -> None:
-    comparison = mor_bench.run(["beam-tiny"], ["linear-fem", "pca-regression"], out=tmp_path / "out", cache=cache)
+def test_data_costs_what_its_generation_took_and_only_those_who_learn_from_it(
+    cache: Path, tmp_path: Path
+) -> None:
+    comparison = mor_bench.run(
+        ["beam-tiny"], ["linear-fem", "pca-regression"], out=tmp_path / "out", cache=cache
+    )
     seconds = generation_seconds(load_generated_spec("beam-tiny"), cache, 170)
     assert seconds is not None
     assert [row["offline_s"]["data"] for row in comparison.rows] == [0.0, seconds, seconds, seconds]
 
 
-def test_a_stopped_run_goes_on_and_another_run_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clock, "SAME_SPEED", float("inf"))  # timings of a machine that is busy otherwise hold no longer
+def test_a_stopped_run_goes_on_and_another_run_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        clock, "SAME_SPEED", float("inf")
+    )  # timings of a machine that is busy otherwise hold no longer
 
     class StopError(Exception):
         pass
@@ -130,7 +172,12 @@ def test_a_stopped_run_goes_on_and_another_run_is_refused(tmp_path: Path, monkey
             raise StopError
 
     out, cache = tmp_path / "out", tmp_path / "cache"
-    arguments: dict[str, Any] = {"datasets": ["beam-tiny"], "methods": ["linear-fem", "pod"], "out": out, "cache": cache}
+    arguments: dict[str, Any] = {
+        "datasets": ["beam-tiny"],
+        "methods": ["linear-fem", "pod"],
+        "out": out,
+        "cache": cache,
+    }
     with pytest.raises(StopError):
         mor_bench.run(**arguments, listener=Listener(fitted=stop))
     begun = Comparison.read(out).rows
@@ -150,7 +197,9 @@ def test_a_stopped_run_goes_on_and_another_run_is_refused(tmp_path: Path, monkey
 
 def test_everything_is_checked_before_anything_runs(cache: Path, tmp_path: Path) -> None:
     mine = tmp_path / "pod.toml"
-    mine.write_text('title = "t"\nsource = "s"\nsurrogate = "mor_bench.surrogates.pod:PODGalerkin"\n[parameters]\nn_mode = 3')
+    mine.write_text(
+        'title = "t"\nsource = "s"\nsurrogate = "mor_bench.surrogates.pod:PODGalerkin"\n[parameters]\nn_mode = 3'
+    )
     out = tmp_path / "out"
     with pytest.raises(SpecError, match="unknown key `n_mode`"):
         mor_bench.run(["beam-tiny"], ["fem", mine], out=out, cache=cache)
@@ -170,9 +219,13 @@ def comparison(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Compari
     methods: list[str | Path] = ["fem", "pod"]
     for how in ("crash", "shape", "nan"):
         path = folder / f"broken-{how}.toml"
-        path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Broken"\n[parameters]\nhow = "{how}"')
+        path.write_text(
+            f'title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Broken"\n[parameters]\nhow = "{how}"'
+        )
         methods.append(path)
-    return mor_bench.run(["beam-tiny"], methods, out=tmp_path_factory.mktemp("out") / "run", cache=cache, threads=1)
+    return mor_bench.run(
+        ["beam-tiny"], methods, out=tmp_path_factory.mktemp("out") / "run", cache=cache, threads=1
+    )
 
 
 def test_every_configuration_has_a_row(comparison: Comparison) -> None:
@@ -197,8 +250,28 @@ def test_rows_hold_what_the_schema_promises(comparison: Comparison) -> None:
     assert row["status"] == "ok"
     assert (row["dataset"], row["method"], row["parameters"]["n_modes"]) == ("beam-tiny", "pod", 3)
     assert (row["n_train"], row["n_test"], row["threads"], row["split"]) == (170, 40, 1, "region")
-    assert set(row["error"]) == {"mean_dof_m", "std_dof_m", "max_dof_m", "rel_l2_median", "rel_l2_p95", "rel_l2_max", "max_nodal_m", "slope"}
-    assert set(row["latency_ms"]) == {"median", "p95", "p99", "low", "high", "gc", "n_queries", "n_processes", "stable", "unstable_because"}
+    assert set(row["error"]) == {
+        "mean_dof_m",
+        "std_dof_m",
+        "max_dof_m",
+        "rel_l2_median",
+        "rel_l2_p95",
+        "rel_l2_max",
+        "max_nodal_m",
+        "slope",
+    }
+    assert set(row["latency_ms"]) == {
+        "median",
+        "p95",
+        "p99",
+        "low",
+        "high",
+        "gc",
+        "n_queries",
+        "n_processes",
+        "stable",
+        "unstable_because",
+    }
     assert 0 < row["latency_ms"]["low"] <= row["latency_ms"]["median"] <= row["latency_ms"]["high"]
     assert row["all_threads_ms"]["median"] > 0
     assert set(row["throughput"]) == {"8", "64", "512"}
@@ -228,13 +301,20 @@ def test_it_reads_back_as_it_was(comparison: Comparison) -> None:
     assert again.frontier == comparison.frontier
     text = (comparison.out / "results.json").read_text()
     json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
-    reached = {(row["method"], row["target_rel_l2_median"]): row["best"] for row in comparison.frontier["time_at_error"]}
+    reached = {
+        (row["method"], row["target_rel_l2_median"]): row["best"]
+        for row in comparison.frontier["time_at_error"]
+    }
     assert reached["fem", 0.001] is not None
     assert reached["broken-crash", 0.1] is None
 
 
-def test_the_same_run_gives_the_same_errors_to_the_last_digit(comparison: Comparison, cache: Path, tmp_path: Path) -> None:
-    again = mor_bench.run(["beam-tiny"], ["fem", "pod"], out=tmp_path / "again", cache=cache, threads=1)
+def test_the_same_run_gives_the_same_errors_to_the_last_digit(
+    comparison: Comparison, cache: Path, tmp_path: Path
+) -> None:
+    again = mor_bench.run(
+        ["beam-tiny"], ["fem", "pod"], out=tmp_path / "again", cache=cache, threads=1
+    )
     assert [row["error"] for row in again.rows] == [row["error"] for row in comparison.rows[:11]]
 
 
@@ -245,7 +325,9 @@ def test_listener_hears_of_every_row(cache: Path, tmp_path: Path) -> None:
         fitted=lambda row: heard.append(f"{row['status']} {row['latency_ms']}"),
         finished=lambda row: heard.append("timed" if row["latency_ms"] else "not"),
     )
-    mor_bench.run(["beam-tiny"], ["linear-fem"], out=tmp_path / "out", cache=cache, listener=listener)
+    mor_bench.run(
+        ["beam-tiny"], ["linear-fem"], out=tmp_path / "out", cache=cache, listener=listener
+    )
     assert heard == ["1/1 linear-fem", "ok None", "timed"]
 
 
@@ -285,12 +367,23 @@ def test_reading_a_folder_that_is_no_run(tmp_path: Path) -> None:
 def tip_only(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """beam-tiny, of which only the tip's displacements are wanted."""
     path = tmp_path_factory.mktemp("datasets") / "tip.toml"
-    path.write_text(list_suite("datasets")["beam-tiny"].read_text().replace('outputs    = "all"', 'outputs = "x-max"'))
+    path.write_text(
+        list_suite("datasets")["beam-tiny"]
+        .read_text()
+        .replace('outputs    = "all"', 'outputs = "x-max"')
+    )
     return path
 
 
 def test_errors_count_the_wanted_nodes_alone(tip_only: Path, cache: Path, tmp_path: Path) -> None:
-    comparison = mor_bench.run([tip_only], ["fem", "pod-tensor"], out=tmp_path / "run", cache=cache, threads=1, profile="quick")
+    comparison = mor_bench.run(
+        [tip_only],
+        ["fem", "pod-tensor"],
+        out=tmp_path / "run",
+        cache=cache,
+        threads=1,
+        profile="quick",
+    )
     data = mor_bench.load_dataset(tip_only, cache=cache)
     tip = data.scene.output_nodes
     assert (data.scene.mesh.points[tip, 0] == data.scene.mesh.points[:, 0].max()).all()
@@ -301,12 +394,18 @@ def test_errors_count_the_wanted_nodes_alone(tip_only: Path, cache: Path, tmp_pa
     errors = np.abs(predicted[:, tip] - reference[:, tip]).mean(axis=(1, 2))
     assert row["error"]["mean_dof_m"] == pytest.approx(errors.mean(), rel=1e-6)
     assert row["indicator"] is None
-    hybrid = mor_bench.load_method("hybrid", steps=2).fit(data.scene, data.train).predict(data.test.forces[:3])
+    hybrid = (
+        mor_bench.load_method("hybrid", steps=2)
+        .fit(data.scene, data.train)
+        .predict(data.test.forces[:3])
+    )
     assert np.isfinite(hybrid).all()
 
 
 def test_indicated_errors_stand_in_the_row(cache: Path, tmp_path: Path) -> None:
-    comparison = mor_bench.run(["beam-tiny"], ["fem", "pod-tensor"], out=tmp_path / "run", cache=cache, threads=1)
+    comparison = mor_bench.run(
+        ["beam-tiny"], ["fem", "pod-tensor"], out=tmp_path / "run", cache=cache, threads=1
+    )
     for row in comparison.rows:
         if row["method"] == "pod-tensor":
             assert row["indicator"]["n"] > 30
@@ -316,16 +415,26 @@ def test_indicated_errors_stand_in_the_row(cache: Path, tmp_path: Path) -> None:
     assert comparison.rows[3]["indicator"] is None
 
 
-def test_a_region_of_outputs_without_nodes_is_an_error_of_the_dataset(tip_only: Path, tmp_path: Path) -> None:
+def test_a_region_of_outputs_without_nodes_is_an_error_of_the_dataset(
+    tip_only: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "none.toml"
-    path.write_text(tip_only.read_text().replace('"x-max"\nerror', "{ sphere_m = [[90.0, 0.0, 0.0], 1.0] }\nerror"))
+    path.write_text(
+        tip_only.read_text().replace(
+            '"x-max"\nerror', "{ sphere_m = [[90.0, 0.0, 0.0], 1.0] }\nerror"
+        )
+    )
     with pytest.raises(SpecError, match="holds no node"):
         mor_bench.load_scene(path)
 
 
-def test_a_method_without_an_answer_to_some_loads_is_timed_on_all(cache: Path, tmp_path: Path) -> None:
+def test_a_method_without_an_answer_to_some_loads_is_timed_on_all(
+    cache: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "sometimes.toml"
-    path.write_text('title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Broken"\n[parameters]\nhow = "sometimes"')
+    path.write_text(
+        'title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Broken"\n[parameters]\nhow = "sometimes"'
+    )
     row = mor_bench.run(["beam-tiny"], [path], out=tmp_path / "run", cache=cache, threads=1).rows[0]
     assert row["status"] == "ok"
     assert 0 < row["n_failed"] < row["n_test"]

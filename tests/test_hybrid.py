@@ -24,7 +24,11 @@ def coarse(cache: Path) -> Dataset:
 
 
 def error(method: Surrogate, data: Dataset, n: int = 40) -> float:
-    return float(sample_errors(method.predict(data.test.forces[:n]), data.test.displacements[:n]).relative_l2.mean())
+    return float(
+        sample_errors(
+            method.predict(data.test.forces[:n]), data.test.displacements[:n]
+        ).relative_l2.mean()
+    )
 
 
 @pytest.mark.parametrize("start", ["linear-fem", "pod-tensor", "pca-regression"])
@@ -59,7 +63,9 @@ class Nonsense(Surrogate):
         return np.broadcast_to(-2.0 * self.scene_.mesh.points, np.shape(forces)).copy()
 
 
-def test_a_start_that_is_nonsense_costs_time_and_not_the_answer(coarse: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_that_is_nonsense_costs_time_and_not_the_answer(
+    coarse: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Hybrid, "_unfitted", lambda self: Nonsense())
     for knobs in ({"steps": 1}, {"tolerance": 1e-8}):
         assert error(Hybrid(**knobs).fit(coarse.scene, coarse.train), coarse, 10) < 1e-6
@@ -71,10 +77,14 @@ def test_two_stopping_rules_are_refused(coarse: Dataset) -> None:
 
 
 def test_sizes_chosen_for_the_start_are_saved_with_it(coarse: Dataset, tmp_path: Path) -> None:
-    method = Hybrid("pod-tensor", {"n_modes": 8, "tolerance": "auto"}, steps=1).fit(coarse.scene, coarse.train)
+    method = Hybrid("pod-tensor", {"n_modes": 8, "tolerance": "auto"}, steps=1).fit(
+        coarse.scene, coarse.train
+    )
     method.save(tmp_path / "model.safetensors")
     again = mor_bench.load_surrogate(tmp_path / "model.safetensors")
-    np.testing.assert_array_equal(again.predict(coarse.test.forces[:2]), method.predict(coarse.test.forces[:2]))
+    np.testing.assert_array_equal(
+        again.predict(coarse.test.forces[:2]), method.predict(coarse.test.forces[:2])
+    )
 
 
 def test_knobs_of_the_start_are_checked(coarse: Dataset) -> None:
@@ -127,7 +137,9 @@ def test_moved_supports_are_errors_and_missing_nodes_are_refused(coarse: Dataset
 
 def test_no_loads_have_no_indications(coarse: Dataset) -> None:
     fem = mor_bench.load_method("fem").fit(coarse.scene, None)
-    assert fem.indicate_error(coarse.test.forces[:0], coarse.test.forces[:0]).relative_correction.shape == (0,)
+    assert fem.indicate_error(
+        coarse.test.forces[:0], coarse.test.forces[:0]
+    ).relative_correction.shape == (0,)
 
 
 def test_inverted_answers_are_not_returned(coarse: Dataset) -> None:

@@ -20,7 +20,13 @@ from mor_bench.mechanics.assembly import Assembler, quadrature_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.basis import pod
-from mor_bench.reduction.cubature import ActiveColumns, CubatureError, SparseWeights, ecsw_system, sparse_nnls
+from mor_bench.reduction.cubature import (
+    ActiveColumns,
+    CubatureError,
+    SparseWeights,
+    ecsw_system,
+    sparse_nnls,
+)
 from mor_bench.reduction.empirical_cubature import cell_basis, empirical_cubature
 from mor_bench.reduction.galerkin import CubatureProblem, GalerkinProblem
 from mor_bench.reduction.interpolation import Selection, interpolation_rows
@@ -42,8 +48,12 @@ from tests.verification.test_equilibria import scene_of
 Array = NDArray[np.float64]
 
 
-def cubature_of(scene: Scene, cells: NDArray[np.int64], weights: Array, modes: Array) -> CubatureProblem:
-    return CubatureProblem(reduced_points(scene, cells, weights, nodal(scene, modes)), extent_of(scene))
+def cubature_of(
+    scene: Scene, cells: NDArray[np.int64], weights: Array, modes: Array
+) -> CubatureProblem:
+    return CubatureProblem(
+        reduced_points(scene, cells, weights, nodal(scene, modes)), extent_of(scene)
+    )
 
 
 def whole_mesh(scene: Scene, weights: Array, modes: Array) -> GalerkinProblem:
@@ -52,7 +62,18 @@ def whole_mesh(scene: Scene, weights: Array, modes: Array) -> GalerkinProblem:
     number = np.full(scene.mesh.n_dofs, len(scene.free_dofs))
     number[scene.free_dofs] = np.arange(len(scene.free_dofs))
     mesh, dofs = scene.mesh, number.reshape(-1, 3)
-    return GalerkinProblem(Assembler(mesh.points, mesh.cells, dofs, len(scene.free_dofs), scene.material, weights, scene.selective), modes)
+    return GalerkinProblem(
+        Assembler(
+            mesh.points,
+            mesh.cells,
+            dofs,
+            len(scene.free_dofs),
+            scene.material,
+            weights,
+            scene.selective,
+        ),
+        modes,
+    )
 
 
 @pytest.mark.parametrize(("law", "kind"), EVERY)
@@ -66,22 +87,37 @@ def test_points_sum_to_what_is_assembled(law: str, kind: tuple[str, bool]) -> No
     few, whole = cubature_of(scene, cells, weights[cells], modes), whole_mesh(scene, weights, modes)
     q = 0.1 * rng.normal(size=7)
     (state, tangent), (expected, stiffness) = few.linearise(q), whole.linearise(q)
-    np.testing.assert_allclose(state.force, expected.force, rtol=0, atol=1e-12 * np.abs(expected.force).max())
-    np.testing.assert_allclose(few.force(q).force, state.force, rtol=0, atol=1e-13 * np.abs(expected.force).max())
+    np.testing.assert_allclose(
+        state.force, expected.force, rtol=0, atol=1e-12 * np.abs(expected.force).max()
+    )
+    np.testing.assert_allclose(
+        few.force(q).force, state.force, rtol=0, atol=1e-13 * np.abs(expected.force).max()
+    )
     np.testing.assert_allclose(tangent, stiffness, rtol=0, atol=1e-12 * np.abs(stiffness).max())
     assert state.energy_j == pytest.approx(expected.energy_j, rel=1e-12)
     assert scene.material is not None
-    shapes = quadrature_of(scene.mesh.points, scene.mesh.cells[cells], scene.material, scene.selective).gradients
+    shapes = quadrature_of(
+        scene.mesh.points, scene.mesh.cells[cells], scene.material, scene.selective
+    ).gradients
     u = (nodal(scene, modes) @ q)[scene.mesh.cells[cells]]
-    assert state.min_det_f == pytest.approx(np.linalg.det(np.eye(3) + np.einsum("cai,cqaj->cqij", u, shapes)).min(), rel=1e-12)
+    assert state.min_det_f == pytest.approx(
+        np.linalg.det(np.eye(3) + np.einsum("cai,cqaj->cqij", u, shapes)).min(), rel=1e-12
+    )
 
 
 def solved(scene: Scene, n: int) -> Snapshots:
     """Samples of a scene that no dataset holds."""
     loads = draw_loads(scene, 0, n)
-    found = FullOrderModel(scene).solve_many(loads.nodal_forces(scene.patch_weights).reshape(n, -1)[:, scene.free_dofs])
+    found = FullOrderModel(scene).solve_many(
+        loads.nodal_forces(scene.patch_weights).reshape(n, -1)[:, scene.free_dofs]
+    )
     assert not any(isinstance(answer, SolverError) for answer in found)
-    return Snapshots(scene, loads, np.array([a.displacement for a in found]), np.array([a.min_det_f for a in found]))  # type: ignore[union-attr]
+    return Snapshots(
+        scene,
+        loads,
+        np.array([a.displacement for a in found]),
+        np.array([a.min_det_f for a in found]),
+    )  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(("law", "kind"), EVERY)
@@ -91,8 +127,14 @@ def test_every_law_and_element(law: str, kind: tuple[str, bool]) -> None:
     train = solved(scene, 24)
     plain = PODGalerkin(5).fit(scene, train).predict(train.forces)
     size = np.abs(plain).max()
-    assert np.abs(HyperReducedPOD(5, 0.0).fit(scene, train).predict(train.forces) - plain).max() <= 1e-10 * size
-    assert np.abs(EmpiricalCubaturePOD(5, 0.0).fit(scene, train).predict(train.forces) - plain).max() <= 1e-10 * size
+    assert (
+        np.abs(HyperReducedPOD(5, 0.0).fit(scene, train).predict(train.forces) - plain).max()
+        <= 1e-10 * size
+    )
+    assert (
+        np.abs(EmpiricalCubaturePOD(5, 0.0).fit(scene, train).predict(train.forces) - plain).max()
+        <= 1e-10 * size
+    )
     few = HyperReducedPOD(5, 1e-3, sampling="cells").fit(scene, train)
     fewer = HyperReducedPOD(5, 1e-3, sampling="points").fit(scene, train)
     assert fewer.problem_.points.n_points < few.problem_.points.n_points or kind[0] == "tetrahedron"
@@ -117,7 +159,12 @@ def test_the_compiled_steps_end_as_the_shared_solve_does(tiny: Dataset, scale: f
                 problem.solve(load, options)
             continue
         found = problem.solve(load, options)
-        np.testing.assert_allclose(found.displacement, expected.displacement, rtol=0, atol=1e-10 * np.abs(expected.displacement).max())
+        np.testing.assert_allclose(
+            found.displacement,
+            expected.displacement,
+            rtol=0,
+            atol=1e-10 * np.abs(expected.displacement).max(),
+        )
         assert found.iterations == expected.iterations or found.cuts == expected.cuts
         assert found.min_det_f > 0
     assert (failed > 0) == (scale == 100.0)
@@ -129,7 +176,11 @@ def optimality(matrix: Array, target: Array, x: Array) -> tuple[float, float, fl
     norms = np.linalg.norm(matrix, axis=0)
     gradient = matrix.T @ residual / np.where(norms > 0, norms, 1.0) / size
     passive = x > 0
-    return float(np.linalg.norm(residual) / size), float(np.abs(gradient[passive]).max(initial=0.0)), float(gradient[~passive].max(initial=0.0))
+    return (
+        float(np.linalg.norm(residual) / size),
+        float(np.abs(gradient[passive]).max(initial=0.0)),
+        float(gradient[~passive].max(initial=0.0)),
+    )
 
 
 def hard_matrix(kind: str) -> Array:
@@ -144,7 +195,9 @@ def hard_matrix(kind: str) -> Array:
     return matrix
 
 
-@pytest.mark.parametrize("kind", ["plain", "duplicated columns", "badly scaled columns", "zero columns"])
+@pytest.mark.parametrize(
+    "kind", ["plain", "duplicated columns", "badly scaled columns", "zero columns"]
+)
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-8])
 def test_nnls_of_hard_columns_keeps_its_conditions(kind: str, tolerance: float) -> None:
     """Weights not negative, residual as asked, zero gradient on positive weights; the dual condition is that of the optimum only."""
@@ -155,12 +208,16 @@ def test_nnls_of_hard_columns_keeps_its_conditions(kind: str, tolerance: float) 
     assert (found.weights >= 0).all()
     assert residual <= tolerance * (1 + 1e-9)
     assert passive <= 1e-10
-    assert (found.relative_residual, found.passive_gradient, found.dual_gradient) == pytest.approx((residual, passive, dual), rel=1e-9, abs=1e-16)
+    assert (found.relative_residual, found.passive_gradient, found.dual_gradient) == pytest.approx(
+        (residual, passive, dual), rel=1e-9, abs=1e-16
+    )
     assert (found.weights[~matrix.any(axis=0)] == 0).all()
     assert (found.weights > 0).sum() <= 60
 
 
-@pytest.mark.parametrize("kind", ["plain", "duplicated columns", "badly scaled columns", "zero columns"])
+@pytest.mark.parametrize(
+    "kind", ["plain", "duplicated columns", "badly scaled columns", "zero columns"]
+)
 def test_nnls_run_to_the_end_meets_all_conditions(kind: str) -> None:
     """On a target out of reach; scipy's solution has the same residual."""
     from scipy.optimize import nnls
@@ -171,7 +228,10 @@ def test_nnls_run_to_the_end_meets_all_conditions(kind: str) -> None:
     found = sparse_nnls(matrix, target, 0.0)
     residual, passive, dual = optimality(matrix, target, found.weights)
     norms = np.linalg.norm(matrix, axis=0)
-    assert residual == pytest.approx(nnls(matrix / np.where(norms > 0, norms, 1.0), target)[1] / np.linalg.norm(target), rel=1e-10)
+    assert residual == pytest.approx(
+        nnls(matrix / np.where(norms > 0, norms, 1.0), target)[1] / np.linalg.norm(target),
+        rel=1e-10,
+    )
     assert (found.weights >= 0).all()
     assert max(passive, dual) <= 1e-10
     assert 0.1 < residual < 1
@@ -197,14 +257,18 @@ def test_nnls_refuses_what_is_not_finite(bad: float) -> None:
 
 def test_nnls_of_a_zero_target_has_zero_weights() -> None:
     found = sparse_nnls(np.ones((3, 4)), np.zeros(3), 1e-3)
-    assert asdict(found) | {"weights": None} == asdict(SparseWeights(np.zeros(4), 0.0, 0.0, 0.0, 0)) | {"weights": None}
+    assert asdict(found) | {"weights": None} == asdict(
+        SparseWeights(np.zeros(4), 0.0, 0.0, 0.0, 0)
+    ) | {"weights": None}
     assert not found.weights.any()
 
 
 def test_the_updated_factor_stays_that_of_its_columns() -> None:
     """600 changes to some of 300 nearly dependent columns."""
     rng = np.random.default_rng(0)
-    matrix = rng.normal(size=(120, 60)) @ rng.normal(size=(60, 300)) + 1e-4 * rng.normal(size=(120, 300))
+    matrix = rng.normal(size=(120, 60)) @ rng.normal(size=(60, 300)) + 1e-4 * rng.normal(
+        size=(120, 300)
+    )
     target = rng.normal(size=120)
     columns = ActiveColumns(matrix, target)
     for _ in range(600):
@@ -215,7 +279,9 @@ def test_the_updated_factor_stays_that_of_its_columns() -> None:
     assert len(columns.chosen) > 30
 
     def off() -> float:
-        return float(np.abs(columns.gradient(columns.residual(columns.coefficients()))[columns.chosen]).max())
+        return float(
+            np.abs(columns.gradient(columns.residual(columns.coefficients()))[columns.chosen]).max()
+        )
 
     updated = off()
     columns.refactor()
@@ -233,18 +299,26 @@ def test_blocks_of_rows_are_compressed_to_the_same_least_squares(tiny: Dataset) 
     for compressed in (ecsw_system(*arguments), ecsw_system(*arguments, max_entries=1)):
         assert len(compressed) <= 2 * 24 + 4
         for x in (weights, weights - 1, np.ones(24)):
-            assert np.linalg.norm(compressed @ x) == pytest.approx(np.linalg.norm(whole @ x), rel=1e-12)
+            assert np.linalg.norm(compressed @ x) == pytest.approx(
+                np.linalg.norm(whole @ x), rel=1e-12
+            )
 
 
 def test_the_cell_basis_leaves_what_it_may_and_is_hardly_larger_than_the_smallest() -> None:
     rng = np.random.default_rng(0)
-    matrix = rng.normal(size=(400, 150)) * 10.0 ** -np.linspace(0, 8, 150) @ np.linalg.qr(rng.normal(size=(150, 150)))[0]
+    matrix = (
+        rng.normal(size=(400, 150))
+        * 10.0 ** -np.linspace(0, 8, 150)
+        @ np.linalg.qr(rng.normal(size=(150, 150)))[0]
+    )
     values = np.linalg.svd(matrix, compute_uv=False)
     tails = np.sqrt(np.cumsum(values[::-1] ** 2)[::-1])
     for tolerance in (1e-1, 1e-2, 1e-4):
         basis = cell_basis(matrix, tolerance)
         assert np.linalg.norm(basis.T @ basis - np.eye(basis.shape[1])) <= 1e-12
-        assert np.linalg.norm(matrix - matrix @ basis @ basis.T) <= tolerance * np.linalg.norm(matrix) * (1 + 1e-6)
+        assert np.linalg.norm(matrix - matrix @ basis @ basis.T) <= tolerance * np.linalg.norm(
+            matrix
+        ) * (1 + 1e-6)
         assert basis.shape[1] <= int((tails > tolerance * np.linalg.norm(matrix)).sum()) + 3
 
 
@@ -252,7 +326,9 @@ def test_the_cell_basis_leaves_what_it_may_and_is_hardly_larger_than_the_smalles
 def test_empirical_cubature_integrates_its_basis_and_one(tiny: Dataset, tolerance: float) -> None:
     model = FullOrderModel(tiny.scene)
     modes = pod(tiny.train.free_displacements, 3).modes
-    system = ecsw_system(model.assembler, model.cell_dofs, modes, tiny.train.free_displacements[:60] @ modes)
+    system = ecsw_system(
+        model.assembler, model.cell_dofs, modes, tiny.train.free_displacements[:60] @ modes
+    )
     found = empirical_cubature(system, tolerance)
     basis = cell_basis(system, tolerance)
     np.testing.assert_allclose(basis.T @ found.weights, basis.sum(axis=0), atol=1e-7 * np.sqrt(24))
@@ -260,7 +336,9 @@ def test_empirical_cubature_integrates_its_basis_and_one(tiny: Dataset, toleranc
     assert (found.weights >= 0).all()
     assert (found.weights > 0).sum() <= basis.shape[1] + 1
     missed = system @ (found.weights - 1)
-    assert np.linalg.norm(missed) <= tolerance * np.linalg.norm(system) * np.linalg.norm(found.weights - 1) * (1 + 1e-6)
+    assert np.linalg.norm(missed) <= tolerance * np.linalg.norm(system) * np.linalg.norm(
+        found.weights - 1
+    ) * (1 + 1e-6)
     with pytest.raises(CubatureError, match="in 1 iterations"):
         empirical_cubature(system, tolerance, max_iterations=1)
 
@@ -281,18 +359,26 @@ def test_interpolation_is_exact_in_the_basis_and_at_its_rows(selection: Selectio
     factor = np.linalg.norm(np.linalg.inv(basis[rows]), 2)
     best = np.linalg.norm(other - basis @ basis.T @ other)
     assert np.linalg.norm(lift @ other[rows] - other) <= factor * best * (1 + 1e-9)
-    scattered = [np.linalg.norm(np.linalg.inv(basis[rng.choice(200, 12, replace=False)]), 2) for _ in range(20)]
+    scattered = [
+        np.linalg.norm(np.linalg.inv(basis[rng.choice(200, 12, replace=False)]), 2)
+        for _ in range(20)
+    ]
     assert factor < 0.2 * min(scattered)
 
 
 def test_greedy_rows_of_a_small_basis_by_hand() -> None:
     basis = np.array([[1.0, 1.0], [2.0, 0.0], [0.0, -3.0]])
-    assert interpolation_rows(basis, "greedy").tolist() == [1, 2]  # after row 1 the second column is not interpolated at all
+    assert interpolation_rows(basis, "greedy").tolist() == [
+        1,
+        2,
+    ]  # after row 1 the second column is not interpolated at all
     with pytest.raises(InvalidInputError, match="3 rows cannot have 4"):
         interpolation_rows(np.ones((3, 4)), "greedy")
 
 
-def test_the_interpolated_force_is_projected_exactly_at_rest_and_has_its_tangent(tiny: Dataset) -> None:
+def test_the_interpolated_force_is_projected_exactly_at_rest_and_has_its_tangent(
+    tiny: Dataset,
+) -> None:
     method = InterpolatedPOD(6, 12).fit(tiny.scene, tiny.train)
     model, modes = FullOrderModel(tiny.scene), method.modes_
     rng = np.random.default_rng(0)
@@ -324,13 +410,17 @@ def test_points_keep_the_reduced_force_of_training(kind: tuple[str, bool]) -> No
     method = HyperReducedPOD(4, 1e-2).fit(scene, train)
     model, q = FullOrderModel(scene), train.free_displacements @ method.modes_
     own = np.array([method.problem_.force(coordinates).force for coordinates in q])
-    whole = np.array([model.force(method.modes_ @ coordinates).force @ method.modes_ for coordinates in q])
+    whole = np.array(
+        [model.force(method.modes_ @ coordinates).force @ method.modes_ for coordinates in q]
+    )
     assert np.linalg.norm(own - whole) <= 1.0001e-2 * np.linalg.norm(whole)
     assert method.problem_.points.n_points < 2 * len(method.cells_)
     assert method.weights_.shape == (len(method.cells_), 9 if kind[1] else 8)
 
 
-@pytest.mark.parametrize("method", [HyperReducedPOD(4, 1e-2), EmpiricalCubaturePOD(4, 1e-2), InterpolatedPOD(4, 6)])
+@pytest.mark.parametrize(
+    "method", [HyperReducedPOD(4, 1e-2), EmpiricalCubaturePOD(4, 1e-2), InterpolatedPOD(4, 6)]
+)
 @pytest.mark.parametrize("forged", [-1, 10**6, "twice", 0.5])
 def test_indices_of_a_file_are_checked(tiny: Dataset, method: Any, forged: Any) -> None:
     """Kernels check no bounds."""
@@ -355,11 +445,15 @@ def on_twice_the_cells(method: HyperReducedPOD) -> CubatureProblem:
     scene = method.scene_
     fine = with_cells(scene, (30, 3, 3))
     assert fine.mesh.n_cells == 2 * scene.mesh.n_cells
-    modes = interpolation_matrix(scene.mesh, fine.mesh.points) @ nodal(scene, method.modes_).reshape(scene.mesh.n_nodes, -1)
+    modes = interpolation_matrix(scene.mesh, fine.mesh.points) @ nodal(
+        scene, method.modes_
+    ).reshape(scene.mesh.n_nodes, -1)
     centres, kept = (s.mesh.points[s.mesh.cells].mean(axis=1) for s in (fine, scene))
     nearest = np.linalg.norm(centres[:, None] - kept[method.cells_], axis=2).argmin(axis=0)
     assert len(np.unique(nearest)) == len(method.cells_)
-    points = reduced_points(fine, nearest, 2 * method.weights_, modes.reshape(fine.mesh.n_nodes, 3, -1))
+    points = reduced_points(
+        fine, nearest, 2 * method.weights_, modes.reshape(fine.mesh.n_nodes, 3, -1)
+    )
     return CubatureProblem(points, extent_of(scene))
 
 
@@ -367,7 +461,9 @@ def wanted_at_the_tip(method: HyperReducedPOD) -> tuple[HyperReducedPOD, HyperRe
     """The method, and the same on twice the cells, where only the displacements of the loaded end are wanted."""
     scene = method.scene_
     fine = with_cells(scene, (30, 3, 3))
-    modes = interpolation_matrix(scene.mesh, fine.mesh.points) @ nodal(scene, method.modes_).reshape(scene.mesh.n_nodes, -1)
+    modes = interpolation_matrix(scene.mesh, fine.mesh.points) @ nodal(
+        scene, method.modes_
+    ).reshape(scene.mesh.n_nodes, -1)
     centres, kept = (s.mesh.points[s.mesh.cells].mean(axis=1) for s in (fine, scene))
     nearest = np.linalg.norm(centres[:, None] - kept[method.cells_], axis=2).argmin(axis=0)
     both = []
@@ -394,14 +490,20 @@ def test_a_query_does_not_depend_on_the_mesh_where_few_outputs_are_wanted(cache:
         loads = []
         for method in (coarse, fine):
             load = np.zeros((method.scene_.mesh.n_nodes, 3))
-            load[np.linalg.norm(method.scene_.mesh.points - corner, axis=1).argmin()] = [0.01, 0.02, -0.05]
+            load[np.linalg.norm(method.scene_.mesh.points - corner, axis=1).argmin()] = [
+                0.01,
+                0.02,
+                -0.05,
+            ]
             loads.append(load)
         with counted() as own:
             answer = coarse.predict(loads[0])
         with counted() as other:
             again = fine.predict(loads[1])
         tips = [u[method.scene_.output_nodes] for method, u in ((coarse, answer), (fine, again))]
-        assert np.linalg.norm(tips[1] - tips[0]) <= 0.05 * np.linalg.norm(tips[0])  # another quadrature of the same body
+        assert np.linalg.norm(tips[1] - tips[0]) <= 0.05 * np.linalg.norm(
+            tips[0]
+        )  # another quadrature of the same body
         assert np.isnan(answer).any()
         if steps(own, len(coarse.cells_)) == steps(other, len(fine.cells_)):
             assert own == other != Cost()
@@ -446,13 +548,17 @@ def test_the_solve_does_not_depend_on_the_mesh(cache: Path) -> None:
             coarse.solve(load, NewtonOptions(1e-4))
         with counted() as other:
             fine.solve(load, NewtonOptions(1e-4))
-        if steps(own, len(method.cells_)) == steps(other, len(method.cells_)):  # it is another body: a load may take a step more
+        if steps(own, len(method.cells_)) == steps(
+            other, len(method.cells_)
+        ):  # it is another body: a load may take a step more
             assert own == other != Cost()
             same.append(load)
     assert len(same) >= 35
     ratios: list[float] = []
     while not any(0.8 <= ratio <= 1.2 for ratio in ratios) and len(ratios) < 5:
-        rounds = [(seconds(coarse, np.array(same)), seconds(fine, np.array(same))) for _ in range(9)]
+        rounds = [
+            (seconds(coarse, np.array(same)), seconds(fine, np.array(same))) for _ in range(9)
+        ]
         ratios.append(median(two for _, two in rounds) / median(one for one, _ in rounds))
     assert any(0.8 <= ratio <= 1.2 for ratio in ratios), ratios
 

@@ -15,7 +15,13 @@ import pytest
 from safetensors.numpy import save as serialise
 
 import mor_bench
-from mor_bench.errors import FallbackWarning, InvalidInputError, MorBenchError, StoreError, UnavailableBackendError
+from mor_bench.errors import (
+    FallbackWarning,
+    InvalidInputError,
+    MorBenchError,
+    StoreError,
+    UnavailableBackendError,
+)
 from mor_bench.harness.export import export_onnx
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogate import Surrogate, _digest, _read_model
@@ -68,11 +74,15 @@ def available(net: Any, backend: Any) -> Inference:
 @pytest.mark.parametrize("backend", list(EXACT))
 @pytest.mark.parametrize("activation", ["relu", "silu"])
 @torch.inference_mode()  # type: ignore[untyped-decorator]
-def test_a_back_end_answers_as_torch_and_a_batch_as_its_samples(backend: str, activation: Activation) -> None:
+def test_a_back_end_answers_as_torch_and_a_batch_as_its_samples(
+    backend: str, activation: Activation
+) -> None:
     net = network(activation)
     weights = {name: value.clone() for name, value in net.state_dict().items()}
     function = available(net, backend)
-    x = torch.randn(5, 12, 8, 4, 3, generator=torch.Generator().manual_seed(0)).permute(0, 4, 1, 2, 3)  # channels-last
+    x = torch.randn(5, 12, 8, 4, 3, generator=torch.Generator().manual_seed(0)).permute(
+        0, 4, 1, 2, 3
+    )  # channels-last
     expected = net(x)
     answer = function(x)
     assert answer.dtype == torch.float32
@@ -93,9 +103,13 @@ def test_geometry_of_convolutions_is_kept() -> None:
     generator = torch.Generator().manual_seed(0)
     nn = torch.nn
     layers = nn.Sequential(
-        nn.Conv2d(4, 6, 3, stride=2, padding=(1, 2), bias=False), nn.ReLU(), nn.Conv2d(6, 4, 3, dilation=2, groups=2),
-        nn.ConvTranspose2d(4, 5, (2, 3), stride=(2, 3), bias=False), nn.ConvTranspose2d(5, 2, 3, stride=2), nn.Tanh(),
-    )  # fmt: skip
+        nn.Conv2d(4, 6, 3, stride=2, padding=(1, 2), bias=False),
+        nn.ReLU(),
+        nn.Conv2d(6, 4, 3, dilation=2, groups=2),
+        nn.ConvTranspose2d(4, 5, (2, 3), stride=(2, 3), bias=False),
+        nn.ConvTranspose2d(5, 2, 3, stride=2),
+        nn.Tanh(),
+    )
     x = torch.randn(2, 4, 17, 19, generator=generator)
     torch.testing.assert_close(available(layers, "packed")(x), layers(x), rtol=1e-4, atol=1e-5)
     with pytest.raises(UnavailableBackendError, match="no convolutions"):
@@ -105,14 +119,20 @@ def test_geometry_of_convolutions_is_kept() -> None:
         Inference(layers, "onnx")
 
 
-def choose(monkeypatch: pytest.MonkeyPatch, times: dict[str, float], own_error: float) -> inference.Choice:
+def choose(
+    monkeypatch: pytest.MonkeyPatch, times: dict[str, float], own_error: float
+) -> inference.Choice:
     """The choice where queries take these times and the network errs so much, relative to its output."""
-    monkeypatch.setattr(inference, "_fastest_ms", lambda able, inputs: {name: times[name] for name in able})
+    monkeypatch.setattr(
+        inference, "_fastest_ms", lambda able, inputs: {name: times[name] for name in able}
+    )
     net = network()
     x = torch.randn(4, 3, 8, 4, 4, generator=torch.Generator().manual_seed(0))
     with torch.inference_mode():
         answer = net(x)
-    target = answer + own_error * answer.square().mean().sqrt() * torch.randn(answer.shape, generator=torch.Generator().manual_seed(2))
+    target = answer + own_error * answer.square().mean().sqrt() * torch.randn(
+        answer.shape, generator=torch.Generator().manual_seed(2)
+    )
     return choose_inference(net, x, lambda function: function(x) - target)
 
 
@@ -126,22 +146,39 @@ def test_the_choice_is_by_error_and_clear_gains(monkeypatch: pytest.MonkeyPatch)
     assert "own error" in exact.left_out["packed-bfloat16"]
     assert exact.milliseconds == {"eager": 10.0, "packed": 5.0, "onnx": 4.5}
     assert choose(monkeypatch, {**times, "packed-bfloat16": 4.9}, 1.0).inference.backend == "packed"
-    assert choose(monkeypatch, {**times, "packed": 9.5, "onnx": 9.0, "packed-bfloat16": 9.0}, 1.0).inference.backend == "eager"
+    assert (
+        choose(
+            monkeypatch, {**times, "packed": 9.5, "onnx": 9.0, "packed-bfloat16": 9.0}, 1.0
+        ).inference.backend
+        == "eager"
+    )
 
 
-def test_what_was_chosen_and_measured_is_saved_and_not_measured_again(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    method: Any = mor_bench.load_method("umesh", **{**TINY, "inference": "auto"}).fit(data.scene, data.train)
+def test_what_was_chosen_and_measured_is_saved_and_not_measured_again(
+    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method: Any = mor_bench.load_method("umesh", **{**TINY, "inference": "auto"}).fit(
+        data.scene, data.train
+    )
     assert method.sizes_ == {"inference": method.inference_.backend}
     assert method.timings_ms_["eager"] > 0
     path = tmp_path / "model.safetensors"
     method.save(path)
     monkeypatch.delattr(inference, "_fastest_ms")
     loaded: Any = mor_bench.load_surrogate(path)
-    assert (loaded.sizes_, loaded.timings_ms_, loaded.inference_.backend) == (method.sizes_, method.timings_ms_, method.inference_.backend)
-    np.testing.assert_array_equal(loaded.predict(data.test.forces), method.predict(data.test.forces))
+    assert (loaded.sizes_, loaded.timings_ms_, loaded.inference_.backend) == (
+        method.sizes_,
+        method.timings_ms_,
+        method.inference_.backend,
+    )
+    np.testing.assert_array_equal(
+        loaded.predict(data.test.forces), method.predict(data.test.forces)
+    )
 
 
-def test_another_machine_answers_by_torch_with_a_warning(fitted: Surrogate, data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_machine_answers_by_torch_with_a_warning(
+    fitted: Surrogate, data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "model.safetensors"
     other: Any = copy.copy(fitted)
     other.inference = "packed-bfloat16"
@@ -155,15 +192,23 @@ def test_another_machine_answers_by_torch_with_a_warning(fitted: Surrogate, data
         inference._reason_against_packing.cache_clear()
     assert loaded.inference_.backend == "eager"
     other.inference_ = Inference(other.network_)
-    np.testing.assert_array_equal(loaded.predict(data.test.forces[0]), other.predict(data.test.forces[0]))
+    np.testing.assert_array_equal(
+        loaded.predict(data.test.forces[0]), other.predict(data.test.forces[0])
+    )
     with pytest.warns(FallbackWarning, match="no convolutions"):
         assert inference_or_eager(torch.nn.Linear(3, 3), "packed").backend == "eager"
 
 
-@pytest.mark.parametrize("knobs", [{}, {"input": "linear-response", "zero_at_rest": True, "activation": "silu"}])
-def test_an_onnx_file_answers_as_the_method(data: Dataset, tmp_path: Path, knobs: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "knobs", [{}, {"input": "linear-response", "zero_at_rest": True, "activation": "silu"}]
+)
+def test_an_onnx_file_answers_as_the_method(
+    data: Dataset, tmp_path: Path, knobs: dict[str, Any]
+) -> None:
     onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
-    method = mor_bench.load_method("umesh", **{**TINY, **knobs, "inference": "eager"}).fit(data.scene, data.train)
+    method = mor_bench.load_method("umesh", **{**TINY, **knobs, "inference": "eager"}).fit(
+        data.scene, data.train
+    )
     method.save(tmp_path / "model.safetensors")
     path, difference = export_onnx(tmp_path / "model.safetensors", tmp_path / "new" / "model.onnx")
     assert difference is not None
@@ -180,13 +225,17 @@ def test_an_onnx_file_answers_as_the_method(data: Dataset, tmp_path: Path, knobs
         expected = method.predict(forces)
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
         assert (found[:, data.scene.fixed_nodes] == 0).all()
-    (at_rest,) = session.run(["displacements"], {"forces": np.zeros((3, *forces.shape[1:]), np.float32)})
+    (at_rest,) = session.run(
+        ["displacements"], {"forces": np.zeros((3, *forces.shape[1:]), np.float32)}
+    )
     assert at_rest.any() != method.parameters["zero_at_rest"]
     with pytest.raises(InvalidInputError, match="not overwritten"):
         export_onnx(tmp_path / "model.safetensors", path)
 
 
-def test_what_cannot_be_written_as_onnx(data: Dataset, fitted: Surrogate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_written_as_onnx(
+    data: Dataset, fitted: Surrogate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     mor_bench.load_method("linear-fem").fit(data.scene, None).save(tmp_path / "linear.safetensors")
     with pytest.raises(MorBenchError, match="LinearFEM has no network"):
         export_onnx(tmp_path / "linear.safetensors", tmp_path / "linear.onnx")
@@ -208,13 +257,24 @@ def test_what_cannot_be_written_as_onnx(data: Dataset, fitted: Surrogate, tmp_pa
 
 
 KNOBS: list[dict[str, Any]] = [
-    {"channels": 10**9}, {"channels": 10**30}, {"channels": 512}, {"steps": 10**9}, {"steps": 6}, {"channels": "4"}, {"steps": True},
-    {"unknown": 1}, {"inference": "os.system"}, {"inference": ["packed"]}, {"iterations": float("nan")},
-]  # fmt: skip
+    {"channels": 10**9},
+    {"channels": 10**30},
+    {"channels": 512},
+    {"steps": 10**9},
+    {"steps": 6},
+    {"channels": "4"},
+    {"steps": True},
+    {"unknown": 1},
+    {"inference": "os.system"},
+    {"inference": ["packed"]},
+    {"iterations": float("nan")},
+]
 
 
 @pytest.fixture(scope="module")
-def parts(fitted: Surrogate, tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, dict[str, str], dict[str, np.ndarray]]:
+def parts(
+    fitted: Surrogate, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[bytes, dict[str, str], dict[str, np.ndarray]]:
     """A model's file, its header and its arrays."""
     path = tmp_path_factory.mktemp("hostile") / "model.safetensors"
     fitted.save(path)
@@ -234,7 +294,9 @@ def forged(header: dict[str, str], arrays: dict[str, np.ndarray]) -> bytes:
 
 
 @pytest.mark.parametrize("knobs", KNOBS, ids=str)
-def test_forged_knobs(parts: Any, tmp_path: Path, knobs: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forged_knobs(
+    parts: Any, tmp_path: Path, knobs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     _, header, arrays = parts
 
     def allocated(*_: Any, **__: Any) -> None:
@@ -242,10 +304,16 @@ def test_forged_knobs(parts: Any, tmp_path: Path, knobs: dict[str, Any], monkeyp
 
     monkeypatch.setattr(torch.nn.Module, "to_empty", allocated)
     knobs = {**json.loads(header["parameters"]), **knobs}
-    refused(tmp_path / "model.safetensors", forged({**header, "parameters": json.dumps(knobs)}, arrays))
+    refused(
+        tmp_path / "model.safetensors", forged({**header, "parameters": json.dumps(knobs)}, arrays)
+    )
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, "{", "null", "[]", '{"channels":' + "9" * 5000 + "}"], ids=lambda text: text[:12])
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, "{", "null", "[]", '{"channels":' + "9" * 5000 + "}"],
+    ids=lambda text: text[:12],
+)
 def test_forged_json(parts: Any, tmp_path: Path, text: str) -> None:
     _, header, arrays = parts
     for key in ("parameters", "scene"):
@@ -257,11 +325,19 @@ def test_a_forged_scene_whose_file_never_ends(parts: Any, tmp_path: Path) -> Non
     _, header, arrays = parts
     os.mkfifo(tmp_path / "pipe")
     for path in ("/dev/zero", str(tmp_path / "pipe")):
-        scene = {**json.loads(header["scene"]), "geometry": {"shape": "file", "file": {"path": path, "sha256": "0" * 64}}}
-        refused(tmp_path / "model.safetensors", forged({**header, "scene": json.dumps(scene)}, arrays))
+        scene = {
+            **json.loads(header["scene"]),
+            "geometry": {"shape": "file", "file": {"path": path, "sha256": "0" * 64}},
+        }
+        refused(
+            tmp_path / "model.safetensors", forged({**header, "scene": json.dumps(scene)}, arrays)
+        )
 
 
-@pytest.mark.parametrize("name", ["../../evil:Evil", "/etc/passwd", "os:system", "mor_bench.surrogates.umesh.method:_scale", ""])
+@pytest.mark.parametrize(
+    "name",
+    ["../../evil:Evil", "/etc/passwd", "os:system", "mor_bench.surrogates.umesh.method:_scale", ""],
+)
 def test_forged_class(parts: Any, tmp_path: Path, name: str) -> None:
     _, header, arrays = parts
     refused(tmp_path / "model.safetensors", forged({**header, "surrogate": name}, arrays))
@@ -270,28 +346,62 @@ def test_forged_class(parts: Any, tmp_path: Path, name: str) -> None:
 def test_forged_arrays(parts: Any, tmp_path: Path) -> None:
     _, header, arrays = parts
     path, weight = tmp_path / "model.safetensors", "network.encoder.0.2.weight"
-    changes: list[dict[str, np.ndarray | None]] = [{name: None} for name in arrays if not name.startswith("range.")]
+    changes: list[dict[str, np.ndarray | None]] = [
+        {name: None} for name in arrays if not name.startswith("range.")
+    ]
     for name in (weight, "network.head.bias", "scales", "loss_curve", "iterations"):
         other = np.float64 if arrays[name].dtype == np.float32 else np.float32
-        changes += [{name: arrays[name].astype(dtype)} for dtype in (other, np.int32, np.float16, np.uint8)]
-        changes += [{name: arrays[name].reshape(1, -1)}, {name: arrays[name][:0]} if name != "loss_curve" else {name: arrays[name][None]}]
+        changes += [
+            {name: arrays[name].astype(dtype)} for dtype in (other, np.int32, np.float16, np.uint8)
+        ]
+        changes += [
+            {name: arrays[name].reshape(1, -1)},
+            {name: arrays[name][:0]} if name != "loss_curve" else {name: arrays[name][None]},
+        ]
         if arrays[name].dtype.kind == "f":
             changes += [{name: np.full_like(arrays[name], bad)} for bad in (np.nan, -np.inf)]
-    changes += [{name: np.ones(1, np.float32)} for name in ("evil", "network.evil", "size.channels", "size.evil", "range.evil")]
-    changes += [{"size.inference": np.frombuffer(word, np.uint8)} for word in (b"packed", b"\xff\xfe", b"")]
+    changes += [
+        {name: np.ones(1, np.float32)}
+        for name in ("evil", "network.evil", "size.channels", "size.evil", "range.evil")
+    ]
+    changes += [
+        {"size.inference": np.frombuffer(word, np.uint8)} for word in (b"packed", b"\xff\xfe", b"")
+    ]
     changes += [{"scales": np.zeros(2)}, {"scales": -np.ones(2)}, {"iterations": np.array([-1])}]
     changes += [{"timing.eager": np.array([-1.0])}, {"timing.eager": np.ones(3)}]
     for change in changes:
-        refused(path, forged(header, {name: array for name, array in {**arrays, **change}.items() if array is not None}))
+        refused(
+            path,
+            forged(
+                header,
+                {name: array for name, array in {**arrays, **change}.items() if array is not None},
+            ),
+        )
 
 
 def test_damaged_bytes_and_headers(parts: Any, tmp_path: Path) -> None:
     content, _, _ = parts
     path, length = tmp_path / "model.safetensors", int.from_bytes(content[:8], "little")
-    for end in {0, 1, 7, 8, 9, length // 2, length + 7, length + 8, length + 9, len(content) // 2, len(content) - 1}:
+    for end in {
+        0,
+        1,
+        7,
+        8,
+        9,
+        length // 2,
+        length + 7,
+        length + 8,
+        length + 9,
+        len(content) // 2,
+        len(content) - 1,
+    }:
         refused(path, content[:end])
     generator = np.random.default_rng(0)
-    for place in [*range(8), *generator.integers(8, 8 + length, 30), *generator.integers(8 + length, len(content), 10)]:
+    for place in [
+        *range(8),
+        *generator.integers(8, 8 + length, 30),
+        *generator.integers(8 + length, len(content), 10),
+    ]:
         flipped = bytearray(content)
         flipped[place] ^= 1 << int(generator.integers(8))
         refused(path, bytes(flipped))
@@ -299,9 +409,13 @@ def test_damaged_bytes_and_headers(parts: Any, tmp_path: Path) -> None:
     name = "network.encoder.0.2.weight"
     begin, end = table[name]["data_offsets"]
     entries: list[dict[str, Any]] = [
-        {"dtype": "BF16", "shape": [(end - begin) // 2]}, {"dtype": "F8_E4M3", "shape": [end - begin]}, {"shape": [10**9] * 3},
-        {"shape": [10**12, 0]}, {"data_offsets": [0, 10**12]}, {"dtype": "object"},
-    ]  # fmt: skip
+        {"dtype": "BF16", "shape": [(end - begin) // 2]},
+        {"dtype": "F8_E4M3", "shape": [end - begin]},
+        {"shape": [10**9] * 3},
+        {"shape": [10**12, 0]},
+        {"data_offsets": [0, 10**12]},
+        {"dtype": "object"},
+    ]
     for entry in entries:
         forgery = json.dumps({**table, name: {**table[name], **entry}}).encode()
         refused(path, len(forgery).to_bytes(8, "little") + forgery + body)

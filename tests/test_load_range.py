@@ -29,7 +29,12 @@ Array = NDArray[np.float64]
 
 @pytest.fixture(scope="module")
 def with_sets(cache: Path) -> Dataset:
-    return mor_bench.load_dataset("beam-tiny", tests=["in-range", "2x", "4x", "unseen-regions", "several-forces"], cache=cache, workers=1)
+    return mor_bench.load_dataset(
+        "beam-tiny",
+        tests=["in-range", "2x", "4x", "unseen-regions", "several-forces"],
+        cache=cache,
+        workers=1,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +64,9 @@ def test_the_named_test_sets_are_told_apart(pod: Surrogate, with_sets: Dataset) 
 def test_directions_across_those_of_training_are_flagged(tmp_path: Path) -> None:
     spec = mor_bench.load_scene("beam-tiny").spec.model_dump(mode="json")
     pressed = {**spec, "loads": {**spec["loads"], "kind": "normal"}}
-    data = mor_bench.load_dataset(pressed, tests=["in-range", "unseen-directions"], cache=tmp_path, workers=1)
+    data = mor_bench.load_dataset(
+        pressed, tests=["in-range", "unseen-directions"], cache=tmp_path, workers=1
+    )
     method = mor_bench.load_method("pod", n_modes=5).fit(data.scene, data.train)
     assert method.out_of_range(data.tests["unseen-directions"].forces).all()
     assert not method.out_of_range(data.tests["in-range"].forces).any()
@@ -76,18 +83,26 @@ def test_the_strangeness_is_that_of_its_definition(tiny: Dataset) -> None:
             moment = at_node.T @ at_node / max(float((at_node**2).sum()), 1e-300)
             if size > 0:
                 direction = force / size
-                expected += size * direction @ np.linalg.solve(moment + load_range.REGULARISATION * np.eye(3), direction)
+                expected += (
+                    size
+                    * direction
+                    @ np.linalg.solve(moment + load_range.REGULARISATION * np.eye(3), direction)
+                )
                 total += size
         assert known.strangeness(load[None]) == pytest.approx([expected / total], rel=1e-12)
 
 
-def test_patches_and_nodal_forces_have_one_range_in_chunks_or_not(tiny: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_patches_and_nodal_forces_have_one_range_in_chunks_or_not(
+    tiny: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole = LoadRange.of(tiny.train)
     monkeypatch.setattr(load_range, "CHUNK", 7)
     for snapshots in (tiny.train, nodal(tiny.train)):
         assert isinstance(snapshots.loads, PatchLoads) == (snapshots is tiny.train)
         found = LoadRange.of(snapshots)
-        np.testing.assert_allclose([found.size_n, found.width], [whole.size_n, whole.width], rtol=1e-12)
+        np.testing.assert_allclose(
+            [found.size_n, found.width], [whole.size_n, whole.width], rtol=1e-12
+        )
         np.testing.assert_array_equal(found.nodes, whole.nodes)
         np.testing.assert_allclose(found.moments, whole.moments, atol=1e-14)
 
@@ -106,7 +121,9 @@ def test_shapes_and_bad_input(pod: Surrogate, tiny: Dataset) -> None:
     assert pod.out_of_range(batch).dtype == bool
     assert not pod.out_of_range(0 * one)
     assert pod.out_of_range(100 * one)
-    np.testing.assert_array_equal(pod.out_of_range(batch), [pod.out_of_range(force) for force in batch])
+    np.testing.assert_array_equal(
+        pod.out_of_range(batch), [pod.out_of_range(force) for force in batch]
+    )
     with pytest.raises(InvalidInputError, match="forces"):
         pod.out_of_range(one * np.nan)
     with pytest.raises(NotFittedError):
@@ -165,15 +182,24 @@ def test_the_range_survives_a_file(pod: Surrogate, with_sets: Dataset, tmp_path:
     pod.save(path)
     loaded = mor_bench.load_surrogate(path)
     for snapshots in (with_sets.test, *with_sets.tests.values()):
-        np.testing.assert_array_equal(loaded.out_of_range(snapshots.forces), pod.out_of_range(snapshots.forces))
+        np.testing.assert_array_equal(
+            loaded.out_of_range(snapshots.forces), pod.out_of_range(snapshots.forces)
+        )
 
 
-def test_a_file_without_a_range_is_read_and_says_so(pod: Surrogate, tiny: Dataset, tmp_path: Path) -> None:
+def test_a_file_without_a_range_is_read_and_says_so(
+    pod: Surrogate, tiny: Dataset, tmp_path: Path
+) -> None:
     path = tmp_path / "model.safetensors"
     pod.save(path)
-    rewritten(path, lambda arrays: [arrays.pop(name) for name in list(arrays) if name.startswith("range.")])
+    rewritten(
+        path,
+        lambda arrays: [arrays.pop(name) for name in list(arrays) if name.startswith("range.")],
+    )
     loaded = mor_bench.load_surrogate(path)
-    np.testing.assert_array_equal(loaded.predict(tiny.test.forces[0]), pod.predict(tiny.test.forces[0]))
+    np.testing.assert_array_equal(
+        loaded.predict(tiny.test.forces[0]), pod.predict(tiny.test.forces[0])
+    )
     with pytest.raises(UnknownRangeError, match="older version"):
         loaded.out_of_range(tiny.test.forces[0])
     loaded.save(path)
@@ -185,14 +211,20 @@ DAMAGE: dict[str, Callable[[dict[str, NDArray[Any]]], object]] = {
     "one more": lambda arrays: arrays.update({"range.more": np.zeros(1)}),
     "NaN limit": lambda arrays: arrays.update({"range.limits": np.array([np.nan, 1.0])}),
     "negative limit": lambda arrays: arrays.update({"range.limits": np.array([-1.0, 1.0])}),
-    "nodes beyond the mesh": lambda arrays: arrays.update({"range.nodes": arrays["range.nodes"] + 1000}),
+    "nodes beyond the mesh": lambda arrays: arrays.update(
+        {"range.nodes": arrays["range.nodes"] + 1000}
+    ),
     "negative nodes": lambda arrays: arrays.update({"range.nodes": arrays["range.nodes"] - 1000}),
     "nodes twice": lambda arrays: arrays.update({"range.nodes": 0 * arrays["range.nodes"]}),
     "fewer moments": lambda arrays: arrays.update({"range.moments": arrays["range.moments"][1:]}),
     "NaN moment": lambda arrays: arrays.update({"range.moments": arrays["range.moments"] * np.nan}),
     "moments negative": lambda arrays: arrays.update({"range.moments": -arrays["range.moments"]}),
-    "moments not symmetric": lambda arrays: arrays.update({"range.moments": arrays["range.moments"] + np.eye(3, k=1)}),
-    "moments not of unit trace": lambda arrays: arrays.update({"range.moments": 2 * arrays["range.moments"]}),
+    "moments not symmetric": lambda arrays: arrays.update(
+        {"range.moments": arrays["range.moments"] + np.eye(3, k=1)}
+    ),
+    "moments not of unit trace": lambda arrays: arrays.update(
+        {"range.moments": 2 * arrays["range.moments"]}
+    ),
 }
 
 

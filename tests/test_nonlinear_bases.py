@@ -15,7 +15,12 @@ from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction import modal_derivatives as derivatives_module
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.manifold import ManifoldProblem, QuadraticManifold
-from mor_bench.reduction.modal_derivatives import derivative_basis, linear_modes, modal_derivatives, pairs
+from mor_bench.reduction.modal_derivatives import (
+    derivative_basis,
+    linear_modes,
+    modal_derivatives,
+    pairs,
+)
 from mor_bench.reduction.tensors import polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
@@ -30,7 +35,10 @@ LAWS: dict[str, dict[str, Any]] = {
     "neo-hookean": {"young_pa": 500.0, "poisson": 0.4},
     "mooney-rivlin": {"c10_pa": 60.0, "c01_pa": 30.0, "bulk_pa": 800.0},
 }
-NO_SNAPSHOTS: list[tuple[str, dict[str, Any]]] = [("modal-derivatives", {"n_linear": 5, "n_modes": 20}), ("quadratic-manifold", {"n_modes": 4})]
+NO_SNAPSHOTS: list[tuple[str, dict[str, Any]]] = [
+    ("modal-derivatives", {"n_linear": 5, "n_modes": 20}),
+    ("quadratic-manifold", {"n_modes": 4}),
+]
 
 
 def tiny_of(law: str) -> Scene:
@@ -55,17 +63,25 @@ def test_modal_derivatives_are_those_of_the_tangent(law: str) -> None:
 
     h = 1e-4
     for column, (i, j) in enumerate(zip(*pairs(3), strict=True)):
-        difference = (model.linearise(h * modes[:, j])[1] - model.linearise(-h * modes[:, j])[1]) / (2 * h)
+        difference = (
+            model.linearise(h * modes[:, j])[1] - model.linearise(-h * modes[:, j])[1]
+        ) / (2 * h)
         expected = -model.rest_factor.solve(times(difference, modes[:, i]))
-        np.testing.assert_allclose(found[:, column], expected, rtol=0, atol=1e-4 * np.abs(expected).max())
+        np.testing.assert_allclose(
+            found[:, column], expected, rtol=0, atol=1e-4 * np.abs(expected).max()
+        )
 
 
-def test_of_a_cubic_force_the_differences_are_exact_whatever_their_step(tiny: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_a_cubic_force_the_differences_are_exact_whatever_their_step(
+    tiny: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model = FullOrderModel(tiny.scene)
     modes = linear_modes(tiny.scene, model, 3).modes
     small = modal_derivatives(model, modes)
     monkeypatch.setattr(derivatives_module, "DIFFERENCE", 1.0)
-    np.testing.assert_allclose(small, modal_derivatives(model, modes), rtol=0, atol=1e-8 * np.abs(small).max())
+    np.testing.assert_allclose(
+        small, modal_derivatives(model, modes), rtol=0, atol=1e-8 * np.abs(small).max()
+    )
 
 
 def test_the_basis_is_orthonormal_and_holds_modes_and_derivatives(tiny: Dataset) -> None:
@@ -84,27 +100,47 @@ def test_force_and_tangent_on_the_manifold_are_derivatives_of_its_energy(law: st
     linear = linear_modes(scene, model, 4)
     manifold = QuadraticManifold(linear.modes, modal_derivatives(model, linear.modes))
     rng = np.random.default_rng(0)
-    problem = ManifoldProblem(GalerkinProblem(model.assembler, linear.modes), manifold, manifold.curvature(1e-3 * rng.normal(size=model.n_unknowns)))
-    q, direction = 0.5 * linear.amplitudes_m * rng.normal(size=4), linear.amplitudes_m * rng.normal(size=4)
+    problem = ManifoldProblem(
+        GalerkinProblem(model.assembler, linear.modes),
+        manifold,
+        manifold.curvature(1e-3 * rng.normal(size=model.n_unknowns)),
+    )
+    q, direction = (
+        0.5 * linear.amplitudes_m * rng.normal(size=4),
+        linear.amplitudes_m * rng.normal(size=4),
+    )
     state, tangent = problem.linearise(q)
     np.testing.assert_allclose(state.force, problem.force(q).force, rtol=1e-10, atol=1e-14)
     h = 1e-4
     there, back = problem.force(q + h * direction), problem.force(q - h * direction)
-    assert (there.energy_j - back.energy_j) / (2 * h) == pytest.approx(state.force @ direction, rel=1e-6)
+    assert (there.energy_j - back.energy_j) / (2 * h) == pytest.approx(
+        state.force @ direction, rel=1e-6
+    )
     expected = (there.force - back.force) / (2 * h)
-    np.testing.assert_allclose(tangent @ direction, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        tangent @ direction, expected, rtol=0, atol=1e-6 * np.abs(expected).max()
+    )
 
 
-@pytest.mark.parametrize(("name", "knobs"), [*NO_SNAPSHOTS, ("local-pod", {"n_clusters": 3, "n_modes": 4})])
-def test_small_loads_get_the_linear_response(name: str, knobs: dict[str, Any], tiny: Dataset) -> None:
+@pytest.mark.parametrize(
+    ("name", "knobs"), [*NO_SNAPSHOTS, ("local-pod", {"n_clusters": 3, "n_modes": 4})]
+)
+def test_small_loads_get_the_linear_response(
+    name: str, knobs: dict[str, Any], tiny: Dataset
+) -> None:
     """The static correction holds under a load that no basis saw: the error falls with the square of the load."""
-    method = mor_bench.load_method(name, **knobs).fit(tiny.scene, tiny.train if name == "local-pod" else None)
+    method = mor_bench.load_method(name, **knobs).fit(
+        tiny.scene, tiny.train if name == "local-pod" else None
+    )
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
     force = np.zeros((tiny.scene.mesh.n_nodes, 3))
     force[-1] = [0.3, -0.2, 0.1]
     for size in (1e-3, 1e-5):
         expected = linear.predict(size * force)
-        assert np.abs(method.predict(size * force) - expected).max() <= 3 * size * np.abs(expected).max()
+        assert (
+            np.abs(method.predict(size * force) - expected).max()
+            <= 3 * size * np.abs(expected).max()
+        )
 
 
 def test_the_quadratic_manifold_is_exact_to_second_order(tiny: Dataset) -> None:
@@ -129,14 +165,20 @@ def test_the_quadratic_manifold_is_exact_to_second_order(tiny: Dataset) -> None:
 
 @pytest.mark.parametrize(("name", "knobs"), NO_SNAPSHOTS)
 @pytest.mark.parametrize("law", LAWS)
-def test_without_snapshots_they_beat_linear_elasticity_for_every_law(name: str, knobs: dict[str, Any], law: str) -> None:
+def test_without_snapshots_they_beat_linear_elasticity_for_every_law(
+    name: str, knobs: dict[str, Any], law: str
+) -> None:
     scene = tiny_of(law)
     loads = draw_loads(scene, 0, 21)
     forces = loads.nodal_forces(scene.patch_weights)
     exact = mor_bench.load_method("fem", tolerance=1e-8).fit(scene, None).predict(forces)
     sizes = np.linalg.norm(exact, axis=(1, 2))
     errors = {
-        method: np.linalg.norm(mor_bench.load_method(method, **its).fit(scene, None).predict(forces) - exact, axis=(1, 2)) / sizes
+        method: np.linalg.norm(
+            mor_bench.load_method(method, **its).fit(scene, None).predict(forces) - exact,
+            axis=(1, 2),
+        )
+        / sizes
         for method, its in ((name, knobs), ("linear-fem", {}))
     }
     assert np.median(errors[name]) <= 0.3 * np.median(errors["linear-fem"])
@@ -145,14 +187,19 @@ def test_without_snapshots_they_beat_linear_elasticity_for_every_law(name: str, 
 
 @pytest.mark.parametrize("change", [{"integration": "selective"}, {"element": "tetrahedron"}])
 @pytest.mark.parametrize(("name", "knobs"), NO_SNAPSHOTS)
-def test_other_elements_and_integration(name: str, knobs: dict[str, Any], change: dict[str, str]) -> None:
+def test_other_elements_and_integration(
+    name: str, knobs: dict[str, Any], change: dict[str, str]
+) -> None:
     content = load_generated_spec("beam-tiny").model_dump(mode="json")
     content["discretisation"] = {**content["discretisation"], **change}
     scene = mor_bench.load_scene(content)
     forces = draw_loads(scene, 0, 10).nodal_forces(scene.patch_weights)
     exact = mor_bench.load_method("fem", tolerance=1e-8).fit(scene, None).predict(forces)
     found = mor_bench.load_method(name, **knobs).fit(scene, None).predict(forces)
-    assert np.median(np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2))) <= 0.01
+    assert (
+        np.median(np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2)))
+        <= 0.01
+    )
 
 
 def test_a_load_is_answered_from_the_basis_of_its_direction(tiny: Dataset) -> None:
@@ -165,19 +212,26 @@ def test_a_load_is_answered_from_the_basis_of_its_direction(tiny: Dataset) -> No
     assert len(set(asked)) > 1
     first, other = (asked.index(number) for number in sorted(set(asked))[:2])
     before = method.predict(tiny.test.forces[[first, other]])
-    method.problems_[asked[first]], method.bases_[asked[first]] = method.problems_[asked[other]], method.bases_[asked[other]]
+    method.problems_[asked[first]], method.bases_[asked[first]] = (
+        method.problems_[asked[other]],
+        method.bases_[asked[other]],
+    )
     after = method.predict(tiny.test.forces[[first, other]])
     assert (after[0] != before[0]).any()
     assert (after[1] == before[1]).all()
     assert len(LocalPOD(n_clusters=500, n_modes=1).fit(tiny.scene, tiny.train[:6]).problems_) == 6
 
 
-def test_with_one_cluster_and_all_modes_local_pod_is_the_full_model_on_its_snapshots(tiny: Dataset) -> None:
+def test_with_one_cluster_and_all_modes_local_pod_is_the_full_model_on_its_snapshots(
+    tiny: Dataset,
+) -> None:
     method = LocalPOD(n_clusters=1, n_modes=10_000)
     with pytest.warns(UserWarning, match="rank"):
         method.fit(tiny.scene, tiny.train[:30])
     found = method.predict(tiny.train.forces[:30])
-    np.testing.assert_allclose(found, tiny.train.displacements[:30], rtol=0, atol=1e-6 * np.abs(found).max())
+    np.testing.assert_allclose(
+        found, tiny.train.displacements[:30], rtol=0, atol=1e-6 * np.abs(found).max()
+    )
 
 
 def test_of_clusters_of_like_loads_each_does_better_than_one_basis(cache: Path) -> None:
@@ -186,7 +240,12 @@ def test_of_clusters_of_like_loads_each_does_better_than_one_basis(cache: Path) 
     medians = []
     for n_clusters in (1, 16):
         found = LocalPOD(n_clusters, 5, 1e-4).fit(data.scene, data.train).predict(data.test.forces)
-        medians.append(np.median(np.linalg.norm(found - data.test.displacements, axis=(1, 2)) / np.linalg.norm(data.test.displacements, axis=(1, 2))))
+        medians.append(
+            np.median(
+                np.linalg.norm(found - data.test.displacements, axis=(1, 2))
+                / np.linalg.norm(data.test.displacements, axis=(1, 2))
+            )
+        )
     assert medians[1] < 0.85 * medians[0]
 
 
@@ -194,7 +253,9 @@ def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_answers(cache: Pat
     """Also at a loose tolerance small loads get the linear response, since the correction is of the sampled stiffness."""
     scene = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache).scene
     forces = draw_loads(scene, 0, 30).nodal_forces(scene.patch_weights)
-    whole = mor_bench.load_method("quadratic-manifold", n_modes=4, cubature_tolerance=0.0).fit(scene, None)
+    whole = mor_bench.load_method("quadratic-manifold", n_modes=4, cubature_tolerance=0.0).fit(
+        scene, None
+    )
     sampled = QuadraticManifoldGalerkin(4, 1e-3, 1e-4).fit(scene, None)
     assert len(sampled.cells_) < 0.3 * scene.mesh.n_cells
     assert (sampled.weights_ > 0).all()
@@ -204,7 +265,9 @@ def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_answers(cache: Pat
     loose = QuadraticManifoldGalerkin(4, 0.1, 1e-8).fit(scene, None)
     assert len(loose.cells_) < len(sampled.cells_)
     linear = mor_bench.load_method("linear-fem").fit(scene, None).predict(1e-5 * forces)
-    np.testing.assert_allclose(loose.predict(1e-5 * forces), linear, rtol=0, atol=1e-4 * np.abs(linear).max())
+    np.testing.assert_allclose(
+        loose.predict(1e-5 * forces), linear, rtol=0, atol=1e-4 * np.abs(linear).max()
+    )
 
 
 def test_the_autoencoder_learns_what_linear_elasticity_lacks(cache: Path) -> None:
@@ -213,7 +276,10 @@ def test_the_autoencoder_learns_what_linear_elasticity_lacks(cache: Path) -> Non
     sizes, medians = np.linalg.norm(data.test.displacements, axis=(1, 2)), {}
     for name, knobs in (("linear-fem", {}), ("autoencoder", {"n_latent": 10, "iterations": 1000})):
         method = mor_bench.load_method(name, **knobs).fit(data.scene, data.train)
-        medians[name] = np.median(np.linalg.norm(method.predict(data.test.forces) - data.test.displacements, axis=(1, 2)) / sizes)
+        medians[name] = np.median(
+            np.linalg.norm(method.predict(data.test.forces) - data.test.displacements, axis=(1, 2))
+            / sizes
+        )
         assert not method.predict(np.zeros((data.scene.mesh.n_nodes, 3))).any()
     assert medians["autoencoder"] <= 0.7 * medians["linear-fem"]
 
@@ -223,13 +289,21 @@ def test_modes_of_a_damaged_model_are_refused(spoil: str, tiny: Dataset) -> None
     method = mor_bench.load_method("modal-derivatives", n_linear=3, n_modes=6).fit(tiny.scene, None)
     state = method._state()
     modes = state["modes"]
-    state["modes"] = {"nan": modes * np.nan, "columns": modes[:, 1:], "integers": modes.astype(np.int64)}[spoil]
+    state["modes"] = {
+        "nan": modes * np.nan,
+        "columns": modes[:, 1:],
+        "integers": modes.astype(np.int64),
+    }[spoil]
     with pytest.raises(InvalidInputError):
         method._restore(state)
 
 
-@pytest.mark.parametrize(("name", "knobs"), [*NO_SNAPSHOTS, ("local-pod", {"n_clusters": 2, "n_modes": 4})])
-def test_what_the_static_correction_inverts_is_refused(name: str, knobs: dict[str, Any], tiny: Dataset) -> None:
+@pytest.mark.parametrize(
+    ("name", "knobs"), [*NO_SNAPSHOTS, ("local-pod", {"n_clusters": 2, "n_modes": 4})]
+)
+def test_what_the_static_correction_inverts_is_refused(
+    name: str, knobs: dict[str, Any], tiny: Dataset
+) -> None:
     method = mor_bench.load_method(name, **knobs).fit(tiny.scene, tiny.train)
     model, free, refused = FullOrderModel(tiny.scene), tiny.scene.free_dofs, 0
     for force in 100.0 * tiny.test.forces[:30]:
@@ -243,7 +317,9 @@ def test_what_the_static_correction_inverts_is_refused(name: str, knobs: dict[st
 
 
 def test_the_polynomial_is_used_where_it_pays(tiny: Dataset) -> None:
-    coarse, fine = (FullOrderModel(mor_bench.load_scene(name)) for name in ("beam-coarse", "beam-fine"))
+    coarse, fine = (
+        FullOrderModel(mor_bench.load_scene(name)) for name in ("beam-coarse", "beam-fine")
+    )
     assert polynomial_pays(coarse, 40)
     assert not polynomial_pays(coarse, 60)
     assert polynomial_pays(fine, 80)
@@ -251,7 +327,9 @@ def test_the_polynomial_is_used_where_it_pays(tiny: Dataset) -> None:
     assert not polynomial_pays(FullOrderModel(tiny_of("neo-hookean")), 4)
 
 
-def test_the_autoencoder_says_that_it_cannot_start_from_another(tiny: Dataset, tmp_path: Path) -> None:
+def test_the_autoencoder_says_that_it_cannot_start_from_another(
+    tiny: Dataset, tmp_path: Path
+) -> None:
     pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
     method = mor_bench.load_method("autoencoder", iterations=2).fit(tiny.scene, tiny.train)
     method.save(tmp_path / "model.safetensors")

@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 import mor_bench
-from mor_bench.errors import InvalidInputError, MissingDependencyError, NotFittedError, SpecError, UnknownRangeError, UnsupportedSceneError
+from mor_bench.errors import (
+    InvalidInputError,
+    MissingDependencyError,
+    NotFittedError,
+    SpecError,
+    UnknownRangeError,
+    UnsupportedSceneError,
+)
 from mor_bench.harness.contestants import OBSERVATION_METHODS, checked_specs
 from mor_bench.harness.export import export_numpy, export_onnx, export_vtu
 from mor_bench.harness.fits import Material
@@ -54,14 +61,23 @@ CAN: dict[str, dict[str, Any]] = {
 }
 """The methods that can be given displacements, with knobs that keep a costly one short."""
 
-BOUNDS = {"UMesh": 0.7, "FullFEM": 1e-6, "LinearFEM": 0.1, "GappyPOD": 0.5, "PCARegression": 0.3, "DeepONet": 0.3}
+BOUNDS = {
+    "UMesh": 0.7,
+    "FullFEM": 1e-6,
+    "LinearFEM": 0.1,
+    "GappyPOD": 0.5,
+    "PCARegression": 0.3,
+    "DeepONet": 0.3,
+}
 """On the median relative l2, by class, others 0.1: beam-tiny turns far, and has few samples."""
 
 
 def written(folder: Path, observed: str, name: str = "beam-tiny-observed") -> Path:
     """beam-tiny with a table of what is observed."""
     path = folder / f"{name}.toml"
-    path.write_text(list_suite("datasets")["beam-tiny"].read_text(encoding="utf-8") + observed, encoding="utf-8")
+    path.write_text(
+        list_suite("datasets")["beam-tiny"].read_text(encoding="utf-8") + observed, encoding="utf-8"
+    )
     return path
 
 
@@ -91,7 +107,9 @@ def relative_l2(predicted: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return sample_errors(predicted, reference).relative_l2
 
 
-def test_the_samples_are_those_of_the_scene_without_the_option(data: Dataset, tiny: Dataset, cache: Path) -> None:
+def test_the_samples_are_those_of_the_scene_without_the_option(
+    data: Dataset, tiny: Dataset, cache: Path
+) -> None:
     assert data.scene.spec.digest() == tiny.scene.spec.digest()
     assert not list((cache / "datasets").glob("beam-tiny-observed*"))
     for part, plain in ((data.train, tiny.train), (data.test, tiny.test)):
@@ -107,7 +125,9 @@ def test_the_samples_are_those_of_the_scene_without_the_option(data: Dataset, ti
     assert tiny.test.inputs is tiny.test.forces
 
 
-def test_the_manifest_of_shared_samples_stays_that_of_the_dataset_that_made_them(data: Dataset, tiny: Dataset, cache: Path) -> None:
+def test_the_manifest_of_shared_samples_stays_that_of_the_dataset_that_made_them(
+    data: Dataset, tiny: Dataset, cache: Path
+) -> None:
     assert isinstance(tiny.scene.spec, type(data.scene.generated))
     folder = dataset_folder(data.scene.generated, cache)
     assert folder == dataset_folder(tiny.scene.spec, cache)
@@ -119,7 +139,11 @@ def test_the_manifest_of_shared_samples_stays_that_of_the_dataset_that_made_them
 def test_the_shipped_dataset_shares_the_samples_of_the_liver() -> None:
     observed, plain = load_generated_spec("liver-hex-observed"), load_generated_spec("liver-hex")
     assert observed.digest() == plain.digest()
-    assert (observed.split, observed.tests, observed.needs) == (plain.split, plain.tests, plain.needs)
+    assert (observed.split, observed.tests, observed.needs) == (
+        plain.split,
+        plain.tests,
+        plain.needs,
+    )
 
 
 @pytest.mark.parametrize(
@@ -130,7 +154,10 @@ def test_the_shipped_dataset_shares_the_samples_of_the_liver() -> None:
         ({"regoin": "z-max"}, r"unknown key `observed.regoin`; did you mean 'region'\?"),
         ({"region": {"sphere_m": [[9.0, 9.0, 9.0], 1.0]}}, "holds no node of the mesh"),
         ({"region": "x-min"}, "no node that lies on the surface and is free to move"),
-        ({"region": {"sphere_m": [[1.0, 0.5, 0.5], 0.1]}}, "no node that lies on the surface and is free to move"),
+        (
+            {"region": {"sphere_m": [[1.0, 0.5, 0.5], 0.1]}},
+            "no node that lies on the surface and is free to move",
+        ),
     ],
 )
 def test_a_table_that_observes_nothing_is_refused(observed: Any, message: str) -> None:
@@ -140,13 +167,17 @@ def test_a_table_that_observes_nothing_is_refused(observed: Any, message: str) -
 
 def test_a_scene_with_nothing_hidden_is_refused() -> None:
     geometry = {"shape": "box", "size_m": [2.0, 1.0, 1.0], "cells": [6, 1, 1]}
-    with pytest.raises(SpecError, match="every node that is free to move: nothing is left to be found"):
+    with pytest.raises(
+        SpecError, match="every node that is free to move: nothing is left to be found"
+    ):
         scene_of({"region": "surface"}, geometry=geometry)
 
 
 @pytest.mark.parametrize("region", ["z-max", "surface"])
 @pytest.mark.parametrize("solver", [None, "rotated-pcg", "cholesky", "superlu", "jacobi-pcg"])
-def test_fem_finds_the_equilibrium_where_every_loaded_node_is_seen(region: str, solver: Any, tiny: Dataset) -> None:
+def test_fem_finds_the_equilibrium_where_every_loaded_node_is_seen(
+    region: str, solver: Any, tiny: Dataset
+) -> None:
     scene = scene_of({"region": region})
     model = ObservedModel(scene, solver)
     largest = np.abs(tiny.test.free_displacements).max(axis=1).argsort()[-3:]
@@ -170,19 +201,27 @@ def test_the_linear_extension_is_linear_elasticity(tiny: Dataset) -> None:
     scene = scene_of({"region": "z-max"})
     response = FullOrderModel(tiny.scene).rest_factor.solve(tiny.test.free_forces[:5].T).T
     model = ObservedModel(scene)
-    np.testing.assert_allclose(model.linear_response(response), response, rtol=0, atol=1e-10 * np.abs(response).max())
+    np.testing.assert_allclose(
+        model.linear_response(response), response, rtol=0, atol=1e-10 * np.abs(response).max()
+    )
     axes = np.random.default_rng(0).normal(size=(len(scene.free_dofs), 4))
     coordinates = response @ model.to_coordinates(axes)[scene.free_dofs]
-    np.testing.assert_allclose(coordinates, response @ axes, rtol=0, atol=1e-10 * np.abs(coordinates).max())
+    np.testing.assert_allclose(
+        coordinates, response @ axes, rtol=0, atol=1e-10 * np.abs(coordinates).max()
+    )
 
 
 def test_large_displacements_are_reached_by_and_by() -> None:
     """A tip turned by half a circle: from the linear response no equilibrium is found, by steps one is."""
-    scene = scene_of({"region": "x-max"}, material={"law": "neo-hookean", "young_pa": 500.0, "poisson": 0.4})
+    scene = scene_of(
+        {"region": "x-max"}, material={"law": "neo-hookean", "young_pa": 500.0, "poisson": 0.4}
+    )
     x = scene.mesh.points
     seen = np.zeros(x.shape)
     angle, centre = np.pi, np.array([2.0, 0.5, 0.5])
-    turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    turn = np.array(
+        [[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]]
+    )
     tip = x[:, 0] == 2.0
     seen[tip] = (x[tip] - centre) @ (turn - np.eye(3)).T
     model = ObservedModel(scene)
@@ -206,11 +245,19 @@ def test_gappy_pod_reproduces_what_its_modes_span(data: Dataset) -> None:
 
 
 def test_regularisation_keeps_noise_out_of_gappy_pod(data: Dataset) -> None:
-    noise = 0.01 * np.sqrt((data.test.displacements**2).mean()) * np.random.default_rng(0).normal(size=data.test.inputs.shape)
+    noise = (
+        0.01
+        * np.sqrt((data.test.displacements**2).mean())
+        * np.random.default_rng(0).normal(size=data.test.inputs.shape)
+    )
     errors = {}
     for regularisation in (0.0, 0.01):
-        method = mor_bench.load_method("gappy-pod", n_modes=80, regularisation=regularisation).fit(data.scene, data.train)
-        errors[regularisation] = np.median(relative_l2(method.predict(data.test.inputs + noise), data.test.displacements))
+        method = mor_bench.load_method("gappy-pod", n_modes=80, regularisation=regularisation).fit(
+            data.scene, data.train
+        )
+        errors[regularisation] = np.median(
+            relative_l2(method.predict(data.test.inputs + noise), data.test.displacements)
+        )
     assert errors[0.01] < 0.5 * errors[0.0]
 
 
@@ -241,11 +288,15 @@ def test_what_unobserved_nodes_hold_is_not_looked_at(fitted: Surrogate, data: Da
         fitted.predict(seen)
 
 
-def test_saved_models_know_what_they_are_given(fitted: Surrogate, data: Dataset, tmp_path: Path) -> None:
+def test_saved_models_know_what_they_are_given(
+    fitted: Surrogate, data: Dataset, tmp_path: Path
+) -> None:
     fitted.save(tmp_path / "model.safetensors")
     loaded = mor_bench.load_surrogate(tmp_path / "model.safetensors")
     np.testing.assert_array_equal(loaded.scene_.observed_nodes, data.scene.observed_nodes)
-    np.testing.assert_array_equal(loaded.predict(data.test.inputs[:3]), fitted.predict(data.test.inputs[:3]))
+    np.testing.assert_array_equal(
+        loaded.predict(data.test.inputs[:3]), fitted.predict(data.test.inputs[:3])
+    )
 
 
 @pytest.mark.parametrize("name", sorted(set(list_suite("methods")) - set(CAN)))
@@ -275,7 +326,9 @@ class Forgetful(Surrogate):
         return self._checked_forces(forces)
 
 
-def test_a_method_that_does_not_say_that_it_can_is_not_given_displacements(data: Dataset, tiny: Dataset) -> None:
+def test_a_method_that_does_not_say_that_it_can_is_not_given_displacements(
+    data: Dataset, tiny: Dataset
+) -> None:
     with pytest.raises(UnsupportedSceneError, match=NO_FORCES):
         Forgetful().fit(data.scene, data.train)
     Forgetful().fit(tiny.scene, tiny.train)
@@ -298,14 +351,26 @@ def test_a_range_of_loads_that_are_not_known_is_not_made_up(data: Dataset) -> No
         method.out_of_range(data.test.inputs)
 
 
-def test_a_run_has_rows_of_those_that_can_and_reasons_of_the_others(data: Dataset, cache: Path, tmp_path: Path) -> None:
+def test_a_run_has_rows_of_those_that_can_and_reasons_of_the_others(
+    data: Dataset, cache: Path, tmp_path: Path
+) -> None:
     path, pod = written(tmp_path, TOP), tmp_path / "pod.toml"
-    pod.write_text('title = "t"\nsource = "s"\nsurrogate = "mor_bench.surrogates.pod:PODGalerkin"\n')
-    comparison = mor_bench.run([path], ["linear-fem", "pca-regression-force", pod], out=tmp_path / "out", cache=cache)
+    pod.write_text(
+        'title = "t"\nsource = "s"\nsurrogate = "mor_bench.surrogates.pod:PODGalerkin"\n'
+    )
+    comparison = mor_bench.run(
+        [path], ["linear-fem", "pca-regression-force", pod], out=tmp_path / "out", cache=cache
+    )
     rows = {row["label"]: row for row in comparison.rows}
     assert set(rows) == {"linear-fem", "pca-regression-force", "pod"}
-    direct = mor_bench.load_method("pca-regression-force").fit(data.scene, data.train).predict(data.test.inputs)
-    assert rows["pca-regression-force"]["error"]["rel_l2_median"] == pytest.approx(np.median(relative_l2(direct, data.test.displacements)))
+    direct = (
+        mor_bench.load_method("pca-regression-force")
+        .fit(data.scene, data.train)
+        .predict(data.test.inputs)
+    )
+    assert rows["pca-regression-force"]["error"]["rel_l2_median"] == pytest.approx(
+        np.median(relative_l2(direct, data.test.displacements))
+    )
     for label, row in rows.items():
         assert row["status"] == ("skipped" if label == "pod" else "ok"), row["reason"]
         if row["status"] == "skipped":
@@ -316,15 +381,26 @@ def test_a_run_has_rows_of_those_that_can_and_reasons_of_the_others(data: Datase
     assert comparison.datasets["beam-tiny-observed"]["observed"] == {"region": "z-max"}
 
 
-def test_the_fit_command_scores_answers_to_what_is_seen(data: Dataset, cache: Path, tmp_path: Path) -> None:
-    fitted = mor_bench.fit(written(tmp_path, TOP), "linear-fem", out=tmp_path / "model.safetensors", cache=cache)
+def test_the_fit_command_scores_answers_to_what_is_seen(
+    data: Dataset, cache: Path, tmp_path: Path
+) -> None:
+    fitted = mor_bench.fit(
+        written(tmp_path, TOP), "linear-fem", out=tmp_path / "model.safetensors", cache=cache
+    )
     predicted = fitted.method.predict(data.test.inputs)
-    assert fitted.error["rel_l2_median"] == pytest.approx(np.median(relative_l2(predicted, data.test.displacements)))
+    assert fitted.error["rel_l2_median"] == pytest.approx(
+        np.median(relative_l2(predicted, data.test.displacements))
+    )
 
 
-def test_a_model_of_other_observed_nodes_is_not_taken_from_the_cache(data: Dataset, tiny: Dataset, tmp_path: Path) -> None:
+def test_a_model_of_other_observed_nodes_is_not_taken_from_the_cache(
+    data: Dataset, tiny: Dataset, tmp_path: Path
+) -> None:
     corner = scene_of({"region": {"nearest_m": [[2.0, 1.0, 1.0], 20]}})
-    digests = {Material(scene, tiny.train, {}, tmp_path).train_digest for scene in (tiny.scene, data.scene, corner)}
+    digests = {
+        Material(scene, tiny.train, {}, tmp_path).train_digest
+        for scene in (tiny.scene, data.scene, corner)
+    }
     assert len(digests) == 3
 
 
@@ -335,7 +411,9 @@ def test_by_default_the_methods_run_that_can(tmp_path: Path) -> None:
     assert set(chosen) <= set(CAN)
 
 
-def test_exported_answers_are_those_to_what_is_seen(data: Dataset, tiny: Dataset, tmp_path: Path) -> None:
+def test_exported_answers_are_those_to_what_is_seen(
+    data: Dataset, tiny: Dataset, tmp_path: Path
+) -> None:
     import meshio
 
     method = mor_bench.load_method("gappy-pod").fit(data.scene, data.train)
@@ -349,18 +427,27 @@ def test_exported_answers_are_those_to_what_is_seen(data: Dataset, tiny: Dataset
 
 
 @pytest.mark.parametrize("name", ["umesh-small", "umesh-linear"])
-def test_an_onnx_file_does_not_look_at_what_is_not_seen(name: str, data: Dataset, tmp_path: Path) -> None:
+def test_an_onnx_file_does_not_look_at_what_is_not_seen(
+    name: str, data: Dataset, tmp_path: Path
+) -> None:
     onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
     pytest.importorskip("torch")
-    method = mor_bench.load_method(name, channels=2, steps=1, iterations=3).fit(data.scene, data.train)
+    method = mor_bench.load_method(name, channels=2, steps=1, iterations=3).fit(
+        data.scene, data.train
+    )
     method.save(tmp_path / "model.safetensors")
     path, _ = export_onnx(tmp_path / "model.safetensors", tmp_path / "model.onnx")
-    assert "displacements of the observed nodes in m" in {entry.key: entry.value for entry in onnx.load(path).metadata_props}["units"]
+    assert (
+        "displacements of the observed nodes in m"
+        in {entry.key: entry.value for entry in onnx.load(path).metadata_props}["units"]
+    )
     observed = data.scene.observed_nodes
     assert observed is not None
     given = data.test.inputs[:3].astype(np.float32)
     given[:, np.setdiff1d(np.arange(given.shape[1]), observed)] = np.nan
-    (found,) = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"]).run(None, {"forces": given})
+    (found,) = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"]).run(
+        None, {"forces": given}
+    )
     expected = method.predict(data.test.inputs[:3])
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
 
@@ -369,8 +456,12 @@ def test_imported_snapshots_can_be_completed(data: Dataset, tmp_path: Path) -> N
     _, path = export_numpy(data, tmp_path / "mine.npz")
     path.write_text(path.read_text() + TOP)
     mine = mor_bench.load_dataset(path)
-    own, first = (mor_bench.load_method("gappy-pod").fit(each.scene, each.train) for each in (mine, data))
-    np.testing.assert_allclose(own.predict(data.test.inputs), first.predict(data.test.inputs), atol=1e-9)
+    own, first = (
+        mor_bench.load_method("gappy-pod").fit(each.scene, each.train) for each in (mine, data)
+    )
+    np.testing.assert_allclose(
+        own.predict(data.test.inputs), first.predict(data.test.inputs), atol=1e-9
+    )
     assert mor_bench.load_method("fem").supports(mine.scene) is not None
     path.write_text(path.read_text().replace('"z-max"', '"x-min"'))
     with pytest.raises(SpecError, match="free to move"):

@@ -60,7 +60,9 @@ def tetrahedral() -> Mesh:
 
 
 @pytest.mark.parametrize(("shape", "modes"), [((6, 5, 4), 2), ((5, 4, 6), 3), ((4, 3, 5), 9)])
-def test_the_spectral_convolution_is_a_circular_convolution_with_a_real_kernel(shape: tuple[int, int, int], modes: int) -> None:
+def test_the_spectral_convolution_is_a_circular_convolution_with_a_real_kernel(
+    shape: tuple[int, int, int], modes: int
+) -> None:
     """The kernel from the weights by its defining sum over all wave numbers; the convolution as a sum over shifts."""
     layer = SpectralConvolution(shape, modes, 2)
     layer.initialise(torch.Generator().manual_seed(0))
@@ -88,11 +90,23 @@ def test_forces_are_spread_over_the_grid_and_displacements_averaged() -> None:
     mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
     grid = padded_grid(grid_map(mesh), 0)
     fields = random(2, mesh.n_nodes, 3)
-    for spread, expected in ((True, grid.to_grid(fields)), (False, grid.displacements_to_grid(fields))):
-        torch.testing.assert_close(FNO(grid, spread, 2, 2, 1).encode(fields), expected.permute(0, 2, 3, 4, 1), rtol=0, atol=0)
+    for spread, expected in (
+        (True, grid.to_grid(fields)),
+        (False, grid.displacements_to_grid(fields)),
+    ):
+        torch.testing.assert_close(
+            FNO(grid, spread, 2, 2, 1).encode(fields),
+            expected.permute(0, 2, 3, 4, 1),
+            rtol=0,
+            atol=0,
+        )
     assert not torch.equal(grid.to_grid(fields), grid.displacements_to_grid(fields))
     spec = load_dataset_spec("beam-tiny").model_dump(mode="json", exclude_none=True)
-    for input, observed, spread in (("force", None, True), ("force", {"region": "z-max"}, False), ("linear-response", None, False)):
+    for input, observed, spread in (
+        ("force", None, True),
+        ("force", {"region": "z-max"}, False),
+        ("linear-response", None, False),
+    ):
         method: Any = make("fno", input=input)
         method.scene_ = load_scene({**spec, "observed": observed} if observed else spec)
         assert method._network({}).spread == spread
@@ -113,7 +127,9 @@ def test_the_padding_keeps_opposite_ends_apart() -> None:
         torch.testing.assert_close(network(network.encode(fields)), expected)
 
 
-@pytest.mark.parametrize("mesh", [box_mesh((2.0, 1.0, 1.0), (3, 2, 2)), tetrahedral()], ids=["hexahedra", "tetrahedra"])
+@pytest.mark.parametrize(
+    "mesh", [box_mesh((2.0, 1.0, 1.0), (3, 2, 2)), tetrahedral()], ids=["hexahedra", "tetrahedra"]
+)
 def test_message_passing_is_the_sum_over_edges_written_out(mesh: Mesh) -> None:
     graph = Graph(mesh)
     pairs = {(int(s), int(r)) for s, r in zip(graph.senders, graph.receivers, strict=True)}
@@ -124,7 +140,9 @@ def test_message_passing_is_the_sum_over_edges_written_out(mesh: Mesh) -> None:
         lengths = np.linalg.norm(mesh.points[graph.senders] - mesh.points[graph.receivers], axis=1)
         np.testing.assert_allclose(np.unique(lengths.round(9)), [0.5, round(2 / 3, 9)])
     else:  # each pair of nodes in a tetrahedron is an edge
-        assert pairs == {(int(a), int(b)) for cell in mesh.cells for a in cell for b in cell if a != b}
+        assert pairs == {
+            (int(a), int(b)) for cell in mesh.cells for a in cell for b in cell if a != b
+        }
     step = MessagePassing(5)
     initialise(step, torch.Generator().manual_seed(0))
     edges, nodes = random(graph.n_edges, 2, 5, seed=1), random(mesh.n_nodes, 2, 5, seed=2)
@@ -134,24 +152,35 @@ def test_message_passing_is_the_sum_over_edges_written_out(mesh: Mesh) -> None:
         bias = step.edge.bias + step.sender.bias + step.receiver.bias
         received: list[Any] = [torch.zeros(2, 5) for _ in range(mesh.n_nodes)]
         for number, (s, r) in enumerate(zip(graph.senders, graph.receivers, strict=True)):
-            hidden = torch.nn.functional.silu(torch.cat([edges[number], nodes[s], nodes[r]], dim=1) @ whole.T + bias)
+            hidden = torch.nn.functional.silu(
+                torch.cat([edges[number], nodes[s], nodes[r]], dim=1) @ whole.T + bias
+            )
             message = edges[number] + step.norms[0](step.message(hidden))
             torch.testing.assert_close(found_edges[number], message)
             received[int(r)] = received[int(r)] + message
         for node in range(mesh.n_nodes):
-            expected = nodes[node] + step.norms[1](step.node(torch.cat([nodes[node], received[node]], dim=1)))
+            expected = nodes[node] + step.norms[1](
+                step.node(torch.cat([nodes[node], received[node]], dim=1))
+            )
             torch.testing.assert_close(found_nodes[node], expected, rtol=1e-4, atol=1e-5)
 
 
 def test_gradients_through_the_graph_are_those_of_dense_matrices() -> None:
     mesh = tetrahedral()
     graph = Graph(mesh)
-    senders, receivers = (torch.nn.functional.one_hot(ends, mesh.n_nodes).float() for ends in (graph.senders, graph.receivers))
+    senders, receivers = (
+        torch.nn.functional.one_hot(ends, mesh.n_nodes).float()
+        for ends in (graph.senders, graph.receivers)
+    )
     nodes, weight = random(mesh.n_nodes, 4).requires_grad_(), random(mesh.n_nodes, 4, seed=1)
-    own = (graph.to_receivers(graph.from_senders(nodes) * graph.from_receivers(nodes).tanh()) * weight).sum()
+    own = (
+        graph.to_receivers(graph.from_senders(nodes) * graph.from_receivers(nodes).tanh()) * weight
+    ).sum()
     dense = ((receivers.T @ ((senders @ nodes) * (receivers @ nodes).tanh())) * weight).sum()
     torch.testing.assert_close(own, dense)
-    torch.testing.assert_close(*(torch.autograd.grad(value, nodes)[0] for value in (own, dense)), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        *(torch.autograd.grad(value, nodes)[0] for value in (own, dense)), rtol=1e-4, atol=1e-5
+    )
 
 
 def test_a_graph_network_sees_as_many_edges_far_as_it_has_steps_and_no_numbers_or_places() -> None:
@@ -169,7 +198,9 @@ def test_a_graph_network_sees_as_many_edges_far_as_it_has_steps_and_no_numbers_o
 
         order = np.random.default_rng(0).permutation(mesh.n_nodes)
         place = np.argsort(order)
-        renumbered = replace(mesh, points=mesh.points[order] + [3.0, -1.0, 2.0], cells=place[mesh.cells])
+        renumbered = replace(
+            mesh, points=mesh.points[order] + [3.0, -1.0, 2.0], cells=place[mesh.cells]
+        )
         other = GraphNetwork(renumbered, place[:4], 8, 2)
         other.load_state_dict(network.state_dict())
         torch.testing.assert_close(other(force[:, order]), answer[:, order], rtol=1e-4, atol=1e-5)
@@ -188,12 +219,19 @@ def test_deeponet_is_the_branch_times_the_trunk(name: str, tiny: Dataset) -> Non
         b = (network.branch(inputs[None]) - network.branch(torch.zeros(1, axes.shape[1])))[0]
         for node, component in product(range(n_nodes), range(3)):
             if name == "deeponet":
-                t = network.trunk(network.positions[node])[8 * component : 8 * component + 8] / 8**0.5
+                t = (
+                    network.trunk(network.positions[node])[8 * component : 8 * component + 8]
+                    / 8**0.5
+                )
             else:
-                t = torch.from_numpy(method.constants_["modes"][3 * node + component].astype(np.float32))
+                t = torch.from_numpy(
+                    method.constants_["modes"][3 * node + component].astype(np.float32)
+                )
             expected[node, component] = float(b @ t) * method.output_scale_
     expected[tiny.scene.fixed_nodes] = 0.0
-    np.testing.assert_allclose(method.predict(force), expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        method.predict(force), expected, rtol=0, atol=1e-5 * np.abs(expected).max()
+    )
     assert np.abs(expected).max() > 0.01 * method.output_scale_
     if name == "pod-deeponet":
         rows = tiny.train.displacements.reshape(len(tiny.train), -1)
@@ -204,20 +242,28 @@ def test_deeponet_is_the_branch_times_the_trunk(name: str, tiny: Dataset) -> Non
 
 @pytest.mark.parametrize("input", ["force", "linear-response"])
 @pytest.mark.parametrize("name", SMALL)
-def test_the_first_loss_is_that_of_the_network_less_its_answer_at_rest(name: str, input: str, tiny: Dataset) -> None:
+def test_the_first_loss_is_that_of_the_network_less_its_answer_at_rest(
+    name: str, input: str, tiny: Dataset
+) -> None:
     """One step on all samples at a rate that changes nothing: the loss of the predictions is that of the training."""
     samples = tiny.train[:20]
-    method: Any = make(name, input=input, iterations=1, batch_size=20, learning_rate=1e-30).fit(tiny.scene, samples)
+    method: Any = make(name, input=input, iterations=1, batch_size=20, learning_rate=1e-30).fit(
+        tiny.scene, samples
+    )
     error = (method.predict(samples.forces) - samples.displacements) / method.output_scale_
     assert method.loss_curve_[0] == pytest.approx((error**2).mean(), rel=1e-4)
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None).predict(samples.forces)
-    learned = samples.displacements - linear if input == "linear-response" else samples.displacements
+    learned = (
+        samples.displacements - linear if input == "linear-response" else samples.displacements
+    )
     assert method.output_scale_ == pytest.approx(np.sqrt((learned**2).mean()), rel=1e-9)
 
 
 @pytest.mark.parametrize("input", ["force", "linear-response"])
 @pytest.mark.parametrize("name", SMALL)
-def test_no_force_gives_no_displacement_alone_and_among_others(name: str, input: str, tiny: Dataset) -> None:
+def test_no_force_gives_no_displacement_alone_and_among_others(
+    name: str, input: str, tiny: Dataset
+) -> None:
     method = make(name, input=input).fit(tiny.scene, tiny.train)
     forces = tiny.test.forces[:5].copy()
     forces[3] = 0.0
@@ -231,11 +277,15 @@ def test_no_force_gives_no_displacement_alone_and_among_others(name: str, input:
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("name", SMALL)
-def test_a_second_fit_is_bit_identical_and_leaves_global_random_state_alone(name: str, threads: int, tiny: Dataset) -> None:
+def test_a_second_fit_is_bit_identical_and_leaves_global_random_state_alone(
+    name: str, threads: int, tiny: Dataset
+) -> None:
     state, before = torch.get_rng_state(), torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        first, second = (make(name, iterations=2).fit(tiny.scene, tiny.train[:20]) for _ in range(2))
+        first, second = (
+            make(name, iterations=2).fit(tiny.scene, tiny.train[:20]) for _ in range(2)
+        )
     finally:
         torch.set_num_threads(before)
     assert torch.equal(torch.get_rng_state(), state)
@@ -246,22 +296,32 @@ def test_a_second_fit_is_bit_identical_and_leaves_global_random_state_alone(name
 @pytest.mark.parametrize("name", SMALL)
 def test_training_lowers_the_error_of_the_linear_response(name: str, tiny: Dataset) -> None:
     """Of the training loads, and for DeepONet, which sees the whole body at once, of loads in regions that it never saw."""
-    method: Any = make(name, input="linear-response", iterations=400, learning_rate=3e-3).fit(tiny.scene, tiny.train)
+    method: Any = make(name, input="linear-response", iterations=400, learning_rate=3e-3).fit(
+        tiny.scene, tiny.train
+    )
     assert method.loss_curve_.shape == (8,)
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
-    for part, factor in ((tiny.train, 0.95), (tiny.test, 0.8)) if "deeponet" in name else ((tiny.train, 0.95),):
-        own, without = (np.abs(m.predict(part.forces) - part.displacements).mean() for m in (method, linear))
+    for part, factor in (
+        ((tiny.train, 0.95), (tiny.test, 0.8)) if "deeponet" in name else ((tiny.train, 0.95),)
+    ):
+        own, without = (
+            np.abs(m.predict(part.forces) - part.displacements).mean() for m in (method, linear)
+        )
         assert own < factor * without
 
 
 @pytest.mark.parametrize("input", ["force", "linear-response"])
 @pytest.mark.parametrize("name", SMALL)
-def test_saved_and_loaded_is_the_same_model_and_other_knobs_are_refused(name: str, input: str, tiny: Dataset, tmp_path: Path) -> None:
+def test_saved_and_loaded_is_the_same_model_and_other_knobs_are_refused(
+    name: str, input: str, tiny: Dataset, tmp_path: Path
+) -> None:
     method: Any = make(name, input=input).fit(tiny.scene, tiny.train)
     path = tmp_path / "model.safetensors"
     method.save(path)
     loaded: Any = mor_bench.load_surrogate(path)
-    np.testing.assert_array_equal(loaded.predict(tiny.test.forces), method.predict(tiny.test.forces))
+    np.testing.assert_array_equal(
+        loaded.predict(tiny.test.forces), method.predict(tiny.test.forces)
+    )
     np.testing.assert_array_equal(loaded.loss_curve_, method.loss_curve_)
     assert loaded.parameters == method.parameters
     knob = {"fno": "channels"}.get(name, "width")
@@ -290,9 +350,17 @@ def test_a_mesh_that_lies_in_no_grid_is_learned(name: str) -> None:
     scene = replace(scene, mesh=mesh, fixed_nodes=np.flatnonzero(mesh.points[:, 0] == 0))
     assert scene.mesh.grid_index is None
     loads = draw_loads(scene, 0, 60)
-    displacements = mor_bench.load_method("fem").fit(scene, None).predict(loads.nodal_forces(scene.patch_weights))
-    samples = Snapshots(scene, loads, displacements.reshape(60, -1)[:, scene.free_dofs], np.ones(60))
-    method = make(name, input="linear-response", iterations=300, learning_rate=3e-3).fit(scene, samples)
+    displacements = (
+        mor_bench.load_method("fem")
+        .fit(scene, None)
+        .predict(loads.nodal_forces(scene.patch_weights))
+    )
+    samples = Snapshots(
+        scene, loads, displacements.reshape(60, -1)[:, scene.free_dofs], np.ones(60)
+    )
+    method = make(name, input="linear-response", iterations=300, learning_rate=3e-3).fit(
+        scene, samples
+    )
     answer = method.predict(samples.forces)
     linear = mor_bench.load_method("linear-fem").fit(scene, None).predict(samples.forces)
     assert not answer[:, scene.fixed_nodes].any()
@@ -300,7 +368,9 @@ def test_a_mesh_that_lies_in_no_grid_is_learned(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_training_starts_from_the_weights_that_fit(name: str, tiny: Dataset, tmp_path: Path) -> None:
+def test_a_training_starts_from_the_weights_that_fit(
+    name: str, tiny: Dataset, tmp_path: Path
+) -> None:
     first: Any = make(name).fit(tiny.scene, tiny.train)
     first.save(tmp_path / "first.safetensors")
     second: Any = make(name, iterations=1, learning_rate=1e-30, seed=5)
@@ -309,7 +379,9 @@ def test_a_training_starts_from_the_weights_that_fit(name: str, tiny: Dataset, t
     for key, value in first.network_.state_dict().items():
         torch.testing.assert_close(second.network_.state_dict()[key], value, rtol=0, atol=0)
     unlike = make(name, seed=5).fit(tiny.scene, tiny.train)
-    assert not np.array_equal(unlike.predict(tiny.test.forces[0]), first.predict(tiny.test.forces[0]))
+    assert not np.array_equal(
+        unlike.predict(tiny.test.forces[0]), first.predict(tiny.test.forces[0])
+    )
     other = make("fno" if name != "fno" else "mesh-graph-net")
     other.training = second.training
     with pytest.raises(InvalidInputError, match="must be a model of class"):

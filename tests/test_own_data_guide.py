@@ -22,8 +22,13 @@ def test_the_guide_s_examples_work(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         exec(compile(script, "own-data.md", "exec"), {})
     for name, text in files:
         Path(name).write_text(text, encoding="utf-8")
-    assert check_file(Path("body.toml")) == "dataset, 96 cells, 195 nodes, 65 load patches, 650 samples"
-    assert check_file(Path("mine.toml")).startswith("dataset of imported snapshots, 96 cells, 195 nodes, 15 of them fixed, ")
+    assert (
+        check_file(Path("body.toml"))
+        == "dataset, 96 cells, 195 nodes, 65 load patches, 650 samples"
+    )
+    assert check_file(Path("mine.toml")).startswith(
+        "dataset of imported snapshots, 96 cells, 195 nodes, 15 of them fixed, "
+    )
     comparison = mor_bench.run(["mine.toml"], ["pod", "pca-regression-force"], out="out")
     assert {row["status"] for row in comparison.rows} == {"skipped", "ok"}
 

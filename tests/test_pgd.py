@@ -22,11 +22,16 @@ def functions(x: Array, kind: str) -> list[list[Array]]:
     first = np.stack([np.ones(len(x)), x[:, 0], x[:, 0] ** 2], axis=1)
     second = np.stack([np.ones(len(x)), x[:, 1], x[:, 1] ** 2, x[:, 1] ** 3], axis=1)
     even, odd = np.stack([x[:, 2] ** 2, x[:, 2] ** 4], axis=1), x[:, 2:] ** 3
-    return [[first, second, even], [first, second, odd]] if kind == "both" else [[first, second, even]]
+    return (
+        [[first, second, even], [first, second, odd]] if kind == "both" else [[first, second, even]]
+    )
 
 
 def values(separation: Separation, families: list[list[Array]]) -> Array:
-    terms = [np.prod([f @ c for f, c in zip(families[t.family], t.coefficients, strict=True)], axis=0) for t in separation.terms]
+    terms = [
+        np.prod([f @ c for f, c in zip(families[t.family], t.coefficients, strict=True)], axis=0)
+        for t in separation.terms
+    ]
     return np.stack(terms, axis=1) @ separation.vectors
 
 
@@ -54,7 +59,9 @@ def test_a_sum_of_products_is_found_and_holds_elsewhere() -> None:
 
 def test_one_product_takes_one_term() -> None:
     x = np.random.default_rng(0).uniform(-1, 1, (300, 3))
-    target = ((1 + x[:, 0]) * (0.4 + x[:, 1] ** 2) * (x[:, 2] ** 2 + x[:, 2] ** 4))[:, None] * np.arange(1.0, 5.0)
+    target = ((1 + x[:, 0]) * (0.4 + x[:, 1] ** 2) * (x[:, 2] ** 2 + x[:, 2] ** 4))[
+        :, None
+    ] * np.arange(1.0, 5.0)
     assert separate(target, functions(x, "both"), 1, 0.0).residuals[0] <= 1e-2
     # What a term leaves is what its alternation left.
     assert separate(target, functions(x, "both"), 4, 0.0).residuals[-1] <= 1e-4
@@ -87,7 +94,12 @@ def test_no_load_and_a_couple(base: str, tiny: Dataset) -> None:
     assert not method.predict(force).any()
     force[[-1, -2], 2] = 1.0, -1.0
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None).predict(force)
-    np.testing.assert_allclose(method.predict(force), linear if base == "linear-response" else 0 * linear, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        method.predict(force),
+        linear if base == "linear-response" else 0 * linear,
+        rtol=0,
+        atol=1e-12,
+    )
 
 
 def test_a_separable_solution_of_patch_loads_is_found_in_unseen_regions(tiny: Dataset) -> None:
@@ -98,11 +110,17 @@ def test_a_separable_solution_of_patch_loads_is_found_in_unseen_regions(tiny: Da
     def displacements(forces: Array) -> Array:
         positions, f = _coordinates(tiny.scene.mesh.points, forces)
         x, y = positions[:, 0], positions[:, 1]
-        products = [(1 + x) * f[:, 2], (x - y**2) * f[:, 0] * f[:, 1], (0.5 + y) * f[:, 0] ** 2 * f[:, 2]]
+        products = [
+            (1 + x) * f[:, 2],
+            (x - y**2) * f[:, 0] * f[:, 1],
+            (0.5 + y) * f[:, 0] ** 2 * f[:, 2],
+        ]
         return np.stack(products, axis=1) @ vectors
 
     samples = replace(tiny.train, free_displacements=displacements(tiny.train.forces))
-    method = SeparatedLoad("none", n_terms=100, position_degree=2, n_output_modes=3, ridge=0.0).fit(tiny.scene, samples)
+    method = SeparatedLoad("none", n_terms=100, position_degree=2, n_output_modes=3, ridge=0.0).fit(
+        tiny.scene, samples
+    )
     exact = displacements(tiny.test.forces)
     found = method.predict(tiny.test.forces).reshape(len(exact), -1)[:, tiny.scene.free_dofs]
     assert np.linalg.norm(found - exact) <= 2e-3 * np.linalg.norm(exact)
@@ -114,8 +132,11 @@ def test_beside_the_linear_response_terms_are_of_second_degree_and_more(tiny: Da
     method = SeparatedLoad(n_terms=30).fit(tiny.scene, samples)
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
     small, smaller = (
-        np.linalg.norm(method.predict(scale * tiny.test.forces) - linear.predict(scale * tiny.test.forces)) for scale in (1e-3, 1e-5)
-    )  # fmt: skip
+        np.linalg.norm(
+            method.predict(scale * tiny.test.forces) - linear.predict(scale * tiny.test.forces)
+        )
+        for scale in (1e-3, 1e-5)
+    )
     assert 0.9e-4 * small <= smaller <= 1.1e-4 * small
 
 
@@ -123,8 +144,9 @@ def test_on_unseen_load_regions_it_is_far_better_than_the_linear_response(tiny: 
     method = SeparatedLoad(n_terms=20, position_degree=2).fit(tiny.scene, tiny.train)
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
     mine, theirs = (
-        np.median(sample_errors(one.predict(tiny.test.forces), tiny.test.displacements).relative_l2) for one in (method, linear)
-    )  # fmt: skip
+        np.median(sample_errors(one.predict(tiny.test.forces), tiny.test.displacements).relative_l2)
+        for one in (method, linear)
+    )
     assert mine <= 0.4 * theirs
 
 
@@ -135,11 +157,17 @@ def test_outside_the_positions_of_training_it_answers_as_at_their_edge(tiny: Dat
     back = np.linalg.pinv(method.frame_[:3]).T
     edge = np.clip(far @ method.frame_[:3] + method.frame_[3], *method.ends_)
     near = (edge - method.frame_[3]) @ back.T
-    (position, _, _), (there, _, _) = method._functions(far, vector), method._functions(near, vector)
+    (position, _, _), (there, _, _) = (
+        method._functions(far, vector),
+        method._functions(near, vector),
+    )
     np.testing.assert_allclose(position, there, atol=1e-9)
 
 
 def test_several_forces_are_named_as_the_reason() -> None:
     scene = mor_bench.load_scene("beam-coarse-3-forces")
-    assert SeparatedLoad().supports(scene) == "its coordinates are those of one load patch, and here several act at once"
+    assert (
+        SeparatedLoad().supports(scene)
+        == "its coordinates are those of one load patch, and here several act at once"
+    )
     assert SeparatedLoad().supports(mor_bench.load_scene("beam-tiny")) is None

@@ -33,25 +33,34 @@ def test_a_method_of_which_nothing_is_known_says_so(tmp_path: Path) -> None:
     path.write_text('title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Zero"\n')
     planned = plan(["beam-tiny"], [path], cache=tmp_path / "cache")
     assert planned.n_unknown == 1
-    said = CliRunner().invoke(app, ["run", "beam-tiny", "-m", str(path), "--dry-run", "--cache", str(tmp_path / "cache")])
+    said = CliRunner().invoke(
+        app, ["run", "beam-tiny", "-m", str(path), "--dry-run", "--cache", str(tmp_path / "cache")]
+    )
     assert said.exit_code == 0, said.output
     assert "1 steps of which nothing is known" in said.output
 
 
 @pytest.mark.parametrize("name", ["fem", "umesh"])
 def test_a_digest_follows_what_a_method_imports(name: str) -> None:
-    surrogate = {"fem": "mor_bench.surrogates.fem:FullFEM", "umesh": "mor_bench.surrogates.umesh.method:UMesh"}[name]
+    surrogate = {
+        "fem": "mor_bench.surrogates.fem:FullFEM",
+        "umesh": "mor_bench.surrogates.umesh.method:UMesh",
+    }[name]
     modules = set(_closure(surrogate.partition(":")[0], None))
     assert "mor_bench.surrogate" in modules
     assert ("mor_bench.surrogates.umesh.network" in modules) == (name == "umesh")
-    assert not any(module.startswith(("mor_bench.harness", "mor_bench.report")) for module in modules)
+    assert not any(
+        module.startswith(("mor_bench.harness", "mor_bench.report")) for module in modules
+    )
     assert code_digest(surrogate) == code_digest(surrogate)
 
 
 def test_a_digest_follows_modules_beside_a_third_party_s(tmp_path: Path) -> None:
     (tmp_path / "theirs").mkdir()
     (tmp_path / "theirs" / "__init__.py").write_text("")
-    (tmp_path / "theirs" / "method.py").write_text("from . import part\nfrom mor_bench.surrogates.pod import PODGalerkin as Mine\n")
+    (tmp_path / "theirs" / "method.py").write_text(
+        "from . import part\nfrom mor_bench.surrogates.pod import PODGalerkin as Mine\n"
+    )
     part = tmp_path / "theirs" / "part.py"
     part.write_text("x = 1")
     modules = set(_closure("theirs.method", tmp_path))

@@ -27,29 +27,51 @@ BRIEF: dict[str, Any] = {"n_hidden": 32, "iterations": 600}
 
 def relative_errors(method: mor_bench.Surrogate, samples: Snapshots) -> Any:
     found = method.predict(samples.forces)
-    return np.linalg.norm(found - samples.displacements, axis=(1, 2)) / np.linalg.norm(samples.displacements, axis=(1, 2))
+    return np.linalg.norm(found - samples.displacements, axis=(1, 2)) / np.linalg.norm(
+        samples.displacements, axis=(1, 2)
+    )
 
 
 @pytest.mark.parametrize("of_force", [False, True])
-def test_sensitivities_are_finite_differences_of_full_order_solves(of_force: bool, tiny: Dataset) -> None:
+def test_sensitivities_are_finite_differences_of_full_order_solves(
+    of_force: bool, tiny: Dataset
+) -> None:
     model, few = FullOrderModel(tiny.scene), tiny.train[np.array([3, 40])]
     generator = np.random.default_rng(0)
-    axes, modes = generator.normal(size=(model.n_unknowns, 3)), generator.normal(size=(model.n_unknowns, 4))
+    axes, modes = (
+        generator.normal(size=(model.n_unknowns, 3)),
+        generator.normal(size=(model.n_unknowns, 4)),
+    )
     known = sensitivities(model, few, axes, modes, of_force)
     assert known.inputs.shape == (2, 3, 3)
     assert known.outputs.shape == (2, 3, 4)
-    largest, step, options = np.linalg.norm(few.loads.vectors, axis=2).max(), 1e-4, NewtonOptions(tolerance=1e-12)
+    largest, step, options = (
+        np.linalg.norm(few.loads.vectors, axis=2).max(),
+        1e-4,
+        NewtonOptions(tolerance=1e-12),
+    )
     for i in range(2):
         for axis in range(3):
             unit = np.zeros((tiny.scene.mesh.n_nodes, 3))
             unit[:, axis] = largest * tiny.scene.patch_weights.toarray()[few.loads.patches[i, 0]]
             along = unit.ravel()[tiny.scene.free_dofs]
-            ahead, behind = (model.solve(few.free_forces[i] + sign * step * along, options=options).displacement for sign in (1, -1))
+            ahead, behind = (
+                model.solve(few.free_forces[i] + sign * step * along, options=options).displacement
+                for sign in (1, -1)
+            )
             slope, linear = (ahead - behind) / (2 * step), model.rest_factor.solve(along)
             wanted = (along, slope) if of_force else (linear, slope - linear)
-            for array, matrix, expected in zip((known.inputs, known.outputs), (axes, modes), wanted, strict=True):
-                scale = np.abs(slope @ modes).max() if matrix is modes else np.abs(expected @ matrix).max()
-                np.testing.assert_allclose(array[i, axis], expected @ matrix, rtol=0, atol=2e-5 * scale)
+            for array, matrix, expected in zip(
+                (known.inputs, known.outputs), (axes, modes), wanted, strict=True
+            ):
+                scale = (
+                    np.abs(slope @ modes).max()
+                    if matrix is modes
+                    else np.abs(expected @ matrix).max()
+                )
+                np.testing.assert_allclose(
+                    array[i, axis], expected @ matrix, rtol=0, atol=2e-5 * scale
+                )
 
 
 def test_samples_without_a_stable_tangent_are_left_out(tiny: Dataset) -> None:
@@ -78,11 +100,16 @@ def test_the_network_of_torch_and_of_numpy_agree_with_their_slopes() -> None:
             weight.copy_(torch.from_numpy(generator.normal(size=tuple(weight.shape))))
     x, directions = generator.normal(size=(5, 3)), generator.normal(size=(5, 4, 3))
     weights = network.arrays()
-    values, slopes = (found.detach().numpy() for found in network.with_derivatives(torch.from_numpy(x), torch.from_numpy(directions)))
+    values, slopes = (
+        found.detach().numpy()
+        for found in network.with_derivatives(torch.from_numpy(x), torch.from_numpy(directions))
+    )
     np.testing.assert_allclose(values, evaluate(weights, x), atol=1e-12)
     np.testing.assert_allclose(network(torch.from_numpy(x)).detach().numpy(), values, atol=1e-12)
     for k in range(4):
-        difference = evaluate(weights, x + 1e-5 * directions[:, k]) - evaluate(weights, x - 1e-5 * directions[:, k])
+        difference = evaluate(weights, x + 1e-5 * directions[:, k]) - evaluate(
+            weights, x - 1e-5 * directions[:, k]
+        )
         np.testing.assert_allclose(slopes[:, k], difference / 2e-5, atol=1e-7)
     difference = evaluate(weights, 1e-5 * np.eye(3)) - evaluate(weights, -1e-5 * np.eye(3))
     np.testing.assert_allclose(slope_at_rest(weights), difference / 2e-5, atol=1e-7)
@@ -90,11 +117,21 @@ def test_the_network_of_torch_and_of_numpy_agree_with_their_slopes() -> None:
 
 @pytest.mark.parametrize("derivatives", [False, True])
 @pytest.mark.parametrize("input", ["force", "linear-response"])
-def test_the_loss_of_the_training_is_that_of_the_predictions(input: str, derivatives: bool, tiny: Dataset, tmp_path: Path) -> None:
+def test_the_loss_of_the_training_is_that_of_the_predictions(
+    input: str, derivatives: bool, tiny: Dataset, tmp_path: Path
+) -> None:
     """One step on all samples, from a trained network, whose value and slope at rest are not zero."""
     few, scene = tiny.train[:20], tiny.scene
     methods: list[Any] = [
-        mor_bench.load_method("pod-nn", input=input, derivatives=derivatives, n_input_modes=8, n_output_modes=8, n_hidden=8, iterations=n)
+        mor_bench.load_method(
+            "pod-nn",
+            input=input,
+            derivatives=derivatives,
+            n_input_modes=8,
+            n_output_modes=8,
+            n_hidden=8,
+            iterations=n,
+        )
         for n in (200, 1)
     ]
     methods[0].fit(scene, few).save(tmp_path / "model.safetensors")
@@ -117,20 +154,34 @@ def test_the_loss_of_the_training_is_that_of_the_predictions(input: str, derivat
     expected = (((predicted(few.free_forces) - wanted) * weights) ** 2).sum(axis=1).mean()
     if derivatives:
         known = sensitivities(model, few, methods[0].axes_, modes, of_force=input == "force")
-        largest, patches = np.linalg.norm(few.loads.vectors, axis=2).max(), scene.patch_weights.toarray()[few.loads.patches[:, 0]]
+        largest, patches = (
+            np.linalg.norm(few.loads.vectors, axis=2).max(),
+            scene.patch_weights.toarray()[few.loads.patches[:, 0]],
+        )
         for axis in range(3):
             unit = np.zeros((len(few), scene.mesh.n_nodes, 3))
             unit[:, :, axis] = 1e-4 * largest * patches
             step = unit.reshape(len(few), -1)[:, scene.free_dofs]
             slopes = (predicted(few.free_forces + step) - predicted(few.free_forces - step)) / 2e-4
-            expected += DERIVATIVE_WEIGHT * (((slopes - known.outputs[:, axis]) * weights) ** 2).sum(axis=1).mean()
-    assert methods[1].loss_curve_[0] == pytest.approx(expected / (wanted**2).sum(axis=1).mean(), rel=1e-3)
+            expected += (
+                DERIVATIVE_WEIGHT
+                * (((slopes - known.outputs[:, axis]) * weights) ** 2).sum(axis=1).mean()
+            )
+    assert methods[1].loss_curve_[0] == pytest.approx(
+        expected / (wanted**2).sum(axis=1).mean(), rel=1e-3
+    )
 
 
 def test_derivatives_spare_samples(tiny: Dataset) -> None:
     few = tiny.train[::6]
     medians = [
-        np.median(relative_errors(mor_bench.load_method("pod-nn", derivatives=d, **BRIEF).fit(tiny.scene, few), tiny.test)) for d in (False, True)
+        np.median(
+            relative_errors(
+                mor_bench.load_method("pod-nn", derivatives=d, **BRIEF).fit(tiny.scene, few),
+                tiny.test,
+            )
+        )
+        for d in (False, True)
     ]
     assert medians[1] <= 0.8 * medians[0]
 
@@ -140,14 +191,19 @@ def test_what_is_learned_is_of_second_order_in_the_load(tiny: Dataset) -> None:
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
     forces = tiny.test.forces[:5].copy()
     forces[2] = 0.0
-    learned = [np.abs(method.predict(size * forces) - linear.predict(size * forces)).max() for size in (1e-2, 1e-3)]
+    learned = [
+        np.abs(method.predict(size * forces) - linear.predict(size * forces)).max()
+        for size in (1e-2, 1e-3)
+    ]
     assert learned[0] > 0
     assert learned[1] == pytest.approx(1e-2 * learned[0], rel=0.2)
     assert not method.predict(forces)[2].any()
 
 
 def test_from_the_force_alone_training_loads_are_learned(tiny: Dataset) -> None:
-    method = mor_bench.load_method("pod-nn", input="force", n_input_modes=40, **BRIEF).fit(tiny.scene, tiny.train)
+    method = mor_bench.load_method("pod-nn", input="force", n_input_modes=40, **BRIEF).fit(
+        tiny.scene, tiny.train
+    )
     assert np.median(relative_errors(method, tiny.train)) < 0.6
     forces = np.zeros((2, tiny.scene.mesh.n_nodes, 3))
     forces[1] = tiny.test.forces[0]
@@ -161,7 +217,9 @@ def test_a_training_starts_from_a_saved_model_in_other_bases(tiny: Dataset, tmp_
     for start in (None, tmp_path / "model.safetensors"):
         method = mor_bench.load_method("pod-nn", n_hidden=32, iterations=1)
         method.training = TrainingOptions(start_from=start)
-        medians.append(np.median(relative_errors(method.fit(tiny.scene, tiny.train[::2]), tiny.test)))
+        medians.append(
+            np.median(relative_errors(method.fit(tiny.scene, tiny.train[::2]), tiny.test))
+        )
     own = np.median(relative_errors(first, tiny.test))
     assert medians[1] <= 1.5 * own
     assert medians[0] > 3 * own

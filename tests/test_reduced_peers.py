@@ -7,7 +7,15 @@ import pytest
 
 from mor_bench.snapshots.dataset import Dataset
 from tests.benchmarks.peers import MAX_DIFFERENCE, DisagreementError, installed
-from tests.benchmarks.reduced_peers import KRATOS_ROM, METHODS, SAME_AS_POD, Ours, compare, make_contenders, own_methods
+from tests.benchmarks.reduced_peers import (
+    KRATOS_ROM,
+    METHODS,
+    SAME_AS_POD,
+    Ours,
+    compare,
+    make_contenders,
+    own_methods,
+)
 
 
 def test_kratos_solves_our_reduced_equations(tiny: Dataset) -> None:
@@ -15,7 +23,10 @@ def test_kratos_solves_our_reduced_equations(tiny: Dataset) -> None:
     if missing:
         pytest.skip(f"not installed: {', '.join(missing)}")
     contenders = make_contenders(tiny.scene, tiny.train, 2)
-    rows = {row.name: row for row in compare(tiny.test.forces[:2], tiny.test.displacements[:2], contenders, rounds=2)}
+    rows = {
+        row.name: row
+        for row in compare(tiny.test.forces[:2], tiny.test.displacements[:2], contenders, rounds=2)
+    }
     kratos = [row for name, row in rows.items() if name.startswith("Kratos")]
     assert len(kratos) == 5
     for row in kratos:
@@ -27,7 +38,9 @@ def test_kratos_solves_our_reduced_equations(tiny: Dataset) -> None:
     assert rows["mor-bench, pod"].errors_m == pytest.approx(rows["Kratos POD, global"].errors_m)
     by_name = {contender.name: contender for contender in contenders}
     pod, ecm = by_name["mor-bench, pod"], by_name["mor-bench, hpod, ECM cells"]
-    assert np.linalg.norm(ecm.displacement() - pod.displacement()) < 2e-3 * np.linalg.norm(pod.displacement())  # cells for 1e-3
+    assert np.linalg.norm(ecm.displacement() - pod.displacement()) < 2e-3 * np.linalg.norm(
+        pod.displacement()
+    )  # cells for 1e-3
 
 
 def test_other_answers_are_refused(tiny: Dataset) -> None:
@@ -37,6 +50,10 @@ def test_other_answers_are_refused(tiny: Dataset) -> None:
     assert len(said) == len(METHODS) + 1 - len(fitted)
     pod = fitted["pod"]
     load = tiny.test.forces[:1], tiny.test.displacements[:1]
-    compare(*load, [Ours(name, fitted[name], pod) for name in ("pod", *SAME_AS_POD) if name in fitted], rounds=1)  # type: ignore[arg-type]
+    compare(
+        *load,
+        [Ours(name, fitted[name], pod) for name in ("pod", *SAME_AS_POD) if name in fitted],
+        rounds=1,
+    )  # type: ignore[arg-type]
     with pytest.raises(DisagreementError, match="another problem"):
         compare(*load, [Ours("hpod", fitted["hpod"], pod)], rounds=1)  # type: ignore[arg-type]

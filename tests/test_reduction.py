@@ -36,7 +36,9 @@ def test_the_basis_is_optimal_and_its_error_is_the_tail(coarse: Dataset) -> None
     snapshots = coarse.train.free_displacements
     basis = pod(snapshots, 10)
     rest = snapshots - snapshots @ basis.modes @ basis.modes.T
-    assert np.linalg.norm(rest) == pytest.approx(np.linalg.norm(basis.singular_values[10:]), rel=1e-10)
+    assert np.linalg.norm(rest) == pytest.approx(
+        np.linalg.norm(basis.singular_values[10:]), rel=1e-10
+    )
 
 
 @pytest.mark.parametrize("kind", ["duplicates", "one", "with zeros", "r above the rank"])
@@ -66,11 +68,15 @@ def test_projected_tangent_and_force(coarse: Dataset) -> None:
     problem = GalerkinProblem(model.assembler, modes)
     q = coarse.train.free_displacements[5] @ modes
     state, tangent = problem.linearise(q)
-    np.testing.assert_allclose(state.force, modes.T @ model.force(modes @ q).force, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(
+        state.force, modes.T @ model.force(modes @ q).force, rtol=1e-12, atol=1e-14
+    )
     np.testing.assert_allclose(tangent, tangent.T, atol=1e-12 * np.abs(tangent).max())
     h = 1e-6 * np.random.default_rng(0).normal(size=12)
     difference = problem.force(q + h).force - problem.force(q - h).force
-    np.testing.assert_allclose(2 * tangent @ h, difference, rtol=1e-6, atol=1e-8 * np.abs(difference).max())
+    np.testing.assert_allclose(
+        2 * tangent @ h, difference, rtol=1e-6, atol=1e-8 * np.abs(difference).max()
+    )
 
 
 def test_galerkin_energy_never_lies_below_the_full_one_and_approaches_it(coarse: Dataset) -> None:
@@ -80,7 +86,10 @@ def test_galerkin_energy_never_lies_below_the_full_one_and_approaches_it(coarse:
     for r in (3, 10, 40):
         method = PODGalerkin(r, tolerance=1e-10).fit(coarse.scene, coarse.train)
         reduced = method.predict(coarse.test.forces[:20]).reshape(20, -1)[:, coarse.scene.free_dofs]
-        gap = [model.force(v).energy_j - f @ v - model.force(u).energy_j + f @ u for u, v, f in zip(exact, reduced, forces, strict=True)]
+        gap = [
+            model.force(v).energy_j - f @ v - model.force(u).energy_j + f @ u
+            for u, v, f in zip(exact, reduced, forces, strict=True)
+        ]
         assert min(gap) >= -1e-12
         gaps.append(np.mean(gap))
     assert gaps[0] > gaps[1] > gaps[2]
@@ -90,14 +99,18 @@ def test_ecsw_with_every_cell_is_plain_pod(coarse: Dataset) -> None:
     plain = PODGalerkin(10).fit(coarse.scene, coarse.train).predict(coarse.test.forces[:10])
     whole = HyperReducedPOD(10, cubature_tolerance=0.0).fit(coarse.scene, coarse.train)
     assert len(whole.cells_) == coarse.scene.mesh.n_cells
-    assert np.abs(whole.predict(coarse.test.forces[:10]) - plain).max() <= 1e-10 * np.abs(plain).max()
+    assert (
+        np.abs(whole.predict(coarse.test.forces[:10]) - plain).max() <= 1e-10 * np.abs(plain).max()
+    )
 
 
 def test_ecsw_keeps_few_cells_and_stays_close_to_pod(coarse: Dataset) -> None:
     reference = coarse.test.displacements
     plain = PODGalerkin(10).fit(coarse.scene, coarse.train)
     reduced = HyperReducedPOD(10, sampling="cells").fit(coarse.scene, coarse.train)
-    errors = [np.abs(method.predict(coarse.test.forces) - reference).mean() for method in (plain, reduced)]
+    errors = [
+        np.abs(method.predict(coarse.test.forces) - reference).mean() for method in (plain, reduced)
+    ]
     assert errors[1] <= 1.2 * errors[0]
     assert len(reduced.cells_) < 0.6 * coarse.scene.mesh.n_cells
     assert (reduced.weights_ > 0).all()
@@ -113,8 +126,15 @@ def test_the_compressed_training_system_is_the_whole_one(coarse: Dataset) -> Non
     assert np.linalg.norm(system.sum(axis=1)) == pytest.approx(np.linalg.norm(rows), rel=1e-10)
     weights = np.random.default_rng(0).random(135)
     padded = np.vstack([modes, np.zeros(4)])
-    whole = np.concatenate([np.einsum("eir,ei->re", padded[model.cell_dofs], model.assembler.cell_forces(modes @ c)) for c in q])
-    assert np.linalg.norm(system @ weights - system.sum(axis=1)) == pytest.approx(np.linalg.norm(whole @ weights - rows), rel=1e-10)
+    whole = np.concatenate(
+        [
+            np.einsum("eir,ei->re", padded[model.cell_dofs], model.assembler.cell_forces(modes @ c))
+            for c in q
+        ]
+    )
+    assert np.linalg.norm(system @ weights - system.sum(axis=1)) == pytest.approx(
+        np.linalg.norm(whole @ weights - rows), rel=1e-10
+    )
 
 
 def test_monomials_are_all_of_their_degree() -> None:
@@ -124,7 +144,12 @@ def test_monomials_are_all_of_their_degree() -> None:
     expected = {
         *np.round(z[0], 12),
         *(round(z[0, i] * z[0, j], 12) for i in range(4) for j in range(4)),
-        *(round(z[0, i] * z[0, j] * z[0, k], 12) for i in range(4) for j in range(4) for k in range(4)),
+        *(
+            round(z[0, i] * z[0, j] * z[0, k], 12)
+            for i in range(4)
+            for j in range(4)
+            for k in range(4)
+        ),
     }
     assert {*np.round(values[0], 12)} == expected
 

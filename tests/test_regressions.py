@@ -41,7 +41,9 @@ FAMILIES: dict[str, dict[str, Any]] = {
 
 def scene_with(element: str, integration: str) -> Scene:
     spec = load_generated_spec("beam-tiny")
-    changed = spec.discretisation.model_copy(update={"element": element, "integration": integration})
+    changed = spec.discretisation.model_copy(
+        update={"element": element, "integration": integration}
+    )
     return load_scene(spec.model_copy(update={"discretisation": changed}))
 
 
@@ -61,8 +63,10 @@ def by_back_solves(model: FullOrderModel, loads: NDArray[np.float64]) -> NDArray
 
 
 SCENES = {
-    "H8, full": ("hexahedron", "full"), "H8, selective": ("hexahedron", "selective"), "T4": ("tetrahedron", "full"),
-}  # fmt: skip
+    "H8, full": ("hexahedron", "full"),
+    "H8, selective": ("hexahedron", "selective"),
+    "T4": ("tetrahedron", "full"),
+}
 
 
 @pytest.mark.parametrize("case", [*SCENES, "l-shape", "liver-hex"])
@@ -84,7 +88,9 @@ def test_columns_and_back_solves_give_the_same_response(case: str) -> None:
     np.testing.assert_array_equal(compliance.solve(loads[:, free].T), found[:, free].T)
     axes = np.random.default_rng(1).normal(size=(len(free), 4))
     reduced = project(compliance.to_coordinates(axes), loads)
-    np.testing.assert_allclose(reduced, expected[:, free] @ axes, rtol=0, atol=1e-11 * np.abs(reduced).max())
+    np.testing.assert_allclose(
+        reduced, expected[:, free] @ axes, rtol=0, atol=1e-11 * np.abs(reduced).max()
+    )
 
 
 @pytest.mark.parametrize("solver", ["cholesky", "superlu", "pardiso", "jacobi-pcg"])
@@ -101,7 +107,9 @@ def test_loads_without_columns_are_solved_for(tiny: Dataset, solver: SolverName)
     loads[3, 3 * scene.fixed_nodes[0]] = 5.0
     with counted() as cost:
         found = compliance.respond(loads)
-    np.testing.assert_allclose(found, by_back_solves(model, loads), rtol=0, atol=1e-11 * np.abs(found).max())
+    np.testing.assert_allclose(
+        found, by_back_solves(model, loads), rtol=0, atol=1e-11 * np.abs(found).max()
+    )
     if solver in ("cholesky", "superlu"):
         assert cost.back_solves == 2
     else:
@@ -127,11 +135,15 @@ def test_more_columns_than_pay_are_not_used_or_not_kept(monkeypatch: pytest.Monk
     monkeypatch.setattr(compliance_module, "MAX_BYTES", compliance.columns.nbytes - 1)
     without = Compliance(model)
     assert len(without.columns) == 0
-    np.testing.assert_allclose(without.respond(loads), compliance.respond(loads), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        without.respond(loads), compliance.respond(loads), rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("scene", ["l-shape", "liver-hex"])
-def test_many_right_hand_sides_are_solved_for_as_few(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_right_hand_sides_are_solved_for_as_few(
+    scene: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """By blocks, in natural order and reordered, the last block shorter than the others."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -147,27 +159,42 @@ def test_many_right_hand_sides_are_solved_for_as_few(scene: str, monkeypatch: py
     np.testing.assert_allclose(many, few, rtol=0, atol=1e-11 * np.abs(few).max())
 
 
-@pytest.fixture(scope="module", params=[(name, source) for name in FAMILIES for source in INPUTS], ids=str)
+@pytest.fixture(
+    scope="module", params=[(name, source) for name in FAMILIES for source in INPUTS], ids=str
+)
 def fitted(request: pytest.FixtureRequest, tiny: Dataset) -> Surrogate:
     name, source = request.param
     knobs = {"n_input_modes": 6, "n_output_modes": 5, "input": source, **FAMILIES[name]}
     return mor_bench.load_method(name, **knobs).fit(tiny.scene, tiny.train)
 
 
-def coordinates(method: Any, data: Dataset) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def coordinates(
+    method: Any, data: Dataset
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Inputs and outputs of the training samples, and the inputs of the test samples, rounded as in `fit`: trees see each bit of them."""
     rest = data.train.free_displacements
-    z, queries = (project(method._from_forces, part.forces.reshape(len(part), -1)) for part in (data.train, data.test))
+    z, queries = (
+        project(method._from_forces, part.forces.reshape(len(part), -1))
+        for part in (data.train, data.test)
+    )
     if method.input == "linear-response":
-        responses = method.compliance_.respond(data.train.forces.reshape(len(data.train), -1))[:, data.scene.free_dofs]
-        np.testing.assert_allclose(z, responses @ method.axes_, rtol=0, atol=1e-10 * np.abs(z).max())
+        responses = method.compliance_.respond(data.train.forces.reshape(len(data.train), -1))[
+            :, data.scene.free_dofs
+        ]
+        np.testing.assert_allclose(
+            z, responses @ method.axes_, rtol=0, atol=1e-10 * np.abs(z).max()
+        )
         rest = rest - responses
     else:
-        np.testing.assert_allclose(z, data.train.free_forces @ method.axes_, rtol=0, atol=1e-10 * np.abs(z).max())
+        np.testing.assert_allclose(
+            z, data.train.free_forces @ method.axes_, rtol=0, atol=1e-10 * np.abs(z).max()
+        )
     return z, rest @ method.modes_, queries
 
 
-def expected_outputs(method: Any, z: NDArray[np.float64], outputs: NDArray[np.float64], queries: NDArray[np.float64]) -> NDArray[np.float64]:
+def expected_outputs(
+    method: Any, z: NDArray[np.float64], outputs: NDArray[np.float64], queries: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """What scikit-learn predicts, with g(0) = 0 in each family's own way."""
     from sklearn.ensemble import ExtraTreesRegressor, RandomForestRegressor
     from sklearn.gaussian_process import GaussianProcessRegressor
@@ -178,7 +205,11 @@ def expected_outputs(method: Any, z: NDArray[np.float64], outputs: NDArray[np.fl
     kind = type(method).__name__
     if kind == "PCARegression":
         scale = np.sqrt((z**2).mean(axis=0))
-        found = Ridge(alpha=method.ridge * len(z), fit_intercept=False).fit(z / scale, outputs).predict(queries / scale)
+        found = (
+            Ridge(alpha=method.ridge * len(z), fit_intercept=False)
+            .fit(z / scale, outputs)
+            .predict(queries / scale)
+        )
     elif kind == "PCAKernelRidge":
         gaussian = RBF(LENGTH_SCALES[method.input])
         origin = np.zeros((1, z.shape[1]))
@@ -187,17 +218,32 @@ def expected_outputs(method: Any, z: NDArray[np.float64], outputs: NDArray[np.fl
             return gaussian(a, b) - gaussian(a, origin) @ gaussian(origin, b)
 
         n = method.n_points
-        model = KernelRidge(alpha=method.ridge, kernel="precomputed").fit(kernel(z[:n], z[:n]), outputs[:n])
+        model = KernelRidge(alpha=method.ridge, kernel="precomputed").fit(
+            kernel(z[:n], z[:n]), outputs[:n]
+        )
         found = model.predict(kernel(queries, z[:n]))
     elif kind == "PCAGaussianProcess":
         process = GaussianProcessRegressor(RBF(method.lengths_), optimizer=None)
-        process.X_train_, process.alpha_, process.kernel_ = method.points_, method.weights_, RBF(method.lengths_)
-        process._y_train_mean, process._y_train_std = np.zeros(outputs.shape[1]), np.ones(outputs.shape[1])
-        np.testing.assert_allclose(method.points_[:-1], z[: method.n_points], atol=1e-9 * np.abs(z).max())
+        process.X_train_, process.alpha_, process.kernel_ = (
+            method.points_,
+            method.weights_,
+            RBF(method.lengths_),
+        )
+        process._y_train_mean, process._y_train_std = (
+            np.zeros(outputs.shape[1]),
+            np.ones(outputs.shape[1]),
+        )
+        np.testing.assert_allclose(
+            method.points_[:-1], z[: method.n_points], atol=1e-9 * np.abs(z).max()
+        )
         found = process.predict(queries)
     else:
-        ensemble = {"PCARandomForest": RandomForestRegressor, "PCAExtraTrees": ExtraTreesRegressor}[kind]
-        forest = ensemble(method.n_trees, min_samples_leaf=method.min_samples_leaf, random_state=method.seed).fit(z, outputs)
+        ensemble = {"PCARandomForest": RandomForestRegressor, "PCAExtraTrees": ExtraTreesRegressor}[
+            kind
+        ]
+        forest = ensemble(
+            method.n_trees, min_samples_leaf=method.min_samples_leaf, random_state=method.seed
+        ).fit(z, outputs)
         found = forest.predict(queries) - forest.predict(np.zeros((1, z.shape[1])))
     return np.asarray(found)
 
@@ -206,9 +252,16 @@ def test_predictions_are_those_of_scikit_learn(fitted: Any, tiny: Dataset) -> No
     z, outputs, queries = coordinates(fitted, tiny)
     predicted = fitted.predict(tiny.test.forces).reshape(len(tiny.test), -1)
     if fitted.input == "linear-response":
-        predicted = predicted - by_back_solves(FullOrderModel(tiny.scene), tiny.test.forces.reshape(len(tiny.test), -1))
+        predicted = predicted - by_back_solves(
+            FullOrderModel(tiny.scene), tiny.test.forces.reshape(len(tiny.test), -1)
+        )
     expected = expected_outputs(fitted, z, outputs, queries)
-    np.testing.assert_allclose(predicted[:, tiny.scene.free_dofs] @ fitted.modes_, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        predicted[:, tiny.scene.free_dofs] @ fitted.modes_,
+        expected,
+        rtol=0,
+        atol=1e-6 * np.abs(expected).max(),
+    )
 
 
 def test_no_load_gives_no_displacement(fitted: Any, tiny: Dataset) -> None:
@@ -222,7 +275,9 @@ def test_no_load_gives_no_displacement(fitted: Any, tiny: Dataset) -> None:
 
 def test_a_gaussian_process_fits_its_points(tiny: Dataset) -> None:
     """With the noise that it found, which is small: the mean passes near the outputs, and the length scales have been moved."""
-    method: Any = mor_bench.load_method("pca-gaussian-process", n_input_modes=6, n_output_modes=5).fit(tiny.scene, tiny.train)
+    method: Any = mor_bench.load_method(
+        "pca-gaussian-process", n_input_modes=6, n_output_modes=5
+    ).fit(tiny.scene, tiny.train)
     z, outputs, _ = coordinates(method, tiny)
     np.testing.assert_allclose(method._coefficients(z), outputs, atol=0.03 * np.abs(outputs).max())
     assert np.ptp(method.lengths_) > 0.1
@@ -244,11 +299,36 @@ def at(array: NDArray[Any], place: Any, value: float) -> NDArray[Any]:
 
 
 FORGERIES = [
-    ("pca-extra-trees", "children", "a child that is its own parent", lambda m: at(m.children_, (0, 1), 0)),
-    ("pca-extra-trees", "children", "a child behind all nodes", lambda m: at(m.children_, (0, 0), len(m.features_))),
-    ("pca-random-forest", "children", "a leaf without values", lambda m: at(m.children_, (len(m.features_) - 1, 0), len(m.values_))),
-    ("pca-random-forest", "children", "a leaf before all values", lambda m: at(m.children_, (len(m.features_) - 1, 0), -1)),
-    ("pca-random-forest", "features", "an input that is none", lambda m: at(m.features_, 0, m.axes_.shape[1])),
+    (
+        "pca-extra-trees",
+        "children",
+        "a child that is its own parent",
+        lambda m: at(m.children_, (0, 1), 0),
+    ),
+    (
+        "pca-extra-trees",
+        "children",
+        "a child behind all nodes",
+        lambda m: at(m.children_, (0, 0), len(m.features_)),
+    ),
+    (
+        "pca-random-forest",
+        "children",
+        "a leaf without values",
+        lambda m: at(m.children_, (len(m.features_) - 1, 0), len(m.values_)),
+    ),
+    (
+        "pca-random-forest",
+        "children",
+        "a leaf before all values",
+        lambda m: at(m.children_, (len(m.features_) - 1, 0), -1),
+    ),
+    (
+        "pca-random-forest",
+        "features",
+        "an input that is none",
+        lambda m: at(m.features_, 0, m.axes_.shape[1]),
+    ),
     ("pca-random-forest", "features", "less than a leaf", lambda m: at(m.features_, 0, -2)),
     ("pca-random-forest", "features", "floats", lambda m: m.features_.astype(np.float64)),
     ("pca-random-forest", "features", "64 bits", lambda m: m.features_.astype(np.int64)),
@@ -263,8 +343,14 @@ FORGERIES = [
 ]
 
 
-@pytest.mark.parametrize(("name", "array", "what", "forge"), FORGERIES, ids=[f"{name}: {array}, {what}" for name, array, what, _ in FORGERIES])
-def test_arrays_that_would_mislead_a_kernel_are_refused(tiny: Dataset, tmp_path: Path, name: str, array: str, what: str, forge: Any) -> None:
+@pytest.mark.parametrize(
+    ("name", "array", "what", "forge"),
+    FORGERIES,
+    ids=[f"{name}: {array}, {what}" for name, array, what, _ in FORGERIES],
+)
+def test_arrays_that_would_mislead_a_kernel_are_refused(
+    tiny: Dataset, tmp_path: Path, name: str, array: str, what: str, forge: Any
+) -> None:
     method: Any = mor_bench.load_method(name, **FAMILIES[name]).fit(tiny.scene, tiny.train[:40])
     path = tmp_path / "model.safetensors"
     method.save(path)
@@ -278,24 +364,38 @@ def test_arrays_that_would_mislead_a_kernel_are_refused(tiny: Dataset, tmp_path:
 def test_more_arrays_than_a_model_has_are_refused(tiny: Dataset, tmp_path: Path) -> None:
     method = mor_bench.load_method("pca-ridge").fit(tiny.scene, tiny.train[:40])
     state = method._state()
-    with pytest.raises(mor_bench.errors.InvalidInputError, match="axes, modes, weights; got axes, modes, other, weights"):
+    with pytest.raises(
+        mor_bench.errors.InvalidInputError,
+        match="axes, modes, weights; got axes, modes, other, weights",
+    ):
         method._restore({**state, "other": np.zeros(3)})
 
 
 def test_inputs_too_large_for_single_precision_find_a_leaf(tiny: Dataset) -> None:
-    method = mor_bench.load_method("pca-extra-trees", **FAMILIES["pca-extra-trees"]).fit(tiny.scene, tiny.train)
+    method = mor_bench.load_method("pca-extra-trees", **FAMILIES["pca-extra-trees"]).fit(
+        tiny.scene, tiny.train
+    )
     assert np.isfinite(method.predict(1e29 * tiny.test.forces[:2])).all()
 
 
 @pytest.mark.parametrize("order", ["generated", "imported"])
 @pytest.mark.parametrize("name", ["pca-kernel-ridge", "pca-gaussian-process"])
-def test_the_samples_that_kernels_see_are_of_all_load_regions(tiny: Dataset, name: str, order: str) -> None:
+def test_the_samples_that_kernels_see_are_of_all_load_regions(
+    tiny: Dataset, name: str, order: str
+) -> None:
     """Imported snapshots may come region by region: the first hundred of these are of ten of them."""
     train = tiny.train
     if order == "imported":
         train = train[np.argsort(train.regions, kind="stable")]
-        train = Snapshots(train.scene, NodalLoads(train.forces, train.loads.patches), train.free_displacements, train.min_det_f)
-    method: Any = mor_bench.load_method(name, input="force", **FAMILIES[name]).fit(tiny.scene, train)
+        train = Snapshots(
+            train.scene,
+            NodalLoads(train.forces, train.loads.patches),
+            train.free_displacements,
+            train.min_det_f,
+        )
+    method: Any = mor_bench.load_method(name, input="force", **FAMILIES[name]).fit(
+        tiny.scene, train
+    )
     assert len(method.points_) == 101
     assert not method.points_[-1].any()
     z = project(method._from_forces, train.forces.reshape(len(train), -1))
@@ -310,26 +410,51 @@ def test_the_samples_that_kernels_see_are_of_all_load_regions(tiny: Dataset, nam
     [
         ("pca-regression", {"ridge": np.inf}, "`ridge` must be a finite number; got inf"),
         ("pca-kernel-ridge", {"ridge": np.inf}, "`ridge` must be a finite number; got inf"),
-        ("pca-kernel-ridge", {"length_scale": 1e-300}, "`length_scale` must be greater than or equal to 0.01; got 1e-300"),
-        ("pca-kernel-ridge", {"length_scale": np.inf}, "`length_scale` must be less than or equal to 1000; got inf"),
+        (
+            "pca-kernel-ridge",
+            {"length_scale": 1e-300},
+            "`length_scale` must be greater than or equal to 0.01; got 1e-300",
+        ),
+        (
+            "pca-kernel-ridge",
+            {"length_scale": np.inf},
+            "`length_scale` must be less than or equal to 1000; got inf",
+        ),
     ],
 )
-def test_knobs_that_would_end_in_infinite_numbers_are_refused(name: str, knobs: dict[str, Any], message: str) -> None:
+def test_knobs_that_would_end_in_infinite_numbers_are_refused(
+    name: str, knobs: dict[str, Any], message: str
+) -> None:
     with pytest.raises(mor_bench.errors.SpecError, match=message):
         mor_bench.load_method(name, **knobs)
 
 
-def test_more_monomials_than_fit_into_memory_are_refused(tiny: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_monomials_than_fit_into_memory_are_refused(
+    tiny: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     train = tiny.train[:40]
     monkeypatch.setattr(pca_regression, "MAX_FEATURE_BYTES", 8 * 65 * 40)
     mor_bench.load_method("pca-regression", n_input_modes=10, degree=2).fit(tiny.scene, train)
-    with pytest.raises(mor_bench.errors.InvalidInputError, match=r"`degree` 2 of 11 input modes gives 77 monomials, .* lower it or `n_input_modes`"):
+    with pytest.raises(
+        mor_bench.errors.InvalidInputError,
+        match=r"`degree` 2 of 11 input modes gives 77 monomials, .* lower it or `n_input_modes`",
+    ):
         mor_bench.load_method("pca-regression", n_input_modes=11, degree=2).fit(tiny.scene, train)
 
 
 def test_length_scales_too_short_to_divide_by_are_refused(tiny: Dataset) -> None:
     """With points as near to the origin they passed for a model, whose answers were NaN."""
-    method: Any = mor_bench.load_method("pca-kernel-ridge", **FAMILIES["pca-kernel-ridge"]).fit(tiny.scene, tiny.train)
+    method: Any = mor_bench.load_method("pca-kernel-ridge", **FAMILIES["pca-kernel-ridge"]).fit(
+        tiny.scene, tiny.train
+    )
     state = method._state()
-    with pytest.raises(mor_bench.errors.InvalidInputError, match="`lengths` must be at least 1e-06"):
-        method._restore({**state, "points": 1e-300 + 0 * state["points"], "lengths": 1e-300 + 0 * state["lengths"]})
+    with pytest.raises(
+        mor_bench.errors.InvalidInputError, match="`lengths` must be at least 1e-06"
+    ):
+        method._restore(
+            {
+                **state,
+                "points": 1e-300 + 0 * state["points"],
+                "lengths": 1e-300 + 0 * state["lengths"],
+            }
+        )

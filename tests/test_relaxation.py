@@ -26,20 +26,32 @@ LAWS: dict[str, dict[str, Any]] = {
     "mooney-rivlin": {"c10_pa": 60.0, "c01_pa": 29.0, "bulk_pa": 833.0},
     "ogden": {"mu_pa": [178.0], "alpha": [2.5], "bulk_pa": 833.0},
 }
-ELEMENTS = {"H8": ("hexahedron", "full"), "H8 selective": ("hexahedron", "selective"), "T4": ("tetrahedron", "full")}
+ELEMENTS = {
+    "H8": ("hexahedron", "full"),
+    "H8 selective": ("hexahedron", "selective"),
+    "T4": ("tetrahedron", "full"),
+}
 
 
 def model(law: str = "saint-venant-kirchhoff", element: str = "H8") -> FullOrderModel:
     """beam-tiny of another law and element."""
     spec = load_generated_spec("beam-tiny").model_dump(mode="json", exclude_none=True)
     kind, integration = ELEMENTS[element]
-    spec |= {"material": {"law": law, **LAWS[law]}, "discretisation": {"element": kind, "integration": integration}}
+    spec |= {
+        "material": {"law": law, **LAWS[law]},
+        "discretisation": {"element": kind, "integration": integration},
+    }
     return FullOrderModel(load_scene(spec))
 
 
 def loads(of: FullOrderModel, numbers: list[int], factor: float = 1.0) -> NDArray[np.float64]:
     drawn = draw_loads(of.scene, 0, 200)[np.array(numbers)]
-    return factor * drawn.nodal_forces(of.scene.patch_weights).reshape(len(numbers), -1)[:, of.scene.free_dofs]
+    return (
+        factor
+        * drawn.nodal_forces(of.scene.patch_weights).reshape(len(numbers), -1)[
+            :, of.scene.free_dofs
+        ]
+    )
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
@@ -49,7 +61,9 @@ def test_it_rests_where_the_full_order_solve_ends(law: str, element: str) -> Non
     relaxed = DynamicRelaxation(full)
     for load in loads(full, [14, 133], 3.0):
         exact, found = full.solve(load).displacement, relaxed.solve(load, 1e-7, 5000)
-        assert np.linalg.norm(load - full.force(found.displacement).force) <= 1.001e-7 * np.linalg.norm(load)
+        assert np.linalg.norm(
+            load - full.force(found.displacement).force
+        ) <= 1.001e-7 * np.linalg.norm(load)
         assert found.min_det_f == pytest.approx(full.force(found.displacement).min_det_f, rel=1e-12)
         assert np.linalg.norm(found.displacement - exact) <= 2e-6 * np.linalg.norm(exact)
         assert found.cuts == 0
@@ -75,7 +89,9 @@ def test_steps_are_what_is_counted_and_a_cap_on_them_raises() -> None:
     with counted() as cost:
         steps = relaxed.solve(load, 1e-4, 5000).iterations
     assert cost.element_evaluations == steps * 24
-    assert cost.multiply_adds == steps * (24 * 8 * kernels.FORCE_MULTIPLY_ADDS + kernels.ADVANCE_MULTIPLY_ADDS * full.n_unknowns)
+    assert cost.multiply_adds == steps * (
+        24 * 8 * kernels.FORCE_MULTIPLY_ADDS + kernels.ADVANCE_MULTIPLY_ADDS * full.n_unknowns
+    )
     assert relaxed.solve(load, 1e-4, steps).iterations == steps
     with pytest.raises(NoEquilibriumError, match=f"after {steps - 1} steps the residual is"):
         relaxed.solve(load, 1e-4, steps - 1)
@@ -104,7 +120,9 @@ def test_a_body_that_came_to_rest_inverted_is_let_go_once_more() -> None:
         assert np.linalg.norm(found.displacement - exact) <= 2e-5 * np.linalg.norm(exact)
 
 
-def test_a_step_beyond_the_limit_of_stability_is_made_shorter(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_beyond_the_limit_of_stability_is_made_shorter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     full = model()
     relaxed, load = DynamicRelaxation(full), loads(full, [14])[0]
     exact = full.solve(load).displacement
@@ -116,8 +134,12 @@ def test_a_step_beyond_the_limit_of_stability_is_made_shorter(monkeypatch: pytes
 
 def test_a_linear_start_takes_the_same_load_to_the_same_rest(tiny_scene: mor_bench.Scene) -> None:
     drawn = draw_loads(tiny_scene, 14, 15).nodal_forces(tiny_scene.patch_weights)
-    near, far = (ExplicitDynamics(1e-7, start).fit(tiny_scene, None) for start in ("linear-response", "rest"))
-    assert np.linalg.norm(near.predict(drawn) - far.predict(drawn)) <= 4e-6 * np.linalg.norm(far.predict(drawn))
+    near, far = (
+        ExplicitDynamics(1e-7, start).fit(tiny_scene, None) for start in ("linear-response", "rest")
+    )
+    assert np.linalg.norm(near.predict(drawn) - far.predict(drawn)) <= 4e-6 * np.linalg.norm(
+        far.predict(drawn)
+    )
     with counted() as without:
         far.predict(drawn)
     with counted() as cost:

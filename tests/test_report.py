@@ -41,15 +41,33 @@ HOSTILE = "<script>alert(1)</script> & [bold]$x_1$"
 REASON = "OutOfMemoryError: 31 GiB <needed> & 24 GiB there"
 N_TEST = 40
 UNMEASURED: dict[str, Any] = {
-    "n_dofs": 135, "all_threads_ms": None, "throughput": None, "memory_bytes": None, "cost": None, "sets": {}, "hidden": None,
-}  # fmt: skip
+    "n_dofs": 135,
+    "all_threads_ms": None,
+    "throughput": None,
+    "memory_bytes": None,
+    "cost": None,
+    "sets": {},
+    "hidden": None,
+}
 MESH = box_mesh((2.0, 1.0, 1.0), (4, 2, 2))
 
 
-def add_row(comparison: Comparison, method: str, swept: dict[str, Any], error: float, latency_ms: float, **more: Any) -> dict[str, Any]:
+def add_row(
+    comparison: Comparison,
+    method: str,
+    swept: dict[str, Any],
+    error: float,
+    latency_ms: float,
+    **more: Any,
+) -> dict[str, Any]:
     """Add a row with raw samples whose median relative l2 is `error`; `more` replaces entries, `n_failed` fails samples."""
     generator = np.random.default_rng(len(comparison.rows))
-    reference = generator.random((N_TEST, 1, 1)) * 0.2 * MESH.points[None, :, [0]] ** 2 * np.array([0.2, 0.1, 1.0])
+    reference = (
+        generator.random((N_TEST, 1, 1))
+        * 0.2
+        * MESH.points[None, :, [0]] ** 2
+        * np.array([0.2, 0.1, 1.0])
+    )
     size = error * np.linspace(0.5, 1.5, N_TEST + 1)[1:, None, None]
     prediction = reference * (1 + size)
     prediction[: more.get("n_failed", 0)] = np.nan
@@ -59,28 +77,69 @@ def add_row(comparison: Comparison, method: str, swept: dict[str, Any], error: f
     forces[-1, 2] = -0.7
     latencies = latency_ms * np.linspace(0.9, 1.1, 41)
     row = {
-        "dataset": "beam-tiny", "split": "region", "method": method, "label": label_of(method, swept), "parameters": dict(swept),
-        "status": "ok", "reason": None, "n_train": 200, "n_test": N_TEST, "n_failed": 0, "threads": 1, "error": summary(errors), **UNMEASURED,
+        "dataset": "beam-tiny",
+        "split": "region",
+        "method": method,
+        "label": label_of(method, swept),
+        "parameters": dict(swept),
+        "status": "ok",
+        "reason": None,
+        "n_train": 200,
+        "n_test": N_TEST,
+        "n_failed": 0,
+        "threads": 1,
+        "error": summary(errors),
+        **UNMEASURED,
         "latency_ms": {"median": latency_ms, "p95": 1.09 * latency_ms, "p99": 1.1 * latency_ms},
-        "offline_s": {"data": 3.0, "fit": 0.5}, "model_bytes": 12345, "discretisation_error_m": None, **more,
-    }  # fmt: skip
+        "offline_s": {"data": 3.0, "fit": 0.5},
+        "model_bytes": 12345,
+        "discretisation_error_m": None,
+        **more,
+    }
     samples = {
-        "latency_ms": latencies, "mean_dof_m": errors.mean_dof_m, "relative_l2": errors.relative_l2, "max_nodal_m": errors.max_nodal_m,
-        "amplitude_m": errors.amplitude_m, "worst_prediction": prediction[worst], "worst_reference": reference[worst], "worst_forces": forces,
-    }  # fmt: skip
+        "latency_ms": latencies,
+        "mean_dof_m": errors.mean_dof_m,
+        "relative_l2": errors.relative_l2,
+        "max_nodal_m": errors.max_nodal_m,
+        "amplitude_m": errors.amplitude_m,
+        "worst_prediction": prediction[worst],
+        "worst_reference": reference[worst],
+        "worst_forces": forces,
+    }
     comparison.put(row, samples if row["status"] == "ok" else None)
     return row
 
 
-def add_failed(comparison: Comparison, method: str, swept: dict[str, Any], status: str, reason: str, dataset: str = "beam-tiny") -> None:
+def add_failed(
+    comparison: Comparison,
+    method: str,
+    swept: dict[str, Any],
+    status: str,
+    reason: str,
+    dataset: str = "beam-tiny",
+) -> None:
     """Add a row without any figure."""
     comparison.put(
         {
-            "dataset": dataset, "split": "region", "method": method, "label": label_of(method, swept), "parameters": dict(swept),
-            "status": status, "reason": reason, "n_train": 200, "n_test": N_TEST, "n_failed": None, "threads": 1, "error": None,
-            "latency_ms": None, "offline_s": None, "model_bytes": None, "discretisation_error_m": None, **UNMEASURED,
+            "dataset": dataset,
+            "split": "region",
+            "method": method,
+            "label": label_of(method, swept),
+            "parameters": dict(swept),
+            "status": status,
+            "reason": reason,
+            "n_train": 200,
+            "n_test": N_TEST,
+            "n_failed": None,
+            "threads": 1,
+            "error": None,
+            "latency_ms": None,
+            "offline_s": None,
+            "model_bytes": None,
+            "discretisation_error_m": None,
+            **UNMEASURED,
         }
-    )  # fmt: skip
+    )
 
 
 def add_tiny(comparison: Comparison, name: str = "beam-tiny") -> None:
@@ -92,14 +151,30 @@ def add_tiny(comparison: Comparison, name: str = "beam-tiny") -> None:
 @pytest.fixture(scope="module")
 def comparison(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
     """Two sweeps, a failed and a skipped row, a row with infinite errors, one with a few failed samples, a hostile label."""
-    made = Comparison(tmp_path_factory.mktemp("run"), {"processor": "<b>fast</b>", "versions": {"numpy": "2.4"}})
+    made = Comparison(
+        tmp_path_factory.mktemp("run"), {"processor": "<b>fast</b>", "versions": {"numpy": "2.4"}}
+    )
     add_tiny(made)
-    for rank, error, latency in ((5, 0.05, 1.0), (10, 0.02, 1.5), (20, 0.008, 2.5), (25, 0.002, 4.0)):
+    for rank, error, latency in (
+        (5, 0.05, 1.0),
+        (10, 0.02, 1.5),
+        (20, 0.008, 2.5),
+        (25, 0.002, 4.0),
+    ):
         add_row(made, "pod", {"n_modes": rank}, error, latency)
     for rank, error, latency in ((5, 0.06, 0.2), (20, 0.029, 0.5)):
         add_row(made, "hpod", {"n_modes": rank, "cubature_tolerance": 0.01}, error, latency)
     add_row(made, "fem", {}, 0.0, 8.0)
-    add_row(made, "partial", {}, 0.004, 5.0, n_failed=3, reason="SolverError: no equilibrium", warnings=["only 12 modes of <25>"])
+    add_row(
+        made,
+        "partial",
+        {},
+        0.004,
+        5.0,
+        n_failed=3,
+        reason="SolverError: no equilibrium",
+        warnings=["only 12 modes of <25>"],
+    )
     add_row(made, "broken", {}, 0.001, 0.1, n_failed=N_TEST)
     add_row(made, HOSTILE, {}, 0.2, 2.0)
     add_failed(made, "umesh", {"channels": 64}, "failed", REASON)
@@ -131,7 +206,11 @@ class _Resources(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
-        self.sources += [value or "" for name, value in attrs if name in ("src", "srcset", "data", "poster", "background")]
+        self.sources += [
+            value or ""
+            for name, value in attrs
+            if name in ("src", "srcset", "data", "poster", "background")
+        ]
         self.links += [value or "" for name, value in attrs if name == "href"]
 
 
@@ -139,7 +218,12 @@ def test_console_shows_every_row_with_its_reason(comparison: Comparison) -> None
     text = console_text(comparison)
     for row in comparison.rows:
         assert row["label"] in text
-    for said in (REASON, "needs pip install 'mor-bench[learn]'", "SolverError: no equilibrium", "warning: only 12 modes of <25>"):
+    for said in (
+        REASON,
+        "needs pip install 'mor-bench[learn]'",
+        "SolverError: no equilibrium",
+        "warning: only 12 modes of <25>",
+    ):
         assert said in text
     assert f"3 of {N_TEST} test samples without a prediction" in text
     assert "not measured" in text
@@ -152,7 +236,9 @@ def test_console_fits_its_width_without_squeezed_words(comparison: Comparison, w
     table = lines[4 : next(i for i, line in enumerate(lines) if line.startswith("Pareto"))]
     fragments = [line.strip() for line in table if line.strip()]
     assert min(map(len, fragments)) >= 3
-    assert any(line.startswith("pod [n_modes=20]") and line.rstrip().endswith("yes") for line in table)
+    assert any(
+        line.startswith("pod [n_modes=20]") and line.rstrip().endswith("yes") for line in table
+    )
 
 
 def test_a_legacy_code_page_does_not_end_the_run(comparison: Comparison) -> None:
@@ -166,9 +252,15 @@ def test_needs_and_front_marks(comparison: Comparison) -> None:
     entries = {entry.label: entry for entry in entries_of(comparison, "beam-tiny")}
     assert [label for label, entry in entries.items() if entry.meets_needs] == ["pod [n_modes=20]"]
     on_front = {label for label, entry in entries.items() if entry.on_front}
-    expected = {f"hpod [n_modes={r}, cubature_tolerance=0.01]" for r in (5, 20)} | {f"pod [n_modes={r}]" for r in (10, 20, 25)} | {"fem"}
+    expected = (
+        {f"hpod [n_modes={r}, cubature_tolerance=0.01]" for r in (5, 20)}
+        | {f"pod [n_modes={r}]" for r in (10, 20, 25)}
+        | {"fem"}
+    )
     assert on_front == expected
-    assert "pod [n_modes=20] is the only configuration that meets the needs" in headline(comparison, "beam-tiny")
+    assert "pod [n_modes=20] is the only configuration that meets the needs" in headline(
+        comparison, "beam-tiny"
+    )
 
 
 def test_meeting_only_one_need_is_not_enough(tmp_path: Path) -> None:
@@ -177,7 +269,10 @@ def test_meeting_only_one_need_is_not_enough(tmp_path: Path) -> None:
     add_row(made, "slow", {}, 0.001, 6.0)
     add_row(made, "coarse", {}, 0.03, 0.1)
     assert not any(entry.meets_needs for entry in entries_of(made, "beam-tiny"))
-    assert re.search(r"No configuration meets .* Nearest is slow: .* 2 times the latency allowed", headline(made, "beam-tiny"))
+    assert re.search(
+        r"No configuration meets .* Nearest is slow: .* 2 times the latency allowed",
+        headline(made, "beam-tiny"),
+    )
 
 
 def test_targets_out_of_reach(comparison: Comparison) -> None:
@@ -202,9 +297,22 @@ def test_the_page_says_it_all(comparison: Comparison, written: list[Path]) -> No
         assert (row["reason"] or "") in text
     assert headline(comparison, "beam-tiny") in text
     assert "warning: only 12 modes of <25>" in text
-    for word in (NOT_REACHED, "not measured", "results.json", "samples/", "x-min", "2.4", "never extrapolates", "infinite"):
+    for word in (
+        NOT_REACHED,
+        "not measured",
+        "results.json",
+        "samples/",
+        "x-min",
+        "2.4",
+        "never extrapolates",
+        "infinite",
+    ):
         assert word in text
-    assert len(re.findall(r'<tr class="[^"]*"><td class="text">', page.split("Failures, skips and warnings")[0])) == len(comparison.rows)
+    assert len(
+        re.findall(
+            r'<tr class="[^"]*"><td class="text">', page.split("Failures, skips and warnings")[0]
+        )
+    ) == len(comparison.rows)
 
 
 def test_the_page_escapes_and_needs_no_network(written: list[Path]) -> None:
@@ -223,7 +331,10 @@ def test_the_page_escapes_and_needs_no_network(written: list[Path]) -> None:
 
 def test_figures_are_pictures(comparison: Comparison, written: list[Path]) -> None:
     kinds = ["error-against-time", "error-against-deformation", "worst-samples", "singular-values"]
-    assert [path.name for path in written[:-1]] == [*(f"beam-tiny--{kind}.png" for kind in kinds), "all-datasets--performance-profile.png"]
+    assert [path.name for path in written[:-1]] == [
+        *(f"beam-tiny--{kind}.png" for kind in kinds),
+        "all-datasets--performance-profile.png",
+    ]
     for path in written[:-1]:
         assert path.parent == comparison.out / "figures"
         assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
@@ -231,11 +342,15 @@ def test_figures_are_pictures(comparison: Comparison, written: list[Path]) -> No
         assert pixels.shape[1] == 1410
         assert pixels.shape[0] > 300
         assert pixels.std() > 0.03
-        assert len(np.unique(pixels @ np.array([1.0, 7.3, 53.1]))) > 50  # colours, not only black on white
+        assert (
+            len(np.unique(pixels @ np.array([1.0, 7.3, 53.1]))) > 50
+        )  # colours, not only black on white
     assert not list(comparison.out.rglob("*.tmp"))
 
 
-def test_inputs_are_unchanged_and_reading_back_gives_the_same_text(comparison: Comparison, written: list[Path]) -> None:
+def test_inputs_are_unchanged_and_reading_back_gives_the_same_text(
+    comparison: Comparison, written: list[Path]
+) -> None:
     again = Comparison.read(comparison.out)
     assert again.rows == comparison.rows
     assert console_text(again) == console_text(comparison)
@@ -245,9 +360,13 @@ def test_one_row(tmp_path: Path) -> None:
     made = Comparison(tmp_path, {})
     add_tiny(made)
     add_row(made, "pod", {"n_modes": 5}, 0.005, 1.0, discretisation_error_m=0.0123)
-    assert discretisation_error(entries_of(made, "beam-tiny")).startswith("1.2e-02 m; methods' errors below it")
+    assert discretisation_error(entries_of(made, "beam-tiny")).startswith(
+        "1.2e-02 m; methods' errors below it"
+    )
     made.rows[0]["discretisation_rel_l2"] = 0.205
-    assert discretisation_error(entries_of(made, "beam-tiny")).startswith("1.2e-02 m, relative L2 (median) 20.5 %; ")
+    assert discretisation_error(entries_of(made, "beam-tiny")).startswith(
+        "1.2e-02 m, relative L2 (median) 20.5 %; "
+    )
     assert "1.2e-02 m" in console_text(made)
     assert len(render(made)) == 5
 
@@ -286,22 +405,45 @@ def test_best_of_a_method_prefers_finite_errors(tmp_path: Path) -> None:
     add_tiny(made)
     add_row(made, "pod", {"n_modes": 20}, 0.001, 1.0, n_failed=2)
     add_row(made, "pod", {"n_modes": 5}, 0.05, 1.0)
-    assert [entry.label for entry in best_per_method(entries_of(made, "beam-tiny"))] == ["pod [n_modes=5]"]
+    assert [entry.label for entry in best_per_method(entries_of(made, "beam-tiny"))] == [
+        "pod [n_modes=5]"
+    ]
 
 
 def test_numbers() -> None:
-    assert [number(v) for v in (None, float("inf"), 0.0, 0.00064, 0.843, 99.94, 99.96, 1234.4, 123456.0)] == [
-        "–", "inf", "0", "6.4e-04", "0.843", "99.9", "100", "1234", "1.2e+05",
-    ]  # fmt: skip
+    assert [
+        number(v) for v in (None, float("inf"), 0.0, 0.00064, 0.843, 99.94, 99.96, 1234.4, 123456.0)
+    ] == [
+        "–",
+        "inf",
+        "0",
+        "6.4e-04",
+        "0.843",
+        "99.9",
+        "100",
+        "1234",
+        "1.2e+05",
+    ]
     assert percent(0.008) == "0.8"
-    assert [size_of(v) for v in (None, 12, 999.6, 12345, 2.5e9)] == ["–", "12 B", "1 kB", "12.3 kB", "2.5 GB"]
-    assert short_swept({"n_modes": "20", "cubature_tolerance": "0.01", "n_heads": "4"}) == "r=20, ctol=0.01, nh=4"
+    assert [size_of(v) for v in (None, 12, 999.6, 12345, 2.5e9)] == [
+        "–",
+        "12 B",
+        "1 kB",
+        "12.3 kB",
+        "2.5 GB",
+    ]
+    assert (
+        short_swept({"n_modes": "20", "cubature_tolerance": "0.01", "n_heads": "4"})
+        == "r=20, ctol=0.01, nh=4"
+    )
 
 
 def test_a_warning_that_many_configurations_gave_is_said_once(tmp_path: Path) -> None:
     made = Comparison(tmp_path, {})
     for n in range(3):
-        add_row(made, "pod", {"n_modes": n}, 0.01, 1.0, warnings=["it locks"] + ["few modes"] * (n == 2))
+        add_row(
+            made, "pod", {"n_modes": n}, 0.01, 1.0, warnings=["it locks"] + ["few modes"] * (n == 2)
+        )
     entries = entries_of(made, "beam-tiny")
     first, _, last = (entry.label for entry in entries)
     assert warnings_of(entries) == [(f"{first} and 2 more", "it locks"), (last, "few modes")]
@@ -322,41 +464,82 @@ def page_text(page: Path) -> str:
     return unescape(re.sub(r"<[^>]*>", " ", page.read_text(encoding="utf-8")))
 
 
-def test_the_page_has_a_section_for_all_that_was_measured(rich: Comparison, analysis: dict[str, Any]) -> None:
+def test_the_page_has_a_section_for_all_that_was_measured(
+    rich: Comparison, analysis: dict[str, Any]
+) -> None:
     paths = render(rich, analysis)
-    kinds = ["error-against-time", "learning-curves", "error-against-deformation", "worst-samples", "singular-values"]
+    kinds = [
+        "error-against-time",
+        "learning-curves",
+        "error-against-deformation",
+        "worst-samples",
+        "singular-values",
+    ]
     names = [f"{dataset}--{kind}.png" for dataset in ("beam-coarse", "beam-fine") for kind in kinds]
-    assert [path.name for path in paths] == [*names, "all-datasets--performance-profile.png", "report.html"]
+    assert [path.name for path in paths] == [
+        *names,
+        "all-datasets--performance-profile.png",
+        "report.html",
+    ]
     page = paths[-1].read_text(encoding="utf-8")
     assert page.count("<img ") == len(names) + 1
     titles = re.findall("<h3>(.*?)</h3>", page)
     assert [title for title in titles if not title.startswith("Who is faster")] == [
         *[
-            "What was run", "Configurations", "Failures, skips and warnings", "Time at error: median latency at a median relative L2 error",
-            "Error at time: median relative L2 error within a median latency", "Whole cost", "Timing", "Memory and cost", "Named test sets",
-            "Hidden test set", "Tuning budget", "Error measures of the networks", "Comparison at the same error", "Comparison at the same time",
-        ] * 2,
-        "Performance profile", "In its regime",
-    ]  # fmt: skip
+            "What was run",
+            "Configurations",
+            "Failures, skips and warnings",
+            "Time at error: median latency at a median relative L2 error",
+            "Error at time: median relative L2 error within a median latency",
+            "Whole cost",
+            "Timing",
+            "Memory and cost",
+            "Named test sets",
+            "Hidden test set",
+            "Tuning budget",
+            "Error measures of the networks",
+            "Comparison at the same error",
+            "Comparison at the same time",
+        ]
+        * 2,
+        "Performance profile",
+        "In its regime",
+    ]
     text = page_text(paths[-1])
     for said in (
-        "processes differ by 14 %", "4.2 times as large as on the shipped one", "no graphics processor): 20,000 samples or more, on a GPU",
-        "errors over 13 load regions, latencies over 5 processes that differ by", "6 of 5 (over)", "flagged 41.7 % of 60",
+        "processes differ by 14 %",
+        "4.2 times as large as on the shipped one",
+        "no graphics processor): 20,000 samples or more, on a GPU",
+        "errors over 13 load regions, latencies over 5 processes that differ by",
+        "6 of 5 (over)",
+        "flagged 41.7 % of 60",
         "Who is faster at 1 %, the error that is needed",
-    ):  # fmt: skip
+    ):
         assert said in text
 
 
-def test_nothing_is_shown_of_what_was_not_measured(comparison: Comparison, written: list[Path]) -> None:
+def test_nothing_is_shown_of_what_was_not_measured(
+    comparison: Comparison, written: list[Path]
+) -> None:
     page = written[-1].read_text(encoding="utf-8")
-    for absent in ("Timing<", "Memory and cost", "Named test sets", "Hidden test set", "Tuning budget", "In its regime", "Error measures"):
+    for absent in (
+        "Timing<",
+        "Memory and cost",
+        "Named test sets",
+        "Hidden test set",
+        "Tuning budget",
+        "In its regime",
+        "Error measures",
+    ):
         assert absent not in page
     assert "nan" not in page_text(written[-1]).split()
     assert not re.search("<tbody></tbody>", page)
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_the_console_shows_doubts_and_pairs(rich: Comparison, analysis: dict[str, Any], width: int) -> None:
+def test_the_console_shows_doubts_and_pairs(
+    rich: Comparison, analysis: dict[str, Any], width: int
+) -> None:
     stream = io.StringIO()
     print_tables(rich, Console(file=stream, width=width), analysis)
     text = stream.getvalue()
@@ -372,16 +555,33 @@ def test_the_console_shows_doubts_and_pairs(rich: Comparison, analysis: dict[str
     assert len(text.splitlines()) < 2 * 100 + (width < 100) * 60
 
 
-def test_the_matrix_and_its_targets_carry_intervals(rich: Comparison, analysis: dict[str, Any]) -> None:
+def test_the_matrix_and_its_targets_carry_intervals(
+    rich: Comparison, analysis: dict[str, Any]
+) -> None:
     reached, cells, absent = pairwise_cells(rich, "beam-coarse", 0.01, analysis)
     assert (reached, absent) == (["fem", "pod", "pca-regression"], ["hpod", "linear-fem", "umesh"])
     assert [line[i] for i, line in enumerate(cells)] == ["·"] * 3
     assert cells[0][1][1:] == cells[1][0][1:]
-    record = next(r for r in analysis["pairwise"] if (r["dataset"], r["target_rel_l2_median"], r["a"], r["b"]) == ("beam-coarse", 0.01, "pod", "fem"))
+    record = next(
+        r
+        for r in analysis["pairwise"]
+        if (r["dataset"], r["target_rel_l2_median"], r["a"], r["b"])
+        == ("beam-coarse", 0.01, "pod", "fem")
+    )
     assert cells[1][0] == f"-{number(record['ratio'])}"
-    matrix = next(grid for grid in dataset_details(rich, "beam-coarse", analysis) if "1 %, the error" in grid.title)
-    assert matrix.rows[1][1] == f"-{number(record['ratio'])}\n{number(record['low'])}–{number(record['high'])}"
-    assert matrix.rows[0][2] == f"+{number(record['ratio'])}\n{number(record['low'])}–{number(record['high'])}"
+    matrix = next(
+        grid
+        for grid in dataset_details(rich, "beam-coarse", analysis)
+        if "1 %, the error" in grid.title
+    )
+    assert (
+        matrix.rows[1][1]
+        == f"-{number(record['ratio'])}\n{number(record['low'])}–{number(record['high'])}"
+    )
+    assert (
+        matrix.rows[0][2]
+        == f"+{number(record['ratio'])}\n{number(record['low'])}–{number(record['high'])}"
+    )
     _, rows = target_cells(rich, "beam-coarse", "time_at_error", analysis)
     assert re.fullmatch(r"[\d.]+ ms \([\d.]+\)\nr=\d+\n[\d.]+–[\d.]+", rows["pod"][1])
 
@@ -390,10 +590,20 @@ def test_the_tables_of_the_paper(rich: Comparison) -> None:
     entries = entries_of(rich, "beam-coarse")
     network = next(entry for entry in entries if entry.method == "umesh")
     measures = error_measures(
-        "beam-coarse", [*entries, Entry({**network.row, "label": "large", "parameters": {"channels": 128, "steps": 3}}, False, False)]
+        "beam-coarse",
+        [
+            *entries,
+            Entry(
+                {**network.row, "label": "large", "parameters": {"channels": 128, "steps": 3}},
+                False,
+                False,
+            ),
+        ],
     )
     assert measures is not None
-    assert len(measures.rows) == 2 + 8 - 1  # both of ours; of the paper's eight, one has the size of one of ours
+    assert (
+        len(measures.rows) == 2 + 8 - 1
+    )  # both of ours; of the paper's eight, one has the size of one of ours
     small, large = dict(zip(measures.headings, measures.rows[0], strict=False)), measures.rows[1]
     assert (small["c"], small["k"], small["FSS"]) == ("16", "2", "64")
     assert large[:4] == ["large", "128", "3", "1024"]
@@ -408,7 +618,11 @@ def test_the_tables_of_the_paper(rich: Comparison) -> None:
     assert {row[0]: row[1] for row in error.rows}["linear-fem"] == "not reached"
     assert {row[0]: row[1] for row in error.rows}["fem"] == "fem [tolerance=0.1]"
     others = [entry for entry in entries if entry.method != "umesh"]
-    assert (error_measures("beam-coarse", others), same_error("beam-coarse", others), same_time("beam-coarse", others)) == (None, None, None)
+    assert (
+        error_measures("beam-coarse", others),
+        same_error("beam-coarse", others),
+        same_time("beam-coarse", others),
+    ) == (None, None, None)
 
 
 def test_the_figures_of_the_paper_are_those_of_its_tables() -> None:
@@ -416,4 +630,11 @@ def test_the_figures_of_the_paper_are_those_of_its_tables() -> None:
     assert len(sizes) == len(PUBLISHED) == 13
     assert sizes["beam-coarse", 64, 5].train_min == 426
     assert sizes["liver-tet", 128, 3].mean_m == 5.33e-5
-    assert {row.dataset for row in PUBLISHED} <= {"beam-coarse", "beam-coarse-3-forces", "beam-fine", "l-shape", "liver-hex", "liver-tet"}
+    assert {row.dataset for row in PUBLISHED} <= {
+        "beam-coarse",
+        "beam-coarse-3-forces",
+        "beam-fine",
+        "l-shape",
+        "liver-hex",
+        "liver-tet",
+    }

@@ -28,18 +28,30 @@ def tiny(**loads: Any) -> Scene:
 
 
 def several(**loads: Any) -> Scene:
-    return tiny(**{"samples_per_patch": None, "samples": 300, "simultaneous": 3, "min_distance_m": 0.7, **loads})
+    return tiny(
+        **{
+            "samples_per_patch": None,
+            "samples": 300,
+            "simultaneous": 3,
+            "min_distance_m": 0.7,
+            **loads,
+        }
+    )
 
 
 def coordinates(vectors: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:
     """What is uniform in the unit cube if directions are on the sphere and magnitudes in their range, (n, 3)."""
     size = np.linalg.norm(vectors, axis=1)
     x, y, z = (vectors / size[:, None]).T
-    return np.stack([(z + 1) / 2, np.arctan2(y, x) / (2 * np.pi) % 1, (size - low) / (high - low)], axis=1)
+    return np.stack(
+        [(z + 1) / 2, np.arctan2(y, x) / (2 * np.pi) % 1, (size - low) / (high - low)], axis=1
+    )
 
 
 @pytest.mark.parametrize("sampling", PLANS)
-def test_directions_and_magnitudes_are_uniform_on_the_whole_and_on_each_patch(sampling: str) -> None:
+def test_directions_and_magnitudes_are_uniform_on_the_whole_and_on_each_patch(
+    sampling: str,
+) -> None:
     scene = tiny(sampling=sampling, samples_per_patch=64, magnitude_n=[1.0, 4.0])
     drawn = draw_loads(scene, 0, n_samples_of(scene))
     unit = coordinates(drawn.vectors[:, 0], 1.0, 4.0)
@@ -55,13 +67,17 @@ def test_directions_and_magnitudes_are_uniform_on_the_whole_and_on_each_patch(sa
 
 
 @pytest.mark.parametrize(("sampling", "n"), [("latin-hypercube", 50), ("sobol", 64)])
-def test_designs_put_one_sample_of_a_patch_into_each_stretch_of_each_coordinate(sampling: str, n: int) -> None:
+def test_designs_put_one_sample_of_a_patch_into_each_stretch_of_each_coordinate(
+    sampling: str, n: int
+) -> None:
     scene = tiny(sampling=sampling, samples_per_patch=n, magnitude_n=[1.0, 4.0])
     drawn = draw_loads(scene, 0, n_samples_of(scene))
     for patch in (0, 7, 20):
         unit = coordinates(drawn.vectors[drawn.patches[:, 0] == patch, 0], 1.0, 4.0)
         for axis in range(3):
-            np.testing.assert_array_equal(np.bincount((unit[:, axis] * n).astype(int), minlength=n), 1)
+            np.testing.assert_array_equal(
+                np.bincount((unit[:, axis] * n).astype(int), minlength=n), 1
+            )
     random = tiny(samples_per_patch=n, magnitude_n=[1.0, 4.0])
     unit = coordinates(draw_loads(random, 0, 21 * n)[np.arange(n) * 21].vectors[:, 0], 1.0, 4.0)
     assert (np.bincount((unit[:, 0] * n).astype(int), minlength=n) == 0).any()
@@ -81,7 +97,14 @@ def test_no_sample_depends_on_where_the_drawing_begins(sampling: str, make: Any)
 @pytest.mark.parametrize("kind", ["normal", "tangential"])
 @pytest.mark.parametrize("sampling", PLANS)
 def test_normal_and_tangential_forces_are_what_they_say(kind: str, sampling: str) -> None:
-    scene = tiny(kind=kind, sampling=sampling, region="surface", samples_per_patch=20, magnitude_n=[1.0, 4.0], patch_area_m2=0.05)
+    scene = tiny(
+        kind=kind,
+        sampling=sampling,
+        region="surface",
+        samples_per_patch=20,
+        magnitude_n=[1.0, 4.0],
+        patch_area_m2=0.05,
+    )
     np.testing.assert_allclose(np.linalg.norm(scene.patch_normals, axis=1), 1, rtol=1e-12)
     drawn = draw_loads(scene, 0, n_samples_of(scene))
     normals = scene.patch_normals[drawn.patches[:, 0]]
@@ -106,12 +129,18 @@ def test_combinations_come_once_each_and_far_apart(sampling: str) -> None:
     scene = several(sampling=sampling)
     centres = scene.patch_centres
     listed = [
-        (a, b, c) for a in range(21) for b in range(a) for c in range(b)
-        if min(np.linalg.norm(centres[p] - centres[q]) for p, q in ((a, b), (b, c), (a, c))) >= 0.7 - 1e-9
-    ]  # fmt: skip
+        (a, b, c)
+        for a in range(21)
+        for b in range(a)
+        for c in range(b)
+        if min(np.linalg.norm(centres[p] - centres[q]) for p, q in ((a, b), (b, c), (a, c)))
+        >= 0.7 - 1e-9
+    ]
     scene = several(sampling=sampling, samples=len(listed) + 5)
     drawn = draw_loads(scene, 0, n_samples_of(scene))
-    assert {tuple(sorted(row, reverse=True)) for row in drawn.patches[: len(listed)].tolist()} == set(listed)
+    assert {
+        tuple(sorted(row, reverse=True)) for row in drawn.patches[: len(listed)].tolist()
+    } == set(listed)
     assert len(np.unique(drawn.patches[: len(listed)], axis=0)) == len(listed)
     np.testing.assert_array_equal(drawn.patches[len(listed) :], drawn.patches[:5])
     assert repeated([(scene, drawn)]) == 0
@@ -133,16 +162,34 @@ def test_the_three_forces_of_the_paper() -> None:
 @pytest.mark.parametrize(
     ("loads", "message"),
     [
-        ({"min_distance_m": 5.0}, r"must leave some 3 of the 21 patches that far apart; 5 leaves none"),
+        (
+            {"min_distance_m": 5.0},
+            r"must leave some 3 of the 21 patches that far apart; 5 leaves none",
+        ),
         ({"min_distance_m": None}, r"`min_distance_m` must be given with `simultaneous` > 1"),
-        ({"samples": None, "samples_per_patch": 3}, r"with `simultaneous` > 1 `samples` must be given"),
+        (
+            {"samples": None, "samples_per_patch": 3},
+            r"with `simultaneous` > 1 `samples` must be given",
+        ),
         ({"samples": None}, r"exactly one of `samples_per_patch` and `samples`"),
         ({"samples_per_patch": 3}, r"exactly one of `samples_per_patch` and `samples`"),
         ({"simultaneous": 9}, r"`loads.simultaneous` must be less than or equal to 8; got 9"),
-        ({"simultaneous": 1}, r"`min_distance_m` must be given with `simultaneous` > 1 and only then"),
-        ({"kind": "normal", "magnitude_n": [1.0, 1.0]}, r"`magnitude_n` of normal forces must be a range"),
-        ({"sampling": "halton"}, r"`loads.sampling` must be 'random', 'latin-hypercube' or 'sobol'; got 'halton'"),
-        ({"n_patches": 22}, r"`n_patches` must be in \[1, \d+\], the points of the load region that are away from the supports; got 22"),
+        (
+            {"simultaneous": 1},
+            r"`min_distance_m` must be given with `simultaneous` > 1 and only then",
+        ),
+        (
+            {"kind": "normal", "magnitude_n": [1.0, 1.0]},
+            r"`magnitude_n` of normal forces must be a range",
+        ),
+        (
+            {"sampling": "halton"},
+            r"`loads.sampling` must be 'random', 'latin-hypercube' or 'sobol'; got 'halton'",
+        ),
+        (
+            {"n_patches": 22},
+            r"`n_patches` must be in \[1, \d+\], the points of the load region that are away from the supports; got 22",
+        ),
     ],
 )
 def test_plans_that_cannot_be_drawn(loads: dict[str, Any], message: str) -> None:
@@ -174,7 +221,9 @@ def test_patches_are_spread_over_the_region_and_away_from_the_supports() -> None
     scene = tiny(n_patches=6)
     assert len(scene.patch_nodes) == 6
     assert scene.patch_centres[:, 0].min() > np.sqrt(0.2 / np.pi)
-    gaps = np.linalg.norm(scene.patch_centres[:, None] - scene.patch_centres, axis=2)[np.triu_indices(6, 1)]
+    gaps = np.linalg.norm(scene.patch_centres[:, None] - scene.patch_centres, axis=2)[
+        np.triu_indices(6, 1)
+    ]
     assert gaps.min() > 0.49
 
 
@@ -211,7 +260,12 @@ def test_splits_keep_apart_what_they_say(by: Any, k: int) -> None:
 
 
 def test_the_sample_split_of_the_paper_has_its_counts() -> None:
-    counts = {"beam-coarse": (5120, 1280), "beam-coarse-3-forces": (9888, 2472), "l-shape": (4800, 1200), "liver-hex": (1600, 400)}
+    counts = {
+        "beam-coarse": (5120, 1280),
+        "beam-coarse-3-forces": (9888, 2472),
+        "l-shape": (4800, 1200),
+        "liver-hex": (1600, 400),
+    }
     for name, expected in counts.items():
         scene = load_scene(name)
         drawn = draw_loads(scene, 0, n_samples_of(scene))
@@ -221,7 +275,9 @@ def test_the_sample_split_of_the_paper_has_its_counts() -> None:
 
 @pytest.fixture(scope="module")
 def with_sets(cache: Path) -> Dataset:
-    return load_dataset("beam-tiny", tests=available_sets(load_generated_spec("beam-tiny")), cache=cache, workers=1)
+    return load_dataset(
+        "beam-tiny", tests=available_sets(load_generated_spec("beam-tiny")), cache=cache, workers=1
+    )
 
 
 def test_named_sets_of_the_tiny_beam(with_sets: Dataset) -> None:
@@ -237,7 +293,9 @@ def test_named_sets_of_the_tiny_beam(with_sets: Dataset) -> None:
     assert sets["several-forces"].loads.patches.shape[1] == 3
     sizes = np.linalg.norm(one.vectors, axis=2)
     assert sizes.max() <= 4
-    assert with_sets.tests["4x"].displacements.max() > with_sets.tests["in-range"].displacements.max()
+    assert (
+        with_sets.tests["4x"].displacements.max() > with_sets.tests["in-range"].displacements.max()
+    )
 
 
 def test_unseen_regions_share_no_facet_with_the_main_set(with_sets: Dataset) -> None:
@@ -247,8 +305,13 @@ def test_unseen_regions_share_no_facet_with_the_main_set(with_sets: Dataset) -> 
     loaded = np.abs(with_sets.train.forces).sum(axis=(0, 2)) > 0
     unseen = np.abs(with_sets.tests["unseen-regions"].forces).sum(axis=(0, 2)) > 0
     assert not (loaded & unseen).any()
-    spec = main.generated.model_copy(update={"tests": main.generated.tests.model_copy(update={"unseen_region": "y-min"})})
-    with pytest.raises(InvalidInputError, match=r"must lie apart from `loads.region`; they share 0 facets of the surface and 7 centres"):
+    spec = main.generated.model_copy(
+        update={"tests": main.generated.tests.model_copy(update={"unseen_region": "y-min"})}
+    )
+    with pytest.raises(
+        InvalidInputError,
+        match=r"must lie apart from `loads.region`; they share 0 facets of the surface and 7 centres",
+    ):
         check_regions(spec)
 
 
@@ -261,9 +324,14 @@ def test_no_named_set_repeats_a_sample(with_sets: Dataset) -> None:
 
 def test_sets_that_a_dataset_has_not_say_why() -> None:
     spec = load_generated_spec("beam-tiny")
-    with pytest.raises(InvalidInputError, match=r"beam-tiny has no test set 'unseen-directions': its directions are all over the sphere"):
+    with pytest.raises(
+        InvalidInputError,
+        match=r"beam-tiny has no test set 'unseen-directions': its directions are all over the sphere",
+    ):
         spec_of_set(spec, "unseen-directions")
-    assert "several forces" in str(why_not(load_generated_spec("beam-coarse-3-forces"), "several-forces"))
+    assert "several forces" in str(
+        why_not(load_generated_spec("beam-coarse-3-forces"), "several-forces")
+    )
     assert "known: in-range, 2x" in str(why_not(spec, "5x"))  # type: ignore[arg-type]
     with pytest.raises(InvalidInputError, match="has no test set '5x'"):
         load_dataset("beam-tiny", tests=["5x"])  # type: ignore[list-item]
@@ -294,7 +362,12 @@ def test_a_stream_gives_the_same_samples(cache: Path) -> None:
     data = mor_bench.load_dataset("beam-tiny", cache=cache)
     parts = list(stream("beam-tiny", 150, cache=cache))
     assert [len(part) for part in parts] == [100, 50]
-    known = {tuple(row): u for row, u in zip(data.train.loads.vectors[:, 0], data.train.free_displacements, strict=True)}
+    known = {
+        tuple(row): u
+        for row, u in zip(
+            data.train.loads.vectors[:, 0], data.train.free_displacements, strict=True
+        )
+    }
     n_found = 0
     for part in parts:
         for row, u in zip(part.loads.vectors[:, 0], part.free_displacements, strict=True):
@@ -307,5 +380,10 @@ def test_a_stream_gives_the_same_samples(cache: Path) -> None:
 def test_patch_loads_of_several_forces_add_up() -> None:
     scene = several()
     loads = draw_loads(scene, 0, 4)
-    single = [PatchLoads(loads.patches[:, [j]], loads.vectors[:, [j]]).nodal_forces(scene.patch_weights) for j in range(3)]
-    np.testing.assert_allclose(loads.nodal_forces(scene.patch_weights), sum(single), rtol=0, atol=1e-15)
+    single = [
+        PatchLoads(loads.patches[:, [j]], loads.vectors[:, [j]]).nodal_forces(scene.patch_weights)
+        for j in range(3)
+    ]
+    np.testing.assert_allclose(
+        loads.nodal_forces(scene.patch_weights), sum(single), rtol=0, atol=1e-15
+    )

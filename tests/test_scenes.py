@@ -25,7 +25,9 @@ def content(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
-def test_the_l_has_the_volume_the_surface_and_the_grid_of_a_box_without_a_corner(element: str) -> None:
+def test_the_l_has_the_volume_the_surface_and_the_grid_of_a_box_without_a_corner(
+    element: str,
+) -> None:
     mesh = load_scene(content(discretisation={"element": element})).mesh
     width, depth, height = 28.424, 10.0, 40.0
     arm, column = width * 3 / 13 * height, width * 4 / 9 * height * 10 / 13
@@ -33,14 +35,21 @@ def test_the_l_has_the_volume_the_surface_and_the_grid_of_a_box_without_a_corner
     volumes = shape_gradients(mesh.points, mesh.cells, reference.derivatives)[1] @ reference.weights
     assert volumes.sum() == pytest.approx(depth * (arm + column), rel=1e-12)
     corners = mesh.points[mesh.boundary_facets]
-    triangles = [corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]] if element == "hexahedron" else [corners]
-    area = sum(0.5 * np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1).sum() for t in triangles)
+    triangles = (
+        [corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]] if element == "hexahedron" else [corners]
+    )
+    area = sum(
+        0.5 * np.linalg.norm(np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]), axis=1).sum()
+        for t in triangles
+    )
     assert area == pytest.approx(2 * (arm + column) + 2 * depth * (width + height), rel=1e-12)
     assert mesh.grid_shape == (10, 6, 14)
     assert mesh.grid_index is not None
     assert len(np.unique(mesh.grid_index)) == mesh.n_nodes == 540
     place = np.stack(np.unravel_index(mesh.grid_index, mesh.grid_shape), axis=1)
-    np.testing.assert_allclose(mesh.points, place * [width / 9, depth / 5, height / 13], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        mesh.points, place * [width / 9, depth / 5, height / 13], rtol=1e-12, atol=1e-12
+    )
 
 
 def test_sixty_nodes_of_the_bottom_are_loaded_and_the_top_of_the_column_is_held() -> None:
@@ -62,7 +71,10 @@ def test_meshes_of_other_sizes_keep_the_body() -> None:
 @pytest.mark.parametrize(
     ("cut", "message"),
     [
-        ([9, 10], r"`geometry`: `cut_cells` must be less than the 9 cells along x and the 13 along z; got \(9, 10\)"),
+        (
+            [9, 10],
+            r"`geometry`: `cut_cells` must be less than the 9 cells along x and the 13 along z; got \(9, 10\)",
+        ),
         ([5, 13], r"got \(5, 13\)"),
         ([0, 10], r"`geometry.cut_cells\[0\]` must be greater than or equal to 1; got 0"),
         ([5], r"`geometry.cut_cells\[1\]` is missing"),
@@ -92,14 +104,22 @@ def test_forces_on_the_livers_surface_reach_the_grid_with_sum_and_moment(liver: 
     np.testing.assert_allclose(weights @ liver.mesh.points, shares @ points, rtol=0, atol=1e-13)
     forces = np.random.default_rng(0).normal(size=(len(liver.surface.points), 3))
     nodal = liver.to_surface.T @ forces
-    moments = [np.cross(x, f).sum(axis=0) for x, f in ((liver.surface.points, forces), (liver.mesh.points, nodal))]
+    moments = [
+        np.cross(x, f).sum(axis=0)
+        for x, f in ((liver.surface.points, forces), (liver.mesh.points, nodal))
+    ]
     np.testing.assert_allclose(moments[0], moments[1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(nodal.sum(axis=0), forces.sum(axis=0), rtol=0, atol=1e-11)
 
 
 def test_displacements_of_the_grid_come_back_to_the_livers_surface(liver: Scene) -> None:
     gradient, shift = np.random.default_rng(1).normal(size=(3, 3)), np.array([0.1, -0.2, 0.3])
-    np.testing.assert_allclose(liver.to_surface @ (liver.mesh.points @ gradient + shift), liver.surface.points @ gradient + shift, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        liver.to_surface @ (liver.mesh.points @ gradient + shift),
+        liver.surface.points @ gradient + shift,
+        rtol=0,
+        atol=1e-12,
+    )
 
 
 def test_the_liver_is_held_between_its_lobes_and_pressed_on_its_upper_half(liver: Scene) -> None:
@@ -116,7 +136,11 @@ def test_the_liver_is_held_between_its_lobes_and_pressed_on_its_upper_half(liver
 def test_the_two_livers_are_one_body(liver: Scene) -> None:
     other = load_scene("liver-tet")
     assert other.mesh.cells.shape[1] == 4
-    np.testing.assert_allclose(other.mesh.bounds, [liver.surface.points.min(axis=0), liver.surface.points.max(axis=0)], atol=5e-4)
+    np.testing.assert_allclose(
+        other.mesh.bounds,
+        [liver.surface.points.min(axis=0), liver.surface.points.max(axis=0)],
+        atol=5e-4,
+    )
     assert other.spec.grid_nodes == liver.mesh.grid_shape == (16, 15, 16)
 
 
@@ -140,7 +164,15 @@ def test_a_users_surface_becomes_a_scene_wherever_its_file_lies(tmp_path: Path) 
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
         cube_stl(tmp_path / folder / "cube.stl")
-        spec = {**base, "geometry": {"shape": "voxels", "surface": str(tmp_path / folder / "cube.stl"), "cells": [3, 2, 2], "unit_m": 0.01}}
+        spec = {
+            **base,
+            "geometry": {
+                "shape": "voxels",
+                "surface": str(tmp_path / folder / "cube.stl"),
+                "cells": [3, 2, 2],
+                "unit_m": 0.01,
+            },
+        }
         cubes.append(load_scene(spec))
     np.testing.assert_allclose(cubes[0].mesh.bounds, [[0.01, 0, 0], [0.03, 0.02, 0.02]], atol=1e-15)
     assert cubes[0].mesh.n_cells == 12
@@ -150,10 +182,14 @@ def test_a_users_surface_becomes_a_scene_wherever_its_file_lies(tmp_path: Path) 
     answer = mor_bench.load_method("fem").fit(cubes[0], None).predict(load)
     assert 0 < np.abs(answer).max() < 0.01
     with pytest.raises(SpecError, match=r"nowhere.stl: no such file"):
-        load_scene({**base, "geometry": {"shape": "voxels", "surface": "nowhere.stl", "cells": [3, 2, 2]}})
+        load_scene(
+            {**base, "geometry": {"shape": "voxels", "surface": "nowhere.stl", "cells": [3, 2, 2]}}
+        )
     kept = cubes[0].spec
     (tmp_path / "one" / "cube.stl").write_text("solid other")
-    with pytest.raises(SpecError, match=r"cube.stl: the file has changed since the dataset was read"):
+    with pytest.raises(
+        SpecError, match=r"cube.stl: the file has changed since the dataset was read"
+    ):
         load_scene(kept)
 
 
@@ -170,7 +206,9 @@ def test_every_load_patch_lies_on_the_surface_and_pushes_something_that_can_move
 
 def test_a_load_region_inside_the_body_is_refused() -> None:
     with pytest.raises(SpecError, match="nodes inside the body only"):
-        load_scene(content(loads={**content()["loads"], "region": {"sphere_m": [[6.3, 4.0, 6.2], 1.5]}}))
+        load_scene(
+            content(loads={**content()["loads"], "region": {"sphere_m": [[6.3, 4.0, 6.2], 1.5]}})
+        )
 
 
 def rod_stl(path: Path, n: int = 24) -> Path:
@@ -184,7 +222,9 @@ def rod_stl(path: Path, n: int = 24) -> Path:
         j = (i + 1) % n
         triangles += [(ends[0][i], ends[1][j], ends[1][i]), (ends[0][i], ends[0][j], ends[1][j])]
         triangles += [(centres[0], ends[0][j], ends[0][i]), (centres[1], ends[1][i], ends[1][j])]
-    meshio.Mesh(np.array(triangles).reshape(-1, 3), [("triangle", np.arange(12 * n).reshape(-1, 3))]).write(path)
+    meshio.Mesh(
+        np.array(triangles).reshape(-1, 3), [("triangle", np.arange(12 * n).reshape(-1, 3))]
+    ).write(path)
     return path
 
 
@@ -192,16 +232,33 @@ def test_patches_on_a_surface_of_long_triangles(tmp_path: Path) -> None:
     base = {key: value for key, value in content().items() if key != "name"}
     base["supports"] = [{"region": "x-min"}]
     base["loads"] = {**base["loads"], "region": "x-max", "patch_area_m2": 2e-4, "kind": "normal"}
-    geometry = {"shape": "voxels", "surface": str(rod_stl(tmp_path / "rod.stl")), "cells": [20, 5, 5]}
+    geometry = {
+        "shape": "voxels",
+        "surface": str(rod_stl(tmp_path / "rod.stl")),
+        "cells": [20, 5, 5],
+    }
     with pytest.raises(SpecError, match="the area of the load region"):
-        load_scene({**base, "geometry": geometry, "loads": {**base["loads"], "patch_area_m2": 2e-3}})
-    scene = load_scene({**base, "geometry": geometry, "loads": {**base["loads"], "region": "surface"}})
+        load_scene(
+            {**base, "geometry": geometry, "loads": {**base["loads"], "patch_area_m2": 2e-3}}
+        )
+    scene = load_scene(
+        {**base, "geometry": geometry, "loads": {**base["loads"], "region": "surface"}}
+    )
     np.testing.assert_allclose(scene._patches.areas.sum(axis=1), 2e-4, rtol=1e-12)
     points, shares = scene.patch_points(np.arange(len(scene.patch_nodes)))
-    np.testing.assert_allclose(scene.patch_weights @ scene.mesh.points, shares @ points, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        scene.patch_weights @ scene.mesh.points, shares @ points, rtol=0, atol=1e-13
+    )
     values = scene._patches.values
-    np.testing.assert_allclose(values @ scene.surface.points, scene._patches.points, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        values @ scene.surface.points, scene._patches.points, rtol=0, atol=1e-15
+    )
     corners = scene.surface.points[scene.surface.facets]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    area = (
+        0.5
+        * np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        ).sum()
+    )
     whole = cut_patches(scene.surface, scene.surface.facets, np.array([0]), area * (1 - 1e-9))
     assert whole.areas.sum() == pytest.approx(area, rel=1e-8)

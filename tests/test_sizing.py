@@ -34,7 +34,12 @@ from mor_bench.surrogates.pod import PODGalerkin
 
 def needing(scene: Scene, error: float) -> Scene:
     """The scene with another need."""
-    return replace(scene, spec=scene.spec.model_copy(update={"needs": scene.spec.needs.model_copy(update={"error": error})}))
+    return replace(
+        scene,
+        spec=scene.spec.model_copy(
+            update={"needs": scene.spec.needs.model_copy(update={"error": error})}
+        ),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -47,11 +52,20 @@ def test_the_least_number_of_modes_that_meets_the_need_is_chosen(coarse: Dataset
     fitted = PODGalerkin("auto", 1e-3).fit(scene, coarse.train)
     n_modes = fitted.sizes_["n_modes"]
     trials = Trials(PODGalerkin("auto", 1e-3), scene, coarse.train)
-    assert trials.score({"n_modes": n_modes}).error <= 0.05 < trials.score({"n_modes": MODES[MODES.index(n_modes) - 1]}).error
+    assert (
+        trials.score({"n_modes": n_modes}).error
+        <= 0.05
+        < trials.score({"n_modes": MODES[MODES.index(n_modes) - 1]}).error
+    )
     assert PODGalerkin("auto", 1e-3).fit(scene, coarse.train).sizes_ == {"n_modes": n_modes}
     # The model itself is fitted to all samples.
-    np.testing.assert_array_equal(fitted.modes_, PODGalerkin(n_modes, 1e-3).fit(scene, coarse.train).modes_)
-    assert PODGalerkin("auto", 1e-3).fit(needing(coarse.scene, 0.2), coarse.train).sizes_["n_modes"] < n_modes
+    np.testing.assert_array_equal(
+        fitted.modes_, PODGalerkin(n_modes, 1e-3).fit(scene, coarse.train).modes_
+    )
+    assert (
+        PODGalerkin("auto", 1e-3).fit(needing(coarse.scene, 0.2), coarse.train).sizes_["n_modes"]
+        < n_modes
+    )
 
 
 def test_the_score_is_that_of_models_which_never_saw_the_load_region(coarse: Dataset) -> None:
@@ -62,28 +76,43 @@ def test_the_score_is_that_of_models_which_never_saw_the_load_region(coarse: Dat
         assert not set(coarse.train.regions[fitted]) & set(coarse.train.regions[held])
         model = PODGalerkin(24, 1e-3).fit(coarse.scene, coarse.train[fitted])
         reference = coarse.train[held].displacements
-        difference = np.linalg.norm(model.predict(coarse.train[held].forces) - reference, axis=(1, 2))
+        difference = np.linalg.norm(
+            model.predict(coarse.train[held].forces) - reference, axis=(1, 2)
+        )
         errors += list(difference / np.linalg.norm(reference, axis=(1, 2)))
     assert score.error == pytest.approx(np.median(errors), rel=1e-9)
     seen = PODGalerkin(24, 1e-3).fit(coarse.scene, coarse.train)
-    own = np.linalg.norm(seen.predict(coarse.train.forces[::4]) - coarse.train.displacements[::4], axis=(1, 2))
-    assert np.median(own / np.linalg.norm(coarse.train.displacements[::4], axis=(1, 2))) < 0.8 * score.error
+    own = np.linalg.norm(
+        seen.predict(coarse.train.forces[::4]) - coarse.train.displacements[::4], axis=(1, 2)
+    )
+    assert (
+        np.median(own / np.linalg.norm(coarse.train.displacements[::4], axis=(1, 2)))
+        < 0.8 * score.error
+    )
 
 
 @pytest.mark.parametrize("n_forces", [1, 2])
 def test_every_load_region_is_held_out_once(n_forces: int, coarse: Dataset) -> None:
     rng = np.random.default_rng(0)
     patches = np.sort(rng.integers(40, size=(600, n_forces)), axis=1) * 3
-    snapshots = replace(coarse.train[np.arange(600) % len(coarse.train)], loads=PatchLoads(patches, np.ones((600, n_forces, 3))))
+    snapshots = replace(
+        coarse.train[np.arange(600) % len(coarse.train)],
+        loads=PatchLoads(patches, np.ones((600, n_forces, 3))),
+    )
     folds = validation_folds(snapshots)
     held_regions = [set(patches[held].ravel()) for _, held in folds]
     assert len(folds) == sizing.N_FOLDS
-    assert sorted(region for regions in held_regions for region in regions) == sorted({*patches.ravel()})
+    assert sorted(region for regions in held_regions for region in regions) == sorted(
+        {*patches.ravel()}
+    )
     for fitted, held in folds:
         assert not set(patches[fitted].ravel()) & set(patches[held].ravel())
         assert len(held) <= sizing.N_VALIDATION // sizing.N_FOLDS
     if n_forces == 1:
-        assert all(len(fitted) + (~np.isin(np.arange(600), fitted)).sum() == 600 and len(fitted) > 400 for fitted, _ in folds)
+        assert all(
+            len(fitted) + (~np.isin(np.arange(600), fitted)).sum() == 600 and len(fitted) > 400
+            for fitted, _ in folds
+        )
 
 
 def test_samples_of_one_region_are_dealt_out(tiny: Dataset) -> None:
@@ -97,7 +126,11 @@ def test_samples_of_one_region_are_dealt_out(tiny: Dataset) -> None:
         PODGalerkin("auto").fit(tiny.scene, tiny.train[:1])
 
 
-ERROR: dict[str, Callable[[float], float]] = {"n_modes": lambda n: 0.5 / n, "cubature_tolerance": lambda t: 0.3 * t, "tolerance": lambda t: 0.02 * t}
+ERROR: dict[str, Callable[[float], float]] = {
+    "n_modes": lambda n: 0.5 / n,
+    "cubature_tolerance": lambda t: 0.3 * t,
+    "tolerance": lambda t: 0.02 * t,
+}
 WORK: dict[str, Callable[[float], float]] = {
     "n_modes": lambda n: 50 + n**2,
     "cubature_tolerance": lambda t: 1 - 0.2 * np.log10(t),
@@ -106,23 +139,35 @@ WORK: dict[str, Callable[[float], float]] = {
 
 
 @pytest.mark.parametrize("need", [0.4, 0.05, 0.02, 0.009])
-def test_the_search_finds_the_least_work_with_few_trials(need: float, monkeypatch: pytest.MonkeyPatch, tiny: Dataset) -> None:
+def test_the_search_finds_the_least_work_with_few_trials(
+    need: float, monkeypatch: pytest.MonkeyPatch, tiny: Dataset
+) -> None:
     """Where error and work are monotone in every knob, against trying all."""
     tried: list[Mapping[str, Any]] = []
 
     def score(knobs: Mapping[str, Any]) -> Score:
-        return Score(sum(ERROR[name](value) for name, value in knobs.items()), float(np.prod([WORK[name](value) for name, value in knobs.items()])))
+        return Score(
+            sum(ERROR[name](value) for name, value in knobs.items()),
+            float(np.prod([WORK[name](value) for name, value in knobs.items()])),
+        )
 
     def counted(self: Trials, knobs: Mapping[str, Any], hopeless: float = 4.0) -> Score:
         tried.append(knobs)
         return score(knobs)
 
     monkeypatch.setattr(Trials, "_tried", counted)
-    rungs = {"n_modes": MODES, "cubature_tolerance": (1e-1, 1e-2, 1e-3), "tolerance": (1e-1, 1e-2, 1e-3)}
+    rungs = {
+        "n_modes": MODES,
+        "cubature_tolerance": (1e-1, 1e-2, 1e-3),
+        "tolerance": (1e-1, 1e-2, 1e-3),
+    }
     method = HyperReducedPOD("auto", "auto", tolerance="auto")
     chosen = size_to_needs(method, needing(tiny.scene, need), tiny.train, rungs)
     every = [dict(zip(rungs, values, strict=True)) for values in product(*rungs.values())]
-    best = min((knobs for knobs in every if score(knobs).error <= need), key=lambda knobs: score(knobs).work)
+    best = min(
+        (knobs for knobs in every if score(knobs).error <= need),
+        key=lambda knobs: score(knobs).work,
+    )
     assert method.sizes_ == best
     assert chosen == {**method.parameters, **best}
     assert len(tried) < 0.15 * len(every)
@@ -138,9 +183,16 @@ def test_knobs_that_are_given_are_left_alone(tiny: Dataset) -> None:
 
 
 def test_a_need_that_nothing_meets_gets_the_most_accurate_with_a_warning(tiny: Dataset) -> None:
-    with pytest.warns(UserWarning, match=r"relative l2 of 1e-12 \(median\); the most accurate candidate, n_modes = \d+, reaches 0\.0") as caught:
+    with pytest.warns(
+        UserWarning,
+        match=r"relative l2 of 1e-12 \(median\); the most accurate candidate, n_modes = \d+, reaches 0\.0",
+    ) as caught:
         fitted = PODGalerkin("auto", 1e-3).fit(needing(tiny.scene, 1e-12), tiny.train)
-    reached = float(str(next(w.message for w in caught if "reaches" in str(w.message))).split("reaches ")[1].split()[0])
+    reached = float(
+        str(next(w.message for w in caught if "reaches" in str(w.message)))
+        .split("reaches ")[1]
+        .split()[0]
+    )
     trials = Trials(PODGalerkin("auto", 1e-3), needing(tiny.scene, 1.0), tiny.train)
     assert trials.score(fitted.sizes_).error == pytest.approx(reached, rel=1e-2)
     assert reached < 0.5 * trials.score({"n_modes": 5}).error
@@ -157,10 +209,20 @@ def test_a_method_without_any_fit_says_so(tiny: Dataset, monkeypatch: pytest.Mon
 
 def test_hyper_reduction_is_sized_in_both_knobs(coarse: Dataset) -> None:
     scene = needing(coarse.scene, 0.05)
-    fitted = HyperReducedPOD("auto", "auto", n_cubature_snapshots=60, tolerance=1e-3).fit(scene, coarse.train)
-    trials = Trials(HyperReducedPOD("auto", "auto", n_cubature_snapshots=60, tolerance=1e-3), scene, coarse.train)
+    fitted = HyperReducedPOD("auto", "auto", n_cubature_snapshots=60, tolerance=1e-3).fit(
+        scene, coarse.train
+    )
+    trials = Trials(
+        HyperReducedPOD("auto", "auto", n_cubature_snapshots=60, tolerance=1e-3),
+        scene,
+        coarse.train,
+    )
     score = trials.score(fitted.sizes_)
-    tight = HyperReducedPOD("auto", 1e-3, n_cubature_snapshots=60, tolerance=1e-3).fit(scene, coarse.train).sizes_
+    tight = (
+        HyperReducedPOD("auto", 1e-3, n_cubature_snapshots=60, tolerance=1e-3)
+        .fit(scene, coarse.train)
+        .sizes_
+    )
     assert score.error <= 0.05
     assert score.work <= trials.score({**tight, "cubature_tolerance": 1e-3}).work
     again = HyperReducedPOD(**{**fitted.parameters, **fitted.sizes_}).fit(scene, coarse.train)
@@ -175,13 +237,27 @@ def test_what_was_chosen_is_saved_and_loaded(tiny: Dataset, tmp_path: Path) -> N
     assert isinstance(loaded, PODGalerkin)
     assert loaded.parameters == fitted.parameters
     assert loaded.sizes_ == fitted.sizes_
-    assert {name: type(value) for name, value in loaded.sizes_.items()} == {"n_modes": int, "tolerance": float}
-    np.testing.assert_array_equal(loaded.predict(tiny.test.forces[:3]), fitted.predict(tiny.test.forces[:3]))
+    assert {name: type(value) for name, value in loaded.sizes_.items()} == {
+        "n_modes": int,
+        "tolerance": float,
+    }
+    np.testing.assert_array_equal(
+        loaded.predict(tiny.test.forces[:3]), fitted.predict(tiny.test.forces[:3])
+    )
     plain = PODGalerkin(**{**fitted.parameters, **fitted.sizes_}).fit(tiny.scene, tiny.train)
-    np.testing.assert_array_equal(plain.predict(tiny.test.forces[:3]), fitted.predict(tiny.test.forces[:3]))
+    np.testing.assert_array_equal(
+        plain.predict(tiny.test.forces[:3]), fitted.predict(tiny.test.forces[:3])
+    )
 
 
-@pytest.mark.parametrize("forgery", [{"size.tolerance": None}, {"size.tolerance": np.array([7.0])}, {"size.n_modes": np.array([3])}])
+@pytest.mark.parametrize(
+    "forgery",
+    [
+        {"size.tolerance": None},
+        {"size.tolerance": np.array([7.0])},
+        {"size.n_modes": np.array([3])},
+    ],
+)
 def test_forged_sizes_are_refused(forgery: dict[str, Any], tiny: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "model.safetensors"
     PODGalerkin(5, "auto").fit(needing(tiny.scene, 0.5), tiny.train).save(path)
@@ -203,7 +279,9 @@ def test_the_record_of_a_fit_shows_what_was_chosen(tmp_path: Path, tiny: Dataset
     surrogate = "mor_bench.surrogates.pod:PODGalerkin"
     shown = []
     for knobs in ({"n_modes": "auto", "tolerance": 1e-3}, {"n_modes": 3}):
-        answer = session.fit(surrogate, knobs, tmp_path / "train", tmp_path / "model.safetensors", 1, 60.0)
+        answer = session.fit(
+            surrogate, knobs, tmp_path / "train", tmp_path / "model.safetensors", 1, 60.0
+        )
         assert answer["parameters"].items() >= knobs.items()
         shown.append(answer["sizes"])
     assert shown == [PODGalerkin("auto", 1e-3).fit(tiny.scene, tiny.train).sizes_, {}]
@@ -214,17 +292,23 @@ def test_a_kept_fit_is_that_of_the_need(tmp_path: Path, tiny: Dataset) -> None:
     place: Any = SimpleNamespace(machine="here", fit_threads=1, cache=tmp_path)
 
     def key(need: float, **knobs: Any) -> str:
-        job: Any = SimpleNamespace(method=load_method_spec(tmp_path / "sized.toml"), parameters=knobs, training=None)
+        job: Any = SimpleNamespace(
+            method=load_method_spec(tmp_path / "sized.toml"), parameters=knobs, training=None
+        )
         return Entry(job, Material(needing(tiny.scene, need), tiny.train, {}, tmp_path), place).key
 
     assert key(0.1, n_modes="auto") != key(0.2, n_modes="auto")
     assert key(0.1, n_modes=3) == key(0.2, n_modes=3)
 
 
-def test_a_method_that_needs_no_equations_is_sized_on_imported_samples(tiny: Dataset, cache: Path) -> None:
+def test_a_method_that_needs_no_equations_is_sized_on_imported_samples(
+    tiny: Dataset, cache: Path
+) -> None:
     """As other programs' samples come: forces on all nodes, maybe with regions, and no material."""
     imported = replace(tiny.train, loads=NodalLoads(tiny.train.forces, tiny.train.loads.patches))
-    for (fitted, held), (same_fitted, same_held) in zip(validation_folds(imported), validation_folds(tiny.train), strict=True):
+    for (fitted, held), (same_fitted, same_held) in zip(
+        validation_folds(imported), validation_folds(tiny.train), strict=True
+    ):
         np.testing.assert_array_equal(fitted, same_fitted)
         np.testing.assert_array_equal(held, same_held)
     scene = replace(tiny.scene, material=None)
@@ -242,4 +326,6 @@ def test_errors_of_the_wanted_nodes_decide(tiny: Dataset) -> None:
     scene = replace(tiny.scene, spec=tiny.scene.spec.model_copy(update={"needs": needs}))
     method = PODGalerkin("auto", 1e-4).fit(scene, replace(tiny.train, scene=scene))
     everywhere = PODGalerkin("auto", 1e-4).fit(needing(tiny.scene, 0.1), tiny.train)
-    assert 1 <= method.sizes_["n_modes"] < everywhere.sizes_["n_modes"]  # the loaded end moves as a whole
+    assert (
+        1 <= method.sizes_["n_modes"] < everywhere.sizes_["n_modes"]
+    )  # the loaded end moves as a whole

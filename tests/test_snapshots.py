@@ -24,19 +24,30 @@ def test_patch_weights_are_a_partition_of_the_force_and_mesh_independent(tiny_sc
     mesh = tiny_scene.mesh
     assert not weights[:, mesh.points[:, 2] < 1.0].any()
     finer = mor_bench.load_scene(
-        {**tiny_scene.spec.model_dump(mode="json"), "geometry": {"shape": "box", "size_m": [2.0, 1.0, 1.0], "cells": [12, 4, 4]}}
+        {
+            **tiny_scene.spec.model_dump(mode="json"),
+            "geometry": {"shape": "box", "size_m": [2.0, 1.0, 1.0], "cells": [12, 4, 4]},
+        }
     )
     fine_weights = finer.patch_weights.toarray()
     for row, node in enumerate(tiny_scene.patch_nodes):
-        same = int(np.linalg.norm(finer.mesh.points[finer.patch_nodes] - mesh.points[node], axis=1).argmin())
-        np.testing.assert_allclose(weights[row] @ mesh.points, fine_weights[same] @ finer.mesh.points, atol=5e-3)
+        same = int(
+            np.linalg.norm(
+                finer.mesh.points[finer.patch_nodes] - mesh.points[node], axis=1
+            ).argmin()
+        )
+        np.testing.assert_allclose(
+            weights[row] @ mesh.points, fine_weights[same] @ finer.mesh.points, atol=5e-3
+        )
 
 
 def test_the_centroid_of_an_inner_patch_is_its_node(tiny_scene: Scene) -> None:
     points = tiny_scene.mesh.points
     for row, node in enumerate(tiny_scene.patch_nodes):
         if 0.3 < points[node, 0] < 1.7 and points[node, 1] == 0.5:
-            np.testing.assert_allclose(tiny_scene.patch_weights.toarray()[row] @ points, points[node], atol=1e-12)
+            np.testing.assert_allclose(
+                tiny_scene.patch_weights.toarray()[row] @ points, points[node], atol=1e-12
+            )
 
 
 def test_directions_are_uniform_and_magnitudes_in_range() -> None:

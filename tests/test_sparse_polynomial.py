@@ -27,12 +27,21 @@ from mor_bench.surrogates.sparse_polynomial import (
 
 def median_error(method: mor_bench.Surrogate, samples: Snapshots) -> float:
     found = method.predict(samples.forces)
-    return float(np.median(np.linalg.norm(found - samples.displacements, axis=(1, 2)) / np.linalg.norm(samples.displacements, axis=(1, 2))))
+    return float(
+        np.median(
+            np.linalg.norm(found - samples.displacements, axis=(1, 2))
+            / np.linalg.norm(samples.displacements, axis=(1, 2))
+        )
+    )
 
 
 def test_the_cheapest_terms_are_those_of_all() -> None:
     costs = np.array([0.3137, 0.7741, 1.0059, 1.9347])
-    every = [term for degree in range(1, MAX_DEGREE + 1) for term in combinations_with_replacement(range(4), degree)]
+    every = [
+        term
+        for degree in range(1, MAX_DEGREE + 1)
+        for term in combinations_with_replacement(range(4), degree)
+    ]
     every.sort(key=lambda term: float(costs[list(term)].sum()))
     assert cheapest_terms(costs, 60) == every[:60]
     assert len(cheapest_terms(costs, 10_000)) == len(every)
@@ -45,8 +54,12 @@ def test_sparse_monomials_and_their_derivatives() -> None:
     z, direction = generator.normal(size=(6, 4)), generator.normal(size=(6, 4))
     expected = np.stack([z[:, list(term)].prod(axis=1) for term in terms], axis=1)
     np.testing.assert_allclose(Monomials(4, levels)(z)[:, places], expected, rtol=1e-12)
-    difference = Monomials(4, levels)(z + 1e-6 * direction) - Monomials(4, levels)(z - 1e-6 * direction)
-    np.testing.assert_allclose(monomial_derivatives(z, direction, levels), difference / 2e-6, rtol=1e-5, atol=1e-6)
+    difference = Monomials(4, levels)(z + 1e-6 * direction) - Monomials(4, levels)(
+        z - 1e-6 * direction
+    )
+    np.testing.assert_allclose(
+        monomial_derivatives(z, direction, levels), difference / 2e-6, rtol=1e-5, atol=1e-6
+    )
 
 
 def test_a_high_degree_in_one_coordinate_is_found_from_few_samples() -> None:
@@ -62,8 +75,17 @@ def test_a_high_degree_in_one_coordinate_is_found_from_few_samples() -> None:
 
 def test_it_beats_the_full_cubic_and_derivatives_spare_samples(cache: Path) -> None:
     data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
-    methods: dict[str, dict[str, Any]] = {"pca-regression": {"n_input_modes": 20}, "sparse-polynomial": {}, "sparse-polynomial-derivative": {}}
-    errors = {name: median_error(mor_bench.load_method(name, **knobs).fit(data.scene, data.train), data.test) for name, knobs in methods.items()}
+    methods: dict[str, dict[str, Any]] = {
+        "pca-regression": {"n_input_modes": 20},
+        "sparse-polynomial": {},
+        "sparse-polynomial-derivative": {},
+    }
+    errors = {
+        name: median_error(
+            mor_bench.load_method(name, **knobs).fit(data.scene, data.train), data.test
+        )
+        for name, knobs in methods.items()
+    }
     assert errors["sparse-polynomial"] <= 0.6 * errors["pca-regression"]
     few = mor_bench.load_method("sparse-polynomial-derivative").fit(data.scene, data.train[::4])
     assert median_error(few, data.test) <= 2.0 * errors["sparse-polynomial"]
@@ -71,13 +93,26 @@ def test_it_beats_the_full_cubic_and_derivatives_spare_samples(cache: Path) -> N
 
 def test_no_load_gives_no_displacement_and_the_force_alone_will_do(tiny: Dataset) -> None:
     for source in ("force", "linear-response"):
-        method = mor_bench.load_method("sparse-polynomial", input=source).fit(tiny.scene, tiny.train)
+        method = mor_bench.load_method("sparse-polynomial", input=source).fit(
+            tiny.scene, tiny.train
+        )
         assert not method.predict(np.zeros((tiny.scene.mesh.n_nodes, 3))).any()
         assert median_error(method, tiny.train) < 0.2
 
 
 @pytest.mark.parametrize(
-    "spoil", [[[0, 1]], [[1, 0], [1, -1]], [[0], [0]], [[7]], [[-1]], [[0, -2]], np.zeros((0, 1)), [0], [[0, 0, 0], [0, -1, -1]]]
+    "spoil",
+    [
+        [[0, 1]],
+        [[1, 0], [1, -1]],
+        [[0], [0]],
+        [[7]],
+        [[-1]],
+        [[0, -2]],
+        np.zeros((0, 1)),
+        [0],
+        [[0, 0, 0], [0, -1, -1]],
+    ],
 )
 def test_damaged_terms_are_refused(spoil: Any) -> None:
     with pytest.raises(InvalidInputError, match="`terms` must hold monomials of 3 variables"):

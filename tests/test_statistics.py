@@ -46,10 +46,17 @@ class Noise:
     heavy: bool = False
 
 
-NOISES = (Noise(), Noise(process=0.01, query=0.1, tails=0.1), Noise(process=0.02, slow_processes=0.0), Noise(process=0.01, heavy=True, drift=0.2))
+NOISES = (
+    Noise(),
+    Noise(process=0.01, query=0.1, tails=0.1),
+    Noise(process=0.02, slow_processes=0.0),
+    Noise(process=0.01, heavy=True, drift=0.2),
+)
 
 
-def machine(generator: np.random.Generator, noise: Noise, n_processes: int = 5, n_rounds: int = 5) -> NDArray[np.float64]:
+def machine(
+    generator: np.random.Generator, noise: Noise, n_processes: int = 5, n_rounds: int = 5
+) -> NDArray[np.float64]:
     """(n_processes, n_rounds) log speed of the machine at the time of each round: a wave of random length and phase."""
     time = np.linspace(0, 1, n_processes * n_rounds)
     wave = np.sin(2 * np.pi * (time / generator.uniform(0.3, 3) + generator.random()))
@@ -57,17 +64,36 @@ def machine(generator: np.random.Generator, noise: Noise, n_processes: int = 5, 
 
 
 def measure(
-    generator: np.random.Generator, noise: Noise, speed: NDArray[np.float64], latency_ms: float = 1.0, n_queries: int = 40
+    generator: np.random.Generator,
+    noise: Noise,
+    speed: NDArray[np.float64],
+    latency_ms: float = 1.0,
+    n_queries: int = 40,
 ) -> dict[str, NDArray[np.float64]]:
     """Simulated raw samples of a configuration on a machine."""
     n, rounds = speed.shape
-    shape = np.asarray(generator.standard_t(3, n) / 3**0.5 if noise.heavy else generator.normal(size=n))
-    process = noise.process * shape + np.where(generator.random(n) < noise.slow_processes, np.log1p(generator.uniform(0.05, 0.1, n)), 0)
+    shape = np.asarray(
+        generator.standard_t(3, n) / 3**0.5 if noise.heavy else generator.normal(size=n)
+    )
+    process = noise.process * shape + np.where(
+        generator.random(n) < noise.slow_processes, np.log1p(generator.uniform(0.05, 0.1, n)), 0
+    )
     query = noise.query * generator.normal(size=(n, rounds, n_queries))
-    query += np.where(generator.random(query.shape) < noise.tails, np.log1p(generator.pareto(1.5, query.shape)), 0)
-    logs = process[:, None, None] + speed[..., None] + 0.003 * generator.normal(size=(n, rounds, 1)) + query
+    query += np.where(
+        generator.random(query.shape) < noise.tails, np.log1p(generator.pareto(1.5, query.shape)), 0
+    )
+    logs = (
+        process[:, None, None]
+        + speed[..., None]
+        + 0.003 * generator.normal(size=(n, rounds, 1))
+        + query
+    )
     numbers = np.indices(logs.shape)
-    return {"latency_ms": latency_ms * np.exp(logs).ravel(), "process": numbers[0].ravel(), "round": numbers[1].ravel()}
+    return {
+        "latency_ms": latency_ms * np.exp(logs).ravel(),
+        "process": numbers[0].ravel(),
+        "round": numbers[1].ravel(),
+    }
 
 
 def verdicts(noise: Noise, slow_down: float, n: int, seed: int) -> list[str]:
@@ -81,7 +107,9 @@ def verdicts(noise: Noise, slow_down: float, n: int, seed: int) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("noise", NOISES, ids=lambda noise: f"{noise.process}-{'heavy' if noise.heavy else 'normal'}")
+@pytest.mark.parametrize(
+    "noise", NOISES, ids=lambda noise: f"{noise.process}-{'heavy' if noise.heavy else 'normal'}"
+)
 def test_identical_code_is_seldom_called_different_and_ten_percent_are_found(noise: Noise) -> None:
     same, slower = verdicts(noise, 1.0, 100, 0), verdicts(noise, 1.1, 100, 1)
     assert same.count("undecided") >= 95
@@ -112,7 +140,9 @@ def test_few_processes_are_told_from_many() -> None:
         widths.append(log(found["high"] / found["low"]))
     assert widths == sorted(widths, reverse=True)
     assert widths[0] == pytest.approx(2 * student_t(0.98, 2) * TYPICAL_SPREAD * 2**0.5)
-    plain = {"latency_ms": np.ones(20)}  # without the numbers of its process and round it is one process
+    plain = {
+        "latency_ms": np.ones(20)
+    }  # without the numbers of its process and round it is one process
     assert compare_latency(plain, plain)["n_processes"] == 1
     with pytest.raises(InvalidInputError, match="in common"):
         compare_latency(plain, {**plain, "process": np.full(20, 7)})
@@ -126,8 +156,14 @@ def test_a_repeated_measurement_falls_into_the_interval(n_processes: int) -> Non
     for noise in NOISES[:3]:
         for _ in range(25):
             first, again = (
-                {str(i): measure(generator, noise, speed, latency) for i, latency in enumerate(latencies)}
-                for speed in (machine(generator, noise, n_processes), machine(generator, noise, n_processes))
+                {
+                    str(i): measure(generator, noise, speed, latency)
+                    for i, latency in enumerate(latencies)
+                }
+                for speed in (
+                    machine(generator, noise, n_processes),
+                    machine(generator, noise, n_processes),
+                )
             )
             for label, (low, high) in intervals_of(first).items():
                 inside.append(low <= np.median(again[label]["latency_ms"]) <= high)
@@ -151,7 +187,14 @@ def test_pooling_narrows_what_two_processes_know_and_an_unsteady_one_keeps_its_o
 def test_the_analysis_of_variance_finds_its_parts() -> None:
     generator = np.random.default_rng(6)
     common, private = generator.normal(0, 0.04, (30, 1)), generator.normal(0, 0.01, (30, 50))
-    samples = [{"latency_ms": np.exp(common[:, 0] + private[:, i]), "process": np.arange(30), "round": np.zeros(30, dtype=int)} for i in range(50)]
+    samples = [
+        {
+            "latency_ms": np.exp(common[:, 0] + private[:, i]),
+            "process": np.arange(30),
+            "round": np.zeros(30, dtype=int),
+        }
+        for i in range(50)
+    ]
     found = spreads_of(samples)
     assert found.specific.sd == pytest.approx(0.01, rel=0.1)
     assert found.common.sd == pytest.approx(np.std(common, ddof=1), rel=0.02)
@@ -162,7 +205,9 @@ def test_the_analysis_of_variance_finds_its_parts() -> None:
     assert two.specific.sd == pytest.approx(ratios.std(ddof=1) / 2**0.5)
     assert two.specific.df == pytest.approx(29)
     one = spreads_of(samples[:1])
-    assert one.specific.sd == one.own[0] == pytest.approx(np.std(common[:, 0] + private[:, 0], ddof=1))
+    assert (
+        one.specific.sd == one.own[0] == pytest.approx(np.std(common[:, 0] + private[:, 0], ddof=1))
+    )
     assert one.common == spreads_of([{"latency_ms": np.ones(5)}]).specific == Spread(0.0, 0.0)
     assert Spread(0.0, 0.0).moderated(0.014) == Spread(0.014, 2.0)
 
@@ -184,8 +229,12 @@ def test_resampled_medians_and_means_are_those_of_the_repeated_samples() -> None
     clusters = clusters_of(generator.integers(0, 6, (41, 1)) * 10, 41)
     weights = resample_weights(clusters, 50, generator)
     repeated = [np.repeat(values, column) for column in weights.T]
-    assert weighted_medians(values, weights).tolist() == [float(np.median(sample)) for sample in repeated]
-    assert weighted_means(values, weights) == pytest.approx([float(np.mean(sample)) for sample in repeated])
+    assert weighted_medians(values, weights).tolist() == [
+        float(np.median(sample)) for sample in repeated
+    ]
+    assert weighted_means(values, weights) == pytest.approx(
+        [float(np.mean(sample)) for sample in repeated]
+    )
     for cluster in range(6):
         assert (np.ptp(weights[clusters[:, 0] == cluster], axis=0) == 0).all()
     assert weights.sum(axis=0).min() > 0
@@ -215,7 +264,9 @@ def coverage(effect: float, k: int, by_region: bool, n_regions: int = 13) -> flo
 @pytest.mark.parametrize("k", [1, 3])
 def test_regions_not_samples_are_resampled(k: int) -> None:
     assert coverage(0.3, k, by_region=True) >= 0.9
-    assert coverage(0.3, k, by_region=False) < 0.7  # what a bootstrap of the samples would have promised
+    assert (
+        coverage(0.3, k, by_region=False) < 0.7
+    )  # what a bootstrap of the samples would have promised
 
 
 def test_widening_is_that_of_student_and_stays_within_bounds() -> None:

@@ -27,7 +27,14 @@ import numpy as np
 import pytest
 
 import mor_bench
-from mor_bench.errors import DamagedFileWarning, InvalidInputError, MissingDependencyError, NewerSchemaError, StoreError, WorkerError
+from mor_bench.errors import (
+    DamagedFileWarning,
+    InvalidInputError,
+    MissingDependencyError,
+    NewerSchemaError,
+    StoreError,
+    WorkerError,
+)
 from mor_bench.snapshots import generate as generate_module
 from mor_bench.snapshots import manifest as manifest_module
 from mor_bench.snapshots import store
@@ -36,7 +43,14 @@ from mor_bench.snapshots.executors import Pool, cluster_pool, worker_pool
 from mor_bench.snapshots.generate import dataset_folder, generate, generation_seconds, shard_path
 from mor_bench.snapshots.manifest import read_manifest
 from mor_bench.snapshots.solve import pack
-from mor_bench.snapshots.store import HEADER_BYTES, parse_shard, read_shard, remove_leftovers, shard_bytes, write_shard
+from mor_bench.snapshots.store import (
+    HEADER_BYTES,
+    parse_shard,
+    read_shard,
+    remove_leftovers,
+    shard_bytes,
+    write_shard,
+)
 from mor_bench.specs import DatasetSpec, load_generated_spec
 from tests.generator_process import Generators
 
@@ -52,7 +66,13 @@ def tiny_spec(samples_per_patch: int = 10, young_pa: float = 500.0, seed: int = 
     """beam-tiny with 21 times as many samples."""
     spec = load_generated_spec("beam-tiny").model_dump()
     changed = {"samples_per_patch": samples_per_patch, "seed": seed}
-    return DatasetSpec.model_validate({**spec, "material": {**spec["material"], "young_pa": young_pa}, "loads": {**spec["loads"], **changed}})
+    return DatasetSpec.model_validate(
+        {
+            **spec,
+            "material": {**spec["material"], "young_pa": young_pa},
+            "loads": {**spec["loads"], **changed},
+        }
+    )
 
 
 LONG = tiny_spec(75)
@@ -60,7 +80,11 @@ LONG = tiny_spec(75)
 
 def files(folder: Path) -> dict[str, bytes]:
     """All that must be the same however often generation was disturbed: not the timings, nor what is not committed."""
-    return {path.name: path.read_bytes() for path in sorted(folder.glob("[!.]*")) if not path.name.startswith("seconds-")}
+    return {
+        path.name: path.read_bytes()
+        for path in sorted(folder.glob("[!.]*"))
+        if not path.name.startswith("seconds-")
+    }
 
 
 def shards(folder: Path) -> dict[str, bytes]:
@@ -83,13 +107,20 @@ def content(cache: Path, tiny: Dataset) -> bytes:
 def test_a_shard_comes_back_as_it_was(content: bytes) -> None:
     assert shard_bytes(parse_shard(content, "it")) == content
     shard = parse_shard(content, "it")
-    assert (shard.start, shard.patches.shape, shard.displacements.shape) == (200, (10, 1), (10, 162))
+    assert (shard.start, shard.patches.shape, shard.displacements.shape) == (
+        200,
+        (10, 1),
+        (10, 162),
+    )
 
 
 def test_any_flipped_bit_is_noticed(content: bytes) -> None:
     rng = np.random.default_rng(0)
     every = [(place, bit) for place in range(HEADER_BYTES) for bit in range(8)]
-    for place, bit in [*every, *zip(rng.integers(0, len(content), 1000), rng.integers(0, 8, 1000), strict=True)]:
+    for place, bit in [
+        *every,
+        *zip(rng.integers(0, len(content), 1000), rng.integers(0, 8, 1000), strict=True),
+    ]:
         flipped = bytearray(content)
         flipped[place] ^= 1 << int(bit)
         with pytest.raises(StoreError, match=r"^it: "):
@@ -97,8 +128,13 @@ def test_any_flipped_bit_is_noticed(content: bytes) -> None:
 
 
 def test_a_file_truncated_anywhere_says_so(content: bytes) -> None:
-    for length in [*range(0, HEADER_BYTES, 7), *np.linspace(HEADER_BYTES, len(content) - 1, 100).astype(int)]:
-        with pytest.raises(StoreError, match="truncated" if length >= HEADER_BYTES else "header|not a shard"):
+    for length in [
+        *range(0, HEADER_BYTES, 7),
+        *np.linspace(HEADER_BYTES, len(content) - 1, 100).astype(int),
+    ]:
+        with pytest.raises(
+            StoreError, match="truncated" if length >= HEADER_BYTES else "header|not a shard"
+        ):
             parse_shard(content[:length], "it")
     with pytest.raises(StoreError, match="not as long"):
         parse_shard(content + b"\0", "it")
@@ -138,12 +174,17 @@ DAMAGE: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "foreign HDF5": (lambda content: foreign_hdf5(), "not a shard"),
     "other fields": (lambda content: with_other_fields(), "not that of a shard"),
     "empty": (lambda content: b"", "not a shard"),
-    "older": (lambda content: of_schema(content, 1), "schema version 1.*generate the dataset again"),
+    "older": (
+        lambda content: of_schema(content, 1),
+        "schema version 1.*generate the dataset again",
+    ),
 }
 
 
 @pytest.mark.parametrize("name", DAMAGE)
-def test_damaged_files_say_what_they_are_and_are_made_again(tmp_path: Path, cache: Path, tiny: Dataset, name: str) -> None:
+def test_damaged_files_say_what_they_are_and_are_made_again(
+    tmp_path: Path, cache: Path, tiny: Dataset, name: str
+) -> None:
     spec = load_generated_spec("beam-tiny")
     folder = dataset_folder(spec, tmp_path)
     shutil.copytree(dataset_folder(spec, cache), folder)
@@ -159,7 +200,10 @@ def test_damaged_files_say_what_they_are_and_are_made_again(tmp_path: Path, cach
     assert (folder / "shard-00000.h5").stat().st_mtime_ns == untouched
 
 
-@pytest.mark.parametrize("other", ["number", "seed", "material", "start", "forces", "fewer", "unknowns", "not solved", "dataset"])
+@pytest.mark.parametrize(
+    "other",
+    ["number", "seed", "material", "start", "forces", "fewer", "unknowns", "not solved", "dataset"],
+)
 def test_a_sound_shard_that_does_not_belong_there_is_made_again(tmp_path: Path, other: str) -> None:
     spec = tiny_spec()
     folder = generate(spec, limit=200, workers=1, cache=tmp_path)
@@ -168,7 +212,9 @@ def test_a_sound_shard_that_does_not_belong_there_is_made_again(tmp_path: Path, 
     shard = read_shard(path)
     if other in ("seed", "material"):
         changed = tiny_spec(seed=1) if other == "seed" else tiny_spec(young_pa=600.0)
-        shutil.copy(generate(changed, limit=200, workers=1, cache=tmp_path / "other") / path.name, path)
+        shutil.copy(
+            generate(changed, limit=200, workers=1, cache=tmp_path / "other") / path.name, path
+        )
     elif other == "number":
         shutil.copy(folder / "shard-00000.h5", path)
     elif other == "fewer":
@@ -208,10 +254,14 @@ def test_worker_count_changes_no_bit(tmp_path: Path, cache: Path, tiny: Dataset)
     assert generation_seconds(spec, tmp_path, 210) is not None
 
 
-def test_a_limit_is_a_prefix_and_progress_counts_what_is_wanted(tmp_path: Path, cache: Path, tiny: Dataset) -> None:
+def test_a_limit_is_a_prefix_and_progress_counts_what_is_wanted(
+    tmp_path: Path, cache: Path, tiny: Dataset
+) -> None:
     spec = load_generated_spec("beam-tiny")
     told: list[tuple[int, int]] = []
-    first = generate(spec, limit=120, workers=1, cache=tmp_path, progress=lambda *counts: told.append(counts))
+    first = generate(
+        spec, limit=120, workers=1, cache=tmp_path, progress=lambda *counts: told.append(counts)
+    )
     assert list(shards(first)) == ["shard-00000.h5", "shard-00001.h5"]
     assert told == [(0, 120), (100, 120), (120, 120)]
     told.clear()
@@ -252,18 +302,32 @@ def test_a_task_is_modest_and_repeats_nothing_that_can_be_worked_out() -> None:
 
 @needs_signals
 def test_a_killed_worker_of_the_pool_is_named_with_its_likely_cause() -> None:
-    with pytest.raises(WorkerError, match=r"killed.*memory.*fewer workers than 2.*kept"), worker_pool(2) as pool:
+    with (
+        pytest.raises(WorkerError, match=r"killed.*memory.*fewer workers than 2.*kept"),
+        worker_pool(2) as pool,
+    ):
         list(pool.in_any_order(signal.raise_signal, [signal.SIGKILL]))
 
 
 # The manifest
 
 
-def test_the_manifest_alone_is_enough_to_generate_the_same_again(tmp_path: Path, cache: Path, tiny: Dataset) -> None:
+def test_the_manifest_alone_is_enough_to_generate_the_same_again(
+    tmp_path: Path, cache: Path, tiny: Dataset
+) -> None:
     original = dataset_folder(load_generated_spec("beam-tiny"), cache)
     manifest = read_manifest(original)
     assert (manifest.n_samples, manifest.shard_size) == (210, 100)
-    assert set(manifest.environments[0]) == {"mor-bench", "python", "numpy", "scipy", "numba", "h5py", "platform", "machine"}
+    assert set(manifest.environments[0]) == {
+        "mor-bench",
+        "python",
+        "numpy",
+        "scipy",
+        "numba",
+        "h5py",
+        "platform",
+        "machine",
+    }
     again = generate(manifest.spec, workers=1, cache=tmp_path)
     assert again.name == original.name
     assert files(again) == files(original)
@@ -277,11 +341,16 @@ def test_the_manifest_alone_is_enough_to_generate_the_same_again(tmp_path: Path,
         (lambda content: b"[1]", "not a manifest"),
         (lambda content: content.replace(b"500.0", b"600.0"), "checksum"),
         (lambda content: of_schema(content, 1), "schema version 1.*generate the dataset again"),
-        (lambda content: content.replace(manifest_module.FORMAT.encode(), b"another"), "not the manifest of a dataset"),
+        (
+            lambda content: content.replace(manifest_module.FORMAT.encode(), b"another"),
+            "not the manifest of a dataset",
+        ),
     ],
     ids=["truncated", "empty", "foreign", "changed", "older", "other format"],
 )
-def test_a_damaged_manifest_says_so_and_is_mended(tmp_path: Path, damage: Callable[[bytes], bytes], message: str) -> None:
+def test_a_damaged_manifest_says_so_and_is_mended(
+    tmp_path: Path, damage: Callable[[bytes], bytes], message: str
+) -> None:
     spec = tiny_spec()
     folder = generate(spec, limit=100, workers=1, cache=tmp_path)
     path, before = folder / "manifest.json", files(folder)
@@ -293,7 +362,9 @@ def test_a_damaged_manifest_says_so_and_is_mended(tmp_path: Path, damage: Callab
     assert files(folder) == before
 
 
-def test_every_environment_that_solved_is_in_the_manifest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_environment_that_solved_is_in_the_manifest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     spec = tiny_spec()
     folder = generate(spec, limit=100, workers=1, cache=tmp_path)
     here = read_manifest(folder).environments
@@ -341,7 +412,12 @@ def tmpfs(folder: Path) -> Iterator[Path]:
     folder.mkdir()
     if not sys.platform.startswith("linux") or shutil.which("mount") is None:
         pytest.skip("needs Linux and mount")
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(folder)], capture_output=True, text=True, check=False)
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(folder)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     if mounted.returncode:
         pytest.skip(f"needs the right to mount a small file system: {mounted.stderr.strip()}")
     try:
@@ -350,7 +426,9 @@ def tmpfs(folder: Path) -> Iterator[Path]:
         subprocess.run(["umount", str(folder)], check=True)
 
 
-def fill_until_done(spec: DatasetSpec, cache: Path, undisturbed: dict[str, bytes], make_room: Callable[[], None]) -> int:
+def fill_until_done(
+    spec: DatasetSpec, cache: Path, undisturbed: dict[str, bytes], make_room: Callable[[], None]
+) -> int:
     """Generate again and again, with more room each time; how often the disk was full."""
     folder = dataset_folder(spec, cache)
     for failures in range(200):
@@ -364,7 +442,9 @@ def fill_until_done(spec: DatasetSpec, cache: Path, undisturbed: dict[str, bytes
         if message is None:
             assert files(folder) == undisturbed
             return failures
-        assert message.startswith(f"{folder}: cannot be written: No space left on device. Finished shards are kept")
+        assert message.startswith(
+            f"{folder}: cannot be written: No space left on device. Finished shards are kept"
+        )
         assert undisturbed.items() >= files(folder).items()
     raise AssertionError("the disk is still full")
 
@@ -374,23 +454,31 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """The files of 42 small shards."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generate_module, "SHARD_SIZE", SMALL)
-        return files(generate(tiny_spec(20), workers=1, cache=tmp_path_factory.mktemp("undisturbed")))
+        return files(
+            generate(tiny_spec(20), workers=1, cache=tmp_path_factory.mktemp("undisturbed"))
+        )
 
 
-def test_a_disk_that_is_full_ten_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, bytes]) -> None:
+def test_a_disk_that_is_full_ten_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, bytes]
+) -> None:
     monkeypatch.setattr(generate_module, "SHARD_SIZE", SMALL)
     rng, size_kb = np.random.default_rng(0), 16
 
     def make_room() -> None:
         nonlocal size_kb
         size_kb += 4 * int(rng.integers(1, 20))
-        subprocess.run(["mount", "-o", f"remount,size={size_kb}k", str(tmp_path / "disk")], check=True)
+        subprocess.run(
+            ["mount", "-o", f"remount,size={size_kb}k", str(tmp_path / "disk")], check=True
+        )
 
     with tmpfs(tmp_path / "disk") as disk:
         assert fill_until_done(tiny_spec(20), disk, undisturbed, make_room) >= 10
 
 
-def test_writes_that_fail_at_any_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, bytes]) -> None:
+def test_writes_that_fail_at_any_byte(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, bytes]
+) -> None:
     monkeypatch.setattr(generate_module, "SHARD_SIZE", SMALL)
     rng = np.random.default_rng(0)
 
@@ -400,7 +488,9 @@ def test_writes_that_fail_at_any_byte(tmp_path: Path, monkeypatch: pytest.Monkey
     assert fill_until_done(tiny_spec(20), tmp_path, undisturbed, make_room) >= 10
 
 
-def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes) -> None:
+def test_a_failed_write_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes
+) -> None:
     shard = parse_shard(content, "it")
     write_shard(tmp_path / "shard.h5", shard)
 
@@ -435,7 +525,9 @@ def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(tmp_p
     an_hour_ago = time.time() - store.STALE_AFTER_S - 1
     os.utime(tmp_path / f".d.h5.{host}.{living}.01.tmp", (an_hour_ago, an_hour_ago))
     remove_leftovers(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {name for name, stays in names.items() if stays}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        name for name, stays in names.items() if stays
+    }
 
 
 @pytest.fixture(scope="module")
@@ -445,7 +537,9 @@ def generators() -> Iterator[Generators]:
 
 
 @pytest.fixture(scope="module")
-def long_undisturbed(tmp_path_factory: pytest.TempPathFactory, generators: Generators) -> dict[str, bytes]:
+def long_undisturbed(
+    tmp_path_factory: pytest.TempPathFactory, generators: Generators
+) -> dict[str, bytes]:
     """The files of 157 small shards."""
     cache = tmp_path_factory.mktemp("long")
     assert generators.wait(generators.start(cache)) == 0
@@ -455,7 +549,7 @@ def long_undisturbed(tmp_path_factory: pytest.TempPathFactory, generators: Gener
 @needs_signals
 def test_killed_fifty_times_and_resumed_is_bit_identical(
     tmp_path: Path, generators: Generators, long_undisturbed: dict[str, bytes]
-) -> None:  # fmt: skip
+) -> None:
     """Every tenth time with a pool of workers, whose start takes longer. Beyond its end a dataset is begun anew."""
     rng = np.random.default_rng(int(time.time()))
     kills = in_a_write = partial = attempt = 0
@@ -485,7 +579,9 @@ def test_killed_fifty_times_and_resumed_is_bit_identical(
 
 
 @needs_signals
-def test_generators_at_once_on_one_dataset(tmp_path: Path, generators: Generators, long_undisturbed: dict[str, bytes]) -> None:
+def test_generators_at_once_on_one_dataset(
+    tmp_path: Path, generators: Generators, long_undisturbed: dict[str, bytes]
+) -> None:
     folder = dataset_folder(LONG, tmp_path)
     first, second, killed = (generators.start(tmp_path) for _ in range(3))
     time.sleep(1.5)
@@ -505,20 +601,27 @@ def test_generators_at_once_on_one_dataset(tmp_path: Path, generators: Generator
     ("options", "message"),
     [
         ({"workers": 0}, "`workers` must be an integer >= 1; got 0"),
-        ({"workers": 2, "cluster": "tcp://127.0.0.1:8786"}, "`workers` and `cluster` exclude each other"),
+        (
+            {"workers": 2, "cluster": "tcp://127.0.0.1:8786"},
+            "`workers` and `cluster` exclude each other",
+        ),
         ({"cluster": "127.0.0.1:8786"}, r"tcp://host:port; got '127.0.0.1:8786'"),
         ({"cluster": "tcp://127.0.0.1"}, "tcp://host:port"),
         ({"cluster": "http://127.0.0.1:8786"}, "tcp://host:port"),
     ],
 )
-def test_where_to_solve_is_checked_before_anything_is_done(tmp_path: Path, options: dict[str, Any], message: str) -> None:
+def test_where_to_solve_is_checked_before_anything_is_done(
+    tmp_path: Path, options: dict[str, Any], message: str
+) -> None:
     for function in (generate, mor_bench.load_dataset):
         with pytest.raises(InvalidInputError, match=message):
             function(tiny_spec(), cache=tmp_path, **options)
     assert not list(tmp_path.iterdir())
 
 
-def test_without_the_extra_a_cluster_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_a_cluster_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'mor-bench\[cluster\]'"):
         generate(tiny_spec(), cache=tmp_path, cluster="tcp://127.0.0.1:1")
@@ -532,7 +635,9 @@ class Cluster:
         folder.mkdir()
         file = folder / "scheduler.json"
         self._folder, self.processes = folder, {}
-        self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))
+        self._start(
+            "scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file)
+        )
         limit = time.time() + 60
         while not file.exists() or not file.stat().st_size:
             assert time.time() < limit, "the scheduler does not start"
@@ -573,17 +678,26 @@ def test_a_cluster_that_loses_a_worker_half_way(tmp_path: Path, many: dict[str, 
 
         with Client(cluster.address, set_as_default=False) as client:
             client.wait_for_workers(2, timeout=60)
-            names = {address: worker["name"] for address, worker in client.scheduler_info()["workers"].items()}
+            names = {
+                address: worker["name"]
+                for address, worker in client.scheduler_info()["workers"].items()
+            }
             killed: list[str] = []
 
             def kill_one_at_work(done: int, total: int) -> None:
-                if done >= total // 2 and not killed:  # what is in flight may be done when it is looked for: then after the next shard
-                    busy = [names[address] for address, tasks in client.processing().items() if tasks]
+                if (
+                    done >= total // 2 and not killed
+                ):  # what is in flight may be done when it is looked for: then after the next shard
+                    busy = [
+                        names[address] for address, tasks in client.processing().items() if tasks
+                    ]
                     for name in busy[:1] or ["first"] * (done >= total - 2):
                         cluster.processes[name].kill()
                         killed.append(name)
 
-            folder = generate(tiny_spec(200), cache=tmp_path, progress=kill_one_at_work, cluster=cluster.address)
+            folder = generate(
+                tiny_spec(200), cache=tmp_path, progress=kill_one_at_work, cluster=cluster.address
+            )
             assert len(client.nthreads()) == 1
         assert cluster.processes[killed[0]].wait() == -signal.SIGKILL
     assert files(folder) == many
@@ -592,7 +706,10 @@ def test_a_cluster_that_loses_a_worker_half_way(tmp_path: Path, many: dict[str, 
 @needs_signals
 @pytest.mark.parametrize(
     ("lost", "message"),
-    [("scheduler", r"connection to the Dask scheduler .* was lost\. Finished shards are kept"), ("only", r"died one after the other.* memory\?")],
+    [
+        ("scheduler", r"connection to the Dask scheduler .* was lost\. Finished shards are kept"),
+        ("only", r"died one after the other.* memory\?"),
+    ],
 )
 def test_a_cluster_that_loses_what_it_cannot_do_without(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, many: dict[str, bytes], lost: str, message: str
@@ -615,9 +732,14 @@ def test_a_cluster_that_loses_what_it_cannot_do_without(
 
 def test_a_cluster_that_cannot_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mor_bench.snapshots.executors.CONNECT_S", 2)
-    with Cluster(tmp_path / "cluster", ()) as cluster, pytest.raises(WorkerError, match=r"has no workers; start some with: dask worker tcp"):
+    with (
+        Cluster(tmp_path / "cluster", ()) as cluster,
+        pytest.raises(WorkerError, match=r"has no workers; start some with: dask worker tcp"),
+    ):
         generate(tiny_spec(), cache=tmp_path, cluster=cluster.address)
-    with pytest.raises(WorkerError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:\d+ within 2 s"):
+    with pytest.raises(
+        WorkerError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:\d+ within 2 s"
+    ):
         generate(tiny_spec(), cache=tmp_path, cluster=cluster.address)
 
 
@@ -673,7 +795,10 @@ def test_a_dataset_of_a_users_file_is_made_again_from_its_folder_alone(tmp_path:
     mesh = mor_bench.load_scene("beam-tiny").mesh
     body = tmp_path / "body.vtu"
     meshio.Mesh(mesh.points, [("hexahedron", mesh.cells)]).write(body)
-    content = {**load_generated_spec("beam-tiny").model_dump(mode="json"), "geometry": {"shape": "file", "file": str(body)}}
+    content = {
+        **load_generated_spec("beam-tiny").model_dump(mode="json"),
+        "geometry": {"shape": "file", "file": str(body)},
+    }
     spec = DatasetSpec.model_validate(content)
     folder = generate(spec, 100, workers=1, cache=tmp_path / "one")
     body.unlink()

@@ -44,11 +44,18 @@ SECTION: dict[str, list[tuple[str, ...]]] = {
     "one huge step": [("huge-step", "")],
     "distortion; stiffness contrast": [("distortion", ""), ("stiffness-contrast", "")],
     "unconstrained body": [("unconstrained", "")],
-    "NaN, infinity, wrong shape, wrong dtype": [("bad-forces", ""), ("bad-mesh", ""), ("bad-snapshots", "")],
+    "NaN, infinity, wrong shape, wrong dtype": [
+        ("bad-forces", ""),
+        ("bad-mesh", ""),
+        ("bad-snapshots", ""),
+    ],
     "poor snapshots": [("poor-snapshots", "")],
     "NNLS": [("nnls", "duplicated and badly scaled columns"), ("nnls", "one iteration only")],
     "ECSW with every element kept": [("ecsw-all-cells", "")],
-    "out of distribution": [("out-of-distribution", part) for part in ("2x", "4x", "unseen-regions", "unseen-directions", "several-forces")],
+    "out of distribution": [
+        ("out-of-distribution", part)
+        for part in ("2x", "4x", "unseen-regions", "unseen-directions", "several-forces")
+    ],
     "zero force": [("zero-force", "")],
     "symmetry": [("symmetry", "")],
     "determinism": [("determinism", "two runs"), ("determinism", "batch of 1 and of 8")],
@@ -56,10 +63,24 @@ SECTION: dict[str, list[tuple[str, ...]]] = {
 }
 """The hard cases that a simulation meets, and the cases that try them."""
 
-ANY = {"bad-forces", "out-of-distribution", "zero-force", "symmetry", "determinism", "low-precision"}
+ANY = {
+    "bad-forces",
+    "out-of-distribution",
+    "zero-force",
+    "symmetry",
+    "determinism",
+    "low-precision",
+}
 LEARNERS = {"bad-snapshots", "poor-snapshots"}
 ANY_SOLVER = {"near-incompressible", "slender", "huge-step"}
-FULL_ORDER = ANY_SOLVER | {"inversion", "snap-through", "distortion", "stiffness-contrast", "unconstrained", "bad-mesh"}
+FULL_ORDER = ANY_SOLVER | {
+    "inversion",
+    "snap-through",
+    "distortion",
+    "stiffness-contrast",
+    "unconstrained",
+    "bad-mesh",
+}
 CUBATURE = {"nnls", "ecsw-all-cells"}
 CONCERNED = {
     "fem": ANY | FULL_ORDER,
@@ -121,20 +142,38 @@ def everything(cache: Path) -> Stress:
 
 
 def test_every_hard_case_is_there() -> None:
-    assert {(case.name, case.part) for case in CASES} == {pair for pairs in SECTION.values() for pair in pairs}
+    assert {(case.name, case.part) for case in CASES} == {
+        pair for pairs in SECTION.values() for pair in pairs
+    }
 
 
 def test_every_case_is_tried_on_every_method_that_it_concerns(everything: Stress) -> None:
     """A new method file must be added here, with what concerns it."""
     assert set(CONCERNED) == set(list_suite("methods"))
-    expected = {(case.name, case.part, name) for case in CASES for name, concerned in CONCERNED.items() if case.name in concerned}
+    expected = {
+        (case.name, case.part, name)
+        for case in CASES
+        for name, concerned in CONCERNED.items()
+        if case.name in concerned
+    }
     assert sorted((row.case, row.part, row.method) for row in everything.rows) == sorted(expected)
 
 
 def test_the_suite_falls_short_where_its_limits_say_so_only(everything: Stress) -> None:
-    short = {(row.case, row.part, row.method, row.happened) for row in everything.rows if row.verdict == "fall short"}
-    assert {(name, part, method) for name, part, method, _ in short} == {("zero-force", "", "umesh"), ("zero-force", "", "umesh-small")}
-    skipped = {(row.case, row.part) for row in everything.rows if row.verdict == "not applicable" and row.method not in ("fem-pardiso", "gappy-pod")}
+    short = {
+        (row.case, row.part, row.method, row.happened)
+        for row in everything.rows
+        if row.verdict == "fall short"
+    }
+    assert {(name, part, method) for name, part, method, _ in short} == {
+        ("zero-force", "", "umesh"),
+        ("zero-force", "", "umesh-small"),
+    }
+    skipped = {
+        (row.case, row.part)
+        for row in everything.rows
+        if row.verdict == "not applicable" and row.method not in ("fem-pardiso", "gappy-pod")
+    }
     assert skipped == {("low-precision", "bfloat16 inference")}
 
 
@@ -142,9 +181,14 @@ def test_errors_out_of_distribution_are_published_and_flagged(everything: Stress
     for row in everything.rows:
         if row.case == "out-of-distribution" and row.verdict != "not applicable":
             measured = row.measured
-            worst = [np.inf if measured[key] is None else measured[key] for key in ("rel_l2_median", "rel_l2_p95", "rel_l2_max")]
+            worst = [
+                np.inf if measured[key] is None else measured[key]
+                for key in ("rel_l2_median", "rel_l2_p95", "rel_l2_max")
+            ]
             assert 0 <= worst[0] <= worst[1] <= worst[2]
-            assert worst[2] < np.inf or row.method == "deim"  # which has no answer to a few loads, as its limits say
+            assert (
+                worst[2] < np.inf or row.method == "deim"
+            )  # which has no answer to a few loads, as its limits say
             assert measured["n"] >= 50
             assert ("flagged" in measured) == (CONCERNED[row.method] >= LEARNERS)
 
@@ -162,7 +206,10 @@ def test_the_table_has_every_row_and_the_count(everything: Stress, tmp_path: Pat
 def method_file(folder: Path, name: str, surrogate: str = "", parameters: str = "") -> Path:
     path = folder / f"{name}.toml"
     target = surrogate or f"tests.test_stress:{name.capitalize()}"
-    path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "{target}"\n[parameters]\n{parameters}', encoding="utf-8")
+    path.write_text(
+        f'title = "t"\nsource = "s"\nsurrogate = "{target}"\n[parameters]\n{parameters}',
+        encoding="utf-8",
+    )
     return path
 
 
@@ -209,7 +256,15 @@ class Unchecked(PODGalerkin):
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             assert snapshots is not None
-            self._restore({"modes": np.nan_to_num(np.linalg.svd(np.nan_to_num(snapshots.free_displacements), full_matrices=False)[2][:5].T)})
+            self._restore(
+                {
+                    "modes": np.nan_to_num(
+                        np.linalg.svd(
+                            np.nan_to_num(snapshots.free_displacements), full_matrices=False
+                        )[2][:5].T
+                    )
+                }
+            )
         return self
 
 
@@ -265,18 +320,26 @@ FLAWS: dict[str, set[tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("name", list(FLAWS))
-def test_a_method_falls_short_exactly_where_it_is_bad(name: str, tmp_path: Path, cache: Path) -> None:
+def test_a_method_falls_short_exactly_where_it_is_bad(
+    name: str, tmp_path: Path, cache: Path
+) -> None:
     found = stress([method_file(tmp_path, name)], cache=cache)
     assert short_of(found) == FLAWS[name]
     assert {row.case for row in found.rows} == ANY | LEARNERS
     if name == "elsewhere":
-        assert {(row.verdict, row.happened) for row in found.rows} == {("not applicable", "it is for other scenes")}
+        assert {(row.verdict, row.happened) for row in found.rows} == {
+            ("not applicable", "it is for other scenes")
+        }
     if name == "crashing":
-        assert tried(found)["zero-force", ""].happened == "crashed with ZeroDivisionError: on purpose"
+        assert (
+            tried(found)["zero-force", ""].happened == "crashed with ZeroDivisionError: on purpose"
+        )
 
 
 def test_a_learner_that_does_not_check_its_samples_falls_short(tmp_path: Path, cache: Path) -> None:
-    found = stress([method_file(tmp_path, "unchecked")], ["out-of-distribution", "bad-snapshots"], cache=cache)
+    found = stress(
+        [method_file(tmp_path, "unchecked")], ["out-of-distribution", "bad-snapshots"], cache=cache
+    )
     assert short_of(found) == {*OUT, ("bad-snapshots", "")}
     assert "not known" in tried(found)["out-of-distribution", "2x"].happened
 
@@ -285,13 +348,23 @@ def test_a_fit_that_fails_costs_its_own_method_only(tmp_path: Path, cache: Path)
     broken = method_file(tmp_path, "broken", "tests.test_stress:Unfit", "n_modes = 3")
     good = method_file(tmp_path, "good")
     found = stress([broken, good], ["zero-force", "symmetry"], cache=cache)
-    assert [(row.method, row.verdict) for row in found.rows] == [("broken", "fall short")] * 2 + [("good", "pass")] * 2
+    assert [(row.method, row.verdict) for row in found.rows] == [("broken", "fall short")] * 2 + [
+        ("good", "pass")
+    ] * 2
 
 
-def test_a_method_that_ends_its_process_costs_its_own_rows_only(tmp_path: Path, cache: Path) -> None:
-    methods = [method_file(tmp_path, "ending", "tests.test_stress:Ending", "n_modes = 3"), method_file(tmp_path, "good")]
+def test_a_method_that_ends_its_process_costs_its_own_rows_only(
+    tmp_path: Path, cache: Path
+) -> None:
+    methods = [
+        method_file(tmp_path, "ending", "tests.test_stress:Ending", "n_modes = 3"),
+        method_file(tmp_path, "good"),
+    ]
     found = stress(methods, ["zero-force", "symmetry"], cache=cache)
-    assert [(row.method, row.case, row.verdict) for row in found.rows[:2]] == [("ending", "zero-force", "fall short"), ("ending", "symmetry", "pass")]
+    assert [(row.method, row.case, row.verdict) for row in found.rows[:2]] == [
+        ("ending", "zero-force", "fall short"),
+        ("ending", "symmetry", "pass"),
+    ]
     assert "ended with code 7" in found.rows[0].happened
     assert {row.verdict for row in found.rows[2:]} == {"pass"}
 
@@ -318,7 +391,12 @@ def lopsided(mesh: Any, law: Any = setups.LAW, selective: bool = False) -> Assem
     return Assembler(mesh.points, mesh.cells, dofs, mesh.n_dofs, law, weights, selective)
 
 
-def optimistic(matrix: NDArray[np.float64], target: NDArray[np.float64], tolerance: float, max_iterations: int | None = None) -> SparseWeights:
+def optimistic(
+    matrix: NDArray[np.float64],
+    target: NDArray[np.float64],
+    tolerance: float,
+    max_iterations: int | None = None,
+) -> SparseWeights:
     return SparseWeights(np.ones(matrix.shape[1]), 0.0, 0.0, 0.0, 1)
 
 
@@ -332,42 +410,129 @@ _predict = FullFEM.predict
 
 PLANTS: dict[str, tuple[str, str, str, Any, str, Any]] = {
     "inversion": ("fem", "inversion", "", mechanics, "solve_equilibrium", answered),
-    "a limit that is too high": ("fem", "snap-through", "", mechanics, "limit_load", lambda *a: replace(limit_load(*a), factor=0.2)),  # type: ignore[type-var]
+    "a limit that is too high": (
+        "fem",
+        "snap-through",
+        "",
+        mechanics,
+        "limit_load",
+        lambda *a: replace(limit_load(*a), factor=0.2),
+    ),  # type: ignore[type-var]
     "no limit": ("fem", "snap-through", "", mechanics, "limit_load", lambda *_: None),
-    "a path beyond its limit": ("fem", "snap-through", "", mechanics, "solve_on_path", lambda *_: None),
-    "locking not said": ("fem", "near-incompressible", "", model_module, "warn_of_locking", lambda _: None),
-    "shear locking not reported": ("fem", "slender", "", mechanics, "limit_of", lambda ends: (ends[0], None, "finest")),
+    "a path beyond its limit": (
+        "fem",
+        "snap-through",
+        "",
+        mechanics,
+        "solve_on_path",
+        lambda *_: None,
+    ),
+    "locking not said": (
+        "fem",
+        "near-incompressible",
+        "",
+        model_module,
+        "warn_of_locking",
+        lambda _: None,
+    ),
+    "shear locking not reported": (
+        "fem",
+        "slender",
+        "",
+        mechanics,
+        "limit_of",
+        lambda ends: (ends[0], None, "finest"),
+    ),
     "cut-backs not counted": ("fem", "huge-step", "", mechanics, "solve_equilibrium", answered),
     "a patch test that fails": ("fem", "distortion", "", setups, "free_assembler", lopsided),
-    "condition told too small": ("fem", "stiffness-contrast", "", mechanics, "condition_number", lambda *_: 1.0),
-    "ill-conditioning not said": ("fem", "stiffness-contrast", "", model_module, "ILL_CONDITIONED", np.inf),
-    "supports not checked": ("fem", "unconstrained", "", model_module, "check_supports", lambda _: None),
+    "condition told too small": (
+        "fem",
+        "stiffness-contrast",
+        "",
+        mechanics,
+        "condition_number",
+        lambda *_: 1.0,
+    ),
+    "ill-conditioning not said": (
+        "fem",
+        "stiffness-contrast",
+        "",
+        model_module,
+        "ILL_CONDITIONED",
+        np.inf,
+    ),
+    "supports not checked": (
+        "fem",
+        "unconstrained",
+        "",
+        model_module,
+        "check_supports",
+        lambda _: None,
+    ),
     "meshes not checked": ("fem", "bad-mesh", "", soundness, "check_numbers", lambda *_: None),
     "modes cut without a word": ("pod", "poor-snapshots", "", pod_module, "pod", silently),
-    "weights that miss": ("hpod", "nnls", "duplicated and badly scaled columns", reduction, "sparse_nnls", optimistic),
-    "a cap not told of": ("hpod", "nnls", "one iteration only", reduction, "sparse_nnls", optimistic),
-    "ECSW unlike POD": ("hpod", "ecsw-all-cells", "", reduction, "PODGalerkin", lambda n, tolerance: PODGalerkin(n - 1, tolerance)),
-    "snapshots not checked": ("pod", "bad-snapshots", "", Surrogate, "_checked_snapshots", lambda self, snapshots: snapshots),
+    "weights that miss": (
+        "hpod",
+        "nnls",
+        "duplicated and badly scaled columns",
+        reduction,
+        "sparse_nnls",
+        optimistic,
+    ),
+    "a cap not told of": (
+        "hpod",
+        "nnls",
+        "one iteration only",
+        reduction,
+        "sparse_nnls",
+        optimistic,
+    ),
+    "ECSW unlike POD": (
+        "hpod",
+        "ecsw-all-cells",
+        "",
+        reduction,
+        "PODGalerkin",
+        lambda n, tolerance: PODGalerkin(n - 1, tolerance),
+    ),
+    "snapshots not checked": (
+        "pod",
+        "bad-snapshots",
+        "",
+        Surrogate,
+        "_checked_snapshots",
+        lambda self, snapshots: snapshots,
+    ),
     "a model askew": ("fem", "symmetry", "", FullFEM, "predict", askew),
 }
 """Method, case and part; and what is put in the place of what, so that it falls short."""
 
 
 @pytest.mark.parametrize("plant", list(PLANTS))
-def test_what_goes_wrong_is_seen(plant: str, everything: Stress, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_goes_wrong_is_seen(
+    plant: str, everything: Stress, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     method, name, part, where, what, wrong = PLANTS[plant]
-    assert [row.verdict for row in everything.rows if (row.method, row.case, row.part) == (method, name, part)] == ["pass"]
+    assert [
+        row.verdict
+        for row in everything.rows
+        if (row.method, row.case, row.part) == (method, name, part)
+    ] == ["pass"]
     monkeypatch.setattr(where, what, wrong)
     assert tried(stress([method], [name], cache=cache))[name, part].verdict == "fall short"
 
 
-def test_a_method_whose_library_is_missing_is_not_applicable(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_method_whose_library_is_missing_is_not_applicable(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def missing(self: MethodSpec) -> type[Any]:
         raise MissingDependencyError("umesh needs torch")
 
     monkeypatch.setattr(MethodSpec, "load_class", missing)
     found = stress(["umesh"], ["zero-force", "poor-snapshots"], cache=cache)
-    assert [(row.case, row.verdict, row.happened) for row in found.rows] == [("zero-force", "not applicable", "umesh needs torch")]
+    assert [(row.case, row.verdict, row.happened) for row in found.rows] == [
+        ("zero-force", "not applicable", "umesh needs torch")
+    ]
 
 
 BAD_ARGUMENTS: dict[str, tuple[dict[str, Any], str]] = {
@@ -388,7 +553,9 @@ def test_bad_arguments_are_refused(bad: str, cache: Path) -> None:
 def test_numbers_that_are_not_finite_can_be_written(tmp_path: Path) -> None:
     rows = [Row("zero-force", "", "m", "e", "h", "pass", {"ratio": None}, 0.1)]
     Stress(rows, "quick", {}).write(tmp_path / "new" / "stress.json")
-    assert json.loads((tmp_path / "new" / "stress.json").read_text())["rows"][0]["measured"] == {"ratio": None}
+    assert json.loads((tmp_path / "new" / "stress.json").read_text())["rows"][0]["measured"] == {
+        "ratio": None
+    }
 
 
 def test_the_command_line(tmp_path: Path, cache: Path) -> None:
@@ -400,7 +567,9 @@ def test_the_command_line(tmp_path: Path, cache: Path) -> None:
     done = run(*options, "--json", "--out", "stress.json")
     assert done.returncode == 0, done.stderr
     printed = json.loads(done.stdout)
-    assert [(row["method"], row["case"]) for row in printed["rows"]] == [(m, c) for m in ("umesh", "linear-fem") for c in ("zero-force", "symmetry")]
+    assert [(row["method"], row["case"]) for row in printed["rows"]] == [
+        (m, c) for m in ("umesh", "linear-fem") for c in ("zero-force", "symmetry")
+    ]
     written = json.loads((tmp_path / "stress.json").read_text(encoding="utf-8"))
     assert written == printed
     assert "4 tried: 3 pass, 1 fall short" in done.stderr
@@ -412,7 +581,15 @@ def test_the_command_line(tmp_path: Path, cache: Path) -> None:
 def test_inputs_are_those_of_the_dataset(cache: Path) -> None:
     scenes = case_module.Scenes(cache)
     assert scenes.tiny.scene.name == "beam-tiny"
-    for part, along in ((scenes.pressed.train, 1.0), (scenes.pressed.tests["unseen-directions"], 0.0)):
+    for part, along in (
+        (scenes.pressed.train, 1.0),
+        (scenes.pressed.tests["unseen-directions"], 0.0),
+    ):
         vectors = part.loads.vectors[:, 0]
-        np.testing.assert_allclose(np.abs(vectors[:, 2]) / np.linalg.norm(vectors, axis=1), along, atol=1e-12)
-    assert mor_bench.load_dataset("beam-tiny", cache=cache).train.forces.shape == scenes.tiny.train.forces.shape
+        np.testing.assert_allclose(
+            np.abs(vectors[:, 2]) / np.linalg.norm(vectors, axis=1), along, atol=1e-12
+        )
+    assert (
+        mor_bench.load_dataset("beam-tiny", cache=cache).train.forces.shape
+        == scenes.tiny.train.forces.shape
+    )

@@ -17,7 +17,9 @@ from mor_bench.scene.subdivision import subdivide
 
 def volumes(mesh: Mesh) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     element = element_of(mesh.cells)
-    return np.asarray(shape_gradients(mesh.points, mesh.cells, element.derivatives)[1] @ element.weights)
+    return np.asarray(
+        shape_gradients(mesh.points, mesh.cells, element.derivatives)[1] @ element.weights
+    )
 
 
 def bent(tetrahedra: bool) -> Mesh:
@@ -32,9 +34,15 @@ def test_a_subdivided_mesh_fills_the_same_body_and_fits_together(tetrahedra: boo
     fine, parents = subdivide(coarse)
     assert fine.n_cells == 8 * coarse.n_cells
     assert volumes(fine).min() > 0
-    assert volumes(fine).sum() == pytest.approx(volumes(coarse).sum(), rel=1e-12 if tetrahedra else 1e-3)
+    assert volumes(fine).sum() == pytest.approx(
+        volumes(coarse).sum(), rel=1e-12 if tetrahedra else 1e-3
+    )
     assert len(fine.boundary_facets) == 4 * len(coarse.boundary_facets)
-    assert len(np.unique(np.round(fine.points, 9), axis=0)) == fine.n_nodes == len(np.unique(fine.cells))
+    assert (
+        len(np.unique(np.round(fine.points, 9), axis=0))
+        == fine.n_nodes
+        == len(np.unique(fine.cells))
+    )
     np.testing.assert_allclose(fine.points, coarse.points[parents].mean(axis=1), rtol=0, atol=1e-12)
     weights = interpolation_matrix(coarse, fine.points)
     field = coarse.points**2
@@ -47,15 +55,22 @@ def test_subdivision_of_a_grid_is_the_finer_grid(name: str) -> None:
     nx, ny, nz = (2 * n for n in scene.spec.geometry.cells)  # type: ignore[union-attr]
     expected = with_cells(scene, (nx, ny, nz))
     off_grid = refined(replace(scene, mesh=Mesh(scene.mesh.points, scene.mesh.cells)))
-    assert {tuple(p) for p in np.round(off_grid.mesh.points, 9)} == {tuple(p) for p in np.round(expected.mesh.points, 9)}
-    held = [{tuple(p) for p in np.round(s.mesh.points[s.fixed_nodes], 9)} for s in (off_grid, expected)]
+    assert {tuple(p) for p in np.round(off_grid.mesh.points, 9)} == {
+        tuple(p) for p in np.round(expected.mesh.points, 9)
+    }
+    held = [
+        {tuple(p) for p in np.round(s.mesh.points[s.fixed_nodes], 9)} for s in (off_grid, expected)
+    ]
     assert held[0] == held[1]
     assert refined(scene).mesh.grid_shape == expected.mesh.grid_shape
 
 
 def test_answers_on_the_subdivided_mesh_are_those_on_the_finer_grid() -> None:
     scene = load_scene("beam-tiny")
-    on_grid, off_grid = refined(scene), refined(replace(scene, mesh=Mesh(scene.mesh.points, scene.mesh.cells)))
+    on_grid, off_grid = (
+        refined(scene),
+        refined(replace(scene, mesh=Mesh(scene.mesh.points, scene.mesh.cells))),
+    )
     answers = []
     for finer in (on_grid, off_grid):
         tip = finer.mesh.points[:, 0] == 2.0

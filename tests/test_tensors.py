@@ -50,11 +50,17 @@ def problems(scene: Scene, r: int = 6) -> tuple[GalerkinProblem, TensorProblem]:
 @pytest.mark.parametrize("kind", KINDS)
 def test_energy_force_and_tangent_are_those_of_the_mesh(kind: str) -> None:
     galerkin, tensor = problems(scene_of(kind))
-    for size in (0.01, 0.1, *([3.0] if kind == "H8" else [])):  # the general kernel has no energy of inverted states, and loses digits of tiny ones
+    for size in (
+        0.01,
+        0.1,
+        *([3.0] if kind == "H8" else []),
+    ):  # the general kernel has no energy of inverted states, and loses digits of tiny ones
         q = size * np.random.default_rng(3).normal(size=6)
         (expected, stiffness), (state, tangent) = galerkin.linearise(q), tensor.linearise(q)
         assert state.energy_j == pytest.approx(expected.energy_j, rel=1e-12)
-        np.testing.assert_allclose(state.force, expected.force, rtol=0, atol=1e-12 * np.abs(expected.force).max())
+        np.testing.assert_allclose(
+            state.force, expected.force, rtol=0, atol=1e-12 * np.abs(expected.force).max()
+        )
         np.testing.assert_allclose(tangent, stiffness, rtol=0, atol=1e-12 * np.abs(stiffness).max())
 
 
@@ -68,7 +74,9 @@ def test_derivatives_are_symmetric_in_all_indices() -> None:
             quartic[a[:, None], b[:, None], c, d] = tensors.quartic
     for tensor in (tensors.quadratic, cubic, quartic):
         for order in permutations(range(tensor.ndim)):
-            np.testing.assert_allclose(tensor, tensor.transpose(order), rtol=0, atol=1e-12 * np.abs(tensor).max())
+            np.testing.assert_allclose(
+                tensor, tensor.transpose(order), rtol=0, atol=1e-12 * np.abs(tensor).max()
+            )
 
 
 def test_leading_modes_have_the_leading_part_of_the_arrays() -> None:
@@ -77,7 +85,9 @@ def test_leading_modes_have_the_leading_part_of_the_arrays() -> None:
     model = FullOrderModel(scene)
     modes = np.linalg.qr(np.random.default_rng(1).normal(size=(model.n_unknowns, 6)))[0][:, :3]
     small = reduce_energy(model, modes)
-    np.testing.assert_allclose(small.quartic, large.quartic[:6, :6], rtol=0, atol=1e-12 * np.abs(small.quartic).max())
+    np.testing.assert_allclose(
+        small.quartic, large.quartic[:6, :6], rtol=0, atol=1e-12 * np.abs(small.quartic).max()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -87,8 +97,16 @@ def coarse(cache: Path) -> Dataset:
 
 @pytest.mark.parametrize("r", [1, 10, 30])
 def test_answers_are_those_of_plain_pod(coarse: Dataset, r: int) -> None:
-    plain = PODGalerkin(r, tolerance=1e-12).fit(coarse.scene, coarse.train).predict(coarse.test.forces[:30])
-    exact = TensorPOD(r, tolerance=1e-12).fit(coarse.scene, coarse.train).predict(coarse.test.forces[:30])
+    plain = (
+        PODGalerkin(r, tolerance=1e-12)
+        .fit(coarse.scene, coarse.train)
+        .predict(coarse.test.forces[:30])
+    )
+    exact = (
+        TensorPOD(r, tolerance=1e-12)
+        .fit(coarse.scene, coarse.train)
+        .predict(coarse.test.forces[:30])
+    )
     assert np.abs(exact - plain).max() <= 1e-10 * np.abs(plain).max()
 
 
@@ -98,7 +116,9 @@ def test_the_watched_points_see_the_smallest_det_f_of_training_samples(coarse: D
     chosen = np.unique(np.linspace(0, len(coarse.train) - 1, 300).astype(int))
     for u in coarse.train.free_displacements[chosen[::7]]:
         q = u @ method.modes_
-        assert method.problem_.min_det_f(q) == pytest.approx(model.force(method.modes_ @ q).min_det_f, abs=0.02)
+        assert method.problem_.min_det_f(q) == pytest.approx(
+            model.force(method.modes_ @ q).min_det_f, abs=0.02
+        )
     assert len(method.problem_.sentinels) <= 64
 
 
@@ -106,7 +126,10 @@ def test_the_watched_points_see_the_smallest_det_f_of_training_samples(coarse: D
 def test_an_inverted_answer_is_refused(coarse: Dataset, r: int) -> None:
     """Loads far beyond the range turn cells inside out, which the energy alone would accept: seen on the whole mesh."""
     method = TensorPOD(r, tolerance=1e-6).fit(coarse.scene, coarse.train)
-    plain, model = PODGalerkin(r, tolerance=1e-6).fit(coarse.scene, coarse.train), FullOrderModel(coarse.scene)
+    plain, model = (
+        PODGalerkin(r, tolerance=1e-6).fit(coarse.scene, coarse.train),
+        FullOrderModel(coarse.scene),
+    )
     refused = 0
     for force in coarse.test.forces[:20]:
         try:

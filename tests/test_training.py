@@ -37,8 +37,12 @@ class Problem:
     def __post_init__(self) -> None:
         self.generator = torch.Generator().manual_seed(3)
         self.x = torch.randn(60, 4, generator=self.generator)
-        self.y = torch.sin(self.x @ torch.randn(4, 2, generator=self.generator)) + self.noise * torch.randn(60, 2, generator=self.generator)
-        self.network = torch.nn.Sequential(torch.nn.Linear(4, self.width), torch.nn.Tanh(), torch.nn.Linear(self.width, 2))
+        self.y = torch.sin(
+            self.x @ torch.randn(4, 2, generator=self.generator)
+        ) + self.noise * torch.randn(60, 2, generator=self.generator)
+        self.network = torch.nn.Sequential(
+            torch.nn.Linear(4, self.width), torch.nn.Tanh(), torch.nn.Linear(self.width, 2)
+        )
         with torch.no_grad():
             for parameter in self.network.parameters():
                 parameter.copy_(torch.randn(parameter.shape, generator=self.generator) / 2)
@@ -52,12 +56,19 @@ class Problem:
         error: Tensor = self.network(x).float() - self.y[rows]
         return error.square().mean()
 
-    def train(self, plan: TrainingPlan = PLAN, loss: Callable[[Tensor], Tensor] | None = None, **keywords: object) -> Training:
+    def train(
+        self,
+        plan: TrainingPlan = PLAN,
+        loss: Callable[[Tensor], Tensor] | None = None,
+        **keywords: object,
+    ) -> Training:
         return train(self.network, loss or self.loss, len(self.x), plan, self.generator, **keywords)  # type: ignore[arg-type]
 
     @property
     def weights(self) -> np.ndarray:
-        return np.concatenate([parameter.detach().numpy().ravel() for parameter in self.network.parameters()])
+        return np.concatenate(
+            [parameter.detach().numpy().ravel() for parameter in self.network.parameters()]
+        )
 
 
 class KilledError(Exception):
@@ -65,7 +76,9 @@ class KilledError(Exception):
 
 
 @pytest.mark.parametrize("after", [1, 49, 50, 60])
-def test_a_training_that_was_stopped_ends_with_the_same_bits(after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_that_was_stopped_ends_with_the_same_bits(
+    after: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole, stopped, resumed = Problem(), Problem(), Problem()
     expected = whole.train()
     options = TrainingOptions(checkpoint=tmp_path / "checkpoint")
@@ -95,7 +108,11 @@ def test_a_training_that_was_stopped_ends_with_the_same_bits(after: int, tmp_pat
         ({}, {"iterations": 50, "validation_fraction": 0.0}, None),
         ({}, {"iterations": 7, "batch_size": 60}, None),
         ({}, {}, 0.3),
-        ({"noise": 2.0, "width": 200}, {"iterations": 4000, "schedule": "constant", "validation_fraction": 0.5}, None),
+        (
+            {"noise": 2.0, "width": 200},
+            {"iterations": 4000, "schedule": "constant", "validation_fraction": 0.5},
+            None,
+        ),
     ],
     ids=["with samples held out", "without", "one batch an epoch", "to seconds", "ended early"],
 )
@@ -137,7 +154,18 @@ def test_a_checkpoint_of_another_training_is_refused_and_left(checkpoint: Path) 
     assert checkpoint.exists()
 
 
-@pytest.mark.parametrize("name", ["network.0.weight", "best.2.bias", "optimiser.0.exp_avg", "generator", "rows", "order", "numbers"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "network.0.weight",
+        "best.2.bias",
+        "optimiser.0.exp_avg",
+        "generator",
+        "rows",
+        "order",
+        "numbers",
+    ],
+)
 def test_a_checkpoint_with_a_changed_bit_is_refused(checkpoint: Path, name: str) -> None:
     content = bytearray(checkpoint.read_bytes())
     length = int.from_bytes(content[:8], "little")
@@ -153,9 +181,14 @@ def test_a_checkpoint_with_a_changed_bit_is_refused(checkpoint: Path, name: str)
 
 def test_a_checkpoint_of_other_seconds_or_samples_is_refused(checkpoint: Path) -> None:
     with pytest.raises(InvalidInputError, match=r"another training .*seconds"):
-        Problem().train(options=TrainingOptions(checkpoint=checkpoint, fit_seconds=9.0), fingerprint="x")
+        Problem().train(
+            options=TrainingOptions(checkpoint=checkpoint, fit_seconds=9.0), fingerprint="x"
+        )
     samples = Problem()
-    samples.x, samples.y = samples.x[:30], samples.y[:30]  # fewer, and the caller's fingerprint does not tell
+    samples.x, samples.y = (
+        samples.x[:30],
+        samples.y[:30],
+    )  # fewer, and the caller's fingerprint does not tell
     with pytest.raises(StoreError, match=r"`rows` must be .* of shape"):
         samples.train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="x")
 
@@ -163,7 +196,14 @@ def test_a_checkpoint_of_other_seconds_or_samples_is_refused(checkpoint: Path) -
 @pytest.mark.parametrize("damage", ["truncated", "empty", "foreign", "other network"])
 def test_a_damaged_checkpoint_is_refused(checkpoint: Path, damage: str) -> None:
     content = checkpoint.read_bytes()
-    checkpoint.write_bytes({"truncated": content[:-7], "empty": b"", "foreign": b"\x80\x04K\x01.", "other network": content}[damage])
+    checkpoint.write_bytes(
+        {
+            "truncated": content[:-7],
+            "empty": b"",
+            "foreign": b"\x80\x04K\x01.",
+            "other network": content,
+        }[damage]
+    )
     problem = Problem(width=5) if damage == "other network" else Problem()
     with pytest.raises(StoreError, match="checkpoint"):
         problem.train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="x")
@@ -178,7 +218,9 @@ def _tensor(name: str, change: Callable[[Tensor], Tensor]) -> Callable[..., obje
 
 
 def _without(start: str) -> Callable[..., object]:
-    return lambda numbers, tensors: [tensors.pop(name) for name in list(tensors) if name.startswith(start)]
+    return lambda numbers, tensors: [
+        tensors.pop(name) for name in list(tensors) if name.startswith(start)
+    ]
 
 
 FORGERIES: dict[str, tuple[Callable[..., object], str]] = {
@@ -186,34 +228,82 @@ FORGERIES: dict[str, tuple[Callable[..., object], str]] = {
     "an infinite iteration": (_number("iteration", float("inf")), "`iteration`: "),
     "a negative iteration": (_number("iteration", -50), "`iteration`: "),
     "an iteration after the last": (_number("iteration", 10**6), "`iteration` must be 120"),
-    "iterations of another plan": (_number("iterations", 10**6), "`iterations` must be 120 .* got 1000000"),
-    "an iteration before": (_number("iteration", 30), "`n_summed` must be 30 at iteration 30 of 120; got"),
+    "iterations of another plan": (
+        _number("iterations", 10**6),
+        "`iterations` must be 120 .* got 1000000",
+    ),
+    "an iteration before": (
+        _number("iteration", 30),
+        "`n_summed` must be 30 at iteration 30 of 120; got",
+    ),
     "a nested curve": (_number("curve", [[0.5]]), "`curve.0`: "),
     "a curve of words": (_number("curve", ["a"]), "`curve.0`: "),
     "a curve of NaN": (_number("curve", [float("nan")]), "`curve.0`: "),
-    "a long curve": (_number("curve", [0.5, 0.5]), "`curve` must be 0 at iteration 31 of 120; got 2"),
+    "a long curve": (
+        _number("curve", [0.5, 0.5]),
+        "`curve` must be 0 at iteration 31 of 120; got 2",
+    ),
     "validated words": (_number("validated", ["a"]), "`validated.0`: "),
     "a validated dict": (_number("validated", {}), "`validated`: "),
     "another number": (_number("n", 3), "`n`: "),
-    "totals": (_tensor("total", lambda x: x.repeat(3)), r"`total` must be .* of shape \(\); got torch.float32 of shape \(3,\)"),
-    "no moment": (_without("optimiser.1.exp_avg_sq"), "not those of the training: optimiser.1.exp_avg_sq"),
+    "totals": (
+        _tensor("total", lambda x: x.repeat(3)),
+        r"`total` must be .* of shape \(\); got torch.float32 of shape \(3,\)",
+    ),
+    "no moment": (
+        _without("optimiser.1.exp_avg_sq"),
+        "not those of the training: optimiser.1.exp_avg_sq",
+    ),
     "no moments": (_without("optimiser."), "not those of the training: optimiser.0"),
-    "a moment of another shape": (_tensor("optimiser.0.exp_avg", lambda x: x.T.contiguous()), "`optimiser.0.exp_avg` must be"),
-    "a negative second moment": (_tensor("optimiser.0.exp_avg_sq", lambda x: x - 1.0), "`optimiser.0.exp_avg_sq` must not be negative"),
-    "a step of before": (_tensor("optimiser.0.step", lambda x: -x), r"`optimiser.0.step` must be in \[1, "),
-    "an order of floats": (_tensor("order", lambda x: x.double()), "`order` must be finite numbers, torch.int64"),
+    "a moment of another shape": (
+        _tensor("optimiser.0.exp_avg", lambda x: x.T.contiguous()),
+        "`optimiser.0.exp_avg` must be",
+    ),
+    "a negative second moment": (
+        _tensor("optimiser.0.exp_avg_sq", lambda x: x - 1.0),
+        "`optimiser.0.exp_avg_sq` must not be negative",
+    ),
+    "a step of before": (
+        _tensor("optimiser.0.step", lambda x: -x),
+        r"`optimiser.0.step` must be in \[1, ",
+    ),
+    "an order of floats": (
+        _tensor("order", lambda x: x.double()),
+        "`order` must be finite numbers, torch.int64",
+    ),
     "an order of pairs": (_tensor("order", lambda x: x[:, None]), "`order` must be"),
-    "an order that repeats": (_tensor("order", lambda x: x[:1].repeat(len(x))), "samples are not those of the training"),
+    "an order that repeats": (
+        _tensor("order", lambda x: x[:1].repeat(len(x))),
+        "samples are not those of the training",
+    ),
     "a short order": (_tensor("order", lambda x: x[1:]), "`order` must be"),
-    "rows that repeat": (_tensor("rows", lambda x: x[:1].repeat(len(x))), "samples are not those of the training"),
-    "other best weights": (_tensor("best.0.weight", lambda x: x[:, :2].contiguous()), "`best.0.weight` must be"),
-    "best weights of NaN": (_tensor("best.0.weight", lambda x: x * float("nan")), "`best.0.weight` must be finite"),
-    "a best weight missing": (_without("best.0.weight"), "not those of the training: best.0.weight"),
+    "rows that repeat": (
+        _tensor("rows", lambda x: x[:1].repeat(len(x))),
+        "samples are not those of the training",
+    ),
+    "other best weights": (
+        _tensor("best.0.weight", lambda x: x[:, :2].contiguous()),
+        "`best.0.weight` must be",
+    ),
+    "best weights of NaN": (
+        _tensor("best.0.weight", lambda x: x * float("nan")),
+        "`best.0.weight` must be finite",
+    ),
+    "a best weight missing": (
+        _without("best.0.weight"),
+        "not those of the training: best.0.weight",
+    ),
     "no best weights": (_without("best."), "not those of the training: best.0"),
-    "weights of doubles": (_tensor("network.0.weight", lambda x: x.double()), "`network.0.weight` must be"),
+    "weights of doubles": (
+        _tensor("network.0.weight", lambda x: x.double()),
+        "`network.0.weight` must be",
+    ),
     "no generator": (_without("generator"), "not those of the training: generator"),
     "a generator of zeros": (_tensor("generator", lambda x: x * 0), "Invalid mt19937 state"),
-    "another tensor": (lambda numbers, tensors: tensors.update(other=tensors["order"] + 1), "not those of the training: other"),
+    "another tensor": (
+        lambda numbers, tensors: tensors.update(other=tensors["order"] + 1),
+        "not those of the training: other",
+    ),
 }
 
 
@@ -227,7 +317,11 @@ def test_a_forged_checkpoint_is_refused_and_left(name: str, checkpoint: Path) ->
         header, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a mapping
     numbers, (change, message) = json.loads(header["numbers"]), FORGERIES[name]
     change(numbers, tensors)
-    header = {"format": header["format"], "fingerprint": header["fingerprint"], "numbers": json.dumps(numbers)}
+    header = {
+        "format": header["format"],
+        "fingerprint": header["fingerprint"],
+        "numbers": json.dumps(numbers),
+    }
     save_file(tensors, checkpoint, header | {"sha256": fingerprint_of(header, tensors)})
     with pytest.raises(StoreError, match=f"a damaged checkpoint: .*{message}"):
         Problem().train(options=TrainingOptions(checkpoint=checkpoint), fingerprint="x")
@@ -236,12 +330,16 @@ def test_a_forged_checkpoint_is_refused_and_left(name: str, checkpoint: Path) ->
 
 def test_it_ends_when_the_samples_held_out_gain_nothing_and_keeps_the_best_weights() -> None:
     problem = Problem(noise=2.0, width=200)
-    done = problem.train(replace(PLAN, iterations=4000, schedule="constant", validation_fraction=0.5))
+    done = problem.train(
+        replace(PLAN, iterations=4000, schedule="constant", validation_fraction=0.5)
+    )
     best = int(done.validation_curve.argmin())
     assert done.iterations == 4000
     stopped = len(done.validation_curve) * (4000 // training.VALIDATIONS)
     assert stopped < 4000
-    assert len(done.loss_curve) == -(-stopped // training.LOSS_INTERVAL), "the losses before an early end are kept"
+    assert len(done.loss_curve) == -(-stopped // training.LOSS_INTERVAL), (
+        "the losses before an early end are kept"
+    )
     assert len(done.validation_curve) == best + 1 + training.PATIENCE
     rows = torch.randperm(60, generator=Problem(noise=2.0, width=200).generator)[:30]
     assert not problem.network.training
@@ -263,7 +361,9 @@ def test_a_training_that_fills_a_time_is_repeated_by_its_number_of_iterations() 
 
 
 @pytest.mark.parametrize(("seconds", "each"), [(1.0, 2e-4), (1.0, 4e-3)])
-def test_a_time_holds_the_trial_and_the_looks_at_the_samples_held_out(seconds: float, each: float) -> None:
+def test_a_time_holds_the_trial_and_the_looks_at_the_samples_held_out(
+    seconds: float, each: float
+) -> None:
     problem = Problem()
     asked = 0.0
 
@@ -275,14 +375,21 @@ def test_a_time_holds_the_trial_and_the_looks_at_the_samples_held_out(seconds: f
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "perf_counter", lambda: asked)
         patch.setattr(training, "PATIENCE", 10**9)
-        problem.train(replace(PLAN, validation_fraction=0.5), loss=slow, options=TrainingOptions(fit_seconds=seconds))
+        problem.train(
+            replace(PLAN, validation_fraction=0.5),
+            loss=slow,
+            options=TrainingOptions(fit_seconds=seconds),
+        )
     assert 0.8 * seconds < asked < 1.2 * seconds
 
 
 def test_bfloat16_trains_nearly_as_well() -> None:
     exact, rounded = Problem(), Problem()
     plan = replace(PLAN, iterations=400)
-    losses = [problem.train(replace(plan, precision=name)).loss_curve for problem, name in ((exact, "float32"), (rounded, "bfloat16"))]  # type: ignore[arg-type]
+    losses = [
+        problem.train(replace(plan, precision=name)).loss_curve
+        for problem, name in ((exact, "float32"), (rounded, "bfloat16"))
+    ]  # type: ignore[arg-type]
     assert not np.array_equal(exact.weights, rounded.weights)
     assert losses[1][-1] == pytest.approx(losses[0][-1], rel=0.2)
     assert losses[1][-1] < 0.2 * losses[1][0]
@@ -292,14 +399,19 @@ def test_too_little_time_and_divergence_are_errors() -> None:
     with pytest.raises(OutOfTimeError, match="would take"):
         Problem().train(replace(PLAN, iterations=10**9), time_limit_s=1.0)
     with pytest.raises(
-        MorBenchError, match=r"diverged .* the loss is (nan|inf), with a learning rate of 1e\+38 and products in float32; a lower rate may"
+        MorBenchError,
+        match=r"diverged .* the loss is (nan|inf), with a learning rate of 1e\+38 and products in float32; a lower rate may",
     ):
         Problem().train(replace(PLAN, learning_rate=1e38))
-    with pytest.raises(MorBenchError, match=r"products in bfloat16; a lower rate or float32 may help"):
+    with pytest.raises(
+        MorBenchError, match=r"products in bfloat16; a lower rate or float32 may help"
+    ):
         Problem().train(replace(PLAN, learning_rate=1e38, precision="bfloat16"))
 
 
-def test_a_training_that_diverges_writes_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_that_diverges_writes_no_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(training, "CHECKPOINT_EVERY_S", 0.0)
     options = TrainingOptions(checkpoint=tmp_path / "checkpoint")
     for _ in range(2):  # the second goes on from what was finite, and ends as the first
@@ -307,7 +419,9 @@ def test_a_training_that_diverges_writes_no_checkpoint(tmp_path: Path, monkeypat
             Problem().train(replace(PLAN, learning_rate=1e38), options=options)
 
 
-@pytest.mark.parametrize("name", ["autoencoder", "deeponet", "fno", "mesh-graph-net", "pod-nn", "umesh"])
+@pytest.mark.parametrize(
+    "name", ["autoencoder", "deeponet", "fno", "mesh-graph-net", "pod-nn", "umesh"]
+)
 def test_a_seed_that_the_generator_would_cut_is_refused(name: str) -> None:
     for seed in (5, 2**32 - 1):
         mor_bench.load_method(name, seed=seed)

@@ -50,42 +50,77 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def comparison(folder: Path, cache: Path) -> Comparison:
     """Trained for 0.7 s, which comes to 70 iterations, with three seeds."""
     methods: list[str | Path] = [folder / "descent.toml", "linear-fem"]
-    return mor_bench.run(["beam-tiny"], methods, out=folder / "run", cache=cache, limit=LIMIT, fit_seconds=0.7, seeds=3)
+    return mor_bench.run(
+        ["beam-tiny"],
+        methods,
+        out=folder / "run",
+        cache=cache,
+        limit=LIMIT,
+        fit_seconds=0.7,
+        seeds=3,
+    )
 
 
-def test_seconds_come_to_iterations_that_can_be_repeated(comparison: Comparison, folder: Path, cache: Path) -> None:
+def test_seconds_come_to_iterations_that_can_be_repeated(
+    comparison: Comparison, folder: Path, cache: Path
+) -> None:
     row = comparison.rows[0]
-    assert row["training"].items() >= {"device": "cpu", "fit_seconds": 0.7, "iterations": 70}.items()
+    assert (
+        row["training"].items() >= {"device": "cpu", "fit_seconds": 0.7, "iterations": 70}.items()
+    )
     assert comparison.settings["fit_seconds"] == 0.7
-    kept = [json.loads(path.read_bytes())["parameters"] for path in cache.glob("fits/descent-*/fit.json")]
-    assert {knobs["iterations"] for knobs in kept if knobs["seed"] == 2 and knobs["fails"] == 1} == {70}  # the other seeds are not timed
+    kept = [
+        json.loads(path.read_bytes())["parameters"]
+        for path in cache.glob("fits/descent-*/fit.json")
+    ]
+    assert {
+        knobs["iterations"] for knobs in kept if knobs["seed"] == 2 and knobs["fails"] == 1
+    } == {70}  # the other seeds are not timed
     path = folder / "again.toml"
-    path.write_text((folder / "descent.toml").read_text().partition("[sweep]")[0] + "iterations = 70\n")
-    again = mor_bench.run(["beam-tiny"], [path, "linear-fem"], out=folder / "again", cache=cache, limit=LIMIT)
+    path.write_text(
+        (folder / "descent.toml").read_text().partition("[sweep]")[0] + "iterations = 70\n"
+    )
+    again = mor_bench.run(
+        ["beam-tiny"], [path, "linear-fem"], out=folder / "again", cache=cache, limit=LIMIT
+    )
     assert again.rows[0]["error"] == row["error"]
     assert again.rows[0]["training"]["fit_seconds"] is None
-    unlike = mor_bench.run(["beam-tiny"], [folder / "descent.toml"], out=folder / "unlike", cache=cache, limit=LIMIT)
+    unlike = mor_bench.run(
+        ["beam-tiny"], [folder / "descent.toml"], out=folder / "unlike", cache=cache, limit=LIMIT
+    )
     assert unlike.rows[0]["training"]["iterations"] == 40
     assert unlike.rows[0]["error"] != row["error"]
-    assert len(list(cache.glob("fits/linear-fem-*"))) == len({r["label"] for r in comparison.rows if r["method"] == "linear-fem"})
+    assert len(list(cache.glob("fits/linear-fem-*"))) == len(
+        {r["label"] for r in comparison.rows if r["method"] == "linear-fem"}
+    )
 
 
 def test_a_seed_that_fails_is_shown_everywhere(comparison: Comparison) -> None:
     row = comparison.rows[0]
     found = row["seeds"]
     assert (found["n"], found["asked"]) == (2, 3)
-    assert found["failed"] == ["seed 1: OutOfTimeError: all iterations would take 7 h; the limit is 9 s."]
+    assert found["failed"] == [
+        "seed 1: OutOfTimeError: all iterations would take 7 h; the limit is 9 s."
+    ]
     errors = [training["mean_dof_m"] for training in found["trainings"]]
     assert errors[0] == row["error"]["mean_dof_m"]
     assert errors[1] == inf
     assert errors[2] not in (errors[0], inf)
-    assert found["mean_dof_m"] == {"median": max(errors[0], errors[2]), "min": min(errors), "max": inf, "std": inf}
+    assert found["mean_dof_m"] == {
+        "median": max(errors[0], errors[2]),
+        "min": min(errors),
+        "max": inf,
+        "std": inf,
+    }
     assert len(comparison.samples(row)["seeds_relative_l2"]) == 1
     assert comparison.rows[-1]["method"] == "linear-fem"
     assert comparison.rows[-1]["seeds"] is None
     assert Comparison.read(comparison.out).rows == json.loads(json.dumps(comparison.rows))
     assert comparison.table.loc[0, "seeds.mean_dof_m.max"] == inf
-    assert "seeds.rel_l2_median.std" in (comparison.out / "results.csv").read_text(encoding="utf-8").partition("\n")[0]
+    assert (
+        "seeds.rel_l2_median.std"
+        in (comparison.out / "results.csv").read_text(encoding="utf-8").partition("\n")[0]
+    )
     text = tables_of(comparison)
     assert "–inf" in text
     assert "seed 1: OutOfTimeError: all iterations would take 7 h" in text
@@ -124,7 +159,9 @@ def test_curves_are_kept_with_the_samples(comparison: Comparison) -> None:
     assert comparison.rows[0]["training"]["loss"] == samples["loss_curve"][-1]
 
 
-def test_a_killed_comparison_goes_on_in_the_middle_of_a_training(folder: Path, cache: Path, tmp_path: Path) -> None:
+def test_a_killed_comparison_goes_on_in_the_middle_of_a_training(
+    folder: Path, cache: Path, tmp_path: Path
+) -> None:
     knobs = "[parameters]\niterations = 300\n"
     path, out = descent_file(tmp_path, knobs), tmp_path / "out"
     command = [
@@ -148,7 +185,14 @@ def test_a_killed_comparison_goes_on_in_the_middle_of_a_training(folder: Path, c
         return set(cache.glob("fits/*/training/checkpoint")) - before
 
     slow = {**os.environ, "DESCENT_NAP_S": "0.05"}
-    with subprocess.Popen(command, env=slow, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+    with subprocess.Popen(
+        command,
+        env=slow,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
         wait_for(checkpoints, process)
         time.sleep(0.7)
         process.kill()
@@ -158,18 +202,29 @@ def test_a_killed_comparison_goes_on_in_the_middle_of_a_training(folder: Path, c
     assert resumed["warnings"][0].startswith("goes on from iteration ")
     assert resumed["offline_s"]["fit"] > 0.7
     assert not left.exists()
-    whole = mor_bench.fit("beam-tiny", path, out=tmp_path / "whole.safetensors", cache=cache, limit=LIMIT, threads=1)
+    whole = mor_bench.fit(
+        "beam-tiny", path, out=tmp_path / "whole.safetensors", cache=cache, limit=LIMIT, threads=1
+    )
     assert whole.error["mean_dof_m"] == pytest.approx(resumed["error"]["mean_dof_m"], rel=1e-12)
     assert (left.parents[1] / "model.safetensors").read_bytes() == whole.out.read_bytes()
 
 
-def test_a_damaged_checkpoint_is_left_and_the_time_before_a_stop_counts(folder: Path, cache: Path, tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_is_left_and_the_time_before_a_stop_counts(
+    folder: Path, cache: Path, tmp_path: Path
+) -> None:
     data = mor_bench.load_dataset("beam-tiny", LIMIT, cache=cache, workers=1)
     material = Material(data.scene, data.train, {"test": fits.TestSet.of(data.test)}, tmp_path)
-    spec, place = load_method_spec(folder / "descent.toml"), place_of(tmp_path, [tmp_path / "fits"], 1, 1, float("inf"))
+    spec, place = (
+        load_method_spec(folder / "descent.toml"),
+        place_of(tmp_path, [tmp_path / "fits"], 1, 1, float("inf")),
+    )
 
     def entry(seed: int) -> Entry:
-        made = Entry(Job(spec, {"iterations": 20, "seed": seed, "fails": -1}, "descent", TrainingOptions()), material, place)
+        made = Entry(
+            Job(spec, {"iterations": 20, "seed": seed, "fails": -1}, "descent", TrainingOptions()),
+            material,
+            place,
+        )
         made.begin_training()
         made.checkpoint.write_bytes(b"damaged")
         return made
@@ -180,10 +235,15 @@ def test_a_damaged_checkpoint_is_left_and_the_time_before_a_stop_counts(folder: 
     stopped = entry(1)
     began = stopped.checkpoint.stat().st_mtime - 100.0
     (stopped.folder / "training.json").write_text(json.dumps({"taken_s": 30.0, "began": began}))
-    with pytest.raises(MethodFailedError, match="fitting took longer than the limit of 120 s: 130 s until it was stopped"):
+    with pytest.raises(
+        MethodFailedError,
+        match="fitting took longer than the limit of 120 s: 130 s until it was stopped",
+    ):
         fit(stopped, 120.0)
     assert stopped.checkpoint.exists()
-    assert fit(stopped, 200.0)["fit_s"] < 70.0  # the checkpoint was damaged, and with it went the time that it had taken
+    assert (
+        fit(stopped, 200.0)["fit_s"] < 70.0
+    )  # the checkpoint was damaged, and with it went the time that it had taken
 
 
 STOPPED = """
@@ -210,7 +270,9 @@ def test_a_comparison_that_is_stopped_after_a_training_goes_on_after_it(
 ) -> None:
     pytest.importorskip("torch")
     (tmp_path / "stopped.py").write_text(STOPPED.format(module=module, base=base))
-    (tmp_path / "stopped.toml").write_text('title = "t"\nsource = "s"\nsurrogate = "stopped:Stopped"\n')
+    (tmp_path / "stopped.toml").write_text(
+        'title = "t"\nsource = "s"\nsurrogate = "stopped:Stopped"\n'
+    )
     data = mor_bench.load_dataset("beam-tiny", LIMIT, cache=cache, workers=1)
     material = Material(data.scene, data.train, {"test": fits.TestSet.of(data.test)}, tmp_path)
     spec = load_method_spec(tmp_path / "stopped.toml")
@@ -231,7 +293,9 @@ def test_a_comparison_that_is_stopped_after_a_training_goes_on_after_it(
     assert not list(tmp_path.glob("*/fits/*/training/*"))
 
 
-def test_options_of_trainings_are_checked_and_planned(folder: Path, cache: Path, tmp_path: Path) -> None:
+def test_options_of_trainings_are_checked_and_planned(
+    folder: Path, cache: Path, tmp_path: Path
+) -> None:
     bad: list[tuple[dict[str, Any], str]] = [
         ({"seeds": 0}, "`seeds` must be an integer in"),
         ({"fit_seconds": -1.0}, "`fit_seconds` must be above 0 and below 1200"),
@@ -240,15 +304,37 @@ def test_options_of_trainings_are_checked_and_planned(folder: Path, cache: Path,
     ]
     for arguments, message in bad:
         with pytest.raises(InvalidInputError, match=message):
-            mor_bench.run(["beam-tiny"], ["linear-fem"], out=tmp_path / "out", cache=cache, **arguments)
+            mor_bench.run(
+                ["beam-tiny"], ["linear-fem"], out=tmp_path / "out", cache=cache, **arguments
+            )
     assert not list(tmp_path.iterdir())
-    one, three = (plan(["beam-tiny"], ["umesh"], cache=tmp_path / "cache", limit=LIMIT, fit_seconds=50.0, seeds=seeds) for seeds in (1, 3))
+    one, three = (
+        plan(
+            ["beam-tiny"],
+            ["umesh"],
+            cache=tmp_path / "cache",
+            limit=LIMIT,
+            fit_seconds=50.0,
+            seeds=seeds,
+        )
+        for seeds in (1, 3)
+    )
     assert [step.label for step in one.steps[1:]] == ["umesh [channels=16, steps=2]"]
     assert [step.label for step in three.steps[2:]] == ["umesh: other seeds"]
-    trees = plan(["beam-tiny"], ["pca-extra-trees", "pca-ridge"], cache=tmp_path / "cache", limit=LIMIT, seeds=3)
-    assert [step.label for step in trees.steps if "seeds" in step.label] == ["pca-extra-trees: other seeds"]
+    trees = plan(
+        ["beam-tiny"],
+        ["pca-extra-trees", "pca-ridge"],
+        cache=tmp_path / "cache",
+        limit=LIMIT,
+        seeds=3,
+    )
+    assert [step.label for step in trees.steps if "seeds" in step.label] == [
+        "pca-extra-trees: other seeds"
+    ]
     assert one.steps[1].seconds == 50.0
-    assert three.seconds - one.seconds == pytest.approx(100.0, abs=5.0)  # generation is estimated by solving
+    assert three.seconds - one.seconds == pytest.approx(
+        100.0, abs=5.0
+    )  # generation is estimated by solving
 
 
 def test_of_a_sealed_cache_only_the_folder_of_the_own_checkpoint_is_open(tmp_path: Path) -> None:
@@ -276,15 +362,28 @@ for path in (own.parent / "score.h5", own / ".." / "score.h5", own / "link", Pat
 
 def test_the_recall_of_flags_by_hand() -> None:
     usual = {"relative_l2": np.linspace(0.01, 0.2, 20), "flagged": np.arange(20) == 3}
-    far = {"relative_l2": np.array([0.3, 0.25, 0.1, inf, 0.195]), "flagged": np.array([True, False, True, True, True])}
+    far = {
+        "relative_l2": np.array([0.3, 0.25, 0.1, inf, 0.195]),
+        "flagged": np.array([True, False, True, True, True]),
+    }
     flags = flags_of({"test": far, "in-range": usual})
     assert flags is not None
     assert flags.usual_rel_l2 == pytest.approx(0.2)
     assert flags.of(far) == {"n_unusual": 3, "n_unusual_flagged": 2, "recall": 2 / 3}
     assert flags.as_dict(far)["false_alarms"] == 1 / 20
-    assert flags.as_dict(far)["test"] == {"n": 5, "n_flagged": 4, "n_unusual": 3, "n_unusual_flagged": 2, "recall": 2 / 3}
+    assert flags.as_dict(far)["test"] == {
+        "n": 5,
+        "n_flagged": 4,
+        "n_unusual": 3,
+        "n_unusual_flagged": 2,
+        "recall": 2 / 3,
+    }
     assert flags.of(usual)["recall"] is None
     assert flags_of({"test": far, "in-range": {"relative_l2": far["relative_l2"]}}) is None
     main_only = flags_of({"test": far})
     assert main_only is not None
-    assert (main_only.in_range, main_only.usual_rel_l2, main_only.of(far)["n_unusual"]) == ("test", inf, 0)
+    assert (main_only.in_range, main_only.usual_rel_l2, main_only.of(far)["n_unusual"]) == (
+        "test",
+        inf,
+        0,
+    )

@@ -42,7 +42,13 @@ def started(method: Surrogate, path: Path, samples: Snapshots) -> Surrogate:
 
 
 def error(method: Surrogate, samples: Snapshots) -> float:
-    norms = (np.linalg.norm(values, axis=(1, 2)) for values in (method.predict(samples.forces) - samples.displacements, samples.displacements))
+    norms = (
+        np.linalg.norm(values, axis=(1, 2))
+        for values in (
+            method.predict(samples.forces) - samples.displacements,
+            samples.displacements,
+        )
+    )
     return float(np.median(np.divide(*norms)))
 
 
@@ -57,15 +63,22 @@ def files(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
 
 @pytest.mark.filterwarnings("ignore:.* modes were asked for")
 @pytest.mark.parametrize("name", ["deeponet", "pod-deeponet"])
-def test_the_branch_is_turned_into_the_bases_of_other_samples(name: str, tiny: Dataset, tmp_path: Path) -> None:
+def test_the_branch_is_turned_into_the_bases_of_other_samples(
+    name: str, tiny: Dataset, tmp_path: Path
+) -> None:
     knobs = {"width": 32, "depth": 2, "n_functions": 64, "n_input_modes": 200}
-    first, others = make(name, **knobs, iterations=300).fit(tiny.scene, tiny.train[:48:2]), tiny.train[1:48:2]
+    first, others = (
+        make(name, **knobs, iterations=300).fit(tiny.scene, tiny.train[:48:2]),
+        tiny.train[1:48:2],
+    )
     first.save(tmp_path / "model.safetensors")
     second = make(name, **knobs, seed=3, learning_rate=1e-12)
     random = error(second.fit(tiny.scene, others), others)
     own = error(first, others)
     assert own < 0.8 * random
-    assert error(started(second, tmp_path / "model.safetensors", others), others) == pytest.approx(own, rel=0.02)
+    assert error(started(second, tmp_path / "model.safetensors", others), others) == pytest.approx(
+        own, rel=0.02
+    )
 
 
 def test_all_that_train_name_their_architecture() -> None:
@@ -78,25 +91,51 @@ def test_all_that_train_name_their_architecture() -> None:
 @pytest.mark.parametrize(
     ("name", "knob", "value"),
     [
-        ("mesh-graph-net", "width", 8), ("mesh-graph-net", "steps", 2), ("mesh-graph-net", "input", "linear-response"),
-        ("fno", "channels", 4), ("fno", "modes", 3), ("fno", "layers", 2), ("fno", "input", "linear-response"),
-        ("deeponet", "trunk", "pod"), ("deeponet", "depth", 3), ("pod-deeponet", "trunk", "network"), ("pod-deeponet", "n_functions", 4),
-        ("pod-nn", "input", "linear-response"), ("pod-nn", "n_hidden", 8),
-        ("umesh-small", "input", "linear-response"), ("umesh-small", "activation", "silu"), ("umesh-small", "zero_at_rest", True),
-        ("umesh-small", "normalisation", "max"), ("umesh-small", "steps", 2),
+        ("mesh-graph-net", "width", 8),
+        ("mesh-graph-net", "steps", 2),
+        ("mesh-graph-net", "input", "linear-response"),
+        ("fno", "channels", 4),
+        ("fno", "modes", 3),
+        ("fno", "layers", 2),
+        ("fno", "input", "linear-response"),
+        ("deeponet", "trunk", "pod"),
+        ("deeponet", "depth", 3),
+        ("pod-deeponet", "trunk", "network"),
+        ("pod-deeponet", "n_functions", 4),
+        ("pod-nn", "input", "linear-response"),
+        ("pod-nn", "n_hidden", 8),
+        ("umesh-small", "input", "linear-response"),
+        ("umesh-small", "activation", "silu"),
+        ("umesh-small", "zero_at_rest", True),
+        ("umesh-small", "normalisation", "max"),
+        ("umesh-small", "steps", 2),
     ],
-)  # fmt: skip
-def test_another_architecture_is_refused(name: str, knob: str, value: Any, files: dict[str, Path], tiny: Dataset) -> None:
+)
+def test_another_architecture_is_refused(
+    name: str, knob: str, value: Any, files: dict[str, Path], tiny: Dataset
+) -> None:
     saved = getattr(make(name), knob)
     with pytest.raises(InvalidInputError) as raised:
         started(make(name, **{knob: value}), files[name], tiny.train[:12])
-    assert str(raised.value) == f"{files[name]}: `start_from` must be a model with `{knob}` {value!r}; got one with `{knob}` {saved!r}."
+    assert (
+        str(raised.value)
+        == f"{files[name]}: `start_from` must be a model with `{knob}` {value!r}; got one with `{knob}` {saved!r}."
+    )
 
 
-def test_another_architecture_is_refused_before_anything_runs(files: dict[str, Path], tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match=r"`activation` 'silu'.*; got one with .*`activation` 'relu'"):
+def test_another_architecture_is_refused_before_anything_runs(
+    files: dict[str, Path], tmp_path: Path
+) -> None:
+    with pytest.raises(
+        InvalidInputError, match=r"`activation` 'silu'.*; got one with .*`activation` 'relu'"
+    ):
         mor_bench.fit(
-            "beam-tiny", "umesh-linear", {"channels": 2, "steps": 1}, out=tmp_path / "a", start_from=files["umesh-small"], cache=tmp_path / "cache"
+            "beam-tiny",
+            "umesh-linear",
+            {"channels": 2, "steps": 1},
+            out=tmp_path / "a",
+            start_from=files["umesh-small"],
+            cache=tmp_path / "cache",
         )
     assert not any(tmp_path.iterdir())
 
@@ -107,7 +146,9 @@ def test_training_knobs_may_differ(files: dict[str, Path], tiny: Dataset) -> Non
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_on_another_mesh_weights_are_taken_where_they_have_the_same_meaning(name: str, files: dict[str, Path], tiny: Dataset, tmp_path: Path) -> None:
+def test_on_another_mesh_weights_are_taken_where_they_have_the_same_meaning(
+    name: str, files: dict[str, Path], tiny: Dataset, tmp_path: Path
+) -> None:
     mesh = box_mesh((2.0, 1.0, 1.0), (3, 1, 1))
     scene = replace(tiny.scene, mesh=mesh, fixed_nodes=np.flatnonzero(mesh.points[:, 0] == 0))
     displacements = np.random.default_rng(0).normal(size=(8, len(scene.free_dofs)))
@@ -120,26 +161,43 @@ def test_on_another_mesh_weights_are_taken_where_they_have_the_same_meaning(name
     if name == "fno":  # of a grid that has more wave numbers
         knobs, path = {"modes": 4}, tmp_path / "fno.safetensors"
         make(name, **knobs).fit(tiny.scene, tiny.train[:12]).save(path)
-    with pytest.raises(InvalidInputError, match=r"to start from it here, `\S+` must be of shape \(.*\); got \("):
+    with pytest.raises(
+        InvalidInputError, match=r"to start from it here, `\S+` must be of shape \(.*\); got \("
+    ):
         started(make(name, **knobs), path, samples)
 
 
 def weight_of(name: str) -> str:
     return {
-        "pod-nn": "network.second", "fno": "network.lift.weight", "mesh-graph-net": "network.decoder.0.weight", "umesh-small": "network.head.weight"
-    }.get(name, "network.branch.2.weight")  # fmt: skip
+        "pod-nn": "network.second",
+        "fno": "network.lift.weight",
+        "mesh-graph-net": "network.decoder.0.weight",
+        "umesh-small": "network.head.weight",
+    }.get(name, "network.branch.2.weight")
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_weights_that_are_not_whole_are_refused(name: str, files: dict[str, Path], tiny: Dataset, tmp_path: Path) -> None:
+def test_weights_that_are_not_whole_are_refused(
+    name: str, files: dict[str, Path], tiny: Dataset, tmp_path: Path
+) -> None:
     method, path = mor_bench.load_surrogate(files[name]), tmp_path / "forged.safetensors"
     whole = method._state()
     forgeries: list[tuple[dict[str, Any], str]] = [({}, "it is missing")]
-    arrays = [weight_of(name), *{"pod-nn": ["axes", "modes"], "deeponet": ["constant.axes"], "pod-deeponet": ["constant.modes"]}.get(name, [])]
+    arrays = [
+        weight_of(name),
+        *{
+            "pod-nn": ["axes", "modes"],
+            "deeponet": ["constant.axes"],
+            "pod-deeponet": ["constant.modes"],
+        }.get(name, []),
+    ]
     for key in arrays:
         array = whole[key]
         forgeries += [
-            ({item: value for item, value in whole.items() if item != key}, f"`{key}` must be float.*; it is missing"),
+            (
+                {item: value for item, value in whole.items() if item != key},
+                f"`{key}` must be float.*; it is missing",
+            ),
             ({**whole, key: array.astype(np.uint8)}, f"`{key}` must be float.*; got uint8"),
             ({**whole, key: array > 0}, f"`{key}` must be float.*; got bool"),
             ({**whole, key: np.full_like(array, np.nan)}, f"`{key}` holds NaN or infinity"),
@@ -147,7 +205,9 @@ def test_weights_that_are_not_whole_are_refused(name: str, files: dict[str, Path
             ({**whole, key: array[:0]}, f"`{key}` must be of shape"),
         ]
     if "scales" in whole and name != "umesh-small":
-        forgeries += [({**whole, "scales": np.array([1.0, 0.0])}, "`scales` must be greater than 0")]
+        forgeries += [
+            ({**whole, "scales": np.array([1.0, 0.0])}, "`scales` must be greater than 0")
+        ]
     for state, message in forgeries:
         method._state = lambda state=state: state  # type: ignore[method-assign,misc]
         method.save(path)
@@ -158,10 +218,21 @@ def test_weights_that_are_not_whole_are_refused(name: str, files: dict[str, Path
 
 
 @pytest.mark.parametrize("knobs", ["nothing", "[1]", "{", '{"width": 0}', '{"depths": 3}'])
-def test_forged_knobs_are_refused(knobs: str, files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    method, path = mor_bench.load_surrogate(files["mesh-graph-net"]), tmp_path / "forged.safetensors"
+def test_forged_knobs_are_refused(
+    knobs: str, files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method, path = (
+        mor_bench.load_surrogate(files["mesh-graph-net"]),
+        tmp_path / "forged.safetensors",
+    )
     with monkeypatch.context() as patch:
-        patch.setattr(json, "dumps", lambda value, dumps=json.dumps, **keywords: knobs if value == method.parameters else dumps(value, **keywords))
+        patch.setattr(
+            json,
+            "dumps",
+            lambda value, dumps=json.dumps, **keywords: (
+                knobs if value == method.parameters else dumps(value, **keywords)
+            ),
+        )
         method.save(path)
     with pytest.raises(StoreError, match="its knobs are not those of a MeshGraphNet") as raised:
         weights_to_start_from(path, make("mesh-graph-net"))

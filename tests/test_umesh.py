@@ -31,8 +31,14 @@ from mor_bench.surrogates.umesh.grid import padded_grid  # noqa: E402
 from mor_bench.surrogates.umesh.network import DoubleConvolution, UNet, new_network  # noqa: E402
 
 SMALL = {
-    "channels": 8, "steps": 1, "iterations": 400, "batch_size": 16, "learning_rate": 3e-3, "schedule": "one-cycle", "second_moment_decay": 0.99,
-}  # fmt: skip
+    "channels": 8,
+    "steps": 1,
+    "iterations": 400,
+    "batch_size": 16,
+    "learning_rate": 3e-3,
+    "schedule": "one-cycle",
+    "second_moment_decay": 0.99,
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -64,11 +70,21 @@ def test_number_of_parameters(channels: int, steps: int) -> None:
     def convolution(c_in: int, c_out: int, size: int) -> int:
         return c_out * (c_in * size**3 + 1)
 
-    expected = convolution(3, channels, 3) + convolution(channels, channels, 3) + convolution(channels, 3, 1)
+    expected = (
+        convolution(3, channels, 3)
+        + convolution(channels, channels, 3)
+        + convolution(channels, 3, 1)
+    )
     for level in range(steps):
         here, below = channels * 2**level, channels * 2 ** (level + 1)
-        expected += convolution(here, below, 3) + convolution(below, below, 3)  # encoder below, or the bottom
-        expected += convolution(below, here, 2) + convolution(2 * here, here, 3) + convolution(here, here, 3)
+        expected += convolution(here, below, 3) + convolution(
+            below, below, 3
+        )  # encoder below, or the bottom
+        expected += (
+            convolution(below, here, 2)
+            + convolution(2 * here, here, 3)
+            + convolution(here, here, 3)
+        )
     with torch.device("meta"):
         network = UNet(channels, steps)
     assert sum(p.numel() for p in network.parameters()) == expected
@@ -92,7 +108,9 @@ def test_grid_round_trip_and_padding() -> None:
     values = grid.to_grid(nodal)
     assert values.is_contiguous(memory_format=torch.channels_last_3d)
     torch.testing.assert_close(grid.to_nodes(values), nodal, rtol=0, atol=0)
-    torch.testing.assert_close(values[:, :, :7, :3, :3], nodal.view(5, 7, 3, 3, 3).permute(0, 4, 1, 2, 3), rtol=0, atol=0)
+    torch.testing.assert_close(
+        values[:, :, :7, :3, :3], nodal.view(5, 7, 3, 3, 3).permute(0, 4, 1, 2, 3), rtol=0, atol=0
+    )
     assert int((values != 0).sum()) == nodal.numel()
 
 
@@ -107,14 +125,22 @@ def test_grid_of_a_part_of_a_box() -> None:
     values = grid.to_grid(full[:, kept])
     body = grid.to_grid(torch.ones(1, 40, 3))
     assert int(body.sum()) == 3 * 40
-    torch.testing.assert_close(values, padded_grid(grid_map(whole), 1).to_grid(full) * body, rtol=0, atol=0)
+    torch.testing.assert_close(
+        values, padded_grid(grid_map(whole), 1).to_grid(full) * body, rtol=0, atol=0
+    )
     torch.testing.assert_close(grid.to_nodes(values), full[:, kept], rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("regular", [True, False])
-def test_gradients_at_the_nodes_go_to_the_grid_points_around_them_and_none_to_padding(regular: bool) -> None:
+def test_gradients_at_the_nodes_go_to_the_grid_points_around_them_and_none_to_padding(
+    regular: bool,
+) -> None:
     """The product rule written out with the dense matrix N, and torch's own numerical gradients."""
-    mesh = box_mesh((2.0, 1.0, 1.0), (6, 2, 2)) if regular else irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
+    mesh = (
+        box_mesh((2.0, 1.0, 1.0), (6, 2, 2))
+        if regular
+        else irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
+    )
     grid = padded_grid(grid_map(mesh), 2)
     assert (grid.places is not None) == regular
     matrix = torch.from_numpy(grid.grid.weights.toarray())
@@ -136,15 +162,30 @@ def test_the_loss_is_the_mean_square_over_the_components_of_all_nodes(
 ) -> None:
     """Before the first step, on one batch of all samples; values of the network at padding do not enter."""
     samples = data.train[:20] if regular else irregular[0][:20]
-    method = mor_bench.load_method("umesh", **{**SMALL, "iterations": 1, "batch_size": 20, "loss": loss}).fit(samples.scene, samples)
-    grid, network = padded_grid(grid_map(samples.scene.mesh), 1), new_network(8, 1, torch.Generator().manual_seed(0))
+    method = mor_bench.load_method(
+        "umesh", **{**SMALL, "iterations": 1, "batch_size": 20, "loss": loss}
+    ).fit(samples.scene, samples)
+    grid, network = (
+        padded_grid(grid_map(samples.scene.mesh), 1),
+        new_network(8, 1, torch.Generator().manual_seed(0)),
+    )
     with torch.inference_mode():
-        inputs = grid.to_grid(torch.from_numpy((samples.forces / rms(samples.forces)).astype(np.float32)))
+        inputs = grid.to_grid(
+            torch.from_numpy((samples.forces / rms(samples.forces)).astype(np.float32))
+        )
         flat = network(inputs).permute(0, 2, 3, 4, 1).reshape(20, -1, 3).numpy()
     targets = samples.displacements / rms(samples.displacements)
-    errors = np.square(np.einsum("ng,sgc->snc", grid.grid.weights.toarray(), flat) - targets).mean(axis=(1, 2))
-    weights = np.ones(20) if loss == "absolute" else 1 / np.maximum(np.square(targets).mean(axis=(1, 2)), 0.1**2)
-    assert method.loss_curve_[0] == pytest.approx((weights / weights.mean() * errors).mean(), rel=1e-5)  # type: ignore[attr-defined]
+    errors = np.square(np.einsum("ng,sgc->snc", grid.grid.weights.toarray(), flat) - targets).mean(
+        axis=(1, 2)
+    )
+    weights = (
+        np.ones(20)
+        if loss == "absolute"
+        else 1 / np.maximum(np.square(targets).mean(axis=(1, 2)), 0.1**2)
+    )
+    assert method.loss_curve_[0] == pytest.approx(
+        (weights / weights.mean() * errors).mean(), rel=1e-5
+    )  # type: ignore[attr-defined]
 
 
 def rms(values: np.ndarray) -> float:
@@ -153,9 +194,15 @@ def rms(values: np.ndarray) -> float:
 
 def test_normalisation_divides_by_what_it_says(data: Dataset) -> None:
     forces, displacements = data.train.forces, data.train.displacements
-    expected = {"rms": (rms(forces), rms(displacements)), "max": (np.abs(forces).max(), np.abs(displacements).max()), "none": (1.0, 1.0)}
+    expected = {
+        "rms": (rms(forces), rms(displacements)),
+        "max": (np.abs(forces).max(), np.abs(displacements).max()),
+        "none": (1.0, 1.0),
+    }
     for normalisation, scales in expected.items():
-        method: Any = mor_bench.load_method("umesh", channels=2, steps=1, iterations=1, normalisation=normalisation).fit(data.scene, data.train)
+        method: Any = mor_bench.load_method(
+            "umesh", channels=2, steps=1, iterations=1, normalisation=normalisation
+        ).fit(data.scene, data.train)
         assert (method.input_scale_, method.output_scale_) == pytest.approx(scales)
 
 
@@ -170,7 +217,9 @@ def test_one_cycle_rises_falls_and_stays_in_range() -> None:
 
 def test_training_beats_predicting_zero(fitted: Surrogate, data: Dataset) -> None:
     error = mean_dof_error(fitted.predict(data.test.forces), data.test.displacements)
-    assert error < 0.4 * mean_dof_error(np.zeros_like(data.test.displacements), data.test.displacements)
+    assert error < 0.4 * mean_dof_error(
+        np.zeros_like(data.test.displacements), data.test.displacements
+    )
 
 
 def test_loss_curve_falls(fitted: Surrogate) -> None:
@@ -179,14 +228,19 @@ def test_loss_curve_falls(fitted: Surrogate) -> None:
     assert curve[-1] < 0.1 * curve[0]
 
 
-def test_a_second_fit_is_bit_identical_and_leaves_global_random_state_alone(fitted: Surrogate, data: Dataset) -> None:
+def test_a_second_fit_is_bit_identical_and_leaves_global_random_state_alone(
+    fitted: Surrogate, data: Dataset
+) -> None:
     before = torch.get_rng_state()
     numpy_before = np.random.get_state()[1].copy()  # type: ignore[index]  # noqa: NPY002 - the global state is the subject
     threads, deterministic = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     again = mor_bench.load_method("umesh", **SMALL).fit(data.scene, data.train)
     assert torch.equal(torch.get_rng_state(), before)
     np.testing.assert_array_equal(np.random.get_state()[1], numpy_before)  # type: ignore[index]  # noqa: NPY002
-    assert (torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()) == (threads, deterministic)
+    assert (torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()) == (
+        threads,
+        deterministic,
+    )
     first, second = fitted._state(), again._state()
     assert first.keys() == second.keys()
     for name, array in first.items():
@@ -194,15 +248,24 @@ def test_a_second_fit_is_bit_identical_and_leaves_global_random_state_alone(fitt
 
 
 def test_another_seed_gives_another_network(data: Dataset) -> None:
-    one, two = (mor_bench.load_method("umesh", **{**SMALL, "iterations": 2, "seed": seed}).fit(data.scene, data.train) for seed in (0, 1))
+    one, two = (
+        mor_bench.load_method("umesh", **{**SMALL, "iterations": 2, "seed": seed}).fit(
+            data.scene, data.train
+        )
+        for seed in (0, 1)
+    )
     assert not np.array_equal(one.predict(data.test.forces[0]), two.predict(data.test.forces[0]))
 
 
-def test_saved_and_loaded_is_the_same_model(fitted: Surrogate, data: Dataset, tmp_path: Path) -> None:
+def test_saved_and_loaded_is_the_same_model(
+    fitted: Surrogate, data: Dataset, tmp_path: Path
+) -> None:
     path = tmp_path / "umesh.safetensors"
     fitted.save(path)
     loaded = mor_bench.load_surrogate(path)
-    np.testing.assert_array_equal(loaded.predict(data.test.forces), fitted.predict(data.test.forces))
+    np.testing.assert_array_equal(
+        loaded.predict(data.test.forces), fitted.predict(data.test.forces)
+    )
     assert loaded.parameters == fitted.parameters
     np.testing.assert_array_equal(loaded.loss_curve_, fitted.loss_curve_)  # type: ignore[attr-defined]
 
@@ -236,7 +299,9 @@ def test_a_batch_larger_than_the_data_is_cut(data: Dataset) -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_forces_that_are_not_finite_are_refused(fitted: Surrogate, data: Dataset, bad: float) -> None:
+def test_forces_that_are_not_finite_are_refused(
+    fitted: Surrogate, data: Dataset, bad: float
+) -> None:
     force = data.test.forces[0].copy()
     force[5, 2] = bad
     with pytest.raises(InvalidInputError, match="finite"):
@@ -257,8 +322,14 @@ def irregular() -> tuple[Snapshots, Snapshots]:
     mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
     scene = replace(scene, mesh=mesh, fixed_nodes=np.flatnonzero(mesh.points[:, 0] == 0))
     loads = draw_loads(scene, 0, 140)
-    displacements = mor_bench.load_method("fem").fit(scene, None).predict(loads.nodal_forces(scene.patch_weights))
-    samples = Snapshots(scene, loads, displacements.reshape(140, -1)[:, scene.free_dofs], np.ones(140))
+    displacements = (
+        mor_bench.load_method("fem")
+        .fit(scene, None)
+        .predict(loads.nodal_forces(scene.patch_weights))
+    )
+    samples = Snapshots(
+        scene, loads, displacements.reshape(140, -1)[:, scene.free_dofs], np.ones(140)
+    )
     return samples[:100], samples[100:]
 
 
@@ -267,21 +338,32 @@ def fitted_irregular(irregular: tuple[Snapshots, Snapshots]) -> Surrogate:
     return mor_bench.load_method("umesh", **SMALL).fit(irregular[0].scene, irregular[0])
 
 
-def test_a_mesh_without_a_grid_is_learned(fitted_irregular: Surrogate, irregular: tuple[Snapshots, Snapshots]) -> None:
+def test_a_mesh_without_a_grid_is_learned(
+    fitted_irregular: Surrogate, irregular: tuple[Snapshots, Snapshots]
+) -> None:
     test = irregular[1]
     assert test.scene.mesh.grid_index is None
     assert fitted_irregular.grid_.places is None  # type: ignore[attr-defined]
     answer = fitted_irregular.predict(test.forces)
-    assert mean_dof_error(answer, test.displacements) < 0.4 * mean_dof_error(np.zeros_like(answer), test.displacements)
+    assert mean_dof_error(answer, test.displacements) < 0.4 * mean_dof_error(
+        np.zeros_like(answer), test.displacements
+    )
     assert (answer[:, test.scene.fixed_nodes] == 0).all()
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_a_second_fit_without_a_grid_is_bit_identical(irregular: tuple[Snapshots, Snapshots], threads: int) -> None:
+def test_a_second_fit_without_a_grid_is_bit_identical(
+    irregular: tuple[Snapshots, Snapshots], threads: int
+) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        first, second = (mor_bench.load_method("umesh", **{**SMALL, "iterations": 4}).fit(irregular[0].scene, irregular[0]) for _ in range(2))
+        first, second = (
+            mor_bench.load_method("umesh", **{**SMALL, "iterations": 4}).fit(
+                irregular[0].scene, irregular[0]
+            )
+            for _ in range(2)
+        )
     finally:
         torch.set_num_threads(before)
     for name, array in first._state().items():
@@ -289,15 +371,28 @@ def test_a_second_fit_without_a_grid_is_bit_identical(irregular: tuple[Snapshots
 
 
 def test_saved_and_loaded_without_a_grid_is_the_same_model(
-    fitted_irregular: Surrogate, irregular: tuple[Snapshots, Snapshots], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
+    fitted_irregular: Surrogate,
+    irregular: tuple[Snapshots, Snapshots],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     path, test = tmp_path / "umesh.safetensors", irregular[1]
     fitted_irregular.save(path)
-    monkeypatch.setattr("mor_bench.surrogate.load_scene", lambda _: test.scene)  # the file holds the spec, which names a box
-    np.testing.assert_array_equal(mor_bench.load_surrogate(path).predict(test.forces), fitted_irregular.predict(test.forces))
+    monkeypatch.setattr(
+        "mor_bench.surrogate.load_scene", lambda _: test.scene
+    )  # the file holds the spec, which names a box
+    np.testing.assert_array_equal(
+        mor_bench.load_surrogate(path).predict(test.forces), fitted_irregular.predict(test.forces)
+    )
 
 
-IMPROVED = {**SMALL, "input": "linear-response", "activation": "silu", "zero_at_rest": True, "mirrored": True}
+IMPROVED = {
+    **SMALL,
+    "input": "linear-response",
+    "activation": "silu",
+    "zero_at_rest": True,
+    "mirrored": True,
+}
 
 
 @pytest.fixture(scope="module")
@@ -305,14 +400,21 @@ def improved(data: Dataset) -> Surrogate:
     return mor_bench.load_method("umesh", **IMPROVED).fit(data.scene, data.train)
 
 
-def test_the_linear_response_brings_most(improved: Surrogate, fitted: Surrogate, data: Dataset) -> None:
+def test_the_linear_response_brings_most(
+    improved: Surrogate, fitted: Surrogate, data: Dataset
+) -> None:
     linear = mor_bench.load_method("linear-fem").fit(data.scene, None)
-    errors = [mean_dof_error(method.predict(data.test.forces), data.test.displacements) for method in (improved, linear, fitted)]
+    errors = [
+        mean_dof_error(method.predict(data.test.forces), data.test.displacements)
+        for method in (improved, linear, fitted)
+    ]
     assert errors[0] < 0.8 * errors[1]
     assert errors[0] < 0.2 * errors[2]
 
 
-def test_no_force_gives_exactly_no_displacement(improved: Surrogate, fitted: Surrogate, data: Dataset) -> None:
+def test_no_force_gives_exactly_no_displacement(
+    improved: Surrogate, fitted: Surrogate, data: Dataset
+) -> None:
     nothing = np.zeros((3, data.scene.mesh.n_nodes, 3))
     assert not improved.predict(nothing).any()
     assert fitted.predict(nothing).any(), "the paper's network has biases"
@@ -321,10 +423,14 @@ def test_no_force_gives_exactly_no_displacement(improved: Surrogate, fitted: Sur
     assert np.abs(improved.predict(little) - linear).max() < 1e-4 * improved.output_scale_  # type: ignore[attr-defined]
 
 
-def test_saved_and_loaded_improved_is_the_same_model(improved: Surrogate, data: Dataset, tmp_path: Path) -> None:
+def test_saved_and_loaded_improved_is_the_same_model(
+    improved: Surrogate, data: Dataset, tmp_path: Path
+) -> None:
     improved.save(tmp_path / "umesh.safetensors")
     loaded = mor_bench.load_surrogate(tmp_path / "umesh.safetensors")
-    np.testing.assert_array_equal(loaded.predict(data.test.forces[:5]), improved.predict(data.test.forces[:5]))
+    np.testing.assert_array_equal(
+        loaded.predict(data.test.forces[:5]), improved.predict(data.test.forces[:5])
+    )
 
 
 def test_mirror_planes_are_those_of_mesh_supports_and_loads(data: Dataset) -> None:
@@ -336,7 +442,9 @@ def test_mirror_planes_are_those_of_mesh_supports_and_loads(data: Dataset) -> No
     force = data.test.forces[0]
     expected = mirror(fem.predict(force))
     assert np.abs(expected - fem.predict(force)).max() > 1e-3 * np.abs(expected).max()
-    np.testing.assert_allclose(fem.predict(mirror(force)), expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        fem.predict(mirror(force)), expected, rtol=0, atol=1e-8 * np.abs(expected).max()
+    )
     assert mirrors(load_scene("liver-hex")) == []
 
 
@@ -349,12 +457,18 @@ def test_mirror_images_are_learned_from_one_half(data: Dataset) -> None:
     assert len(half) > 50
     errors = {}
     for mirrored in (True, False):
-        method = mor_bench.load_method("umesh", **{**SMALL, "mirrored": mirrored}).fit(data.scene, half)
-        errors[mirrored] = mean_dof_error(method.predict(mirror(half.forces)), mirror(half.displacements))
+        method = mor_bench.load_method("umesh", **{**SMALL, "mirrored": mirrored}).fit(
+            data.scene, half
+        )
+        errors[mirrored] = mean_dof_error(
+            method.predict(mirror(half.forces)), mirror(half.displacements)
+        )
     assert errors[True] < 0.6 * errors[False]
 
 
-def test_a_training_that_was_stopped_resumes_to_the_same_bits(data: Dataset, improved: Surrogate, tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_training_that_was_stopped_resumes_to_the_same_bits(
+    data: Dataset, improved: Surrogate, tmp_path: Path, monkeypatch: Any
+) -> None:
     monkeypatch.setattr(training, "CHECKPOINT_EVERY_S", 0.0)
     method = mor_bench.load_method("umesh", **IMPROVED)
     done: list[int] = []
@@ -376,14 +490,20 @@ def test_a_training_that_was_stopped_resumes_to_the_same_bits(data: Dataset, imp
         np.testing.assert_array_equal(array, method._state()[name], err_msg=name)
 
 
-def test_transfer_starts_from_a_network_of_another_scene(improved: Surrogate, irregular: tuple[Snapshots, Snapshots], tmp_path: Path) -> None:
+def test_transfer_starts_from_a_network_of_another_scene(
+    improved: Surrogate, irregular: tuple[Snapshots, Snapshots], tmp_path: Path
+) -> None:
     path, (train, test) = tmp_path / "umesh.safetensors", irregular
     improved.save(path)
     errors = []
     for start in (None, path):
-        method = mor_bench.load_method("umesh", **{**IMPROVED, "iterations": 20, "learning_rate": 1e-4})
+        method = mor_bench.load_method(
+            "umesh", **{**IMPROVED, "iterations": 20, "learning_rate": 1e-4}
+        )
         method.training = TrainingOptions(start_from=start)
-        errors.append(mean_dof_error(method.fit(train.scene, train).predict(test.forces), test.displacements))
+        errors.append(
+            mean_dof_error(method.fit(train.scene, train).predict(test.forces), test.displacements)
+        )
     assert errors[1] < 0.7 * errors[0]
     wrong = mor_bench.load_method("umesh", **{**IMPROVED, "channels": 4})
     wrong.training = TrainingOptions(start_from=path)
@@ -392,7 +512,9 @@ def test_transfer_starts_from_a_network_of_another_scene(improved: Surrogate, ir
 
 
 @pytest.mark.parametrize("shape", [(2, 1, 1), (2, 2, 4), (4, 2, 2)])
-def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding(shape: tuple[int, int, int]) -> None:
+def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding(
+    shape: tuple[int, int, int],
+) -> None:
     generator = torch.Generator().manual_seed(0)
     block = DoubleConvolution(3, 16, "relu")
     for parameter in block.parameters():
@@ -403,19 +525,35 @@ def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding(shape: tupl
         block.zero_grad()
         with torch.autocast("cpu", torch.bfloat16, enabled=not precise):
             block(x).float().square().mean().backward()
-        found.append(torch.cat([parameter.grad.ravel() for parameter in block.parameters() if parameter.grad is not None]))
+        found.append(
+            torch.cat(
+                [
+                    parameter.grad.ravel()
+                    for parameter in block.parameters()
+                    if parameter.grad is not None
+                ]
+            )
+        )
     assert torch.equal(found[1], found[2])
     assert (found[1] - found[0]).norm() < 0.02 * found[0].norm()
 
 
 def test_losses_are_not_rounded_with_the_products(data: Dataset) -> None:
-    knobs = {**SMALL, "iterations": 3, "batch_size": 64, "precision": "bfloat16", "validation_fraction": 0.2}
+    knobs = {
+        **SMALL,
+        "iterations": 3,
+        "batch_size": 64,
+        "precision": "bfloat16",
+        "validation_fraction": 0.2,
+    }
     curve: Any = mor_bench.load_method("umesh", **knobs).fit(data.scene, data.train)
     losses = torch.from_numpy(curve.validation_curve_)
     assert (losses.bfloat16().double() != losses).all()
 
 
-def test_weights_to_start_from_that_are_not_finite_are_refused(fitted: Surrogate, data: Dataset, tmp_path: Path) -> None:
+def test_weights_to_start_from_that_are_not_finite_are_refused(
+    fitted: Surrogate, data: Dataset, tmp_path: Path
+) -> None:
     other: Any = copy.deepcopy(fitted)
     with torch.no_grad():
         other.network_.head.bias[1] = float("nan")
@@ -426,7 +564,10 @@ def test_weights_to_start_from_that_are_not_finite_are_refused(fitted: Surrogate
         method.fit(data.scene, data.train)
 
 
-@pytest.mark.parametrize(("knob", "value"), [("channels", 0), ("steps", 0), ("schedule", "step"), ("learning_rate", 0.0), ("seed", -1)])
+@pytest.mark.parametrize(
+    ("knob", "value"),
+    [("channels", 0), ("steps", 0), ("schedule", "step"), ("learning_rate", 0.0), ("seed", -1)],
+)
 def test_knobs_out_of_range(knob: str, value: object) -> None:
     with pytest.raises(SpecError, match=knob):
         mor_bench.load_method("umesh", **{knob: value})
@@ -458,12 +599,16 @@ def test_the_network_is_the_papers_with_its_skips() -> None:
         y = functional.max_pool3d(y, 2)
     y = double(y)
     for weight, bias in ups:
-        y = double(torch.cat([skips.pop(), functional.conv_transpose3d(y, weight, bias, stride=2)], dim=1))
+        y = double(
+            torch.cat([skips.pop(), functional.conv_transpose3d(y, weight, bias, stride=2)], dim=1)
+        )
     with torch.inference_mode():
         torch.testing.assert_close(network(x), functional.conv3d(y, *head), rtol=1e-5, atol=1e-5)
 
 
-def test_displacements_on_the_grid_are_means_of_the_nodes_around(irregular: tuple[Snapshots, Snapshots]) -> None:
+def test_displacements_on_the_grid_are_means_of_the_nodes_around(
+    irregular: tuple[Snapshots, Snapshots],
+) -> None:
     """A constant field stays constant wherever there is body, and is zero beside it; a linear one keeps its values at nodes on points."""
     grid = padded_grid(grid_map(irregular[0].scene.mesh), 1)
     assert grid.places is None
@@ -471,7 +616,11 @@ def test_displacements_on_the_grid_are_means_of_the_nodes_around(irregular: tupl
     values = grid.displacements_to_grid(torch.ones(2, n_nodes, 3))
     body = torch.from_numpy((grid.grid.weights.sum(axis=0) > 1e-2).reshape(grid.shape))
     torch.testing.assert_close(values[:, :, body], torch.ones(2, 3, int(body.sum())))
-    assert not values[:, :, torch.from_numpy((grid.grid.weights.sum(axis=0) == 0).reshape(grid.shape))].any()
+    assert not values[
+        :, :, torch.from_numpy((grid.grid.weights.sum(axis=0) == 0).reshape(grid.shape))
+    ].any()
     regular = padded_grid(grid_map(box_mesh((2.0, 1.0, 1.0), (6, 2, 2))), 1)
     nodal = torch.randn(1, 63, 3, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(regular.displacements_to_grid(nodal), regular.to_grid(nodal), rtol=0, atol=0)
+    torch.testing.assert_close(
+        regular.displacements_to_grid(nodal), regular.to_grid(nodal), rtol=0, atol=0
+    )

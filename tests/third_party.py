@@ -75,7 +75,10 @@ class Recorder(mor_bench.Surrogate):
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Recorder:
         with self._fitting(scene):
             assert snapshots is not None
-            content = {"regions": snapshots.regions.tolist(), "vectors": snapshots.loads.vectors.tolist()}
+            content = {
+                "regions": snapshots.regions.tolist(),
+                "vectors": snapshots.loads.vectors.tolist(),
+            }
             Path(self.notes).write_text(json.dumps(content))
             if self.spoil == "train":
                 snapshots.free_displacements[:] *= 0.5
@@ -188,8 +191,15 @@ class Peeker(Zero):
 
     def _in_memory(self, snapshots: Snapshots | None) -> list[str]:
         found = ["dataset" for item in gc.get_objects() if isinstance(item, Dataset)]
-        found += ["snapshots" for item in gc.get_objects() if isinstance(item, Snapshots) and item is not snapshots]
-        if snapshots is not None and getattr(snapshots.free_displacements, "base", None) is not None:
+        found += [
+            "snapshots"
+            for item in gc.get_objects()
+            if isinstance(item, Snapshots) and item is not snapshots
+        ]
+        if (
+            snapshots is not None
+            and getattr(snapshots.free_displacements, "base", None) is not None
+        ):
             base = snapshots.free_displacements.base
             found += ["base"] if isinstance(base, np.ndarray) and len(base) > len(snapshots) else []
         frame = sys._getframe()
@@ -222,7 +232,9 @@ class Peeker(Zero):
         return found
 
     def _program(self, folder: Path) -> list[str]:
-        return subprocess.run(["ls", "-R", str(folder)], capture_output=True, text=True, check=True).stdout.split()
+        return subprocess.run(
+            ["ls", "-R", str(folder)], capture_output=True, text=True, check=True
+        ).stdout.split()
 
     def _load(self, folder: Path) -> list[str]:
         data = mor_bench.load_dataset(self.dataset, cache=folder, workers=1)
@@ -231,7 +243,11 @@ class Peeker(Zero):
 
 def _known(folder: Path) -> list[str]:
     """Names that someone who knows this package can guess, without listing the folder."""
-    return [line for line in os.environ.get("MOR_BENCH_TEST_SHARDS", "").split(os.pathsep) if line.startswith(str(folder))]
+    return [
+        line
+        for line in os.environ.get("MOR_BENCH_TEST_SHARDS", "").split(os.pathsep)
+        if line.startswith(str(folder))
+    ]
 
 
 class Descent(mor_bench.Surrogate):
@@ -243,7 +259,14 @@ class Descent(mor_bench.Surrogate):
     EACH = 10
     """Iterations per point of the loss curve, and between two checkpoints."""
 
-    def __init__(self, iterations: Annotated[int, Field(ge=1)] = 40, seed: int = 0, channels: int = 1, steps: int = 1, fails: int = -1) -> None:
+    def __init__(
+        self,
+        iterations: Annotated[int, Field(ge=1)] = 40,
+        seed: int = 0,
+        channels: int = 1,
+        steps: int = 1,
+        fails: int = -1,
+    ) -> None:
         self.iterations = iterations
         self.seed = seed
         self.channels = channels
@@ -255,11 +278,23 @@ class Descent(mor_bench.Surrogate):
             samples = self._checked_snapshots(snapshots)
             if self.seed == self.fails:
                 raise OutOfTimeError("all iterations would take 7 h; the limit is 9 s.")
-            if self.time_limit_s is not None and self.channels * self.steps * 60 > self.time_limit_s:
-                raise OutOfTimeError(f"all iterations would take {self.channels * self.steps / 60:.3g} h; the limit is {self.time_limit_s:.0f} s.")
-            forces, displacements = samples.forces.sum(axis=1), samples.displacements.reshape(len(samples), -1)
+            if (
+                self.time_limit_s is not None
+                and self.channels * self.steps * 60 > self.time_limit_s
+            ):
+                raise OutOfTimeError(
+                    f"all iterations would take {self.channels * self.steps / 60:.3g} h; the limit is {self.time_limit_s:.0f} s."
+                )
+            forces, displacements = (
+                samples.forces.sum(axis=1),
+                samples.displacements.reshape(len(samples), -1),
+            )
             generator = np.random.default_rng(self.seed)
-            weights, losses, first = 1e-3 * generator.normal(size=(forces.shape[1], displacements.shape[1])), np.zeros(0), 0
+            weights, losses, first = (
+                1e-3 * generator.normal(size=(forces.shape[1], displacements.shape[1])),
+                np.zeros(0),
+                0,
+            )
             seconds, checkpoint = self.training.fit_seconds, self.training.checkpoint
             iterations = self.iterations if seconds is None else int(100 * seconds)
             if checkpoint is not None and checkpoint.exists():
@@ -267,7 +302,12 @@ class Descent(mor_bench.Surrogate):
                     kept = load_file(checkpoint)
                 except SafetensorError as error:
                     raise StoreError(f"{checkpoint}: {error}") from None
-                weights, losses, first, iterations = kept["weights"], kept["losses"], int(kept["numbers"][0]), int(kept["numbers"][1])
+                weights, losses, first, iterations = (
+                    kept["weights"],
+                    kept["losses"],
+                    int(kept["numbers"][0]),
+                    int(kept["numbers"][1]),
+                )
                 warnings.warn(f"goes on from iteration {first} of {iterations}", stacklevel=2)
             rate = 0.5 / np.linalg.norm(forces, 2) ** 2
             for iteration in range(first, iterations):
@@ -278,10 +318,18 @@ class Descent(mor_bench.Surrogate):
                     losses = np.append(losses, np.square(off).mean())
                     if checkpoint is not None:
                         numbers = np.array([iteration + 1, iterations])
-                        write_atomically(checkpoint, serialise({"weights": weights, "losses": losses, "numbers": numbers}))
+                        write_atomically(
+                            checkpoint,
+                            serialise({"weights": weights, "losses": losses, "numbers": numbers}),
+                        )
                     if self.training.progress is not None:
                         self.training.progress(iteration + 1, iterations, float(losses[-1]))
-            self.weights_, self.loss_curve_, self.validation_curve_, self.iterations_ = weights, losses, 1.5 * losses, iterations
+            self.weights_, self.loss_curve_, self.validation_curve_, self.iterations_ = (
+                weights,
+                losses,
+                1.5 * losses,
+                iterations,
+            )
             if checkpoint is not None:
                 checkpoint.unlink(missing_ok=True)
         return self

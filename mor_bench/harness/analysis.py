@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.harness.frontier import EXACT, TARGET_ERRORS, TARGET_TIMES_MS, compare, frontier_draws, is_point
+from mor_bench.harness.frontier import (
+    EXACT,
+    TARGET_ERRORS,
+    TARGET_TIMES_MS,
+    compare,
+    frontier_draws,
+    is_point,
+)
 from mor_bench.harness.statistics import (
     LEVEL,
     clusters_of,
@@ -101,8 +108,15 @@ def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -
     }
     for dataset in dict.fromkeys(row["dataset"] for row in comparison.rows):
         draws = _draws_of(comparison, dataset, n_resamples, np.random.default_rng(seed))
-        mine = {kind: [record for record in analysis[kind] if record["dataset"] == dataset] for kind in ("time_at_error", "error_at_time")}
-        analysis["rows"] += [_headlines(row, draws) for row in comparison.rows if row["dataset"] == dataset and row["status"] == "ok"]
+        mine = {
+            kind: [record for record in analysis[kind] if record["dataset"] == dataset]
+            for kind in ("time_at_error", "error_at_time")
+        }
+        analysis["rows"] += [
+            _headlines(row, draws)
+            for row in comparison.rows
+            if row["dataset"] == dataset and row["status"] == "ok"
+        ]
         analysis["pairwise"] += _with_intervals(mine, draws, needed_error(comparison, dataset))
         analysis["break_even"] += break_even(comparison.rows, mine["time_at_error"])
         analysis["hidden"] += hidden(comparison.rows, dataset, draws.intervals)
@@ -136,7 +150,9 @@ def _finite(value: float) -> float | None:
     return float(value) if isfinite(value) else None
 
 
-def _draws_of(comparison: Comparison, dataset: str, n: int, generator: np.random.Generator) -> _Draws:
+def _draws_of(
+    comparison: Comparison, dataset: str, n: int, generator: np.random.Generator
+) -> _Draws:
     ran = [row for row in comparison.rows if row["dataset"] == dataset and row["status"] == "ok"]
     raw = {row["label"]: _raw(comparison, row) for row in ran}
     try:
@@ -163,23 +179,51 @@ def _draws_of(comparison: Comparison, dataset: str, n: int, generator: np.random
         intervals[label]["rel_l2_median"] = quantiles(errors[label])
         if "mean_dof_m" in samples:
             e = np.asarray(samples["mean_dof_m"], dtype=float)
-            intervals[label]["mean_dof_m"] = quantiles(widened(weighted_means(e, drawn), float(e.mean()), factor, (float(e.min()), float(e.max()))))
+            intervals[label]["mean_dof_m"] = quantiles(
+                widened(
+                    weighted_means(e, drawn),
+                    float(e.mean()),
+                    factor,
+                    (float(e.min()), float(e.max())),
+                )
+            )
     for label, interval in intervals_of(raw).items():
         intervals[label]["latency_ms"] = interval
     timed = [samples for samples in raw.values() if len(samples.get("latency_ms", ()))]
     timing: dict[str, Any] = {}
     if timed:
         spreads = spreads_of(timed)
-        specific, common = (spread.sd if spread.df > 0 else None for spread in (spreads.specific, spreads.common))
-        timing = {"n_processes": max(map(n_processes_of, timed)), "specific": specific, "common": common}
+        specific, common = (
+            spread.sd if spread.df > 0 else None for spread in (spreads.specific, spreads.common)
+        )
+        timing = {
+            "n_processes": max(map(n_processes_of, timed)),
+            "specific": specific,
+            "common": common,
+        }
     usable = [row for row in ran if is_point(row)]
     medians = np.array([row["latency_ms"]["median"] for row in usable], dtype=float)
     latencies = latency_draws([raw[row["label"]] for row in usable], medians, n, generator)
-    plain = [errors.get(row["label"], np.full(n, _number(row["error"]["rel_l2_median"]))) for row in usable]
-    return _Draws(usable, latencies, np.log(np.maximum(np.array(plain).reshape(len(usable), n), EXACT)), intervals, found, timing)
+    plain = [
+        errors.get(row["label"], np.full(n, _number(row["error"]["rel_l2_median"])))
+        for row in usable
+    ]
+    return _Draws(
+        usable,
+        latencies,
+        np.log(np.maximum(np.array(plain).reshape(len(usable), n), EXACT)),
+        intervals,
+        found,
+        timing,
+    )
 
 
-def _error_draws(samples: dict[str, NDArray[Any]], weights: NDArray[np.int32], factor: float, generator: np.random.Generator) -> NDArray[np.float64]:
+def _error_draws(
+    samples: dict[str, NDArray[Any]],
+    weights: NDArray[np.int32],
+    factor: float,
+    generator: np.random.Generator,
+) -> NDArray[np.float64]:
     """Medians of relative l2 over resampled load regions; where other training seeds were tried, each of a random one of them.
 
     Another seed moves the error by as much as its median differs from the geometric mean of all seeds' medians.
@@ -193,7 +237,9 @@ def _error_draws(samples: dict[str, NDArray[Any]], weights: NDArray[np.int32], f
     medians = np.median(np.concatenate([values[None], others]), axis=1)
     if not (np.isfinite(medians) & (medians > 0)).all():
         return draws
-    moved = np.exp(np.log(medians) - np.log(medians).mean()) ** np.sqrt(len(medians) / (len(medians) - 1))
+    moved = np.exp(np.log(medians) - np.log(medians).mean()) ** np.sqrt(
+        len(medians) / (len(medians) - 1)
+    )
     return np.asarray(draws * generator.choice(moved, draws.size))
 
 
@@ -208,15 +254,28 @@ def _headlines(row: Row, draws: _Draws) -> Row:
         figures = row[group] or {}
         value = _number(figures.get(key))
         low, high = mine.get(name, (inf, inf))
-        if name == "latency_ms" and figures.get("low") is not None and figures.get("high") is not None:
+        if (
+            name == "latency_ms"
+            and figures.get("low") is not None
+            and figures.get("high") is not None
+        ):
             low, high = float(figures["low"]), float(figures["high"])
-        out[name] = {"value": _finite(value), "low": _finite(min(low, value) if isfinite(low) else low), "high": _finite(max(high, value))}
+        out[name] = {
+            "value": _finite(value),
+            "low": _finite(min(low, value) if isfinite(low) else low),
+            "high": _finite(max(high, value)),
+        }
     return out
 
 
-def _with_intervals(records: dict[str, list[Row]], draws: _Draws, needed: float | None) -> list[Row]:
+def _with_intervals(
+    records: dict[str, list[Row]], draws: _Draws, needed: float | None
+) -> list[Row]:
     """Add intervals to the records of a dataset; return those of its pairs of methods."""
-    targets = sorted({*TARGET_ERRORS, *([needed] if needed and isfinite(needed) and needed > 0 else [])}, reverse=True)
+    targets = sorted(
+        {*TARGET_ERRORS, *([needed] if needed and isfinite(needed) and needed > 0 else [])},
+        reverse=True,
+    )
     times: dict[str, dict[float, NDArray[np.float64]]] = {}
     for method in dict.fromkeys(record["method"] for record in records["time_at_error"]):
         mine = [i for i, row in enumerate(draws.rows) if row["method"] == method]
@@ -224,18 +283,28 @@ def _with_intervals(records: dict[str, list[Row]], draws: _Draws, needed: float 
             at_error = np.full((len(targets), draws.log_latencies.shape[1]), inf)
             at_time = np.full((len(TARGET_TIMES_MS), draws.log_latencies.shape[1]), inf)
         else:
-            at_error, at_time = frontier_draws(draws.log_latencies[mine], draws.log_errors[mine], targets, TARGET_TIMES_MS)
+            at_error, at_time = frontier_draws(
+                draws.log_latencies[mine], draws.log_errors[mine], targets, TARGET_TIMES_MS
+            )
         times[method] = dict(zip(targets, at_error, strict=True))
         for record in records["time_at_error"]:
             if record["method"] == method:
                 _add_interval(record, "latency_ms", times[method][record["target_rel_l2_median"]])
         for record in records["error_at_time"]:
             if record["method"] == method:
-                _add_interval(record, "error", at_time[TARGET_TIMES_MS.index(record["target_latency_ms"])])
+                _add_interval(
+                    record, "error", at_time[TARGET_TIMES_MS.index(record["target_latency_ms"])]
+                )
     values = _point_times(draws.rows, targets)
     dataset = records["time_at_error"][0]["dataset"] if records["time_at_error"] else ""
     return [
-        {"dataset": dataset, "target_rel_l2_median": target, "a": a, "b": b, **_pair(values, times, a, b, target)}
+        {
+            "dataset": dataset,
+            "target_rel_l2_median": target,
+            "a": a,
+            "b": b,
+            **_pair(values, times, a, b, target),
+        }
         for target in targets
         for a in times
         for b in times
@@ -260,13 +329,26 @@ def _point_times(rows: Sequence[Row], targets: Sequence[float]) -> dict[tuple[st
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = [row for row in rows if row["method"] == method]
         latencies = np.log([[row["latency_ms"]["median"]] for row in mine])
-        errors = np.log(np.maximum([[_number(row["error"]["rel_l2_median"])] for row in mine], EXACT))
+        errors = np.log(
+            np.maximum([[_number(row["error"]["rel_l2_median"])] for row in mine], EXACT)
+        )
         at_error, _ = frontier_draws(latencies, errors, targets, ())
-        out.update({(method, target): float(value) for target, value in zip(targets, at_error[:, 0], strict=True)})
+        out.update(
+            {
+                (method, target): float(value)
+                for target, value in zip(targets, at_error[:, 0], strict=True)
+            }
+        )
     return out
 
 
-def _pair(values: dict[tuple[str, float], float], times: dict[str, dict[float, NDArray[np.float64]]], a: str, b: str, target: float) -> Row:
+def _pair(
+    values: dict[tuple[str, float], float],
+    times: dict[str, dict[float, NDArray[np.float64]]],
+    a: str,
+    b: str,
+    target: float,
+) -> Row:
     """Ratio of the times of a and b at an error; an end of None: one of them may not reach it."""
     here = values.get((a, target), inf), values.get((b, target), inf)
     if not all(map(isfinite, here)):
@@ -276,7 +358,10 @@ def _pair(values: dict[tuple[str, float], float], times: dict[str, dict[float, N
     neither = ~np.isfinite(first) & ~np.isfinite(second)
     with np.errstate(invalid="ignore"):
         ratios = first - second
-    low, high = quantiles(np.where(neither, -inf, ratios))[0], quantiles(np.where(neither, inf, ratios))[1]
+    low, high = (
+        quantiles(np.where(neither, -inf, ratios))[0],
+        quantiles(np.where(neither, inf, ratios))[1],
+    )
     low, high = min(low, here[0] - here[1]), max(high, here[0] - here[1])
     return {
         "verdict": verdict_of(low, high),
@@ -311,12 +396,27 @@ def break_even(rows: Sequence[Row], at_error: Sequence[Row]) -> list[Row]:
 
 def _break_even(by_label: dict[tuple[str, str], Row], record: Row) -> Row:
     out: Row = {key: record[key] for key in ("dataset", "method", "target_rel_l2_median")}
-    out |= {"label": None, "latency_ms": None, "fem_label": None, "fem_latency_ms": None, "offline_s": None, "queries": None}
+    out |= {
+        "label": None,
+        "latency_ms": None,
+        "fem_label": None,
+        "fem_latency_ms": None,
+        "offline_s": None,
+        "queries": None,
+    }
     if record["best"] is None:
         return {**out, "verdict": "not reached", "reason": "no configuration is that accurate"}
     row = by_label[record["dataset"], record["best"]["label"]]
-    latency, error, offline = record["best"]["latency_ms"], record["best"]["error"], row["offline_s"] or {}
-    out |= {"label": row["label"], "latency_ms": latency, "offline_s": {key: offline.get(key) for key in ("data", "fit")}}
+    latency, error, offline = (
+        record["best"]["latency_ms"],
+        record["best"]["error"],
+        row["offline_s"] or {},
+    )
+    out |= {
+        "label": row["label"],
+        "latency_ms": latency,
+        "offline_s": {key: offline.get(key) for key in ("data", "fit")},
+    }
     full = [
         other
         for (dataset, _), other in by_label.items()
@@ -325,7 +425,11 @@ def _break_even(by_label: dict[tuple[str, str], Row], record: Row) -> Row:
         and _number((other["error"] or {}).get("rel_l2_median")) <= error
     ]
     if not full:
-        return {**out, "verdict": "unknown", "reason": f"no configuration of {FULL_ORDER} is as accurate"}
+        return {
+            **out,
+            "verdict": "unknown",
+            "reason": f"no configuration of {FULL_ORDER} is as accurate",
+        }
     fastest = min(full, key=lambda other: float(other["latency_ms"]["median"]))
     full_order_ms = float(fastest["latency_ms"]["median"])
     out |= {"fem_label": fastest["label"], "fem_latency_ms": full_order_ms}
@@ -337,7 +441,9 @@ def _break_even(by_label: dict[tuple[str, str], Row], record: Row) -> Row:
     return {**out, "verdict": "pays off", "reason": "", "queries": queries}
 
 
-def hidden(rows: Iterable[Row], dataset: str, intervals: dict[str, dict[str, tuple[float, float]]]) -> list[Row]:
+def hidden(
+    rows: Iterable[Row], dataset: str, intervals: dict[str, dict[str, tuple[float, float]]]
+) -> list[Row]:
     """How much worse each configuration is on the hidden test set than on the one that everybody knows.
 
     `worse` where the ratio of the medians is beyond what the sizes of both sets explain: the half-width of the shipped
@@ -345,14 +451,38 @@ def hidden(rows: Iterable[Row], dataset: str, intervals: dict[str, dict[str, tup
     """
     out = []
     for row in rows:
-        if row["dataset"] != dataset or row["status"] != "ok" or not row.get("hidden") or not row["error"]:
+        if (
+            row["dataset"] != dataset
+            or row["status"] != "ok"
+            or not row.get("hidden")
+            or not row["error"]
+        ):
             continue
-        shipped, fresh = _number(row["error"]["rel_l2_median"]), _number(row["hidden"].get("rel_l2_median"))
-        ratio = fresh / shipped if shipped > EXACT and isfinite(shipped) else 1.0 if fresh <= max(shipped, EXACT) else inf
+        shipped, fresh = (
+            _number(row["error"]["rel_l2_median"]),
+            _number(row["hidden"].get("rel_l2_median")),
+        )
+        ratio = (
+            fresh / shipped
+            if shipped > EXACT and isfinite(shipped)
+            else 1.0
+            if fresh <= max(shipped, EXACT)
+            else inf
+        )
         high = intervals.get(row["label"], {}).get("rel_l2_median", (inf, inf))[1]
         room = max(high / shipped, 1.0) if isfinite(high) and EXACT < shipped < inf else 1.0
-        limit = max(HIDDEN_WORSE, room ** np.sqrt(1 + row["n_test"] / max(row["hidden"].get("n") or 1, 1)))
-        out.append({"dataset": dataset, "label": row["label"], "ratio": _finite(ratio), "limit": float(limit), "worse": bool(ratio > limit)})
+        limit = max(
+            HIDDEN_WORSE, room ** np.sqrt(1 + row["n_test"] / max(row["hidden"].get("n") or 1, 1))
+        )
+        out.append(
+            {
+                "dataset": dataset,
+                "label": row["label"],
+                "ratio": _finite(ratio),
+                "limit": float(limit),
+                "worse": bool(ratio > limit),
+            }
+        )
     return out
 
 
@@ -382,7 +512,12 @@ def profile(at_error: Sequence[Row]) -> Row:
     problems = [problem for problem, solved in times.items() if solved]
     methods = dict.fromkeys(record["method"] for record in at_error)
     factors = {
-        method: [times[problem][method] / min(times[problem].values()) if method in times[problem] else None for problem in problems]
+        method: [
+            times[problem][method] / min(times[problem].values())
+            if method in times[problem]
+            else None
+            for problem in problems
+        ]
         for method in methods
     }
     return {
@@ -395,7 +530,11 @@ def profile(at_error: Sequence[Row]) -> Row:
 
 def share_within(factors: Sequence[float | None], tau: float) -> float:
     """Share of problems that a method solves within a factor of the fastest."""
-    return sum(factor is not None and factor <= tau for factor in factors) / len(factors) if factors else 0.0
+    return (
+        sum(factor is not None and factor <= tau for factor in factors) / len(factors)
+        if factors
+        else 0.0
+    )
 
 
 def regimes(comparison: Comparison) -> list[Row]:
@@ -407,12 +546,27 @@ def regimes(comparison: Comparison) -> list[Row]:
     for method in dict.fromkeys(row["method"] for row in comparison.rows):
         regime = (comparison.methods.get(method) or {}).get("regime")
         if not regime:
-            out.append({"method": method, "says": "", "in_regime": None, "verdict": "its file names no regime"})
+            out.append(
+                {
+                    "method": method,
+                    "says": "",
+                    "in_regime": None,
+                    "verdict": "its file names no regime",
+                }
+            )
             continue
-        missing = [_outside(row, regime, device) for row in comparison.rows if row["method"] == method and row["status"] == "ok"]
+        missing = [
+            _outside(row, regime, device)
+            for row in comparison.rows
+            if row["method"] == method and row["status"] == "ok"
+        ]
         least = min(missing, key=len, default=["no configuration ran"])
         says = str(regime.get("says") or "")
-        verdict = "not tested in its regime" + f" ({', '.join(least)}): {says}" if least else "in its regime"
+        verdict = (
+            "not tested in its regime" + f" ({', '.join(least)}): {says}"
+            if least
+            else "in its regime"
+        )
         out.append({"method": method, "says": says, "in_regime": not least, "verdict": verdict})
     return out
 
@@ -420,10 +574,20 @@ def regimes(comparison: Comparison) -> list[Row]:
 def _outside(row: Row, regime: Row, device: str) -> list[str]:
     """What a row lacks of a regime."""
     missing = []
-    for name, what in (("min_dofs", "degrees of freedom"), ("min_train", "training samples"), ("min_iterations", "iterations")):
+    for name, what in (
+        ("min_dofs", "degrees of freedom"),
+        ("min_train", "training samples"),
+        ("min_iterations", "iterations"),
+    ):
         least = regime.get(name)
-        iterations = (row.get("training") or {}).get("iterations") or row["parameters"].get("iterations")
-        has = {"min_dofs": row.get("n_dofs"), "min_train": row.get("n_train"), "min_iterations": iterations}[name] or 0
+        iterations = (row.get("training") or {}).get("iterations") or row["parameters"].get(
+            "iterations"
+        )
+        has = {
+            "min_dofs": row.get("n_dofs"),
+            "min_train": row.get("n_train"),
+            "min_iterations": iterations,
+        }[name] or 0
         if least and has < least:
             missing.append(f"{has:,} of {least:,} {what}")
     if regime.get("split") and row.get("split") != regime["split"]:
@@ -437,10 +601,30 @@ def tuning(comparison: Comparison) -> list[Row]:
     """What each method was allowed to try on each dataset, and what it did; seconds are of fitting, failed fits included."""
     budget = comparison.settings.get("budget") or {}
     out = []
-    for dataset, method in dict.fromkeys((row["dataset"], row["method"]) for row in comparison.rows):
-        tried = [row for row in comparison.rows if (row["dataset"], row["method"]) == (dataset, method) and row["status"] != "skipped"]
-        seconds = sum(row.get("tuning_s") or (row["offline_s"] or {}).get("fit") or 0.0 for row in tried)
+    for dataset, method in dict.fromkeys(
+        (row["dataset"], row["method"]) for row in comparison.rows
+    ):
+        tried = [
+            row
+            for row in comparison.rows
+            if (row["dataset"], row["method"]) == (dataset, method) and row["status"] != "skipped"
+        ]
+        seconds = sum(
+            row.get("tuning_s") or (row["offline_s"] or {}).get("fit") or 0.0 for row in tried
+        )
         seeds = max(((row.get("seeds") or {}).get("n", 1) for row in tried), default=0)
-        allowed = {"configurations_allowed": budget.get("configurations"), "seconds_allowed": budget.get("seconds")}
-        out.append({"dataset": dataset, "method": method, "configurations": len(tried), "seconds": seconds, "seeds": seeds, **allowed})
+        allowed = {
+            "configurations_allowed": budget.get("configurations"),
+            "seconds_allowed": budget.get("seconds"),
+        }
+        out.append(
+            {
+                "dataset": dataset,
+                "method": method,
+                "configurations": len(tried),
+                "seconds": seconds,
+                "seeds": seeds,
+                **allowed,
+            }
+        )
     return out

@@ -11,7 +11,13 @@ from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import load_dataset
 from mor_bench.snapshots.sampling import draw_loads, n_samples_of
 from mor_bench.snapshots.test_sets import check_regions
-from mor_bench.specs import ImportedDatasetSpec, check_method, is_method_file, load_dataset_spec, load_method_spec
+from mor_bench.specs import (
+    ImportedDatasetSpec,
+    check_method,
+    is_method_file,
+    load_dataset_spec,
+    load_method_spec,
+)
 
 
 def check_file(path: Path) -> str:

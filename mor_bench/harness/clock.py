@@ -126,16 +126,35 @@ class Timing:
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All of it as arrays, to be kept; NaN where a batch was too slow."""
-        rates = [np.nan if rate is None else rate for rate in map(self.throughput.get, map(str, BATCHES))]
-        return {**self.samples, "throughput": np.array(rates), "memory_bytes": np.array(self.memory_bytes), "probe_s": np.array(self.probe_s)}
+        rates = [
+            np.nan if rate is None else rate for rate in map(self.throughput.get, map(str, BATCHES))
+        ]
+        return {
+            **self.samples,
+            "throughput": np.array(rates),
+            "memory_bytes": np.array(self.memory_bytes),
+            "probe_s": np.array(self.probe_s),
+        }
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
         """A timing that was kept."""
-        lists = {name: arrays[name].tolist() for name in ("latency_ms", "gc_ms", "process", "round", "all_threads_ms")}
-        rates = {str(size): None if np.isnan(rate) else float(rate) for size, rate in zip(BATCHES, arrays["throughput"], strict=True)}
+        lists = {
+            name: arrays[name].tolist()
+            for name in ("latency_ms", "gc_ms", "process", "round", "all_threads_ms")
+        }
+        rates = {
+            str(size): None if np.isnan(rate) else float(rate)
+            for size, rate in zip(BATCHES, arrays["throughput"], strict=True)
+        }
         used = [(wall, own, others) for wall, own, others in arrays["used"].tolist()]
-        return cls(**lists, throughput=rates, memory_bytes=int(arrays["memory_bytes"]), used=used, probe_s=float(arrays["probe_s"]))
+        return cls(
+            **lists,
+            throughput=rates,
+            memory_bytes=int(arrays["memory_bytes"]),
+            used=used,
+            probe_s=float(arrays["probe_s"]),
+        )
 
 
 def probe_s() -> float:
@@ -227,14 +246,38 @@ def measure(
         for group in groups:
             with ExitStack() as stack:
                 nursery = stack.enter_context(closing(Nursery())) if CAN_FORK else None
-                workers = _open_all(stack, nursery, {label: openers[label] for label in group}, queries, threads, seed + process, timings)
+                workers = _open_all(
+                    stack,
+                    nursery,
+                    {label: openers[label] for label in group},
+                    queries,
+                    threads,
+                    seed + process,
+                    timings,
+                )
                 for number in range(protocol.rounds):
                     for label in order.permutation(list(workers)):
-                        _attempt(timings[label], _turn, workers[label], queries, protocol.queries, threads, process, number)
+                        _attempt(
+                            timings[label],
+                            _turn,
+                            workers[label],
+                            queries,
+                            protocol.queries,
+                            threads,
+                            process,
+                            number,
+                        )
                         done += 1
                         progress(done, total)
                 for label, worker in workers.items() if not single_only else ():
-                    _attempt(timings[label], _on_all_cores, worker, queries, protocol.queries, process == 0)
+                    _attempt(
+                        timings[label],
+                        _on_all_cores,
+                        worker,
+                        queries,
+                        protocol.queries,
+                        process == 0,
+                    )
                     done += 1
                     progress(done, total)
     return timings
@@ -255,16 +298,23 @@ def _groups(openers: Mapping[str, Opener]) -> list[list[str]]:
 
 
 def _open_all(
-    stack: ExitStack, nursery: Nursery | None, openers: Mapping[str, Opener], queries: Queries, threads: int, seed: int,
+    stack: ExitStack,
+    nursery: Nursery | None,
+    openers: Mapping[str, Opener],
+    queries: Queries,
+    threads: int,
+    seed: int,
     timings: Mapping[str, Timing],
-) -> dict[str, Worker]:  # fmt: skip
+) -> dict[str, Worker]:
     """Processes with a loaded and warm method each; what fails on the way says so in its timing."""
 
     def start(label: str) -> Worker | None:
         worker = None
         try:
             worker = openers[label].open(nursery)
-            found = worker.ask("warm", ANSWER_LIMIT_S, forces=queries.forces, threads=threads, seed=seed)
+            found = worker.ask(
+                "warm", ANSWER_LIMIT_S, forces=queries.forces, threads=threads, seed=seed
+            )
         except MorBenchError as error:
             timings[label].failed = str(error)
             if worker:
@@ -280,7 +330,9 @@ def _open_all(
     return {label: worker for label, worker in started.items() if worker}
 
 
-def _attempt(timing: Timing, measurement: Callable[..., None], worker: Worker, *arguments: Any) -> None:
+def _attempt(
+    timing: Timing, measurement: Callable[..., None], worker: Worker, *arguments: Any
+) -> None:
     if timing.failed:
         return
     try:
@@ -293,9 +345,14 @@ def _ask(timing: Timing, worker: Worker, queries: Queries, n: int, threads: int)
     """A turn of single queries; errors of the answers that were kept are noted."""
     with TemporaryDirectory(dir=queries.scratch) as folder:
         out = Path(folder) / "answers.npy"
-        found = worker.ask("time", ANSWER_LIMIT_S, out=out, n=n, floor_s=CHUNK_S, most_s=MOST_S, threads=threads)
+        found = worker.ask(
+            "time", ANSWER_LIMIT_S, out=out, n=n, floor_s=CHUNK_S, most_s=MOST_S, threads=threads
+        )
         try:
-            answers, references = np.load(out, allow_pickle=False), queries.references[found["checked"]]
+            answers, references = (
+                np.load(out, allow_pickle=False),
+                queries.references[found["checked"]],
+            )
             errors = sample_errors(answers, references, queries.nodes).relative_l2
         except (OSError, ValueError, IndexError, KeyError, TypeError) as error:
             raise MethodFailedError(f"its answers cannot be read: {error}") from None
@@ -303,7 +360,15 @@ def _ask(timing: Timing, worker: Worker, queries: Queries, n: int, threads: int)
     return found
 
 
-def _turn(timing: Timing, worker: Worker, queries: Queries, n: int, threads: int, process: int, number: int) -> None:
+def _turn(
+    timing: Timing,
+    worker: Worker,
+    queries: Queries,
+    n: int,
+    threads: int,
+    process: int,
+    number: int,
+) -> None:
     busy, own = _busy_s(), process_time()
     start = perf_counter()
     found = _ask(timing, worker, queries, n, threads)
@@ -320,14 +385,27 @@ def _on_all_cores(timing: Timing, worker: Worker, queries: Queries, n: int, batc
     cores = cpu_count() or 1
     timing.all_threads_ms += _ask(timing, worker, queries, n, cores)["latency_ms"]
     if batches:
-        found = worker.ask("throughput", ANSWER_LIMIT_S, sizes=list(BATCHES), floor_s=BATCH_S, most_s=MOST_BATCH_S, threads=cores)
+        found = worker.ask(
+            "throughput",
+            ANSWER_LIMIT_S,
+            sizes=list(BATCHES),
+            floor_s=BATCH_S,
+            most_s=MOST_BATCH_S,
+            threads=cores,
+        )
         timing.throughput = found["throughput"]
 
 
 def _busy_s() -> float:
     """Processor time that all processes of the machine have used, s."""
     times = psutil.cpu_times()
-    return float(sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0) - getattr(times, "guest_nice", 0.0))
+    return float(
+        sum(times)
+        - times.idle
+        - getattr(times, "iowait", 0.0)
+        - getattr(times, "guest", 0.0)
+        - getattr(times, "guest_nice", 0.0)
+    )
 
 
 def why_unstable(timing: Timing, threads: int) -> list[str]:
@@ -341,8 +419,13 @@ def why_unstable(timing: Timing, threads: int) -> list[str]:
     if threads == 1 and own / wall > MORE_THAN_ONE:
         reasons.append(f"it used {own / wall:.1f} cores though pinned to one")
     samples = timing.samples
-    for name, groups in (("rounds", samples["process"] * (samples["round"].max() + 1) + samples["round"]), ("processes", samples["process"])):
-        medians = [float(np.median(samples["latency_ms"][groups == group])) for group in np.unique(groups)]
+    for name, groups in (
+        ("rounds", samples["process"] * (samples["round"].max() + 1) + samples["round"]),
+        ("processes", samples["process"]),
+    ):
+        medians = [
+            float(np.median(samples["latency_ms"][groups == group])) for group in np.unique(groups)
+        ]
         spread = _spread(medians)
         if spread > SPREAD:
             reasons.append(f"medians of {len(medians)} {name} spread by {spread:.0%}")
@@ -371,10 +454,14 @@ def check_answers(timing: Timing, scored: NDArray[np.float64]) -> None:
     numbers, errors = (np.array(column) for column in zip(*timing.checked, strict=True))
     then, now = float(np.median(scored[numbers.astype(int)])), float(np.median(errors))
     if now > SAME_ERROR[0] * then + SAME_ERROR[1]:
-        raise MethodFailedError(f"its median relative l2 error is {now:.3g} while it is timed, on loads on which it was scored with {then:.3g}")
+        raise MethodFailedError(
+            f"its median relative l2 error is {now:.3g} while it is timed, on loads on which it was scored with {then:.3g}"
+        )
 
 
-def summary_of_timing(timing: Timing, interval: tuple[float, float], threads: int) -> dict[str, Any]:
+def summary_of_timing(
+    timing: Timing, interval: tuple[float, float], threads: int
+) -> dict[str, Any]:
     """The figures of a results row: `latency_ms`, `all_threads_ms`, `throughput`.
 
     Parameters

@@ -13,9 +13,21 @@ from pathlib import Path
 
 import mor_bench
 
-LIBRARIES = ("numpy", "scipy", "numba", "scikit-learn", "torch", "pyamg", "pypardiso", "safetensors")
+LIBRARIES = (
+    "numpy",
+    "scipy",
+    "numba",
+    "scikit-learn",
+    "torch",
+    "pyamg",
+    "pypardiso",
+    "safetensors",
+)
 
-DATA_ONLY = frozenset(f"mor_bench.snapshots.{name}" for name in ("executors", "generate", "manifest", "solve", "store", "test_sets"))
+DATA_ONLY = frozenset(
+    f"mor_bench.snapshots.{name}"
+    for name in ("executors", "generate", "manifest", "solve", "store", "test_sets")
+)
 """What makes datasets has its say through the samples themselves, which are part of a fit's key."""
 
 
@@ -60,7 +72,9 @@ def _imports_of(path: Path, changed: int, package: str) -> tuple[str, ...]:
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            above = (
+                package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            )
             base = ".".join(filter(None, [*above, node.module]))
             names += [base, *(f"{base}.{alias.name}" for alias in node.names)]
     return tuple(dict.fromkeys(names))
@@ -69,7 +83,11 @@ def _imports_of(path: Path, changed: int, package: str) -> tuple[str, ...]:
 def _nodes(tree: ast.AST) -> Iterator[ast.AST]:
     """All nodes but those for type checkers only."""
     for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+        if (
+            isinstance(node, ast.If)
+            and isinstance(node.test, ast.Name)
+            and node.test.id == "TYPE_CHECKING"
+        ):
             continue
         yield node
         yield from _nodes(node)
@@ -84,7 +102,11 @@ def _closure(module: str, folder: Path | None) -> dict[str, Path]:
         name = waiting.pop()
         if name in found or name in DATA_ONLY:
             continue
-        path = _file_of(name, folder if name.partition(".")[0] != "mor_bench" else None, installed=name.partition(".")[0] in (own, "mor_bench"))
+        path = _file_of(
+            name,
+            folder if name.partition(".")[0] != "mor_bench" else None,
+            installed=name.partition(".")[0] in (own, "mor_bench"),
+        )
         if path is None:
             continue
         found[name] = path
@@ -96,7 +118,13 @@ def _closure(module: str, folder: Path | None) -> dict[str, Path]:
 def _file_of(name: str, folder: Path | None, installed: bool) -> Path | None:
     """The source of a module, found without importing anything: beside the method's file, or an installed one that is its own."""
     parts = name.split(".")
-    roots = [Path(mor_bench.__file__).parent.parent] if parts[0] == "mor_bench" else [folder] if folder else []
+    roots = (
+        [Path(mor_bench.__file__).parent.parent]
+        if parts[0] == "mor_bench"
+        else [folder]
+        if folder
+        else []
+    )
     for root in roots:
         stem = root.joinpath(*parts)
         for path in (stem.with_suffix(".py"), stem / "__init__.py"):

@@ -11,7 +11,12 @@ from typing import Any
 
 from mor_bench.errors import InvalidInputError, MissingDependencyError
 from mor_bench.harness.fits import Job
-from mor_bench.harness.isolation import START_LIMIT_S, MethodFailedError, Worker, default_memory_limit_bytes
+from mor_bench.harness.isolation import (
+    START_LIMIT_S,
+    MethodFailedError,
+    Worker,
+    default_memory_limit_bytes,
+)
 from mor_bench.harness.results import label_of
 from mor_bench.mechanics.model import check_supports
 from mor_bench.scene.scene import load_scene
@@ -49,13 +54,22 @@ class Budget:
 BUDGETS = {"quick": Budget(12, 1200.0), "full": Budget(16, 1800.0)}
 
 
-def jobs_of(methods: Sequence[MethodSpec], profile: str, training: TrainingOptions = TrainingOptions()) -> list[Job]:
+def jobs_of(
+    methods: Sequence[MethodSpec], profile: str, training: TrainingOptions = TrainingOptions()
+) -> list[Job]:
     """Every configuration of every method; those that may train do so with the given device and seconds."""
     jobs = []
     for method in methods:
         swept, options = method.swept_keys(profile), training if may_train(method) else None
         for parameters in method.configurations(profile):
-            jobs.append(Job(method, parameters, label_of(method.name, {key: parameters[key] for key in swept}), options))
+            jobs.append(
+                Job(
+                    method,
+                    parameters,
+                    label_of(method.name, {key: parameters[key] for key in swept}),
+                    options,
+                )
+            )
     return jobs
 
 
@@ -67,7 +81,9 @@ def may_train(method: MethodSpec) -> bool:
 def may_draw(job: Job) -> bool:
     """Whether a fit draws random numbers; a third party's is taken to do so if its file has iterations or a seed."""
     return _of_class(
-        job.method, lambda surrogate: "seed" in signature(surrogate).parameters, of_others=bool({"iterations", "seed"} & set(job.parameters))
+        job.method,
+        lambda surrogate: "seed" in signature(surrogate).parameters,
+        of_others=bool({"iterations", "seed"} & set(job.parameters)),
     )
 
 
@@ -94,10 +110,15 @@ def checked_specs(
     if methods is None:
         methods = _default_methods(specs, profile, suite)
     method_specs = [load_method_spec(method, suite) for method in methods]
-    for kind, names in (("dataset", [spec.name for spec in specs]), ("method", [spec.name for spec in method_specs])):
+    for kind, names in (
+        ("dataset", [spec.name for spec in specs]),
+        ("method", [spec.name for spec in method_specs]),
+    ):
         for name in names:
             if names.count(name) > 1:
-                raise InvalidInputError(f"two {kind}s are called {name!r}; rename one of the files.")
+                raise InvalidInputError(
+                    f"two {kind}s are called {name!r}; rename one of the files."
+                )
     for spec in specs:
         scene = load_scene(spec)
         if isinstance(spec, DatasetSpec):
@@ -107,7 +128,9 @@ def checked_specs(
     return specs, method_specs
 
 
-def _default_methods(specs: Sequence[AnyDatasetSpec], profile: str, suite: Path | None) -> list[str]:
+def _default_methods(
+    specs: Sequence[AnyDatasetSpec], profile: str, suite: Path | None
+) -> list[str]:
     own = list(list_suite("methods", suite)) if suite else []
     if profile == "full":
         return list(dict.fromkeys([*CORE_METHODS, *list_suite("methods"), *own]))
@@ -118,7 +141,11 @@ def _default_methods(specs: Sequence[AnyDatasetSpec], profile: str, suite: Path 
 def _defaults_of(spec: AnyDatasetSpec) -> tuple[str, ...]:
     if spec.observed is None:
         return DATA_METHODS if isinstance(spec, ImportedDatasetSpec) else CORE_METHODS
-    return ("gappy-pod", *DATA_METHODS) if isinstance(spec, ImportedDatasetSpec) else OBSERVATION_METHODS
+    return (
+        ("gappy-pod", *DATA_METHODS)
+        if isinstance(spec, ImportedDatasetSpec)
+        else OBSERVATION_METHODS
+    )
 
 
 def _check_method(spec: MethodSpec, cache: Path, memory_limit_bytes: float | None) -> None:
@@ -128,10 +155,19 @@ def _check_method(spec: MethodSpec, cache: Path, memory_limit_bytes: float | Non
             check_method(spec)
         return
     limit = memory_limit_bytes or default_memory_limit_bytes()
-    with suppress(MethodFailedError, MissingDependencyError), Worker(None, sealed_folders(cache), spec.folder, limit) as worker:
+    with (
+        suppress(MethodFailedError, MissingDependencyError),
+        Worker(None, sealed_folders(cache), spec.folder, limit) as worker,
+    ):
         for profile in ("quick", "full"):
             where = f"method {spec.name} ({profile})"
-            worker.ask("check", START_LIMIT_S, surrogate=spec.surrogate, configurations=spec.configurations(profile), where=where)
+            worker.ask(
+                "check",
+                START_LIMIT_S,
+                surrogate=spec.surrogate,
+                configurations=spec.configurations(profile),
+                where=where,
+            )
 
 
 def sealed_folders(cache: Path, out: Path | None = None) -> list[Path]:

@@ -48,10 +48,14 @@ def chosen_samples(scene: Scene, n_loads: int) -> NDArray[np.int64]:
     generator = np.random.default_rng([loads.seed, 0xD15C])
     bounds = np.arange(n_loads + 1) * n_patches // n_loads
     patches = generator.integers(bounds[:-1], bounds[1:])
-    return np.asarray(generator.integers(loads.samples_per_patch, size=n_loads) * n_patches + patches)
+    return np.asarray(
+        generator.integers(loads.samples_per_patch, size=n_loads) * n_patches + patches
+    )
 
 
-def limit_of(displacements: list[NDArray[np.float64]]) -> tuple[NDArray[np.float64], float | None, str]:
+def limit_of(
+    displacements: list[NDArray[np.float64]],
+) -> tuple[NDArray[np.float64], float | None, str]:
     """The displacement that those of meshes refined by two again and again tend to.
 
     Parameters
@@ -70,7 +74,10 @@ def limit_of(displacements: list[NDArray[np.float64]]) -> tuple[NDArray[np.float
     finest = displacements[-1]
     if len(displacements) < 3:
         return finest, None, "finest"
-    before, last = (float(np.linalg.norm(b - a)) for a, b in zip(displacements[-3:-1], displacements[-2:], strict=True))
+    before, last = (
+        float(np.linalg.norm(b - a))
+        for a, b in zip(displacements[-3:-1], displacements[-2:], strict=True)
+    )
     order = log2(before / last) if before > 0 and last > 0 else inf
     if not SANE_ORDERS[0] <= order <= SANE_ORDERS[1]:
         return finest, order if np.isfinite(order) else None, "finest"
@@ -102,9 +109,15 @@ class _OnMesh:
     def __init__(self, scene: Scene, mesh: Scene, loads: Sequence[PatchLoads]) -> None:
         points, shares = scene.patch_points(np.concatenate([load.patches[0] for load in loads]))
         weights = sp.csr_array(shares @ interpolation_matrix(mesh.mesh, points))
-        rows = np.split(np.arange(weights.shape[0])[:, None], np.cumsum([load.patches.size for load in loads])[:-1])
+        rows = np.split(
+            np.arange(weights.shape[0])[:, None],
+            np.cumsum([load.patches.size for load in loads])[:-1],
+        )
         self.scene = mesh
-        self.forces = [PatchLoads(row.T, load.vectors).nodal_forces(weights)[0] for row, load in zip(rows, loads, strict=True)]
+        self.forces = [
+            PatchLoads(row.T, load.vectors).nodal_forces(weights)[0]
+            for row, load in zip(rows, loads, strict=True)
+        ]
         self.at_nodes = interpolation_matrix(mesh.mesh, scene.mesh.points)
         self.model = FullOrderModel(mesh)
 
@@ -112,7 +125,9 @@ class _OnMesh:
         """(n_nodes of this mesh, 3) displacements, m, from a start of that shape."""
         free = self.scene.free_dofs
         out = np.zeros(self.scene.mesh.n_dofs)
-        out[free] = self.model.solve(self.forces[row].ravel()[free], None if start is None else start.ravel()[free]).displacement
+        out[free] = self.model.solve(
+            self.forces[row].ravel()[free], None if start is None else start.ravel()[free]
+        ).displacement
         return out.reshape(-1, 3)
 
 
@@ -165,7 +180,9 @@ def refine(
     scene = load_scene(spec)
     n_patches = len(scene.patch_nodes)
     if not 1 <= n_loads <= n_patches:
-        raise InvalidInputError(f"`loads` must be an integer in [1, {n_patches}], the load patches of {spec.name}; got {n_loads}.")
+        raise InvalidInputError(
+            f"`loads` must be an integer in [1, {n_patches}], the load patches of {spec.name}; got {n_loads}."
+        )
     if not 1 <= levels <= 10:
         raise InvalidInputError(f"`levels` must be an integer in [1, 10]; got {levels}.")
     scenes, left_out = _meshes(scene, levels, max_dofs)
@@ -177,7 +194,9 @@ def refine(
     previous: Scene | None = None
     for number, mesh in enumerate(scenes):
         on_mesh = _OnMesh(scene, mesh, loads)
-        carried = None if previous is None else interpolation_matrix(previous.mesh, mesh.mesh.points)
+        carried = (
+            None if previous is None else interpolation_matrix(previous.mesh, mesh.mesh.points)
+        )
         for row in range(n_loads):
             if reasons[row] is None:
                 known = starts[row]
@@ -193,12 +212,19 @@ def refine(
                 progress(number * n_loads + row + 1, len(scenes) * n_loads)
         previous = mesh
     records = [
-        {"sample": int(i), "patches": load.patches[0].tolist(), "vectors_n": load.vectors[0].tolist(), **_errors(answer, reason)}
+        {
+            "sample": int(i),
+            "patches": load.patches[0].tolist(),
+            "vectors_n": load.vectors[0].tolist(),
+            **_errors(answer, reason),
+        }
         for i, load, answer, reason in zip(samples, loads, answers, reasons, strict=True)
     ]
     solved = [record for record in records if record["error_m"] is not None]
     if not solved:
-        raise SolverError(f"{spec.name}: no load has an equilibrium on every mesh; the first: {reasons[0]}")
+        raise SolverError(
+            f"{spec.name}: no load has an equilibrium on every mesh; the first: {reasons[0]}"
+        )
     result = {
         "format": FORMAT,
         "schema_version": SCHEMA_VERSION,
@@ -222,17 +248,30 @@ def refine(
 def _errors(answers: list[NDArray[np.float64]], reason: str | None) -> dict[str, Any]:
     """The part of a load's record that its displacements on all meshes yield."""
     if reason is not None:
-        return {"error_m": None, "relative_l2": None, "order": None, "limit": "none", "reason": reason}
+        return {
+            "error_m": None,
+            "relative_l2": None,
+            "order": None,
+            "limit": "none",
+            "reason": reason,
+        }
     limit, order, kind = limit_of(answers)
     errors = sample_errors(answers[0][None], limit[None])
-    return {"error_m": float(errors.mean_dof_m[0]), "relative_l2": float(errors.relative_l2[0]), "order": order, "limit": kind}
+    return {
+        "error_m": float(errors.mean_dof_m[0]),
+        "relative_l2": float(errors.relative_l2[0]),
+        "order": order,
+        "limit": kind,
+    }
 
 
 def _cached_path(spec: DatasetSpec, cache: Path | None) -> Path:
     return dataset_folder(spec, cache) / "discretisation.json"
 
 
-def measured(spec: DatasetSpec, cache: Path | None = None, suite: Path | None = None) -> dict[str, Any] | None:
+def measured(
+    spec: DatasetSpec, cache: Path | None = None, suite: Path | None = None
+) -> dict[str, Any] | None:
     """The record of `refine` for a dataset: the one in the cache, else one shipped as ``datasets/*.refine.json``, else None.
 
     Records are told apart by the digest of the dataset's physics: of a dataset that was changed there is none.
@@ -256,10 +295,17 @@ def measured(spec: DatasetSpec, cache: Path | None = None, suite: Path | None = 
 def _read(path: Path) -> dict[str, Any]:
     try:
         record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        sound = (record["format"], record["schema_version"]) == (FORMAT, SCHEMA_VERSION) and isinstance(record["digest"], str)
-        sound = sound and all(0 <= float(record[key]) < inf for key in ("error_m", "relative_l2_median"))
+        sound = (record["format"], record["schema_version"]) == (
+            FORMAT,
+            SCHEMA_VERSION,
+        ) and isinstance(record["digest"], str)
+        sound = sound and all(
+            0 <= float(record[key]) < inf for key in ("error_m", "relative_l2_median")
+        )
     except (OSError, ValueError, KeyError, TypeError):
         sound = False
     if not sound:
-        raise StoreError(f"{path}: damaged, or not a discretisation error of schema version {SCHEMA_VERSION}; remove it and run `mor-bench refine`.")
+        raise StoreError(
+            f"{path}: damaged, or not a discretisation error of schema version {SCHEMA_VERSION}; remove it and run `mor-bench refine`."
+        )
     return record

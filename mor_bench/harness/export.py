@@ -29,7 +29,14 @@ ONNX_AGREES = 1e-5
 """Largest difference between a written network and the method's own predictions, relative to the largest displacement."""
 
 
-def export_vtu(data: Dataset, sample: int, out: str | Path, *, part: Part = "test", models: Sequence[str | Path] = ()) -> list[Path]:
+def export_vtu(
+    data: Dataset,
+    sample: int,
+    out: str | Path,
+    *,
+    part: Part = "test",
+    models: Sequence[str | Path] = (),
+) -> list[Path]:
     """Write a sample's reference, and the prediction of each model, as VTU.
 
     Each file holds the mesh at rest and as point data `displacement`, m, and `force`, N; that of a model also `error`, its
@@ -64,21 +71,33 @@ def export_vtu(data: Dataset, sample: int, out: str | Path, *, part: Part = "tes
     """
     samples, out = _part(data, part), Path(out)
     if not 0 <= sample < len(samples):
-        raise InvalidInputError(f"`sample` must be an integer in [0, {len(samples) - 1}], the samples of part {part!r}; got {sample}.")
+        raise InvalidInputError(
+            f"`sample` must be an integer in [0, {len(samples) - 1}], the samples of part {part!r}; got {sample}."
+        )
     names = ["reference", *(Path(model).stem for model in models)]
     if len(set(names)) < len(names):
-        raise InvalidInputError(f"files would have one name: models must differ in name, and none be called 'reference'; got {', '.join(names[1:])}.")
+        raise InvalidInputError(
+            f"files would have one name: models must differ in name, and none be called 'reference'; got {', '.join(names[1:])}."
+        )
     force, reference = samples.forces[sample], samples.displacements[sample]
     fields = [{"displacement": reference, "force": force}]
     for path in models:
         model = load_surrogate(path)
-        if model.scene_.spec.physics() != data.scene.spec.physics() or _observed(model.scene_) != _observed(data.scene):
-            raise InvalidInputError(f"{path}: the model was fitted to {model.scene_.name!r}, not to {data.scene.name!r} as it is.")
+        if model.scene_.spec.physics() != data.scene.spec.physics() or _observed(
+            model.scene_
+        ) != _observed(data.scene):
+            raise InvalidInputError(
+                f"{path}: the model was fitted to {model.scene_.name!r}, not to {data.scene.name!r} as it is."
+            )
         predicted = model.predict(samples.inputs[sample])
         fields.append({"displacement": predicted, "force": force, "error": predicted - reference})
     out.mkdir(parents=True, exist_ok=True)
     stems = [f"{data.scene.name}-{part}-{sample:05d}-{name}" for name in names]
-    return [path for stem, found in zip(stems, fields, strict=True) for path in _write(data.scene, found, out, stem)]
+    return [
+        path
+        for stem, found in zip(stems, fields, strict=True)
+        for path in _write(data.scene, found, out, stem)
+    ]
 
 
 def _observed(scene: Scene) -> list[int] | None:
@@ -95,16 +114,24 @@ def _part(data: Dataset, part: Part) -> Snapshots:
     return parts[part]
 
 
-def _write(scene: Scene, fields: Mapping[str, NDArray[np.float64]], out: Path, stem: str) -> list[Path]:
+def _write(
+    scene: Scene, fields: Mapping[str, NDArray[np.float64]], out: Path, stem: str
+) -> list[Path]:
     kind = "tetra" if scene.mesh.cells.shape[1] == 4 else "hexahedron"
     paths = [out / f"{stem}.vtu"]
-    meshio.Mesh(scene.mesh.points, [(kind, scene.mesh.cells)], point_data=dict(fields)).write(paths[0], binary=True)
+    meshio.Mesh(scene.mesh.points, [(kind, scene.mesh.cells)], point_data=dict(fields)).write(
+        paths[0], binary=True
+    )
     surface = scene.embedded_surface
     if surface is not None:
         # The force stays at the nodes: what is a sum over nodes is not interpolated.
-        carried = {name: scene.to_surface @ values for name, values in fields.items() if name != "force"}
+        carried = {
+            name: scene.to_surface @ values for name, values in fields.items() if name != "force"
+        }
         paths.append(out / f"{stem}-surface.vtu")
-        meshio.Mesh(surface.points, [("triangle", surface.facets)], point_data=carried).write(paths[1], binary=True)
+        meshio.Mesh(surface.points, [("triangle", surface.facets)], point_data=carried).write(
+            paths[1], binary=True
+        )
     return paths
 
 
@@ -114,8 +141,14 @@ def snapshot_arrays(data: Dataset) -> dict[str, NDArray[Any]]:
     They take turns, so that every beginning holds both parts in about their proportion.
     """
     parts = (data.train, data.test)
-    order = np.argsort(np.concatenate([(np.arange(len(part)) + 0.5) / len(part) for part in parts]), kind="stable")
-    arrays: dict[str, NDArray[Any]] = {"points": data.scene.mesh.points, "cells": data.scene.mesh.cells, "fixed_nodes": data.scene.fixed_nodes}
+    order = np.argsort(
+        np.concatenate([(np.arange(len(part)) + 0.5) / len(part) for part in parts]), kind="stable"
+    )
+    arrays: dict[str, NDArray[Any]] = {
+        "points": data.scene.mesh.points,
+        "cells": data.scene.mesh.cells,
+        "fixed_nodes": data.scene.fixed_nodes,
+    }
     for name in ("forces", "displacements", "regions"):
         arrays[name] = np.concatenate([getattr(part, name) for part in parts])[order]
     if isinstance(data.train.loads, NodalLoads) and not arrays["regions"].any():
@@ -142,7 +175,9 @@ def export_numpy(data: Dataset, out: str | Path) -> list[Path]:
         raise InvalidInputError(f"`out` must end in .npz; got {str(out)!r}.")
     for path in (out, out.with_suffix(".toml")):
         if path.exists():
-            raise InvalidInputError(f"`out`: {path} exists and is not overwritten; remove it or choose another name.")
+            raise InvalidInputError(
+                f"`out`: {path} exists and is not overwritten; remove it or choose another name."
+            )
     out.parent.mkdir(parents=True, exist_ok=True)
     buffer = io.BytesIO()
     np.savez(buffer, **snapshot_arrays(data))  # type: ignore[arg-type]
@@ -211,12 +246,16 @@ def export_onnx(model: str | Path, out: str | Path) -> tuple[Path, float | None]
     if out.suffix != ".onnx":
         raise InvalidInputError(f"`out` must end in .onnx; got {str(out)!r}.")
     if out.exists():
-        raise InvalidInputError(f"`out`: {out} exists and is not overwritten; remove it or choose another name.")
+        raise InvalidInputError(
+            f"`out`: {out} exists and is not overwritten; remove it or choose another name."
+        )
     surrogate = load_surrogate(model)
     written = surrogate._onnx_model().SerializeToString()
     difference = _onnx_difference(surrogate, written)
     if difference is not None and not difference <= ONNX_AGREES:
-        raise MorBenchError(f"{model}: ONNX Runtime's answers differ from the method's by {difference:.1e} of the largest; nothing was written.")
+        raise MorBenchError(
+            f"{model}: ONNX Runtime's answers differ from the method's by {difference:.1e} of the largest; nothing was written."
+        )
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(out, written)
     return out, difference

@@ -60,20 +60,50 @@ class _Quantity:
 
 
 QUANTITIES: dict[str, _Quantity] = {
-    "latency": _Quantity("time", "seconds", ("latency_ms", "median"), "Median latency of a single query.", 1e-3),
-    "relative_error": _Quantity("track", "relative l2", ("error", "rel_l2_median"), "Median relative l2 error on the test samples."),
-    "mean_dof_error": _Quantity("track", "m", ("error", "mean_dof_m"), "Mean absolute error per degree of freedom on the test samples."),
-    "fit": _Quantity("time", "seconds", ("offline_s", "fit"), "Fitting, without the generation of the samples."),
-    "peak_memory_fit": _Quantity("peakmemory", "bytes", ("memory_bytes", "fit"), "Peak resident memory of fitting."),
-    "peak_memory_predict": _Quantity("peakmemory", "bytes", ("memory_bytes", "predict"), "Peak resident memory of queries."),
+    "latency": _Quantity(
+        "time", "seconds", ("latency_ms", "median"), "Median latency of a single query.", 1e-3
+    ),
+    "relative_error": _Quantity(
+        "track",
+        "relative l2",
+        ("error", "rel_l2_median"),
+        "Median relative l2 error on the test samples.",
+    ),
+    "mean_dof_error": _Quantity(
+        "track",
+        "m",
+        ("error", "mean_dof_m"),
+        "Mean absolute error per degree of freedom on the test samples.",
+    ),
+    "fit": _Quantity(
+        "time", "seconds", ("offline_s", "fit"), "Fitting, without the generation of the samples."
+    ),
+    "peak_memory_fit": _Quantity(
+        "peakmemory", "bytes", ("memory_bytes", "fit"), "Peak resident memory of fitting."
+    ),
+    "peak_memory_predict": _Quantity(
+        "peakmemory", "bytes", ("memory_bytes", "predict"), "Peak resident memory of queries."
+    ),
     **{
-        f"query_in_batch_{n}": _Quantity("time", "seconds", ("throughput", n), f"Time per query in batches of {n}: 1 / throughput.", inverse=True)
+        f"query_in_batch_{n}": _Quantity(
+            "time",
+            "seconds",
+            ("throughput", n),
+            f"Time per query in batches of {n}: 1 / throughput.",
+            inverse=True,
+        )
         for n in ("8", "64", "512")
     },
 }
 
 
-def export_asv(comparison: Comparison, out: str | Path, *, commit: str | None = None, machine: str | None = None) -> list[Path]:
+def export_asv(
+    comparison: Comparison,
+    out: str | Path,
+    *,
+    commit: str | None = None,
+    machine: str | None = None,
+) -> list[Path]:
     """Write a comparison's figures for one commit into asv's folder of results, beside what is there.
 
     What the folder holds of other commits, machines, configurations and settings stays; the same configuration in the same
@@ -109,15 +139,24 @@ def export_asv(comparison: Comparison, out: str | Path, *, commit: str | None = 
     name = _machine_name(comparison, machine)
     figures = _figures(comparison)
     if not figures:
-        raise InvalidInputError(f"{comparison.out}: no configuration has finished; there is nothing to export.")
+        raise InvalidInputError(
+            f"{comparison.out}: no configuration has finished; there is nothing to export."
+        )
     python = ".".join(str(comparison.machine["python"]).split(".")[:2])
     environment = f"mor-bench-py{python}"
-    path, machine_path = out / name / f"{commit_hash[:8]}-{environment}.json", out / name / "machine.json"
-    _read(out / "benchmarks.json", "benchmarks")  # so that nothing is written if it cannot be added to
+    path, machine_path = (
+        out / name / f"{commit_hash[:8]}-{environment}.json",
+        out / name / "machine.json",
+    )
+    _read(
+        out / "benchmarks.json", "benchmarks"
+    )  # so that nothing is written if it cannot be added to
     about = _read(machine_path, "machine") or _about(comparison, name)
     before = _read(path, "results") or {"results": {}, "commit_hash": commit_hash}
     if before["commit_hash"] != commit_hash:
-        raise StoreError(f"{path}: holds results of commit {before['commit_hash']}, not of {commit_hash}.")
+        raise StoreError(
+            f"{path}: holds results of commit {before['commit_hash']}, not of {commit_hash}."
+        )
     results = dict(before["results"])
     for benchmark, values in figures.items():
         results[benchmark] = _row({**_values(before, benchmark), **values})
@@ -125,7 +164,10 @@ def export_asv(comparison: Comparison, out: str | Path, *, commit: str | None = 
         "commit_hash": commit_hash,
         "env_name": environment,
         "date": date,
-        "params": {**{key: value for key, value in about.items() if key != "version"}, "python": python},
+        "params": {
+            **{key: value for key, value in about.items() if key != "version"},
+            "python": python,
+        },
         "python": python,
         "requirements": {},
         "env_vars": {},
@@ -159,7 +201,12 @@ def describe(out: str | Path) -> Path:
                 values.update(dict.fromkeys(more))
     path = out / "benchmarks.json"
     entries = _read(path, "benchmarks") or {}
-    entries.update({benchmark: _entry(benchmark, [list(values) for values in seen]) for benchmark, seen in parameters.items()})
+    entries.update(
+        {
+            benchmark: _entry(benchmark, [list(values) for values in seen])
+            for benchmark, seen in parameters.items()
+        }
+    )
     _write(path, entries, "benchmarks")
     return path
 
@@ -186,8 +233,15 @@ def _figures(comparison: Comparison) -> dict[str, dict[Key, tuple[float | None, 
         ok = row["status"] == "ok"
         statistics = _statistics(row) if ok and name == "latency" else {}
         key = repr(row["label"]), repr(_setting(comparison, row))
-        figures.setdefault(f"{GROUP}.{row['dataset']}.{name}", {})[key] = (quantity.of(row) if ok else None), statistics
-    return {name: values for name, values in figures.items() if any(value is not None and not math.isnan(value) for value, _ in values.values())}
+        figures.setdefault(f"{GROUP}.{row['dataset']}.{name}", {})[key] = (
+            (quantity.of(row) if ok else None),
+            statistics,
+        )
+    return {
+        name: values
+        for name, values in figures.items()
+        if any(value is not None and not math.isnan(value) for value, _ in values.values())
+    }
 
 
 def _setting(comparison: Comparison, row: Mapping[str, Any]) -> str:
@@ -202,8 +256,15 @@ def _statistics(row: Mapping[str, Any]) -> dict[str, float]:
     if low is None or high is None or not 0 < low <= median <= high:
         return {}
     wider, narrower = 2.5758 / 1.9600, 0.6745 / 1.9600
-    limits = {"ci_99_a": (low, wider), "ci_99_b": (high, wider), "q_25": (low, narrower), "q_75": (high, narrower)}
-    return {name: 1e-3 * median * (limit / median) ** power for name, (limit, power) in limits.items()} | {
+    limits = {
+        "ci_99_a": (low, wider),
+        "ci_99_b": (high, wider),
+        "q_25": (low, narrower),
+        "q_75": (high, narrower),
+    }
+    return {
+        name: 1e-3 * median * (limit / median) ** power for name, (limit, power) in limits.items()
+    } | {
         "number": 1,
         "repeat": latency.get("n_queries") or 1,
     }
@@ -214,17 +275,28 @@ def _row(values: Mapping[Key, tuple[float | None, Mapping[str, float]]]) -> list
     parameters = [list(dict.fromkeys(column)) for column in zip(*values, strict=True)]
     listed = [values.get(key, (math.nan, {})) for key in itertools.product(*parameters)]
     statistics = [[figures.get(name) for _, figures in listed] for name in _STATISTICS]
-    return [[value for value, _ in listed], parameters, "1", *(column if any(x is not None for x in column) else None for column in statistics)]
+    return [
+        [value for value, _ in listed],
+        parameters,
+        "1",
+        *(column if any(x is not None for x in column) else None for column in statistics),
+    ]
 
 
-def _values(content: Mapping[str, Any], benchmark: str) -> dict[Key, tuple[float | None, dict[str, float]]]:
+def _values(
+    content: Mapping[str, Any], benchmark: str
+) -> dict[Key, tuple[float | None, dict[str, float]]]:
     """The inverse of `_row`."""
     if benchmark not in content["results"]:
         return {}
     listed, parameters, _, *columns = content["results"][benchmark]
     values = {}
     for i, key in enumerate(itertools.product(*parameters)):
-        figures = {name: column[i] for name, column in zip(_STATISTICS, columns, strict=True) if column and column[i] is not None}
+        figures = {
+            name: column[i]
+            for name, column in zip(_STATISTICS, columns, strict=True)
+            if column and column[i] is not None
+        }
         values[key] = listed[i], figures
     return values
 
@@ -238,7 +310,9 @@ def _machine_name(comparison: Comparison, machine: str | None) -> str:
             )
         machine = platform.node()
     if not re.fullmatch(r"\w[\w.-]*", machine):
-        raise InvalidInputError(f"`machine` must consist of letters, digits, '.', '-' and '_', and not begin with a mark; got {machine!r}.")
+        raise InvalidInputError(
+            f"`machine` must consist of letters, digits, '.', '-' and '_', and not begin with a mark; got {machine!r}."
+        )
     return machine
 
 
@@ -266,9 +340,23 @@ def _commit(folder: Path, commit: str | None) -> tuple[str, int]:
     """Hash of a commit and its date, ms since 1970."""
     top = _git(folder, "rev-parse", "--show-toplevel")
     project = Path(top) / "pyproject.toml" if top else None
-    if project is None or not project.is_file() or tomllib.loads(project.read_text(encoding="utf-8")).get("project", {}).get("name") != "mor-bench":
-        raise InvalidInputError(f"{folder.resolve()} is in no git checkout of mor-bench, which must hold the commit that ran the comparison.")
-    found = _git(folder, "rev-parse", "--verify", "--quiet", "--end-of-options", f"{commit or 'HEAD'}^{{commit}}")
+    if (
+        project is None
+        or not project.is_file()
+        or tomllib.loads(project.read_text(encoding="utf-8")).get("project", {}).get("name")
+        != "mor-bench"
+    ):
+        raise InvalidInputError(
+            f"{folder.resolve()} is in no git checkout of mor-bench, which must hold the commit that ran the comparison."
+        )
+    found = _git(
+        folder,
+        "rev-parse",
+        "--verify",
+        "--quiet",
+        "--end-of-options",
+        f"{commit or 'HEAD'}^{{commit}}",
+    )
     if not found:
         raise InvalidInputError(f"`commit` must name a commit of {top}; got {commit or 'HEAD'!r}.")
     return found, 1000 * int(_git(folder, "show", "-s", "--format=%at", found) or 0)
@@ -277,7 +365,14 @@ def _commit(folder: Path, commit: str | None) -> tuple[str, int]:
 def _git(folder: Path, *arguments: str) -> str | None:
     """What git prints; None if it fails or is not installed."""
     try:
-        return subprocess.run(["git", *arguments], cwd=folder, check=True, capture_output=True, text=True, encoding="utf-8").stdout.strip()
+        return subprocess.run(
+            ["git", *arguments],
+            cwd=folder,
+            check=True,
+            capture_output=True,
+            text=True,
+            encoding="utf-8",
+        ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
 
@@ -292,7 +387,9 @@ def _read(path: Path, kind: str) -> dict[str, Any] | None:
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise StoreError(f"{path}: not a file of asv: {error!r}") from None
     if version != VERSION[kind]:
-        raise StoreError(f"{path}: asv's {kind} in version {version}; this version of mor-bench knows version {VERSION[kind]}.")
+        raise StoreError(
+            f"{path}: asv's {kind} in version {version}; this version of mor-bench knows version {VERSION[kind]}."
+        )
     if kind == "results" and not _ours(content):
         raise StoreError(f"{path}: not written by mor-bench.")
     return dict(content)
@@ -300,8 +397,15 @@ def _read(path: Path, kind: str) -> dict[str, Any] | None:
 
 def _ours(content: Mapping[str, Any]) -> bool:
     named: Iterable[str] = content.get("results") or ()
-    known = all(name.startswith(f"{GROUP}.") and name.rpartition(".")[2] in QUANTITIES for name in named)
-    return known and content.get("result_columns") == list(_COLUMNS) and "commit_hash" in content and "date" in content
+    known = all(
+        name.startswith(f"{GROUP}.") and name.rpartition(".")[2] in QUANTITIES for name in named
+    )
+    return (
+        known
+        and content.get("result_columns") == list(_COLUMNS)
+        and "commit_hash" in content
+        and "date" in content
+    )
 
 
 def _write(path: Path, content: Mapping[str, Any], kind: str) -> None:

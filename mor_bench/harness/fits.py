@@ -50,7 +50,17 @@ N_COUNTED = 32
 SCORE_CHUNK = 256
 """Samples that are predicted at once."""
 
-FIT_KEYS = {"fit_s", "fit_memory_bytes", "model_bytes", "needs_snapshots", "parameters", "warnings", "n_train", "n_dofs", "model_sha256"}
+FIT_KEYS = {
+    "fit_s",
+    "fit_memory_bytes",
+    "model_bytes",
+    "needs_snapshots",
+    "parameters",
+    "warnings",
+    "n_train",
+    "n_dofs",
+    "model_sha256",
+}
 """What a record of a fit holds."""
 
 LOAD_LIMIT_S = 300.0
@@ -131,7 +141,9 @@ class TestSet:
             snapshots.inputs,
             snapshots.displacements,
             nodes,
-            digest_of(arrays if len(nodes) == snapshots.scene.mesh.n_nodes else {**arrays, "nodes": nodes}),
+            digest_of(
+                arrays if len(nodes) == snapshots.scene.mesh.n_nodes else {**arrays, "nodes": nodes}
+            ),
         )
 
 
@@ -157,7 +169,9 @@ class Material:
         An existing folder that every method's process may write to.
     """
 
-    def __init__(self, scene: Scene, train: Snapshots, sets: Mapping[str, TestSet], scratch: Path) -> None:
+    def __init__(
+        self, scene: Scene, train: Snapshots, sets: Mapping[str, TestSet], scratch: Path
+    ) -> None:
         self.scene, self.scratch, self.sets = scene, scratch, dict(sets)
         self.n_train = len(train)
         self._train = train
@@ -183,7 +197,11 @@ class Material:
     def train_digest(self) -> str:
         """Of the training snapshots and the scene."""
         spec = self.scene.spec
-        asked = [] if spec.needs.outputs == "all" else [spec.needs.model_dump(mode="json", include={"outputs"})]
+        asked = (
+            []
+            if spec.needs.outputs == "all"
+            else [spec.needs.model_dump(mode="json", include={"outputs"})]
+        )
         if self.scene.observed_nodes is not None:
             asked.append({"observed": self.scene.observed_nodes.tolist()})
         scene = json.dumps([spec.physics(), spec.grid_nodes, *asked], sort_keys=True)
@@ -239,7 +257,10 @@ class Entry:
             "data": material.train_digest,
             "surrogate": job.method.surrogate,
             "parameters": job.parameters,
-            "code": [code_digest(job.method.surrogate, job.method.folder), *_code_of_named(job.parameters)],
+            "code": [
+                code_digest(job.method.surrogate, job.method.folder),
+                *_code_of_named(job.parameters),
+            ],
             "machine": place.machine,
             "threads": place.fit_threads,
         }
@@ -264,9 +285,18 @@ class Entry:
     def settled(self) -> Job:
         """The job with the number of iterations that its seconds came to, once it is fitted: another training is then no longer timed."""
         job, iterations = self.job, ((self.fit or {}).get("training") or {}).get("iterations")
-        if job.training is None or job.training.fit_seconds is None or iterations is None or "iterations" not in (self.fit or {})["parameters"]:
+        if (
+            job.training is None
+            or job.training.fit_seconds is None
+            or iterations is None
+            or "iterations" not in (self.fit or {})["parameters"]
+        ):
             return job
-        return replace(job, parameters={**job.parameters, "iterations": iterations}, training=replace(job.training, fit_seconds=None))
+        return replace(
+            job,
+            parameters={**job.parameters, "iterations": iterations},
+            training=replace(job.training, fit_seconds=None),
+        )
 
     def begin_training(self) -> None:
         """Make room for a checkpoint, and note the seconds that a stopped training took until it wrote the one that is there."""
@@ -289,8 +319,15 @@ class Entry:
         """What is known of the fit; None if it is not there, or damaged."""
         try:
             record = json.loads((self.folder / "fit.json").read_bytes())
-            whole = isinstance(record, dict) and record.keys() >= FIT_KEYS and isinstance(record["parameters"], dict)
-            if not whole or (record["model_sha256"] is not None and record["model_sha256"] != _file_digest(self.model)):
+            whole = (
+                isinstance(record, dict)
+                and record.keys() >= FIT_KEYS
+                and isinstance(record["parameters"], dict)
+            )
+            if not whole or (
+                record["model_sha256"] is not None
+                and record["model_sha256"] != _file_digest(self.model)
+            ):
                 return None
         except (OSError, ValueError):
             return None
@@ -319,22 +356,39 @@ class Entry:
 
     def keep_arrays(self, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Keep arrays."""
-        write_arrays(self.folder / f"{name}.h5", {**arrays, "digest": np.array(digest_of(arrays).encode())})
+        write_arrays(
+            self.folder / f"{name}.h5", {**arrays, "digest": np.array(digest_of(arrays).encode())}
+        )
 
     def process(self, nursery: Nursery | None = None, open_one: Path | None = None) -> Worker:
         """A fresh process for this method, without a model."""
         sealed, own = list(self.place.sealed), self.job.method.folder
-        return Worker(self.material.scene, sealed, own, self.place.memory_limit_bytes, nursery or self.place.nursery, open_one)
+        return Worker(
+            self.material.scene,
+            sealed,
+            own,
+            self.place.memory_limit_bytes,
+            nursery or self.place.nursery,
+            open_one,
+        )
 
-    def ask_fit(self, worker: Worker, limit_s: float, checkpoint: Path | None = None) -> tuple[dict[str, Any], Path]:
+    def ask_fit(
+        self, worker: Worker, limit_s: float, checkpoint: Path | None = None
+    ) -> tuple[dict[str, Any], Path]:
         """Let a process fit, anew or going on from a checkpoint; its answer, and where the model is."""
         model = Path(tempfile.mkdtemp(dir=self.material.scratch)) / "model.safetensors"
         job = self.settled
         answer = worker.ask(
-            "fit", limit_s, surrogate=job.method.surrogate, parameters=job.parameters, train=self.material.train_folder,
-            model=model, threads=self.place.fit_threads, limit_s=limit_s,
+            "fit",
+            limit_s,
+            surrogate=job.method.surrogate,
+            parameters=job.parameters,
+            train=self.material.train_folder,
+            model=model,
+            threads=self.place.fit_threads,
+            limit_s=limit_s,
             training=None if job.training is None else replace(job.training, checkpoint=checkpoint),
-        )  # fmt: skip
+        )
         if answer["needs_snapshots"]:
             self.material.check_unchanged()
         return answer, model
@@ -347,7 +401,9 @@ class Entry:
         worker = self.process(nursery)
         try:
             if self.fit and self.fit["model_sha256"] is not None:
-                worker.ask("load", LOAD_LIMIT_S, surrogate=self.job.method.surrogate, model=self.model)
+                worker.ask(
+                    "load", LOAD_LIMIT_S, surrogate=self.job.method.surrogate, model=self.model
+                )
             else:
                 self.ask_fit(worker, limit_s)
         except BaseException:
@@ -442,7 +498,9 @@ def _fitting_process(entry: Entry) -> Worker:
 
 def _left(limit_s: float, taken_s: float) -> float:
     if taken_s >= limit_s:
-        raise MethodFailedError(f"fitting took longer than the limit of {limit_s:g} s: {taken_s:.0f} s until it was stopped")
+        raise MethodFailedError(
+            f"fitting took longer than the limit of {limit_s:g} s: {taken_s:.0f} s until it was stopped"
+        )
     return limit_s - taken_s
 
 
@@ -492,7 +550,11 @@ def evaluate(entry: Entry, limit_s: float) -> Outcome:
 
 def _record(entry: Entry, answer: dict[str, Any]) -> dict[str, Any]:
     """The answer to a fit, and what estimates of others need."""
-    known = {"method": entry.job.method.name, "n_train": entry.material.n_train, "n_dofs": entry.material.scene.mesh.n_dofs}
+    known = {
+        "method": entry.job.method.name,
+        "n_train": entry.material.n_train,
+        "n_dofs": entry.material.scene.mesh.n_dofs,
+    }
     return {**known, **answer}
 
 
@@ -509,7 +571,11 @@ def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[
     """Errors of each sample of a test set, and the worst sample."""
     parts: list[SampleErrors] = []
     flagged: list[bool] | None = []
-    worst: tuple[float, int, NDArray[np.float64]] = (-1.0, 0, np.full(test.references.shape[1:], np.nan))
+    worst: tuple[float, int, NDArray[np.float64]] = (
+        -1.0,
+        0,
+        np.full(test.references.shape[1:], np.nan),
+    )
     main = test is entry.material.sets.get("test")
     indicated = Indicated(entry.material.indicator if main else None, len(test.forces))
     until = monotonic() + limit_s
@@ -517,17 +583,28 @@ def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[
         for start in range(0, len(test.forces), SCORE_CHUNK):
             rows = slice(start, start + SCORE_CHUNK)
             predicted = ask_answers(
-                worker, "predict", max(1.0, until - monotonic()), Path(folder) / "answers.npy", test.forces[rows], entry.place.threads
+                worker,
+                "predict",
+                max(1.0, until - monotonic()),
+                Path(folder) / "answers.npy",
+                test.forces[rows],
+                entry.place.threads,
             )
             parts.append(sample_errors(predicted, test.references[rows], test.nodes))
             finite = np.where(np.isfinite(parts[-1].mean_dof_m), parts[-1].mean_dof_m, -1.0)
             if finite.max() > worst[0]:
-                worst = float(finite.max()), start + int(finite.argmax()), predicted[finite.argmax()].copy()
+                worst = (
+                    float(finite.max()),
+                    start + int(finite.argmax()),
+                    predicted[finite.argmax()].copy(),
+                )
             indicated.add(start, test.forces[rows], predicted)
             flags = worker.ask("flag", LOAD_LIMIT_S, forces=test.forces[rows])["flagged"]
             flagged = None if flags is None or flagged is None else flagged + flags
     return {
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])},
+        **{
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])
+        },
         **({} if flagged is None else {"flagged": np.asarray(flagged, dtype=bool)}),
         **indicated.arrays,
         "worst_prediction": worst[2],
@@ -537,7 +614,9 @@ def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[
     }
 
 
-def ask_answers(worker: Worker, do: str, limit_s: float, out: Path, forces: NDArray[np.float64], threads: int) -> NDArray[np.float64]:
+def ask_answers(
+    worker: Worker, do: str, limit_s: float, out: Path, forces: NDArray[np.float64], threads: int
+) -> NDArray[np.float64]:
     """Predictions that a process writes to a file, checked: a third party's code ran there."""
     worker.ask(do, limit_s, forces=forces, out=out, threads=threads)
     try:
@@ -545,7 +624,9 @@ def ask_answers(worker: Worker, do: str, limit_s: float, out: Path, forces: NDAr
     except (OSError, ValueError) as error:
         raise MethodFailedError(f"its predictions cannot be read: {error}") from None
     if predicted.shape != forces.shape or predicted.dtype != np.float64:
-        raise MethodFailedError(f"its predictions have shape {predicted.shape} and are {predicted.dtype}; expected {forces.shape} and float64")
+        raise MethodFailedError(
+            f"its predictions have shape {predicted.shape} and are {predicted.dtype}; expected {forces.shape} and float64"
+        )
     out.unlink()
     return np.asarray(predicted)
 
@@ -556,18 +637,27 @@ def _cost(entry: Entry, opened: Callable[[], Worker]) -> dict[str, float] | None
     path = entry.folder / f"cost-{test.digest[:20]}.json"
     with suppress(OSError, ValueError):
         kept = json.loads(path.read_bytes())
-        if kept is None or (isinstance(kept, dict) and all(isinstance(value, int | float) for value in kept.values())):
+        if kept is None or (
+            isinstance(kept, dict)
+            and all(isinstance(value, int | float) for value in kept.values())
+        ):
             return kept
     chosen = np.linspace(0, len(test.forces) - 1, min(N_COUNTED, len(test.forces))).astype(int)
-    cost: dict[str, float] | None = opened().ask("cost", LOAD_LIMIT_S, forces=test.forces[chosen])["cost"]
+    cost: dict[str, float] | None = opened().ask("cost", LOAD_LIMIT_S, forces=test.forces[chosen])[
+        "cost"
+    ]
     write_atomically(path, json.dumps(cost).encode())
     return cost
 
 
 def fit_elsewhere(
-    scene: Scene, arrays: dict[str, NDArray[Any]], surrogate: str, parameters: dict[str, Any], limits: tuple[float, float],
+    scene: Scene,
+    arrays: dict[str, NDArray[Any]],
+    surrogate: str,
+    parameters: dict[str, Any],
+    limits: tuple[float, float],
     training: TrainingOptions | None = None,
-) -> tuple[dict[str, Any], bytes | None]:  # fmt: skip
+) -> tuple[dict[str, Any], bytes | None]:
     """A fit on another machine, in a process of its own there: its answer, and the model.
 
     Parameters
@@ -590,7 +680,14 @@ def fit_elsewhere(
         with Worker(scene, [], memory_limit_bytes=limits[1]) as worker:
             model = folder / "model.safetensors"
             answer = worker.ask(
-                "fit", limits[0], surrogate=surrogate, parameters=parameters, train=folder / "train", model=model,
-                threads=os.cpu_count() or 1, limit_s=limits[0], training=training,
-            )  # fmt: skip
+                "fit",
+                limits[0],
+                surrogate=surrogate,
+                parameters=parameters,
+                train=folder / "train",
+                model=model,
+                threads=os.cpu_count() or 1,
+                limit_s=limits[0],
+                training=training,
+            )
         return answer, model.read_bytes() if model.exists() else None

@@ -63,8 +63,13 @@ def time_at_error(points: Sequence[Point], target: float) -> dict[str, Any]:
     latency = real.latency_ms
     if before >= 0:
         p = front[before]
-        latency = _interpolate(target, p.error, p.latency_ms, max(real.error, EXACT), real.latency_ms)
-    return {"latency_ms": latency, "best": {"label": real.label, "latency_ms": real.latency_ms, "error": real.error}}
+        latency = _interpolate(
+            target, p.error, p.latency_ms, max(real.error, EXACT), real.latency_ms
+        )
+    return {
+        "latency_ms": latency,
+        "best": {"label": real.label, "latency_ms": real.latency_ms, "error": real.error},
+    }
 
 
 def error_at_time(points: Sequence[Point], target_ms: float) -> dict[str, Any]:
@@ -77,12 +82,20 @@ def error_at_time(points: Sequence[Point], target_ms: float) -> dict[str, Any]:
     error = real.error
     if len(within) < len(front):
         p = front[len(within)]
-        error = _interpolate(target_ms, real.latency_ms, max(real.error, EXACT), p.latency_ms, max(p.error, EXACT))
-    return {"error": error, "best": {"label": real.label, "latency_ms": real.latency_ms, "error": real.error}}
+        error = _interpolate(
+            target_ms, real.latency_ms, max(real.error, EXACT), p.latency_ms, max(p.error, EXACT)
+        )
+    return {
+        "error": error,
+        "best": {"label": real.label, "latency_ms": real.latency_ms, "error": real.error},
+    }
 
 
 def frontier_draws(
-    log_latencies: NDArray[np.float64], log_errors: NDArray[np.float64], errors: Sequence[float], times_ms: Sequence[float]
+    log_latencies: NDArray[np.float64],
+    log_errors: NDArray[np.float64],
+    errors: Sequence[float],
+    times_ms: Sequence[float],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """`time_at_error` and `error_at_time` of many resamples at once.
 
@@ -101,12 +114,17 @@ def frontier_draws(
         Logarithms of the errors at the latencies, infinite where not reached.
     """
     order = np.lexsort((log_errors, log_latencies), axis=0)
-    latency, error = np.take_along_axis(log_latencies, order, 0), np.take_along_axis(log_errors, order, 0)
+    latency, error = (
+        np.take_along_axis(log_latencies, order, 0),
+        np.take_along_axis(log_errors, order, 0),
+    )
     n_configurations, n = latency.shape
     numbers, columns = np.arange(n_configurations)[:, None], np.arange(n)
     least = np.minimum.accumulate(error, axis=0)
     on_front = np.vstack([np.isfinite(error[:1]), (error[1:] < least[:-1])])
-    last = np.maximum.accumulate(np.where(on_front, numbers, -1), axis=0)  # of the front's points so far
+    last = np.maximum.accumulate(
+        np.where(on_front, numbers, -1), axis=0
+    )  # of the front's points so far
     at_error, at_time = np.full((len(errors), n), np.inf), np.full((len(times_ms), n), np.inf)
     for out, target in zip(at_error, np.log(np.maximum(errors, EXACT)), strict=True):
         meets = error <= target
@@ -140,7 +158,10 @@ def is_point(row: dict[str, Any]) -> bool:
     """Whether a results row has a place on the plane: it ran, was timed and was scored."""
     if row["status"] != "ok":
         return False
-    latency, error = (row["latency_ms"] or {}).get("median"), (row["error"] or {}).get("rel_l2_median")
+    latency, error = (
+        (row["latency_ms"] or {}).get("median"),
+        (row["error"] or {}).get("rel_l2_median"),
+    )
     return latency is not None and error is not None and 0 < latency < inf
 
 
@@ -154,6 +175,12 @@ def compare(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
             if (row["dataset"], row["method"]) == (dataset, method) and is_point(row)
         ]
         key = {"dataset": dataset, "method": method}
-        at_error += [{**key, "target_rel_l2_median": target, **time_at_error(points, target)} for target in TARGET_ERRORS]
-        at_time += [{**key, "target_latency_ms": target, **error_at_time(points, target)} for target in TARGET_TIMES_MS]
+        at_error += [
+            {**key, "target_rel_l2_median": target, **time_at_error(points, target)}
+            for target in TARGET_ERRORS
+        ]
+        at_time += [
+            {**key, "target_latency_ms": target, **error_at_time(points, target)}
+            for target in TARGET_TIMES_MS
+        ]
     return {"time_at_error": at_error, "error_at_time": at_time}

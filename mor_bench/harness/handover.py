@@ -18,8 +18,15 @@ from mor_bench.surrogate import Surrogate
 def arrays_of(snapshots: Snapshots) -> dict[str, NDArray[np.generic]]:
     """All that snapshots hold beside their scene."""
     loads = snapshots.loads
-    forces = {"forces": loads.forces} if isinstance(loads, NodalLoads) else {"vectors": loads.vectors}
-    return {"patches": loads.patches, **forces, "free_displacements": snapshots.free_displacements, "min_det_f": snapshots.min_det_f}
+    forces = (
+        {"forces": loads.forces} if isinstance(loads, NodalLoads) else {"vectors": loads.vectors}
+    )
+    return {
+        "patches": loads.patches,
+        **forces,
+        "free_displacements": snapshots.free_displacements,
+        "min_det_f": snapshots.min_det_f,
+    }
 
 
 def write_snapshots(folder: Path, snapshots: Snapshots) -> None:
@@ -31,9 +38,15 @@ def write_snapshots(folder: Path, snapshots: Snapshots) -> None:
 
 def read_snapshots(folder: Path, scene: Scene) -> Snapshots:
     """Read what `write_snapshots` wrote; the arrays are read-only."""
-    arrays = {path.stem: np.load(path, mmap_mode="r", allow_pickle=False) for path in folder.glob("*.npy")}
+    arrays = {
+        path.stem: np.load(path, mmap_mode="r", allow_pickle=False) for path in folder.glob("*.npy")
+    }
     patches = np.asarray(arrays["patches"])
-    loads = NodalLoads(arrays["forces"], patches) if "forces" in arrays else PatchLoads(patches, np.asarray(arrays["vectors"]))
+    loads = (
+        NodalLoads(arrays["forces"], patches)
+        if "forces" in arrays
+        else PatchLoads(patches, np.asarray(arrays["vectors"]))
+    )
     return Snapshots(scene, loads, arrays["free_displacements"], arrays["min_det_f"])
 
 
@@ -62,5 +75,7 @@ def predict_all(method: Surrogate, forces: NDArray[np.float64]) -> NDArray[np.fl
             except SolverError:
                 continue
     if predicted.shape != forces.shape or predicted.dtype.kind != "f":
-        raise InvalidInputError(f"`predict` must return floats of shape {forces.shape}; it returned {predicted.dtype} of shape {predicted.shape}.")
+        raise InvalidInputError(
+            f"`predict` must return floats of shape {forces.shape}; it returned {predicted.dtype} of shape {predicted.shape}."
+        )
     return predicted.astype(np.float64, copy=False)

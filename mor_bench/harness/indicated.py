@@ -41,7 +41,9 @@ class Indicated:
             return
         chosen = self._chosen[(self._chosen >= first) & (self._chosen < first + len(forces))]
         found = self._indicator(forces[chosen - first], predicted[chosen - first])
-        self._rows.append(np.stack([chosen, found.relative_correction, found.relative_residual], axis=1))
+        self._rows.append(
+            np.stack([chosen, found.relative_correction, found.relative_residual], axis=1)
+        )
 
     @property
     def arrays(self) -> dict[str, NDArray[np.float64]]:
@@ -53,7 +55,9 @@ def indicator_summary(score: Mapping[str, Any]) -> dict[str, float] | None:
     """How far the indicated errors of some samples tell the measured ones; None where there are too few."""
     rows, correction, residual = score.get("indicated", np.zeros((0, 3))).T
     measured = score["relative_l2"][rows.astype(int)]
-    usable = np.isfinite(measured) & (measured > 0) & np.isfinite(correction) & np.isfinite(residual)
+    usable = (
+        np.isfinite(measured) & (measured > 0) & np.isfinite(correction) & np.isfinite(residual)
+    )
     measured, correction, residual = measured[usable], correction[usable], residual[usable]
     if len(measured) < LEAST_INDICATED or measured.max() < EXACT:
         return None
@@ -62,5 +66,8 @@ def indicator_summary(score: Mapping[str, Any]) -> dict[str, float] | None:
         "n": len(measured),
         "rank_correlation": float(spearmanr(measured, correction)[0]),
         "residual_rank_correlation": float(spearmanr(measured, residual)[0]),
-        **{f"ratio_{name}": float(np.quantile(ratio, share)) for name, share in (("p5", 0.05), ("median", 0.5), ("p95", 0.95))},
+        **{
+            f"ratio_{name}": float(np.quantile(ratio, share))
+            for name, share in (("p5", 0.05), ("median", 0.5), ("p95", 0.95))
+        },
     }

@@ -79,7 +79,14 @@ class Worker:
         path = [str(folder), *sys.path] if folder else list(sys.path)
         try:
             within = None if open_one is None else str(open_one)
-            self.ask("begin", START_LIMIT_S, path=path, scene=scene, sealed=[str(item) for item in sealed], open_one=within)
+            self.ask(
+                "begin",
+                START_LIMIT_S,
+                path=path,
+                scene=scene,
+                sealed=[str(item) for item in sealed],
+                open_one=within,
+            )
         except BaseException:
             self.end()
             raise
@@ -120,7 +127,9 @@ class Worker:
             except Empty:
                 if monotonic() >= until:
                     self.end()
-                    raise MethodFailedError(f"{_DOING.get(do, do)} took longer than the limit of {within_s:g} s") from None
+                    raise MethodFailedError(
+                        f"{_DOING.get(do, do)} took longer than the limit of {within_s:g} s"
+                    ) from None
                 if self._is_dead() and self._answers.empty():  # a child of it may hold the pipe
                     line = b""
                     break
@@ -182,13 +191,29 @@ class Worker:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         self.end()
 
 
-_DOING = {"begin": "starting its process", "check": "importing it", "fit": "fitting", "load": "loading the model", "predict": "predicting",
-          "warm": "warming up", "time": "timing", "throughput": "timing batches", "cost": "counting the cost",
-          "flag": "telling its range", "stress": "importing it", "stress_case": "the case"}  # fmt: skip
+_DOING = {
+    "begin": "starting its process",
+    "check": "importing it",
+    "fit": "fitting",
+    "load": "loading the model",
+    "predict": "predicting",
+    "warm": "warming up",
+    "time": "timing",
+    "throughput": "timing batches",
+    "cost": "counting the cost",
+    "flag": "telling its range",
+    "stress": "importing it",
+    "stress_case": "the case",
+}
 
 
 class _Started:
@@ -224,7 +249,10 @@ class _Forked:
     def __init__(self, nursery: Nursery, said: str) -> None:
         self._nursery = nursery
         self._connection, self.pid = nursery.new_worker(said)
-        self.requests, self.answers = self._connection.makefile("wb"), self._connection.makefile("rb")
+        self.requests, self.answers = (
+            self._connection.makefile("wb"),
+            self._connection.makefile("rb"),
+        )
 
     def exit_code(self) -> int:
         return self._nursery.exit_code(self.pid)

@@ -35,8 +35,10 @@ class SampleErrors:
 
 
 def sample_errors(
-    predicted: NDArray[np.float64], reference: NDArray[np.float64], nodes: NDArray[np.int64] | None = None
-) -> SampleErrors:  # fmt: skip
+    predicted: NDArray[np.float64],
+    reference: NDArray[np.float64],
+    nodes: NDArray[np.int64] | None = None,
+) -> SampleErrors:
     """Errors of predictions (n, n_nodes, 3) against references of the same shape, both in m.
 
     NaN in a prediction means that there is none, and gives infinite errors. Where only some nodes are wanted, the others
@@ -66,7 +68,11 @@ def summary(errors: SampleErrors) -> dict[str, float]:
     """
     e, relative = errors.mean_dof_m, errors.relative_l2
     with np.errstate(invalid="ignore"):
-        spread = float(e.std(ddof=1)) if len(e) > 1 and np.isfinite(e).all() else float("nan" if len(e) < 2 else "inf")
+        spread = (
+            float(e.std(ddof=1))
+            if len(e) > 1 and np.isfinite(e).all()
+            else float("nan" if len(e) < 2 else "inf")
+        )
         slope = float(errors.amplitude_m @ e / (errors.amplitude_m @ errors.amplitude_m))
     return {
         "mean_dof_m": float(e.mean()),

@@ -51,14 +51,20 @@ class Nursery:
         self._ended: dict[int, int] = {}
         self._news = Condition()
         self._lock = Lock()
-        self._environment = {**({"OMP_WAIT_POLICY": "passive"} if yielding else {}), **environment()}
+        self._environment = {
+            **({"OMP_WAIT_POLICY": "passive"} if yielding else {}),
+            **environment(),
+        }
         self._start()
 
     def _start(self) -> None:
         self._process = subprocess.Popen(
             [sys.executable, "-m", "mor_bench.harness.worker", self._path],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=self._environment, start_new_session=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=self._environment,
+            start_new_session=True,
+        )
         Thread(target=self._listen, args=(self._process.stdout,), daemon=True).start()
 
     def _listen(self, news: BinaryIO) -> None:
@@ -83,7 +89,9 @@ class Nursery:
                 break
             except (FileNotFoundError, ConnectionRefusedError):
                 if monotonic() > until or self._process.poll() is not None:
-                    raise errors.MorBenchError("the server that methods' processes are forked from does not start.") from None
+                    raise errors.MorBenchError(
+                        "the server that methods' processes are forked from does not start."
+                    ) from None
                 sleep(0.02)
         connection.sendall(said.encode() + b"\n")
         return connection, int.from_bytes(_exactly(connection, 8), "little")
@@ -108,16 +116,25 @@ def _exactly(connection: socket.socket, n: int) -> bytes:
     while len(received) < n:
         part = connection.recv(n - len(received))
         if not part:
-            raise errors.MorBenchError("the server that methods' processes are forked from has died.")
+            raise errors.MorBenchError(
+                "the server that methods' processes are forked from has died."
+            )
         received += part
     return received
 
 
 PRELOADED = (
-    "sklearn.linear_model", "mor_bench.harness.cost", "mor_bench.harness.handover", "mor_bench.harness.timing", "mor_bench.surrogates.fem",
-    "mor_bench.surrogates.deim", "mor_bench.surrogates.ecm", "mor_bench.surrogates.hpod",
-    "mor_bench.surrogates.pca_regression", "mor_bench.surrogates.pod",
-)  # fmt: skip
+    "sklearn.linear_model",
+    "mor_bench.harness.cost",
+    "mor_bench.harness.handover",
+    "mor_bench.harness.timing",
+    "mor_bench.surrogates.fem",
+    "mor_bench.surrogates.deim",
+    "mor_bench.surrogates.ecm",
+    "mor_bench.surrogates.hpod",
+    "mor_bench.surrogates.pca_regression",
+    "mor_bench.surrogates.pod",
+)
 """What methods import: no fit's time holds an import. PyTorch is not among it, since few need it and it takes two seconds."""
 
 

@@ -44,7 +44,12 @@ class Flags:
     def as_dict(self, main: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
         """For a row, with the figures of the main test set."""
         test = {"n": len(main["flagged"]), "n_flagged": int(main["flagged"].sum()), **self.of(main)}
-        usual = {"in_range": self.in_range, "usual_rel_l2": self.usual_rel_l2, "n": self.n, "n_flagged": self.n_flagged}
+        usual = {
+            "in_range": self.in_range,
+            "usual_rel_l2": self.usual_rel_l2,
+            "n": self.n,
+            "n_flagged": self.n_flagged,
+        }
         return {**usual, "false_alarms": self.n_flagged / self.n, "test": test}
 
 

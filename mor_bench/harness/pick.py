@@ -52,7 +52,11 @@ class Requirements:
 
     def __post_init__(self) -> None:
         for name, limit in self.asked.items():
-            if isinstance(limit, bool) or not isinstance(limit, int | float) or not (limit > 0 and isfinite(limit)):
+            if (
+                isinstance(limit, bool)
+                or not isinstance(limit, int | float)
+                or not (limit > 0 and isfinite(limit))
+            ):
                 raise InvalidInputError(f"`{name}` must be a positive number; got {limit!r}.")
 
     @property
@@ -126,24 +130,45 @@ class Pick:
         """Everything, for `json.dumps`; infinite errors are strings."""
         content: dict[str, Any] = _plain(asdict(self))
         run = None if self.run is None else str(self.run)
-        return {**content, "requirements": self.requirements.asked, "ranked_by": RANKED_BY, "run": run}
+        return {
+            **content,
+            "requirements": self.requirements.asked,
+            "ranked_by": RANKED_BY,
+            "run": run,
+        }
 
     def text(self) -> str:
         """A few lines for people."""
-        lines = [f"{self.dataset} needs {', '.join(_said(name, limit) for name, limit in self.requirements.asked.items())}."]
+        lines = [
+            f"{self.dataset} needs {', '.join(_said(name, limit) for name, limit in self.requirements.asked.items())}."
+        ]
         if self.choice is not None:
             lines += [f"Cheapest by {RANKED_BY}:", *_evidence(self.choice)]
-            lines += ["Next method:", *_evidence(self.runner_up)] if self.runner_up is not None else ["No other method meets all."]
-            lines.append(f"{self.n_meeting} of {self.n_configurations} configurations meet all{self._left_out()}.")
+            lines += (
+                ["Next method:", *_evidence(self.runner_up)]
+                if self.runner_up is not None
+                else ["No other method meets all."]
+            )
+            lines.append(
+                f"{self.n_meeting} of {self.n_configurations} configurations meet all{self._left_out()}."
+            )
         else:
-            lines.append(f"None of {self.n_configurations} configurations meets all{self._left_out()}.")
+            lines.append(
+                f"None of {self.n_configurations} configurations meets all{self._left_out()}."
+            )
             lines += self._what_would_have_to_give()
         if self.run is not None:
-            lines.append(f"Evidence: {self.run}{f', {self.kind}' if self.kind else ''}{f', timed on {self.processor}' if self.processor else ''}")
+            lines.append(
+                f"Evidence: {self.run}{f', {self.kind}' if self.kind else ''}{f', timed on {self.processor}' if self.processor else ''}"
+            )
         return "\n".join(lines)
 
     def _left_out(self) -> str:
-        return f"; {self.n_without_answers} of them failed, were skipped or left loads without an answer" if self.n_without_answers else ""
+        return (
+            f"; {self.n_without_answers} of them failed, were skipped or left loads without an answer"
+            if self.n_without_answers
+            else ""
+        )
 
     def _what_would_have_to_give(self) -> list[str]:
         lines = []
@@ -152,12 +177,18 @@ class Pick:
             if name in self.unknown:
                 lines.append(f"Not known of any configuration: {_NAMES[name]}")
             elif relaxed is not None:
-                lines.append(f"Enough alone: {_said(name, relaxed.needed, up=True)}, by {relaxed.row['label']}")
+                lines.append(
+                    f"Enough alone: {_said(name, relaxed.needed, up=True)}, by {relaxed.row['label']}"
+                )
             else:
                 lines.append(f"Not enough alone: {_NAMES[name]}, whatever the limit")
         if self.nearest is not None:
             excess = _excesses(self.nearest, self.requirements)
-            misses = ", ".join(f"{_NAMES[name]} {factor:.3g} times the limit" for name, factor in excess.items() if factor > 1)
+            misses = ", ".join(
+                f"{_NAMES[name]} {factor:.3g} times the limit"
+                for name, factor in excess.items()
+                if factor > 1
+            )
             lines += [f"Nearest, with {misses}:", *_evidence(self.nearest)]
         return lines
 
@@ -167,10 +198,17 @@ def figure(row: Row, name: str) -> float:
     value = inf
     if name == "error" and row.get("error"):
         error, fresh = row["error"], row.get("hidden") or {}
-        value = max(error.get("rel_l2_median_high") or error["rel_l2_median"], fresh.get("rel_l2_median", 0.0))
+        value = max(
+            error.get("rel_l2_median_high") or error["rel_l2_median"],
+            fresh.get("rel_l2_median", 0.0),
+        )
     elif name == "latency_ms" and row.get("latency_ms"):
         latency = row["latency_ms"]
-        value = latency["median"] if latency.get("high") is None else max(latency["high"], latency["median"])
+        value = (
+            latency["median"]
+            if latency.get("high") is None
+            else max(latency["high"], latency["median"])
+        )
     elif name == "memory_bytes":
         value = _known((row.get("memory_bytes") or {}).get("predict"))
     elif name == "offline_s":
@@ -202,7 +240,12 @@ def offline_rank(row: Row) -> tuple[bool, float]:
 
 
 def _rank(row: Row) -> tuple[Any, ...]:
-    return (*offline_rank(row), figure(row, "latency_ms"), figure(row, "memory_bytes"), row["label"])
+    return (
+        *offline_rank(row),
+        figure(row, "latency_ms"),
+        figure(row, "memory_bytes"),
+        row["label"],
+    )
 
 
 def _excesses(row: Row, requirements: Requirements) -> dict[str, float]:
@@ -224,14 +267,31 @@ def choose(rows: Sequence[Row], requirements: Requirements, dataset: str) -> Pic
     mine = [row for row in rows if row["dataset"] == dataset]
     answering = [row for row in mine if _answers(row)]
     meeting = sorted((row for row in answering if _meets(row, asked)), key=_rank)
-    relaxations = [] if meeting else [r for name in asked if (r := _relaxation(name, asked, answering))]
+    relaxations = (
+        [] if meeting else [r for name in asked if (r := _relaxation(name, asked, answering))]
+    )
     excess = {id(row): max(_excesses(row, requirements).values(), default=0.0) for row in answering}
     measured = [] if meeting else [row for row in answering if excess[id(row)] < inf]
     nearest = min(measured, key=lambda row: (excess[id(row)], _rank(row)), default=None)
-    unknown = [] if meeting else [name for name in asked if all(figure(row, name) == inf for row in answering)]
+    unknown = (
+        []
+        if meeting
+        else [name for name in asked if all(figure(row, name) == inf for row in answering)]
+    )
     first = meeting[0] if meeting else None
     second = next((row for row in meeting if row["method"] != meeting[0]["method"]), None)
-    return Pick(dataset, requirements, first, second, relaxations, nearest, unknown, len(mine), len(meeting), len(mine) - len(answering))
+    return Pick(
+        dataset,
+        requirements,
+        first,
+        second,
+        relaxations,
+        nearest,
+        unknown,
+        len(mine),
+        len(meeting),
+        len(mine) - len(answering),
+    )
 
 
 def _relaxation(name: str, asked: Mapping[str, float], rows: Sequence[Row]) -> Relaxation | None:
@@ -281,32 +341,56 @@ def pick(
     """
     spec = load_dataset_spec(dataset, suite)
     requirements = Requirements(
-        spec.needs.error if error is None else error, spec.needs.latency_ms if latency_ms is None else latency_ms, memory_bytes, offline_s
+        spec.needs.error if error is None else error,
+        spec.needs.latency_ms if latency_ms is None else latency_ms,
+        memory_bytes,
+        offline_s,
     )
     if comparison is None:
         evidence = newest_run(spec) or run([dataset], cache=cache, suite=suite, listener=listener)
     elif not isinstance(comparison, Comparison | str | Path):
-        raise InvalidInputError(f"`comparison` must be a Comparison or the folder of a run; got {type(comparison).__name__}.")
+        raise InvalidInputError(
+            f"`comparison` must be a Comparison or the folder of a run; got {type(comparison).__name__}."
+        )
     else:
         evidence = comparison if isinstance(comparison, Comparison) else Comparison.read(comparison)
         _check_evidence(evidence, spec)
     chosen = choose(_with_intervals(evidence), requirements, spec.name)
-    return replace(chosen, run=evidence.out, processor=str(evidence.machine.get("processor", "")), kind=_kind(evidence))
+    return replace(
+        chosen,
+        run=evidence.out,
+        processor=str(evidence.machine.get("processor", "")),
+        kind=_kind(evidence),
+    )
 
 
 def _kind(comparison: Comparison) -> str:
     settings = comparison.settings
-    parts = [f"profile {settings.get('profile')}", f"split by {settings['split']}" if settings.get("split") else ""]
-    return ", ".join(filter(None, [*parts, f"first {settings['limit']:,} samples" if settings.get("limit") else ""]))
+    parts = [
+        f"profile {settings.get('profile')}",
+        f"split by {settings['split']}" if settings.get("split") else "",
+    ]
+    return ", ".join(
+        filter(
+            None, [*parts, f"first {settings['limit']:,} samples" if settings.get("limit") else ""]
+        )
+    )
 
 
 def _with_intervals(comparison: Comparison) -> list[Row]:
     """Rows with the upper end of their median error's interval."""
-    high = {(record["dataset"], record["label"]): record["rel_l2_median"]["high"] for record in analyse(comparison)["rows"]}
+    high = {
+        (record["dataset"], record["label"]): record["rel_l2_median"]["high"]
+        for record in analyse(comparison)["rows"]
+    }
 
     def extended(row: Row) -> Row:
         bound = high.get((row["dataset"], row["label"]))
-        return row if bound is None or not row["error"] else {**row, "error": {**row["error"], "rel_l2_median_high": bound}}
+        return (
+            row
+            if bound is None or not row["error"]
+            else {**row, "error": {**row["error"], "rel_l2_median_high": bound}}
+        )
 
     return [extended(row) for row in comparison.rows]
 
@@ -324,9 +408,13 @@ def _is_of(comparison: Comparison, spec: AnyDatasetSpec) -> bool:
 
 def _check_evidence(comparison: Comparison, spec: AnyDatasetSpec) -> None:
     if spec.name not in comparison.datasets:
-        raise InvalidInputError(f"{comparison.out} holds no {spec.name}; it holds {', '.join(comparison.datasets) or 'nothing'}.")
+        raise InvalidInputError(
+            f"{comparison.out} holds no {spec.name}; it holds {', '.join(comparison.datasets) or 'nothing'}."
+        )
     if not _is_of(comparison, spec):
-        raise InvalidInputError(f"{comparison.out} holds another {spec.name}: the dataset's file has changed since.")
+        raise InvalidInputError(
+            f"{comparison.out} holds another {spec.name}: the dataset's file has changed since."
+        )
 
 
 def newest_run(spec: AnyDatasetSpec, runs: Path = RUNS) -> Comparison | None:
@@ -340,13 +428,29 @@ def newest_run(spec: AnyDatasetSpec, runs: Path = RUNS) -> Comparison | None:
             comparison = Comparison.read(file.parent)
         except StoreError:  # of another version, or damaged
             continue
-        if _is_of(comparison, spec) and any(row["dataset"] == spec.name and row["status"] == "ok" for row in comparison.rows):
+        if _is_of(comparison, spec) and any(
+            row["dataset"] == spec.name and row["status"] == "ok" for row in comparison.rows
+        ):
             settings = comparison.settings
-            found.append(((settings.get("limit") is None, settings.get("profile") == "full", file.stat().st_mtime), comparison))
+            found.append(
+                (
+                    (
+                        settings.get("limit") is None,
+                        settings.get("profile") == "full",
+                        file.stat().st_mtime,
+                    ),
+                    comparison,
+                )
+            )
     return max(found, key=lambda item: item[0])[1] if found else None
 
 
-_NAMES = {"error": "error", "latency_ms": "latency", "memory_bytes": "memory", "offline_s": "offline time"}
+_NAMES = {
+    "error": "error",
+    "latency_ms": "latency",
+    "memory_bytes": "memory",
+    "offline_s": "offline time",
+}
 
 
 def _up(value: float, digits: int = 3) -> str:
@@ -377,21 +481,30 @@ def _errors(record: Row | None) -> str:
 
 def _evidence(row: Row) -> list[str]:
     """The figures of a configuration, indented."""
-    lines = [f"  {row['label']}", f"    error    {_errors(row['error'])} on {row['n_test']} test loads"]
+    lines = [
+        f"  {row['label']}",
+        f"    error    {_errors(row['error'])} on {row['n_test']} test loads",
+    ]
     if row.get("hidden"):
-        lines.append(f"    fresh    {_errors(row['hidden'])} on {row['hidden']['n']} loads drawn anew")
+        lines.append(
+            f"    fresh    {_errors(row['hidden'])} on {row['hidden']['n']} loads drawn anew"
+        )
     lines.append(f"    latency  {_latency(row)}")
     memory, model = (row.get("memory_bytes") or {}).get("predict"), row.get("model_bytes")
     lines.append(f"    memory   {_size(memory)} to predict, model {_size(model)}")
     offline = row.get("offline_s") or {}
     samples = f" of {row['n_train']} samples" if offline.get("data") else ""
-    lines.append(f"    offline  data {_seconds(offline.get('data'))}{samples}, fit {_seconds(offline.get('fit'))}")
+    lines.append(
+        f"    offline  data {_seconds(offline.get('data'))}{samples}, fit {_seconds(offline.get('fit'))}"
+    )
     for name, record in (row.get("sets") or {}).items():
         missing = f", {record['n_failed']} without an answer" if record.get("n_failed") else ""
         lines.append(f"    {name:<8} {_errors(record)} on {record['n']} loads{missing}")
     mesh = row.get("discretisation_rel_l2")
     if mesh is not None:
-        lines.append(f"    mesh     {100 * mesh:.3g} % median: what the mesh itself errs, which no method makes good")
+        lines.append(
+            f"    mesh     {100 * mesh:.3g} % median: what the mesh itself errs, which no method makes good"
+        )
     return lines
 
 
@@ -399,7 +512,9 @@ def _latency(row: Row) -> str:
     latency = row.get("latency_ms")
     if not latency:
         return "unknown"
-    interval = f" [{latency['low']:.3g}, {latency['high']:.3g}]" if latency.get("high") is not None else ""
+    interval = (
+        f" [{latency['low']:.3g}, {latency['high']:.3g}]" if latency.get("high") is not None else ""
+    )
     reasons = "; ".join(latency.get("unstable_because") or ["no reason given"])
     unstable = f"; unstable: {reasons}" if latency.get("stable") is False else ""
     return f"{latency['median']:.3g} ms median{interval}, {latency['p95']:.3g} p95, {row['threads']} thread{'s' * (row['threads'] != 1)}{unstable}"

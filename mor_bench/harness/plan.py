@@ -21,7 +21,13 @@ from mor_bench.harness.run import checked_seeds, training_options
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import load_dataset
-from mor_bench.snapshots.generate import SHARD_SIZE, dataset_folder, default_cache, n_samples_to_generate, shard_path
+from mor_bench.snapshots.generate import (
+    SHARD_SIZE,
+    dataset_folder,
+    default_cache,
+    n_samples_to_generate,
+    shard_path,
+)
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import AnyDatasetSpec, DatasetSpec, SplitBy
 from mor_bench.surrogate import Device
@@ -119,8 +125,13 @@ def plan(
     root = Path(cache or default_cache())
     budget = BUDGETS[profile]
     allowed = budget.configurations
-    training, n_seeds = training_options(device, fit_seconds, budget.seconds), checked_seeds(seeds, profile)
-    all_jobs = [job for method in method_specs for job in jobs_of([method], profile, training)[:allowed]]
+    training, n_seeds = (
+        training_options(device, fit_seconds, budget.seconds),
+        checked_seeds(seeds, profile),
+    )
+    all_jobs = [
+        job for method in method_specs for job in jobs_of([method], profile, training)[:allowed]
+    ]
     steps: list[Step] = []
     for spec in specs:
         data = _data_step(spec, limit, workers, root)
@@ -129,10 +140,23 @@ def plan(
         n_dofs, n_train = _size(spec, limit)
         left = {job.method.name: budget.seconds for job in all_jobs}
         for job in all_jobs:
-            seconds = _within(_fit_s(job, profile, n_dofs, n_train, _earlier(root, job)), left[job.method.name], job.parameters.get("iterations"))
+            seconds = _within(
+                _fit_s(job, profile, n_dofs, n_train, _earlier(root, job)),
+                left[job.method.name],
+                job.parameters.get("iterations"),
+            )
             left[job.method.name] -= seconds or 0.0
-            steps.append(Step(spec.name, job.label, job.label in done, None if seconds is None else seconds / jobs))
-        steps += _extras(spec.name, all_jobs, steps[-len(all_jobs) :], n_seeds - 1, profile == "full")
+            steps.append(
+                Step(
+                    spec.name,
+                    job.label,
+                    job.label in done,
+                    None if seconds is None else seconds / jobs,
+                )
+            )
+        steps += _extras(
+            spec.name, all_jobs, steps[-len(all_jobs) :], n_seeds - 1, profile == "full"
+        )
     protocol = PROTOCOLS[profile]
     turns = protocol.processes * (protocol.rounds + 2) * len(all_jobs) * len(specs)
     return Plan(steps, turns * TURN_S + protocol.processes * START_S * len(specs))
@@ -145,17 +169,28 @@ def _within(seconds: float | None, left_s: float, iterations: int | None) -> flo
     return left_s if iterations is None else min(left_s, seconds * SEES / max(iterations, SEES))
 
 
-def _extras(dataset: str, jobs: Sequence[Job], fits: Sequence[Step], other_seeds: int, curves: bool) -> list[Step]:
+def _extras(
+    dataset: str, jobs: Sequence[Job], fits: Sequence[Step], other_seeds: int, curves: bool
+) -> list[Step]:
     """What is fitted beside: other seeds of what draws random numbers, and in a full comparison learning curves."""
     extras = []
     for method in dict.fromkeys(job.method.name for job in jobs):
-        mine = [(job, step.seconds or 0.0) for job, step in zip(jobs, fits, strict=True) if job.method.name == method]
-        trained, draws = "iterations" in mine[0][0].parameters, bool(other_seeds) and may_draw(mine[0][0])
+        mine = [
+            (job, step.seconds or 0.0)
+            for job, step in zip(jobs, fits, strict=True)
+            if job.method.name == method
+        ]
+        trained, draws = (
+            "iterations" in mine[0][0].parameters,
+            bool(other_seeds) and may_draw(mine[0][0]),
+        )
         seconds = 0.0
         if draws:
             seconds += other_seeds * sum(s for _, s in mine)
         if curves:
-            seconds += LEARNING_POINTS * mine[-1][1] if trained else mine[-1][1] / (LEARNING_STEP - 1)
+            seconds += (
+                LEARNING_POINTS * mine[-1][1] if trained else mine[-1][1] / (LEARNING_STEP - 1)
+            )
         named = [*(["other seeds"] if draws else []), *(["learning curve"] if curves else [])]
         if named:
             extras.append(Step(dataset, f"{method}: {', '.join(named)}", False, seconds))
@@ -164,7 +199,11 @@ def _extras(dataset: str, jobs: Sequence[Job], fits: Sequence[Step], other_seeds
 
 def _size(spec: AnyDatasetSpec, limit: int | None) -> tuple[int, int]:
     """Dofs and, about, training samples of a dataset."""
-    n = n_samples_to_generate(spec, limit) if isinstance(spec, DatasetSpec) else len(load_dataset(spec, limit).train)
+    n = (
+        n_samples_to_generate(spec, limit)
+        if isinstance(spec, DatasetSpec)
+        else len(load_dataset(spec, limit).train)
+    )
     return load_scene(spec).mesh.n_dofs, max(1, round((1 - spec.split.test_fraction) * n))
 
 
@@ -173,23 +212,44 @@ def _data_step(spec: AnyDatasetSpec, limit: int | None, workers: int | None, cac
         return Step(spec.name, "imported snapshots", True, 0.0)
     n = n_samples_to_generate(spec, limit)
     folder = dataset_folder(spec, cache)
-    missing = sum(min(SHARD_SIZE, n - start) for start in range(0, n, SHARD_SIZE) if not shard_path(folder, start // SHARD_SIZE).exists())
+    missing = sum(
+        min(SHARD_SIZE, n - start)
+        for start in range(0, n, SHARD_SIZE)
+        if not shard_path(folder, start // SHARD_SIZE).exists()
+    )
     label = f"{missing:,} of {n:,} samples" if missing else f"{n:,} samples"
-    return Step(spec.name, label, missing == 0, missing * _sample_s(spec) / (workers or os.cpu_count() or 1) if missing else 0.0)
+    return Step(
+        spec.name,
+        label,
+        missing == 0,
+        missing * _sample_s(spec) / (workers or os.cpu_count() or 1) if missing else 0.0,
+    )
 
 
 def _sample_s(spec: DatasetSpec) -> float:
     """Seconds of a full-order solve among others."""
     scene = load_scene(spec)
     model = FullOrderModel(scene)
-    forces = draw_loads(scene, 0, PROBED).nodal_forces(scene.patch_weights).reshape(PROBED, -1)[:, scene.free_dofs]
+    forces = (
+        draw_loads(scene, 0, PROBED)
+        .nodal_forces(scene.patch_weights)
+        .reshape(PROBED, -1)[:, scene.free_dofs]
+    )
     model.solve_many(forces[:1])
     start = perf_counter()
     model.solve_many(forces)
     return (perf_counter() - start) / PROBED
 
 
-def _fitted(spec: AnyDatasetSpec, jobs: Sequence[Job], limit: int | None, split: SplitBy | None, threads: int, at_once: int, cache: Path) -> set[str]:
+def _fitted(
+    spec: AnyDatasetSpec,
+    jobs: Sequence[Job],
+    limit: int | None,
+    split: SplitBy | None,
+    threads: int,
+    at_once: int,
+    cache: Path,
+) -> set[str]:
     """Labels that the cache has."""
     data = load_dataset(spec, limit, split=split, cache=cache)
     with TemporaryDirectory(prefix="mor-bench-") as scratch:
@@ -204,11 +264,17 @@ def _earlier(cache: Path, job: Job) -> list[dict[str, Any]]:
     for path in (cache / "fits").glob(f"{job.method.name}-*/fit.json"):
         with suppress(OSError, ValueError):
             records.append(json.loads(path.read_bytes()))
-    same = [record for record in records if record.get("parameters", {}).items() >= job.parameters.items()]
+    same = [
+        record
+        for record in records
+        if record.get("parameters", {}).items() >= job.parameters.items()
+    ]
     return same or records
 
 
-def _fit_s(job: Job, profile: str, n_dofs: int, n_train: int, earlier: Sequence[Mapping[str, Any]]) -> float | None:
+def _fit_s(
+    job: Job, profile: str, n_dofs: int, n_train: int, earlier: Sequence[Mapping[str, Any]]
+) -> float | None:
     """Scaled from earlier fits or the method's file; iterations cost the same however many samples there are, or what they are given."""
     if job.training and job.training.fit_seconds and "iterations" in job.parameters:
         return job.training.fit_seconds
@@ -216,10 +282,20 @@ def _fit_s(job: Job, profile: str, n_dofs: int, n_train: int, earlier: Sequence[
     for record in earlier:
         with suppress(KeyError, TypeError, ZeroDivisionError):
             grows = record["needs_snapshots"] and "iterations" not in job.parameters
-            times.append(record["fit_s"] * n_dofs / record["n_dofs"] * (n_train / record["n_train"] if grows else 1.0))
+            times.append(
+                record["fit_s"]
+                * n_dofs
+                / record["n_dofs"]
+                * (n_train / record["n_train"] if grows else 1.0)
+            )
     if times:
         return median(times)
     shipped = job.method.fit_seconds(profile)
     if shipped is None:
         return None
-    return shipped * n_dofs / REFERENCE[1] * (1.0 if "iterations" in job.parameters else n_train / REFERENCE[2])
+    return (
+        shipped
+        * n_dofs
+        / REFERENCE[1]
+        * (1.0 if "iterations" in job.parameters else n_train / REFERENCE[2])
+    )

@@ -29,11 +29,33 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SCHEMA_VERSION = 2
-_WHAT_RAN = ("dataset", "split", "method", "label", "parameters", "n_train", "n_test", "n_dofs", "threads")
+_WHAT_RAN = (
+    "dataset",
+    "split",
+    "method",
+    "label",
+    "parameters",
+    "n_train",
+    "n_test",
+    "n_dofs",
+    "threads",
+)
 _WHAT_CAME_OUT = (
-    "status", "reason", "n_failed", "error", "latency_ms", "all_threads_ms", "throughput", "offline_s", "memory_bytes", "model_bytes",
-    "cost", "sets", "hidden", "discretisation_error_m",
-)  # fmt: skip
+    "status",
+    "reason",
+    "n_failed",
+    "error",
+    "latency_ms",
+    "all_threads_ms",
+    "throughput",
+    "offline_s",
+    "memory_bytes",
+    "model_bytes",
+    "cost",
+    "sets",
+    "hidden",
+    "discretisation_error_m",
+)
 ROW_KEYS = frozenset([*_WHAT_RAN, *_WHAT_CAME_OUT])
 """What every row of results.json has."""
 
@@ -59,16 +81,33 @@ def _with_numbers(row: dict[str, Any]) -> dict[str, Any]:
     """A row read from JSON with the `nan` and `inf` of its errors as numbers again."""
 
     def numbers(record: dict[str, Any]) -> dict[str, Any]:
-        return {name: float(value) if isinstance(value, str) and value in ("nan", "inf", "-inf") else value for name, value in record.items()}
+        return {
+            name: float(value)
+            if isinstance(value, str) and value in ("nan", "inf", "-inf")
+            else value
+            for name, value in record.items()
+        }
 
     def of_seeds(record: dict[str, Any]) -> dict[str, Any]:
         spread = {name: numbers(value) for name, value in record.items() if isinstance(value, dict)}
-        return {**record, **spread, "trainings": [numbers(training) for training in record.get("trainings", [])]}
+        return {
+            **record,
+            **spread,
+            "trainings": [numbers(training) for training in record.get("trainings", [])],
+        }
 
-    read: dict[str, Any] = {key: row[key] and numbers(row[key]) for key in ("error", "hidden", "range", "training") if key in row}
+    read: dict[str, Any] = {
+        key: row[key] and numbers(row[key])
+        for key in ("error", "hidden", "range", "training")
+        if key in row
+    }
     if row.get("seeds"):
         read["seeds"] = of_seeds(row["seeds"])
-    return {**row, **read, "sets": {name: numbers(record) for name, record in row.get("sets", {}).items()}}
+    return {
+        **row,
+        **read,
+        "sets": {name: numbers(record) for name, record in row.get("sets", {}).items()},
+    }
 
 
 def _write_json(path: Path, content: Any) -> None:
@@ -154,7 +193,11 @@ class Comparison:
         """Add a row, or replace that of the same configuration, and write everything; raw samples first."""
         if samples:
             write_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"), samples)
-        places = [i for i, other in enumerate(self.rows) if (other["dataset"], other["label"]) == (row["dataset"], row["label"])]
+        places = [
+            i
+            for i, other in enumerate(self.rows)
+            if (other["dataset"], other["label"]) == (row["dataset"], row["label"])
+        ]
         if places:
             self.rows[places[0]] = row
         else:
@@ -163,9 +206,14 @@ class Comparison:
 
     def add_samples(self, row: Mapping[str, Any], samples: Mapping[str, NDArray[Any]]) -> None:
         """Write more raw samples of a row beside those that are there."""
-        write_arrays(self._samples_path(f"{row['dataset']}--{row['label']}"), {**self.samples(row), **samples})
+        write_arrays(
+            self._samples_path(f"{row['dataset']}--{row['label']}"),
+            {**self.samples(row), **samples},
+        )
 
-    def add_dataset(self, name: str, spec: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+    def add_dataset(
+        self, name: str, spec: dict[str, Any], arrays: Mapping[str, NDArray[Any]]
+    ) -> None:
         """Record a dataset: its spec and arrays such as `singular_values` (of the training snapshots)."""
         self.datasets[name] = spec
         write_arrays(self._samples_path(name), arrays)
@@ -198,7 +246,10 @@ class Comparison:
         """Write results.json and results.csv, each atomically."""
         self.out.mkdir(parents=True, exist_ok=True)
         parts = ("machine", "settings", "datasets", "methods", "rows", "learning")
-        content = {"schema_version": SCHEMA_VERSION, **{name: getattr(self, name) for name in parts}}
+        content = {
+            "schema_version": SCHEMA_VERSION,
+            **{name: getattr(self, name) for name in parts},
+        }
         _write_json(self.out / "results.json", content)
         write_atomically(self.out / "results.csv", self.table.to_csv(index=False).encode())
 
@@ -216,14 +267,24 @@ class Comparison:
             content = json.loads(path.read_text(encoding="utf-8"))
             version = content["schema_version"]
             if version != SCHEMA_VERSION:
-                raise StoreError(f"{path}: schema version {version}; this version of mor-bench reads version {SCHEMA_VERSION}.")
+                raise StoreError(
+                    f"{path}: schema version {version}; this version of mor-bench reads version {SCHEMA_VERSION}."
+                )
             rows = [_with_numbers(row) for row in content["rows"]]
             for row in rows:
                 absent = ROW_KEYS - row.keys()
                 if absent:
                     raise StoreError(f"{path}: a row lacks {', '.join(sorted(absent))}.")
             learning = [_with_numbers(record) for record in content["learning"]]
-            return cls(Path(out), content["machine"], rows, content["datasets"], content["settings"], content["methods"], learning)
+            return cls(
+                Path(out),
+                content["machine"],
+                rows,
+                content["datasets"],
+                content["settings"],
+                content["methods"],
+                learning,
+            )
         except FileNotFoundError:
             raise StoreError(f"{path}: no such file; is {out} the folder of a run?") from None
         except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -127,16 +127,37 @@ def run(
     check_pool(workers, cluster)
     if not datasets or (methods is not None and not methods):
         raise InvalidInputError("`datasets` and `methods` must name at least one each.")
-    specs, method_specs = checked_specs(datasets, methods, profile, suite, cache, memory_limit_bytes)
+    specs, method_specs = checked_specs(
+        datasets, methods, profile, suite, cache, memory_limit_bytes
+    )
     if test_seed is not None:
         _check_test_seed(test_seed, specs)
     budget = replace(BUDGETS[profile], seconds=time_limit_s or BUDGETS[profile].seconds)
     training = training_options(device, fit_seconds, budget.seconds)
     settings = Settings(
-        profile, limit, split, threads, workers, jobs, cluster, Path(cache or default_cache()), budget,
-        memory_limit_bytes or default_memory_limit_bytes(), test_seed, training, checked_seeds(seeds, profile), retime, fail_fast, listener,
-    )  # fmt: skip
-    comparison = _open_run(Path(out) if out else _default_out([spec.name for spec in specs]), specs, method_specs, settings)
+        profile,
+        limit,
+        split,
+        threads,
+        workers,
+        jobs,
+        cluster,
+        Path(cache or default_cache()),
+        budget,
+        memory_limit_bytes or default_memory_limit_bytes(),
+        test_seed,
+        training,
+        checked_seeds(seeds, profile),
+        retime,
+        fail_fast,
+        listener,
+    )
+    comparison = _open_run(
+        Path(out) if out else _default_out([spec.name for spec in specs]),
+        specs,
+        method_specs,
+        settings,
+    )
     jobs_of_all = jobs_of(method_specs, profile, training)
     with ExitStack() as stack:
         stack.enter_context(_alone(comparison.out))
@@ -144,12 +165,21 @@ def run(
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mor-bench-")))
         stack.enter_context(suppress(StopRunError))
         for number, spec in enumerate(specs):
-            DatasetRun(spec, jobs_of_all, comparison, settings, scratch, nursery, suite, number, len(specs)).go()
+            DatasetRun(
+                spec, jobs_of_all, comparison, settings, scratch, nursery, suite, number, len(specs)
+            ).go()
     comparison.finish()
     return comparison
 
 
-def _check(profile: str, threads: int, jobs: int, cores: int, time_limit_s: float | None, memory_limit_bytes: float | None) -> None:
+def _check(
+    profile: str,
+    threads: int,
+    jobs: int,
+    cores: int,
+    time_limit_s: float | None,
+    memory_limit_bytes: float | None,
+) -> None:
     if profile not in BUDGETS:
         raise InvalidInputError(f"`profile` must be 'quick' or 'full'; got {profile!r}.")
     for name, count in (("threads", threads), ("jobs", jobs)):
@@ -158,10 +188,14 @@ def _check(profile: str, threads: int, jobs: int, cores: int, time_limit_s: floa
     if time_limit_s is not None and not time_limit_s > 0:
         raise InvalidInputError(f"`time_limit_s` must be above 0; got {time_limit_s}.")
     if memory_limit_bytes is not None and not memory_limit_bytes >= 1e8:
-        raise InvalidInputError(f"`memory_limit_bytes` must be at least 1e8, which a process takes without a method; got {memory_limit_bytes:g}.")
+        raise InvalidInputError(
+            f"`memory_limit_bytes` must be at least 1e8, which a process takes without a method; got {memory_limit_bytes:g}."
+        )
 
 
-def training_options(device: Device, fit_seconds: float | None, budget_s: float = float("inf")) -> TrainingOptions:
+def training_options(
+    device: Device, fit_seconds: float | None, budget_s: float = float("inf")
+) -> TrainingOptions:
     """Device and seconds of trainings, checked; "auto" is decided here, so that a fit's record says where it was trained.
 
     Raises
@@ -170,9 +204,15 @@ def training_options(device: Device, fit_seconds: float | None, budget_s: float 
         If there is no such device, or the seconds are not above 0 and below the budget of all fits of a method.
     """
     if device not in get_args(Device):
-        raise InvalidInputError(f"`device` must be one of {', '.join(get_args(Device))}; got {device!r}.")
+        raise InvalidInputError(
+            f"`device` must be one of {', '.join(get_args(Device))}; got {device!r}."
+        )
     if fit_seconds is not None and not 0 < fit_seconds < budget_s:
-        most = "" if budget_s == float("inf") else f" and below {budget_s:g}, the seconds of all fits of a method together"
+        most = (
+            ""
+            if budget_s == float("inf")
+            else f" and below {budget_s:g}, the seconds of all fits of a method together"
+        )
         raise InvalidInputError(f"`fit_seconds` must be above 0{most}; got {fit_seconds:g}.")
     options = TrainingOptions(device, fit_seconds)
     if device != "cpu":
@@ -186,7 +226,9 @@ def _device_here(options: TrainingOptions) -> Device:
     except ImportError:
         if options.device == "auto":
             return "cpu"
-        raise MissingDependencyError("`device`: training on a graphics processor needs PyTorch: pip install 'mor-bench[learn]'.") from None
+        raise MissingDependencyError(
+            "`device`: training on a graphics processor needs PyTorch: pip install 'mor-bench[learn]'."
+        ) from None
     return "cuda" if device_of(options).type == "cuda" else "cpu"
 
 
@@ -200,8 +242,12 @@ def checked_seeds(seeds: int | None, profile: str) -> int:
 def _check_test_seed(test_seed: int | str, specs: Sequence[AnyDatasetSpec]) -> None:
     for spec in specs:
         if isinstance(spec, ImportedDatasetSpec):
-            raise InvalidInputError(f"`test_seed`: no fresh test set can be drawn of {spec.name}, whose snapshots were imported.")
-        if test_seed != "fresh" and (not isinstance(test_seed, int) or test_seed == spec.loads.seed or test_seed < 0):
+            raise InvalidInputError(
+                f"`test_seed`: no fresh test set can be drawn of {spec.name}, whose snapshots were imported."
+            )
+        if test_seed != "fresh" and (
+            not isinstance(test_seed, int) or test_seed == spec.loads.seed or test_seed < 0
+        ):
             raise InvalidInputError(
                 f"`test_seed` must be 'fresh' or an integer >= 0 other than the seed of {spec.name}, {spec.loads.seed}; got {test_seed!r}."
             )
@@ -211,23 +257,44 @@ def _default_out(names: Sequence[str]) -> Path:
     return Path("reports") / "runs" / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{'-'.join(names)}"
 
 
-def _open_run(out: Path, specs: Sequence[AnyDatasetSpec], methods: Sequence[MethodSpec], settings: Settings) -> Comparison:
+def _open_run(
+    out: Path, specs: Sequence[AnyDatasetSpec], methods: Sequence[MethodSpec], settings: Settings
+) -> Comparison:
     """The comparison in a folder: a new one, or the one that was begun there with the same settings and datasets."""
     datasets = {spec.name: spec.model_dump(mode="json") for spec in specs}
     said = {
-        "profile": settings.profile, "split": settings.split, "limit": settings.limit, "threads": settings.threads, "test_seed": settings.test_seed,
-        "budget": {"configurations": settings.budget.configurations, "seconds": settings.budget.seconds},
-        "seeds": settings.seeds, "device": settings.training.device, "version": __version__,
-        **({} if settings.training.fit_seconds is None else {"fit_seconds": settings.training.fit_seconds}),
-    }  # fmt: skip
+        "profile": settings.profile,
+        "split": settings.split,
+        "limit": settings.limit,
+        "threads": settings.threads,
+        "test_seed": settings.test_seed,
+        "budget": {
+            "configurations": settings.budget.configurations,
+            "seconds": settings.budget.seconds,
+        },
+        "seeds": settings.seeds,
+        "device": settings.training.device,
+        "version": __version__,
+        **(
+            {}
+            if settings.training.fit_seconds is None
+            else {"fit_seconds": settings.training.fit_seconds}
+        ),
+    }
     if (out / "results.json").exists():
         comparison = Comparison.read(out)
-        if comparison.settings != said or any(datasets.get(name) != spec for name, spec in comparison.datasets.items()):
-            raise InvalidInputError(f"{out} holds a run with other settings or datasets; choose another folder or remove it.")
+        if comparison.settings != said or any(
+            datasets.get(name) != spec for name, spec in comparison.datasets.items()
+        ):
+            raise InvalidInputError(
+                f"{out} holds a run with other settings or datasets; choose another folder or remove it."
+            )
     else:
         gpu = {"gpu": gpu_name()} if settings.training.device == "cuda" else {}
         comparison = Comparison(out, {**describe_machine(), **gpu}, settings=said)
-    comparison.methods |= {method.name: method.model_dump(mode="json", exclude={"folder"}) for method in methods}
+    comparison.methods |= {
+        method.name: method.model_dump(mode="json", exclude={"folder"}) for method in methods
+    }
     try:
         comparison.write()
     except OSError as error:
@@ -244,7 +311,9 @@ def _alone(out: Path) -> Iterator[None]:
         number, created = map(float, lock.read_text().split())
         other = int(number) if psutil.Process(int(number)).create_time() == created else None
     if other not in (None, os.getpid()):
-        raise InvalidInputError(f"{out}: another run, process {other}, writes there; wait for it or choose another folder.")
+        raise InvalidInputError(
+            f"{out}: another run, process {other}, writes there; wait for it or choose another folder."
+        )
     lock.write_text(f"{os.getpid()} {psutil.Process().create_time()!r}")
     try:
         yield

@@ -78,10 +78,16 @@ def student_t(level: float, df: float) -> float:
 def _log_medians(samples: Samples) -> dict[tuple[int, int], float]:
     """Logarithm of the median latency of each process and round."""
     times = np.asarray(samples["latency_ms"], dtype=float)
-    process, turn = (np.asarray(samples[name]) if name in samples else np.zeros(len(times), dtype=int) for name in ("process", "round"))
+    process, turn = (
+        np.asarray(samples[name]) if name in samples else np.zeros(len(times), dtype=int)
+        for name in ("process", "round")
+    )
     keys, group = np.unique(np.stack([process, turn], axis=1), axis=0, return_inverse=True)
     group = group.ravel()
-    return {(int(p), int(r)): float(np.log(np.median(times[group == i]))) for i, (p, r) in enumerate(keys)}
+    return {
+        (int(p), int(r)): float(np.log(np.median(times[group == i])))
+        for i, (p, r) in enumerate(keys)
+    }
 
 
 def _cube(all_samples: Sequence[Samples]) -> NDArray[np.float64]:
@@ -110,7 +116,11 @@ def spreads_of(all_samples: Sequence[Samples]) -> Spreads:
     n, degrees = len(cube), np.maximum(np.isfinite(cube).any(axis=2).sum(axis=1) - 1.0, 0.0)
     correction = n / (n - 1) if n > 1 else 1.0
     with np.errstate(invalid="ignore", divide="ignore"):
-        moments = _nan_mean(cube - _nan_mean(_nan_median(cube), axis=1)[:, None, None], axis=0) if n > 1 else np.zeros(cube.shape[1:])
+        moments = (
+            _nan_mean(cube - _nan_mean(_nan_median(cube), axis=1)[:, None, None], axis=0)
+            if n > 1
+            else np.zeros(cube.shape[1:])
+        )
         rest = _centred(_nan_median(cube - moments))
         own = np.where(degrees > 0, np.sqrt(correction * np.nansum(rest**2, axis=1) / degrees), nan)
         shared = _nan_mean(_centred(_nan_median(cube)), axis=0)
@@ -119,7 +129,9 @@ def spreads_of(all_samples: Sequence[Samples]) -> Spreads:
         return Spreads(Spread(0.0, 0.0), Spread(0.0, 0.0), own)
     specific = float(np.nansum(rest**2)) / df
     common = float(np.nansum(shared**2)) / most - specific / n if n > 1 else 0.0
-    return Spreads(Spread(sqrt(max(common, 0.0)), most if n > 1 else 0.0), Spread(sqrt(specific), df), own)
+    return Spreads(
+        Spread(sqrt(max(common, 0.0)), most if n > 1 else 0.0), Spread(sqrt(specific), df), own
+    )
 
 
 def _nan_median(cube: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -172,11 +184,23 @@ def latency_interval(samples: Samples, pooled: Spreads | None = None) -> tuple[f
     """
     own = spreads_of([samples])
     pooled = pooled or own
-    common, specific = pooled.common.moderated(TYPICAL_DRIFT), pooled.specific.moderated(TYPICAL_SPREAD)
-    sd = float(np.nanmax([specific.sd, own.own[0] if pooled.common.df == 0 else _without(own.own[0], common.sd)]))
+    common, specific = (
+        pooled.common.moderated(TYPICAL_DRIFT),
+        pooled.specific.moderated(TYPICAL_SPREAD),
+    )
+    sd = float(
+        np.nanmax(
+            [specific.sd, own.own[0] if pooled.common.df == 0 else _without(own.own[0], common.sd)]
+        )
+    )
     private, shared = sd**2 * median_variance(n_processes_of(samples)), common.sd**2
-    df = (private + shared) ** 2 / (private**2 / specific.df + shared**2 / common.df)  # Welch and Satterthwaite
-    centre, half = log(float(np.median(samples["latency_ms"]))), student_t(LEVEL, df) * sqrt(2 * (private + shared))
+    df = (private + shared) ** 2 / (
+        private**2 / specific.df + shared**2 / common.df
+    )  # Welch and Satterthwaite
+    centre, half = (
+        log(float(np.median(samples["latency_ms"]))),
+        student_t(LEVEL, df) * sqrt(2 * (private + shared)),
+    )
     return exp(centre - half), exp(centre + half)
 
 
@@ -187,7 +211,11 @@ def _without(total: float, part: float) -> float:
 
 def intervals_of(samples_by_label: Mapping[str, Samples]) -> dict[str, tuple[float, float]]:
     """`latency_interval` of each of the configurations that were timed together, with the spread pooled over them."""
-    timed = {label: samples for label, samples in samples_by_label.items() if len(samples.get("latency_ms", ()))}
+    timed = {
+        label: samples
+        for label, samples in samples_by_label.items()
+        if len(samples.get("latency_ms", ()))
+    }
     if not timed:
         return {}
     pooled = spreads_of(list(timed.values()))
@@ -226,15 +254,28 @@ def compare_latency(samples_a: Samples, samples_b: Samples) -> dict[str, Any]:
     cube = _cube([samples_a, samples_b])
     both = np.isfinite(cube).all(axis=0)
     if not both.any():
-        raise InvalidInputError("`samples_a` and `samples_b` must have a `process` and `round` in common; they have none.")
+        raise InvalidInputError(
+            "`samples_a` and `samples_b` must have a `process` and `round` in common; they have none."
+        )
     logs = _nan_median(np.where(both, cube[0] - cube[1], nan))
     logs = logs[np.isfinite(logs)]
     n = len(logs)
     # A difference scatters sqrt(2) times as much as one configuration.
-    spread = Spread(float(logs.std(ddof=1)) / sqrt(2) if n > 1 else 0.0, n - 1.0).moderated(TYPICAL_SPREAD)
-    centre, half = float(logs.mean()), student_t(COMPARISON_LEVEL, spread.df) * spread.sd * sqrt(2 / n)
+    spread = Spread(float(logs.std(ddof=1)) / sqrt(2) if n > 1 else 0.0, n - 1.0).moderated(
+        TYPICAL_SPREAD
+    )
+    centre, half = (
+        float(logs.mean()),
+        student_t(COMPARISON_LEVEL, spread.df) * spread.sd * sqrt(2 / n),
+    )
     low, high = centre - half, centre + half
-    return {"ratio": exp(centre), "low": exp(low), "high": exp(high), "verdict": verdict_of(low, high), "n_processes": n}
+    return {
+        "ratio": exp(centre),
+        "low": exp(low),
+        "high": exp(high),
+        "verdict": verdict_of(low, high),
+        "n_processes": n,
+    }
 
 
 def verdict_of(low: float, high: float) -> str:
@@ -243,7 +284,10 @@ def verdict_of(low: float, high: float) -> str:
 
 
 def latency_draws(
-    all_samples: Sequence[Samples | None], medians_ms: NDArray[np.float64], n: int, generator: np.random.Generator
+    all_samples: Sequence[Samples | None],
+    medians_ms: NDArray[np.float64],
+    n: int,
+    generator: np.random.Generator,
 ) -> NDArray[np.float64]:
     """Log latencies as other sets of processes would have given them.
 
@@ -264,9 +308,20 @@ def latency_draws(
     -------
     (n_configurations, n) float64
     """
-    timed = {i: samples for i, samples in enumerate(all_samples) if samples is not None and len(samples.get("latency_ms", ()))}
-    spreads = spreads_of(list(timed.values())) if timed else Spreads(Spread(0.0, 0.0), Spread(0.0, 0.0), np.zeros(0))
-    specific, common = spreads.specific.moderated(TYPICAL_SPREAD), spreads.common.moderated(TYPICAL_DRIFT)
+    timed = {
+        i: samples
+        for i, samples in enumerate(all_samples)
+        if samples is not None and len(samples.get("latency_ms", ()))
+    }
+    spreads = (
+        spreads_of(list(timed.values()))
+        if timed
+        else Spreads(Spread(0.0, 0.0), Spread(0.0, 0.0), np.zeros(0))
+    )
+    specific, common = (
+        spreads.specific.moderated(TYPICAL_SPREAD),
+        spreads.common.moderated(TYPICAL_DRIFT),
+    )
     sd, variance = np.full(len(medians_ms), specific.sd), np.ones(len(medians_ms))
     sd[list(timed)] = np.fmax(specific.sd, spreads.own)
     variance[list(timed)] = [median_variance(n_processes_of(samples)) for samples in timed.values()]
@@ -286,7 +341,9 @@ def clusters_of(regions: NDArray[np.int64] | None, n_samples: int) -> NDArray[np
     return np.arange(n_samples)[:, None]
 
 
-def resample_weights(clusters: NDArray[np.int64], n: int, generator: np.random.Generator) -> NDArray[np.int32]:
+def resample_weights(
+    clusters: NDArray[np.int64], n: int, generator: np.random.Generator
+) -> NDArray[np.int32]:
     """How often each test sample is in each bootstrap resample of the load regions.
 
     Regions are drawn with replacement, as many as there are. A sample with one region is taken as often as its region; one
@@ -311,7 +368,9 @@ def resample_weights(clusters: NDArray[np.int64], n: int, generator: np.random.G
     weights = np.empty((len(clusters), n), dtype=np.int32)
     missing = np.arange(n)
     while len(missing):
-        counts = generator.multinomial(n_clusters, np.full(n_clusters, 1 / n_clusters), size=len(missing)).T.astype(np.int32)
+        counts = generator.multinomial(
+            n_clusters, np.full(n_clusters, 1 / n_clusters), size=len(missing)
+        ).T.astype(np.int32)
         drawn = counts[clusters[:, 0]]
         for column in clusters[:, 1:].T:
             drawn *= counts[column]
@@ -320,7 +379,9 @@ def resample_weights(clusters: NDArray[np.int64], n: int, generator: np.random.G
     return weights
 
 
-def weighted_medians(values: NDArray[np.float64], weights: NDArray[np.int32]) -> NDArray[np.float64]:
+def weighted_medians(
+    values: NDArray[np.float64], weights: NDArray[np.int32]
+) -> NDArray[np.float64]:
     """(n,) medians of values (n_samples,), each taken as often as its row of weights (n_samples, n) says."""
     order = np.argsort(values)
     ordered, below = values[order], np.cumsum(weights[order], axis=0, dtype=np.int32)
@@ -334,7 +395,9 @@ def weighted_means(values: NDArray[np.float64], weights: NDArray[np.int32]) -> N
     with np.errstate(invalid="ignore"):
         failed = ~np.isfinite(values)
         means = np.where(failed, 0.0, values) @ weights / weights.sum(axis=0)
-    return np.asarray(np.where(weights[failed].any(axis=0), np.inf, means) if failed.any() else means)
+    return np.asarray(
+        np.where(weights[failed].any(axis=0), np.inf, means) if failed.any() else means
+    )
 
 
 def widening(n_clusters: int) -> float:
@@ -345,10 +408,16 @@ def widening(n_clusters: int) -> float:
     """
     from scipy.special import ndtri
 
-    return sqrt(n_clusters / (n_clusters - 1)) * student_t(LEVEL, n_clusters - 1) / float(ndtri((1 + LEVEL) / 2))
+    return (
+        sqrt(n_clusters / (n_clusters - 1))
+        * student_t(LEVEL, n_clusters - 1)
+        / float(ndtri((1 + LEVEL) / 2))
+    )
 
 
-def widened(draws: NDArray[np.float64], value: float, factor: float, bounds: tuple[float, float]) -> NDArray[np.float64]:
+def widened(
+    draws: NDArray[np.float64], value: float, factor: float, bounds: tuple[float, float]
+) -> NDArray[np.float64]:
     """Draws of a positive figure, moved away from its value on the log scale by a factor, within the bounds that it cannot leave."""
     finite = np.isfinite(draws)
     if not 0 < value < np.inf:

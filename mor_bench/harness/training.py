@@ -134,7 +134,15 @@ def fit(
     cores = os.cpu_count() or 1
     if threads is not None and not 1 <= threads <= cores:
         raise InvalidInputError(f"`threads` must be an integer in [1, {cores}]; got {threads}.")
-    _check_options(unfitted, {"device": device == "cuda", "fit_seconds": fit_seconds, "checkpoint": checkpoint, "start_from": start_from})
+    _check_options(
+        unfitted,
+        {
+            "device": device == "cuda",
+            "fit_seconds": fit_seconds,
+            "checkpoint": checkpoint,
+            "start_from": start_from,
+        },
+    )
     options = training_options(device, fit_seconds)
     if start_from is not None:
         weights_to_start_from(start_from, unfitted)
@@ -143,10 +151,19 @@ def fit(
     if unfitted.trains():
         _check_writable("checkpoint", kept)
         if kept.resolve() == out.resolve():
-            raise InvalidInputError(f"`checkpoint` must be another file than `out`; got {kept} for both.")
+            raise InvalidInputError(
+                f"`checkpoint` must be another file than `out`; got {kept} for both."
+            )
         remove_leftovers(kept.parent, kept.name)
         unfitted.training = replace(options, checkpoint=kept, progress=listener.training)
-    data = load_dataset(spec, limit, split=split, workers=workers, cache=cache, progress=partial(listener.generating, spec.name))
+    data = load_dataset(
+        spec,
+        limit,
+        split=split,
+        workers=workers,
+        cache=cache,
+        progress=partial(listener.generating, spec.name),
+    )
     with pinned_threads(threads or cores):
         start = perf_counter()
         unfitted.fit(data.scene, data.train if unfitted.needs_snapshots else None)
@@ -155,9 +172,20 @@ def fit(
         if unfitted.trains():
             kept.unlink(missing_ok=True)
         if fit_seconds is not None and getattr(unfitted, "iterations_", None) is None:
-            warnings.warn(f"{type(unfitted).__name__} did not size its training to seconds: its knob `iterations` counted.", stacklevel=2)
+            warnings.warn(
+                f"{type(unfitted).__name__} did not size its training to seconds: its knob `iterations` counted.",
+                stacklevel=2,
+            )
         error = _test_error(unfitted, data.test)
-    return Fit(unfitted, out, error, seconds, getattr(unfitted, "iterations_", None), len(data.train), len(data.test))
+    return Fit(
+        unfitted,
+        out,
+        error,
+        seconds,
+        getattr(unfitted, "iterations_", None),
+        len(data.train),
+        len(data.test),
+    )
 
 
 def _unfitted(source: str | Path, parameters: Mapping[str, Any], suite: Path | None) -> Surrogate:
@@ -171,7 +199,9 @@ def _unfitted(source: str | Path, parameters: Mapping[str, Any], suite: Path | N
 def _check_options(unfitted: Surrogate, given: Mapping[str, Any]) -> None:
     named = [f"`{name}`" for name, value in given.items() if value]
     if named and not unfitted.trains():
-        raise InvalidInputError(f"{type(unfitted).__name__} has no training that {', '.join(named)} could act on.")
+        raise InvalidInputError(
+            f"{type(unfitted).__name__} has no training that {', '.join(named)} could act on."
+        )
 
 
 def _check_writable(name: str, path: Path) -> None:
@@ -186,5 +216,10 @@ def _check_writable(name: str, path: Path) -> None:
 
 
 def _test_error(method: Surrogate, test: Snapshots) -> dict[str, float]:
-    predicted = [predict_all(method, test[start : start + SCORE_CHUNK].inputs) for start in range(0, len(test), SCORE_CHUNK)]
-    return summary(sample_errors(np.concatenate(predicted), test.displacements, test.scene.output_nodes))
+    predicted = [
+        predict_all(method, test[start : start + SCORE_CHUNK].inputs)
+        for start in range(0, len(test), SCORE_CHUNK)
+    ]
+    return summary(
+        sample_errors(np.concatenate(predicted), test.displacements, test.scene.output_nodes)
+    )

@@ -47,12 +47,29 @@ CURVES = ("loss_curve", "validation_curve")
 WARM_UP_QUERIES = 20
 WARM_UP_S = 2.0
 
-PROGRAM_EVENTS = ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.startfile")
+PROGRAM_EVENTS = (
+    "subprocess.Popen",
+    "os.system",
+    "os.exec",
+    "os.posix_spawn",
+    "os.spawn",
+    "os.startfile",
+)
 """Audit events of launching a program, which would not be under this process's seal."""
 
 FILE_EVENTS = (
-    "open", "os.listdir", "os.scandir", "os.mkdir", "os.remove", "os.rename", "os.rmdir", "os.link", "os.symlink", "os.truncate", "shutil.rmtree",
-)  # fmt: skip
+    "open",
+    "os.listdir",
+    "os.scandir",
+    "os.mkdir",
+    "os.remove",
+    "os.rename",
+    "os.rmdir",
+    "os.link",
+    "os.symlink",
+    "os.truncate",
+    "shutil.rmtree",
+)
 
 
 def seal(folders: list[str], open_one: str | None = None) -> None:
@@ -71,7 +88,9 @@ def seal(folders: list[str], open_one: str | None = None) -> None:
             return
         real = os.path.realpath(os.fsdecode(path)) + os.sep
         if real.startswith(prefixes) and not (exempt and real.startswith(exempt)):
-            raise PermissionError(f"{os.fsdecode(path)}: a method may not look at datasets and results while it is compared.")
+            raise PermissionError(
+                f"{os.fsdecode(path)}: a method may not look at datasets and results while it is compared."
+            )
 
     def refuse(event: str, arguments: tuple[Any, ...]) -> None:
         if event in FILE_EVENTS:
@@ -100,7 +119,9 @@ def _guard_hdf5(check: Callable[[object], None]) -> None:
 def peak_memory_bytes() -> int:
     """The most memory that this process has had resident."""
     try:
-        with open("/proc/self/status", encoding="ascii") as status:  # getrusage tells the parent's peak, where that is higher
+        with open(
+            "/proc/self/status", encoding="ascii"
+        ) as status:  # getrusage tells the parent's peak, where that is higher
             return next(int(line.split()[1]) * 1024 for line in status if line.startswith("VmHWM:"))
     except (OSError, StopIteration):
         import psutil
@@ -118,14 +139,18 @@ class Session:
     subject: Subject
     concerning: list[tuple[Case, str | None]]
 
-    def begin(self, path: list[str], scene: Scene, sealed: list[str], open_one: str | None) -> dict[str, Any]:
+    def begin(
+        self, path: list[str], scene: Scene, sealed: list[str], open_one: str | None
+    ) -> dict[str, Any]:
         """Take over the parent's import path and keep out of some folders but for one within them."""
         self.scene = scene
         seal(sealed, open_one)
         sys.path[:] = path
         return {}
 
-    def check(self, surrogate: str, configurations: list[dict[str, Any]], where: str) -> dict[str, Any]:
+    def check(
+        self, surrogate: str, configurations: list[dict[str, Any]], where: str
+    ) -> dict[str, Any]:
         """Import a class and check knobs against it."""
         from mor_bench.specs import check_parameters, load_class
 
@@ -134,7 +159,9 @@ class Session:
             check_parameters(loaded, configuration, where)
         return {}
 
-    def stress(self, method: MethodSpec, profile: str, cases: list[str], cache: Path | None) -> dict[str, Any]:
+    def stress(
+        self, method: MethodSpec, profile: str, cases: list[str], cache: Path | None
+    ) -> dict[str, Any]:
         """Which hard cases concern a method."""
         from mor_bench.harness.stress import concerning
         from mor_bench.harness.stress.case import Scenes, Subject
@@ -151,9 +178,15 @@ class Session:
         return {"row": asdict(attempt(case, self.subject, missing))}
 
     def fit(
-        self, surrogate: str, parameters: dict[str, Any], train: Path, model: Path, threads: int, limit_s: float,
+        self,
+        surrogate: str,
+        parameters: dict[str, Any],
+        train: Path,
+        model: Path,
+        threads: int,
+        limit_s: float,
         training: TrainingOptions | None = None,
-    ) -> dict[str, Any]:  # fmt: skip
+    ) -> dict[str, Any]:
         """Fit on the snapshots of a folder and save."""
         from mor_bench.harness.handover import read_snapshots
         from mor_bench.harness.timing import pinned_threads
@@ -213,7 +246,9 @@ class Session:
         except UnknownRangeError:
             return {"flagged": None}
         if flagged.shape != (len(forces),):
-            raise InvalidInputError(f"`out_of_range` must return {len(forces)} flags for as many loads; it returned shape {flagged.shape}.")
+            raise InvalidInputError(
+                f"`out_of_range` must return {len(forces)} flags for as many loads; it returned shape {flagged.shape}."
+            )
         return {"flagged": [bool(flag) for flag in flagged]}
 
     def cost(self, forces: NDArray[np.float64]) -> dict[str, Any]:
@@ -240,7 +275,9 @@ class Session:
                     break
         return {"memory_bytes": peak_memory_bytes()}
 
-    def time(self, out: Path, n: int, floor_s: float, most_s: float, threads: int) -> dict[str, Any]:
+    def time(
+        self, out: Path, n: int, floor_s: float, most_s: float, threads: int
+    ) -> dict[str, Any]:
         """Wall times of single queries, ms: n and at least for a time, but for no longer than another.
 
         Each load is one of the queries, drawn at random and made smaller by a random factor, so that none comes twice. A few
@@ -272,7 +309,10 @@ class Session:
             gc.callbacks.append(clock)
             try:
                 while True:
-                    number, check = int(draw.integers(len(queries))), len(kept) < CHECKED_ANSWERS and draw.random() < CHECKED_SHARE
+                    number, check = (
+                        int(draw.integers(len(queries))),
+                        len(kept) < CHECKED_ANSWERS and draw.random() < CHECKED_SHARE,
+                    )
                     query = queries[number] * (1.0 if check else draw.uniform(0.5, 1.0))
                     clock.seconds, busy = 0.0, process_time()
                     before = perf_counter()
@@ -291,13 +331,24 @@ class Session:
         if {answer.shape for answer in kept.values()} - {queries.shape[1:]}:
             from mor_bench.errors import InvalidInputError
 
-            raise InvalidInputError(f"a single load of shape {queries.shape[1:]} is not answered in that shape.")
-        np.save(out, np.array(list(kept.values())).reshape(-1, *queries.shape[1:]), allow_pickle=False)
+            raise InvalidInputError(
+                f"a single load of shape {queries.shape[1:]} is not answered in that shape."
+            )
+        np.save(
+            out, np.array(list(kept.values())).reshape(-1, *queries.shape[1:]), allow_pickle=False
+        )
         return {
-            "latency_ms": times, "gc_ms": collecting, "cpu_s": cpu, "wall_s": wall, "cpu_all_s": process_time() - begun, "checked": list(kept),
-        }  # fmt: skip
+            "latency_ms": times,
+            "gc_ms": collecting,
+            "cpu_s": cpu,
+            "wall_s": wall,
+            "cpu_all_s": process_time() - begun,
+            "checked": list(kept),
+        }
 
-    def throughput(self, sizes: list[int], floor_s: float, most_s: float, threads: int) -> dict[str, Any]:
+    def throughput(
+        self, sizes: list[int], floor_s: float, most_s: float, threads: int
+    ) -> dict[str, Any]:
         """Queries per second in batches of some sizes; None where one batch would take longer than a time, or has no answer."""
         import numpy as np
 
@@ -328,7 +379,9 @@ class Session:
 def _told_of_training(method: Surrogate) -> dict[str, Any] | None:
     """The iterations and loss curves of a method that has trained; None of others, or where they are no numbers."""
     try:
-        told: dict[str, Any] = {name: [float(loss) for loss in getattr(method, f"{name}_", ())] for name in CURVES}
+        told: dict[str, Any] = {
+            name: [float(loss) for loss in getattr(method, f"{name}_", ())] for name in CURVES
+        }
         iterations = getattr(method, "iterations_", None)
         told["iterations"] = None if iterations is None else int(iterations)
     except (TypeError, ValueError):
@@ -361,8 +414,17 @@ def _answer(session: Session, request: dict[str, Any]) -> dict[str, Any]:
         except MorBenchError as error:
             answer = {"error": type(error).__name__, "message": _printable(error)}
         except (Exception, SystemExit) as error:  # third parties' code runs here
-            answer = {"error": None, "message": f"crashed with {type(error).__name__}: {_printable(error)}"}
-    notes = list(dict.fromkeys(_printable(warning.message) for warning in caught if issubclass(warning.category, UserWarning)))
+            answer = {
+                "error": None,
+                "message": f"crashed with {type(error).__name__}: {_printable(error)}",
+            }
+    notes = list(
+        dict.fromkeys(
+            _printable(warning.message)
+            for warning in caught
+            if issubclass(warning.category, UserWarning)
+        )
+    )
     return {**answer, "warnings": notes}
 
 
@@ -382,7 +444,9 @@ def _read(requests: BinaryIO, queue: SimpleQueue[dict[str, Any]]) -> None:
 
 def work(requests: BinaryIO, answers: BinaryIO) -> None:
     """Answer requests until there are no more. What a method prints is no answer: standard output goes where errors go."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent ends its workers
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # a terminal sends it to all; the parent ends its workers
     os.dup2(2, 1)
     with open(os.devnull, "rb") as nothing:
         os.dup2(nothing.fileno(), 0)

@@ -95,7 +95,9 @@ def inference_or_eager(network: nn.Module, backend: Backend) -> Inference:
         return Inference(network, backend)
     except UnavailableBackendError as error:
         warnings.warn(
-            f"inference by {backend!r} is not available: {error} The network answers by 'eager', more slowly.", FallbackWarning, stacklevel=2
+            f"inference by {backend!r} is not available: {error} The network answers by 'eager', more slowly.",
+            FallbackWarning,
+            stacklevel=2,
         )
         return Inference(network)
 
@@ -119,7 +121,9 @@ class Choice:
 
 
 @torch.inference_mode()
-def choose_inference(network: nn.Module, inputs: Tensor, errors: Callable[[Inference], Tensor]) -> Choice:
+def choose_inference(
+    network: nn.Module, inputs: Tensor, errors: Callable[[Inference], Tensor]
+) -> Choice:
     """Choose the fastest back end that is exact enough and clearly faster than plainer ones.
 
     Timed with single queries on one thread, where time differs between machines but hardly the order. A back end qualifies
@@ -149,7 +153,9 @@ def choose_inference(network: nn.Module, inputs: Tensor, errors: Callable[[Infer
             left_out[backend] = f"{type(error).__name__}: {error}".splitlines()[0]
             continue
         if not added <= ADDED_ERROR:
-            left_out[backend] = f"it changes the answers by {added:.1%} of the network's own error; at most {ADDED_ERROR:.0%} would do."
+            left_out[backend] = (
+                f"it changes the answers by {added:.1%} of the network's own error; at most {ADDED_ERROR:.0%} would do."
+            )
             continue
         able[backend] = candidate
     times = _fastest_ms(able, inputs)
@@ -188,13 +194,22 @@ class _PackedConvolution(nn.Module):
 
     def __init__(self, layer: nn.Conv2d | nn.Conv3d, activation: str | None) -> None:
         super().__init__()
-        self.geometry = [list(layer.padding), list(layer.stride), list(layer.dilation), layer.groups]
-        self.weight = torch.ops.mkldnn._reorder_convolution_weight(layer.weight.detach(), *self.geometry, None)
+        self.geometry = [
+            list(layer.padding),
+            list(layer.stride),
+            list(layer.dilation),
+            layer.groups,
+        ]
+        self.weight = torch.ops.mkldnn._reorder_convolution_weight(
+            layer.weight.detach(), *self.geometry, None
+        )
         self.bias = None if layer.bias is None else layer.bias.detach()
         self.activation = activation or "none"
 
     def forward(self, x: Tensor) -> Tensor:
-        y: Tensor = torch.ops.mkldnn._convolution_pointwise(x, self.weight, self.bias, *self.geometry, self.activation, [], "")
+        y: Tensor = torch.ops.mkldnn._convolution_pointwise(
+            x, self.weight, self.bias, *self.geometry, self.activation, [], ""
+        )
         return y
 
 
@@ -205,14 +220,22 @@ class _Upsampling(nn.Module):
         super().__init__()
         c_in, self.c_out, *self.kernel = layer.weight.shape
         self.weight = layer.weight.detach().movedim((0, 1), (-1, -2)).reshape(-1, c_in).contiguous()
-        self.bias = None if layer.bias is None else layer.bias.detach().repeat(len(self.weight) // self.c_out)
+        self.bias = (
+            None
+            if layer.bias is None
+            else layer.bias.detach().repeat(len(self.weight) // self.c_out)
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         n, c_in, *shape = x.shape
         d = len(shape)
-        y = nn.functional.linear(x.movedim(1, -1).reshape(-1, c_in), self.weight, self.bias).view(n, *shape, *self.kernel, self.c_out)
+        y = nn.functional.linear(x.movedim(1, -1).reshape(-1, c_in), self.weight, self.bias).view(
+            n, *shape, *self.kernel, self.c_out
+        )
         interleaved = [axis for i in range(1, d + 1) for axis in (i, i + d)]
-        y = y.permute(0, *interleaved, 2 * d + 1).reshape(n, *(a * b for a, b in zip(shape, self.kernel, strict=True)), self.c_out)
+        y = y.permute(0, *interleaved, 2 * d + 1).reshape(
+            n, *(a * b for a, b in zip(shape, self.kernel, strict=True)), self.c_out
+        )
         return y.movedim(-1, 1)
 
 
@@ -250,7 +273,11 @@ def _pack_layers(module: nn.Module) -> int:
     children = list(module.named_children())
     following = [child for _, child in children[1:]] if isinstance(module, nn.Sequential) else []
     for i, (name, child) in enumerate(children):
-        if isinstance(child, nn.Conv2d | nn.Conv3d) and child.padding_mode == "zeros" and not isinstance(child.padding, str):
+        if (
+            isinstance(child, nn.Conv2d | nn.Conv3d)
+            and child.padding_mode == "zeros"
+            and not isinstance(child.padding, str)
+        ):
             activation = FUSED.get(type(following[i])) if i < len(following) else None
             setattr(module, name, _PackedConvolution(child, activation))
             if activation is not None:
@@ -265,7 +292,12 @@ def _pack_layers(module: nn.Module) -> int:
 
 def _is_upsampling(layer: nn.ConvTranspose2d | nn.ConvTranspose3d) -> bool:
     """Whether every output depends on one input point."""
-    plain = layer.groups == 1 and not any(layer.padding) and not any(layer.output_padding) and set(layer.dilation) == {1}
+    plain = (
+        layer.groups == 1
+        and not any(layer.padding)
+        and not any(layer.output_padding)
+        and set(layer.dilation) == {1}
+    )
     return plain and layer.kernel_size == layer.stride
 
 
@@ -284,7 +316,11 @@ def _reason_against_packing(dtype: torch.dtype) -> str | None:
     expected = layer(x.float()).relu()
     try:
         found = _PackedConvolution(layer.to(dtype), "relu")(x)
-    except (AttributeError, RuntimeError, TypeError) as error:  # torch's operations for its own compiler may change with its versions
+    except (
+        AttributeError,
+        RuntimeError,
+        TypeError,
+    ) as error:  # torch's operations for its own compiler may change with its versions
         return f"torch {torch.__version__} does not offer oneDNN's convolutions as expected: {type(error).__name__}."
     allowed = SAME if dtype == torch.float32 else 2e-2
     if not float((found.float() - expected).abs().max()) <= allowed * float(expected.max()):
@@ -294,7 +330,9 @@ def _reason_against_packing(dtype: torch.dtype) -> str | None:
 
 def _processor_has_bfloat16() -> bool:
     """Whether it multiplies bfloat16 by itself; oneDNN emulates it elsewhere, and then it is slower than float32."""
-    capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()  # torch 2.10 and later
+    capabilities: dict[str, Any] = getattr(
+        torch.cpu, "get_capabilities", dict
+    )()  # torch 2.10 and later
     return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
 
 
@@ -307,7 +345,9 @@ class _OnnxSession:
         try:
             import onnxruntime
         except ImportError as error:
-            raise UnavailableBackendError(f"ONNX needs pip install 'mor-bench[onnx]' ({error}).") from None
+            raise UnavailableBackendError(
+                f"ONNX needs pip install 'mor-bench[onnx]' ({error})."
+            ) from None
         self._runtime = onnxruntime
         self._model = network_model(network).SerializeToString()
         self._sessions: dict[int, Any] = {}
@@ -318,8 +358,12 @@ class _OnnxSession:
         if threads not in self._sessions:
             options = self._runtime.SessionOptions()
             options.intra_op_num_threads = threads
-            options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads would slow what comes next
-            self._sessions[threads] = self._runtime.InferenceSession(self._model, options, providers=["CPUExecutionProvider"])
+            options.add_session_config_entry(
+                "session.intra_op.allow_spinning", "0"
+            )  # idle threads would slow what comes next
+            self._sessions[threads] = self._runtime.InferenceSession(
+                self._model, options, providers=["CPUExecutionProvider"]
+            )
         return self._sessions[threads]
 
     def __call__(self, inputs: Tensor) -> Tensor:

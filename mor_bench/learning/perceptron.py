@@ -19,11 +19,17 @@ class Perceptron(nn.Module):
     The weights are drawn with variance 1 / inputs, and the biases are zero, in the order of the parameters.
     """
 
-    def __init__(self, n_inputs: int, n_hidden: int, n_outputs: int, generator: torch.Generator) -> None:
+    def __init__(
+        self, n_inputs: int, n_hidden: int, n_outputs: int, generator: torch.Generator
+    ) -> None:
         super().__init__()
         self.weights = nn.ParameterList()
         for shape in _shapes(n_inputs, n_hidden, n_outputs):
-            drawn = torch.randn(shape, generator=generator) / shape[0] ** 0.5 if len(shape) == 2 else torch.zeros(shape)
+            drawn = (
+                torch.randn(shape, generator=generator) / shape[0] ** 0.5
+                if len(shape) == 2
+                else torch.zeros(shape)
+            )
             self.weights.append(nn.Parameter(drawn))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -76,9 +82,14 @@ def named(prefix: str, weights: Sequence[Array]) -> dict[str, Array]:
     return {f"{prefix}.{name}": weight for name, weight in zip(NAMES, weights, strict=True)}
 
 
-def named_shapes(prefix: str, n_inputs: int, n_hidden: int, n_outputs: int) -> dict[str, tuple[int, ...]]:
+def named_shapes(
+    prefix: str, n_inputs: int, n_hidden: int, n_outputs: int
+) -> dict[str, tuple[int, ...]]:
     """Of the arrays of `named`."""
-    return {f"{prefix}.{name}": shape for name, shape in zip(NAMES, _shapes(n_inputs, n_hidden, n_outputs), strict=True)}
+    return {
+        f"{prefix}.{name}": shape
+        for name, shape in zip(NAMES, _shapes(n_inputs, n_hidden, n_outputs), strict=True)
+    }
 
 
 def taken(state: Mapping[str, Array], prefix: str) -> list[Array]:

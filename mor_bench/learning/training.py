@@ -107,7 +107,9 @@ def device_of(options: TrainingOptions) -> torch.device:
         If CUDA is asked for and there is none.
     """
     if options.device == "cuda" and not torch.cuda.is_available():
-        raise InvalidInputError("`device` is 'cuda', but PyTorch finds no CUDA device here; 'cpu' and 'auto' train on the processor.")
+        raise InvalidInputError(
+            "`device` is 'cuda', but PyTorch finds no CUDA device here; 'cpu' and 'auto' train on the processor."
+        )
     return torch.device("cuda" if options.device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
@@ -123,7 +125,11 @@ def fingerprint_of(parts: Mapping[str, object], arrays: Mapping[str, Tensor]) ->
 
 def network_weights(state: Mapping[str, NDArray[Any]]) -> dict[str, Tensor]:
     """Of a model's arrays those of its network, by the names that they have there."""
-    return {name.removeprefix("network."): torch.from_numpy(array) for name, array in state.items() if name.startswith("network.")}
+    return {
+        name.removeprefix("network."): torch.from_numpy(array)
+        for name, array in state.items()
+        if name.startswith("network.")
+    }
 
 
 def rate_factor(schedule: Schedule, iteration: int, iterations: int) -> float:
@@ -189,7 +195,14 @@ def train(
     """
     options = options or TrainingOptions()
     course = _Course(network, loss, n_samples, plan, generator, options)
-    fingerprint = fingerprint_of({"caller": fingerprint, "fit_seconds": options.fit_seconds, "versions": [__version__, torch.__version__]}, {})
+    fingerprint = fingerprint_of(
+        {
+            "caller": fingerprint,
+            "fit_seconds": options.fit_seconds,
+            "versions": [__version__, torch.__version__],
+        },
+        {},
+    )
     if options.checkpoint is None or not course.resume(options.checkpoint, fingerprint):
         course.begin()
     start, first, written = perf_counter(), course.iteration, perf_counter()
@@ -199,7 +212,12 @@ def train(
         if done == 1:
             start = perf_counter()
         elif done - 1 in LOOKS_AHEAD and time_limit_s is not None:
-            _check_time((perf_counter() - start) / (done - 1), course.iterations - first, time_limit_s, LOOKS_AHEAD[done - 1])
+            _check_time(
+                (perf_counter() - start) / (done - 1),
+                course.iterations - first,
+                time_limit_s,
+                LOOKS_AHEAD[done - 1],
+            )
         if options.checkpoint is not None and perf_counter() - written > CHECKPOINT_EVERY_S:
             course.write(options.checkpoint, fingerprint)
             written = perf_counter()
@@ -240,7 +258,9 @@ class _Course:
     def __post_init__(self) -> None:
         self.device = device_of(self.options)
         betas = 0.9, self.plan.second_moment_decay
-        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=self.plan.learning_rate, betas=betas, fused=True)
+        self.optimiser = torch.optim.Adam(
+            self.network.parameters(), lr=self.plan.learning_rate, betas=betas, fused=True
+        )
         self.rows = torch.arange(self.n_samples)
         self.held = torch.empty(0, dtype=torch.int64)
         self.order = torch.empty(0, dtype=torch.int64)
@@ -252,7 +272,9 @@ class _Course:
     def n_held(self) -> int:
         """Samples that are held out."""
         fraction = self.plan.validation_fraction
-        return max(1, round(fraction * self.n_samples)) if fraction > 0 and self.n_samples > 1 else 0
+        return (
+            max(1, round(fraction * self.n_samples)) if fraction > 0 and self.n_samples > 1 else 0
+        )
 
     @property
     def validation_interval(self) -> int:
@@ -262,13 +284,19 @@ class _Course:
     @property
     def stopped(self) -> bool:
         """Whether the samples held out have gained nothing for long."""
-        return bool(self.validated) and len(self.validated) - 1 - int(np.argmin(self.validated)) >= PATIENCE
+        return (
+            bool(self.validated)
+            and len(self.validated) - 1 - int(np.argmin(self.validated)) >= PATIENCE
+        )
 
     def begin(self) -> None:
         """From the first iteration."""
         if self.n_held:
             order = torch.randperm(self.n_samples, generator=self.generator)
-            self.held, self.rows = order[: self.n_held].sort().values, order[self.n_held :].sort().values
+            self.held, self.rows = (
+                order[: self.n_held].sort().values,
+                order[self.n_held :].sort().values,
+            )
         self.iterations = self.plan.iterations
         if self.options.fit_seconds is not None:
             self.iterations = self._that_fit(self.options.fit_seconds)
@@ -276,7 +304,14 @@ class _Course:
     def _that_fit(self, seconds: float) -> int:
         """How many iterations take so long, with the looks at the samples held out, by some that leave no trace."""
         weights, drawn = deepcopy(self.network.state_dict()), self.generator.get_state()
-        trial = _Course(self.network, self.loss, self.n_samples, self.plan, self.generator, TrainingOptions(device=self.options.device))
+        trial = _Course(
+            self.network,
+            self.loss,
+            self.n_samples,
+            self.plan,
+            self.generator,
+            TrainingOptions(device=self.options.device),
+        )
         trial.iterations, trial.rows = self.plan.iterations, self.rows
         trial.step()  # makes what the others find
         start = now = self._now()
@@ -293,7 +328,12 @@ class _Course:
         self.generator.set_state(drawn)
         left = seconds - (self._now() - start)
         # As many looks as `VALIDATIONS`; one after every iteration where there are no more iterations than these.
-        return max(1, int((left - VALIDATIONS * look) / each) if left > VALIDATIONS * (look + each) else int(left / (look + each)))
+        return max(
+            1,
+            int((left - VALIDATIONS * look) / each)
+            if left > VALIDATIONS * (look + each)
+            else int(left / (look + each)),
+        )
 
     def _now(self) -> float:
         """Seconds of a clock, when all that was begun is done."""
@@ -309,7 +349,9 @@ class _Course:
             self.order = self.rows[torch.randperm(len(self.rows), generator=self.generator)]
         rows, self.order = self.order[:batch_size], self.order[batch_size:]
         for group in self.optimiser.param_groups:
-            group["lr"] = plan.learning_rate * rate_factor(plan.schedule, self.iteration, self.iterations)
+            group["lr"] = plan.learning_rate * rate_factor(
+                plan.schedule, self.iteration, self.iterations
+            )
         with self._products():
             loss = self.loss(rows.to(self.device))
         self.optimiser.zero_grad()
@@ -323,23 +365,34 @@ class _Course:
             self.total, self.n_summed = torch.zeros((), device=self.device), 0
             if self.options.progress is not None:
                 self.options.progress(self.iteration, self.iterations, self.curve[-1])
-        if len(self.held) and (self.iteration % self.validation_interval == 0 or self.iteration == self.iterations):
+        if len(self.held) and (
+            self.iteration % self.validation_interval == 0 or self.iteration == self.iterations
+        ):
             self._validate()
 
     def _products(self) -> AbstractContextManager[object]:
         """In what precision the loss is taken."""
-        return torch.autocast(self.device.type, torch.bfloat16) if self.plan.precision == "bfloat16" else nullcontext()
+        return (
+            torch.autocast(self.device.type, torch.bfloat16)
+            if self.plan.precision == "bfloat16"
+            else nullcontext()
+        )
 
     def _validate(self) -> None:
         """The loss of the samples held out; the weights of the lowest are kept."""
         self.network.eval()
         with torch.no_grad(), self._products():
-            parts = [(len(rows), self.loss(rows.to(self.device))) for rows in torch.split(self.held, self.plan.batch_size)]
+            parts = [
+                (len(rows), self.loss(rows.to(self.device)))
+                for rows in torch.split(self.held, self.plan.batch_size)
+            ]
         self.network.train()
         self.validated.append(sum(n * float(part) for n, part in parts) / len(self.held))
         self._check_finite(self.validated[-1])
         if self.validated[-1] <= min(self.validated):
-            self.best = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
+            self.best = {
+                name: value.detach().clone() for name, value in self.network.state_dict().items()
+            }
 
     def _check_finite(self, loss: float) -> None:
         if not isfinite(loss):
@@ -365,15 +418,34 @@ class _Course:
         tensors |= {f"best.{name}": value for name, value in self.best.items()}
         for number, state in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{number}.{name}": value for name, value in state.items()}
-        tensors |= {"generator": self.generator.get_state(), "order": self.order, "rows": self.rows, "held": self.held, "total": self.total}
+        tensors |= {
+            "generator": self.generator.get_state(),
+            "order": self.order,
+            "rows": self.rows,
+            "held": self.held,
+            "total": self.total,
+        }
         if not all(value.isfinite().all() for value in tensors.values()):
             return
         numbers = {
-            "iteration": self.iteration, "iterations": self.iterations, "n_summed": self.n_summed, "curve": self.curve, "validated": self.validated,
-        }  # fmt: skip
-        header = {"format": "mor-bench checkpoint", "fingerprint": fingerprint, "numbers": json.dumps(numbers)}
+            "iteration": self.iteration,
+            "iterations": self.iterations,
+            "n_summed": self.n_summed,
+            "curve": self.curve,
+            "validated": self.validated,
+        }
+        header = {
+            "format": "mor-bench checkpoint",
+            "fingerprint": fingerprint,
+            "numbers": json.dumps(numbers),
+        }
         header["sha256"] = fingerprint_of(header, tensors)
-        write_atomically(path, save({name: value.cpu().contiguous().clone() for name, value in tensors.items()}, header))
+        write_atomically(
+            path,
+            save(
+                {name: value.cpu().contiguous().clone() for name, value in tensors.items()}, header
+            ),
+        )
 
     def resume(self, path: Path, fingerprint: str) -> bool:
         """Go on from a file, if it is there."""
@@ -386,8 +458,13 @@ class _Course:
                 header = file.metadata() or {}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         except (SafetensorError, OSError) as error:
-            raise StoreError(f"{path}: not a checkpoint, or damaged: {error}. Without it the training begins anew.") from None
-        if header.get("format") != "mor-bench checkpoint" or header.get("fingerprint") != fingerprint:
+            raise StoreError(
+                f"{path}: not a checkpoint, or damaged: {error}. Without it the training begins anew."
+            ) from None
+        if (
+            header.get("format") != "mor-bench checkpoint"
+            or header.get("fingerprint") != fingerprint
+        ):
             raise InvalidInputError(
                 f"{path}: the checkpoint of another training (knobs, seconds, samples or version); name another file, or delete it."
             )
@@ -395,14 +472,20 @@ class _Course:
             if header.pop("sha256") != fingerprint_of(header, tensors):
                 raise ValueError("the checksum does not match")
             numbers = _Numbers.model_validate(json.loads(header["numbers"]))
-            self.iteration, self.iterations, self.n_summed = numbers.iteration, numbers.iterations, numbers.n_summed
+            self.iteration, self.iterations, self.n_summed = (
+                numbers.iteration,
+                numbers.iterations,
+                numbers.n_summed,
+            )
             self.curve, self.validated = numbers.curve, numbers.validated
             self._check(tensors)
             self.network.load_state_dict(_under("network.", tensors))
             self.best = _under("best.", tensors)
             whole = self.optimiser.state_dict()
             n_parameters = len(whole["param_groups"][0]["params"])
-            whole["state"] = {number: _under(f"optimiser.{number}.", tensors) for number in range(n_parameters)}
+            whole["state"] = {
+                number: _under(f"optimiser.{number}.", tensors) for number in range(n_parameters)
+            }
             self.optimiser.load_state_dict(whole)
             self.generator.set_state(tensors["generator"])
             self.order, self.rows, self.held = tensors["order"], tensors["rows"], tensors["held"]
@@ -410,17 +493,23 @@ class _Course:
         except (KeyError, ValueError, TypeError, RuntimeError) as error:
             first = error.errors()[0] if isinstance(error, ValidationError) else None
             reason = f"`{'.'.join(map(str, first['loc']))}`: {first['msg']}" if first else error
-            raise StoreError(f"{path}: a damaged checkpoint: {reason}. Without it the training begins anew.") from None
+            raise StoreError(
+                f"{path}: a damaged checkpoint: {reason}. Without it the training begins anew."
+            ) from None
         return True
 
     def _check(self, tensors: Mapping[str, Tensor]) -> None:
         """Raise `ValueError` unless the numbers and a checkpoint's tensors are some that the training can have come to."""
         ended = self.iteration == self.iterations
         n_points, n_looks = (
-            -(-self.iteration // interval) if ended else self.iteration // interval for interval in (LOSS_INTERVAL, self.validation_interval)
+            -(-self.iteration // interval) if ended else self.iteration // interval
+            for interval in (LOSS_INTERVAL, self.validation_interval)
         )
         counts = {
-            "iterations": (self.iterations, self.iterations if self.options.fit_seconds is not None else self.plan.iterations),
+            "iterations": (
+                self.iterations,
+                self.iterations if self.options.fit_seconds is not None else self.plan.iterations,
+            ),
             "iteration": (self.iteration, min(self.iteration, self.iterations)),
             "n_summed": (self.n_summed, 0 if ended else self.iteration % LOSS_INTERVAL),
             "curve": (len(self.curve), n_points),
@@ -428,23 +517,35 @@ class _Course:
         }
         for name, (came, due) in counts.items():
             if came != due:
-                raise ValueError(f"`{name}` must be {due} at iteration {self.iteration} of {self.iterations}; got {came}")
+                raise ValueError(
+                    f"`{name}` must be {due} at iteration {self.iteration} of {self.iterations}; got {came}"
+                )
         due_tensors = self._tensors_due()
         if tensors.keys() != due_tensors.keys():
-            raise ValueError(f"its tensors are not those of the training: {', '.join(sorted(tensors.keys() ^ due_tensors.keys()))}")
+            raise ValueError(
+                f"its tensors are not those of the training: {', '.join(sorted(tensors.keys() ^ due_tensors.keys()))}"
+            )
         for name, like in due_tensors.items():
             found = tensors[name]
             if (found.dtype, found.shape) != (like.dtype, like.shape) or not found.isfinite().all():
                 raise ValueError(
                     f"`{name}` must be finite numbers, {like.dtype} of shape {tuple(like.shape)}; got {found.dtype} of shape {tuple(found.shape)}"
                 )
-            if name.startswith("optimiser.") and name.endswith(".step") and not 1 <= found <= self.iteration:
+            if (
+                name.startswith("optimiser.")
+                and name.endswith(".step")
+                and not 1 <= found <= self.iteration
+            ):
                 raise ValueError(f"`{name}` must be in [1, {self.iteration}]; got {found}")
             if name.startswith("optimiser.") and name.endswith(".exp_avg_sq") and (found < 0).any():
                 raise ValueError(f"`{name}` must not be negative")
         rows, held, order = (tensors[name] for name in ("rows", "held", "order"))
         parts = torch.cat([rows, held]).sort().values
-        if not torch.equal(parts, torch.arange(self.n_samples)) or not torch.isin(order, rows).all() or len(set(order.tolist())) < len(order):
+        if (
+            not torch.equal(parts, torch.arange(self.n_samples))
+            or not torch.isin(order, rows).all()
+            or len(set(order.tolist())) < len(order)
+        ):
             raise ValueError("its samples are not those of the training")
 
     def _tensors_due(self) -> dict[str, Tensor]:
@@ -452,16 +553,35 @@ class _Course:
         network, n_rows = self.network.state_dict(), self.n_samples - self.n_held
         batch_size = min(self.plan.batch_size, n_rows)
         n_drawn = batch_size * ((self.iteration - 1) % (n_rows // batch_size) + 1)
-        due = {f"{part}.{name}": value for part in ("network", "best")[: 1 + bool(self.validated)] for name, value in network.items()}
+        due = {
+            f"{part}.{name}": value
+            for part in ("network", "best")[: 1 + bool(self.validated)]
+            for name, value in network.items()
+        }
         for number, parameter in enumerate(self.optimiser.param_groups[0]["params"]):
-            due |= {f"optimiser.{number}.{name}": like for name, like in (("step", self.total), ("exp_avg", parameter), ("exp_avg_sq", parameter))}
+            due |= {
+                f"optimiser.{number}.{name}": like
+                for name, like in (
+                    ("step", self.total),
+                    ("exp_avg", parameter),
+                    ("exp_avg_sq", parameter),
+                )
+            }
         samples = {"rows": n_rows, "held": self.n_held, "order": n_rows - n_drawn}
-        return due | {name: self.rows.new_empty(n) for name, n in samples.items()} | {"generator": self.generator.get_state(), "total": self.total}
+        return (
+            due
+            | {name: self.rows.new_empty(n) for name, n in samples.items()}
+            | {"generator": self.generator.get_state(), "total": self.total}
+        )
 
 
 def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Those whose names begin so, without that."""
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+    return {
+        name.removeprefix(prefix): value
+        for name, value in tensors.items()
+        if name.startswith(prefix)
+    }
 
 
 def _check_time(each_s: float, iterations: int, limit_s: float, factor: float) -> None:

@@ -62,7 +62,11 @@ class Anderson:
     """The acceleration's memory: the last differences of iterates, of corrections and of residuals."""
 
     def __init__(self, n: int) -> None:
-        self._steps, self._changes, self._basis = np.empty((WINDOW, n)), np.empty((WINDOW, n)), np.empty((WINDOW, n))
+        self._steps, self._changes, self._basis = (
+            np.empty((WINDOW, n)),
+            np.empty((WINDOW, n)),
+            np.empty((WINDOW, n)),
+        )
         self._held = 0
         self._count = 0
         self._last: tuple[Array, Array, Array] | None = None
@@ -85,7 +89,9 @@ class Anderson:
             self._held = min(self._count, WINDOW)
         self._last = q, correction, residual
         if counting.running is not None:
-            counting.running.add(multiply_adds=len(q) * (self._held * (self._held + 4) + (self._held > 0)))
+            counting.running.add(
+                multiply_adds=len(q) * (self._held * (self._held + 4) + (self._held > 0))
+            )
         step = np.empty_like(q)
         _combine(correction, self._steps, self._changes, self._held, self._basis, step)
         return step

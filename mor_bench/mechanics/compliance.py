@@ -40,8 +40,15 @@ def _respond(columns, place, most, loads, out, used):
         used[i] = n
         u[:] = 0.0
         whole = n - n % 4 if n > 0 else 0
-        for k in range(0, whole, 4):  # four at once, so that u is loaded and stored once for four multiply-adds
-            a, b, c, d = columns[rows[k]], columns[rows[k + 1]], columns[rows[k + 2]], columns[rows[k + 3]]
+        for k in range(
+            0, whole, 4
+        ):  # four at once, so that u is loaded and stored once for four multiply-adds
+            a, b, c, d = (
+                columns[rows[k]],
+                columns[rows[k + 1]],
+                columns[rows[k + 2]],
+                columns[rows[k + 3]],
+            )
             fa, fb, fc, fd = forces[k], forces[k + 1], forces[k + 2], forces[k + 3]
             for dof in range(len(u)):
                 u[dof] += fa * a[dof] + fb * b[dof] + fc * c[dof] + fd * d[dof]
@@ -109,7 +116,10 @@ class Compliance:
         n_dofs, n_free = model.scene.mesh.n_dofs, len(self._free)
         kept = (3 * np.unique(model.scene.patch_weights.indices)[:, None] + np.arange(3)).ravel()
         kept = kept[np.isin(kept, self._free)]
-        if not isinstance(self._factor, BandedFactor | SparseFactor) or 8 * len(kept) * n_dofs > MAX_BYTES:
+        if (
+            not isinstance(self._factor, BandedFactor | SparseFactor)
+            or 8 * len(kept) * n_dofs > MAX_BYTES
+        ):
             kept = kept[:0]
         self._place = np.full(n_dofs, _FIXED, dtype=np.int32)
         self._place[self._free] = _ELSEWHERE
@@ -145,7 +155,9 @@ class Compliance:
             counting.running.add(multiply_adds=int(used[~others].sum()) * len(self._free))
         if others.any():
             rows = np.flatnonzero(others)
-            out[rows[:, None], self._free] = self._factor.solve(loads[rows[:, None], self._free].T).T
+            out[rows[:, None], self._free] = self._factor.solve(
+                loads[rows[:, None], self._free].T
+            ).T
         return out
 
     def solve(self, rhs: Array) -> Array:

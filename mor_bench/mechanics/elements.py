@@ -36,12 +36,26 @@ class Element:
         return int(self.derivatives.shape[1])
 
 
-_CORNERS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], dtype=float)
+_CORNERS = np.array(
+    [
+        [-1, -1, -1],
+        [1, -1, -1],
+        [1, 1, -1],
+        [-1, 1, -1],
+        [-1, -1, 1],
+        [1, -1, 1],
+        [1, 1, 1],
+        [-1, 1, 1],
+    ],
+    dtype=float,
+)
 
 
 def _trilinear(points: Array) -> Array:
     terms = 1 + points[:, None, :] * _CORNERS[None, :, :]
-    return 0.125 * np.stack([_CORNERS[:, i] * np.prod(np.delete(terms, i, axis=2), axis=2) for i in range(3)], axis=2)
+    return 0.125 * np.stack(
+        [_CORNERS[:, i] * np.prod(np.delete(terms, i, axis=2), axis=2) for i in range(3)], axis=2
+    )
 
 
 _LINEAR = np.array([[-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -61,10 +75,14 @@ def element_of(cells: NDArray[np.int64]) -> Element:
     for element in (H8, T4):
         if cells.ndim == 2 and cells.shape[1] == element.n_nodes:
             return element
-    raise InvalidInputError(f"cells must have shape (n_cells, 8) for H8 or (n_cells, 4) for T4; got {cells.shape}.")
+    raise InvalidInputError(
+        f"cells must have shape (n_cells, 8) for H8 or (n_cells, 4) for T4; got {cells.shape}."
+    )
 
 
-def shape_gradients(points: Array, cells: NDArray[np.int64], derivatives: Array) -> tuple[Array, Array]:
+def shape_gradients(
+    points: Array, cells: NDArray[np.int64], derivatives: Array
+) -> tuple[Array, Array]:
     """Gradients of the shape functions in the reference configuration, and det J.
 
     Parameters

@@ -49,7 +49,9 @@ class ErrorIndicator:
         self._model = FullOrderModel(scene, "auto")
         self._inverse = self._model.turned_rest
 
-    def __call__(self, forces: NDArray[np.float64], displacements: NDArray[np.float64]) -> Indication:
+    def __call__(
+        self, forces: NDArray[np.float64], displacements: NDArray[np.float64]
+    ) -> Indication:
         """Indicate.
 
         Parameters
@@ -64,14 +66,20 @@ class ErrorIndicator:
         """
         shape = (len(forces), self._scene.mesh.n_nodes, 3)
         if forces.shape != shape or displacements.shape != shape:
-            raise InvalidInputError(f"forces and displacements must have shape (n, {shape[1]}, 3); got {forces.shape} and {displacements.shape}.")
+            raise InvalidInputError(
+                f"forces and displacements must have shape (n, {shape[1]}, 3); got {forces.shape} and {displacements.shape}."
+            )
         n_dofs, free = self._scene.mesh.n_dofs, self._scene.free_dofs
         loads, fields = forces.reshape(-1, n_dofs)[:, free], displacements.reshape(-1, n_dofs)
         moved = np.linalg.norm(np.delete(fields, free, axis=1), axis=1)
-        pairs = np.array([self._indicated(*triple) for triple in zip(loads, fields[:, free], moved, strict=True)]).reshape(-1, 2)
+        pairs = np.array(
+            [self._indicated(*triple) for triple in zip(loads, fields[:, free], moved, strict=True)]
+        ).reshape(-1, 2)
         return Indication(pairs[:, 0], pairs[:, 1])
 
-    def _indicated(self, load: NDArray[np.float64], u: NDArray[np.float64], moved: float) -> tuple[float, float]:
+    def _indicated(
+        self, load: NDArray[np.float64], u: NDArray[np.float64], moved: float
+    ) -> tuple[float, float]:
         if not (np.isfinite(u).all() and np.isfinite(moved)):
             return np.inf, np.inf
         residual = load - self._model.force(u).force

@@ -53,13 +53,27 @@ def _component(u_e, g, i, j, l):
 def _add_row(f_e, g, i, l, p0, p1, p2):
     """f_a,i += P_i · g_a for every node."""
     f_e[i * LANES + l] += p0 * g[l] + p1 * g[LANES + l] + p2 * g[2 * LANES + l]
-    f_e[(3 + i) * LANES + l] += p0 * g[3 * LANES + l] + p1 * g[4 * LANES + l] + p2 * g[5 * LANES + l]
-    f_e[(6 + i) * LANES + l] += p0 * g[6 * LANES + l] + p1 * g[7 * LANES + l] + p2 * g[8 * LANES + l]
-    f_e[(9 + i) * LANES + l] += p0 * g[9 * LANES + l] + p1 * g[10 * LANES + l] + p2 * g[11 * LANES + l]
-    f_e[(12 + i) * LANES + l] += p0 * g[12 * LANES + l] + p1 * g[13 * LANES + l] + p2 * g[14 * LANES + l]
-    f_e[(15 + i) * LANES + l] += p0 * g[15 * LANES + l] + p1 * g[16 * LANES + l] + p2 * g[17 * LANES + l]
-    f_e[(18 + i) * LANES + l] += p0 * g[18 * LANES + l] + p1 * g[19 * LANES + l] + p2 * g[20 * LANES + l]
-    f_e[(21 + i) * LANES + l] += p0 * g[21 * LANES + l] + p1 * g[22 * LANES + l] + p2 * g[23 * LANES + l]
+    f_e[(3 + i) * LANES + l] += (
+        p0 * g[3 * LANES + l] + p1 * g[4 * LANES + l] + p2 * g[5 * LANES + l]
+    )
+    f_e[(6 + i) * LANES + l] += (
+        p0 * g[6 * LANES + l] + p1 * g[7 * LANES + l] + p2 * g[8 * LANES + l]
+    )
+    f_e[(9 + i) * LANES + l] += (
+        p0 * g[9 * LANES + l] + p1 * g[10 * LANES + l] + p2 * g[11 * LANES + l]
+    )
+    f_e[(12 + i) * LANES + l] += (
+        p0 * g[12 * LANES + l] + p1 * g[13 * LANES + l] + p2 * g[14 * LANES + l]
+    )
+    f_e[(15 + i) * LANES + l] += (
+        p0 * g[15 * LANES + l] + p1 * g[16 * LANES + l] + p2 * g[17 * LANES + l]
+    )
+    f_e[(18 + i) * LANES + l] += (
+        p0 * g[18 * LANES + l] + p1 * g[19 * LANES + l] + p2 * g[20 * LANES + l]
+    )
+    f_e[(21 + i) * LANES + l] += (
+        p0 * g[21 * LANES + l] + p1 * g[22 * LANES + l] + p2 * g[23 * LANES + l]
+    )
 
 
 @njit(inline="always")
@@ -70,9 +84,21 @@ def _point(u_e, g, w_lam, w_mu, H, S, f_e, energy, min_det):
     instead of 0.36. E is formed from H, not from FᵀF - I, which would lose the digits of a small strain.
     """
     for l in range(LANES):
-        h00, h01, h02 = _component(u_e, g, 0, 0, l), _component(u_e, g, 0, 1, l), _component(u_e, g, 0, 2, l)
-        h10, h11, h12 = _component(u_e, g, 1, 0, l), _component(u_e, g, 1, 1, l), _component(u_e, g, 1, 2, l)
-        h20, h21, h22 = _component(u_e, g, 2, 0, l), _component(u_e, g, 2, 1, l), _component(u_e, g, 2, 2, l)
+        h00, h01, h02 = (
+            _component(u_e, g, 0, 0, l),
+            _component(u_e, g, 0, 1, l),
+            _component(u_e, g, 0, 2, l),
+        )
+        h10, h11, h12 = (
+            _component(u_e, g, 1, 0, l),
+            _component(u_e, g, 1, 1, l),
+            _component(u_e, g, 1, 2, l),
+        )
+        h20, h21, h22 = (
+            _component(u_e, g, 2, 0, l),
+            _component(u_e, g, 2, 1, l),
+            _component(u_e, g, 2, 2, l),
+        )
         e00 = h00 + 0.5 * (h00 * h00 + h10 * h10 + h20 * h20)
         e11 = h11 + 0.5 * (h01 * h01 + h11 * h11 + h21 * h21)
         e22 = h22 + 0.5 * (h02 * h02 + h12 * h12 + h22 * h22)
@@ -86,15 +112,50 @@ def _point(u_e, g, w_lam, w_mu, H, S, f_e, energy, min_det):
         s01, s02, s12 = wm * e01, wm * e02, wm * e12
         energy[l] += 0.5 * (s00 * e00 + s11 * e11 + s22 * e22) + s01 * e01 + s02 * e02 + s12 * e12
         f00, f11, f22 = 1.0 + h00, 1.0 + h11, 1.0 + h22
-        det = f00 * (f11 * f22 - h12 * h21) - h01 * (h10 * f22 - h12 * h20) + h02 * (h10 * h21 - f11 * h20)
+        det = (
+            f00 * (f11 * f22 - h12 * h21)
+            - h01 * (h10 * f22 - h12 * h20)
+            + h02 * (h10 * h21 - f11 * h20)
+        )
         min_det[l] = min(min_det[l], det)
         H[l], H[1 * LANES + l], H[2 * LANES + l] = h00, h01, h02
         H[3 * LANES + l], H[4 * LANES + l], H[5 * LANES + l] = h10, h11, h12
         H[6 * LANES + l], H[7 * LANES + l], H[8 * LANES + l] = h20, h21, h22
-        S[l], S[1 * LANES + l], S[2 * LANES + l], S[3 * LANES + l], S[4 * LANES + l], S[5 * LANES + l] = s00, s11, s22, s01, s02, s12
-        _add_row(f_e, g, 0, l, f00 * s00 + h01 * s01 + h02 * s02, f00 * s01 + h01 * s11 + h02 * s12, f00 * s02 + h01 * s12 + h02 * s22)
-        _add_row(f_e, g, 1, l, h10 * s00 + f11 * s01 + h12 * s02, h10 * s01 + f11 * s11 + h12 * s12, h10 * s02 + f11 * s12 + h12 * s22)
-        _add_row(f_e, g, 2, l, h20 * s00 + h21 * s01 + f22 * s02, h20 * s01 + h21 * s11 + f22 * s12, h20 * s02 + h21 * s12 + f22 * s22)
+        (
+            S[l],
+            S[1 * LANES + l],
+            S[2 * LANES + l],
+            S[3 * LANES + l],
+            S[4 * LANES + l],
+            S[5 * LANES + l],
+        ) = s00, s11, s22, s01, s02, s12
+        _add_row(
+            f_e,
+            g,
+            0,
+            l,
+            f00 * s00 + h01 * s01 + h02 * s02,
+            f00 * s01 + h01 * s11 + h02 * s12,
+            f00 * s02 + h01 * s12 + h02 * s22,
+        )
+        _add_row(
+            f_e,
+            g,
+            1,
+            l,
+            h10 * s00 + f11 * s01 + h12 * s02,
+            h10 * s01 + f11 * s11 + h12 * s12,
+            h10 * s02 + f11 * s12 + h12 * s22,
+        )
+        _add_row(
+            f_e,
+            g,
+            2,
+            l,
+            h20 * s00 + h21 * s01 + f22 * s02,
+            h20 * s01 + h21 * s11 + f22 * s12,
+            h20 * s02 + h21 * s12 + f22 * s22,
+        )
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -120,8 +181,16 @@ def _push_forward(H, S, g, w_lam, w_mu, h, h_lam, h_mu, t, M):
             h2 = g2 + H[6 * LANES + l] * g0 + H[7 * LANES + l] * g1 + H[8 * LANES + l] * g2
             wl, wm = w_lam[l], w_mu[l]
             h[x * LANES + l], h[y * LANES + l], h[z * LANES + l] = h0, h1, h2
-            h_lam[x * LANES + l], h_lam[y * LANES + l], h_lam[z * LANES + l] = wl * h0, wl * h1, wl * h2
-            h_mu[x * LANES + l], h_mu[y * LANES + l], h_mu[z * LANES + l] = wm * h0, wm * h1, wm * h2
+            h_lam[x * LANES + l], h_lam[y * LANES + l], h_lam[z * LANES + l] = (
+                wl * h0,
+                wl * h1,
+                wl * h2,
+            )
+            h_mu[x * LANES + l], h_mu[y * LANES + l], h_mu[z * LANES + l] = (
+                wm * h0,
+                wm * h1,
+                wm * h2,
+            )
             t[x * LANES + l] = S[l] * g0 + S[3 * LANES + l] * g1 + S[4 * LANES + l] * g2
             t[y * LANES + l] = S[3 * LANES + l] * g0 + S[1 * LANES + l] * g1 + S[5 * LANES + l] * g2
             t[z * LANES + l] = S[4 * LANES + l] * g0 + S[5 * LANES + l] * g1 + S[2 * LANES + l] * g2
@@ -135,8 +204,16 @@ def _add_blocks(g, h, h_lam, h_mu, t, M, k_e):
         x, y, z = 3 * a, 3 * a + 1, 3 * a + 2
         block = k_e[p * LANES : (p + 6) * LANES]
         for l in range(LANES):
-            gg = g[x * LANES + l] * g[x * LANES + l] + g[y * LANES + l] * g[y * LANES + l] + g[z * LANES + l] * g[z * LANES + l]
-            s = g[x * LANES + l] * t[x * LANES + l] + g[y * LANES + l] * t[y * LANES + l] + g[z * LANES + l] * t[z * LANES + l]
+            gg = (
+                g[x * LANES + l] * g[x * LANES + l]
+                + g[y * LANES + l] * g[y * LANES + l]
+                + g[z * LANES + l] * g[z * LANES + l]
+            )
+            s = (
+                g[x * LANES + l] * t[x * LANES + l]
+                + g[y * LANES + l] * t[y * LANES + l]
+                + g[z * LANES + l] * t[z * LANES + l]
+            )
             b0, b1, b2 = (
                 h_lam[x * LANES + l] + h_mu[x * LANES + l],
                 h_lam[y * LANES + l] + h_mu[y * LANES + l],
@@ -153,8 +230,16 @@ def _add_blocks(g, h, h_lam, h_mu, t, M, k_e):
             u, v, q = 3 * b, 3 * b + 1, 3 * b + 2
             block = k_e[p * LANES : (p + 9) * LANES]
             for l in range(LANES):
-                gg = g[x * LANES + l] * g[u * LANES + l] + g[y * LANES + l] * g[v * LANES + l] + g[z * LANES + l] * g[q * LANES + l]
-                s = g[u * LANES + l] * t[x * LANES + l] + g[v * LANES + l] * t[y * LANES + l] + g[q * LANES + l] * t[z * LANES + l]
+                gg = (
+                    g[x * LANES + l] * g[u * LANES + l]
+                    + g[y * LANES + l] * g[v * LANES + l]
+                    + g[z * LANES + l] * g[q * LANES + l]
+                )
+                s = (
+                    g[u * LANES + l] * t[x * LANES + l]
+                    + g[v * LANES + l] * t[y * LANES + l]
+                    + g[q * LANES + l] * t[z * LANES + l]
+                )
                 m00, m11, m22 = gg * M[l] + s, gg * M[1 * LANES + l] + s, gg * M[2 * LANES + l] + s
                 m01, m02, m12 = gg * M[3 * LANES + l], gg * M[4 * LANES + l], gg * M[5 * LANES + l]
                 l0, l1, l2 = h_lam[x * LANES + l], h_lam[y * LANES + l], h_lam[z * LANES + l]
@@ -224,7 +309,12 @@ def internal_force_and_tangent(u, dofs, gradients, w_lam, w_mu, slots, force, va
     """
     u_e, f_e, k_e = np.empty(24 * LANES), np.empty(24 * LANES), np.empty(N_UPPER * LANES)
     H, S, M = np.empty(9 * LANES), np.empty(6 * LANES), np.empty(6 * LANES)
-    h, h_lam, h_mu, t = np.empty(24 * LANES), np.empty(24 * LANES), np.empty(24 * LANES), np.empty(24 * LANES)
+    h, h_lam, h_mu, t = (
+        np.empty(24 * LANES),
+        np.empty(24 * LANES),
+        np.empty(24 * LANES),
+        np.empty(24 * LANES),
+    )
     energy, min_det = np.zeros(LANES), np.full(LANES, np.inf)
     for b in range(dofs.shape[0]):
         for i in range(24):

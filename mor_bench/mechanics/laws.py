@@ -19,7 +19,12 @@ from numba import njit
 
 SAINT_VENANT_KIRCHHOFF, NEO_HOOKEAN, MOONEY_RIVLIN, OGDEN = range(4)
 
-_LAW_MULTIPLY_ADDS = {SAINT_VENANT_KIRCHHOFF: 55, NEO_HOOKEAN: 340, MOONEY_RIVLIN: 1563, OGDEN: 3313 + 122}
+_LAW_MULTIPLY_ADDS = {
+    SAINT_VENANT_KIRCHHOFF: 55,
+    NEO_HOOKEAN: 340,
+    MOONEY_RIVLIN: 1563,
+    OGDEN: 3313 + 122,
+}
 """Of a law's stress and tangent at one point; the eigenvectors that Ogden's needs count as 9/2 n³ = 122."""
 
 _OGDEN_TERM_MULTIPLY_ADDS = 44
@@ -48,7 +53,11 @@ def _add_dyad(D, factor, A, B):
     """D += factor (A ⊗ B + B ⊗ A) / 2 for symmetric A, B."""
     for m in range(6):
         for n in range(6):
-            D[m, n] += 0.5 * factor * (A[_I[m], _J[m]] * B[_I[n], _J[n]] + B[_I[m], _J[m]] * A[_I[n], _J[n]])
+            D[m, n] += (
+                0.5
+                * factor
+                * (A[_I[m], _J[m]] * B[_I[n], _J[n]] + B[_I[m], _J[m]] * A[_I[n], _J[n]])
+            )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -115,7 +124,9 @@ def _mooney_rivlin(C, p, S, D):
     second = 0.5 * (first * first - (C * C).sum())
     a, b = c10 * J ** (-2.0 / 3.0), c01 * J ** (-4.0 / 3.0)
     d_second = first * identity - C
-    S += 2.0 * a * (identity - first / 3.0 * inverse) + 2.0 * b * (d_second - 2.0 / 3.0 * second * inverse)
+    S += 2.0 * a * (identity - first / 3.0 * inverse) + 2.0 * b * (
+        d_second - 2.0 / 3.0 * second * inverse
+    )
     # dS/dE = 2 dS/dC, term by term.
     _add_dyad(D, -8.0 / 3.0 * a, identity, inverse)
     _add_dyad(D, 4.0 / 9.0 * a * first, inverse, inverse)
@@ -148,7 +159,12 @@ def _ogden(C, p, S, D):
         for a in range(3):
             beta[a] += mu * (powers[a] - mean)
             for b in range(3):
-                gamma[a, b] += mu * alpha / 3.0 * ((powers[a] * 3.0 if a == b else 0.0) - powers[a] - powers[b] + mean)
+                gamma[a, b] += (
+                    mu
+                    * alpha
+                    / 3.0
+                    * ((powers[a] * 3.0 if a == b else 0.0) - powers[a] - powers[b] + mean)
+                )
     # S_a = β_a / λ_a²; dS_a/dlnλ_b gives the normal block, differences of S the shear block.
     principal = beta / values
     for a in range(3):
@@ -218,7 +234,13 @@ def general_force(u, dofs, gradients, weights, law, parameters, slots, force, va
         since these laws have no meaning there.
     """
     n = gradients.shape[2]
-    H, F, C, S, D = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((6, 6))
+    H, F, C, S, D = (
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((6, 6)),
+    )
     B, DB, Sg = np.empty((n, 6, 3)), np.empty((6, 3)), np.empty((n, 3))
     u_e, f_e, k_e = np.empty((n, 3)), np.empty((n, 3)), np.empty(slots.shape[1])
     energy, min_det = 0.0, np.inf
@@ -311,7 +333,13 @@ def point_stresses(H, weights, law, parameters, P, A):
         Stored energy and the smallest det F; the energy is infinite where det F <= 0.
     """
     n_lanes = weights.shape[1]
-    F, C, S, D, DL = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((6, 6)), np.empty((6, 9))
+    F, C, S, D, DL = (
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty((6, 6)),
+        np.empty((6, 9)),
+    )
     energy, min_det = 0.0, np.inf
     P[:] = 0.0
     A[:] = 0.0
@@ -332,24 +360,38 @@ def point_stresses(H, weights, law, parameters, P, A):
             continue
         for i in range(3):
             for j in range(3):
-                C[i, j] = h[(3 * i + j) * n_lanes + l] + h[(3 * j + i) * n_lanes + l] + (1.0 if i == j else 0.0)
+                C[i, j] = (
+                    h[(3 * i + j) * n_lanes + l]
+                    + h[(3 * j + i) * n_lanes + l]
+                    + (1.0 if i == j else 0.0)
+                )
                 for k in range(3):
                     C[i, j] += h[(3 * k + i) * n_lanes + l] * h[(3 * k + j) * n_lanes + l]
         energy += w * evaluate(law, C, parameters[point], S, D)
         for i in range(3):
             for j in range(3):
-                P[b, (3 * i + j) * n_lanes + l] = w * (F[i, 0] * S[0, j] + F[i, 1] * S[1, j] + F[i, 2] * S[2, j])
+                P[b, (3 * i + j) * n_lanes + l] = w * (
+                    F[i, 0] * S[0, j] + F[i, 1] * S[1, j] + F[i, 2] * S[2, j]
+                )
         if len(A) == 0:
             continue
         # dE = sym(Fᵀ dH): dH_iJ changes the strains that hold the index J, each by a component of row i of F.
         for m in range(6):
             for i in range(3):
                 for j in range(3):
-                    DL[m, 3 * i + j] = w * (D[m, _VOIGT[0, j]] * F[i, 0] + D[m, _VOIGT[1, j]] * F[i, 1] + D[m, _VOIGT[2, j]] * F[i, 2])
+                    DL[m, 3 * i + j] = w * (
+                        D[m, _VOIGT[0, j]] * F[i, 0]
+                        + D[m, _VOIGT[1, j]] * F[i, 1]
+                        + D[m, _VOIGT[2, j]] * F[i, 2]
+                    )
         for i in range(3):
             for j in range(3):
                 for d in range(9):
-                    a = F[i, 0] * DL[_VOIGT[0, j], d] + F[i, 1] * DL[_VOIGT[1, j], d] + F[i, 2] * DL[_VOIGT[2, j], d]
+                    a = (
+                        F[i, 0] * DL[_VOIGT[0, j], d]
+                        + F[i, 1] * DL[_VOIGT[1, j], d]
+                        + F[i, 2] * DL[_VOIGT[2, j], d]
+                    )
                     if d // 3 == i:
                         a += w * S[j, d % 3]
                     A[b, (9 * (3 * i + j) + d) * n_lanes + l] = a
@@ -359,7 +401,9 @@ def point_stresses(H, weights, law, parameters, P, A):
 def point_multiply_adds(law: int, n_parameters: int) -> tuple[int, int]:
     """Of `point_stresses` at one point: of P, energy and det F, and what A adds."""
     terms = n_parameters // 2 if law == OGDEN else 0
-    return 27 + 9 + 37 + _LAW_MULTIPLY_ADDS[law] + terms * _OGDEN_TERM_MULTIPLY_ADDS, 9 * 6 * 4 + 81 * 3 + 27
+    return 27 + 9 + 37 + _LAW_MULTIPLY_ADDS[
+        law
+    ] + terms * _OGDEN_TERM_MULTIPLY_ADDS, 9 * 6 * 4 + 81 * 3 + 27
 
 
 def general_multiply_adds(law: int, n_parameters: int, n_nodes: int) -> tuple[int, int]:

@@ -82,7 +82,9 @@ def banded_solve(band, right_hand_sides):
             tail = x[j + 4 : j + 4 + last]
             for k in range(last):
                 tail[k] -= a4[k] * x0 + b4[k] * x1 + c4[k] * x2 + d4[k] * x3
-            for k in range(last, min(width - 1, n - j - 4)):  # the ends of b, c, d reach beyond that of a
+            for k in range(
+                last, min(width - 1, n - j - 4)
+            ):  # the ends of b, c, d reach beyond that of a
                 at = x[j + 4 + k]
                 if k + 3 < width:
                     at -= b[k + 3] * x1
@@ -142,8 +144,14 @@ class BandedFactor:
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         if counting.running is not None:
             (width, n), m = self._band.shape, _n_columns(rhs)
-            counting.running.add(back_solves=m, multiply_adds=m * triangular_multiply_adds(n, width - 1))
-        solve = self._solve_many if _n_columns(rhs) >= MANY and len(self._band) >= WIDE else self._solve_few
+            counting.running.add(
+                back_solves=m, multiply_adds=m * triangular_multiply_adds(n, width - 1)
+            )
+        solve = (
+            self._solve_many
+            if _n_columns(rhs) >= MANY and len(self._band) >= WIDE
+            else self._solve_few
+        )
         if self._order is None:
             return solve(rhs)
         solution = np.empty_like(rhs)
@@ -173,10 +181,14 @@ class BandedFactor:
 
         for start in starts:
             end, first, left, triangle = rows_of(start)
-            x[start:end] = solve_triangular(triangle, x[start:end] - left @ x[first:start], lower=True, check_finite=False)
+            x[start:end] = solve_triangular(
+                triangle, x[start:end] - left @ x[first:start], lower=True, check_finite=False
+            )
         for start in reversed(starts):
             end, first, left, triangle = rows_of(start)
-            x[start:end] = solve_triangular(triangle, x[start:end], lower=True, trans="T", check_finite=False)
+            x[start:end] = solve_triangular(
+                triangle, x[start:end], lower=True, trans="T", check_finite=False
+            )
             x[first:start] -= left.T @ x[start:end]
         return x
 
@@ -203,7 +215,9 @@ class SingleBandedFactor:
         """Overwrite the right-hand sides x (m, n), in the factor's order, by the solutions."""
         if counting.running is not None:
             n, width = self._columns.shape
-            counting.running.add(back_solves=len(x), multiply_adds=len(x) * triangular_multiply_adds(n, width - 1))
+            counting.running.add(
+                back_solves=len(x), multiply_adds=len(x) * triangular_multiply_adds(n, width - 1)
+            )
         banded_solve(self._columns, x)
 
 
@@ -229,7 +243,10 @@ class BandedCholesky:
 
     def factor(self, values: NDArray[np.float64]) -> BandedFactor:
         if counting.running is not None:
-            counting.running.add(factorisations=1, multiply_adds=cholesky_multiply_adds(self._pattern.n, self.bandwidth))
+            counting.running.add(
+                factorisations=1,
+                multiply_adds=cholesky_multiply_adds(self._pattern.n, self.bandwidth),
+            )
         rows, columns = self._pattern.rows, self._pattern.indices
         if self._place is not None:
             rows, columns = self._place[rows], self._place[columns]
@@ -263,7 +280,10 @@ class SparseLU:
         rows, columns = pattern.rows, pattern.indices
         off = np.flatnonzero(rows != columns)
         number = np.arange(1, len(rows) + 1)
-        entries = (np.concatenate([number, number[off]]), (np.concatenate([rows, columns[off]]), np.concatenate([columns, rows[off]])))
+        entries = (
+            np.concatenate([number, number[off]]),
+            (np.concatenate([rows, columns[off]]), np.concatenate([columns, rows[off]])),
+        )
         template = sp.csc_array(entries, shape=(pattern.n, pattern.n))
         template.sort_indices()
         self._template, self._gather = template, template.data - 1
@@ -271,7 +291,12 @@ class SparseLU:
     def _splu(self, entries: NDArray[np.float64]) -> sp_linalg.SuperLU:
         t = self._template
         matrix = sp.csc_matrix((entries, t.indices, t.indptr), shape=t.shape)
-        return sp_linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        return sp_linalg.splu(
+            matrix,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
 
     @cached_property
     def multiply_adds(self) -> tuple[int, int]:
@@ -304,9 +329,13 @@ class Pardiso:
 
         self._error: type[Exception] = PyPardisoError
         self._solver = PyPardisoSolver(mtype=2)
-        os.environ.setdefault("PYPARDISO_MKL_RT", self._solver.libmkl._name)  # without it, each solver searches all of Python's folders for MKL
+        os.environ.setdefault(
+            "PYPARDISO_MKL_RT", self._solver.libmkl._name
+        )  # without it, each solver searches all of Python's folders for MKL
         indices, indptr = pattern.indices.astype(np.int32), pattern.indptr.astype(np.int32)
-        self._matrix = sp.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(pattern.n, pattern.n))
+        self._matrix = sp.csr_matrix(
+            (np.ones(len(indices)), indices, indptr), shape=(pattern.n, pattern.n)
+        )
         self._phase(11, np.zeros(pattern.n))
 
     def _phase(self, phase: int, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -324,7 +353,10 @@ class Pardiso:
         if counting.running is not None:
             # MKL reports millions of operations; that L's columns are equally long is the least that its entries allow.
             least = self._entries**2 // (2 * self._matrix.shape[0])
-            counting.running.add(factorisations=1, multiply_adds=max(500_000 * int(self._solver.get_iparm(19)), least))
+            counting.running.add(
+                factorisations=1,
+                multiply_adds=max(500_000 * int(self._solver.get_iparm(19)), least),
+            )
         return self
 
     @property
@@ -362,10 +394,14 @@ class Multigrid:
 class MultigridFactor:
     """A multigrid hierarchy; one V-cycle in float32 is a preconditioner, conjugate gradients with it solve."""
 
-    def __init__(self, pattern: Pattern, values: NDArray[np.float64], points: NDArray[np.float64]) -> None:
+    def __init__(
+        self, pattern: Pattern, values: NDArray[np.float64], points: NDArray[np.float64]
+    ) -> None:
         from pyamg import smoothed_aggregation_solver
 
-        upper = sp.csr_matrix((values, pattern.indices, pattern.indptr), shape=(pattern.n, pattern.n))
+        upper = sp.csr_matrix(
+            (values, pattern.indices, pattern.indptr), shape=(pattern.n, pattern.n)
+        )
         self._matrix = (upper + sp.triu(upper, 1).T).tobsr(blocksize=(3, 3))
         x = points - points.mean(axis=0)
         motions = np.zeros((len(points), 3, 6))
@@ -373,15 +409,26 @@ class MultigridFactor:
         for axis in range(3):
             motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], x / np.abs(x).max())
         # Of plates and other ill-conditioned bodies the coarsest matrix is not definite in single precision, or not at all.
-        for dtype, coarse in ((np.float32, "cholesky"), (np.float64, "cholesky"), (np.float64, "pinv")):
+        for dtype, coarse in (
+            (np.float32, "cholesky"),
+            (np.float64, "cholesky"),
+            (np.float64, "pinv"),
+        ):
             levels: Any = smoothed_aggregation_solver(
-                self._matrix.astype(dtype), B=motions.reshape(-1, 6).astype(dtype), strength=None, improve_candidates=None, max_coarse=500,
-                presmoother=("block_gauss_seidel", {"sweep": "forward"}), postsmoother=("block_gauss_seidel", {"sweep": "backward"}),
+                self._matrix.astype(dtype),
+                B=motions.reshape(-1, 6).astype(dtype),
+                strength=None,
+                improve_candidates=None,
+                max_coarse=500,
+                presmoother=("block_gauss_seidel", {"sweep": "forward"}),
+                postsmoother=("block_gauss_seidel", {"sweep": "backward"}),
                 coarse_solver=coarse,
-            )  # fmt: skip
+            )
             self._cycle, self._dtype = levels.aspreconditioner(), dtype
             # Of a cycle: three sweeps over each level's matrix (smoother, residual, smoother), its transfers, the coarsest solve.
-            transfers = sum(3 * level.A.nnz + level.R.nnz + level.P.nnz for level in levels.levels[:-1])
+            transfers = sum(
+                3 * level.A.nnz + level.R.nnz + level.P.nnz for level in levels.levels[:-1]
+            )
             self._cycle_multiply_adds = int(transfers + levels.levels[-1].A.shape[0] ** 2)
             try:
                 response = self._cycle @ np.ones(pattern.n, dtype)
@@ -396,7 +443,9 @@ class MultigridFactor:
 
     def solve_in_place(self, x: NDArray[np.float32]) -> None:
         if counting.running is not None:
-            counting.running.add(back_solves=len(x), multiply_adds=len(x) * self._cycle_multiply_adds)
+            counting.running.add(
+                back_solves=len(x), multiply_adds=len(x) * self._cycle_multiply_adds
+            )
         for row in x:
             row[:] = self._cycle @ row.astype(self._dtype)
 
@@ -406,13 +455,26 @@ class MultigridFactor:
         scale = float(np.abs(rhs).max()) or 1.0
 
         def one_cycle(residual: NDArray[np.float64]) -> NDArray[Any]:
-            if counting.running is not None:  # a cycle, a product with the matrix, and six with vectors
-                counting.running.add(back_solves=1, multiply_adds=self._cycle_multiply_adds + self._matrix.nnz + 6 * len(rhs))
+            if (
+                counting.running is not None
+            ):  # a cycle, a product with the matrix, and six with vectors
+                counting.running.add(
+                    back_solves=1,
+                    multiply_adds=self._cycle_multiply_adds + self._matrix.nnz + 6 * len(rhs),
+                )
             return np.asarray(self._cycle @ residual.astype(self._dtype))
 
         cycle = sp_linalg.LinearOperator(self._matrix.shape, one_cycle, dtype=np.float64)
-        solution, failed = sp_linalg.cg(self._matrix, rhs / scale, rtol=CYCLE_TOLERANCE, maxiter=MAX_CYCLES, M=cycle)
-        missed = float(np.linalg.norm(self._matrix @ solution - rhs / scale) / np.linalg.norm(rhs / scale)) if failed else 0.0
+        solution, failed = sp_linalg.cg(
+            self._matrix, rhs / scale, rtol=CYCLE_TOLERANCE, maxiter=MAX_CYCLES, M=cycle
+        )
+        missed = (
+            float(
+                np.linalg.norm(self._matrix @ solution - rhs / scale) / np.linalg.norm(rhs / scale)
+            )
+            if failed
+            else 0.0
+        )
         if not missed <= ACCEPTED_RESIDUAL:
             raise SolverError(
                 f"multigrid does not solve with the stiffness at rest: a residual of {missed:.1e} of the load after {MAX_CYCLES} cycles; "

@@ -19,7 +19,11 @@ def locking_risk(scene: Scene) -> str | None:
     if poisson <= LOCKING_FROM or scene.selective:
         return None
     tetrahedra = scene.mesh.cells.shape[1] == 4
-    remedy = 'element = "hexahedron" and integration = "selective"' if tetrahedra else 'integration = "selective"'
+    remedy = (
+        'element = "hexahedron" and integration = "selective"'
+        if tetrahedra
+        else 'integration = "selective"'
+    )
     return (
         f"{scene.name}: with Poisson's ratio {poisson:.6g} at rest, above {LOCKING_FROM}, {'T4' if tetrahedra else 'fully integrated H8'} "
         f"cells lock: displacements are too small; set {remedy} under [discretisation]."

@@ -34,7 +34,13 @@ from mor_bench.mechanics.linear import (
 )
 from mor_bench.mechanics.locking import warn_of_locking
 from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibria, solve_equilibrium
-from mor_bench.mechanics.rotated import BlockJacobi, JacobiFactor, RotatedRest, condition_number, conjugate_gradients
+from mor_bench.mechanics.rotated import (
+    BlockJacobi,
+    JacobiFactor,
+    RotatedRest,
+    condition_number,
+    conjugate_gradients,
+)
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import NO_EQUATIONS, NO_FORCES, SolverName
 
@@ -61,7 +67,14 @@ CERTIFY_TOLERANCE = 1e-2
 ILL_CONDITIONED = 1e10
 """Condition number of the stiffness at rest from which answers cannot be trusted to the default tolerance."""
 
-RIGID_MODES = ("translation x", "translation y", "translation z", "rotation about x", "rotation about y", "rotation about z")
+RIGID_MODES = (
+    "translation x",
+    "translation y",
+    "translation z",
+    "rotation about x",
+    "rotation about y",
+    "rotation about z",
+)
 
 
 def missing_library(solver: SolverName) -> str | None:
@@ -146,7 +159,14 @@ class FullOrderModel:
         number[scene.free_dofs] = np.arange(self.n_unknowns)
         dof_of_node = number.reshape(-1, 3)
         self.cell_dofs = dof_of_node[mesh.cells].reshape(mesh.n_cells, -1)
-        self.assembler = Assembler(mesh.points, mesh.cells, dof_of_node, self.n_unknowns, scene.material, selective=scene.selective)
+        self.assembler = Assembler(
+            mesh.points,
+            mesh.cells,
+            dof_of_node,
+            self.n_unknowns,
+            scene.material,
+            selective=scene.selective,
+        )
         self.extent = self.assembler.extent_m
         self._direct = self._direct_solver()
 
@@ -172,13 +192,19 @@ class FullOrderModel:
         if self.solver == "jacobi-pcg":
             return JacobiFactor(self.assembler.pattern, self.rest_tangent)
         try:
-            factor = (self._direct_solver() if self.solver == "pardiso" else self._direct).factor(self.rest_tangent)
+            factor = (self._direct_solver() if self.solver == "pardiso" else self._direct).factor(
+                self.rest_tangent
+            )
         except NotPositiveDefiniteError:
             raise SolverError(
                 f"{self.scene.name}: the stiffness at rest is not positive definite in double precision; is the material too nearly "
                 "incompressible, or the body too slender?"
             ) from None
-        condition = condition_number(self.assembler.pattern, self.rest_tangent, factor) if isinstance(factor, BandedFactor) else 1.0
+        condition = (
+            condition_number(self.assembler.pattern, self.rest_tangent, factor)
+            if isinstance(factor, BandedFactor)
+            else 1.0
+        )
         if condition > ILL_CONDITIONED:
             warnings.warn(
                 f"{self.scene.name}: the condition number of the stiffness at rest is about {condition:.0e}, above {ILL_CONDITIONED:.0e}: "
@@ -234,21 +260,36 @@ class FullOrderModel:
         return self.turned_rest if self.solver == "auto" else None
 
     def step(
-        self, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64], tolerance: float
-    ) -> NDArray[np.float64]:  # fmt: skip
+        self,
+        q: NDArray[np.float64],
+        tangent: NDArray[np.float64],
+        residual: NDArray[np.float64],
+        tolerance: float,
+    ) -> NDArray[np.float64]:
         pattern = self.assembler.pattern
         if self.solver == "jacobi-pcg":
             self._jacobi.take(tangent)
-            return conjugate_gradients(pattern, tangent, self._jacobi, residual, tolerance, JACOBI_ITERATIONS)[0]
+            return conjugate_gradients(
+                pattern, tangent, self._jacobi, residual, tolerance, JACOBI_ITERATIONS
+            )[0]
         if self._iterative:
-            return conjugate_gradients(pattern, tangent, self.turned_rest.at(q), residual, tolerance)[0]
+            return conjugate_gradients(
+                pattern, tangent, self.turned_rest.at(q), residual, tolerance
+            )[0]
         return self.factor(tangent).solve(residual)
 
-    def solve(self, load: NDArray[np.float64], start: NDArray[np.float64] | None = None, options: NewtonOptions = NewtonOptions()) -> Solution:
+    def solve(
+        self,
+        load: NDArray[np.float64],
+        start: NDArray[np.float64] | None = None,
+        options: NewtonOptions = NewtonOptions(),
+    ) -> Solution:
         """Equilibrium under forces on the free dofs, (n_free,) N; see `solve_equilibrium`."""
         return solve_equilibrium(self, load, start, options)
 
-    def solve_many(self, loads: NDArray[np.float64], options: NewtonOptions = NewtonOptions()) -> list[Solution | SolverError]:
+    def solve_many(
+        self, loads: NDArray[np.float64], options: NewtonOptions = NewtonOptions()
+    ) -> list[Solution | SolverError]:
         """Equilibria under loads (m, n_free), N, or the errors that `solve` would raise; faster than one after the other."""
         found = dict(solve_equilibria(self, list(loads), options=options))
         return [found[i] for i in range(len(loads))]

@@ -15,7 +15,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mor_bench.errors import InvalidInputError, InvertedElementError, NoEquilibriumError, SolverError
+from mor_bench.errors import (
+    InvalidInputError,
+    InvertedElementError,
+    NoEquilibriumError,
+    SolverError,
+)
 from mor_bench.mechanics.anderson import Anderson
 from mor_bench.mechanics.assembly import State
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
@@ -94,7 +99,7 @@ class Turning(Protocol):
 
     def solve_many(
         self, residuals: Sequence[NDArray[np.float64]], rotations: Sequence[NDArray[np.float64]]
-    ) -> NDArray[np.float64]:  # fmt: skip
+    ) -> NDArray[np.float64]:
         """Corrections (m, n_unknowns), one for each residual under its own rotations, whatever the others are."""
         ...
 
@@ -123,8 +128,12 @@ class Problem(Protocol):
         ...
 
     def step(
-        self, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64], tolerance: float
-    ) -> NDArray[np.float64]:  # fmt: skip
+        self,
+        q: NDArray[np.float64],
+        tangent: NDArray[np.float64],
+        residual: NDArray[np.float64],
+        tolerance: float,
+    ) -> NDArray[np.float64]:
         """Solve tangent · step = residual, to a relative tolerance if the solver is iterative.
 
         Raises `NotPositiveDefiniteError` where the tangent is seen not to be positive definite.
@@ -209,7 +218,9 @@ class _Probes:
         """The residual whose correction is the next probe."""
         return self._products[-1]
 
-    def add(self, answer: NDArray[np.float64], q: NDArray[np.float64], force: NDArray[np.float64]) -> None:
+    def add(
+        self, answer: NDArray[np.float64], q: NDArray[np.float64], force: NDArray[np.float64]
+    ) -> None:
         """Take the next probe, at q with its internal force."""
         for probe in self._probes:
             answer = answer - float(probe @ answer) / float(probe @ probe) * probe
@@ -229,8 +240,12 @@ class _Probes:
 
 
 def _accelerated(
-    problem: Problem, inverse: Turning, load: NDArray[np.float64], start: NDArray[np.float64] | None, tolerance: float
-) -> _Correcting:  # fmt: skip
+    problem: Problem,
+    inverse: Turning,
+    load: NDArray[np.float64],
+    start: NDArray[np.float64] | None,
+    tolerance: float,
+) -> _Correcting:
     """Anderson's acceleration of the iteration with an approximate inverse; converged only where no curvature was negative."""
     load_norm = float(np.linalg.norm(load))
     memory, probes = Anderson(problem.n_unknowns), _Probes(problem)
@@ -286,7 +301,12 @@ def _in_step(inverse: Turning, passes: Iterator[_Correcting]) -> Iterator[tuple[
         if not waiting:
             return
         together_asked = [pair for _, _, asked in waiting for pair in asked]
-        answers = iter(inverse.solve_many([residual for residual, _ in together_asked], [rotations for _, rotations in together_asked]))
+        answers = iter(
+            inverse.solve_many(
+                [residual for residual, _ in together_asked],
+                [rotations for _, rotations in together_asked],
+            )
+        )
         still = []
         for number, running, asked in waiting:
             try:
@@ -304,7 +324,9 @@ def _is_certified(problem: Problem, q: NDArray[np.float64]) -> bool:
     return True
 
 
-def _plain(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float64] | None, tolerance: float) -> _Pass:
+def _plain(
+    problem: Problem, load: NDArray[np.float64], start: NDArray[np.float64] | None, tolerance: float
+) -> _Pass:
     """Full Newton steps; from rest, the first one uses the rest-state factor that every solve shares."""
     load_norm = float(np.linalg.norm(load))
     q = problem.rest_factor.solve(load) if start is None else start.copy()
@@ -337,8 +359,11 @@ def _plain(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float6
 
 
 def _descent(
-    problem: Problem, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], bool]:  # fmt: skip
+    problem: Problem,
+    q: NDArray[np.float64],
+    tangent: NDArray[np.float64],
+    residual: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], bool]:
     """A descent direction of the potential, and whether the tangent itself was positive definite.
 
     An indefinite tangent is shifted towards the rest-state stiffness until it is positive definite.
@@ -350,14 +375,18 @@ def _descent(
     shift = 0.01
     while True:
         try:
-            return problem.step(q, tangent + shift * problem.rest_tangent, residual, DAMPED_FORCING), False
+            return problem.step(
+                q, tangent + shift * problem.rest_tangent, residual, DAMPED_FORCING
+            ), False
         except NotPositiveDefiniteError:
             shift *= 4.0
             if shift > 1e6:
                 return problem.rest_factor.solve(residual), False
 
 
-def _damped(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float64], tolerance: float) -> _Pass:
+def _damped(
+    problem: Problem, load: NDArray[np.float64], start: NDArray[np.float64], tolerance: float
+) -> _Pass:
     """Descent on the potential W(q) - f·q from a valid state, never leaving det F > 0."""
     load_norm = float(np.linalg.norm(load))
     q, before = start, np.inf
@@ -375,7 +404,11 @@ def _damped(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float
             length = 0.5**halving
             trial_q = q + length * step
             trial = problem.force(trial_q)
-            if trial.min_det_f > 0 and trial.energy_j - float(load @ trial_q) <= potential - ARMIJO * length * slope + noise:
+            if (
+                trial.min_det_f > 0
+                and trial.energy_j - float(load @ trial_q)
+                <= potential - ARMIJO * length * slope + noise
+            ):
                 break
         else:
             return _Pass(q, trial.min_det_f, iteration, converged=False)
@@ -384,8 +417,11 @@ def _damped(problem: Problem, load: NDArray[np.float64], start: NDArray[np.float
 
 
 def solve_equilibrium(
-    problem: Problem, load: NDArray[np.float64], start: NDArray[np.float64] | None = None, options: NewtonOptions = NewtonOptions()
-) -> Solution:  # fmt: skip
+    problem: Problem,
+    load: NDArray[np.float64],
+    start: NDArray[np.float64] | None = None,
+    options: NewtonOptions = NewtonOptions(),
+) -> Solution:
     """Find the stable equilibrium under a dead load.
 
     Parameters
@@ -419,8 +455,14 @@ def solve_equilibrium(
 def _checked(values: ArrayLike, name: str, problem: Problem) -> NDArray[np.float64]:
     """A float64 vector of the problem's unknowns; the kernels behind check no bounds."""
     array = np.asarray(values)
-    if array.dtype.kind not in "fiu" or array.shape != (problem.n_unknowns,) or not np.isfinite(array).all():
-        raise InvalidInputError(f"{name} must be finite real numbers of shape ({problem.n_unknowns},); got shape {array.shape}, dtype {array.dtype}.")
+    if (
+        array.dtype.kind not in "fiu"
+        or array.shape != (problem.n_unknowns,)
+        or not np.isfinite(array).all()
+    ):
+        raise InvalidInputError(
+            f"{name} must be finite real numbers of shape ({problem.n_unknowns},); got shape {array.shape}, dtype {array.dtype}."
+        )
     return np.ascontiguousarray(array, dtype=np.float64)
 
 
@@ -442,16 +484,25 @@ def solve_equilibria(
     loads = [_checked(load, f"load {number}", problem) for number, load in enumerate(loads)]
     for number, load in enumerate(loads):
         if np.abs(load).max() > MAX_LOAD_N:
-            raise InvalidInputError(f"load {number} must be within ±{MAX_LOAD_N:g} N; got {load[np.abs(load).argmax()]:g}.")
-    starts = [None if start is None else _checked(start, "`start`", problem) for start in starts or [None] * len(loads)]
+            raise InvalidInputError(
+                f"load {number} must be within ±{MAX_LOAD_N:g} N; got {load[np.abs(load).argmax()]:g}."
+            )
+    starts = [
+        None if start is None else _checked(start, "`start`", problem)
+        for start in starts or [None] * len(loads)
+    ]
     pending = [i for i, load in enumerate(loads) if load.any()]
     for i in sorted(set(range(len(loads))) - set(pending)):
         yield i, Solution(np.zeros(problem.n_unknowns), 1.0, 0, 0)
     inverse = problem.accelerator
     if inverse is None:
-        outcomes: Iterator[tuple[int, _Pass | None]] = ((number, None) for number in range(len(pending)))
+        outcomes: Iterator[tuple[int, _Pass | None]] = (
+            (number, None) for number in range(len(pending))
+        )
     else:
-        passes = (_accelerated(problem, inverse, loads[i], starts[i], options.tolerance) for i in pending)
+        passes = (
+            _accelerated(problem, inverse, loads[i], starts[i], options.tolerance) for i in pending
+        )
         outcomes = _in_step(inverse, passes)
     for number, first in outcomes:
         i = pending[number]
@@ -459,14 +510,21 @@ def solve_equilibria(
             yield i, Solution(first.q, first.min_det_f, first.iterations, 0)
             continue
         try:
-            yield i, _by_newton(problem, loads[i], starts[i], options, first.iterations if first else 0)
+            yield (
+                i,
+                _by_newton(problem, loads[i], starts[i], options, first.iterations if first else 0),
+            )
         except SolverError as error:
             yield i, error
 
 
 def _by_newton(
-    problem: Problem, load: NDArray[np.float64], start: NDArray[np.float64] | None, options: NewtonOptions, iterations: int
-) -> Solution:  # fmt: skip
+    problem: Problem,
+    load: NDArray[np.float64],
+    start: NDArray[np.float64] | None,
+    options: NewtonOptions,
+    iterations: int,
+) -> Solution:
     """Plain Newton steps, then increments; ``iterations`` were done before."""
     first = _plain(problem, load, start, options.tolerance)
     iterations, cuts = iterations + first.iterations, 0
@@ -495,4 +553,6 @@ def _by_newton(
                 raise InvertedElementError(
                     f"elements invert: {story}; the largest det F <= 0 tried was {min(attempt.min_det_f, first.min_det_f):.3g}."
                 )
-            raise NoEquilibriumError(f"no stable equilibrium found: {story}; `mor_bench.mechanics.stability.limit_load` tells where its path ends.")
+            raise NoEquilibriumError(
+                f"no stable equilibrium found: {story}; `mor_bench.mechanics.stability.limit_load` tells where its path ends."
+            )

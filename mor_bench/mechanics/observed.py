@@ -43,7 +43,9 @@ class _HiddenRest(RotatedRest):
         Places of the hidden dofs among the free ones.
     """
 
-    def __init__(self, factor: SingleFactor, whole: FullOrderModel, hidden: NDArray[np.int64]) -> None:
+    def __init__(
+        self, factor: SingleFactor, whole: FullOrderModel, hidden: NDArray[np.int64]
+    ) -> None:
         super().__init__(factor, *whole.turning_cells)
         self._hidden, self._rows = hidden, np.append(hidden[::3] // 3, whole.n_unknowns // 3)
         self._base = np.zeros(whole.n_unknowns)
@@ -62,7 +64,9 @@ class _HiddenRest(RotatedRest):
         rotations = np.empty((len(u) // 3, 3, 3))
         iterations = nodal_rotations(u.reshape(-1, 3), *self.cells, rotations)
         if counting.running is not None:
-            counting.running.add(multiply_adds=4 * self.cells[1].size + 20 * len(rotations) + 40 * int(iterations))
+            counting.running.add(
+                multiply_adds=4 * self.cells[1].size + 20 * len(rotations) + 40 * int(iterations)
+            )
         return np.asarray(rotations[self._rows])
 
 
@@ -112,7 +116,11 @@ class _HiddenModel(FullOrderModel):
         return np.asarray(u)
 
     def _relative(self, state: State, q: Array) -> State:
-        return State(state.force[self.hidden] - self._offset, state.energy_j - float(self._offset @ q), state.min_det_f)
+        return State(
+            state.force[self.hidden] - self._offset,
+            state.energy_j - float(self._offset @ q),
+            state.min_det_f,
+        )
 
     def force(self, q: Array) -> State:
         return self._relative(self._whole.force(self.at(q)), q)
@@ -175,7 +183,9 @@ class ObservedModel:
         out[:, self._seen] = observed[:, self._seen]
         if counting.running is not None:
             counting.running.add(multiply_adds=len(out) * self._coupling.nnz)
-        out[:, self._model.hidden] = -self._model.rest_factor.solve(np.asarray(self._coupling @ out[:, self._seen].T)).T
+        out[:, self._model.hidden] = -self._model.rest_factor.solve(
+            np.asarray(self._coupling @ out[:, self._seen].T)
+        ).T
         return out
 
     def respond(self, observed: Array) -> Array:
@@ -203,7 +213,9 @@ class ObservedModel:
         out[self.scene.free_dofs[self._seen]] = axes[self._seen] - self._coupling.T @ hidden
         return out
 
-    def solve_many(self, observed: Array, options: NewtonOptions = NewtonOptions()) -> list[Solution | SolverError]:
+    def solve_many(
+        self, observed: Array, options: NewtonOptions = NewtonOptions()
+    ) -> list[Solution | SolverError]:
         """Equilibria of all free dofs under displacements of the observed ones, or the errors that there is none.
 
         Parameters
@@ -231,7 +243,9 @@ class ObservedModel:
             cuts += 1
             increment *= 0.5
             if cuts > options.max_cuts:
-                return NoEquilibriumError(f"no stable equilibrium found: stopped at {reached:.4g} of the observed displacement; {found}")
+                return NoEquilibriumError(
+                    f"no stable equilibrium found: stopped at {reached:.4g} of the observed displacement; {found}"
+                )
 
     def _beside(self, base: Array, tolerance: float) -> Solution | SolverError:
         """The equilibrium next to a state whose observed nodes are where they were seen."""
@@ -240,7 +254,9 @@ class ObservedModel:
         if not np.isfinite(force).all():
             return NoEquilibriumError("the linear response inverts elements.")
         size = float(np.linalg.norm(load))
-        allowed = min(1.0, tolerance * float(np.linalg.norm(force[self._seen])) / size) if size else 1.0
+        allowed = (
+            min(1.0, tolerance * float(np.linalg.norm(force[self._seen])) / size) if size else 1.0
+        )
         try:
             found = model.solve(load, options=NewtonOptions(allowed, max_cuts=0))
         except SolverError as error:
@@ -257,7 +273,9 @@ class LinearResponse(Protocol):
 
 def linear_response(scene: Scene) -> LinearResponse:
     """To forces, or to displacements of a part of the surface, where these are given; made once, so that no query has to."""
-    return Compliance(FullOrderModel(scene)) if scene.observed_nodes is None else ObservedModel(scene)
+    return (
+        Compliance(FullOrderModel(scene)) if scene.observed_nodes is None else ObservedModel(scene)
+    )
 
 
 def forward_model(scene: Scene, solver: SolverName | None = None) -> FullOrderModel | ObservedModel:

@@ -39,14 +39,18 @@ SECOND_STEP = 0.25
 
 def _symmetric_product(model: FullOrderModel, x: Array) -> Array:
     y = np.empty_like(x)
-    multiply(model.assembler.pattern.indptr, model.assembler.pattern.indices, model.rest_tangent, x, y)
+    multiply(
+        model.assembler.pattern.indptr, model.assembler.pattern.indices, model.rest_tangent, x, y
+    )
     return y
 
 
 def _row_sums(model: FullOrderModel) -> Array:
     """Σ_j |K_ij| of the stiffness at rest, (n,), N/m."""
     pattern, values = model.assembler.pattern, np.abs(model.rest_tangent)
-    sums = np.bincount(pattern.rows, values, pattern.n) + np.bincount(pattern.indices, values, pattern.n)
+    sums = np.bincount(pattern.rows, values, pattern.n) + np.bincount(
+        pattern.indices, values, pattern.n
+    )
     return np.asarray(sums - values[pattern.indptr[:-1]])
 
 
@@ -83,7 +87,9 @@ class DynamicRelaxation:
             self.lowest = float((self.mass * x) @ y / ((self.mass * y) @ y))
             x = y / np.linalg.norm(y)
 
-    def solve(self, load: Array, tolerance: float, max_steps: int, start: Array | None = None) -> Solution:
+    def solve(
+        self, load: Array, tolerance: float, max_steps: int, start: Array | None = None
+    ) -> Solution:
         """Let the body come to rest under a load (n_unknowns,), N.
 
         A body that diverges, or comes to rest inverted, is let go once more, with half the step.
@@ -112,13 +118,23 @@ class DynamicRelaxation:
             step = 4.0 / MARGIN * (SECOND_STEP if attempt else 1.0)
             control = np.array([(tolerance * size) ** 2, step, self.lowest, (GROWN * size) ** 2])
             u = np.zeros_like(load) if first is None else first.copy()
-            steps, status, min_det = self.model.assembler.relax(u, load, self.mass, control, max_steps)
+            steps, status, min_det = self.model.assembler.relax(
+                u, load, self.mass, control, max_steps
+            )
             done += steps
             if status == MET and min_det > 0.0:
                 return Solution(u, min_det, done, attempt)
             if steps == max_steps:
                 break
         if status == MET:
-            raise InvertedElementError(f"elements invert: after {done} steps the body rests with a least det F of {min_det:.3g}.")
-        residual = float(np.linalg.norm(load - self.model.force(u).force)) / size if np.isfinite(u).all() else np.inf
-        raise NoEquilibriumError(f"the body does not come to rest: after {done} steps the residual is {residual:.3g} of the load.")
+            raise InvertedElementError(
+                f"elements invert: after {done} steps the body rests with a least det F of {min_det:.3g}."
+            )
+        residual = (
+            float(np.linalg.norm(load - self.model.force(u).force)) / size
+            if np.isfinite(u).all()
+            else np.inf
+        )
+        raise NoEquilibriumError(
+            f"the body does not come to rest: after {done} steps the residual is {residual:.3g} of the load."
+        )

@@ -89,7 +89,9 @@ def nodal_rotations(u, cell_nodes, centre_gradients, volumes, rotations):
         a, b, c = scale * Q[0, 0], scale * Q[0, 1], scale * Q[0, 2]
         d, e, f = scale * Q[1, 0], scale * Q[1, 1], scale * Q[1, 2]
         g, h, i = scale * Q[2, 0], scale * Q[2, 1], scale * Q[2, 2]
-        for _ in range(8):  # Newton's iteration for the polar factor (Higham): quadratic, from within the basin
+        for _ in range(
+            8
+        ):  # Newton's iteration for the polar factor (Higham): quadratic, from within the basin
             iterations += 1
             ca, cb, cc = e * i - f * h, f * g - d * i, d * h - e * g
             det = a * ca + b * cb + c * cc
@@ -99,14 +101,35 @@ def nodal_rotations(u, cell_nodes, centre_gradients, volumes, rotations):
             r = 0.5 / det
             cd, ce, cf = c * h - b * i, a * i - c * g, b * g - a * h
             cg, ch, ci = b * f - c * e, c * d - a * f, a * e - b * d
-            change = abs(r * ca - 0.5 * a) + abs(r * ce - 0.5 * e) + abs(r * ci - 0.5 * i) + abs(r * cb - 0.5 * b) + abs(r * cf - 0.5 * f)
-            change += abs(r * cc - 0.5 * c) + abs(r * cd - 0.5 * d) + abs(r * cg - 0.5 * g) + abs(r * ch - 0.5 * h)
+            change = (
+                abs(r * ca - 0.5 * a)
+                + abs(r * ce - 0.5 * e)
+                + abs(r * ci - 0.5 * i)
+                + abs(r * cb - 0.5 * b)
+                + abs(r * cf - 0.5 * f)
+            )
+            change += (
+                abs(r * cc - 0.5 * c)
+                + abs(r * cd - 0.5 * d)
+                + abs(r * cg - 0.5 * g)
+                + abs(r * ch - 0.5 * h)
+            )
             a, b, c = 0.5 * a + r * ca, 0.5 * b + r * cb, 0.5 * c + r * cc
             d, e, f = 0.5 * d + r * cd, 0.5 * e + r * ce, 0.5 * f + r * cf
             g, h, i = 0.5 * g + r * cg, 0.5 * h + r * ch, 0.5 * i + r * ci
             if change < 1e-4:  # the next one would change by its square
                 break
-        Q[0, 0], Q[0, 1], Q[0, 2], Q[1, 0], Q[1, 1], Q[1, 2], Q[2, 0], Q[2, 1], Q[2, 2] = a, b, c, d, e, f, g, h, i
+        Q[0, 0], Q[0, 1], Q[0, 2], Q[1, 0], Q[1, 1], Q[1, 2], Q[2, 0], Q[2, 1], Q[2, 2] = (
+            a,
+            b,
+            c,
+            d,
+            e,
+            f,
+            g,
+            h,
+            i,
+        )
     return iterations
 
 
@@ -178,7 +201,13 @@ class RotatedRest:
         m³.
     """
 
-    def __init__(self, factor: SingleFactor, cell_nodes: NDArray[np.int32], centre_gradients: Array, volumes: Array) -> None:
+    def __init__(
+        self,
+        factor: SingleFactor,
+        cell_nodes: NDArray[np.int32],
+        centre_gradients: Array,
+        volumes: Array,
+    ) -> None:
         self._factor = factor
         self._place = np.ascontiguousarray(factor.place[::3] // 3)
         self.cells = cell_nodes, centre_gradients, volumes
@@ -189,9 +218,13 @@ class RotatedRest:
         if q is None:
             return self._identity
         rotations = np.empty_like(self._identity)
-        iterations = nodal_rotations(np.append(q, np.zeros(3)).reshape(-1, 3), *self.cells, rotations)
+        iterations = nodal_rotations(
+            np.append(q, np.zeros(3)).reshape(-1, 3), *self.cells, rotations
+        )
         if counting.running is not None:  # per component of a cell's nodes, per node, per iteration
-            counting.running.add(multiply_adds=4 * self.cells[1].size + 20 * len(self._place) + 40 * int(iterations))
+            counting.running.add(
+                multiply_adds=4 * self.cells[1].size + 20 * len(self._place) + 40 * int(iterations)
+            )
         return rotations
 
     def solve_many(self, residuals: Sequence[Array], rotations: Sequence[Array]) -> Array:
@@ -214,7 +247,9 @@ class RotatedRest:
 
     @cached_property
     def _soft(self) -> NDArray[np.float32]:
-        response = np.random.default_rng(0).normal(size=(1, 3 * len(self._place))).astype(np.float32)
+        response = (
+            np.random.default_rng(0).normal(size=(1, 3 * len(self._place))).astype(np.float32)
+        )
         with counting.uncounted():
             self._factor.solve_in_place(response)
         return np.asarray(response[0] / np.abs(response).max())
@@ -249,7 +284,20 @@ class BlockJacobi:
     def __init__(self, pattern: Pattern) -> None:
         first = pattern.indptr[:-1:3]
         second, third = pattern.indptr[1::3], pattern.indptr[2::3]
-        self._places = np.stack([first, first + 1, first + 2, first + 1, second, second + 1, first + 2, second + 1, third], axis=1)
+        self._places = np.stack(
+            [
+                first,
+                first + 1,
+                first + 2,
+                first + 1,
+                second,
+                second + 1,
+                first + 2,
+                second + 1,
+                third,
+            ],
+            axis=1,
+        )
 
     def take(self, values: Array) -> None:
         """Invert the diagonal blocks of a tangent."""
@@ -287,8 +335,13 @@ def condition_number(pattern: Pattern, values: Array, factor: Factor, iterations
 
 
 def conjugate_gradients(
-    pattern: Pattern, values: Array, preconditioner: Preconditioner, rhs: Array, tolerance: float, max_iterations: int = MAX_ITERATIONS
-) -> tuple[Array, int]:  # fmt: skip
+    pattern: Pattern,
+    values: Array,
+    preconditioner: Preconditioner,
+    rhs: Array,
+    tolerance: float,
+    max_iterations: int = MAX_ITERATIONS,
+) -> tuple[Array, int]:
     """Solve K x = rhs to a relative tolerance; returns x and the number of iterations.
 
     Raises
@@ -305,7 +358,9 @@ def conjugate_gradients(
         rz, before = float(r @ z), rz
         p = z + (rz / before) * p
         multiply(pattern.indptr, pattern.indices, values, p, q)
-        if counting.running is not None:  # the product with K, of which one triangle is stored, and six with vectors
+        if (
+            counting.running is not None
+        ):  # the product with K, of which one triangle is stored, and six with vectors
             counting.running.add(multiply_adds=2 * len(values) + 5 * len(p))
         curvature = float(p @ q)
         if not curvature > 0.0:

@@ -69,17 +69,33 @@ def lowest_tangent_eigenvalue(problem: AssembledProblem, q: Array) -> float:
     q : (n_unknowns,) float64
         m.
     """
-    tangent, rest = _matrix(problem, problem.linearise(q)[1]), _matrix(problem, problem.rest_tangent)
+    tangent, rest = (
+        _matrix(problem, problem.linearise(q)[1]),
+        _matrix(problem, problem.rest_tangent),
+    )
     n = problem.n_unknowns
     if n <= DENSE_UP_TO:
         here, there = (m if isinstance(m, np.ndarray) else m.toarray() for m in (tangent, rest))
         return float(scipy.linalg.eigvalsh(here, there, subset_by_index=(0, 0))[0])
     inverse = LinearOperator((n, n), matvec=problem.rest_factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).normal(size=n)
-    return float(eigsh(tangent, 1, M=rest, Minv=inverse, which="SA", v0=start, tol=1e-8, return_eigenvectors=False)[0])
+    return float(
+        eigsh(
+            tangent,
+            1,
+            M=rest,
+            Minv=inverse,
+            which="SA",
+            v0=start,
+            tol=1e-8,
+            return_eigenvectors=False,
+        )[0]
+    )
 
 
-def limit_load(problem: AssembledProblem, load: Array, most: float = 1.0, tolerance: float = 1e-8) -> LimitPoint | None:
+def limit_load(
+    problem: AssembledProblem, load: Array, most: float = 1.0, tolerance: float = 1e-8
+) -> LimitPoint | None:
     """Follow the stable path from rest until its tangent is no longer positive definite.
 
     The load factor grows in increments, each solved from the state before and halved where the solver finds no stable
@@ -107,12 +123,18 @@ def limit_load(problem: AssembledProblem, load: Array, most: float = 1.0, tolera
     def neighbour(target: float) -> tuple[Array, Array] | None:
         """State and speed at the target, unless it was not reached or only by a leap to another path."""
         try:
-            there = solve_equilibrium(problem, target * load, q, NewtonOptions(max_cuts=0)).displacement
+            there = solve_equilibrium(
+                problem, target * load, q, NewtonOptions(max_cuts=0)
+            ).displacement
             after = speed(there)
         except (SolverError, NotPositiveDefiniteError):
             return None
         predicted = 0.5 * (target - reached) * (before + after)
-        return (there, after) if np.linalg.norm(there - q - predicted) <= LEAP * np.linalg.norm(there - q) else None
+        return (
+            (there, after)
+            if np.linalg.norm(there - q - predicted) <= LEAP * np.linalg.norm(there - q)
+            else None
+        )
 
     q, reached, increment, successes = np.zeros(problem.n_unknowns), 0.0, FIRST_INCREMENT * most, 0
     before = speed(q)

@@ -57,8 +57,12 @@ class Basis:
 
 
 def pod(
-    snapshots: NDArray[np.float64], n_modes: int | None = None, *, energy_tolerance: float | None = None, inner_product: Any = None
-) -> Basis:  # fmt: skip
+    snapshots: NDArray[np.float64],
+    n_modes: int | None = None,
+    *,
+    energy_tolerance: float | None = None,
+    inner_product: Any = None,
+) -> Basis:
     """The leading right singular vectors of a snapshot matrix, without removing the mean.
 
     Without the mean, no load gives no displacement. A large matrix of which few modes are wanted is decomposed by
@@ -81,7 +85,11 @@ def pod(
         `energy_tolerance` are given, or one is out of range; if K has another shape or is not positive definite.
     """
     _check_wanted(n_modes, energy_tolerance)
-    precision = float(np.finfo(snapshots.dtype).eps) if getattr(snapshots, "dtype", np.dtype(int)).kind == "f" else EPS
+    precision = (
+        float(np.finfo(snapshots.dtype).eps)
+        if getattr(snapshots, "dtype", np.dtype(int)).kind == "f"
+        else EPS
+    )
     snapshots = _checked(snapshots, inner_product)
     if not snapshots.any():
         raise InvalidInputError("the snapshots are all zero: they span no basis.")
@@ -90,13 +98,23 @@ def pod(
         key = _remembered.key(snapshots, inner_product)
         found = _remembered.of(key, n_modes)
     if found is None:
-        most = min(snapshots.shape) // RANDOMISED_SHARE if min(snapshots.shape) >= RANDOMISED_FROM else 0
+        most = (
+            min(snapshots.shape) // RANDOMISED_SHARE
+            if min(snapshots.shape) >= RANDOMISED_FROM
+            else 0
+        )
         reach = None
         if n_modes is not None and n_modes <= most:
             # More of them will be asked for where decompositions are remembered.
-            reach = n_modes if _remembered is None else min(max(2 * n_modes, FIRST_DIRECTIONS), most)
+            reach = (
+                n_modes if _remembered is None else min(max(2 * n_modes, FIRST_DIRECTIONS), most)
+            )
             found = _randomised(lambda: [snapshots], reach, None, inner_product)
-        elif most > FIRST_DIRECTIONS and energy_tolerance is not None and energy_tolerance >= LEAST_STREAMED_TOLERANCE:
+        elif (
+            most > FIRST_DIRECTIONS
+            and energy_tolerance is not None
+            and energy_tolerance >= LEAST_STREAMED_TOLERANCE
+        ):
             found = _randomised(lambda: [snapshots], None, energy_tolerance, inner_product, most)
             reach = 0
         if found is None:
@@ -108,8 +126,12 @@ def pod(
 
 
 def pod_streamed(
-    blocks: Blocks, n_modes: int | None = None, *, energy_tolerance: float | None = None, inner_product: Any = None
-) -> Basis:  # fmt: skip
+    blocks: Blocks,
+    n_modes: int | None = None,
+    *,
+    energy_tolerance: float | None = None,
+    inner_product: Any = None,
+) -> Basis:
     """As `pod`, of snapshots that are never all in memory: a randomised SVD over blocks of rows, the same in every run.
 
     With l directions, some 1.5 times the modes, it holds a few matrices (n_samples, l) and (n, l), and reads the blocks
@@ -151,13 +173,28 @@ def _check_wanted(n_modes: int | None, energy_tolerance: float | None) -> None:
         raise InvalidInputError(f"`energy_tolerance` must be in [0, 1); got {energy_tolerance}.")
 
 
-def _checked(rows: NDArray[np.float64], inner_product: Any, n: int | None = None) -> NDArray[np.float64]:
+def _checked(
+    rows: NDArray[np.float64], inner_product: Any, n: int | None = None
+) -> NDArray[np.float64]:
     """Rows of snapshots that can be computed with."""
-    if getattr(rows, "ndim", None) != 2 or rows.dtype.kind not in "fiu" or rows.shape[1] == 0 or n not in (None, rows.shape[1]):
-        came = f"shape {rows.shape} and dtype {rows.dtype}" if isinstance(rows, np.ndarray) else type(rows).__name__
-        raise InvalidInputError(f"the snapshots must be real numbers of shape (n_samples, {n or 'n'}); got {came}.")
+    if (
+        getattr(rows, "ndim", None) != 2
+        or rows.dtype.kind not in "fiu"
+        or rows.shape[1] == 0
+        or n not in (None, rows.shape[1])
+    ):
+        came = (
+            f"shape {rows.shape} and dtype {rows.dtype}"
+            if isinstance(rows, np.ndarray)
+            else type(rows).__name__
+        )
+        raise InvalidInputError(
+            f"the snapshots must be real numbers of shape (n_samples, {n or 'n'}); got {came}."
+        )
     if inner_product is not None and inner_product.shape != (rows.shape[1], rows.shape[1]):
-        raise InvalidInputError(f"`inner_product` must have shape ({rows.shape[1]}, {rows.shape[1]}); got {inner_product.shape}.")
+        raise InvalidInputError(
+            f"`inner_product` must have shape ({rows.shape[1]}, {rows.shape[1]}); got {inner_product.shape}."
+        )
     if not np.isfinite(rows).all():
         raise InvalidInputError("the snapshots hold NaN or infinity.")
     return rows.astype(np.float64, copy=False)
@@ -182,13 +219,21 @@ class _Decomposition:
     precision = EPS
     """Of the numbers that the snapshots came in: what is relatively smaller than their round-off spans nothing."""
 
-    def __init__(self, tall: NDArray[np.float64], inner_product: Any, n_samples: int, energy: float | None = None) -> None:
+    def __init__(
+        self,
+        tall: NDArray[np.float64],
+        inner_product: Any,
+        n_samples: int,
+        energy: float | None = None,
+    ) -> None:
         (self._reflections, self._scales), r = qr(tall, mode="raw", check_finite=False)
         n, k = tall.shape
         self._inner_product, self._energy = inner_product, energy
         self.n_samples, self.n = n_samples, n
         if inner_product is None:
-            self._left, self.values, _ = svd(np.triu(r[:k]), full_matrices=False, check_finite=False)
+            self._left, self.values, _ = svd(
+                np.triu(r[:k]), full_matrices=False, check_finite=False
+            )
             return
         q = self._expanded(np.eye(k))
         try:
@@ -203,25 +248,35 @@ class _Decomposition:
         padded = np.zeros((self.n, coefficients.shape[1]), order="F")
         padded[: len(coefficients)] = coefficients
         size = int(lapack.dormqr("L", "N", self._reflections, self._scales, padded, -1)[1][0])
-        return np.asarray(lapack.dormqr("L", "N", self._reflections, self._scales, padded, size, overwrite_c=1)[0])
+        return np.asarray(
+            lapack.dormqr("L", "N", self._reflections, self._scales, padded, size, overwrite_c=1)[0]
+        )
 
     def modes(self, r: int) -> NDArray[np.float64]:
         """The r leading modes."""
         found = self._expanded(self._left[:, :r])
         if self._inner_product is not None:
-            upper = cholesky(_symmetric(found.T @ (self._inner_product @ found)), check_finite=False)
+            upper = cholesky(
+                _symmetric(found.T @ (self._inner_product @ found)), check_finite=False
+            )
             found = solve_triangular(upper, found.T, trans="T", check_finite=False).T
         return np.ascontiguousarray(found)
 
     @cached_property
     def rank(self) -> int:
         """Singular values that are no round-off."""
-        return int((self.values > self.values[0] * max(self.n_samples, self.n) * self.precision).sum())
+        return int(
+            (self.values > self.values[0] * max(self.n_samples, self.n) * self.precision).sum()
+        )
 
     def n_modes_of(self, energy_tolerance: float) -> int:
         """The least number of modes that leave no larger a share; one more than there are if none does."""
         squares = (self.values / self.values[0]) ** 2
-        rest = 0.0 if self._energy is None else max(self._energy / float(self.values[0]) ** 2 - float(squares.sum()), 0.0)
+        rest = (
+            0.0
+            if self._energy is None
+            else max(self._energy / float(self.values[0]) ** 2 - float(squares.sum()), 0.0)
+        )
         tails = np.append(np.cumsum(squares[::-1])[::-1], 0.0) + rest
         enough = np.flatnonzero(tails <= energy_tolerance**2 * tails[0])
         return max(1, int(enough[0])) if len(enough) else len(squares) + 1
@@ -231,7 +286,8 @@ class _Decomposition:
         wanted = self.n_modes_of(energy_tolerance) if energy_tolerance is not None else n_modes
         if wanted is not None and wanted > self.rank:
             warnings.warn(
-                f"{wanted} modes were asked for, but the {self.n_samples} snapshots have rank {self.rank}: {self.rank} are used.", stacklevel=3
+                f"{wanted} modes were asked for, but the {self.n_samples} snapshots have rank {self.rank}: {self.rank} are used.",
+                stacklevel=3,
             )
         kept = self.rank if wanted is None else min(wanted, self.rank)
         return Basis(self.modes(kept), self.values if self._energy is None else self.values[:kept])
@@ -244,20 +300,28 @@ def _symmetric(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 def _exact(snapshots: NDArray[np.float64], inner_product: Any) -> _Decomposition:
     n_samples, n = snapshots.shape
     # Of a tall matrix the triangular factor is enough; left singular vectors of the whole are never formed.
-    tall: Any = qr(snapshots, mode="r", check_finite=False)[0][:n].T if n_samples > n else snapshots.T
+    tall: Any = (
+        qr(snapshots, mode="r", check_finite=False)[0][:n].T if n_samples > n else snapshots.T
+    )
     return _Decomposition(tall, inner_product, n_samples)
 
 
 def _randomised(
-    blocks: Blocks, n_modes: int | None, energy_tolerance: float | None, inner_product: Any, most: int | None = None
-) -> _Decomposition | None:  # fmt: skip
+    blocks: Blocks,
+    n_modes: int | None,
+    energy_tolerance: float | None,
+    inner_product: Any,
+    most: int | None = None,
+) -> _Decomposition | None:
     """Subspace iteration on blocks of rows A: Y = A K V, Q = orth(Y), V = the modes of QᵀA; None if it takes more than `most` directions."""
     n = next((block.shape[1] for block in _read(blocks, inner_product)), 0)
     if n == 0:
         raise InvalidInputError("there are no snapshots.")
     generator = np.random.default_rng(SEED)
     directions, more = np.zeros((n, 0)), POWER_ITERATIONS
-    n_directions = FIRST_DIRECTIONS if n_modes is None else n_modes + max(OVERSAMPLING, n_modes // 2)
+    n_directions = (
+        FIRST_DIRECTIONS if n_modes is None else n_modes + max(OVERSAMPLING, n_modes // 2)
+    )
     energy: float | None = None
     while True:
         drawn = generator.normal(size=(n, max(min(n_directions, n) - directions.shape[1], 0)))
@@ -267,9 +331,13 @@ def _randomised(
         for block in _read(blocks, inner_product, n):
             images.append(block @ weighted)
             if energy is None:
-                squares += float(np.vdot(block, block if inner_product is None else (inner_product @ block.T).T))
+                squares += float(
+                    np.vdot(block, block if inner_product is None else (inner_product @ block.T).T)
+                )
         if not images:
-            raise InvalidInputError("`blocks` gave snapshots at first and none later; it must begin anew every time.")
+            raise InvalidInputError(
+                "`blocks` gave snapshots at first and none later; it must begin anew every time."
+            )
         q = qr(np.concatenate(images), mode="economic", overwrite_a=True, check_finite=False)[0]
         del images, directions, weighted, drawn
         if energy is None:
@@ -282,7 +350,9 @@ def _randomised(
                 columns += block.T @ q[start : start + len(block)]
             start += len(block)
         if not start == len(q) == n_samples:
-            raise InvalidInputError(f"`blocks` gave {n_samples} snapshots at first and {start} later; it must begin anew every time.")
+            raise InvalidInputError(
+                f"`blocks` gave {n_samples} snapshots at first and {start} later; it must begin anew every time."
+            )
         n_directions = q.shape[1]
         del q
         found = _Decomposition(columns, inner_product, n_samples, energy)
@@ -300,7 +370,9 @@ def _randomised(
         n_directions = found.rank
 
 
-def _read(blocks: Blocks, inner_product: Any, n: int | None = None) -> Iterator[NDArray[np.float64]]:
+def _read(
+    blocks: Blocks, inner_product: Any, n: int | None = None
+) -> Iterator[NDArray[np.float64]]:
     for block in blocks():
         yield _checked(block, inner_product, n)
 
@@ -314,7 +386,11 @@ class _Remembered:
     @staticmethod
     def key(snapshots: NDArray[np.float64], inner_product: Any) -> bytes:
         digest = hashlib.blake2b(repr((snapshots.shape, snapshots.dtype.str)).encode())
-        product = () if inner_product is None else (inner_product.data, inner_product.indices, inner_product.indptr)
+        product = (
+            ()
+            if inner_product is None
+            else (inner_product.data, inner_product.indices, inner_product.indptr)
+        )
         for array in (snapshots, *product):
             digest.update(np.ascontiguousarray(array).data)
         return digest.digest()

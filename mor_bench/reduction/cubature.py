@@ -65,7 +65,13 @@ class SparseWeights:
         gradient = (matrix.T @ residual) * _inverse_norms(matrix) / size
         passive = weights > 0
         relative = float(np.linalg.norm(residual)) / size
-        return cls(weights, relative, float(np.abs(gradient[passive]).max(initial=0.0)), float(gradient[~passive].max(initial=0.0)), iterations)
+        return cls(
+            weights,
+            relative,
+            float(np.abs(gradient[passive]).max(initial=0.0)),
+            float(gradient[~passive].max(initial=0.0)),
+            iterations,
+        )
 
 
 def _inverse_norms(matrix: Array) -> Array:
@@ -152,7 +158,11 @@ class ActiveColumns:
     def refactor(self) -> None:
         """Make the factor of the chosen columns anew."""
         n = len(self.chosen)
-        q, r = qr(self.matrix[:, self.chosen] * self.scale[self.chosen], mode="economic", check_finite=False)
+        q, r = qr(
+            self.matrix[:, self.chosen] * self.scale[self.chosen],
+            mode="economic",
+            check_finite=False,
+        )
         self._q[:n], self._r[:n, :n], self._c[:n] = q.T, r, q.T @ self.target
 
     def coefficients(self) -> Array:
@@ -181,7 +191,9 @@ def check_finite(matrix: Array, target: Array) -> None:
         raise InvalidInputError("the cubature's training matrix holds NaN or infinity.")
 
 
-def sparse_nnls(matrix: Array, target: Array, tolerance: float, max_iterations: int | None = None) -> SparseWeights:
+def sparse_nnls(
+    matrix: Array, target: Array, tolerance: float, max_iterations: int | None = None
+) -> SparseWeights:
     """Few non-negative weights with ‖A x - b‖ <= tolerance ‖b‖: Lawson and Hanson's active set, stopped early.
 
     Farhat, Avery, Chapman, Cortial: Dimensional reduction of nonlinear finite element dynamic models with finite
@@ -210,11 +222,17 @@ def sparse_nnls(matrix: Array, target: Array, tolerance: float, max_iterations: 
     """
     check_finite(matrix, target)
     columns = ActiveColumns(matrix, target)
-    size, limit = float(np.linalg.norm(target)), 3 * matrix.shape[1] if max_iterations is None else max_iterations
+    size, limit = (
+        float(np.linalg.norm(target)),
+        3 * matrix.shape[1] if max_iterations is None else max_iterations,
+    )
     x, residual, iterations = np.zeros(0), target, 0
     unusable = columns.scale == 0
     rejected = unusable.copy()
-    while float(np.linalg.norm(residual)) > max(tolerance, LEAST_GRADIENT) * size and iterations < limit:
+    while (
+        float(np.linalg.norm(residual)) > max(tolerance, LEAST_GRADIENT) * size
+        and iterations < limit
+    ):
         gradient = columns.gradient(residual)
         if np.abs(gradient[columns.chosen]).max(initial=0.0) > DRIFT * max(size, float(x.sum())):
             columns.refactor()
@@ -264,7 +282,13 @@ def _feasible(columns: ActiveColumns, x: Array, residual: Array) -> tuple[Array,
     return (trial, columns.residual(trial)) if (trial > 0).all() else (x, residual)
 
 
-def ecsw_system(assembler: Assembler, cell_dofs: NDArray[np.int64], modes: Array, q: Array, max_entries: int = MAX_ENTRIES) -> Array:
+def ecsw_system(
+    assembler: Assembler,
+    cell_dofs: NDArray[np.int64],
+    modes: Array,
+    q: Array,
+    max_entries: int = MAX_ENTRIES,
+) -> Array:
     """The ECSW training matrix G, or a shorter one of as much worth to least squares.
 
     G[(s, i), e] = φ_iᵀ f_e(Φ q_s), (n_snapshots r, n_cells); the target is G·1. Since ‖Gξ - G1‖ = ‖Rξ - R1‖ for G = QR, R will
@@ -289,7 +313,9 @@ def ecsw_system(assembler: Assembler, cell_dofs: NDArray[np.int64], modes: Array
     for coordinates in q:
         if used + r > most:
             system[:n_cells], used = triangle(system[:used]), n_cells
-        system[used : used + r] = np.matmul(assembler.cell_forces(modes @ coordinates)[:, None], local)[:, 0].T
+        system[used : used + r] = np.matmul(
+            assembler.cell_forces(modes @ coordinates)[:, None], local
+        )[:, 0].T
         used += r
     return triangle(system[:used]) if used > 4 * n_cells else system[:used]
 

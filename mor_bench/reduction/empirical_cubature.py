@@ -43,25 +43,35 @@ def cell_basis(matrix: Array, tolerance: float) -> Array:
         largest = float(np.linalg.norm(new, axis=1).max())
         for _ in range(2):
             new -= (new @ rows.T) @ rows
-            new = new[np.linalg.norm(new, axis=1) > 1e-13 * largest]  # within the span of the others but for round-off
+            new = new[
+                np.linalg.norm(new, axis=1) > 1e-13 * largest
+            ]  # within the span of the others but for round-off
         fresh, triangular = qr(new.T, mode="economic")
         fresh = fresh[:, np.abs(np.diag(triangular)) > 1e-13 * largest]
         fresh -= rows.T @ (rows @ fresh)
         rows = np.vstack([rows, qr(fresh, mode="economic")[0].T])
         projected = matrix @ rows.T
         rest = float(np.linalg.norm(matrix - projected @ rows))
-        if rest <= max(0.5 * tolerance, 1e-13) * total or fresh.shape[1] == 0 or len(rows) == min(matrix.shape):
+        if (
+            rest <= max(0.5 * tolerance, 1e-13) * total
+            or fresh.shape[1] == 0
+            or len(rows) == min(matrix.shape)
+        ):
             break
     _, values, vt = svd(projected, full_matrices=False, check_finite=False)
     tails = np.sqrt(np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0) + rest**2)
     enough = np.flatnonzero(tails <= max(tolerance, 1e-12) * total)
     if not len(enough):
-        raise CubatureError(f"the basis of the cell forces leaves out {rest / total:.3g} of them; `cubature_tolerance` asks for {tolerance:.3g}.")
+        raise CubatureError(
+            f"the basis of the cell forces leaves out {rest / total:.3g} of them; `cubature_tolerance` asks for {tolerance:.3g}."
+        )
     kept = int(enough[0]) or 1
     return np.ascontiguousarray((vt[:kept] @ rows).T)
 
 
-def empirical_cubature(matrix: Array, tolerance: float, max_iterations: int | None = None) -> SparseWeights:
+def empirical_cubature(
+    matrix: Array, tolerance: float, max_iterations: int | None = None
+) -> SparseWeights:
     """Cells and non-negative weights that integrate the leading singular vectors of the training matrix, and 1, exactly.
 
     Hernández, Caicedo, Ferrer: Dimensional hyper-reduction of nonlinear finite element models via empirical cubature, CMAME 313
@@ -101,7 +111,10 @@ def empirical_cubature(matrix: Array, tolerance: float, max_iterations: int | No
     equations = np.ascontiguousarray(basis.T)
     target = equations.sum(axis=1)
     columns = ActiveColumns(equations, target)
-    size, limit = float(np.linalg.norm(target)), 3 * len(ones) if max_iterations is None else max_iterations
+    size, limit = (
+        float(np.linalg.norm(target)),
+        3 * len(ones) if max_iterations is None else max_iterations,
+    )
     x, residual, iterations = np.zeros(0), target, 0
     rejected = columns.scale == 0
     while float(np.linalg.norm(residual)) > EXACT * size and iterations < limit:
@@ -128,5 +141,7 @@ def empirical_cubature(matrix: Array, tolerance: float, max_iterations: int | No
             rejected[entering] = True
     found = SparseWeights.of(equations, target, columns.weights(x), iterations)
     if found.relative_residual > EXACT * (1 + 1e-6):
-        raise CubatureError(f"cubature reached a relative residual of {found.relative_residual:.3g} in {iterations} iterations; {EXACT:g} is needed.")
+        raise CubatureError(
+            f"cubature reached a relative residual of {found.relative_residual:.3g} in {iterations} iterations; {EXACT:g} is needed."
+        )
     return found

@@ -16,7 +16,13 @@ from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
 from mor_bench.errors import InvalidInputError, SolverError
 from mor_bench.mechanics.assembly import Assembler, Pattern, State
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
-from mor_bench.mechanics.newton import MAX_LOAD_N, NewtonOptions, Solution, is_linear, solve_equilibrium
+from mor_bench.mechanics.newton import (
+    MAX_LOAD_N,
+    NewtonOptions,
+    Solution,
+    is_linear,
+    solve_equilibrium,
+)
 from mor_bench.reduction.points import ReducedPoints
 
 
@@ -33,7 +39,9 @@ def _symmetric_product(indptr: Any, indices: Any, values: Any, modes: Any, produ
                     product[j, m] += value * modes[i, m]
 
 
-def stiffness_times(pattern: Pattern, values: NDArray[np.float64], modes: NDArray[np.float64]) -> NDArray[np.float64]:
+def stiffness_times(
+    pattern: Pattern, values: NDArray[np.float64], modes: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """K modes, (n, r), of a stiffness whose upper triangle is given."""
     product = np.zeros_like(modes)
     _symmetric_product(pattern.indptr, pattern.indices, values, modes, product)
@@ -47,7 +55,11 @@ class _DenseFactor:
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         if counting.running is not None:
             r, m = len(rhs), 1 if rhs.ndim == 1 else rhs.shape[1]
-            counting.running.add(back_solves=m, reduced_back_solves=m, multiply_adds=m * triangular_multiply_adds(r, r - 1))
+            counting.running.add(
+                back_solves=m,
+                reduced_back_solves=m,
+                multiply_adds=m * triangular_multiply_adds(r, r - 1),
+            )
         return np.asarray(dpotrs(self._cholesky, rhs)[0]).reshape(rhs.shape)
 
 
@@ -55,7 +67,11 @@ def dense_factor(tangent: NDArray[np.float64]) -> Factor:
     """Cholesky factor of a reduced tangent (r, r); raises `NotPositiveDefiniteError`."""
     if counting.running is not None:
         r = len(tangent)
-        counting.running.add(factorisations=1, reduced_factorisations=1, multiply_adds=cholesky_multiply_adds(r, r - 1))
+        counting.running.add(
+            factorisations=1,
+            reduced_factorisations=1,
+            multiply_adds=cholesky_multiply_adds(r, r - 1),
+        )
     cholesky, info = dpotrf(tangent)
     if info != 0:
         raise NotPositiveDefiniteError
@@ -82,8 +98,12 @@ class DenseProblem(ABC):
             ) from None
 
     def step(
-        self, q: NDArray[np.float64], tangent: NDArray[np.float64], residual: NDArray[np.float64], tolerance: float
-    ) -> NDArray[np.float64]:  # fmt: skip
+        self,
+        q: NDArray[np.float64],
+        tangent: NDArray[np.float64],
+        residual: NDArray[np.float64],
+        tolerance: float,
+    ) -> NDArray[np.float64]:
         return self.factor(tangent).solve(residual)
 
     def certify(self, q: NDArray[np.float64]) -> None:  # noqa: B027 - not to be overridden
@@ -113,12 +133,16 @@ class GalerkinProblem(DenseProblem):
 
     def __init__(self, assembler: Assembler, modes: NDArray[np.float64]) -> None:
         if modes.ndim != 2 or len(modes) != assembler.n_dofs or not np.isfinite(modes).all():
-            raise InvalidInputError(f"`modes` must be a finite array of shape ({assembler.n_dofs}, r); got shape {modes.shape}.")
+            raise InvalidInputError(
+                f"`modes` must be a finite array of shape ({assembler.n_dofs}, r); got shape {modes.shape}."
+            )
         self.assembler = assembler
         self.modes = np.ascontiguousarray(modes)
         self.n_unknowns = modes.shape[1]
         # Of an orthonormal basis the largest mode has norm 1, of one that is so in another inner product any.
-        self.extent = assembler.extent_m * float(np.sqrt(len(modes)) / (np.linalg.norm(modes, axis=0).max() or 1.0))
+        self.extent = assembler.extent_m * float(
+            np.sqrt(len(modes)) / (np.linalg.norm(modes, axis=0).max() or 1.0)
+        )
 
     @cached_property
     def rest_tangent(self) -> NDArray[np.float64]:
@@ -134,10 +158,14 @@ class GalerkinProblem(DenseProblem):
 
     def linearise(self, q: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
         state, values = self.assembler.force_and_tangent(self.modes @ q)
-        if counting.running is not None:  # Φq, Φᵀf, KΦ with the K of which one triangle is stored, ΦᵀKΦ
+        if (
+            counting.running is not None
+        ):  # Φq, Φᵀf, KΦ with the K of which one triangle is stored, ΦᵀKΦ
             n, r = self.modes.shape
             counting.running.add(multiply_adds=2 * n * r + (2 * len(values) - n) * r + n * r**2)
-        return self._project(state), self.modes.T @ stiffness_times(self.assembler.pattern, values, self.modes)
+        return self._project(state), self.modes.T @ stiffness_times(
+            self.assembler.pattern, values, self.modes
+        )
 
 
 class CubatureProblem(DenseProblem):

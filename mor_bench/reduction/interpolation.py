@@ -38,7 +38,9 @@ def interpolation_rows(basis: NDArray[np.float64], selection: Selection) -> NDAr
     if k > n:
         raise InvalidInputError(f"a basis of {n} rows cannot have {k} independent columns.")
     if selection == "pivoted-qr":
-        return np.asarray(qr(basis.T, mode="r", pivoting=True, check_finite=False)[1][:k], dtype=np.int64)
+        return np.asarray(
+            qr(basis.T, mode="r", pivoting=True, check_finite=False)[1][:k], dtype=np.int64
+        )
     rows = [int(np.abs(basis[:, 0]).argmax())]
     for column in range(1, k):
         coefficients = np.linalg.solve(basis[rows, :column], basis[rows, column])

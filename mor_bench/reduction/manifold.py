@@ -37,9 +37,14 @@ class QuadraticManifold:
         n, r = modes.shape
         first, second = pairs(r)
         if derivatives.shape != (n, len(first)) or not np.isfinite(derivatives).all():
-            raise InvalidInputError(f"`derivatives` must be a finite array of shape ({n}, {len(first)}); got shape {derivatives.shape}.")
+            raise InvalidInputError(
+                f"`derivatives` must be a finite array of shape ({n}, {len(first)}); got shape {derivatives.shape}."
+            )
         # One memory order, fitted or loaded: BLAS rounds differently in another.
-        self.modes, self.derivatives = np.ascontiguousarray(modes), np.ascontiguousarray(derivatives)
+        self.modes, self.derivatives = (
+            np.ascontiguousarray(modes),
+            np.ascontiguousarray(derivatives),
+        )
         self._bend = np.empty((n, r, r))
         self._bend[:, first, second] = derivatives
         self._bend[:, second, first] = derivatives
@@ -61,8 +66,11 @@ class QuadraticManifold:
 
 
 def manifold_system(
-    assembler: Assembler, cell_dofs: NDArray[np.int64], manifold: QuadraticManifold, states: list[NDArray[np.float64]]
-) -> NDArray[np.float64]:  # fmt: skip
+    assembler: Assembler,
+    cell_dofs: NDArray[np.int64],
+    manifold: QuadraticManifold,
+    states: list[NDArray[np.float64]],
+) -> NDArray[np.float64]:
     """The ECSW training matrix on a manifold, compressed by QR as in `cubature.ecsw_system`.
 
     G[(s, i), e] = T(q_s)ᵢᵀ f_e(u(q_s)); the target is G·1. Jain, Tiso: Hyper-reduction over nonlinear manifolds for large
@@ -103,7 +111,12 @@ class ManifoldProblem(DenseProblem):
         B = Σₐ fₐ ∂²uₐ/∂q² over all dofs, N/m.
     """
 
-    def __init__(self, linear: GalerkinProblem, manifold: QuadraticManifold, bending_load: NDArray[np.float64]) -> None:
+    def __init__(
+        self,
+        linear: GalerkinProblem,
+        manifold: QuadraticManifold,
+        bending_load: NDArray[np.float64],
+    ) -> None:
         self._linear, self._manifold, self._bending_load = linear, manifold, bending_load
         self.n_unknowns, self.extent = linear.n_unknowns, linear.extent
 
@@ -120,7 +133,9 @@ class ManifoldProblem(DenseProblem):
         if counting.running is not None:
             counting.running.add(multiply_adds=tangents.size)
         done = self._bending_load @ q
-        return State(tangents.T @ state.force - done, state.energy_j - 0.5 * float(done @ q), state.min_det_f)
+        return State(
+            tangents.T @ state.force - done, state.energy_j - 0.5 * float(done @ q), state.min_det_f
+        )
 
     def force(self, q: NDArray[np.float64]) -> State:
         u, tangents = self._manifold.at(q)

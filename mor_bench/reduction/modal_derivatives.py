@@ -77,13 +77,16 @@ def modal_derivatives(model: FullOrderModel, modes: NDArray[np.float64]) -> NDAr
 
     own = [even(step) for step in steps]
     products = [
-        (2.0 * own[i] if i == j else even(steps[i] + steps[j]) - own[i] - own[j]) / (scales[i] * scales[j])
+        (2.0 * own[i] if i == j else even(steps[i] + steps[j]) - own[i] - own[j])
+        / (scales[i] * scales[j])
         for i, j in zip(*pairs(modes.shape[1]), strict=True)
-    ]  # fmt: skip
+    ]
     return -model.rest_factor.solve(np.array(products).T)
 
 
-def derivative_basis(scene: Scene, model: FullOrderModel, n_linear: int, n_modes: int) -> NDArray[np.float64]:
+def derivative_basis(
+    scene: Scene, model: FullOrderModel, n_linear: int, n_modes: int
+) -> NDArray[np.float64]:
     """An orthonormal basis of linear modes and the modal derivatives of the first n_linear, (n_free, n_modes).
 
     All enter one singular value decomposition with the size that they have in the second-order expansion of a response,
@@ -92,6 +95,13 @@ def derivative_basis(scene: Scene, model: FullOrderModel, n_linear: int, n_modes
     linear = linear_modes(scene, model)
     n_linear = min(n_linear, linear.modes.shape[1])
     first, second = pairs(n_linear)
-    sizes = np.where(first == second, 0.5, 1.0) * linear.amplitudes_m[first] * linear.amplitudes_m[second]
+    sizes = (
+        np.where(first == second, 0.5, 1.0)
+        * linear.amplitudes_m[first]
+        * linear.amplitudes_m[second]
+    )
     bent = modal_derivatives(model, linear.modes[:, :n_linear]) * sizes
-    return pod(np.vstack([(linear.modes * linear.amplitudes_m).T[: max(n_linear, n_modes)], bent.T]), n_modes).modes
+    return pod(
+        np.vstack([(linear.modes * linear.amplitudes_m).T[: max(n_linear, n_modes)], bent.T]),
+        n_modes,
+    ).modes

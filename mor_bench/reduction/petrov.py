@@ -14,7 +14,15 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 from mor_bench import counting
 from mor_bench.counting import triangular_multiply_adds
 from mor_bench.errors import InvalidInputError, InvertedElementError, NoEquilibriumError
-from mor_bench.mechanics.newton import HOPELESS, LINEAR, MAX_ITERATIONS, MAX_LOAD_N, PLAIN_ITERATIONS, ROUND_OFF, NewtonOptions
+from mor_bench.mechanics.newton import (
+    HOPELESS,
+    LINEAR,
+    MAX_ITERATIONS,
+    MAX_LOAD_N,
+    PLAIN_ITERATIONS,
+    ROUND_OFF,
+    NewtonOptions,
+)
 from mor_bench.reduction.points import ReducedPoints
 
 Array = NDArray[np.float64]
@@ -70,7 +78,9 @@ class InterpolatedProblem:
         if not load.any():
             return np.zeros_like(load)
         if np.abs(load).max() > MAX_LOAD_N:
-            raise InvalidInputError(f"the reduced load must be within ±{MAX_LOAD_N:g} N; got {np.abs(load).max():g}.")
+            raise InvalidInputError(
+                f"the reduced load must be within ±{MAX_LOAD_N:g} N; got {np.abs(load).max():g}."
+            )
         start = _factored(self._rest, load)[0]
         if np.abs(start).max() <= LINEAR * self.extent:
             return start
@@ -92,10 +102,16 @@ class InterpolatedProblem:
             if cuts > options.max_cuts or iterations > MAX_ITERATIONS:
                 story = f"stopped at {reached:.4g} of the load after {iterations} iterations and {cuts} cut-backs"
                 if min_det <= 0:
-                    raise InvertedElementError(f"sampled elements invert: {story}; det F <= 0 was {min_det:.3g}.")
-                raise NoEquilibriumError(f"no equilibrium of the interpolated force found: {story}; a symmetric method may find one.")
+                    raise InvertedElementError(
+                        f"sampled elements invert: {story}; det F <= 0 was {min_det:.3g}."
+                    )
+                raise NoEquilibriumError(
+                    f"no equilibrium of the interpolated force found: {story}; a symmetric method may find one."
+                )
 
-    def _newton(self, load: Array, start: Array, tolerance: float, damped: bool) -> tuple[Array | None, float, int]:
+    def _newton(
+        self, load: Array, start: Array, tolerance: float, damped: bool
+    ) -> tuple[Array | None, float, int]:
         """The solution or None, the last min det F, and the number of iterations; damped, every step lowers the residual."""
         q, size, load_norm = start, np.inf, float(np.linalg.norm(load))
         force, tangent, min_det = self.linearise(q)
@@ -124,7 +140,13 @@ def _factored(matrix: Array, rhs: Array) -> tuple[Array, bool]:
     n = len(rhs)
     if counting.running is not None:
         work = sum(k + k * k for k in range(n)) + triangular_multiply_adds(n, n - 1)
-        counting.running.add(factorisations=1, reduced_factorisations=1, back_solves=1, reduced_back_solves=1, multiply_adds=work)
+        counting.running.add(
+            factorisations=1,
+            reduced_factorisations=1,
+            back_solves=1,
+            reduced_back_solves=1,
+            multiply_adds=work,
+        )
     factor, pivots, info = dgetrf(matrix)
     if info != 0:
         return np.full(n, np.nan), False

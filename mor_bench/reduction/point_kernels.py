@@ -76,10 +76,18 @@ def _add_tangent(test, trial, symmetric, A, T, tangent):
         other = min(k + 1, r - 1)  # the same where a single mode is left
         for c in range(9):
             lanes = slice(c * LANES, (c + 1) * LANES)
-            _rows(A[c * _COMPONENTS : (c + 1) * _COMPONENTS], trial[k], trial[other], T[0, lanes], T[1, lanes])
+            _rows(
+                A[c * _COMPONENTS : (c + 1) * _COMPONENTS],
+                trial[k],
+                trial[other],
+                T[0, lanes],
+                T[1, lanes],
+            )
         n = other + 1 if symmetric else r
         for m in range(0, n - n % 4, 4):
-            at, bt, ct, dt, au, bu, cu, du = _dots(test[m], test[m + 1], test[m + 2], test[m + 3], T[0], T[1])
+            at, bt, ct, dt, au, bu, cu, du = _dots(
+                test[m], test[m + 1], test[m + 2], test[m + 3], T[0], T[1]
+            )
             tangent[m, k] += at
             tangent[m + 1, k] += bt
             tangent[m + 2, k] += ct
@@ -129,15 +137,39 @@ def _saint_venant_kirchhoff(H, w, lam, mu, want_tangent, P, S, A, energy, min_de
         s01, s02, s12 = wm2 * e01, wm2 * e02, wm2 * e12
         energy[l] += 0.5 * (s00 * e00 + s11 * e11 + s22 * e22) + s01 * e01 + s02 * e02 + s12 * e12
         f00, f11, f22 = 1.0 + h00, 1.0 + h11, 1.0 + h22
-        det = f00 * (f11 * f22 - h12 * h21) - h01 * (h10 * f22 - h12 * h20) + h02 * (h10 * h21 - f11 * h20)
+        det = (
+            f00 * (f11 * f22 - h12 * h21)
+            - h01 * (h10 * f22 - h12 * h20)
+            + h02 * (h10 * h21 - f11 * h20)
+        )
         min_det[l] = min(min_det[l], det)
-        P[l], P[L + l], P[2 * L + l] = f00 * s00 + h01 * s01 + h02 * s02, f00 * s01 + h01 * s11 + h02 * s12, f00 * s02 + h01 * s12 + h02 * s22
-        P[3 * L + l], P[4 * L + l] = h10 * s00 + f11 * s01 + h12 * s02, h10 * s01 + f11 * s11 + h12 * s12
-        P[5 * L + l], P[6 * L + l] = h10 * s02 + f11 * s12 + h12 * s22, h20 * s00 + h21 * s01 + f22 * s02
-        P[7 * L + l], P[8 * L + l] = h20 * s01 + h21 * s11 + f22 * s12, h20 * s02 + h21 * s12 + f22 * s22
+        P[l], P[L + l], P[2 * L + l] = (
+            f00 * s00 + h01 * s01 + h02 * s02,
+            f00 * s01 + h01 * s11 + h02 * s12,
+            f00 * s02 + h01 * s12 + h02 * s22,
+        )
+        P[3 * L + l], P[4 * L + l] = (
+            h10 * s00 + f11 * s01 + h12 * s02,
+            h10 * s01 + f11 * s11 + h12 * s12,
+        )
+        P[5 * L + l], P[6 * L + l] = (
+            h10 * s02 + f11 * s12 + h12 * s22,
+            h20 * s00 + h21 * s01 + f22 * s02,
+        )
+        P[7 * L + l], P[8 * L + l] = (
+            h20 * s01 + h21 * s11 + f22 * s12,
+            h20 * s02 + h21 * s12 + f22 * s22,
+        )
         if want_tangent:
             H[l], H[4 * L + l], H[8 * L + l] = f00, f11, f22  # F from here on
-            S[l], S[L + l], S[2 * L + l], S[3 * L + l], S[4 * L + l], S[5 * L + l] = s00, s11, s22, s01, s02, s12
+            S[l], S[L + l], S[2 * L + l], S[3 * L + l], S[4 * L + l], S[5 * L + l] = (
+                s00,
+                s11,
+                s22,
+                s01,
+                s02,
+                s12,
+            )
     if not want_tangent:
         return
     for i in range(3):
@@ -154,7 +186,14 @@ def _saint_venant_kirchhoff(H, w, lam, mu, want_tangent, P, S, A, energy, min_de
                 a10, a11, a12 = l1 * k0 + m0 * k1, (l1 + m1) * k1 + b, l1 * k2 + m2 * k1
                 a20, a21, a22 = l2 * k0 + m0 * k2, l2 * k1 + m1 * k2, (l2 + m2) * k2 + b
                 if i == k:
-                    s00, s11, s22, s01, s02, s12 = S[l], S[L + l], S[2 * L + l], S[3 * L + l], S[4 * L + l], S[5 * L + l]
+                    s00, s11, s22, s01, s02, s12 = (
+                        S[l],
+                        S[L + l],
+                        S[2 * L + l],
+                        S[3 * L + l],
+                        S[4 * L + l],
+                        S[5 * L + l],
+                    )
                     a00, a01, a02 = a00 + s00, a01 + s01, a02 + s02
                     a10, a11, a12 = a10 + s01, a11 + s11, a12 + s12
                     a20, a21, a22 = a20 + s02, a21 + s12, a22 + s22
@@ -221,12 +260,19 @@ def integrate(q, trial, test, symmetric, weights, lame, force, tangent):
     want_tangent = len(tangent) > 0
     force[:] = 0.0
     tangent[:] = 0.0
-    H, P, T, S = np.empty(_COMPONENTS), np.empty(_COMPONENTS), np.empty((2, _COMPONENTS)), np.empty(6 * LANES)
+    H, P, T, S = (
+        np.empty(_COMPONENTS),
+        np.empty(_COMPONENTS),
+        np.empty((2, _COMPONENTS)),
+        np.empty(6 * LANES),
+    )
     A = np.empty(9 * _COMPONENTS)
     energy, min_det = np.zeros(LANES), np.full(LANES, np.inf)
     for b in range(len(weights)):
         _gradients(trial[b], q, H)
-        _saint_venant_kirchhoff(H, weights[b], lame[b, 0], lame[b, 1], want_tangent, P, S, A, energy, min_det)
+        _saint_venant_kirchhoff(
+            H, weights[b], lame[b, 0], lame[b, 1], want_tangent, P, S, A, energy, min_det
+        )
         _add_force(test[b], P, force)
         if want_tangent:
             _add_tangent(test[b], trial[b], symmetric, A, T, tangent)
@@ -267,7 +313,9 @@ def _solve(lower, rhs):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def full_steps(load, q, trial, weights, lame, tolerance, hopeless, round_off, extent, max_iterations):
+def full_steps(
+    load, q, trial, weights, lame, tolerance, hopeless, round_off, extent, max_iterations
+):
     """Newton's full steps from q, as `mor_bench.mechanics.newton` takes them, in one compiled loop.
 
     It ends well only where the load is met in a state whose tangent is positive definite, or was one step before when the

@@ -91,26 +91,51 @@ class ReducedPoints:
         self.n_cells, self.n_points, self.n_unknowns = len(cells), len(kept), modes.shape[2]
         self.trial = _mode_gradients(rule.gradients, modes[cells], kept)
         self.symmetric = test_modes is None
-        self.test = self.trial if test_modes is None else _mode_gradients(rule.gradients, test_modes[cells], kept)
+        self.test = (
+            self.trial
+            if test_modes is None
+            else _mode_gradients(rule.gradients, test_modes[cells], kept)
+        )
         self.weights = _batched(weights[kept])
         self.law, self.parameters = material.law, np.tile(rule.parameters, (len(cells), 1))[kept]
         self._lame = _batched(self.parameters) if self.law == SAINT_VENANT_KIRCHHOFF else None
         r = self.n_unknowns
-        force, tangent = SVK_MULTIPLY_ADDS if self.law == SAINT_VENANT_KIRCHHOFF else point_multiply_adds(self.law, rule.parameters.shape[1])
+        force, tangent = (
+            SVK_MULTIPLY_ADDS
+            if self.law == SAINT_VENANT_KIRCHHOFF
+            else point_multiply_adds(self.law, rule.parameters.shape[1])
+        )
         tangent += tangent_multiply_adds(r, self.symmetric)
-        self._multiply_adds = self.n_points * (force + 18 * r), self.n_points * (force + 18 * r + tangent)
+        self._multiply_adds = (
+            self.n_points * (force + 18 * r),
+            self.n_points * (force + 18 * r + tangent),
+        )
 
     def count(self, forces: int, tangents: int) -> None:
         """Count evaluations of the force alone, and of force and tangent."""
         if counting.running is not None:
             work = forces * self._multiply_adds[0] + tangents * self._multiply_adds[1]
-            counting.running.add(element_evaluations=(forces + tangents) * self.n_cells, multiply_adds=work)
+            counting.running.add(
+                element_evaluations=(forces + tangents) * self.n_cells, multiply_adds=work
+            )
 
     def _sum(self, q: Array, tangent: Array) -> State:
         force = np.zeros(self.n_unknowns)
         self.count(len(tangent) == 0, len(tangent) > 0)
         if self._lame is not None:
-            return State(force, *integrate(q, self.trial, self.test, self.symmetric, self.weights, self._lame, force, tangent))
+            return State(
+                force,
+                *integrate(
+                    q,
+                    self.trial,
+                    self.test,
+                    self.symmetric,
+                    self.weights,
+                    self._lame,
+                    force,
+                    tangent,
+                ),
+            )
         H, P = np.empty((2, len(self.weights), 9 * LANES))
         A = np.empty((len(self.weights) if len(tangent) else 0, 81 * LANES))
         gradients(self.trial, q, H)
@@ -132,22 +157,41 @@ class ReducedPoints:
         H, P = np.empty((2, len(self.weights), 9 * LANES))
         gradients(self.trial, q, H)
         point_stresses(H, self.weights, self.law, self.parameters, P, np.empty((0, 81 * LANES)))
-        own = np.einsum("bmcl,bcl->blm", self.test.reshape(len(P), -1, 9, LANES), P.reshape(len(P), 9, LANES))
+        own = np.einsum(
+            "bmcl,bcl->blm", self.test.reshape(len(P), -1, 9, LANES), P.reshape(len(P), 9, LANES)
+        )
         return np.asarray(own.reshape(-1, self.n_unknowns)[: self.n_points])
 
-    def full_steps(self, load: Array, start: Array, tolerance: float, extent: float) -> Solution | None:
+    def full_steps(
+        self, load: Array, start: Array, tolerance: float, extent: float
+    ) -> Solution | None:
         """Newton's full steps; None for other laws than Saint Venant-Kirchhoff, or without a stable end with det F > 0."""
         if self._lame is None:
             return None
         q = start.copy()
         converged, min_det, iterations, tangents, forces, factors, solves = full_steps(
-            load, q, self.trial, self.weights, self._lame, tolerance, HOPELESS, ROUND_OFF, extent, PLAIN_ITERATIONS
+            load,
+            q,
+            self.trial,
+            self.weights,
+            self._lame,
+            tolerance,
+            HOPELESS,
+            ROUND_OFF,
+            extent,
+            PLAIN_ITERATIONS,
         )
         self.count(forces, tangents)
         if counting.running is not None:
             r = self.n_unknowns
-            dense = factors * cholesky_multiply_adds(r, r - 1) + solves * triangular_multiply_adds(r, r - 1)
+            dense = factors * cholesky_multiply_adds(r, r - 1) + solves * triangular_multiply_adds(
+                r, r - 1
+            )
             counting.running.add(
-                factorisations=factors, reduced_factorisations=factors, back_solves=solves, reduced_back_solves=solves, multiply_adds=dense
+                factorisations=factors,
+                reduced_factorisations=factors,
+                back_solves=solves,
+                reduced_back_solves=solves,
+                multiply_adds=dense,
             )
         return Solution(q, min_det, iterations, 0) if converged and min_det > 0 else None

@@ -33,7 +33,9 @@ class Sensitivities:
     outputs: Array
 
 
-def sensitivities(model: FullOrderModel, snapshots: Snapshots, axes: Array, modes: Array, of_force: bool = False) -> Sensitivities:
+def sensitivities(
+    model: FullOrderModel, snapshots: Snapshots, axes: Array, modes: Array, of_force: bool = False
+) -> Sensitivities:
     """Differentiate f(u) = B t at the snapshots: du/dt = K(u)⁻¹ B, one factorisation and 3k back-solves per sample.
 
     B are unit forces along the axes on the patches that the sample loads. Other directions of the force are no less exact, but
@@ -67,7 +69,9 @@ def sensitivities(model: FullOrderModel, snapshots: Snapshots, axes: Array, mode
     """
     loads, scene = snapshots.loads, snapshots.scene
     if not isinstance(loads, PatchLoads):
-        raise InvalidInputError("derivatives with respect to the load need snapshots of forces on patches.")
+        raise InvalidInputError(
+            "derivatives with respect to the load need snapshots of forces on patches."
+        )
     largest = float(np.linalg.norm(loads.vectors, axis=2).max())
     n, k = loads.patches.shape
     inputs, outputs = np.zeros((n, 3 * k, axes.shape[1])), np.zeros((n, 3 * k, modes.shape[1]))
@@ -76,7 +80,9 @@ def sensitivities(model: FullOrderModel, snapshots: Snapshots, axes: Array, mode
 
     def unit_forces(patch: int) -> Array:
         on_nodes = scene.patch_weights[[patch]].toarray()[0]
-        unit: Array = (largest * np.einsum("n,ab->anb", on_nodes, np.eye(3))).reshape(3, -1)[:, scene.free_dofs]
+        unit: Array = (largest * np.einsum("n,ab->anb", on_nodes, np.eye(3))).reshape(3, -1)[
+            :, scene.free_dofs
+        ]
         return unit
 
     for i, patches in enumerate(loads.patches):
@@ -84,7 +90,11 @@ def sensitivities(model: FullOrderModel, snapshots: Snapshots, axes: Array, mode
         for patch, unit in zip(patches, units, strict=True):
             if patch not in known:
                 response = model.rest_factor.solve(unit.T).T
-                known[patch] = (unit @ axes, np.zeros((3, modes.shape[1]))) if of_force else (response @ axes, response @ modes)
+                known[patch] = (
+                    (unit @ axes, np.zeros((3, modes.shape[1])))
+                    if of_force
+                    else (response @ axes, response @ modes)
+                )
         try:
             factor = model.factor(model.linearise(snapshots.free_displacements[i])[1])
             moved = factor.solve(np.concatenate(units).T).T
@@ -94,9 +104,12 @@ def sensitivities(model: FullOrderModel, snapshots: Snapshots, axes: Array, mode
         inputs[i] = np.concatenate([known[patch][0] for patch in patches])
         outputs[i] = moved @ modes - np.concatenate([known[patch][1] for patch in patches])
     if n_failed == n:
-        raise SolverError(f"{scene.name}: at none of the {n} training samples is the tangent positive definite.")
+        raise SolverError(
+            f"{scene.name}: at none of the {n} training samples is the tangent positive definite."
+        )
     if n_failed:
         warnings.warn(
-            f"{scene.name}: the tangent is not positive definite at {n_failed} of {n} training samples, whose derivatives are left out.", stacklevel=3
+            f"{scene.name}: the tangent is not positive definite at {n_failed} of {n} training samples, whose derivatives are left out.",
+            stacklevel=3,
         )
     return Sensitivities(inputs, outputs)

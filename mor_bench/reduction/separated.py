@@ -66,7 +66,10 @@ class Separation:
 
 def _regularised(matrix: Array, ridge: float) -> Array:
     """With the ridge times its mean diagonal entry added; never singular."""
-    return np.asarray(matrix + (ridge + 1e-14) * max(float(np.trace(matrix)) / len(matrix), 1e-300) * np.eye(len(matrix)))
+    return np.asarray(
+        matrix
+        + (ridge + 1e-14) * max(float(np.trace(matrix)) / len(matrix), 1e-300) * np.eye(len(matrix))
+    )
 
 
 def _solve(matrix: Array, rhs: Array, ridge: float) -> Array:
@@ -83,7 +86,16 @@ def _orthonormal(values: Array) -> tuple[Array, Array]:
 
 
 def _product(factors: Family, coefficients: Sequence[Array], without: int = -1) -> Array:
-    return np.asarray(np.prod([f @ c for j, (f, c) in enumerate(zip(factors, coefficients, strict=True)) if j != without], axis=0))
+    return np.asarray(
+        np.prod(
+            [
+                f @ c
+                for j, (f, c) in enumerate(zip(factors, coefficients, strict=True))
+                if j != without
+            ],
+            axis=0,
+        )
+    )
 
 
 def _rank_one(residual: Array, factors: Family, ridge: float) -> tuple[list[Array], Array] | None:
@@ -145,11 +157,22 @@ def separate(targets: Array, families: Sequence[Family], n_terms: int, ridge: fl
     sampled = np.zeros((len(targets), 0))
     vectors, residual, residuals = np.zeros((0, targets.shape[1])), targets, []
     while len(terms) < n_terms and np.linalg.norm(residual) > EXHAUSTED * norm:
-        found = [(number, term) for number, family in enumerate(factors) if (term := _rank_one(residual, family, ridge))]
+        found = [
+            (number, term)
+            for number, family in enumerate(factors)
+            if (term := _rank_one(residual, family, ridge))
+        ]
         if not found:
             break
-        number, (coefficients, z) = max(found, key=lambda item: float(np.linalg.norm(residual.T @ item[1][1])))
-        terms.append(Term(number, tuple(back @ c for (_, back), c in zip(bases[number], coefficients, strict=True))))
+        number, (coefficients, z) = max(
+            found, key=lambda item: float(np.linalg.norm(residual.T @ item[1][1]))
+        )
+        terms.append(
+            Term(
+                number,
+                tuple(back @ c for (_, back), c in zip(bases[number], coefficients, strict=True)),
+            )
+        )
         sampled = np.hstack([sampled, z[:, None]])
         vectors = _solve(sampled.T @ sampled, sampled.T @ targets, ridge)
         residual = targets - sampled @ vectors

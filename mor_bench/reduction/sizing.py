@@ -88,7 +88,9 @@ def validation_folds(snapshots: Snapshots) -> list[tuple[NDArray[np.int64], NDAr
     """
     n = len(snapshots)
     if n < 2:
-        raise InvalidInputError('a knob set to "auto" needs at least two training samples, of which some are held out.')
+        raise InvalidInputError(
+            'a knob set to "auto" needs at least two training samples, of which some are held out.'
+        )
     generator = np.random.default_rng(SEED)
     ids, ranks = np.unique(snapshots.loads.patches, return_inverse=True)
     n_folds = min(N_FOLDS, len(ids))
@@ -101,7 +103,9 @@ def validation_folds(snapshots: Snapshots) -> list[tuple[NDArray[np.int64], NDAr
     out = []
     for fitted, held in parts:
         rows = np.flatnonzero(held)
-        spread = np.unique(np.linspace(0, len(rows) - 1, -(-N_VALIDATION // len(parts))).astype(int))
+        spread = np.unique(
+            np.linspace(0, len(rows) - 1, -(-N_VALIDATION // len(parts))).astype(int)
+        )
         out.append((np.flatnonzero(fitted), rows[spread]))
     return out
 
@@ -134,7 +138,9 @@ class Trials:
             for fitted, held in self._folds:
                 try:
                     with uncounted(), warnings.catch_warnings():
-                        warnings.simplefilter("ignore")  # what concerns the fit to all samples is said there
+                        warnings.simplefilter(
+                            "ignore"
+                        )  # what concerns the fit to all samples is said there
                         candidate.fit(self._scene, self._snapshots[fitted])
                 except MorBenchError as error:
                     self.refusal = error
@@ -153,11 +159,17 @@ def _relative_errors(method: Sizeable, samples: Snapshots) -> list[float]:
             difference = float(np.linalg.norm(method.predict(force)[nodes] - reference))
         except SolverError:
             difference = np.inf
-        errors.append(difference / (float(np.linalg.norm(reference)) or 1.0) if np.isfinite(difference) else np.inf)
+        errors.append(
+            difference / (float(np.linalg.norm(reference)) or 1.0)
+            if np.isfinite(difference)
+            else np.inf
+        )
     return errors
 
 
-def _first_that_meets(trials: Trials, ladder: Sequence[Mapping[str, Any]], need: float, start: int, most_work: float) -> int | None:
+def _first_that_meets(
+    trials: Trials, ladder: Sequence[Mapping[str, Any]], need: float, start: int, most_work: float
+) -> int | None:
     """Number of the least rung that meets the need; None if none does for less work than ``most_work``.
 
     Error is taken to fall and work to rise along a ladder, so that few rungs are tried.
@@ -179,7 +191,9 @@ def _first_that_meets(trials: Trials, ladder: Sequence[Mapping[str, Any]], need:
     return high
 
 
-def size_to_needs(method: Sizeable, scene: Scene, snapshots: Snapshots, rungs: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
+def size_to_needs(
+    method: Sizeable, scene: Scene, snapshots: Snapshots, rungs: Mapping[str, Sequence[Any]]
+) -> dict[str, Any]:
     """The knobs of a method, those set to ``"auto"`` at the least work that meets the scene's need.
 
     Candidates are cross-validated: fitted to the training samples but for a fifth of the load regions, scored on these, and so
@@ -219,7 +233,9 @@ def size_to_needs(method: Sizeable, scene: Scene, snapshots: Snapshots, rungs: M
     InvalidInputError
         If there are too few samples to hold any out, or no candidate can be fitted at all.
     """
-    open_rungs = {name: values for name, values in rungs.items() if method.parameters[name] == "auto"}
+    open_rungs = {
+        name: values for name, values in rungs.items() if method.parameters[name] == "auto"
+    }
     if not open_rungs:
         return method.parameters
     need = scene.spec.needs.error

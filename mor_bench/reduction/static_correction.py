@@ -19,7 +19,12 @@ from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.tensors import TensorProblem
 
 
-def static_correction(rest_factor: Factor, reduced_factor: Factor, modes: NDArray[np.float64], load: NDArray[np.float64]) -> NDArray[np.float64]:
+def static_correction(
+    rest_factor: Factor,
+    reduced_factor: Factor,
+    modes: NDArray[np.float64],
+    load: NDArray[np.float64],
+) -> NDArray[np.float64]:
     """What a reduced model lacks of the linear response, (K₀⁻¹ - Φ (ΦᵀK₀Φ)⁻¹ Φᵀ) f.
 
     Added to any reduced solution whose tangent space at rest is Φ, it makes the answer to a small load exact to first order,
@@ -77,4 +82,6 @@ def refuse_inverted(model: FullOrderModel, u: NDArray[np.float64]) -> None:
     """Raise `InvertedElementError` if cells are inverted at displacements u (n_free,), m."""
     least = model.force(u).min_det_f
     if not least > 0:
-        raise InvertedElementError(f"the reduced answer inverts elements: its least det F is {least:.3g}.")
+        raise InvertedElementError(
+            f"the reduced answer inverts elements: its least det F is {least:.3g}."
+        )

@@ -49,7 +49,11 @@ class Subspace:
         self._modes = np.zeros((scene.mesh.n_dofs, self.n_modes))
         self._modes[scene.free_dofs] = modes
         nodes = scene.output_nodes
-        self._wanted = None if len(nodes) == scene.mesh.n_nodes else (3 * nodes[:, None] + np.arange(3)).ravel()
+        self._wanted = (
+            None
+            if len(nodes) == scene.mesh.n_nodes
+            else (3 * nodes[:, None] + np.arange(3)).ravel()
+        )
         self._expanding = self._modes if self._wanted is None else self._modes[self._wanted]
 
     def project(self, load: Array) -> Array:

@@ -110,10 +110,20 @@ def _strains(gradients: Any, shape_scale: Any, volume_scale: Any, rows: Any) -> 
                 X0, Y0, Z0 = H[0, 0, i], H[0, 1, i], H[0, 2, i]
                 X1, Y1, Z1 = H[1, 0, i], H[1, 1, i], H[1, 2, i]
                 X2, Y2, Z2 = H[2, 0, i], H[2, 1, i], H[2, 2, i]
-                x, y, z = X0 * x0 + X1 * x1 + X2 * x2, Y0 * y0 + Y1 * y1 + Y2 * y2, Z0 * z0 + Z1 * z1 + Z2 * z2
-                out[0, first + i] = a * half * (X0 * y0 + X1 * y1 + X2 * y2 + Y0 * x0 + Y1 * x1 + Y2 * x2)
-                out[1, first + i] = a * half * (X0 * z0 + X1 * z1 + X2 * z2 + Z0 * x0 + Z1 * x1 + Z2 * x2)
-                out[2, first + i] = a * half * (Y0 * z0 + Y1 * z1 + Y2 * z2 + Z0 * y0 + Z1 * y1 + Z2 * y2)
+                x, y, z = (
+                    X0 * x0 + X1 * x1 + X2 * x2,
+                    Y0 * y0 + Y1 * y1 + Y2 * y2,
+                    Z0 * z0 + Z1 * z1 + Z2 * z2,
+                )
+                out[0, first + i] = (
+                    a * half * (X0 * y0 + X1 * y1 + X2 * y2 + Y0 * x0 + Y1 * x1 + Y2 * x2)
+                )
+                out[1, first + i] = (
+                    a * half * (X0 * z0 + X1 * z1 + X2 * z2 + Z0 * x0 + Z1 * x1 + Z2 * x2)
+                )
+                out[2, first + i] = (
+                    a * half * (Y0 * z0 + Y1 * z1 + Y2 * z2 + Z0 * y0 + Z1 * y1 + Z2 * y2)
+                )
                 out[3, first + i] = a * half * (x - y)
                 out[4, first + i] = a * sixth * (x + y - 2.0 * z)
                 out[5, first + i] = b * trace * (x + y + z)
@@ -129,7 +139,9 @@ class _Gradients:
         self.n_modes = modes.shape[1]
         self._local = np.vstack([modes, np.zeros(self.n_modes)])
         self._cell_dofs = model.cell_dofs
-        self._step = max(1, int(CHUNK_BYTES / (chunk_bytes_per_point * self.quadrature.gradients.shape[1])))
+        self._step = max(
+            1, int(CHUNK_BYTES / (chunk_bytes_per_point * self.quadrature.gradients.shape[1]))
+        )
 
     def __iter__(self) -> Iterator[tuple[slice, Array]]:
         """Cells, and Hᵢ at their points (n, 3, 3, r)."""
@@ -137,7 +149,9 @@ class _Gradients:
         for first in range(0, n_cells, self._step):
             part = slice(first, first + self._step)
             local = self._local[self._cell_dofs[part]].reshape(-1, n_nodes, 3, self.n_modes)
-            gradients = np.einsum("cqaj,caim->cqijm", self.quadrature.gradients[part], local, optimize=True)
+            gradients = np.einsum(
+                "cqaj,caim->cqijm", self.quadrature.gradients[part], local, optimize=True
+            )
             yield part, gradients.reshape(-1, 3, 3, self.n_modes)
 
 
@@ -151,7 +165,10 @@ def reduce_energy(model: FullOrderModel, modes: Array) -> ReducedTensors:
         # E:C:E = 2μ |dev E|² + (3λ + 2μ) |vol E|²; both are >= 0 but for the volumetric part alone of a negative Poisson's ratio.
         weights = points.quadrature.weights[part]
         lame_lambda, lame_mu = np.tile(points.quadrature.parameters, (len(weights), 1)).T
-        shape, volume = 2 * lame_mu * weights.ravel(), (3 * lame_lambda + 2 * lame_mu) * weights.ravel()
+        shape, volume = (
+            2 * lame_mu * weights.ravel(),
+            (3 * lame_lambda + 2 * lame_mu) * weights.ravel(),
+        )
         rows = np.empty((len(gradients), 6, width))
         _strains(gradients, np.sqrt(shape), np.sqrt(np.abs(volume)), rows)
         flat = rows.reshape(-1, width)
@@ -175,7 +192,9 @@ def sentinels_of(model: FullOrderModel, modes: Array, samples: Array) -> Array:
     least, watched = np.full(len(samples), np.inf), np.zeros((len(samples), 9, modes.shape[1]))
     for _, gradients in _Gradients(model, modes, 8 * 9 * (modes.shape[1] + len(samples))):
         H = gradients.reshape(-1, 9, modes.shape[1])
-        F = (H.reshape(-1, H.shape[2]) @ samples.T).reshape(-1, 9, len(samples)) + np.eye(3).reshape(1, 9, 1)
+        F = (H.reshape(-1, H.shape[2]) @ samples.T).reshape(-1, 9, len(samples)) + np.eye(
+            3
+        ).reshape(1, 9, 1)
         det = np.linalg.det(np.moveaxis(F, 1, 2).reshape(-1, 3, 3)).reshape(-1, len(samples))
         lowest = det.argmin(axis=0)
         lower = np.flatnonzero(det.min(axis=0) < least)
@@ -195,11 +214,20 @@ def _symmetric(gram: Array, r: int) -> ReducedTensors:
     number[i, j] = number[j, i] = np.arange(len(i))
     mixed, quartic = gram[:r, r:], gram[r:, r:]
     k = np.arange(r)
-    cubic = mixed[k, np.arange(len(i))[:, None]] + mixed[i[:, None], number[j[:, None], k]] + mixed[j[:, None], number[i[:, None], k]]
+    cubic = (
+        mixed[k, np.arange(len(i))[:, None]]
+        + mixed[i[:, None], number[j[:, None], k]]
+        + mixed[j[:, None], number[i[:, None], k]]
+    )
     symmetric = quartic.copy()
     for row in range(len(i)):
-        symmetric[row] += quartic[number[i[row], i], number[j[row], j]] + quartic[number[i[row], j], number[j[row], i]]
-    return ReducedTensors(0.5 * (gram[:r, :r] + gram[:r, :r].T), cubic, 0.5 * (symmetric + symmetric.T))
+        symmetric[row] += (
+            quartic[number[i[row], i], number[j[row], j]]
+            + quartic[number[i[row], j], number[j[row], i]]
+        )
+    return ReducedTensors(
+        0.5 * (gram[:r, :r] + gram[:r, :r].T), cubic, 0.5 * (symmetric + symmetric.T)
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
@@ -211,7 +239,9 @@ def _dot(a, b, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _evaluate(quadratic: Any, cubic: Any, quartic: Any, q: Any, products: Any, force: Any, hessian: Any) -> float:
+def _evaluate(
+    quadratic: Any, cubic: Any, quartic: Any, q: Any, products: Any, force: Any, hessian: Any
+) -> float:
     """Force and lower Hessian at q, both from one sweep over the tensors; returns the energy."""
     r, p = len(q), 0
     for j in range(r):
@@ -266,13 +296,20 @@ def _back_solve(a, r, x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
-def _equilibrium(quadratic: Any, cubic: Any, quartic: Any, rest: Any, load: Any, tolerance: float, q: Any) -> int:
+def _equilibrium(
+    quadratic: Any, cubic: Any, quartic: Any, rest: Any, load: Any, tolerance: float, q: Any
+) -> int:
     """Full Newton steps from the linear response, by the rest-state factor; the Hessian at the answer is positive definite.
 
     Returns the number of Hessians, negative where there is no answer.
     """
     r = len(load)
-    products, force, step, hessian = np.empty(r * (r + 1) // 2), np.empty(r), np.empty(r), np.empty((r, r))
+    products, force, step, hessian = (
+        np.empty(r * (r + 1) // 2),
+        np.empty(r),
+        np.empty(r),
+        np.empty((r, r)),
+    )
     q[:] = load
     _back_solve(rest, r, q)
     size = np.sqrt(_dot(load, load, r))
@@ -342,7 +379,9 @@ class TensorProblem(DenseProblem):
         If an array has another shape than the others ask for, NaN or infinity: the kernels behind check no bounds.
     """
 
-    def __init__(self, tensors: ReducedTensors, sentinels: Array, usual: Array, extent: float) -> None:
+    def __init__(
+        self, tensors: ReducedTensors, sentinels: Array, usual: Array, extent: float
+    ) -> None:
         r = tensors.n_modes
         shapes = {
             "quadratic": (r, r),
@@ -353,23 +392,35 @@ class TensorProblem(DenseProblem):
         }
         arrays = {**vars(tensors), "sentinels": sentinels, "usual": usual}
         for name, shape in shapes.items():
-            if arrays[name].dtype != np.float64 or arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
-                raise InvalidInputError(f"`{name}` must be finite float64 of shape {shape}; got {arrays[name].dtype} of shape {arrays[name].shape}.")
-        self._arrays = tuple(np.ascontiguousarray(arrays[name]) for name in ("quadratic", "cubic", "quartic"))
+            if (
+                arrays[name].dtype != np.float64
+                or arrays[name].shape != shape
+                or not np.isfinite(arrays[name]).all()
+            ):
+                raise InvalidInputError(
+                    f"`{name}` must be finite float64 of shape {shape}; got {arrays[name].dtype} of shape {arrays[name].shape}."
+                )
+        self._arrays = tuple(
+            np.ascontiguousarray(arrays[name]) for name in ("quadratic", "cubic", "quartic")
+        )
         self.tensors, self.sentinels, self.usual = tensors, np.ascontiguousarray(sentinels), usual
         self.n_unknowns = r
         self.extent = extent
         try:
             self._rest = np.ascontiguousarray(cholesky(tensors.quadratic, lower=True))
         except LinAlgError:
-            raise InvalidInputError("`quadratic`, the reduced stiffness at rest, must be positive definite.") from None
+            raise InvalidInputError(
+                "`quadratic`, the reduced stiffness at rest, must be positive definite."
+            ) from None
 
     @classmethod
     def of_modes(cls, model: FullOrderModel, modes: Array, samples: Array) -> TensorProblem:
         """Of modes (n_free, r) of a mesh; det F is watched where states with coordinates ``samples`` (n, r) have their smallest."""
         sentinels = np.ascontiguousarray(sentinels_of(model, modes, samples))
         usual = min((float(_min_det_f(sentinels, q)) for q in samples), default=1.0)
-        return cls(reduce_energy(model, modes), sentinels, np.array([usual]), extent_of(model.scene))
+        return cls(
+            reduce_energy(model, modes), sentinels, np.array([usual]), extent_of(model.scene)
+        )
 
     @property
     def arrays(self) -> dict[str, Array]:
@@ -385,7 +436,11 @@ class TensorProblem(DenseProblem):
     def solve(self, load: Array, tolerance: float) -> Array:
         """Reduced coordinates (r,) at the equilibrium under a load Φᵀf; raises `SolverError` where there is none."""
         q = self.quick(load, tolerance)
-        return solve_equilibrium(self, load, options=NewtonOptions(tolerance)).displacement if q is None else q
+        return (
+            solve_equilibrium(self, load, options=NewtonOptions(tolerance)).displacement
+            if q is None
+            else q
+        )
 
     def unlike(self, q: Array) -> bool:
         """Whether cells are squeezed more than in typical states, where the watched points may not be the worst."""
@@ -398,8 +453,14 @@ class TensorProblem(DenseProblem):
         iterations: int = _equilibrium(quadratic, cubic, quartic, self._rest, load, tolerance, q)
         if counting.running is not None:
             r, times = self.n_unknowns, abs(iterations)
-            work = self._evaluation + cholesky_multiply_adds(r, r - 1) + triangular_multiply_adds(r, r - 1)
-            counting.running.add(factorisations=times, reduced_factorisations=times, multiply_adds=times * work)
+            work = (
+                self._evaluation
+                + cholesky_multiply_adds(r, r - 1)
+                + triangular_multiply_adds(r, r - 1)
+            )
+            counting.running.add(
+                factorisations=times, reduced_factorisations=times, multiply_adds=times * work
+            )
             counting.running.add(back_solves=times, reduced_back_solves=times)
         return q if iterations > 0 and self.min_det_f(q) > 0 else None
 

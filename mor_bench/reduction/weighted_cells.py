@@ -11,7 +11,9 @@ from mor_bench.scene.scene import Scene
 from mor_bench.specs import NO_EQUATIONS
 
 
-def weighted_cells(scene: Scene, cells: NDArray[np.int64], weights: NDArray[np.float64]) -> tuple[Assembler, NDArray[np.int64]]:
+def weighted_cells(
+    scene: Scene, cells: NDArray[np.int64], weights: NDArray[np.float64]
+) -> tuple[Assembler, NDArray[np.int64]]:
     """An assembler over these cells only, and which free dofs it sees.
 
     Parameters
@@ -30,8 +32,14 @@ def weighted_cells(scene: Scene, cells: NDArray[np.int64], weights: NDArray[np.f
     if scene.material is None:
         raise UnsupportedSceneError(NO_EQUATIONS)
     n_cells = scene.mesh.n_cells
-    if cells.dtype.kind != "i" or cells.shape != weights.shape or not ((cells >= 0) & (cells < n_cells)).all():
-        raise InvalidInputError(f"`cells` must be integers in [0, {n_cells - 1}], as many as there are weights.")
+    if (
+        cells.dtype.kind != "i"
+        or cells.shape != weights.shape
+        or not ((cells >= 0) & (cells < n_cells)).all()
+    ):
+        raise InvalidInputError(
+            f"`cells` must be integers in [0, {n_cells - 1}], as many as there are weights."
+        )
     if len(np.unique(cells)) != len(cells):
         raise InvalidInputError("`cells` must be different integers.")
     if not (np.isfinite(weights).all() and (weights > 0).all()):
@@ -42,4 +50,12 @@ def weighted_cells(scene: Scene, cells: NDArray[np.int64], weights: NDArray[np.f
     rows = np.flatnonzero(touched.reshape(-1)[scene.free_dofs])
     dof_of_node = np.full(scene.mesh.n_dofs, len(rows), dtype=np.int64)
     dof_of_node[scene.free_dofs[rows]] = np.arange(len(rows))
-    return Assembler(scene.mesh.points, nodes, dof_of_node.reshape(-1, 3), len(rows), scene.material, weights, scene.selective), rows
+    return Assembler(
+        scene.mesh.points,
+        nodes,
+        dof_of_node.reshape(-1, 3),
+        len(rows),
+        scene.material,
+        weights,
+        scene.selective,
+    ), rows

@@ -10,7 +10,11 @@ if TYPE_CHECKING:
 
 __all__ = ["print_tables", "render", "write_report"]
 
-_HOMES = {"print_tables": "mor_bench.report.tables", "render": "mor_bench.report.html", "write_report": "mor_bench.report.html"}
+_HOMES = {
+    "print_tables": "mor_bench.report.tables",
+    "render": "mor_bench.report.html",
+    "write_report": "mor_bench.report.html",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -66,7 +66,10 @@ class Style:
 def styles_of(comparison: Comparison) -> dict[str, Style]:
     """A colour and a marker for each method, in the order in which they ran."""
     methods = dict.fromkeys(row["method"] for row in comparison.rows)
-    return {method: Style(COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]) for i, method in enumerate(methods)}
+    return {
+        method: Style(COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)])
+        for i, method in enumerate(methods)
+    }
 
 
 def new_figure(height_in: float) -> Figure:
@@ -108,7 +111,18 @@ def shortened(text: str, length: int) -> str:
     return text if len(text) <= length else text[: length - 1] + "…"
 
 
-_OFFSETS = ((7, 5), (7, -5), (-7, 5), (-7, -5), (0, 9), (0, -9), (11, 0), (-11, 0), (0, 14), (0, -14))
+_OFFSETS = (
+    (7, 5),
+    (7, -5),
+    (-7, 5),
+    (-7, -5),
+    (0, 9),
+    (0, -9),
+    (11, 0),
+    (-11, 0),
+    (0, 14),
+    (0, -14),
+)
 """Places around a point, in points, the best first."""
 
 
@@ -122,7 +136,13 @@ class Note:
     colour: str = INK
 
 
-def annotate(axes: Axes, notes: Sequence[Note], lines: Sequence[NDArray[np.float64]], keep_free: Sequence[Artist] = (), radius: float = 5.0) -> None:
+def annotate(
+    axes: Axes,
+    notes: Sequence[Note],
+    lines: Sequence[NDArray[np.float64]],
+    keep_free: Sequence[Artist] = (),
+    radius: float = 5.0,
+) -> None:
     """Write notes where nothing else stands; one for which there is no room is left out.
 
     Parameters
@@ -138,26 +158,43 @@ def annotate(axes: Axes, notes: Sequence[Note], lines: Sequence[NDArray[np.float
     radius : float
         Of the markers, in typographic points.
     """
-    canvas: Any = FigureCanvasAgg(axes.get_figure(root=True))  # matplotlib's annotations lack this class's methods
+    canvas: Any = FigureCanvasAgg(
+        axes.get_figure(root=True)
+    )  # matplotlib's annotations lack this class's methods
     canvas.draw()
     renderer = canvas.get_renderer()
     half, further = radius * DPI / 72.0, radius - 5.0
     points = axes.transData.transform(np.array([(note.x, note.y) for note in notes]).reshape(-1, 2))
     markers = [Bbox.from_bounds(x - half, y - half, 2 * half, 2 * half) for x, y in points]
     taken = [artist.get_window_extent(renderer) for artist in keep_free]
-    on_lines = np.concatenate([np.zeros((0, 2)), *(_dense(axes.transData.transform(line)) for line in lines)])
+    on_lines = np.concatenate(
+        [np.zeros((0, 2)), *(_dense(axes.transData.transform(line)) for line in lines)]
+    )
     frame = axes.get_window_extent(renderer)
     for note in notes:
         best: tuple[float, Annotation, Bbox] | None = None
         for rank, (dx, dy) in enumerate(_OFFSETS):
             away = (dx + further * np.sign(dx), dy + further * np.sign(dy))
-            text = axes.annotate(plain(note.text), (note.x, note.y), xytext=away, textcoords="offset points", **_look(note, dx, dy))
+            text = axes.annotate(
+                plain(note.text),
+                (note.x, note.y),
+                xytext=away,
+                textcoords="offset points",
+                **_look(note, dx, dy),
+            )
             text.set_in_layout(False)
             text.set_path_effects([withStroke(linewidth=2, foreground="white")])
             box = text.get_window_extent(renderer).padded(1.5)
-            inside = frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
+            inside = (
+                frame.x0 <= box.x0
+                and box.x1 <= frame.x1
+                and frame.y0 <= box.y0
+                and box.y1 <= frame.y1
+            )
             free = inside and not any(box.overlaps(other) for other in [*taken, *markers])
-            cost = 2.0 * rank + float(((on_lines >= box.min) & (on_lines <= box.max)).all(axis=1).sum())
+            cost = 2.0 * rank + float(
+                ((on_lines >= box.min) & (on_lines <= box.max)).all(axis=1).sum()
+            )
             if free and (best is None or cost < best[0]):
                 if best is not None:
                     best[1].remove()

@@ -10,7 +10,17 @@ import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from mor_bench.harness.results import Comparison
-from mor_bench.report.canvas import COLOURS, INK, Drawn, Style, dress, new_figure, plain, save, shortened
+from mor_bench.report.canvas import (
+    COLOURS,
+    INK,
+    Drawn,
+    Style,
+    dress,
+    new_figure,
+    plain,
+    save,
+    shortened,
+)
 from mor_bench.report.details import profile_note
 
 ALL = "all datasets"
@@ -28,7 +38,9 @@ def learning_curves(comparison: Comparison, dataset: str, styles: dict[str, Styl
         if error is None or not isfinite(error) or error <= 0:
             left_out += 1
             continue
-        lines.setdefault((record["method"], record["label"]), []).append((record["n_train"], 100 * error))
+        lines.setdefault((record["method"], record["label"]), []).append(
+            (record["n_train"], 100 * error)
+        )
     if not any(len(points) > 1 for points in lines.values()):
         return None
     figure = new_figure(4.8)
@@ -38,13 +50,21 @@ def learning_curves(comparison: Comparison, dataset: str, styles: dict[str, Styl
         style = styles.get(method, Style(INK, "o"))
         xy = np.array(sorted(points), dtype=float)
         axes.loglog(
-            *xy.T, color=style.colour, marker=style.marker, markeredgecolor="white", markersize=7, linewidth=1.3, label=plain(shortened(label, 40))
+            *xy.T,
+            color=style.colour,
+            marker=style.marker,
+            markeredgecolor="white",
+            markersize=7,
+            linewidth=1.3,
+            label=plain(shortened(label, 40)),
         )
     sizes = sorted({n for points in lines.values() for n, _ in points})
     axes.set_xticks(sizes, [f"{n:,}" for n in sizes])
     axes.xaxis.set_minor_formatter(NullFormatter())
     values = [error for points in lines.values() for _, error in points]
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if max(values) / min(values) < 300 else (1.0,)))
+    axes.yaxis.set_major_locator(
+        LogLocator(subs=(1.0, 2.0, 5.0) if max(values) / min(values) < 300 else (1.0,))
+    )
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("training samples")
@@ -91,7 +111,15 @@ def loss_curves(comparison: Comparison, dataset: str, styles: dict[str, Style]) 
                 x = 100 * np.arange(1, len(losses) + 1) / max(len(losses), 1)
                 alone = "o" if shown.sum() == 1 else ""
                 named = plain(shortened(label, 50)) if line == "-" else None
-                axes.plot(x[shown], losses[shown], line, marker=alone, color=colour, linewidth=1.3, label=named)
+                axes.plot(
+                    x[shown],
+                    losses[shown],
+                    line,
+                    marker=alone,
+                    color=colour,
+                    linewidth=1.3,
+                    label=named,
+                )
                 validated |= name == "validation_curve" and bool(shown.any())
         axes.set_yscale("log")
         axes.set_xlabel("part of the training (%)")
@@ -101,13 +129,24 @@ def loss_curves(comparison: Comparison, dataset: str, styles: dict[str, Style]) 
     figure.suptitle(plain(f"Loss curves – {dataset}"), x=0.01, ha="left", fontsize=13, color=INK)
     path = save(figure, comparison, dataset, "loss-curves")
     caption = "Training loss from the beginning to where the training ended, in the method's own units, which no other method shares."
-    return Drawn(dataset, path, "Loss curves", caption + (" Dashed: of the samples that were held out of the training." if validated else ""))
+    return Drawn(
+        dataset,
+        path,
+        "Loss curves",
+        caption
+        + (" Dashed: of the samples that were held out of the training." if validated else ""),
+    )
 
 
-def performance_profile(comparison: Comparison, analysis: Mapping[str, Any], styles: dict[str, Style]) -> Drawn | None:
+def performance_profile(
+    comparison: Comparison, analysis: Mapping[str, Any], styles: dict[str, Style]
+) -> Drawn | None:
     """Share of problems solved within a factor of the fastest method, a staircase per method; None with less than two methods."""
     found = analysis["profile"]
-    solving = {method: sorted(f for f in factors if f is not None) for method, factors in found["factors"].items()}
+    solving = {
+        method: sorted(f for f in factors if f is not None)
+        for method, factors in found["factors"].items()
+    }
     solving = {method: factors for method, factors in solving.items() if factors}
     n = len(found["problems"])
     if len(solving) < 2:
@@ -119,9 +158,21 @@ def performance_profile(comparison: Comparison, analysis: Mapping[str, Any], sty
     for i, (method, factors) in enumerate(solving.items()):
         style = styles[method]
         # Staircases that run together are told apart by a shift of a thousandth or two.
-        x, y = np.array([1.0, *factors, end]), np.array([0, *range(1, len(factors) + 1), len(factors)]) / n + 0.0015 * (i - len(solving) / 2)
+        x, y = (
+            np.array([1.0, *factors, end]),
+            np.array([0, *range(1, len(factors) + 1), len(factors)]) / n
+            + 0.0015 * (i - len(solving) / 2),
+        )
         axes.step(x, 100 * y, where="post", color=style.colour, linewidth=1.6)
-        axes.plot(x[1:-1], 100 * y[1:-1], style.marker, color=style.colour, markeredgecolor="white", markersize=7, label=plain(method))
+        axes.plot(
+            x[1:-1],
+            100 * y[1:-1],
+            style.marker,
+            color=style.colour,
+            markeredgecolor="white",
+            markersize=7,
+            label=plain(method),
+        )
     axes.set_xscale("log")
     axes.set_xlim(0.95, end)
     axes.set_ylim(-4, 104)
@@ -130,7 +181,16 @@ def performance_profile(comparison: Comparison, analysis: Mapping[str, Any], sty
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("at most this factor slower than the fastest method")
     axes.set_ylabel("problems solved (%)")
-    over = f"{found['n_datasets']} datasets" if found["n_datasets"] > 1 else "the errors of one dataset"
+    over = (
+        f"{found['n_datasets']} datasets"
+        if found["n_datasets"] > 1
+        else "the errors of one dataset"
+    )
     axes.set_title(plain(f"Performance profile over {over}"), loc="left", fontsize=13, color=INK)
     figure.legend(loc="outside right upper", fontsize=9, frameon=False)
-    return Drawn(ALL, save(figure, comparison, ALL, "performance-profile"), "Performance profile", profile_note(found))
+    return Drawn(
+        ALL,
+        save(figure, comparison, ALL, "performance-profile"),
+        "Performance profile",
+        profile_note(found),
+    )

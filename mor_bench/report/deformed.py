@@ -14,8 +14,25 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from mor_bench.harness.results import Comparison
-from mor_bench.report.canvas import GREY, INK, WIDTH_IN, Drawn, Style, new_figure, plain, save, shortened
-from mor_bench.report.summary import Entry, best_per_method, entries_of, metres, percent, short_swept
+from mor_bench.report.canvas import (
+    GREY,
+    INK,
+    WIDTH_IN,
+    Drawn,
+    Style,
+    new_figure,
+    plain,
+    save,
+    shortened,
+)
+from mor_bench.report.summary import (
+    Entry,
+    best_per_method,
+    entries_of,
+    metres,
+    percent,
+    short_swept,
+)
 from mor_bench.scene.mesh import Mesh
 
 REFERENCE, PREDICTION, FORCE = "#7fb2d6", "#D55E00", "#222222"
@@ -54,7 +71,11 @@ def worst_samples(comparison: Comparison, dataset: str, styles: dict[str, Style]
         mesh = Mesh(np.asarray(arrays["points"]), np.asarray(arrays["cells"]))
     except (OSError, KeyError):
         return None
-    samples = [sample for entry in best_per_method(entries_of(comparison, dataset)) if (sample := _read(comparison, entry)) is not None]
+    samples = [
+        sample
+        for entry in best_per_method(entries_of(comparison, dataset))
+        if (sample := _read(comparison, entry)) is not None
+    ]
     if not samples:
         return None
     columns = min(3 if len(samples) > 4 else 2, len(samples))
@@ -75,7 +96,13 @@ def worst_samples(comparison: Comparison, dataset: str, styles: dict[str, Style]
         Line2D([], [], color=FORCE, linewidth=1.5, marker=">", label="total force"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    figure.suptitle(plain(f"Worst test sample of each method – {dataset}"), x=0.01, ha="left", fontsize=13, color=INK)
+    figure.suptitle(
+        plain(f"Worst test sample of each method – {dataset}"),
+        x=0.01,
+        ha="left",
+        fontsize=13,
+        color=INK,
+    )
     path = save(figure, comparison, dataset, "worst-samples")
     caption = (
         "The test sample with the largest e of each method, in the configuration with the smallest ē: the average hides it. "
@@ -90,9 +117,21 @@ def _read(comparison: Comparison, entry: Entry) -> WorstSample | None:
     try:
         arrays = comparison.samples(entry.row)
         e = np.asarray(arrays["mean_dof_m"])
-        worst = int(np.argmax(np.where(np.isfinite(e), e, -1.0)))  # a sample without a prediction has nothing to draw
-        prediction, reference, forces = (np.asarray(arrays[f"worst_{name}"], dtype=float) for name in ("prediction", "reference", "forces"))
-        return WorstSample(entry, prediction, reference, forces, float(e[worst]), float(arrays["relative_l2"][worst]))
+        worst = int(
+            np.argmax(np.where(np.isfinite(e), e, -1.0))
+        )  # a sample without a prediction has nothing to draw
+        prediction, reference, forces = (
+            np.asarray(arrays[f"worst_{name}"], dtype=float)
+            for name in ("prediction", "reference", "forces")
+        )
+        return WorstSample(
+            entry,
+            prediction,
+            reference,
+            forces,
+            float(e[worst]),
+            float(arrays["relative_l2"][worst]),
+        )
     except (OSError, KeyError, ValueError):
         return None
 
@@ -105,14 +144,18 @@ def _project(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     return points @ np.stack([right, np.cross(towards, right)]).T, points @ towards
 
 
-def _limits(mesh: Mesh, samples: list[WorstSample], arrows: list[NDArray[np.float64] | None]) -> NDArray[np.float64]:
+def _limits(
+    mesh: Mesh, samples: list[WorstSample], arrows: list[NDArray[np.float64] | None]
+) -> NDArray[np.float64]:
     """(2, 2) screen box that holds all shapes and arrows; of wild predictions only what lies within half a diagonal of the body."""
     span = _diagonal(mesh)
     shapes = [mesh.points, *(arrow for arrow in arrows if arrow is not None)]
     for sample in samples:
         shapes.append(mesh.points + sample.reference)
         predicted = np.isfinite(sample.prediction).all(axis=1)
-        shapes.append((mesh.points + np.clip(sample.prediction, -0.5 * span, 0.5 * span))[predicted])
+        shapes.append(
+            (mesh.points + np.clip(sample.prediction, -0.5 * span, 0.5 * span))[predicted]
+        )
     screen = np.concatenate([_project(shape)[0] for shape in shapes])
     margin = 0.06 * float(np.ptp(screen[:, 0]))
     return np.array([screen.min(axis=0) - margin, screen.max(axis=0) + margin])
@@ -130,18 +173,28 @@ def _arrow(mesh: Mesh, sample: WorstSample) -> NDArray[np.float64] | None:
     points = mesh.points + sample.reference
     place = size @ points / size.sum()
     arrow = 0.16 * _diagonal(mesh) * total / np.linalg.norm(total)
-    loaded = mesh.boundary_facets[np.isin(mesh.boundary_facets, np.flatnonzero(size > 0)).any(axis=1)]
+    loaded = mesh.boundary_facets[
+        np.isin(mesh.boundary_facets, np.flatnonzero(size > 0)).any(axis=1)
+    ]
     pushes = _normals(points, loaded).sum(axis=0) @ total < 0
     return np.stack([place - arrow, place] if pushes else [place, place + arrow])
 
 
-def _panel(axes: Axes, mesh: Mesh, sample: WorstSample, arrow: NDArray[np.float64] | None, limits: NDArray[np.float64]) -> None:
+def _panel(
+    axes: Axes,
+    mesh: Mesh,
+    sample: WorstSample,
+    arrow: NDArray[np.float64] | None,
+    limits: NDArray[np.float64],
+) -> None:
     axes.set_aspect("equal")
     axes.set_xlim(limits[0, 0], limits[1, 0])
     axes.set_ylim(limits[0, 1], limits[1, 1])
     facets = mesh.boundary_facets
     rest, _ = _project(mesh.points)
-    axes.add_collection(LineCollection(list(rest[_edges(facets)]), colors="#c4c4c4", linewidths=0.5, zorder=1))
+    axes.add_collection(
+        LineCollection(list(rest[_edges(facets)]), colors="#c4c4c4", linewidths=0.5, zorder=1)
+    )
     reference = mesh.points + sample.reference
     _draw_surface(axes, reference, facets)
     predicted = np.asarray(np.isfinite(sample.prediction).all(axis=1))
@@ -149,7 +202,9 @@ def _panel(axes: Axes, mesh: Mesh, sample: WorstSample, arrow: NDArray[np.float6
         screen, _ = _project(mesh.points + sample.prediction)
         whole = facets[predicted[facets].all(axis=1)]
         front = whole[_facing(mesh.points + sample.prediction, whole)]
-        axes.add_collection(LineCollection(list(screen[_edges(front)]), colors=PREDICTION, linewidths=0.9, zorder=4))
+        axes.add_collection(
+            LineCollection(list(screen[_edges(front)]), colors=PREDICTION, linewidths=0.9, zorder=4)
+        )
         figures = f"e = {metres(sample.error_m)} m, relative L2 = {percent(sample.relative_l2)} %"
         if sample.entry.n_failed:
             figures += f"; {sample.entry.n_failed} failed"
@@ -189,14 +244,37 @@ def _draw_surface(axes: Axes, points: NDArray[np.float64], facets: NDArray[np.in
     base = np.array([int(REFERENCE[i : i + 2], 16) / 255 for i in (1, 3, 5)])
     shade = 1.0 - 0.75 * (0.35 + 0.3 * np.clip(up, -1, 1))[:, None]
     colours = 1.0 - (1.0 - base) * np.clip(shade, 0.3, 1.0)
-    axes.add_collection(PolyCollection(list(screen[seen[order]]), facecolors=colours[order], edgecolors="#33607f", linewidths=0.4, zorder=3))
+    axes.add_collection(
+        PolyCollection(
+            list(screen[seen[order]]),
+            facecolors=colours[order],
+            edgecolors="#33607f",
+            linewidths=0.4,
+            zorder=3,
+        )
+    )
 
 
-def _draw_force(axes: Axes, start: NDArray[np.float64], end: NDArray[np.float64], newton: float) -> None:
+def _draw_force(
+    axes: Axes, start: NDArray[np.float64], end: NDArray[np.float64], newton: float
+) -> None:
     shape = {"arrowstyle": "-|>", "color": FORCE, "linewidth": 1.6, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops=shape, zorder=6)
     frame = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
     beside, other = (end, start) if end[1] > start[1] else (start, end)
     right = beside[0] >= other[0]
-    place: dict[str, Any] = {"xytext": (4 if right else -4, 4), "textcoords": "offset points", "ha": "left" if right else "right", "va": "center"}
-    axes.annotate(f"{newton:.2g} N", (beside[0], beside[1]), **place, fontsize=8.5, color=FORCE, bbox=frame, zorder=6)
+    place: dict[str, Any] = {
+        "xytext": (4 if right else -4, 4),
+        "textcoords": "offset points",
+        "ha": "left" if right else "right",
+        "va": "center",
+    }
+    axes.annotate(
+        f"{newton:.2g} N",
+        (beside[0], beside[1]),
+        **place,
+        fontsize=8.5,
+        color=FORCE,
+        bbox=frame,
+        zorder=6,
+    )

@@ -9,7 +9,16 @@ from mor_bench.harness.analysis import share_within
 from mor_bench.harness.frontier import TARGET_ERRORS
 from mor_bench.harness.results import Comparison
 from mor_bench.report.paper import Grid, error_measures, same_error, same_time
-from mor_bench.report.summary import Entry, entries_of, metres, needs_of, number, percent, size_of, span
+from mor_bench.report.summary import (
+    Entry,
+    entries_of,
+    metres,
+    needs_of,
+    number,
+    percent,
+    size_of,
+    span,
+)
 from mor_bench.report.tables import PAIRWISE_LEGEND, pairwise_cells
 from mor_bench.report.trained import out_of_range, seeds, training
 
@@ -20,7 +29,9 @@ Cell = Callable[[Entry], str]
 DASH = "–"
 
 
-def dataset_details(comparison: Comparison, dataset: str, analysis: Mapping[str, Any]) -> list[Grid]:
+def dataset_details(
+    comparison: Comparison, dataset: str, analysis: Mapping[str, Any]
+) -> list[Grid]:
     """The further tables of a dataset, in reading order."""
     entries = entries_of(comparison, dataset, analysis)
     grids = [
@@ -44,17 +55,30 @@ def dataset_details(comparison: Comparison, dataset: str, analysis: Mapping[str,
 
 def overall(analysis: Mapping[str, Any]) -> list[Grid]:
     """The tables over all datasets."""
-    return [grid for grid in (profile(analysis), regimes(analysis)) if grid is not None and grid.rows]
+    return [
+        grid for grid in (profile(analysis), regimes(analysis)) if grid is not None and grid.rows
+    ]
 
 
-def _grid(title: str, note: str, entries: Sequence[Entry], columns: Mapping[str, Cell]) -> Grid | None:
+def _grid(
+    title: str, note: str, entries: Sequence[Entry], columns: Mapping[str, Cell]
+) -> Grid | None:
     """A row per configuration that ran; columns, and then rows, without a single figure are left out."""
-    shown = {heading: [cell(entry) for entry in entries if entry.ran] for heading, cell in columns.items()}
-    shown = {heading: cells for heading, cells in shown.items() if any(cell != DASH for cell in cells)}
+    shown = {
+        heading: [cell(entry) for entry in entries if entry.ran]
+        for heading, cell in columns.items()
+    }
+    shown = {
+        heading: cells for heading, cells in shown.items() if any(cell != DASH for cell in cells)
+    }
     if not shown:
         return None
     labels = [entry.label for entry in entries if entry.ran]
-    rows = [[label, *cells] for label, *cells in zip(labels, *shown.values(), strict=True) if any(cell != DASH for cell in cells)]
+    rows = [
+        [label, *cells]
+        for label, *cells in zip(labels, *shown.values(), strict=True)
+        if any(cell != DASH for cell in cells)
+    ]
     return Grid(title, note, ["configuration", *shown], rows)
 
 
@@ -89,7 +113,10 @@ def timing(entries: Sequence[Entry]) -> Grid | None:
         "queries": _figure("latency_ms", "n_queries", _whole),
         "collector (ms)": _figure("latency_ms", "gc"),
         "all threads (ms)": _figure("all_threads_ms", "median"),
-        **{f"queries/s by {size}": _figure("throughput", size, _whole) for size in ("8", "64", "512")},
+        **{
+            f"queries/s by {size}": _figure("throughput", size, _whole)
+            for size in ("8", "64", "512")
+        },
         "stable": _stable,
     }
     note = (
@@ -115,7 +142,10 @@ def resources(entries: Sequence[Entry]) -> Grid | None:
         return None
     columns["model"] = lambda e: size_of(e.row.get("model_bytes"))
     return _grid(
-        "Memory and cost", "Memory: most of it resident at a time. Counts: means per query; they do not depend on the machine.", entries, columns
+        "Memory and cost",
+        "Memory: most of it resident at a time. Counts: means per query; they do not depend on the machine.",
+        entries,
+        columns,
     )
 
 
@@ -142,14 +172,22 @@ def test_sets(entries: Sequence[Entry]) -> Grid | None:
     rows = []
     for entry in entries:
         if records := entry.row.get("sets"):
-            rows.append([entry.label, *(_set_cell(records[name]) if name in records else DASH for name in names)])
+            rows.append(
+                [
+                    entry.label,
+                    *(_set_cell(records[name]) if name in records else DASH for name in names),
+                ]
+            )
     note = "Relative L2 on each set: median, below it 95th percentile and maximum. Flagged: the method itself said that the load is out of its range."
     return Grid("Named test sets", note, ["configuration", *names], rows) if rows else None
 
 
 def _set_cell(record: Mapping[str, Any]) -> str:
     n, flagged, failed = record.get("n") or 0, record.get("n_flagged"), record.get("n_failed")
-    lines = [f"{percent(record.get('rel_l2_median'))} %", f"p95 {percent(record.get('rel_l2_p95'))}, max {percent(record.get('rel_l2_max'))}"]
+    lines = [
+        f"{percent(record.get('rel_l2_median'))} %",
+        f"p95 {percent(record.get('rel_l2_p95'))}, max {percent(record.get('rel_l2_max'))}",
+    ]
     if flagged is not None and n:
         lines.append(f"flagged {percent(flagged / n)} % of {n}")
     if failed:
@@ -163,16 +201,40 @@ def _count(value: object) -> str:
 
 def hidden(dataset: str, entries: Sequence[Entry], analysis: Mapping[str, Any]) -> Grid | None:
     """Errors on the hidden test set beside those on the shipped one."""
-    records = {record["label"]: record for record in analysis["hidden"] if record["dataset"] == dataset}
+    records = {
+        record["label"]: record for record in analysis["hidden"] if record["dataset"] == dataset
+    }
     rows = []
     for entry in entries:
         if entry.label in records and entry.row.get("hidden"):
             record, found = records[entry.label], entry.row["hidden"]
             ratio = "inf" if record["ratio"] is None else number(record["ratio"])
-            figures = [percent(found.get(key)) for key in ("rel_l2_median", "rel_l2_p95", "rel_l2_max")]
-            verdict = f"worse (more than {number(record['limit'])})" if record["worse"] else "as expected"
-            rows.append([entry.label, _count(found.get("n")), *figures, percent(entry.error), ratio, verdict])
-    headings = ["configuration", "samples", "median (%)", "p95 (%)", "max (%)", "shipped: median (%)", "ratio", "verdict"]
+            figures = [
+                percent(found.get(key)) for key in ("rel_l2_median", "rel_l2_p95", "rel_l2_max")
+            ]
+            verdict = (
+                f"worse (more than {number(record['limit'])})" if record["worse"] else "as expected"
+            )
+            rows.append(
+                [
+                    entry.label,
+                    _count(found.get("n")),
+                    *figures,
+                    percent(entry.error),
+                    ratio,
+                    verdict,
+                ]
+            )
+    headings = [
+        "configuration",
+        "samples",
+        "median (%)",
+        "p95 (%)",
+        "max (%)",
+        "shipped: median (%)",
+        "ratio",
+        "verdict",
+    ]
     note = "Fresh loads of the same distribution that no method's author has seen. Worse: beyond what the number of samples explains."
     return Grid("Hidden test set", note, headings, rows) if rows else None
 
@@ -180,21 +242,37 @@ def hidden(dataset: str, entries: Sequence[Entry], analysis: Mapping[str, Any]) 
 def pairwise(comparison: Comparison, dataset: str, analysis: Mapping[str, Any]) -> list[Grid]:
     """Who is faster than whom: a matrix per error that at least two methods reach."""
     grids = []
-    targets = {record["target_rel_l2_median"] for record in analysis["pairwise"] if record["dataset"] == dataset}
-    records = {(r["target_rel_l2_median"], r["a"], r["b"]): r for r in analysis["pairwise"] if r["dataset"] == dataset}
+    targets = {
+        record["target_rel_l2_median"]
+        for record in analysis["pairwise"]
+        if record["dataset"] == dataset
+    }
+    records = {
+        (r["target_rel_l2_median"], r["a"], r["b"]): r
+        for r in analysis["pairwise"]
+        if r["dataset"] == dataset
+    }
     needed = needs_of(comparison, dataset)["error"]
     for target in sorted(targets, reverse=True):
         reached, cells, absent = pairwise_cells(comparison, dataset, target, analysis)
         if len(reached) < 2:
             continue
         rows = [
-            [a, *(cell if a == b else f"{cell}\n{_factor(records[target, a, b])}" for b, cell in zip(reached, line, strict=True))]
+            [
+                a,
+                *(
+                    cell if a == b else f"{cell}\n{_factor(records[target, a, b])}"
+                    for b, cell in zip(reached, line, strict=True)
+                ),
+            ]
             for a, line in zip(reached, cells, strict=True)
         ]
         of_need = ", the error that is needed" if target == needed else ""
         note = f"{PAIRWISE_LEGEND} Below: the 95 % interval of that factor."
         note += f" Not reached by {', '.join(absent)}." if absent else ""
-        grids.append(Grid(f"Who is faster at {percent(target)} %{of_need}", note, ["", *reached], rows))
+        grids.append(
+            Grid(f"Who is faster at {percent(target)} %{of_need}", note, ["", *reached], rows)
+        )
     return grids
 
 
@@ -217,10 +295,34 @@ def break_even(dataset: str, analysis: Mapping[str, Any], entries: Sequence[Entr
         queries = f"{record['queries']:,}" if record["queries"] is not None else record["verdict"]
         why = f"\n{record['reason']}" if record["verdict"] == "unknown" else ""
         offline, full = record["offline_s"], record["fem_latency_ms"]
-        times = [number(record["latency_ms"]), number(full), *(number(offline[key]) for key in ("data", "fit"))]
+        times = [
+            number(record["latency_ms"]),
+            number(full),
+            *(number(offline[key]) for key in ("data", "fit")),
+        ]
         sizes = [size_of(row.figure("memory_bytes", "fit")), size_of(row.row.get("model_bytes"))]
-        rows.append([record["method"], f"{percent(record['target_rel_l2_median'])} %", record["label"], queries + why, *times, *sizes])
-    headings = ["method", "error", "configuration", "break-even queries", "latency (ms)", "full-order (ms)", "data (s)", "fit (s)", "memory", "model"]
+        rows.append(
+            [
+                record["method"],
+                f"{percent(record['target_rel_l2_median'])} %",
+                record["label"],
+                queries + why,
+                *times,
+                *sizes,
+            ]
+        )
+    headings = [
+        "method",
+        "error",
+        "configuration",
+        "break-even queries",
+        "latency (ms)",
+        "full-order (ms)",
+        "data (s)",
+        "fit (s)",
+        "memory",
+        "model",
+    ]
     note = (
         "Break-even: offline time, data included, over what a query saves against the fastest full-order configuration that is at least as accurate; "
         "never, where that one is as fast. "
@@ -233,11 +335,20 @@ def tuning(dataset: str, analysis: Mapping[str, Any]) -> Grid | None:
     """What each method tried, of what it was allowed to."""
     rows = []
     for record in analysis["tuning"]:
-        if record["dataset"] == dataset and (record["configurations_allowed"] is not None or record["seconds_allowed"] is not None):
-            allowed = (_of(record[key], record[f"{key}_allowed"], shown) for key, shown in (("configurations", str), ("seconds", number)))
+        if record["dataset"] == dataset and (
+            record["configurations_allowed"] is not None or record["seconds_allowed"] is not None
+        ):
+            allowed = (
+                _of(record[key], record[f"{key}_allowed"], shown)
+                for key, shown in (("configurations", str), ("seconds", number))
+            )
             rows.append([record["method"], *allowed])
     note = "What each method tried, of what every method was allowed to."
-    return Grid("Tuning budget", note, ["method", "configurations", "fitting (s)"], rows) if rows else None
+    return (
+        Grid("Tuning budget", note, ["method", "configurations", "fitting (s)"], rows)
+        if rows
+        else None
+    )
 
 
 def _of(value: float, allowed: float | None, shown: Callable[[Any], str]) -> str:
@@ -252,9 +363,15 @@ def profile(analysis: Mapping[str, Any]) -> Grid | None:
     if not found["problems"] or len(found["factors"]) < 2:
         return None
     rows = [
-        [method, *(f"{100 * share_within(factors, tau):.0f}" for tau in FACTORS), _solved(factors)] for method, factors in found["factors"].items()
+        [method, *(f"{100 * share_within(factors, tau):.0f}" for tau in FACTORS), _solved(factors)]
+        for method, factors in found["factors"].items()
     ]
-    return Grid("Performance profile", profile_note(found), ["method", *(f"≤ {tau:g}× (%)" for tau in FACTORS), "solved (%)"], rows)
+    return Grid(
+        "Performance profile",
+        profile_note(found),
+        ["method", *(f"≤ {tau:g}× (%)" for tau in FACTORS), "solved (%)"],
+        rows,
+    )
 
 
 def _solved(factors: Sequence[float | None]) -> str:
@@ -270,14 +387,23 @@ def profile_note(found: Mapping[str, Any]) -> str:
         "Share of them that a method solves within a factor of the fastest one's time. "
         "Only who is first and who solves most can be read from it: the order of the others depends on which methods take part."
     )
-    return note + (" With one dataset this says nothing of other scenes." if found["n_datasets"] == 1 else "")
+    return note + (
+        " With one dataset this says nothing of other scenes." if found["n_datasets"] == 1 else ""
+    )
 
 
 def regimes(analysis: Mapping[str, Any]) -> Grid | None:
     """Whether each method was tested where it belongs."""
-    rows = [[record["method"], record["says"], "yes" if record["in_regime"] else record["verdict"]] for record in analysis["regimes"]]
+    rows = [
+        [record["method"], record["says"], "yes" if record["in_regime"] else record["verdict"]]
+        for record in analysis["regimes"]
+    ]
     note = "Where a method's own file says that it belongs, and whether a configuration of this comparison was there."
-    return Grid("In its regime", note, ["method", "where it belongs", "tested there"], rows) if rows else None
+    return (
+        Grid("In its regime", note, ["method", "where it belongs", "tested there"], rows)
+        if rows
+        else None
+    )
 
 
 def interval_cells(entry: Entry) -> dict[str, str]:

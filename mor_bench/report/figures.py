@@ -15,10 +15,34 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from numpy.typing import NDArray
 
 from mor_bench.harness.results import Comparison
-from mor_bench.report.canvas import GREY, INK, LIGHT, Drawn, Note, Style, annotate, dress, new_figure, plain, save, shortened, styles_of
+from mor_bench.report.canvas import (
+    GREY,
+    INK,
+    LIGHT,
+    Drawn,
+    Note,
+    Style,
+    annotate,
+    dress,
+    new_figure,
+    plain,
+    save,
+    shortened,
+    styles_of,
+)
 from mor_bench.report.curves import learning_curves, loss_curves, performance_profile
 from mor_bench.report.deformed import worst_samples
-from mor_bench.report.summary import Entry, best_per_method, dataset_names, entries_of, needs_of, number, percent, short_names_used, short_swept
+from mor_bench.report.summary import (
+    Entry,
+    best_per_method,
+    dataset_names,
+    entries_of,
+    needs_of,
+    number,
+    percent,
+    short_names_used,
+    short_swept,
+)
 
 FLOOR_PERCENT = 1e-4
 """Errors below stand at this floor: the round-off of the full-order model would squash all else."""
@@ -45,13 +69,21 @@ def write_figures(comparison: Comparison, analysis: Mapping[str, Any]) -> list[D
     drawn: list[Drawn | None] = []
     for dataset in dataset_names(comparison):
         drawn.append(error_against_time(comparison, dataset, styles, analysis))
-        for draw in (learning_curves, loss_curves, error_against_amplitude, worst_samples, singular_values):
+        for draw in (
+            learning_curves,
+            loss_curves,
+            error_against_amplitude,
+            worst_samples,
+            singular_values,
+        ):
             drawn.append(draw(comparison, dataset, styles))
     drawn.append(performance_profile(comparison, analysis, styles))
     return [figure for figure in drawn if figure is not None]
 
 
-def error_against_time(comparison: Comparison, dataset: str, styles: dict[str, Style], analysis: Mapping[str, Any]) -> Drawn | None:
+def error_against_time(
+    comparison: Comparison, dataset: str, styles: dict[str, Style], analysis: Mapping[str, Any]
+) -> Drawn | None:
     """Median error over median latency, log-log, a point per configuration; None if no configuration has both."""
     entries = entries_of(comparison, dataset, analysis)
     shown = [e for e in entries if e.ran and isfinite(e.error) and isfinite(e.latency_ms)]
@@ -68,10 +100,23 @@ def error_against_time(comparison: Comparison, dataset: str, styles: dict[str, S
     axes.set_xlabel("latency of one query, median (ms)")
     axes.set_ylabel("relative L2 error, median over the test set (%)")
     axes.set_title(plain(f"Error against time – {dataset}"), loc="left", fontsize=13, color=INK)
-    front = Line2D([], [], color=INK, linewidth=1.2, linestyle=(0, (4, 2)), marker="o", markerfacecolor="none", markersize=9, label="Pareto front")
+    front = Line2D(
+        [],
+        [],
+        color=INK,
+        linewidth=1.2,
+        linestyle=(0, (4, 2)),
+        marker="o",
+        markerfacecolor="none",
+        markersize=9,
+        label="Pareto front",
+    )
     figure.legend(handles=[*handles, front], loc="outside right upper", fontsize=9, frameon=False)
     ranked = sorted((e for e in shown if e.swept), key=lambda e: not e.on_front)
-    notes = [Note(*_place(e), short_swept(e.swept).split(", ")[0], styles[e.method].colour) for e in ranked]
+    notes = [
+        Note(*_place(e), short_swept(e.swept).split(", ")[0], styles[e.method].colour)
+        for e in ranked
+    ]
     annotate(axes, notes, lines, [box_label] if box_label else [])
     path = save(figure, comparison, dataset, "error-against-time")
     return Drawn(dataset, path, "Error against time", _time_caption(entries, shown))
@@ -82,7 +127,9 @@ def _place(entry: Entry) -> tuple[float, float]:
 
 
 def _time_caption(entries: Sequence[Entry], shown: Sequence[Entry]) -> str:
-    parts = ["Each point is one fitted configuration; left and down is better. A thin line joins the swept configurations of a method in order."]
+    parts = [
+        "Each point is one fitted configuration; left and down is better. A thin line joins the swept configurations of a method in order."
+    ]
     if any(e.intervals for e in shown):
         parts.append("Bars hold 95 % of what a repeated timing and other load regions would give.")
     parts.append(
@@ -90,11 +137,15 @@ def _time_caption(entries: Sequence[Entry], shown: Sequence[Entry]) -> str:
         "In the shaded box the scene's needs are met."
     )
     if any(len(e.swept) > 1 for e in shown):
-        parts.append("Of a method with two swept parameters, labels give the first one, the legend the second.")
+        parts.append(
+            "Of a method with two swept parameters, labels give the first one, the legend the second."
+        )
     names = short_names_used(shown)
     parts.append(f"Labels: {names}." if names else "")
     if any(100 * e.error < FLOOR_PERCENT for e in shown):
-        parts.append(f"An arrow marks errors below {FLOOR_PERCENT:g} %, drawn at that floor so that they do not squash the rest.")
+        parts.append(
+            f"An arrow marks errors below {FLOOR_PERCENT:g} %, drawn at that floor so that they do not squash the rest."
+        )
     if any(e.unstable for e in shown):
         parts.append("A cross marks timings that were not stable.")
     missing = [e.label for e in entries if e.ran and e not in shown]
@@ -123,7 +174,12 @@ def _log_limits(axes: Axes, shown: Sequence[Entry], needs: dict[str, float]) -> 
 def _bars(entry: Entry) -> NDArray[np.float64]:
     """(2, 2) ends of the intervals of latency in ms and of the error in percent, never above or below the point itself."""
     x, y = _place(entry)
-    ends = np.array([entry.intervals.get("latency_ms", (x, x)), np.multiply(100, entry.intervals.get("rel_l2_median", (y / 100, y / 100)))])
+    ends = np.array(
+        [
+            entry.intervals.get("latency_ms", (x, x)),
+            np.multiply(100, entry.intervals.get("rel_l2_median", (y / 100, y / 100))),
+        ]
+    )
     ends[1] = np.maximum(ends[1], FLOOR_PERCENT)
     ends = np.where(np.isfinite(ends), ends, np.array([[x], [y]]))
     return np.stack([np.minimum(ends[:, 0], [x, y]), np.maximum(ends[:, 1], [x, y])], axis=1)
@@ -135,12 +191,33 @@ def _draw_needs(axes: Axes, needs: dict[str, float]) -> Artist | None:
         return None
     (x0, _), (y0, _) = axes.get_xlim(), axes.get_ylim()
     x1, y1 = needs["latency_ms"], 100 * needs["error"]
-    axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor="#eef6ea", edgecolor="#6a9a55", linewidth=1, zorder=1.5, alpha=0.8))
+    axes.add_patch(
+        Rectangle(
+            (x0, y0),
+            x1 - x0,
+            y1 - y0,
+            facecolor="#eef6ea",
+            edgecolor="#6a9a55",
+            linewidth=1,
+            zorder=1.5,
+            alpha=0.8,
+        )
+    )
     text = f"meets the needs: ≤ {number(x1)} ms, ≤ {number(y1)} %"
-    return axes.annotate(text, (x0, y0), xytext=(6, 6), textcoords="offset points", fontsize=9, color="#3f6b2c", va="bottom")
+    return axes.annotate(
+        text,
+        (x0, y0),
+        xytext=(6, 6),
+        textcoords="offset points",
+        fontsize=9,
+        color="#3f6b2c",
+        va="bottom",
+    )
 
 
-def _draw_series(axes: Axes, shown: Sequence[Entry], styles: dict[str, Style]) -> tuple[list[NDArray[np.float64]], list[Line2D]]:
+def _draw_series(
+    axes: Axes, shown: Sequence[Entry], styles: dict[str, Style]
+) -> tuple[list[NDArray[np.float64]], list[Line2D]]:
     """Points, whiskers and joining lines; returns the lines, and handles for the legend."""
     lines, handles = [], []
     for method in dict.fromkeys(e.method for e in shown):
@@ -153,22 +230,49 @@ def _draw_series(axes: Axes, shown: Sequence[Entry], styles: dict[str, Style]) -
             lines.append(xy)
             bars = np.array([_bars(e) for e in members])
             axes.plot(xy[:, 0], xy[:, 1], color=style.colour, linewidth=0.9, alpha=0.6, zorder=2)
-            axes.hlines(xy[:, 1], *bars[:, 0].T, color=style.colour, linewidth=2.2, alpha=0.4, zorder=2)
-            axes.vlines(xy[:, 0], *bars[:, 1].T, color=style.colour, linewidth=2.2, alpha=0.4, zorder=2)
+            axes.hlines(
+                xy[:, 1], *bars[:, 0].T, color=style.colour, linewidth=2.2, alpha=0.4, zorder=2
+            )
+            axes.vlines(
+                xy[:, 0], *bars[:, 1].T, color=style.colour, linewidth=2.2, alpha=0.4, zorder=2
+            )
             unsteady = np.array([bool(e.unstable) for e in members])
             axes.plot(*xy[unsteady].T, "x", color=INK, markersize=10, markeredgewidth=1.4, zorder=6)
             low = np.array([100 * e.error < FLOOR_PERCENT for e in members])
             hollow = rank % 2 == 1
             face, edge = ("white", style.colour) if hollow else (style.colour, "white")
             axes.plot(
-                *xy[~low].T, style.marker, markerfacecolor=face, markeredgecolor=edge, markeredgewidth=1 if hollow else 0.5, markersize=7, zorder=4
+                *xy[~low].T,
+                style.marker,
+                markerfacecolor=face,
+                markeredgecolor=edge,
+                markeredgewidth=1 if hollow else 0.5,
+                markersize=7,
+                zorder=4,
             )
-            axes.plot(*xy[low].T, "v", markerfacecolor=face, markeredgecolor=INK, markersize=8, zorder=4)
+            axes.plot(
+                *xy[low].T, "v", markerfacecolor=face, markeredgecolor=INK, markersize=8, zorder=4
+            )
             for x, y in xy[low]:
-                axes.annotate("", (x, y / 1.75), (x, y), arrowprops={"arrowstyle": "->", "color": style.colour, "linewidth": 1.4}, zorder=3)
+                axes.annotate(
+                    "",
+                    (x, y / 1.75),
+                    (x, y),
+                    arrowprops={"arrowstyle": "->", "color": style.colour, "linewidth": 1.4},
+                    zorder=3,
+                )
             name = plain(shortened(f"{method}, {others}" if others else method, 28))
             handles.append(
-                Line2D([], [], color=style.colour, linewidth=1, marker=style.marker, markerfacecolor=face, markeredgecolor=style.colour, label=name)
+                Line2D(
+                    [],
+                    [],
+                    color=style.colour,
+                    linewidth=1,
+                    marker=style.marker,
+                    markerfacecolor=face,
+                    markeredgecolor=style.colour,
+                    label=name,
+                )
             )
     return lines, handles
 
@@ -178,7 +282,15 @@ def _draw_front(axes: Axes, front: Sequence[Entry]) -> NDArray[np.float64]:
     xy = np.array(sorted(_place(e) for e in front))
     steps = np.stack([np.repeat(xy[:, 0], 2)[1:], np.repeat(xy[:, 1], 2)[:-1]], axis=1)
     axes.plot(*steps.T, color=INK, linewidth=1.2, linestyle=(0, (4, 2)), zorder=3)
-    axes.plot(*xy.T, "o", markersize=11, markerfacecolor="none", markeredgecolor=INK, markeredgewidth=1.2, zorder=5)
+    axes.plot(
+        *xy.T,
+        "o",
+        markersize=11,
+        markerfacecolor="none",
+        markeredgecolor=INK,
+        markeredgewidth=1.2,
+        zorder=5,
+    )
     return steps
 
 
@@ -197,17 +309,41 @@ def singular_values(comparison: Comparison, dataset: str, styles: dict[str, Styl
     figure = new_figure(4.6)
     axes = figure.subplots()
     dress(axes)
-    axes.loglog(count, sigma / sigma[0], color=GREY, linewidth=1.2, marker=".", markersize=4, label=r"$\sigma_i\,/\,\sigma_1$")
-    axes.loglog(count[:-1], tail[:-1], color=INK, linewidth=1.6, label=r"energy tail $\sqrt{\sum_{i>r}\sigma_i^2\,/\,\sum_i\sigma_i^2}$")
+    axes.loglog(
+        count,
+        sigma / sigma[0],
+        color=GREY,
+        linewidth=1.2,
+        marker=".",
+        markersize=4,
+        label=r"$\sigma_i\,/\,\sigma_1$",
+    )
+    axes.loglog(
+        count[:-1],
+        tail[:-1],
+        color=INK,
+        linewidth=1.6,
+        label=r"energy tail $\sqrt{\sum_{i>r}\sigma_i^2\,/\,\sum_i\sigma_i^2}$",
+    )
     used: dict[int, list[str]] = {}
     for entry in entries_of(comparison, dataset):
         rank = (entry.row.get("parameters") or {}).get("n_modes")
-        if isinstance(rank, int) and "n_modes" in entry.swept and 1 <= rank < len(sigma) and entry.method not in used.setdefault(rank, []):
+        if (
+            isinstance(rank, int)
+            and "n_modes" in entry.swept
+            and 1 <= rank < len(sigma)
+            and entry.method not in used.setdefault(rank, [])
+        ):
             used[rank].append(entry.method)
     _draw_ranks(axes, used, tail, styles)
     axes.set_xlabel("number of modes r (index i)")
     axes.set_ylabel("relative to all snapshots")
-    axes.set_title(plain(f"Singular values of the training snapshots – {dataset}"), loc="left", fontsize=13, color=INK)
+    axes.set_title(
+        plain(f"Singular values of the training snapshots – {dataset}"),
+        loc="left",
+        fontsize=13,
+        color=INK,
+    )
     axes.legend(fontsize=9, frameon=False, loc="lower left")
     axes.set_ylim(bottom=max(float(tail[:-1].min(initial=1.0)) / 3, ROUND_OFF))
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -222,28 +358,46 @@ def singular_values(comparison: Comparison, dataset: str, styles: dict[str, Styl
     return Drawn(dataset, path, "Singular values of the training snapshots", caption)
 
 
-def _draw_ranks(axes: Axes, used: dict[int, list[str]], tail: NDArray[np.float64], styles: dict[str, Style]) -> None:
+def _draw_ranks(
+    axes: Axes, used: dict[int, list[str]], tail: NDArray[np.float64], styles: dict[str, Style]
+) -> None:
     """The ranks that methods used, as markers on the energy tail: the first method's filled, those of others as rings around it."""
-    for ring, method in enumerate(dict.fromkeys(method for methods in used.values() for method in methods)):
+    for ring, method in enumerate(
+        dict.fromkeys(method for methods in used.values() for method in methods)
+    ):
         ranks = np.array(sorted(rank for rank, methods in used.items() if method in methods))
         style = styles[method]
         face = "none" if ring else style.colour
         axes.plot(
-            ranks, tail[ranks - 1], style.marker, markersize=7 + 6 * ring, markerfacecolor=face, markeredgecolor=style.colour,
-            markeredgewidth=1.4, zorder=4, label=plain(method),
-        )  # fmt: skip
+            ranks,
+            tail[ranks - 1],
+            style.marker,
+            markersize=7 + 6 * ring,
+            markerfacecolor=face,
+            markeredgecolor=style.colour,
+            markeredgewidth=1.4,
+            zorder=4,
+            label=plain(method),
+        )
     xy = np.column_stack([np.arange(1, len(tail)), tail[:-1]])
-    notes = [Note(rank, float(tail[rank - 1]), f"r={rank}: {percent(float(tail[rank - 1]))} %") for rank in sorted(used)]
+    notes = [
+        Note(rank, float(tail[rank - 1]), f"r={rank}: {percent(float(tail[rank - 1]))} %")
+        for rank in sorted(used)
+    ]
     annotate(axes, notes, [xy], radius=8.0)
 
 
-def error_against_amplitude(comparison: Comparison, dataset: str, styles: dict[str, Style]) -> Drawn | None:
+def error_against_amplitude(
+    comparison: Comparison, dataset: str, styles: dict[str, Style]
+) -> Drawn | None:
     """Error e of every test sample over its largest displacement, a panel per method; None if no samples are left."""
     panels = []
     for entry in best_per_method(entries_of(comparison, dataset)):
         try:
             arrays = comparison.samples(entry.row)
-            panels.append((entry, np.asarray(arrays["amplitude_m"]), np.asarray(arrays["mean_dof_m"])))
+            panels.append(
+                (entry, np.asarray(arrays["amplitude_m"]), np.asarray(arrays["mean_dof_m"]))
+            )
         except (OSError, KeyError):
             continue
     if not panels:
@@ -258,7 +412,9 @@ def error_against_amplitude(comparison: Comparison, dataset: str, styles: dict[s
         _amplitude_panel(axes, entry, amplitude, e, styles[entry.method])
     figure.supxlabel("largest nodal displacement of the reference (m)", fontsize=10)
     figure.supylabel("mean error per dof, e (m)", fontsize=10)
-    figure.suptitle(plain(f"Error against deformation – {dataset}"), x=0.01, ha="left", fontsize=13, color=INK)
+    figure.suptitle(
+        plain(f"Error against deformation – {dataset}"), x=0.01, ha="left", fontsize=13, color=INK
+    )
     path = save(figure, comparison, dataset, "error-against-deformation")
     caption = (
         "Each dot is a test sample, of the configuration of each method with the smallest ē. The line is the least-squares line through the origin; "
@@ -268,12 +424,28 @@ def error_against_amplitude(comparison: Comparison, dataset: str, styles: dict[s
     return Drawn(dataset, path, "Error against deformation", caption)
 
 
-def _amplitude_panel(axes: Axes, entry: Entry, amplitude: NDArray[np.float64], e: NDArray[np.float64], style: Style) -> None:
+def _amplitude_panel(
+    axes: Axes, entry: Entry, amplitude: NDArray[np.float64], e: NDArray[np.float64], style: Style
+) -> None:
     dress(axes)
     finite = np.isfinite(e) & np.isfinite(amplitude)
     x, y = amplitude[finite], e[finite]
-    axes.plot(x, y, ".", color=style.colour, markersize=4.5 if len(x) > 300 else 8, alpha=0.5, markeredgewidth=0, rasterized=True)
-    axes.set_title(plain(f"{entry.method}\n{shortened(short_swept(entry.swept), 40)}".rstrip()), fontsize=10, loc="left", color=INK)
+    axes.plot(
+        x,
+        y,
+        ".",
+        color=style.colour,
+        markersize=4.5 if len(x) > 300 else 8,
+        alpha=0.5,
+        markeredgewidth=0,
+        rasterized=True,
+    )
+    axes.set_title(
+        plain(f"{entry.method}\n{shortened(short_swept(entry.swept), 40)}".rstrip()),
+        fontsize=10,
+        loc="left",
+        color=INK,
+    )
     said = []
     if len(x) and x.max() > 0:
         slope = float(x @ y / (x @ x))
@@ -288,6 +460,16 @@ def _amplitude_panel(axes: Axes, entry: Entry, amplitude: NDArray[np.float64], e
     if not finite.all():
         said.append(f"{int((~finite).sum())} of {len(e)} without prediction")
     frame = {"facecolor": "white", "edgecolor": LIGHT, "pad": 2.5}
-    axes.annotate("\n".join(said), (0.04, 0.95), xycoords="axes fraction", va="top", fontsize=9, color=INK, bbox=frame)
+    axes.annotate(
+        "\n".join(said),
+        (0.04, 0.95),
+        xycoords="axes fraction",
+        va="top",
+        fontsize=9,
+        color=INK,
+        bbox=frame,
+    )
     axes.yaxis.set_major_locator(MaxNLocator(5))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.1e}" if 0 < value < 1e-3 else f"{value:.3g}"))
+    axes.yaxis.set_major_formatter(
+        FuncFormatter(lambda value, _: f"{value:.1e}" if 0 < value < 1e-3 else f"{value:.3g}")
+    )

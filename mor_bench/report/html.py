@@ -61,13 +61,26 @@ figure { margin: 18px 0 26px; } figure img { width: 100%; height: auto; border: 
 SURE = "95 %"
 """The column of intervals."""
 
-OF_TEXT = frozenset({"configuration", "test set", "stable", "verdict", "where it belongs", "tested there"})
+OF_TEXT = frozenset(
+    {"configuration", "test set", "stable", "verdict", "where it belongs", "tested there"}
+)
 """Columns that are no figures."""
 
 GROUPS = (
-    ("relative L2 (%)", (("median", "rel_l2_median"), (SURE, "rel_l2_median"), ("p95", "rel_l2_p95"), ("max", "rel_l2_max"))),
+    (
+        "relative L2 (%)",
+        (
+            ("median", "rel_l2_median"),
+            (SURE, "rel_l2_median"),
+            ("p95", "rel_l2_p95"),
+            ("max", "rel_l2_max"),
+        ),
+    ),
     ("latency (ms)", (("median", "median"), (SURE, "latency_ms"), ("p95", "p95"), ("p99", "p99"))),
-    ("per degree of freedom (m)", (("ē", "mean_dof_m"), (SURE, "mean_dof_m"), ("σ(e)", "std_dof_m"), ("max e", "max_dof_m"))),
+    (
+        "per degree of freedom (m)",
+        (("ē", "mean_dof_m"), (SURE, "mean_dof_m"), ("σ(e)", "std_dof_m"), ("max e", "max_dof_m")),
+    ),
     ("offline (s)", (("data", "data"), ("fit", "fit"))),
     ("nodal (m)", (("max", "max_nodal_m"),)),
     ("e over u", (("slope", "slope"),)),
@@ -82,7 +95,10 @@ DEFINITIONS = (
         "of a test sample: the norm of the error over the norm of the reference displacement; median, 95th percentile, maximum over the test set.",
     ),
     ("largest nodal", "the largest Euclidean error of any node in any test sample."),
-    ("slope", "of the least-squares line through the origin of e over the largest nodal displacement of the sample."),
+    (
+        "slope",
+        "of the least-squares line through the origin of e over the largest nodal displacement of the sample.",
+    ),
     (
         "latency",
         "wall-clock time of one query at a time, from nodal forces to nodal displacements on the host, after warm-up; percentiles over the queries.",
@@ -93,9 +109,18 @@ DEFINITIONS = (
         "load regions of the test set, the same for all methods. Of a latency: the interval in which the median of a repeated measurement in as many "
         "fresh processes is expected. Of the ratio of two times: both, without what the two share. Nothing is corrected for the number of pairs.",
     ),
-    ("failures", "a test sample without a prediction counts as an infinite error; it is never dropped."),
-    ("meets the needs", "the median relative L2 error and the median latency are both within what the dataset's file asks for."),
-    ("Pareto", "no other configuration of the dataset has both a smaller median error and a smaller median latency."),
+    (
+        "failures",
+        "a test sample without a prediction counts as an infinite error; it is never dropped.",
+    ),
+    (
+        "meets the needs",
+        "the median relative L2 error and the median latency are both within what the dataset's file asks for.",
+    ),
+    (
+        "Pareto",
+        "no other configuration of the dataset has both a smaller median error and a smaller median latency.",
+    ),
     (
         "time at error, error at time",
         "log-log between adjacent non-dominated configurations of a method, beside the best real configuration that meets the target. "
@@ -112,7 +137,10 @@ DEFINITIONS = (
 RAW_FILES = (
     ("results.json", "all rows, machine and datasets"),
     ("results.csv", "the same rows, flat"),
-    ("comparison.json", "time at error, error at time, pairs of methods, break-even and more, with intervals"),
+    (
+        "comparison.json",
+        "time at error, error at time, pairs of methods, break-even and more, with intervals",
+    ),
     ("samples/", "raw latencies and per-sample errors of every row (HDF5)"),
     ("figures/", "the figures of this page (PNG)"),
 )
@@ -142,13 +170,29 @@ def write_report(comparison: Comparison, analysis: Mapping[str, Any] | None = No
     return render(comparison, analysis)[-1]
 
 
-def _write_page(comparison: Comparison, drawn: Sequence[Drawn], analysis: Mapping[str, Any]) -> Path:
+def _write_page(
+    comparison: Comparison, drawn: Sequence[Drawn], analysis: Mapping[str, Any]
+) -> Path:
     names = dataset_names(comparison)
-    sections = "\n".join(_dataset_section(comparison, name, [figure for figure in drawn if figure.dataset == name], analysis) for name in names)
-    headlines = "".join(f'<p class="headline"><b>{escape(name)}</b>: {escape(headline(comparison, name))}</p>' for name in names)
-    shared = "".join(map(_grid, overall(analysis))) + "".join(_figure(figure) for figure in drawn if figure.dataset not in names)
-    raw = "".join(f'<dt><a href="{name}">{name}</a></dt><dd>{escape(what)}</dd>' for name, what in RAW_FILES)
-    words = "".join(f"<dt>{escape(word)}</dt><dd>{escape(meaning)}</dd>" for word, meaning in DEFINITIONS)
+    sections = "\n".join(
+        _dataset_section(
+            comparison, name, [figure for figure in drawn if figure.dataset == name], analysis
+        )
+        for name in names
+    )
+    headlines = "".join(
+        f'<p class="headline"><b>{escape(name)}</b>: {escape(headline(comparison, name))}</p>'
+        for name in names
+    )
+    shared = "".join(map(_grid, overall(analysis))) + "".join(
+        _figure(figure) for figure in drawn if figure.dataset not in names
+    )
+    raw = "".join(
+        f'<dt><a href="{name}">{name}</a></dt><dd>{escape(what)}</dd>' for name, what in RAW_FILES
+    )
+    words = "".join(
+        f"<dt>{escape(word)}</dt><dd>{escape(meaning)}</dd>" for word, meaning in DEFINITIONS
+    )
     page = f"""<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>mor-bench: {escape(", ".join(names))}</title><style>{STYLE}</style></head><body>
@@ -184,7 +228,9 @@ def _definition(key: str, value: str) -> str:
     return f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>"
 
 
-def _dataset_section(comparison: Comparison, dataset: str, drawn: Sequence[Drawn], analysis: Mapping[str, Any]) -> str:
+def _dataset_section(
+    comparison: Comparison, dataset: str, drawn: Sequence[Drawn], analysis: Mapping[str, Any]
+) -> str:
     entries, spec = entries_of(comparison, dataset, analysis), comparison.datasets.get(dataset, {})
     names = short_names_used(entries)
     targets = "".join(
@@ -207,7 +253,9 @@ def _dataset_section(comparison: Comparison, dataset: str, drawn: Sequence[Drawn
 {"".join(map(_grid, dataset_details(comparison, dataset, analysis)))}"""
 
 
-def _what_was_run(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> list[tuple[str, str]]:
+def _what_was_run(
+    comparison: Comparison, dataset: str, entries: Sequence[Entry]
+) -> list[tuple[str, str]]:
     spec, needs = comparison.datasets.get(dataset, {}), needs_of(comparison, dataset)
     scene = [
         (key, "; ".join(f"{k}: {v}" if k else v for k, v in _flat(spec[key])))
@@ -218,12 +266,22 @@ def _what_was_run(comparison: Comparison, dataset: str, entries: Sequence[Entry]
     def values(name: str) -> str:
         return ", ".join(dict.fromkeys(str(entry.row.get(name)) for entry in entries)) or "–"
 
-    unused = f"; in neither part: {values('n_unused')}" if any(entry.row.get("n_unused") for entry in entries) else ""
+    unused = (
+        f"; in neither part: {values('n_unused')}"
+        if any(entry.row.get("n_unused") for entry in entries)
+        else ""
+    )
     return [
         *([("source", str(spec["source"]))] if spec.get("source") else []),
         *scene,
-        ("split", f"by {values('split')}; training samples: {values('n_train')}; test samples: {values('n_test')}{unused}"),
-        ("needs", f"median relative L2 error ≤ {percent(needs['error'])} %, median latency ≤ {number(needs['latency_ms'])} ms"),
+        (
+            "split",
+            f"by {values('split')}; training samples: {values('n_train')}; test samples: {values('n_test')}{unused}",
+        ),
+        (
+            "needs",
+            f"median relative L2 error ≤ {percent(needs['error'])} %, median latency ≤ {number(needs['latency_ms'])} ms",
+        ),
         ("discretisation error of the scene itself", discretisation_error(entries)),
         ("threads", values("threads")),
         (
@@ -253,17 +311,37 @@ def _count(value: object) -> str:
 
 def _configuration_table(entries: Sequence[Entry]) -> str:
     sure = any(entry.intervals for entry in entries)
-    groups = [(group, [column for column in columns if sure or column[0] != SURE]) for group, columns in GROUPS]
-    over = "".join(f'<th class="group" colspan="{len(columns)}">{escape(group)}</th>' for group, columns in groups)
+    groups = [
+        (group, [column for column in columns if sure or column[0] != SURE])
+        for group, columns in GROUPS
+    ]
+    over = "".join(
+        f'<th class="group" colspan="{len(columns)}">{escape(group)}</th>'
+        for group, columns in groups
+    )
     under = "".join(f"<th>{escape(name)}</th>" for _, columns in groups for name, _ in columns)
-    plain = ("size", "threads", "n train", "n test", "without<br>prediction", "discretisation<br>error (m)")
+    plain = (
+        "size",
+        "threads",
+        "n train",
+        "n test",
+        "without<br>prediction",
+        "discretisation<br>error (m)",
+    )
     tail = "".join(f'<th rowspan="2">{name}</th>' for name in plain)
     body = []
     for entry in entries:
         row = entry.row
-        cells = [escape(_cell(group, name, key, entry)) for group, columns in groups for name, key in columns]
+        cells = [
+            escape(_cell(group, name, key, entry))
+            for group, columns in groups
+            for name, key in columns
+        ]
         discretisation = row.get("discretisation_error_m")
-        cells += [escape(size_of(row.get("model_bytes"))), *(escape(_count(row.get(key))) for key in ("threads", "n_train", "n_test", "n_failed"))]
+        cells += [
+            escape(size_of(row.get("model_bytes"))),
+            *(escape(_count(row.get(key))) for key in ("threads", "n_train", "n_test", "n_failed")),
+        ]
         cells.append("not measured" if discretisation is None else metres(float(discretisation)))
         kind = "meets" if entry.meets_needs else "bad" if entry.trouble else ""
         marks = f"<td>{'yes' if entry.meets_needs else 'no'}</td><td>{'*' if entry.on_front else ''}</td>"
@@ -273,7 +351,10 @@ def _configuration_table(entries: Sequence[Entry]) -> str:
             + "".join(f"<td>{cell}</td>" for cell in cells)
             + "</tr>"
         )
-    first = "".join(f'<th rowspan="2" class="text">{name}</th>' for name in ("configuration", "status", "needs<br>met", "Pareto"))
+    first = "".join(
+        f'<th rowspan="2" class="text">{name}</th>'
+        for name in ("configuration", "status", "needs<br>met", "Pareto")
+    )
     head = f"<thead><tr>{first}{over}{tail}</tr><tr>{under}</tr></thead>"
     return f'<table class="pinned">{head}<tbody>{"".join(body)}</tbody></table>'
 
@@ -284,7 +365,8 @@ def _troubles(entries: Sequence[Entry], notes: Sequence[str]) -> str:
     said += [("", label, doubt) for label, _, doubt in (note.partition(": ") for note in notes)]
     said += [("", label, f"warning: {warning}") for label, warning in warnings_of(entries)]
     rows = "".join(
-        f'<tr class="{kind}"><td class="text">{escape(label)}</td><td class="reason">{escape(text)}</td></tr>' for kind, label, text in said
+        f'<tr class="{kind}"><td class="text">{escape(label)}</td><td class="reason">{escape(text)}</td></tr>'
+        for kind, label, text in said
     )
     if not rows:
         return "<p>Every configuration ran without a warning and predicted every test sample.</p>"
@@ -292,13 +374,18 @@ def _troubles(entries: Sequence[Entry], notes: Sequence[str]) -> str:
     return f'<h3>Failures, skips and warnings</h3><div class="wide"><table>{head}<tbody>{rows}</tbody></table></div>'
 
 
-def _target_table(comparison: Comparison, dataset: str, kind: str, analysis: Mapping[str, Any]) -> str:
+def _target_table(
+    comparison: Comparison, dataset: str, kind: str, analysis: Mapping[str, Any]
+) -> str:
     headings, rows = target_cells(comparison, dataset, kind, analysis)
     head = "".join(f"<th>{escape(heading)}</th>" for heading in headings)
     body = []
     for method, cells in rows.items():
         lines = (cell.partition("\n") for cell in cells)
-        tds = "".join(f"<td>{escape(first)}<br><small>{_lines(second)}</small></td>" for first, _, second in lines)
+        tds = "".join(
+            f"<td>{escape(first)}<br><small>{_lines(second)}</small></td>"
+            for first, _, second in lines
+        )
         body.append(f'<tr><td class="text">{escape(method)}</td>{tds}</tr>')
     return f'<div class="wide"><table><thead><tr><th class="text">method</th>{head}</tr></thead><tbody>{"".join(body)}</tbody></table></div>'
 
@@ -309,8 +396,13 @@ def _lines(text: str) -> str:
 
 def _grid(grid: Grid) -> str:
     """A table with its title; further lines of a cell in small print, long texts folded."""
-    kinds = ["text" if i == 0 or heading in OF_TEXT else "" for i, heading in enumerate(grid.headings)]
-    head = "".join(f'<th class="{kind}">{escape(heading)}</th>' for kind, heading in zip(kinds, grid.headings, strict=True))
+    kinds = [
+        "text" if i == 0 or heading in OF_TEXT else "" for i, heading in enumerate(grid.headings)
+    ]
+    head = "".join(
+        f'<th class="{kind}">{escape(heading)}</th>'
+        for kind, heading in zip(kinds, grid.headings, strict=True)
+    )
     body = []
     for row in grid.rows:
         cells = []

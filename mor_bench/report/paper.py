@@ -76,7 +76,9 @@ class Grid:
 def _size(entry: Entry) -> tuple[int, int] | None:
     """Channels and steps of a configuration that is such a network."""
     parameters = entry.row.get("parameters") or {}
-    if not entry.ran or not all(isinstance(parameters.get(name), int) for name in ("channels", "steps")):
+    if not entry.ran or not all(
+        isinstance(parameters.get(name), int) for name in ("channels", "steps")
+    ):
         return None
     return parameters["channels"], parameters["steps"]
 
@@ -91,7 +93,9 @@ def error_measures(dataset: str, entries: Sequence[Entry]) -> Grid | None:
     tried = {size for _, size in ours}
     rows += [_measures("", size, None, row) for size, row in published.items() if size not in tried]
     measured = ("ē (m)", "σ(e) (m)", "max e (m)", "slope", "predict (ms)", "train (min)")
-    headings = ["configuration", "c", "k", "FSS"] + [name for each in measured for name in ((each, "paper") if published else (each,))]
+    headings = ["configuration", "c", "k", "FSS"] + [
+        name for each in measured for name in ((each, "paper") if published else (each,))
+    ]
     if not published:
         rows = [[*row[:4], *row[4::2]] for row in rows]
     note = "c channels, k steps, feature space size FSS = c·2ᵏ."
@@ -100,14 +104,22 @@ def error_measures(dataset: str, entries: Sequence[Entry]) -> Grid | None:
     return Grid("Error measures of the networks", note, headings, rows)
 
 
-def _measures(label: str, size: tuple[int, int], entry: Entry | None, paper: Published | None) -> list[str]:
+def _measures(
+    label: str, size: tuple[int, int], entry: Entry | None, paper: Published | None
+) -> list[str]:
     def ours(group: str, key: str) -> float | None:
         return entry.figure(group, key) if entry else None
 
     fit = ours("offline_s", "fit")
     cells = [label or "not run here", str(size[0]), str(size[1]), str(size[0] * 2 ** size[1])]
-    printed = (paper.mean_m, paper.std_m, paper.max_m, paper.slope, paper.predict_ms, paper.train_min) if paper else (None,) * 6
-    measured = [metres(ours("error", key)) for key in ("mean_dof_m", "std_dof_m", "max_dof_m", "slope")]
+    printed = (
+        (paper.mean_m, paper.std_m, paper.max_m, paper.slope, paper.predict_ms, paper.train_min)
+        if paper
+        else (None,) * 6
+    )
+    measured = [
+        metres(ours("error", key)) for key in ("mean_dof_m", "std_dof_m", "max_dof_m", "slope")
+    ]
     measured += [number(ours("latency_ms", "median")), number(None if fit is None else fit / 60)]
     for mine, theirs in zip(measured, printed, strict=True):
         cells += [mine, _as_printed(theirs)]
@@ -125,7 +137,9 @@ def same_error(dataset: str, entries: Sequence[Entry]) -> Grid | None:
         return None
     target = network.mean_error_m
     chosen = {
-        method: min((e for e in mine if e.mean_error_m <= target), key=lambda e: e.latency_ms, default=None)
+        method: min(
+            (e for e in mine if e.mean_error_m <= target), key=lambda e: e.latency_ms, default=None
+        )
         for method, mine in _by_method(entries).items()
     }
     note = f"The fastest configuration of each method with ē ≤ {metres(target)} m, that of {network.label}."
@@ -139,7 +153,9 @@ def same_time(dataset: str, entries: Sequence[Entry]) -> Grid | None:
         return None
     target = network.latency_ms
     chosen = {
-        method: min((e for e in mine if e.latency_ms <= target), key=lambda e: e.mean_error_m, default=None)
+        method: min(
+            (e for e in mine if e.latency_ms <= target), key=lambda e: e.mean_error_m, default=None
+        )
         for method, mine in _by_method(entries).items()
     }
     note = f"The most accurate configuration of each method within {number(target)} ms, the latency of {network.label}."
@@ -150,19 +166,45 @@ def _reference(entries: Sequence[Entry]) -> Entry | None:
     """The most accurate network, whatever its method is called."""
     networks = [entry for entry in entries if _size(entry) is not None]
     best = min(networks, key=lambda e: e.mean_error_m, default=None)
-    return best if best is not None and best.mean_error_m < float("inf") and best.latency_ms < float("inf") else None
+    return (
+        best
+        if best is not None and best.mean_error_m < float("inf") and best.latency_ms < float("inf")
+        else None
+    )
 
 
 def _by_method(entries: Sequence[Entry]) -> dict[str, list[Entry]]:
-    return {method: [e for e in entries if e.ran and e.method == method] for method in dict.fromkeys(e.method for e in entries)}
+    return {
+        method: [e for e in entries if e.ran and e.method == method]
+        for method in dict.fromkeys(e.method for e in entries)
+    }
 
 
-def _comparison(title: str, note: str, dataset: str, chosen: dict[str, Entry | None], paper: dict[str, tuple[float, float]]) -> Grid:
+def _comparison(
+    title: str,
+    note: str,
+    dataset: str,
+    chosen: dict[str, Entry | None],
+    paper: dict[str, tuple[float, float]],
+) -> Grid:
     published = paper if dataset == COMPARED else {}
     rows = []
     for method, entry in chosen.items():
-        cells = [method, *([entry.label, number(entry.latency_ms), metres(entry.mean_error_m)] if entry else ["not reached", "–", "–"])]
+        cells = [
+            method,
+            *(
+                [entry.label, number(entry.latency_ms), metres(entry.mean_error_m)]
+                if entry
+                else ["not reached", "–", "–"]
+            ),
+        ]
         time, error = published.get(method, (None, None))
         rows.append(cells + ([_as_printed(time), _as_printed(error)] if published else []))
-    headings = ["method", "configuration", "time (ms)", "ē (m)", *(["paper: time (ms)", "paper: e (m)"] if published else [])]
+    headings = [
+        "method",
+        "configuration",
+        "time (ms)",
+        "ē (m)",
+        *(["paper: time (ms)", "paper: e (m)"] if published else []),
+    ]
     return Grid(title, note, headings, rows)

@@ -11,7 +11,13 @@ from typing import Any
 from mor_bench.harness.frontier import Point, non_dominated
 from mor_bench.harness.results import Comparison
 
-SHORT_NAMES = {"n_modes": "r", "tolerance": "tol", "cubature_tolerance": "ctol", "n_input_modes": "k", "n_output_modes": "r"}
+SHORT_NAMES = {
+    "n_modes": "r",
+    "tolerance": "tol",
+    "cubature_tolerance": "ctol",
+    "n_input_modes": "k",
+    "n_output_modes": "r",
+}
 """How a swept parameter is called where space is short; others go by the initials of their words."""
 
 
@@ -121,7 +127,9 @@ def needs_of(comparison: Comparison, dataset: str) -> dict[str, float]:
     return {key: float(needs.get(key, inf)) for key in ("error", "latency_ms")}
 
 
-def entries_of(comparison: Comparison, dataset: str, analysis: Mapping[str, Any] | None = None) -> list[Entry]:
+def entries_of(
+    comparison: Comparison, dataset: str, analysis: Mapping[str, Any] | None = None
+) -> list[Entry]:
     """The configurations of a dataset in the order in which they ran, failed and skipped ones included.
 
     Parameters
@@ -135,13 +143,24 @@ def entries_of(comparison: Comparison, dataset: str, analysis: Mapping[str, Any]
     needs = needs_of(comparison, dataset)
     rows = [row for row in comparison.rows if row["dataset"] == dataset]
     plain = [Entry(row, False, False) for row in rows]
-    points = [Point(e.latency_ms, e.error, str(i)) for i, e in enumerate(plain) if e.ran and isfinite(e.latency_ms)]
+    points = [
+        Point(e.latency_ms, e.error, str(i))
+        for i, e in enumerate(plain)
+        if e.ran and isfinite(e.latency_ms)
+    ]
     front = {point.label for point in non_dominated(points)}
-    intervals = {record["label"]: _intervals(record) for record in (analysis or {}).get("rows", ()) if record["dataset"] == dataset}
+    intervals = {
+        record["label"]: _intervals(record)
+        for record in (analysis or {}).get("rows", ())
+        if record["dataset"] == dataset
+    }
     return [
         Entry(
             e.row,
-            e.ran and e.error <= needs["error"] and e.latency_ms <= needs["latency_ms"] and isfinite(e.error),
+            e.ran
+            and e.error <= needs["error"]
+            and e.latency_ms <= needs["latency_ms"]
+            and isfinite(e.error),
             str(i) in front,
             intervals.get(e.label, {}),
         )
@@ -152,7 +171,11 @@ def entries_of(comparison: Comparison, dataset: str, analysis: Mapping[str, Any]
 def _intervals(record: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
     """Of a record of the analysis, the intervals that have a lower end; an upper one of None is infinite."""
     figures = {name: record[name] for name in ("rel_l2_median", "mean_dof_m", "latency_ms")}
-    return {name: (f["low"], inf if f["high"] is None else f["high"]) for name, f in figures.items() if f["low"] is not None}
+    return {
+        name: (f["low"], inf if f["high"] is None else f["high"])
+        for name, f in figures.items()
+        if f["low"] is not None
+    }
 
 
 def warnings_of(entries: Sequence[Entry]) -> list[tuple[str, str]]:
@@ -175,10 +198,14 @@ def notes_of(comparison: Comparison, dataset: str, analysis: Mapping[str, Any]) 
     for record in analysis["hidden"]:
         if record["dataset"] == dataset and record["worse"]:
             ratio = "infinitely" if record["ratio"] is None else f"{number(record['ratio'])} times"
-            notes.append(f"{record['label']}: on the hidden test set the median error is {ratio} as large as on the shipped one")
+            notes.append(
+                f"{record['label']}: on the hidden test set the median error is {ratio} as large as on the shipped one"
+            )
     methods = {entry.method for entry in entries}
     notes += [
-        f"{record['method']}: {record['verdict']}" for record in analysis["regimes"] if record["method"] in methods and record["in_regime"] is False
+        f"{record['method']}: {record['verdict']}"
+        for record in analysis["regimes"]
+        if record["method"] in methods and record["in_regime"] is False
     ]
     return notes
 
@@ -189,13 +216,27 @@ def _and_more(labels: Sequence[str]) -> str:
 
 def basis_of(dataset: str, analysis: Mapping[str, Any]) -> str:
     """What the intervals of a dataset rest on, in a sentence; empty if there are none."""
-    said = [f"Ranges hold 95 %: errors over {c['n']} {c['of']}" for c in analysis["clusters"] if c["dataset"] == dataset]
+    said = [
+        f"Ranges hold 95 %: errors over {c['n']} {c['of']}"
+        for c in analysis["clusters"]
+        if c["dataset"] == dataset
+    ]
     for found in analysis["timing"]:
         if found["dataset"] == dataset:
-            spread = "with a spread that is typical" if found["specific"] is None else f"that differ by {percent(found['specific'])} %"
-            drift = f" and drift together by {percent(found['common'])} %" if found["common"] else ""
+            spread = (
+                "with a spread that is typical"
+                if found["specific"] is None
+                else f"that differ by {percent(found['specific'])} %"
+            )
+            drift = (
+                f" and drift together by {percent(found['common'])} %" if found["common"] else ""
+            )
             n = found["n_processes"]
-            said.append(f"latencies from one process {spread} of processes" if n == 1 else f"latencies over {n} processes {spread}{drift}")
+            said.append(
+                f"latencies from one process {spread} of processes"
+                if n == 1
+                else f"latencies over {n} processes {spread}{drift}"
+            )
     return f"{', '.join(said)}." if said else ""
 
 
@@ -203,12 +244,18 @@ def best_per_method(entries: Sequence[Entry]) -> list[Entry]:
     """Of each method that ran, the configuration with the smallest ē (then the smallest median error)."""
     ran = [entry for entry in entries if entry.ran]
     methods = dict.fromkeys(entry.method for entry in ran)
-    return [min((e for e in ran if e.method == method), key=lambda e: (e.mean_error_m, e.error)) for method in methods]
+    return [
+        min((e for e in ran if e.method == method), key=lambda e: (e.mean_error_m, e.error))
+        for method in methods
+    ]
 
 
 def discretisation_error(entries: Sequence[Entry]) -> str:
     """The scene's own discretisation error, as text, and what it means for the errors beside it."""
-    found = next((entry.row for entry in entries if entry.row.get("discretisation_error_m") is not None), None)
+    found = next(
+        (entry.row for entry in entries if entry.row.get("discretisation_error_m") is not None),
+        None,
+    )
     if found is None:
         return "not measured"
     relative = found.get("discretisation_rel_l2")
@@ -219,14 +266,22 @@ def discretisation_error(entries: Sequence[Entry]) -> str:
 def headline(comparison: Comparison, dataset: str) -> str:
     """The answer in one or two sentences: the cheapest configuration that meets the needs, or the nearest to it."""
     entries, needs = entries_of(comparison, dataset), needs_of(comparison, dataset)
-    usable = [entry for entry in entries if entry.ran and isfinite(entry.error) and isfinite(entry.latency_ms)]
+    usable = [
+        entry
+        for entry in entries
+        if entry.ran and isfinite(entry.error) and isfinite(entry.latency_ms)
+    ]
     wanted = f"median relative L2 error ≤ {percent(needs['error'])} %, median latency ≤ {number(needs['latency_ms'])} ms"
     if not usable:
         return f"No configuration gave a usable result: {len(entries)} tried, none with a finite median error."
     meeting = [entry for entry in usable if entry.meets_needs]
     if meeting:
         best = min(meeting, key=lambda e: (e.latency_ms, e.error))
-        count = "the only configuration" if len(meeting) == 1 else f"the fastest of {len(meeting)} configurations"
+        count = (
+            "the only configuration"
+            if len(meeting) == 1
+            else f"the fastest of {len(meeting)} configurations"
+        )
         return f"{best.label} is {count} that meet{'s' if len(meeting) == 1 else ''} the needs ({wanted}): {_figures(best)}."
 
     def excess(entry: Entry) -> float:
@@ -235,7 +290,10 @@ def headline(comparison: Comparison, dataset: str) -> str:
     nearest = min(usable, key=excess)
     over = [
         f"{number(value)} times the {name} allowed"
-        for name, value in (("error", nearest.error / needs["error"]), ("latency", nearest.latency_ms / needs["latency_ms"]))
+        for name, value in (
+            ("error", nearest.error / needs["error"]),
+            ("latency", nearest.latency_ms / needs["latency_ms"]),
+        )
         if value > 1
     ]
     return f"No configuration meets the needs ({wanted}). Nearest is {nearest.label}: {_figures(nearest)}, {' and '.join(over)}."
@@ -243,7 +301,11 @@ def headline(comparison: Comparison, dataset: str) -> str:
 
 def _figures(entry: Entry) -> str:
     latency = f"{number(entry.latency_ms)} ms (p95 {number(entry.figure('latency_ms', 'p95'))} ms)"
-    worst = f"{entry.n_failed} without a prediction" if entry.n_failed else f"worst sample {percent(entry.figure('error', 'rel_l2_max'))} %"
+    worst = (
+        f"{entry.n_failed} without a prediction"
+        if entry.n_failed
+        else f"worst sample {percent(entry.figure('error', 'rel_l2_max'))} %"
+    )
     return f"{latency} at {percent(entry.error)} % ({worst})"
 
 
@@ -259,7 +321,11 @@ def number(value: float | None) -> str:
     return f"{value:.0f}" if 1 <= size < 1e5 else f"{value:.1e}"
 
 
-def span(interval: tuple[float, float] | None, scale: float = 1.0, of: Callable[[float], str] | None = None) -> str:
+def span(
+    interval: tuple[float, float] | None,
+    scale: float = 1.0,
+    of: Callable[[float], str] | None = None,
+) -> str:
     """An interval such as ``0.51–0.56``; a dash if there is none."""
     if interval is None:
         return "–"
@@ -292,7 +358,9 @@ def size_of(n_bytes: float | None) -> str:
 
 def short_name(key: str) -> str:
     """A swept parameter's name where space is short."""
-    return SHORT_NAMES.get(key, "".join(word[0] for word in key.split("_") if word) if "_" in key else key)
+    return SHORT_NAMES.get(
+        key, "".join(word[0] for word in key.split("_") if word) if "_" in key else key
+    )
 
 
 def short_swept(swept: dict[str, str]) -> str:

@@ -121,15 +121,23 @@ def _columns_for(entries: Sequence[Entry], width: int) -> tuple[list[Column], in
     """The columns that leave the label its room, in their order, and the characters left for the label."""
 
     def needed(column: Column) -> int:
-        return 1 + max(len(line) for line in [*column.heading.split("\n"), *map(column.cell, entries)])
+        return 1 + max(
+            len(line) for line in [*column.heading.split("\n"), *map(column.cell, entries)]
+        )
 
-    chosen = [column for column in COLUMNS if column.weight == 9 or any(column.cell(entry) not in ("", "–") for entry in entries)]
+    chosen = [
+        column
+        for column in COLUMNS
+        if column.weight == 9 or any(column.cell(entry) not in ("", "–") for entry in entries)
+    ]
     while len(chosen) > 5 and LABEL_WIDTH + sum(map(needed, chosen)) > width:
         chosen.remove(min(chosen, key=lambda column: column.weight))
     return chosen, max(width - sum(map(needed, chosen)), 8)
 
 
-def configuration_table(comparison: Comparison, dataset: str, width: int = 120, analysis: Analysis | None = None) -> Table:
+def configuration_table(
+    comparison: Comparison, dataset: str, width: int = 120, analysis: Analysis | None = None
+) -> Table:
     """A row per configuration of a dataset.
 
     Parameters
@@ -160,13 +168,23 @@ def _target_table(headings: Sequence[str], rows: dict[str, list[str]], width: in
     table = Table(box=SIMPLE_HEAD, padding=0, show_edge=False)
     table.add_column("method", overflow="fold", min_width=8)
     for heading in headings:
-        table.add_column(heading, justify="right", overflow="fold", min_width=len(NOT_REACHED) if width >= 100 else 8)
+        table.add_column(
+            heading,
+            justify="right",
+            overflow="fold",
+            min_width=len(NOT_REACHED) if width >= 100 else 8,
+        )
     for method, cells in rows.items():
-        table.add_row(Text(method), *(Text(cell, style="dim" if cell == NOT_REACHED else "") for cell in cells))
+        table.add_row(
+            Text(method),
+            *(Text(cell, style="dim" if cell == NOT_REACHED else "") for cell in cells),
+        )
     return table
 
 
-def target_cells(comparison: Comparison, dataset: str, kind: str, analysis: Analysis | None = None) -> tuple[list[str], dict[str, list[str]]]:
+def target_cells(
+    comparison: Comparison, dataset: str, kind: str, analysis: Analysis | None = None
+) -> tuple[list[str], dict[str, list[str]]]:
     """Headings and, for each method, a cell per target: the interpolated value, the best real configuration and the 95 % interval.
 
     Parameters
@@ -179,18 +197,28 @@ def target_cells(comparison: Comparison, dataset: str, kind: str, analysis: Anal
     analysis : dict, optional
         From `mor_bench.harness.analysis.analyse`, for the intervals.
     """
-    wanted: list[dict[str, Any]] = [record for record in (analysis or comparison.frontier)[kind] if record["dataset"] == dataset]
+    wanted: list[dict[str, Any]] = [
+        record for record in (analysis or comparison.frontier)[kind] if record["dataset"] == dataset
+    ]
     swept = {entry.label: short_swept(entry.swept) for entry in entries_of(comparison, dataset)}
     of_time = kind == "time_at_error"
     headings: dict[str, None] = {}
     rows: dict[str, list[str]] = {}
     for record in wanted:
-        heading = f"{percent(record['target_rel_l2_median'])} %" if of_time else f"{number(record['target_latency_ms'])} ms"
+        heading = (
+            f"{percent(record['target_rel_l2_median'])} %"
+            if of_time
+            else f"{number(record['target_latency_ms'])} ms"
+        )
         value, best = record["latency_ms" if of_time else "error"], record["best"]
         shown, unit = (number, "ms") if of_time else (percent, "%")
         cell = NOT_REACHED
         if best is not None:
-            lines = [f"{shown(value)} {unit} ({shown(best['latency_ms' if of_time else 'error'])})", swept[best["label"]], _sure(record, shown)]
+            lines = [
+                f"{shown(value)} {unit} ({shown(best['latency_ms' if of_time else 'error'])})",
+                swept[best["label"]],
+                _sure(record, shown),
+            ]
             cell = "\n".join(filter(None, lines))
         headings[heading] = None
         rows.setdefault(record["method"], []).append(cell)
@@ -203,11 +231,17 @@ def _sure(record: Mapping[str, Any], shown: Callable[[float | None], str]) -> st
     if low == high == 0:
         return ""
     if low is None:
-        return f"{NOT_REACHED} in {percent(record['not_reached'])} %" if record.get("not_reached") else ""
+        return (
+            f"{NOT_REACHED} in {percent(record['not_reached'])} %"
+            if record.get("not_reached")
+            else ""
+        )
     return f"{shown(low)}–{NOT_REACHED if high is None else shown(high)}"
 
 
-def tables(comparison: Comparison, width: int = 120, analysis: Analysis | None = None) -> list[RenderableType]:
+def tables(
+    comparison: Comparison, width: int = 120, analysis: Analysis | None = None
+) -> list[RenderableType]:
     """All console tables, a group for each dataset.
 
     Parameters
@@ -222,17 +256,29 @@ def tables(comparison: Comparison, width: int = 120, analysis: Analysis | None =
     return [_dataset_group(comparison, name, width, analysis) for name in dataset_names(comparison)]
 
 
-def pairwise_cells(comparison: Comparison, dataset: str, target: float, analysis: Analysis) -> tuple[list[str], list[list[str]], list[str]]:
+def pairwise_cells(
+    comparison: Comparison, dataset: str, target: float, analysis: Analysis
+) -> tuple[list[str], list[list[str]], list[str]]:
     """Who is faster than whom at an error: the methods that reach it, a row of cells for each, and those that do not.
 
     ``+2.3``: the row's method is 2.3 times faster than the column's, ``-2.3``: slower; ``?1.1``: undecided.
     """
-    records = [r for r in analysis["pairwise"] if r["dataset"] == dataset and r["target_rel_l2_median"] == target]
+    records = [
+        r
+        for r in analysis["pairwise"]
+        if r["dataset"] == dataset and r["target_rel_l2_median"] == target
+    ]
     verdicts = {(record["a"], record["b"]): record for record in records}
-    methods = list(dict.fromkeys(row["method"] for row in comparison.rows if row["dataset"] == dataset))
+    methods = list(
+        dict.fromkeys(row["method"] for row in comparison.rows if row["dataset"] == dataset)
+    )
     absent = {name for record in records for name in record["by"]}
     reached = [method for method in methods if method not in absent]
-    cells = [["·" if a == b else _verdict(verdicts[a, b]) for b in reached] for a in reached] if records else []
+    cells = (
+        [["·" if a == b else _verdict(verdicts[a, b]) for b in reached] for a in reached]
+        if records
+        else []
+    )
     return reached, cells, [method for method in methods if method in absent]
 
 
@@ -243,12 +289,12 @@ def _verdict(record: Mapping[str, Any]) -> str:
     return f"+{number(1 / ratio)}" if record["verdict"] == "faster" else f"-{number(ratio)}"
 
 
-PAIRWISE_LEGEND = (
-    "+2: the row's method is 2 times faster than the column's; -2: slower; ?1.1: 1.1 times faster, but the 95 % interval of the ratio holds 1."
-)
+PAIRWISE_LEGEND = "+2: the row's method is 2 times faster than the column's; -2: slower; ?1.1: 1.1 times faster, but the 95 % interval of the ratio holds 1."
 
 
-def _pairwise_parts(comparison: Comparison, dataset: str, analysis: Analysis) -> list[RenderableType]:
+def _pairwise_parts(
+    comparison: Comparison, dataset: str, analysis: Analysis
+) -> list[RenderableType]:
     """Who is faster at the error that the dataset needs; nothing where less than two methods reach it."""
     error = needs_of(comparison, dataset)["error"]
     reached, cells, absent = pairwise_cells(comparison, dataset, error, analysis)
@@ -262,13 +308,20 @@ def _pairwise_parts(comparison: Comparison, dataset: str, analysis: Analysis) ->
         texts = (Text(cell, style={"+": "green", "-": "red"}.get(cell[0], "dim")) for cell in line)
         table.add_row(Text(f"({i + 1}) {method}"), *texts)
     legend = PAIRWISE_LEGEND + (f" Not reached by {', '.join(absent)}." if absent else "")
-    return [Text(""), Text(f"Who is faster at {percent(error)} %, the error that is needed", style="bold"), table, Text(legend, style="dim")]
+    return [
+        Text(""),
+        Text(f"Who is faster at {percent(error)} %, the error that is needed", style="bold"),
+        table,
+        Text(legend, style="dim"),
+    ]
 
 
 def _out_of_range_parts(entries: Sequence[Entry]) -> list[RenderableType]:
     """Errors, flags and their recall on the named test sets, of the best configuration of each method that learns."""
     best = {entry.label for entry in best_per_method(entries)}
-    grid = out_of_range([entry for entry in entries if entry.label in best and entry.row.get("sets")])
+    grid = out_of_range(
+        [entry for entry in entries if entry.label in best and entry.row.get("sets")]
+    )
     if grid is None:
         return []
     table = Table(box=SIMPLE_HEAD, padding=0, show_edge=False)
@@ -283,17 +336,31 @@ def _out_of_range_parts(entries: Sequence[Entry]) -> list[RenderableType]:
 def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: Analysis) -> Group:
     entries, needs = entries_of(comparison, dataset, analysis), needs_of(comparison, dataset)
     title = str(comparison.datasets.get(dataset, {}).get("title", ""))
-    notes = [Text(f"{entry.label}: {entry.trouble}", style="red") for entry in entries if entry.trouble]
+    notes = [
+        Text(f"{entry.label}: {entry.trouble}", style="red") for entry in entries if entry.trouble
+    ]
     unused = max((entry.row.get("n_unused") or 0 for entry in entries), default=0)
     if unused:
-        notes.append(Text(f"{unused:,} samples with forces on both sides of the split are in neither part", style="yellow"))
+        notes.append(
+            Text(
+                f"{unused:,} samples with forces on both sides of the split are in neither part",
+                style="yellow",
+            )
+        )
     notes += [Text(note, style="yellow") for note in notes_of(comparison, dataset, analysis)]
-    notes += [Text(f"{label}: warning: {warning}", style="yellow") for label, warning in warnings_of(entries)]
+    notes += [
+        Text(f"{label}: warning: {warning}", style="yellow")
+        for label, warning in warnings_of(entries)
+    ]
     marks = "Pareto *: no other configuration is both faster and more accurate (medians)."
-    marks += " Latency ~: not stable, see below." if any(entry.unstable for entry in entries) else ""
+    marks += (
+        " Latency ~: not stable, see below." if any(entry.unstable for entry in entries) else ""
+    )
     parts: list[RenderableType] = [
         Text(f"{dataset}{f' – {title}' if title else ''}", style="bold"),
-        Text(f"needs: relative L2 (median) ≤ {percent(needs['error'])} %, latency (median) ≤ {number(needs['latency_ms'])} ms"),
+        Text(
+            f"needs: relative L2 (median) ≤ {percent(needs['error'])} %, latency (median) ≤ {number(needs['latency_ms'])} ms"
+        ),
         Text(f"discretisation error of the scene itself: {discretisation_error(entries)}"),
         Text(""),
         configuration_table(comparison, dataset, width, analysis),
@@ -301,8 +368,14 @@ def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: A
         *notes,
     ]
     for kind, heading in (
-        ("time_at_error", "Time at error: median latency at a median relative L2 error (in brackets: the fastest real configuration)"),
-        ("error_at_time", "Error at time: median relative L2 error within a median latency (in brackets: the best real configuration)"),
+        (
+            "time_at_error",
+            "Time at error: median latency at a median relative L2 error (in brackets: the fastest real configuration)",
+        ),
+        (
+            "error_at_time",
+            "Error at time: median relative L2 error within a median latency (in brackets: the best real configuration)",
+        ),
     ):
         headings, rows = target_cells(comparison, dataset, kind, analysis)
         parts += [Text(""), Text(heading, style="bold"), _target_table(headings, rows, width)]
@@ -314,7 +387,9 @@ def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: A
     return Group(*parts)
 
 
-def print_tables(comparison: Comparison, console: Console | None = None, analysis: Analysis | None = None) -> None:
+def print_tables(
+    comparison: Comparison, console: Console | None = None, analysis: Analysis | None = None
+) -> None:
     """Print all tables.
 
     Parameters
@@ -329,7 +404,9 @@ def print_tables(comparison: Comparison, console: Console | None = None, analysi
     with console.capture() as captured:
         for part in tables(comparison, console.width, analysis):
             console.print(part, highlight=False)
-    encoding = console.encoding or "utf-8"  # a redirected stream of a legacy code page must not end a long run with an error
+    encoding = (
+        console.encoding or "utf-8"
+    )  # a redirected stream of a legacy code page must not end a long run with an error
     console.file.write(captured.get().encode(encoding, "replace").decode(encoding))
     console.file.flush()
 
@@ -349,15 +426,27 @@ def print_discretisation(record: dict[str, Any], console: Console | None = None)
         table.add_column(heading, justify="right")
     for load in record["loads"]:
         force = ", ".join(number(hypot(*vector)) for vector in load["vectors_n"])
-        figures = (metres(load["error_m"]), percent(load["relative_l2"]), number(load["order"]), load["limit"])
+        figures = (
+            metres(load["error_m"]),
+            percent(load["relative_l2"]),
+            number(load["order"]),
+            load["limit"],
+        )
         table.add_row(str(load["sample"]), ", ".join(map(str, load["patches"])), force, *figures)
     console.print(table, highlight=False)
     for load in record["loads"]:
         if load["error_m"] is None:
-            console.print(Text(f"sample {load['sample']} is in no mean: {load['reason']}", style="red"))
-    for kind, meshes in (("meshes", record["meshes"]), ("left out for their size", record["left_out"])):
+            console.print(
+                Text(f"sample {load['sample']} is in no mean: {load['reason']}", style="red")
+            )
+    for kind, meshes in (
+        ("meshes", record["meshes"]),
+        ("left out for their size", record["left_out"]),
+    ):
         if meshes:
-            shown = ", ".join(f"{mesh['n_cells']:,} cells ({mesh['n_dofs']:,} dofs)" for mesh in meshes)
+            shown = ", ".join(
+                f"{mesh['n_cells']:,} cells ({mesh['n_dofs']:,} dofs)" for mesh in meshes
+            )
             console.print(Text(f"{kind}: {shown}"))
     mean = f"mean e {metres(record['error_m'])} m, relative L2 {percent(record['relative_l2'])} % (median {percent(record['relative_l2_median'])} %)"
     console.print(Text(f"discretisation error of {record['dataset']}: {mean}", style="bold"))
@@ -375,4 +464,9 @@ def print_plan(plan: Plan, console: Console | None = None) -> None:
         table.add_row(step.dataset, Text(step.label), "in the cache" if step.done else estimate)
     console.print(table, highlight=False)
     unknown = f", and {plan.n_unknown} steps of which nothing is known" if plan.n_unknown else ""
-    console.print(Text(f"about {plan.seconds / 60:.1f} min, {plan.timing_s / 60:.1f} of them timing{unknown}", style="bold"))
+    console.print(
+        Text(
+            f"about {plan.seconds / 60:.1f} min, {plan.timing_s / 60:.1f} of them timing{unknown}",
+            style="bold",
+        )
+    )

@@ -49,8 +49,12 @@ def read_mesh(path: Path, unit_m: float) -> tuple[Mesh, PointSets]:
     kinds = {block.type for block in raw.cells if block.dim == 3}
     if len(kinds) != 1 or not kinds <= CELLS.keys():
         came = " and ".join(sorted(kinds)) or "no volume cells"
-        raise SpecError(f"{path}: the cells must all be linear hexahedra or all linear tetrahedra, {' or '.join(CELLS)}; got {came}.")
-    cells = np.concatenate([np.asarray(block.data, dtype=np.int64) for block in raw.cells if block.type in kinds])
+        raise SpecError(
+            f"{path}: the cells must all be linear hexahedra or all linear tetrahedra, {' or '.join(CELLS)}; got {came}."
+        )
+    cells = np.concatenate(
+        [np.asarray(block.data, dtype=np.int64) for block in raw.cells if block.type in kinds]
+    )
     try:
         mesh, place = tidied(_positions(raw, unit_m), cells)
     except SpecError as error:
@@ -88,7 +92,9 @@ def read_triangles(path: Path, unit_m: float) -> NDArray[np.float64]:
         raise SpecError(f"{path}: a surface must hold triangles; got none.")
     numbers = np.concatenate(triangles)
     if numbers.min() < 0 or numbers.max() >= len(points):
-        raise SpecError(f"{path}: triangles must have points in [1, {len(points)}]; got {numbers.min() + 1} to {numbers.max() + 1}.")
+        raise SpecError(
+            f"{path}: triangles must have points in [1, {len(points)}]; got {numbers.min() + 1} to {numbers.max() + 1}."
+        )
     corners: NDArray[np.float64] = points[numbers]
     if not np.isfinite(corners).all():
         raise SpecError(f"{path}: positions must be finite.")
@@ -127,13 +133,25 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
             warnings.simplefilter("ignore")
             raw = meshio.read(path, file_format)
     except UnicodeDecodeError:
-        broken = "neither text nor a binary file of the length that it names" if path.suffix.lower() == ".stl" else "damaged, or of another format"
-        raise SpecError(f"{path}: cannot be read as {path.suffix[1:].upper()}: it is {broken}.") from None
+        broken = (
+            "neither text nor a binary file of the length that it names"
+            if path.suffix.lower() == ".stl"
+            else "damaged, or of another format"
+        )
+        raise SpecError(
+            f"{path}: cannot be read as {path.suffix[1:].upper()}: it is {broken}."
+        ) from None
     except (Exception, SystemExit) as error:
         if "need at least one array" in str(error):
             raise SpecError(f"{path}: the file is empty or holds no mesh.") from None
-        said = " ".join((printed.getvalue() if isinstance(error, SystemExit) else str(error)).split())
-        raise SpecError(f"{path}: meshio cannot read it ({said or type(error).__name__}).") from None
+        said = " ".join(
+            (printed.getvalue() if isinstance(error, SystemExit) else str(error)).split()
+        )
+        raise SpecError(
+            f"{path}: meshio cannot read it ({said or type(error).__name__})."
+        ) from None
     if raw.points.size and (raw.points.ndim != 2 or raw.points.shape[1] != 3):
-        raise SpecError(f"{path}: positions must have three coordinates; got an array of shape {raw.points.shape}.")
+        raise SpecError(
+            f"{path}: positions must have three coordinates; got an array of shape {raw.points.shape}."
+        )
     return raw

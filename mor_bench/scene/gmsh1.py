@@ -15,9 +15,24 @@ import numpy as np
 from mor_bench.errors import SpecError
 
 _TYPES = {
-    1: "line", 2: "triangle", 3: "quad", 4: "tetra", 5: "hexahedron", 6: "wedge", 7: "pyramid", 8: "line3", 9: "triangle6",
-    10: "quad9", 11: "tetra10", 12: "hexahedron27", 13: "wedge18", 14: "pyramid14", 15: "vertex", 16: "quad8", 17: "hexahedron20",
-}  # fmt: skip
+    1: "line",
+    2: "triangle",
+    3: "quad",
+    4: "tetra",
+    5: "hexahedron",
+    6: "wedge",
+    7: "pyramid",
+    8: "line3",
+    9: "triangle6",
+    10: "quad9",
+    11: "tetra10",
+    12: "hexahedron27",
+    13: "wedge18",
+    14: "pyramid14",
+    15: "vertex",
+    16: "quad8",
+    17: "hexahedron20",
+}
 """Numbers of element types; linear ones have the node order of VTK."""
 
 
@@ -54,7 +69,9 @@ def read_gmsh1(path: Path) -> meshio.Mesh:
             cell_data={"gmsh:physical": [np.array(groups) for _, groups in blocks.values()]},
         )
     except KeyError as error:
-        raise SpecError(f"{path}: not a sound Gmsh 1 file: there is no node, or no element type, {error}.") from None
+        raise SpecError(
+            f"{path}: not a sound Gmsh 1 file: there is no node, or no element type, {error}."
+        ) from None
     except ValueError as error:
         raise SpecError(f"{path}: not a sound Gmsh 1 file: {error}.") from None
 
@@ -64,7 +81,11 @@ def _section(lines: Sequence[str], name: str) -> list[list[str]]:
     stripped = [line.strip() for line in lines]
     if f"${name}" not in stripped or f"$END{name}" not in stripped:
         raise ValueError(f"${name} or $END{name} is missing")
-    found = [line.split() for line in stripped[stripped.index(f"${name}") + 1 : stripped.index(f"$END{name}")] if line]
+    found = [
+        line.split()
+        for line in stripped[stripped.index(f"${name}") + 1 : stripped.index(f"$END{name}")]
+        if line
+    ]
     if not found or int(found[0][0]) != len(found) - 1:
         raise ValueError(f"${name} must hold as many lines as its first says")
     return found[1:]

@@ -62,7 +62,9 @@ def _product(matrix: sp.csr_array, values: NDArray[np.floating]) -> NDArray[np.f
     """(n, columns, 3) → (n, rows, 3); scipy adds in the same order on any number of threads."""
     rows, columns = matrix.shape
     if values.ndim != 3 or values.shape[1:] != (columns, 3):
-        raise InvalidInputError(f"the values must have shape (n, {columns}, 3); got {values.shape}.")
+        raise InvalidInputError(
+            f"the values must have shape (n, {columns}, 3); got {values.shape}."
+        )
     product = matrix @ values.transpose(1, 0, 2).reshape(columns, 3 * len(values))
     return np.ascontiguousarray(product.reshape(rows, len(values), 3).transpose(1, 0, 2))
 
@@ -89,12 +91,20 @@ def grid_map(mesh: Mesh, shape: tuple[int, int, int] | None = None) -> GridMap:
     InvalidInputError
         If the shape is left to `default_shape` and the body has no volume.
     """
-    if mesh.grid_shape is not None and mesh.grid_index is not None and shape in (None, mesh.grid_shape):
+    if (
+        mesh.grid_shape is not None
+        and mesh.grid_index is not None
+        and shape in (None, mesh.grid_shape)
+    ):
         places = (np.ones(mesh.n_nodes), (np.arange(mesh.n_nodes), mesh.grid_index))
-        return GridMap(mesh.grid_shape, sp.csr_array(places, shape=(mesh.n_nodes, prod(mesh.grid_shape))))
+        return GridMap(
+            mesh.grid_shape, sp.csr_array(places, shape=(mesh.n_nodes, prod(mesh.grid_shape)))
+        )
     nx, ny, nz = default_shape(mesh) if shape is None else shape
     if min(nx, ny, nz) < 2 or nx * ny * nz > MAX_POINTS:
-        raise SpecError(f"a regular grid must have at least 2 points per axis and at most {MAX_POINTS:,} in all; got {nx} x {ny} x {nz}.")
+        raise SpecError(
+            f"a regular grid must have at least 2 points per axis and at most {MAX_POINTS:,} in all; got {nx} x {ny} x {nz}."
+        )
     low, high = mesh.bounds
     length_x, length_y, length_z = (float(length) for length in high - low)
     # Nodes on the bounding box lie inside: rounding is monotone, so that no difference exceeds that of the bounds.

@@ -93,8 +93,19 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
                 return {name: _entry(content, name) for name in content}
     except SpecError:
         raise
-    except (OSError, ValueError, EOFError, TypeError, KeyError, AttributeError, zipfile.BadZipFile, UnpicklingError) as error:
-        raise SpecError(f"not a readable {suffix} file of arrays: {' '.join(str(error).split())}") from None
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        zipfile.BadZipFile,
+        UnpicklingError,
+    ) as error:
+        raise SpecError(
+            f"not a readable {suffix} file of arrays: {' '.join(str(error).split())}"
+        ) from None
     raise SpecError(f"snapshots must be in an .npz, .h5 or .hdf5 file; got {suffix!r}.")
 
 
@@ -105,7 +116,9 @@ def _entry(content: h5py.File, name: str) -> NDArray[Any]:
             return np.asarray(entry[()] if entry.shape is not None else np.zeros(0))
     except (OSError, KeyError, RuntimeError) as error:
         raise SpecError(f"`{name}` cannot be read: {' '.join(str(error).split())}") from None
-    raise SpecError(f"`{name}` must be an array of numbers; got {'text' if isinstance(entry, h5py.Dataset) else 'a group'}.")
+    raise SpecError(
+        f"`{name}` must be an array of numbers; got {'text' if isinstance(entry, h5py.Dataset) else 'a group'}."
+    )
 
 
 def _check_names(names: list[str]) -> None:
@@ -113,7 +126,9 @@ def _check_names(names: list[str]) -> None:
     for name in names:
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1)
-            raise SpecError(f"unknown array `{name}`{f'; did you mean {close[0]!r}?' if close else '.'} Allowed: {', '.join(known)}.")
+            raise SpecError(
+                f"unknown array `{name}`{f'; did you mean {close[0]!r}?' if close else '.'} Allowed: {', '.join(known)}."
+            )
     for name in REQUIRED:
         if name not in names:
             raise SpecError(f"array `{name}` is missing.")
@@ -133,19 +148,33 @@ def _checked(arrays: Mapping[str, NDArray[Any]]) -> ImportedArrays:
         raise SpecError(f"every node must belong to a cell; {unused} of {n_nodes} do not.")
     cells = sound_cells(points, cells)
     _check_samples(forces, displacements, fixed, regions)
-    return ImportedArrays(in_grid(Mesh(points, cells)), forces, displacements, fixed, regions, _truths(arrays.get("test")))
+    return ImportedArrays(
+        in_grid(Mesh(points, cells)),
+        forces,
+        displacements,
+        fixed,
+        regions,
+        _truths(arrays.get("test")),
+    )
 
 
 def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
     """Raise `SpecError` for the first array of a wrong type or shape, or with an entry that is not finite."""
     n, n_nodes = len(np.atleast_1d(arrays["forces"])), len(np.atleast_1d(arrays["points"]))
     shapes: dict[str, tuple[tuple[int | None, ...], ...]] = {
-        "points": ((None, 3),), "cells": ((None, 8), (None, 4)), "forces": ((n, n_nodes, 3),), "displacements": ((n, n_nodes, 3),),
-        "fixed_nodes": ((None,),), "regions": ((n,), (n, None)), "test": ((n,),),
-    }  # fmt: skip
+        "points": ((None, 3),),
+        "cells": ((None, 8), (None, 4)),
+        "forces": ((n, n_nodes, 3),),
+        "displacements": ((n, n_nodes, 3),),
+        "fixed_nodes": ((None,),),
+        "regions": ((n,), (n, None)),
+        "test": ((n,),),
+    }
     for name in (*REQUIRED, *OPTIONAL):
         array = arrays.get(name)
-        if array is None or (name == "fixed_nodes" and array.size == 0):  # what is empty may have any type
+        if array is None or (
+            name == "fixed_nodes" and array.size == 0
+        ):  # what is empty may have any type
             continue
         kinds = _KINDS.get(name, "fiu")
         if array.dtype.kind not in kinds:
@@ -159,7 +188,9 @@ def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _has_shape(array: NDArray[Any], shape: tuple[int | None, ...]) -> bool:
-    return array.ndim == len(shape) and all(size in (None, found) for size, found in zip(shape, array.shape, strict=True))
+    return array.ndim == len(shape) and all(
+        size in (None, found) for size, found in zip(shape, array.shape, strict=True)
+    )
 
 
 def _integers(array: NDArray[Any]) -> NDArray[np.int64]:
@@ -172,9 +203,13 @@ def _in_range(name: str, array: NDArray[Any]) -> NDArray[np.float64]:
     size, unit = np.abs(numbers), {"forces": "N", "displacements": "m"}[name]
     if not (size <= MAX_SIZE[name]).all():
         worst = [int(i) for i in np.unravel_index(size.argmax(), size.shape)]
-        raise SpecError(f"`{name}` must be in [-{MAX_SIZE[name]:g}, {MAX_SIZE[name]:g}] {unit}; entry {worst} is {numbers[tuple(worst)]:g}.")
+        raise SpecError(
+            f"`{name}` must be in [-{MAX_SIZE[name]:g}, {MAX_SIZE[name]:g}] {unit}; entry {worst} is {numbers[tuple(worst)]:g}."
+        )
     if size.size and not size.any():
-        raise SpecError(f"`{name}` must differ from zero somewhere, and be at most {MAX_SIZE[name]:g} {unit}; got zeros only.")
+        raise SpecError(
+            f"`{name}` must differ from zero somewhere, and be at most {MAX_SIZE[name]:g} {unit}; got zeros only."
+        )
     return numbers
 
 
@@ -185,16 +220,23 @@ def _truths(array: NDArray[Any] | None) -> NDArray[np.bool_] | None:
 
 
 def _check_samples(
-    forces: NDArray[np.float64], displacements: NDArray[np.float64], fixed: NDArray[np.int64], regions: NDArray[np.int64] | None
-) -> None:  # fmt: skip
+    forces: NDArray[np.float64],
+    displacements: NDArray[np.float64],
+    fixed: NDArray[np.int64],
+    regions: NDArray[np.int64] | None,
+) -> None:
     n, n_nodes = forces.shape[:2]
     if len(fixed) and (fixed[0] < 0 or fixed[-1] >= n_nodes):
-        raise SpecError(f"`fixed_nodes` must be in [0, {n_nodes - 1}]; got {fixed[0]} to {fixed[-1]}.")
+        raise SpecError(
+            f"`fixed_nodes` must be in [0, {n_nodes - 1}]; got {fixed[0]} to {fixed[-1]}."
+        )
     if len(fixed) == n_nodes:
         raise SpecError("`fixed_nodes` holds every node: nothing can move.")
     moved = np.abs(displacements[:, fixed]).max(axis=(1, 2), initial=0.0)
     if (moved > STILL * np.abs(displacements).max()).any():
-        raise SpecError(f"`displacements` must be zero at `fixed_nodes`; sample {int(moved.argmax())} has {moved.max():.3g} m.")
+        raise SpecError(
+            f"`displacements` must be zero at `fixed_nodes`; sample {int(moved.argmax())} has {moved.max():.3g} m."
+        )
     if regions is not None and (not regions.size or regions.min() < 0):
         raise SpecError("`regions` must be ids from 0 on.")
     # 0.0 and -0.0 are one number and two patterns of bits.

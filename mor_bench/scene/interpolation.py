@@ -17,10 +17,24 @@ NEWTON_STEPS = 30
 ROUND_OFF = 1e-14
 FIRST_CANDIDATES = 8
 
-_CORNERS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], dtype=float)
+_CORNERS = np.array(
+    [
+        [-1, -1, -1],
+        [1, -1, -1],
+        [1, 1, -1],
+        [-1, 1, -1],
+        [-1, -1, 1],
+        [1, -1, 1],
+        [1, 1, 1],
+        [-1, 1, 1],
+    ],
+    dtype=float,
+)
 
 
-def _tetrahedron(corners: NDArray[np.float64], points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _tetrahedron(
+    corners: NDArray[np.float64], points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Barycentric coordinates (n, 4) of points (n, 3) in tetrahedra (n, 4, 3), and how far outside each lies."""
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
     inner = np.linalg.solve(edges, (points - corners[:, 0])[:, :, None])[:, :, 0]
@@ -31,11 +45,20 @@ def _tetrahedron(corners: NDArray[np.float64], points: NDArray[np.float64]) -> t
 def _trilinear(xi: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Shape functions (n, 8) of a hexahedron at xi (n, 3), and their derivatives (n, 8, 3)."""
     terms = 1 + xi[:, None, :] * _CORNERS
-    others = np.stack([terms[:, :, 1] * terms[:, :, 2], terms[:, :, 0] * terms[:, :, 2], terms[:, :, 0] * terms[:, :, 1]], axis=2)
+    others = np.stack(
+        [
+            terms[:, :, 1] * terms[:, :, 2],
+            terms[:, :, 0] * terms[:, :, 2],
+            terms[:, :, 0] * terms[:, :, 1],
+        ],
+        axis=2,
+    )
     return terms.prod(axis=2) / 8, _CORNERS * others / 8
 
 
-def _hexahedron(corners: NDArray[np.float64], points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _hexahedron(
+    corners: NDArray[np.float64], points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Shape functions (n, 8) at points (n, 3) of hexahedra (n, 8, 3), by Newton's method, and how far outside each lies."""
     xi = np.zeros_like(points)
     size = np.linalg.norm(np.ptp(corners, axis=1), axis=1)
@@ -89,9 +112,14 @@ def interpolation_matrix(mesh: Mesh, points: NDArray[np.float64]) -> sp.csr_arra
     searched = np.arange(len(points))
     n_candidates = min(FIRST_CANDIDATES, mesh.n_cells)
     while len(searched):
-        distance, candidates = (np.asarray(found) for found in tree.query(points[searched], k=[*range(1, n_candidates + 1)]))
+        distance, candidates = (
+            np.asarray(found)
+            for found in tree.query(points[searched], k=[*range(1, n_candidates + 1)])
+        )
         x = points[searched][:, None]
-        row, column = np.nonzero(((x >= low[candidates] - margin) & (x <= high[candidates] + margin)).all(axis=2))
+        row, column = np.nonzero(
+            ((x >= low[candidates] - margin) & (x <= high[candidates] + margin)).all(axis=2)
+        )
         cells = candidates[row, column]
         shape, outside = locate(corners[cells], points[searched[row]])
         # Of the cells that hold a point the one that holds it best; the last written wins.
@@ -110,6 +138,8 @@ def interpolation_matrix(mesh: Mesh, points: NDArray[np.float64]) -> sp.csr_arra
         n_candidates = min(4 * n_candidates, mesh.n_cells)
     shape_of[np.abs(shape_of) <= ROUND_OFF] = 0
     rows = np.repeat(np.arange(len(points)), mesh.cells.shape[1])
-    matrix = sp.csr_array((shape_of.ravel(), (rows, mesh.cells[cell_of].ravel())), shape=(len(points), mesh.n_nodes))
+    matrix = sp.csr_array(
+        (shape_of.ravel(), (rows, mesh.cells[cell_of].ravel())), shape=(len(points), mesh.n_nodes)
+    )
     matrix.eliminate_zeros()
     return matrix

@@ -20,11 +20,13 @@ from mor_bench.scene.tetrahedra import tetrahedral_mesh
 _UNIT_M = 0.0101966
 """Metres per unit of the figures below, with which the body is 0.2 m long."""
 
-_ELLIPSOIDS = np.array([
-    [-5.89, 0.81, -0.16, 5.77, 5.13, 3.12, 8.42, 1.26, 17.52],
-    [6.6, -0.09, 0.6, 8.33, 3.55, 2.4, 10.52, -2.03, -6.45],
-    [1.05, -5.38, -2.55, 2.0, 3.19, 4.21, 2.05, 2.15, -18.29],
-])  # fmt: skip
+_ELLIPSOIDS = np.array(
+    [
+        [-5.89, 0.81, -0.16, 5.77, 5.13, 3.12, 8.42, 1.26, 17.52],
+        [6.6, -0.09, 0.6, 8.33, 3.55, 2.4, 10.52, -2.03, -6.45],
+        [1.05, -5.38, -2.55, 2.0, 3.19, 4.21, 2.05, 2.15, -18.29],
+    ]
+)
 """Centre, semi-axes and turns about x, y and z in degrees of the right lobe, the left lobe and the notch."""
 
 _POSE = np.array([-28.36, -26.55, -38.02])
@@ -58,7 +60,8 @@ def liver_level(points: NDArray[np.float64]) -> NDArray[np.float64]:
     own = points / _UNIT_M @ pose
     turns = Rotation.from_euler("xyz", _ELLIPSOIDS[:, 6:], degrees=True).as_matrix()
     right, left, notch = (
-        (((own - ellipsoid[:3]) @ turn / ellipsoid[3:6]) ** 2).sum(axis=1) - 1 for ellipsoid, turn in zip(_ELLIPSOIDS, turns, strict=True)
+        (((own - ellipsoid[:3]) @ turn / ellipsoid[3:6]) ** 2).sum(axis=1) - 1
+        for ellipsoid, turn in zip(_ELLIPSOIDS, turns, strict=True)
     )
     lobes = -np.logaddexp(-_SHARPNESS * right, -_SHARPNESS * left) / _SHARPNESS
     return np.asarray(np.logaddexp(_SHARPNESS * lobes, -_SHARPNESS * notch) / _SHARPNESS)

@@ -34,12 +34,17 @@ def _midpoints(n_corners: int, m: int) -> tuple[NDArray[np.float64], NDArray[np.
         s = (np.arange(m) + 0.5) / m
         x, y = (a.ravel() for a in np.meshgrid(s, s, indexing="ij"))
         shape = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
-        return shape, np.stack([np.stack([y - 1, 1 - y, y, -y], axis=1), np.stack([x - 1, -x, x, 1 - x], axis=1)], axis=2)
+        return shape, np.stack(
+            [np.stack([y - 1, 1 - y, y, -y], axis=1), np.stack([x - 1, -x, x, 1 - x], axis=1)],
+            axis=2,
+        )
     i, j = (a.ravel() for a in np.meshgrid(np.arange(m), np.arange(m), indexing="ij"))
     up = [(i + 1 / 3)[i + j < m] / m, (j + 1 / 3)[i + j < m] / m]
     down = [(i + 2 / 3)[i + j < m - 1] / m, (j + 2 / 3)[i + j < m - 1] / m]
     x, y = np.append(up[0], down[0]), np.append(up[1], down[1])
-    return np.stack([1 - x - y, x, y], axis=1), np.tile(np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]]), (len(x), 1, 1))
+    return np.stack([1 - x - y, x, y], axis=1), np.tile(
+        np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]]), (len(x), 1, 1)
+    )
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,9 @@ class Patches:
         return np.asarray(sums / np.linalg.norm(sums, axis=1, keepdims=True))
 
 
-def _midpoint_rule(surface: Facets, facets: NDArray[np.int64], spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64], sp.csr_array]:
+def _midpoint_rule(
+    surface: Facets, facets: NDArray[np.int64], spacing: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], sp.csr_array]:
     """Positions (n, 3), area vectors (n, 3) and shape-function values (n, n_surface_points) of points on the facets."""
     corners, n_corners = surface.points[facets], facets.shape[1]
     longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
@@ -104,11 +111,16 @@ def _midpoint_rule(surface: Facets, facets: NDArray[np.int64], spacing: float) -
     n_points = len(facets) * len(shape)
     rows = np.repeat(np.arange(n_points), n_corners)
     columns = np.repeat(facets, len(shape), axis=0).ravel()
-    values = sp.csr_array((np.tile(shape, (len(facets), 1)).ravel(), (rows, columns)), shape=(n_points, len(surface.points)))
+    values = sp.csr_array(
+        (np.tile(shape, (len(facets), 1)).ravel(), (rows, columns)),
+        shape=(n_points, len(surface.points)),
+    )
     return positions.reshape(-1, 3), areas.reshape(-1, 3), values
 
 
-def cut_patches(surface: Facets, facets: NDArray[np.int64], centres: NDArray[np.int64], area_m2: float) -> Patches:
+def cut_patches(
+    surface: Facets, facets: NDArray[np.int64], centres: NDArray[np.int64], area_m2: float
+) -> Patches:
     """The patches around some points of a surface.
 
     The patch around a point is the part of the facets that lies nearest to it and has the given area, so that a patch
@@ -130,11 +142,15 @@ def cut_patches(surface: Facets, facets: NDArray[np.int64], centres: NDArray[np.
         If there is no facet, the facets are smaller than one patch, or so large that a patch is lost on one.
     """
     if len(facets) == 0:
-        raise SpecError("the load region holds nodes but no facet of the surface, so no traction can act on it.")
+        raise SpecError(
+            "the load region holds nodes but no facet of the surface, so no traction can act on it."
+        )
     positions, vectors, values = _points(surface, facets, area_m2)
     areas = np.linalg.norm(vectors, axis=1)
     if area_m2 > areas.sum() * (1 + 1e-12):
-        raise SpecError(f"`patch_area_m2` must be in (0, {areas.sum():.6g}], the area of the load region; got {area_m2}.")
+        raise SpecError(
+            f"`patch_area_m2` must be in (0, {areas.sum():.6g}], the area of the load region; got {area_m2}."
+        )
     nearness = sqrt(area_m2) * 1e-9
     rows, columns, shares = [], [], []
     for row, centre in enumerate(surface.points[centres]):
@@ -159,8 +175,11 @@ def cut_patches(surface: Facets, facets: NDArray[np.int64], centres: NDArray[np.
 
 
 def _nearest(
-    positions: NDArray[np.float64], areas: NDArray[np.float64], centre: NDArray[np.float64], area_m2: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:  # fmt: skip
+    positions: NDArray[np.float64],
+    areas: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    area_m2: float,
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Rising numbers of points around a centre that have more than the wanted area together, or of all; and their distances, m."""
     distance = np.linalg.norm(positions - centre, axis=1)
     reach = 2 * sqrt(area_m2 / pi)
@@ -175,7 +194,7 @@ def _nearest(
 
 def _points(
     surface: Facets, facets: NDArray[np.int64], area_m2: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], sp.csr_array]:  # fmt: skip
+) -> tuple[NDArray[np.float64], NDArray[np.float64], sp.csr_array]:
     """As `_midpoint_rule`, after long triangles have been halved, and again, until there are few enough points."""
     spacing = sqrt(area_m2 / POINTS_PER_PATCH)
     longest = _longest_edge(surface.points[facets])
@@ -189,14 +208,18 @@ def _points(
             mean = sp.csr_array(sp.kron(sp.eye_array(len(corners)), np.full((1, 3), 1 / 3)))
             return corners.mean(axis=1), vectors, sp.csr_array(mean @ to_corners)
     least = POINTS_PER_PATCH * len(facets) * longest**2 / MAX_SURFACE_POINTS
-    raise SpecError(f"`patch_area_m2` must be at least about {least:.3g}, for facets with edges of up to {longest:.3g} m; got {area_m2}.")
+    raise SpecError(
+        f"`patch_area_m2` must be at least about {least:.3g}, for facets with edges of up to {longest:.3g} m; got {area_m2}."
+    )
 
 
 def _longest_edge(corners: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
 
 
-def _halved(surface: Facets, facets: NDArray[np.int64], length: float) -> tuple[Facets, sp.csr_array]:
+def _halved(
+    surface: Facets, facets: NDArray[np.int64], length: float
+) -> tuple[Facets, sp.csr_array]:
     """Triangles cut across their longest edges until none is longer than a length, m.
 
     Returns
@@ -218,10 +241,15 @@ def _halved(surface: Facets, facets: NDArray[np.int64], length: float) -> tuple[
         one, other = shares[long].copy(), shares[long].copy()
         middle = 0.5 * (one[rows, a] + one[rows, (a + 1) % 3])
         one[rows, (a + 1) % 3], other[rows, a] = middle, middle
-        owner, shares = np.concatenate([owner[~long], owner[long], owner[long]]), np.concatenate([shares[~long], one, other])
+        owner, shares = (
+            np.concatenate([owner[~long], owner[long], owner[long]]),
+            np.concatenate([shares[~long], one, other]),
+        )
     n = 3 * len(owner)
     at = np.repeat(np.arange(n), 3), np.repeat(facets[owner], 3, axis=0).ravel()
-    return Facets(corners.reshape(-1, 3), np.arange(n).reshape(-1, 3)), sp.csr_array((shares.ravel(), at), shape=(n, len(surface.points)))
+    return Facets(corners.reshape(-1, 3), np.arange(n).reshape(-1, 3)), sp.csr_array(
+        (shares.ravel(), at), shape=(n, len(surface.points))
+    )
 
 
 def spread_out(points: NDArray[np.float64], n: int) -> NDArray[np.int64]:

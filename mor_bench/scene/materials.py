@@ -153,7 +153,11 @@ class Ogden(Material):
     law: ClassVar[int] = 3
 
     def _with(self, bulk: float, factor: float) -> tuple[float, ...]:
-        pairs = [value for mu, alpha in zip(self.mu_pa, self.alpha, strict=True) for value in (factor * mu, alpha)]
+        pairs = [
+            value
+            for mu, alpha in zip(self.mu_pa, self.alpha, strict=True)
+            for value in (factor * mu, alpha)
+        ]
         return (bulk, *pairs)
 
     @property
@@ -170,7 +174,10 @@ class Ogden(Material):
 
     @property
     def poisson_at_rest(self) -> float:
-        return poisson_of(self.bulk_pa, 0.5 * sum(mu * alpha for mu, alpha in zip(self.mu_pa, self.alpha, strict=True)))
+        return poisson_of(
+            self.bulk_pa,
+            0.5 * sum(mu * alpha for mu, alpha in zip(self.mu_pa, self.alpha, strict=True)),
+        )
 
 
 def poisson_of(bulk_pa: float, shear_pa: float) -> float:

@@ -9,12 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 FACES = {
-    8: np.array([[0, 4, 7, 3], [1, 2, 6, 5], [0, 1, 5, 4], [3, 7, 6, 2], [0, 3, 2, 1], [4, 5, 6, 7]]),
+    8: np.array(
+        [[0, 4, 7, 3], [1, 2, 6, 5], [0, 1, 5, 4], [3, 7, 6, 2], [0, 3, 2, 1], [4, 5, 6, 7]]
+    ),
     4: np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]),
 }
 """The faces of a hexahedron and of a tetrahedron in VTK node order, each turned outwards."""
 
-KUHN = np.array([[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]])
+KUHN = np.array(
+    [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]]
+)
 """Six tetrahedra around a hexahedron's diagonal 0-6; those of neighbouring cells fit together."""
 
 
@@ -56,7 +60,9 @@ class Mesh:
         """(n_facets, 4 or 3) node numbers of the faces that belong to one cell only, turned outwards."""
         faces = FACES[self.cells.shape[1]]
         faces = self.cells[:, faces].reshape(-1, faces.shape[1])
-        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+        _, first, count = np.unique(
+            np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+        )
         return np.asarray(faces[np.sort(first[count == 1])])
 
     @cached_property
@@ -65,7 +71,9 @@ class Mesh:
         return np.array([self.points.min(axis=0), self.points.max(axis=0)])
 
 
-def box_mesh(size_m: tuple[float, float, float], cells: tuple[int, int, int], tetrahedra: bool = False) -> Mesh:
+def box_mesh(
+    size_m: tuple[float, float, float], cells: tuple[int, int, int], tetrahedra: bool = False
+) -> Mesh:
     """A box of equal H8 cells, or of six T4 in the place of each, with its lowest corner at the origin.
 
     Nodes are numbered with z fastest and x slowest, which keeps the bandwidth of a beam along x small.
@@ -84,15 +92,26 @@ def box_mesh(size_m: tuple[float, float, float], cells: tuple[int, int, int], te
     node = np.arange(nx * ny * nz).reshape(nx, ny, nz)
     low, high = slice(None, -1), slice(1, None)
     corners = [
-        (low, low, low), (high, low, low), (high, high, low), (low, high, low),
-        (low, low, high), (high, low, high), (high, high, high), (low, high, high),
-    ]  # fmt: skip
+        (low, low, low),
+        (high, low, low),
+        (high, high, low),
+        (low, high, low),
+        (low, low, high),
+        (high, low, high),
+        (high, high, high),
+        (low, high, high),
+    ]
     hexes = np.stack([node[corner].ravel() for corner in corners], axis=1)
     cell_nodes = hexes[:, KUHN].reshape(-1, 4) if tetrahedra else hexes
     return Mesh(points, cell_nodes, (nx, ny, nz), np.arange(len(points)))
 
 
-def l_mesh(size_m: tuple[float, float, float], cells: tuple[int, int, int], cut_cells: tuple[int, int], tetrahedra: bool = False) -> Mesh:
+def l_mesh(
+    size_m: tuple[float, float, float],
+    cells: tuple[int, int, int],
+    cut_cells: tuple[int, int],
+    tetrahedra: bool = False,
+) -> Mesh:
     """A box without the cells in its corner of highest x and highest z, in the box's regular grid.
 
     Parameters

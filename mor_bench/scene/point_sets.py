@@ -24,16 +24,34 @@ def named_point_sets(mesh: meshio.Mesh, path: Path) -> PointSets:
     found: dict[str, list[NDArray[np.int64]]] = {}
     abaqus = path.suffix.lower() == ".inp"
     if abaqus:
-        found |= {name: [np.arange(len(mesh.points))] for name in _keywords(path, "NODE", "NSET") if name is not None}
+        found |= {
+            name: [np.arange(len(mesh.points))]
+            for name in _keywords(path, "NODE", "NSET")
+            if name is not None
+        }
     for name, nodes in mesh.point_sets.items():
         found.setdefault(name, []).append(np.asarray(nodes, dtype=np.int64))
-    for name, chosen in (_abaqus_blocks(mesh, path) if abaqus else []) + _cell_sets(mesh) + _physical_groups(mesh):
-        nodes = [np.asarray(block.data)[rows].ravel() for block, rows in zip(mesh.cells, chosen, strict=True) if len(rows)]
+    for name, chosen in (
+        (_abaqus_blocks(mesh, path) if abaqus else []) + _cell_sets(mesh) + _physical_groups(mesh)
+    ):
+        nodes = [
+            np.asarray(block.data)[rows].ravel()
+            for block, rows in zip(mesh.cells, chosen, strict=True)
+            if len(rows)
+        ]
         found.setdefault(name, []).extend(np.asarray(part, dtype=np.int64) for part in nodes)
     for name, values in mesh.point_data.items():
-        if values.ndim == 1 and values.dtype.kind in "biuf" and np.isin(values, [0, 1]).all() and values.any():
+        if (
+            values.ndim == 1
+            and values.dtype.kind in "biuf"
+            and np.isin(values, [0, 1]).all()
+            and values.any()
+        ):
             found.setdefault(name, []).append(np.flatnonzero(values))
-    return {name: np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *parts])) for name, parts in found.items()}
+    return {
+        name: np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *parts]))
+        for name, parts in found.items()
+    }
 
 
 _Rows = list[NDArray[np.int64]]
@@ -62,19 +80,38 @@ def _physical_groups(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
         return []
     tags = [np.abs(values) for values in data]  # negative where a group holds a surface turned over
     names = {(int(tag), int(dimension)): name for name, (tag, dimension) in mesh.field_data.items()}
-    keys = sorted({(int(tag), block.dim) for block, values in zip(mesh.cells, tags, strict=True) for tag in np.unique(values) if tag != 0})
+    keys = sorted(
+        {
+            (int(tag), block.dim)
+            for block, values in zip(mesh.cells, tags, strict=True)
+            for tag in np.unique(values)
+            if tag != 0
+        }
+    )
     unnamed = [tag for tag, dimension in keys if (tag, dimension) not in names]
-    numbers = {(tag, dim): str(tag) if unnamed.count(tag) == 1 else f"{_DIMENSIONS[dim]} {tag}" for tag, dim in keys}
+    numbers = {
+        (tag, dim): str(tag) if unnamed.count(tag) == 1 else f"{_DIMENSIONS[dim]} {tag}"
+        for tag, dim in keys
+    }
     return [
-        (names.get(key, numbers[key]), [np.flatnonzero(values == key[0]) if block.dim == key[1] else _NO_ROWS
-                                        for block, values in zip(mesh.cells, tags, strict=True)])
+        (
+            names.get(key, numbers[key]),
+            [
+                np.flatnonzero(values == key[0]) if block.dim == key[1] else _NO_ROWS
+                for block, values in zip(mesh.cells, tags, strict=True)
+            ],
+        )
         for key in keys
-    ]  # fmt: skip
+    ]
 
 
 def _keywords(path: Path, keyword: str, parameter: str) -> list[str | None]:
     """For each line of a keyword in an Abaqus file the value of one of its parameters."""
-    lines = re.findall(rf"^\*{keyword}\s*((?:,.*)?)$", path.read_text(encoding="utf-8", errors="replace"), re.IGNORECASE | re.MULTILINE)
+    lines = re.findall(
+        rf"^\*{keyword}\s*((?:,.*)?)$",
+        path.read_text(encoding="utf-8", errors="replace"),
+        re.IGNORECASE | re.MULTILINE,
+    )
     matches = [re.search(rf",\s*{parameter}\s*=\s*([^,]+)", line, re.IGNORECASE) for line in lines]
     return [match and match[1].strip() for match in matches]
 
@@ -84,9 +121,13 @@ def check_abaqus(path: Path) -> None:
     names = _keywords(path, "NSET", "NSET")
     repeated = sorted({name for name in names if name is not None and names.count(name) > 1})
     if repeated:
-        raise SpecError(f"{path}: NSET {repeated[0]!r} is defined more than once; join the parts in one.")
+        raise SpecError(
+            f"{path}: NSET {repeated[0]!r} is defined more than once; join the parts in one."
+        )
     if (n_blocks := len(_keywords(path, "NODE", "NSET"))) > 1:
-        raise SpecError(f"{path}: the nodes must stand under one line *NODE; there are {n_blocks}, of which only the last would be read.")
+        raise SpecError(
+            f"{path}: the nodes must stand under one line *NODE; there are {n_blocks}, of which only the last would be read."
+        )
 
 
 def _abaqus_blocks(mesh: meshio.Mesh, path: Path) -> list[tuple[str, _Rows]]:
@@ -95,12 +136,19 @@ def _abaqus_blocks(mesh: meshio.Mesh, path: Path) -> list[tuple[str, _Rows]]:
     What meshio made of them is removed from the mesh.
     """
     names = _keywords(path, "ELEMENT", "ELSET")
-    for name in {name for name in names if name is not None} - set(_keywords(path, "ELSET", "ELSET")):
+    for name in {name for name in names if name is not None} - set(
+        _keywords(path, "ELSET", "ELSET")
+    ):
         mesh.cell_sets.pop(name, None)
-    if len(names) != len(mesh.cells):  # an included file brought cells: which ones are whose is not known
+    if len(names) != len(
+        mesh.cells
+    ):  # an included file brought cells: which ones are whose is not known
         return []
     return [
-        (name, [np.arange(len(block)) if i == k else _NO_ROWS for i, block in enumerate(mesh.cells)])
+        (
+            name,
+            [np.arange(len(block)) if i == k else _NO_ROWS for i, block in enumerate(mesh.cells)],
+        )
         for k, name in enumerate(names)
         if name is not None
     ]

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mor_bench.errors import SpecError
-from mor_bench.specs import BoxRegion, NearestRegion, NearSurfaceRegion, PointSetRegion, Region, SphereRegion
+from mor_bench.specs import (
+    BoxRegion,
+    NearestRegion,
+    NearSurfaceRegion,
+    PointSetRegion,
+    Region,
+    SphereRegion,
+)
 
 ON_FACE = 1e-9
 """How far from a face of the bounding box a point may lie, as a fraction of the box's diagonal."""
@@ -56,18 +63,37 @@ def region_points(cloud: Cloud, region: Region) -> NDArray[np.int64]:
     else:
         found = np.flatnonzero(_inside(cloud.points, region, low, high, near))
     if not len(found):
-        shown = region if isinstance(region, str) else region.model_dump(exclude={"near_surface": {"sha256"}})
-        raise SpecError(f"region {shown} holds no node of the mesh, whose bounds are {low.tolist()} to {high.tolist()} m.")
+        shown = (
+            region
+            if isinstance(region, str)
+            else region.model_dump(exclude={"near_surface": {"sha256"}})
+        )
+        raise SpecError(
+            f"region {shown} holds no node of the mesh, whose bounds are {low.tolist()} to {high.tolist()} m."
+        )
     return np.sort(found)
 
 
 def _inside(
-    points: NDArray[np.float64], region: Region, low: NDArray[np.float64], high: NDArray[np.float64], near: float
-) -> NDArray[np.bool_]:  # fmt: skip
+    points: NDArray[np.float64],
+    region: Region,
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    near: float,
+) -> NDArray[np.bool_]:
     if isinstance(region, BoxRegion):
-        return np.asarray(np.all((points >= np.array(region.box_m[0]) - near) & (points <= np.array(region.box_m[1]) + near), axis=1))
+        return np.asarray(
+            np.all(
+                (points >= np.array(region.box_m[0]) - near)
+                & (points <= np.array(region.box_m[1]) + near),
+                axis=1,
+            )
+        )
     if isinstance(region, SphereRegion):
-        return np.asarray(np.linalg.norm(points - np.array(region.sphere_m[0]), axis=1) <= region.sphere_m[1] + near)
+        return np.asarray(
+            np.linalg.norm(points - np.array(region.sphere_m[0]), axis=1)
+            <= region.sphere_m[1] + near
+        )
     assert isinstance(region, str)
     axis = "xyz".index(region[0])
     bound = low if region.endswith("min") else high
@@ -84,8 +110,14 @@ def _of_set(cloud: Cloud, region: PointSetRegion) -> NDArray[np.int64]:
 def _nearest(cloud: Cloud, region: NearestRegion) -> NDArray[np.int64]:
     point, n = region.nearest_m
     if n > len(cloud.on_surface):
-        raise SpecError(f"`nearest_m` must ask for at most {len(cloud.on_surface)} nodes, all of the surface; got {n}.")
-    return np.asarray(cloud.on_surface[cKDTree(cloud.points[cloud.on_surface]).query(point, k=[*range(1, n + 1)])[1]])
+        raise SpecError(
+            f"`nearest_m` must ask for at most {len(cloud.on_surface)} nodes, all of the surface; got {n}."
+        )
+    return np.asarray(
+        cloud.on_surface[
+            cKDTree(cloud.points[cloud.on_surface]).query(point, k=[*range(1, n + 1)])[1]
+        ]
+    )
 
 
 def _near_surface(cloud: Cloud, region: NearSurfaceRegion, near: float) -> NDArray[np.int64]:
@@ -93,4 +125,8 @@ def _near_surface(cloud: Cloud, region: NearSurfaceRegion, near: float) -> NDArr
     from mor_bench.scene.triangle_distance import distances
 
     corners = read_triangles(region.near_surface.checked(), region.unit_m)
-    return np.asarray(cloud.on_surface[distances(corners, cloud.points[cloud.on_surface]) <= region.within_m + near])
+    return np.asarray(
+        cloud.on_surface[
+            distances(corners, cloud.points[cloud.on_surface]) <= region.within_m + near
+        ]
+    )

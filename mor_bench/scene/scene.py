@@ -91,7 +91,11 @@ class Scene:
     def output_nodes(self) -> NDArray[np.int64]:
         """(n_output_nodes,) the nodes whose displacements are wanted, sorted; raises `SpecError` if the region holds none."""
         outputs = self.spec.needs.outputs
-        return np.arange(self.mesh.n_nodes) if outputs == "all" else region_points(self._cloud, outputs)
+        return (
+            np.arange(self.mesh.n_nodes)
+            if outputs == "all"
+            else region_points(self._cloud, outputs)
+        )
 
     @cached_property
     def observed_nodes(self) -> NDArray[np.int64] | None:
@@ -108,9 +112,13 @@ class Scene:
         free = np.setdiff1d(np.arange(self.mesh.n_nodes), self.fixed_nodes)
         seen = np.intersect1d(np.intersect1d(region, self._cloud.on_surface), free)
         if not len(seen):
-            raise SpecError("`observed.region` holds no node that lies on the surface and is free to move.")
+            raise SpecError(
+                "`observed.region` holds no node that lies on the surface and is free to move."
+            )
         if len(seen) == len(free):
-            raise SpecError("`observed.region` holds every node that is free to move: nothing is left to be found.")
+            raise SpecError(
+                "`observed.region` holds every node that is free to move: nothing is left to be found."
+            )
         return seen
 
     @cached_property
@@ -127,10 +135,17 @@ class Scene:
     def _loaded_points(self) -> NDArray[np.int64]:
         """Numbers of the surface's points in the load region."""
         on_surface, region = np.unique(self.surface.facets), self.generated.loads.region
-        found = region_points(Cloud(self.surface.points, on_surface, {} if self.embedded_surface else self.point_sets), region)
+        found = region_points(
+            Cloud(
+                self.surface.points, on_surface, {} if self.embedded_surface else self.point_sets
+            ),
+            region,
+        )
         found = np.intersect1d(found, on_surface)
         if not len(found):
-            raise SpecError("the load region holds nodes inside the body only, and none of its surface.")
+            raise SpecError(
+                "the load region holds nodes inside the body only, and none of its surface."
+            )
         return found
 
     @cached_property
@@ -164,7 +179,9 @@ class Scene:
 
     @cached_property
     def _patches(self) -> Patches:
-        return cut_patches(self.surface, self.loaded_facets, self.patch_nodes, self.generated.loads.patch_area_m2)
+        return cut_patches(
+            self.surface, self.loaded_facets, self.patch_nodes, self.generated.loads.patch_area_m2
+        )
 
     @cached_property
     def patch_normals(self) -> NDArray[np.float64]:
@@ -214,9 +231,17 @@ def load_scene(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> Scene
     SpecError
         If the dataset is unknown or not valid, or a region of it is empty.
     """
-    spec = source if isinstance(source, DatasetSpec | ImportedDatasetSpec) else load_dataset_spec(source)
+    spec = (
+        source
+        if isinstance(source, DatasetSpec | ImportedDatasetSpec)
+        else load_dataset_spec(source)
+    )
     try:
-        return _build(spec) if isinstance(spec, DatasetSpec) else imported_scene(spec, read_arrays(spec.snapshots.file))
+        return (
+            _build(spec)
+            if isinstance(spec, DatasetSpec)
+            else imported_scene(spec, read_arrays(spec.snapshots.file))
+        )
     except SpecError as error:
         raise SpecError(f"{spec.name}: {error}") from None
 
@@ -247,16 +272,23 @@ def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
     name = f"{scene.name} with {' x '.join(map(str, cells))} cells"
     changed: dict[str, Any] = {"cells": cells}
     if isinstance(geometry, LShapeGeometry):
-        cut = [Fraction(n * new, old) for n, new, old in zip(geometry.cut_cells, cells[::2], geometry.cells[::2], strict=True)]
+        cut = [
+            Fraction(n * new, old)
+            for n, new, old in zip(geometry.cut_cells, cells[::2], geometry.cells[::2], strict=True)
+        ]
         if any(n.denominator > 1 for n in cut):
-            raise UnsupportedSceneError(f"{name}: the corner of an L that is cut away must consist of whole cells.")
+            raise UnsupportedSceneError(
+                f"{name}: the corner of an L that is cut away must consist of whole cells."
+            )
         changed["cut_cells"] = tuple(int(n) for n in cut)
     elif not isinstance(geometry, BoxGeometry):
         raise UnsupportedSceneError(
             f"{scene.name}: only the mesh of a box or an L can be made finer or coarser; got `geometry.shape` {geometry.shape!r}."
         )
     try:
-        return _without_patches(scene.generated.model_copy(update={"geometry": geometry.model_copy(update=changed)}))
+        return _without_patches(
+            scene.generated.model_copy(update={"geometry": geometry.model_copy(update=changed)})
+        )
     except SpecError as error:
         raise UnsupportedSceneError(f"{name}: {error}") from None
 
@@ -304,7 +336,11 @@ def _voxels(geometry: VoxelsGeometry) -> _Body:
     from mor_bench.scene.surfaces import read_surface
     from mor_bench.scene.voxels import voxel_mesh
 
-    surface = liver_surface() if geometry.surface == "liver" else read_surface(geometry.surface.checked(), geometry.unit_m)
+    surface = (
+        liver_surface()
+        if geometry.surface == "liver"
+        else read_surface(geometry.surface.checked(), geometry.unit_m)
+    )
     return _Body(voxel_mesh(surface, geometry.cells), Facets(surface.points, surface.triangles))
 
 
@@ -320,7 +356,14 @@ def _without_patches(spec: DatasetSpec) -> Scene:
     mesh = body.mesh
     _check_element(spec, mesh)
     cloud = Cloud(mesh.points, np.unique(mesh.boundary_facets), body.point_sets)
-    fixed = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(region_points(cloud, support.region) for support in spec.supports)]))
+    fixed = np.unique(
+        np.concatenate(
+            [
+                np.zeros(0, dtype=np.int64),
+                *(region_points(cloud, support.region) for support in spec.supports),
+            ]
+        )
+    )
     if len(fixed) == mesh.n_nodes:
         raise SpecError("the supports fix every node of the mesh: nothing can move.")
     return Scene(spec, mesh, make_material(spec.material), fixed, body.surface, body.point_sets)
@@ -330,7 +373,9 @@ def _check_element(spec: DatasetSpec, mesh: Mesh) -> None:
     """The element of a body that is not made here must be that of the file."""
     found = "tetrahedron" if mesh.cells.shape[1] == 4 else "hexahedron"
     if found != spec.discretisation.element:
-        raise SpecError(f"`discretisation.element` must be {found!r}, as in the mesh; got {spec.discretisation.element!r}.")
+        raise SpecError(
+            f"`discretisation.element` must be {found!r}, as in the mesh; got {spec.discretisation.element!r}."
+        )
 
 
 def _build(spec: DatasetSpec) -> Scene:

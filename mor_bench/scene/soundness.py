@@ -73,10 +73,16 @@ def in_grid(mesh: Mesh) -> Mesh:
     steps = np.array([gap[gap > near].mean() for gap in gaps])
     index = np.rint((mesh.points - low) / steps).astype(np.int64)
     off = np.abs(mesh.points - low - index * steps).max()
-    if off > near or np.ptp(index[mesh.cells], axis=1).max() > 1 or len(np.unique(index, axis=0)) < mesh.n_nodes:
+    if (
+        off > near
+        or np.ptp(index[mesh.cells], axis=1).max() > 1
+        or len(np.unique(index, axis=0)) < mesh.n_nodes
+    ):
         return mesh
     nx, ny, nz = (int(n) + 1 for n in index.max(axis=0))
-    return replace(mesh, grid_shape=(nx, ny, nz), grid_index=np.ravel_multi_index(tuple(index.T), (nx, ny, nz)))
+    return replace(
+        mesh, grid_shape=(nx, ny, nz), grid_index=np.ravel_multi_index(tuple(index.T), (nx, ny, nz))
+    )
 
 
 def check_numbers(points: NDArray[np.float64], cells: NDArray[np.int64]) -> None:
@@ -84,11 +90,17 @@ def check_numbers(points: NDArray[np.float64], cells: NDArray[np.int64]) -> None
     if not len(points) or not len(cells):
         raise SpecError("there must be points and cells; got none.")
     if cells.ndim != 2 or cells.shape[1] not in FACES:
-        raise SpecError(f"cells must have shape (n_cells, 8) for H8 or (n_cells, 4) for T4; got {cells.shape}.")
+        raise SpecError(
+            f"cells must have shape (n_cells, 8) for H8 or (n_cells, 4) for T4; got {cells.shape}."
+        )
     if not np.isfinite(points).all():
-        raise SpecError(f"positions must be finite; point {int(np.argwhere(~np.isfinite(points))[0, 0])} (counted from 0) is not.")
+        raise SpecError(
+            f"positions must be finite; point {int(np.argwhere(~np.isfinite(points))[0, 0])} (counted from 0) is not."
+        )
     if cells.min() < 0 or cells.max() >= len(points):
-        raise SpecError(f"cells must have nodes in [0, {len(points) - 1}]; got {cells.min()} to {cells.max()}.")
+        raise SpecError(
+            f"cells must have nodes in [0, {len(points) - 1}]; got {cells.min()} to {cells.max()}."
+        )
 
 
 def sound_cells(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -119,18 +131,28 @@ def outwards(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[n
     turned = high < -FLAT
     bad = ~(turned | (low > FLAT))
     if bad.any():
-        raise SpecError(f"cell {int(bad.argmax())} (counted from 0) is flat or folded: its volume must not vanish anywhere.")
+        raise SpecError(
+            f"cell {int(bad.argmax())} (counted from 0) is flat or folded: its volume must not vanish anywhere."
+        )
     if cells.shape[1] == 8 and turned.any() and not turned.all():
-        raise SpecError(f"{int(turned.sum())} of {len(cells)} hexahedra are inside out, the first is cell {int(turned.argmax())} (counted from 0).")
+        raise SpecError(
+            f"{int(turned.sum())} of {len(cells)} hexahedra are inside out, the first is cell {int(turned.argmax())} (counted from 0)."
+        )
     out = cells.copy()
     out[turned] = cells[turned][:, _TURNED[cells.shape[1]]]
     return out
 
 
-def _extreme_volumes(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _extreme_volumes(
+    corners: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Least and greatest det J / |J|³ (n_cells,) at the quadrature points of cells with corners (n_cells, 4 or 8, 3)."""
     edges = corners[:, None, 1:] - corners[:, None, :1]
-    jacobian = edges if corners.shape[1] == 4 else np.einsum("cai,qad->cqdi", corners, _trilinear(_GAUSS)[1])
+    jacobian = (
+        edges
+        if corners.shape[1] == 4
+        else np.einsum("cai,qad->cqdi", corners, _trilinear(_GAUSS)[1])
+    )
     size = np.maximum(np.linalg.norm(jacobian, axis=(2, 3)) ** 3, np.finfo(float).tiny)
     volumes = np.linalg.det(jacobian) / size
     return volumes.min(axis=1), volumes.max(axis=1)
@@ -140,7 +162,9 @@ def _check_doubled(points: NDArray[np.float64]) -> None:
     near = SAME_PLACE * float(np.linalg.norm(np.ptp(points, axis=0)))
     pairs = cKDTree(points).query_pairs(near, output_type="ndarray")
     if len(pairs):
-        raise SpecError(f"{len(np.unique(pairs[:, 1]))} nodes lie in the place of others, as at {points[pairs[:, 0].min()].tolist()} m; merge them.")
+        raise SpecError(
+            f"{len(np.unique(pairs[:, 1]))} nodes lie in the place of others, as at {points[pairs[:, 0].min()].tolist()} m; merge them."
+        )
 
 
 def _check_overlap(cells: NDArray[np.int64]) -> None:
@@ -149,20 +173,26 @@ def _check_overlap(cells: NDArray[np.int64]) -> None:
     numbers = _face_numbers(cells).ravel()
     shared = np.bincount(numbers)
     if shared.max() > 2:
-        raise SpecError(f"{int((shared > 2).sum())} faces belong to more than two cells: cells overlap.")
+        raise SpecError(
+            f"{int((shared > 2).sum())} faces belong to more than two cells: cells overlap."
+        )
     # Seen from outside, cells on either side of a face go round it in opposite senses.
     corners = FACES[cells.shape[1]]
     faces = cells[:, corners].reshape(-1, corners.shape[1])
     second = faces[np.arange(len(faces)), (faces.argmin(axis=1) + 1) % faces.shape[1]]
     n_sides = len(np.unique(np.stack([numbers, second], axis=1), axis=0))
     if n_sides < len(faces):
-        raise SpecError(f"{len(faces) - n_sides} faces have both of their cells on one side: cells overlap.")
+        raise SpecError(
+            f"{len(faces) - n_sides} faces have both of their cells on one side: cells overlap."
+        )
 
 
 def _check_parts(cells: NDArray[np.int64]) -> None:
     """Raise `SpecError` if the cells do not hang together through faces: joined at an edge or a node, they are a hinge."""
     faces = _face_numbers(cells)
-    belongs = sp.csr_array((np.ones(faces.size), (np.repeat(np.arange(len(cells)), faces.shape[1]), faces.ravel())))
+    belongs = sp.csr_array(
+        (np.ones(faces.size), (np.repeat(np.arange(len(cells)), faces.shape[1]), faces.ravel()))
+    )
     n_parts = connected_components(sp.csr_array(belongs @ belongs.T), directed=False)[0]
     if n_parts > 1:
         raise SpecError(f"the mesh must be one body; it is {n_parts} parts that no face joins.")
@@ -183,4 +213,8 @@ def _numbering(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray
     order = along_longest_axis(points)
     number = np.empty_like(order)
     number[order] = np.arange(len(order))
-    return order if np.ptp(number[cells], axis=1).max() < np.ptp(cells, axis=1).max() else np.arange(len(order))
+    return (
+        order
+        if np.ptp(number[cells], axis=1).max() < np.ptp(cells, axis=1).max()
+        else np.arange(len(order))
+    )

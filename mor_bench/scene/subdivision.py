@@ -14,10 +14,22 @@ _HEX = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1,
 
 _THIRDS = list(product(range(3), repeat=3))
 
-HEX_PARENTS = [[c for c, place in enumerate(_HEX) if all(t == 1 or t == 2 * p for t, p in zip(third, place, strict=True))] for third in _THIRDS]
+HEX_PARENTS = [
+    [
+        c
+        for c, place in enumerate(_HEX)
+        if all(t == 1 or t == 2 * p for t, p in zip(third, place, strict=True))
+    ]
+    for third in _THIRDS
+]
 """The corners whose mean each of the 27 nodes of a hexahedron cut in eight is."""
 
-HEX_CHILDREN = np.array([[_THIRDS.index(tuple(o + p for o, p in zip(origin, place, strict=True))) for place in _HEX] for origin in _HEX])
+HEX_CHILDREN = np.array(
+    [
+        [_THIRDS.index(tuple(o + p for o, p in zip(origin, place, strict=True))) for place in _HEX]
+        for origin in _HEX
+    ]
+)
 
 TET_PARENTS = [[0], [1], [2], [3], [0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]]
 """Corners and midpoints of edges of a tetrahedron."""
@@ -60,10 +72,19 @@ def subdivide(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
 def _tetrahedra(points: NDArray[np.float64], numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     """(8 n, 4) the parts of tetrahedra, from the numbers (n, 10) of their corners and midpoints."""
     diagonals = list(_TET_INNER)
-    lengths = np.stack([np.linalg.norm(points[numbers[:, a]] - points[numbers[:, b]], axis=1) for a, b in diagonals], axis=1)
+    lengths = np.stack(
+        [
+            np.linalg.norm(points[numbers[:, a]] - points[numbers[:, b]], axis=1)
+            for a, b in diagonals
+        ],
+        axis=1,
+    )
     shortest = lengths.argmin(axis=1)
     parts = [numbers[:, _TET_CORNERS].reshape(-1, 4)]
-    parts += [numbers[shortest == i][:, inner].reshape(-1, 4) for i, inner in enumerate(_TET_INNER.values())]
+    parts += [
+        numbers[shortest == i][:, inner].reshape(-1, 4)
+        for i, inner in enumerate(_TET_INNER.values())
+    ]
     cells = np.concatenate(parts)
     edges = points[cells[:, 1:]] - points[cells[:, :1]]
     turned = np.linalg.det(edges) < 0

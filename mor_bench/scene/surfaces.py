@@ -57,7 +57,9 @@ def inside(surface: Surface, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     -------
     (n,) bool
     """
-    windings = winding_numbers(surface.points[surface.triangles], np.ascontiguousarray(points, dtype=np.float64))
+    windings = winding_numbers(
+        surface.points[surface.triangles], np.ascontiguousarray(points, dtype=np.float64)
+    )
     return np.asarray(windings > 0.5)
 
 
@@ -101,9 +103,17 @@ def _turned_outwards(surface: Surface, name: str) -> Surface:
     edges = surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     sharing = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]
     if n_open := int((sharing != 2).sum()):
-        raise SpecError(f"{name}: the surface is not closed: {n_open} of its {len(sharing)} edges are not shared by exactly two triangles.")
+        raise SpecError(
+            f"{name}: the surface is not closed: {n_open} of its {len(sharing)} edges are not shared by exactly two triangles."
+        )
     if n_twisted := len(edges) - len(np.unique(edges, axis=0)):
-        raise SpecError(f"{name}: the triangles are not consistently oriented: across {n_twisted} of {len(sharing)} edges they turn over.")
+        raise SpecError(
+            f"{name}: the triangles are not consistently oriented: across {n_twisted} of {len(sharing)} edges they turn over."
+        )
     if abs(surface.volume_m3) <= FLAT * np.linalg.norm(np.diff(surface.bounds, axis=0)) ** 3:
         raise SpecError(f"{name}: the surface encloses no volume.")
-    return surface if surface.volume_m3 > 0 else Surface(surface.points, surface.triangles[:, ::-1].copy())
+    return (
+        surface
+        if surface.volume_m3 > 0
+        else Surface(surface.points, surface.triangles[:, ::-1].copy())
+    )

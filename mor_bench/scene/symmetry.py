@@ -53,7 +53,9 @@ def mirrors(scene: Scene) -> list[Mirror]:
         images = points.copy()
         images[:, axis] = low[axis] + high[axis] - points[:, axis]
         distance, nodes = (np.asarray(part) for part in tree.query(images))
-        if distance.max() > SAME_PLACE * np.linalg.norm(high - low) or len(np.unique(nodes)) < len(nodes):
+        if distance.max() > SAME_PLACE * np.linalg.norm(high - low) or len(np.unique(nodes)) < len(
+            nodes
+        ):
             continue
         same = np.array_equal(_rows(nodes[cells]), own_cells)
         for kept in (scene.fixed_nodes, loaded):

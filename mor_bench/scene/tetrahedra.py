@@ -27,19 +27,27 @@ CLOSE_LONG, CLOSE_SHORT = 0.24999, 0.41189
 BISECTIONS = 60
 
 
-def _lattice(bounds: NDArray[np.float64], spacing: float) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+def _lattice(
+    bounds: NDArray[np.float64], spacing: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """Points (n, 3), tetrahedra (m, 4), long edges first and last, and whole-number places (n, 3), in half cubes, of a lattice over bounds."""
     n = np.ceil((bounds[1] - bounds[0]) / spacing).astype(np.int64) + 2
     start = bounds.mean(axis=0) - spacing * n / 2
     shape = tuple(2 * n + 1)
-    centre = 1 + 2 * np.stack(np.meshgrid(*(np.arange(k) for k in n), indexing="ij"), axis=-1).reshape(-1, 3)
+    centre = 1 + 2 * np.stack(
+        np.meshgrid(*(np.arange(k) for k in n), indexing="ij"), axis=-1
+    ).reshape(-1, 3)
     tetrahedra = []
     for axis in range(3):
         along, *across = np.roll(np.eye(3, dtype=np.int64), -axis, axis=0)
         near = centre[centre[:, axis] < 2 * n[axis] - 1]
-        ring = [along + s * across[0] + t * across[1] for s, t in [(-1, -1), (1, -1), (1, 1), (-1, 1)]]
+        ring = [
+            along + s * across[0] + t * across[1] for s, t in [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+        ]
         for k in range(4):
-            corners = np.stack([near, near + 2 * along, near + ring[k], near + ring[(k + 1) % 4]], axis=1)
+            corners = np.stack(
+                [near, near + 2 * along, near + ring[k], near + ring[(k + 1) % 4]], axis=1
+            )
             tetrahedra.append(np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), shape))
     used, cells = np.unique(np.concatenate(tetrahedra), return_inverse=True)
     places = np.stack(np.unravel_index(used, shape), axis=1)
@@ -54,7 +62,9 @@ def _crossed_edges(cells: NDArray[np.int64], side: NDArray[np.int64]) -> NDArray
     return np.stack(np.divmod(np.unique(first * len(side) + last), len(side)), axis=1)
 
 
-def _crossings(level: Level, points: NDArray[np.float64], edges: NDArray[np.int64]) -> NDArray[np.float64]:
+def _crossings(
+    level: Level, points: NDArray[np.float64], edges: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """Where (n,) along edges from a point inside to one outside the surface lies, in [0, 1], by bisection."""
     low, high = np.zeros(len(edges)), np.ones(len(edges))
     start, step = points[edges[:, 0]], points[edges[:, 1]] - points[edges[:, 0]]
@@ -65,14 +75,24 @@ def _crossings(level: Level, points: NDArray[np.float64], edges: NDArray[np.int6
     return 0.5 * (low + high)
 
 
-def _prisms(top: NDArray[np.int64], bottom: NDArray[np.int64], rank: NDArray[np.int64]) -> NDArray[np.int64]:
+def _prisms(
+    top: NDArray[np.int64], bottom: NDArray[np.int64], rank: NDArray[np.int64]
+) -> NDArray[np.int64]:
     """Three tetrahedra (3n, 4) for each prism (n, 3) to (n, 3); across its sides diagonals run from the top point of higher rank."""
     order = np.argsort(-rank, axis=1)
-    (a, b, c), (x, y, z) = np.take_along_axis(top, order, axis=1).T, np.take_along_axis(bottom, order, axis=1).T
+    (a, b, c), (x, y, z) = (
+        np.take_along_axis(top, order, axis=1).T,
+        np.take_along_axis(bottom, order, axis=1).T,
+    )
     return np.concatenate([np.stack(t, axis=1) for t in [(a, b, c, z), (a, b, y, z), (a, x, y, z)]])
 
 
-def _moved(points: NDArray[np.float64], edges: NDArray[np.int64], at: NDArray[np.float64], close: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _moved(
+    points: NDArray[np.float64],
+    edges: NDArray[np.int64],
+    at: NDArray[np.float64],
+    close: NDArray[np.float64],
+) -> NDArray[np.bool_]:
     """Moves the points that have a crossing `at` (n,) of an edge (n, 2) within the `close` part (n,) of it onto the nearest; says which moved."""
     step = points[edges[:, 1]] - points[edges[:, 0]]
     crossing = points[edges[:, 0]] + at[:, None] * step
@@ -87,7 +107,12 @@ def _moved(points: NDArray[np.float64], edges: NDArray[np.int64], at: NDArray[np
     return moved
 
 
-def _cut(cells: NDArray[np.int64], side: NDArray[np.int64], places: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64]:
+def _cut(
+    cells: NDArray[np.int64],
+    side: NDArray[np.int64],
+    places: NDArray[np.int64],
+    edges: NDArray[np.int64],
+) -> NDArray[np.int64]:
     """The parts (m, 4), of either orientation, that tetrahedra (n, 4) have inside the surface.
 
     Parameters
@@ -110,19 +135,27 @@ def _cut(cells: NDArray[np.int64], side: NDArray[np.int64], places: NDArray[np.i
     def rank(p: NDArray[np.int64], n: NDArray[np.int64]) -> NDArray[np.int64]:
         # Of the diagonals of a face's trapezium one starts at each point inside; that of the higher rank is taken, which
         # depends on the face only, so that both cells at it agree. It ends on the long edge, if only one edge cut is long.
-        return np.asarray(2 * ((places[p] - places[n])[..., 0] % 2) + (places[p] // 2).sum(axis=-1) % 2)
+        return np.asarray(
+            2 * ((places[p] - places[n])[..., 0] % 2) + (places[p] // 2).sum(axis=-1) % 2
+        )
 
     whole = cells[(n_in > 0) & (n_out == 0)]
     p, n = np.split(cells[(n_in == 1) & (n_out > 0)], [1], axis=1)
     tips = np.concatenate([p, end(np.broadcast_to(p, n.shape), n)], axis=1)
     # Two inside and one on the surface are the same with one prism's side shrunk to a point.
-    p, n = np.split(cells[(n_in + (side[cells] == 0).sum(axis=1) == 3) & (n_in > 1) & (n_out == 1)], [3], axis=1)
+    p, n = np.split(
+        cells[(n_in + (side[cells] == 0).sum(axis=1) == 3) & (n_in > 1) & (n_out == 1)], [3], axis=1
+    )
     n = np.broadcast_to(n, p.shape)
     stumps = _prisms(p, np.where(side[p] > 0, end(p, n), p), rank(p, n))
     p, n = np.split(cells[(n_in == 2) & (n_out == 2)], [2], axis=1)
     p, q = np.broadcast_to(p[:, :1], n.shape), np.broadcast_to(p[:, 1:], n.shape)
     first = np.where(rank(p, n) > rank(q, n), -2, 2) + np.array([0, 1])
-    wedges = _prisms(np.column_stack([p[:, 0], end(p, n)]), np.column_stack([q[:, 0], end(q, n)]), np.column_stack([0 * first[:, 0], first]))
+    wedges = _prisms(
+        np.column_stack([p[:, 0], end(p, n)]),
+        np.column_stack([q[:, 0], end(q, n)]),
+        np.column_stack([0 * first[:, 0], first]),
+    )
     parts = np.concatenate([whole, tips, stumps, wedges])
     return parts[(np.diff(np.sort(parts, axis=1), axis=1) > 0).all(axis=1)]
 
@@ -152,9 +185,13 @@ def tetrahedral_mesh(level: Level, bounds: NDArray[np.float64], spacing_m: float
     points, cells, places = _lattice(bounds, spacing_m)
     side = -np.sign(level(points)).astype(np.int64)
     if not (side > 0).any():
-        raise SpecError(f"no point of a lattice of {spacing_m:g} m lies in the body; use a smaller spacing.")
+        raise SpecError(
+            f"no point of a lattice of {spacing_m:g} m lies in the body; use a smaller spacing."
+        )
     if (side[((places == 0) | (places == places.max(axis=0))).any(axis=1)] > 0).any():
-        raise SpecError(f"the body reaches out of its bounds, {bounds[0].tolist()} to {bounds[1].tolist()} m.")
+        raise SpecError(
+            f"the body reaches out of its bounds, {bounds[0].tolist()} to {bounds[1].tolist()} m."
+        )
     cells = cells[(side[cells] > 0).any(axis=1)]
     edges = _crossed_edges(cells, side)
     at = _crossings(level, points, edges)
@@ -163,10 +200,14 @@ def tetrahedral_mesh(level: Level, bounds: NDArray[np.float64], spacing_m: float
     side[_moved(points, edges, at, np.where(is_long, CLOSE_LONG, CLOSE_SHORT))] = 0
     uncut = (side[edges] == 0).any(axis=1)
     parts = _cut(cells, side, places, edges[~uncut])
-    mesh = _numbered(np.concatenate([points, crossings[~uncut]]), parts, int(np.argmax(np.ptp(bounds, axis=0))))
+    mesh = _numbered(
+        np.concatenate([points, crossings[~uncut]]), parts, int(np.argmax(np.ptp(bounds, axis=0)))
+    )
     sides = np.sort(mesh.boundary_facets[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     if n_hinges := int((np.unique(sides, axis=0, return_counts=True)[1] != 2).sum()):
-        raise SpecError(f"with a spacing of {spacing_m:g} m parts of the body touch along {n_hinges} edges only; use a smaller one.")
+        raise SpecError(
+            f"with a spacing of {spacing_m:g} m parts of the body touch along {n_hinges} edges only; use a smaller one."
+        )
     return mesh
 
 

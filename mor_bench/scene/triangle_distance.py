@@ -45,7 +45,12 @@ def _distances(corners, points, out):
             vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
             nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
             size = _dot(nx, ny, nz, nx, ny, nz)
-            if size > 0.0 and _side(px, py, pz, a, b, nx, ny, nz) and _side(px, py, pz, b, c, nx, ny, nz) and _side(px, py, pz, c, a, nx, ny, nz):
+            if (
+                size > 0.0
+                and _side(px, py, pz, a, b, nx, ny, nz)
+                and _side(px, py, pz, b, c, nx, ny, nz)
+                and _side(px, py, pz, c, a, nx, ny, nz)
+            ):
                 height = _dot(px - a[0], py - a[1], pz - a[2], nx, ny, nz)
                 least = min(least, height * height / size)
             else:
@@ -65,5 +70,9 @@ def distances(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDAr
     area counts as its edges.
     """
     out = np.empty(len(points))
-    _distances(np.ascontiguousarray(corners, dtype=np.float64), np.ascontiguousarray(points, dtype=np.float64), out)
+    _distances(
+        np.ascontiguousarray(corners, dtype=np.float64),
+        np.ascontiguousarray(points, dtype=np.float64),
+        out,
+    )
     return out

@@ -23,12 +23,32 @@ def winding_numbers(corners, points):
     for n in range(len(points)):
         half_angles = 0.0
         for t in range(len(corners)):
-            ax, ay, az = corners[t, 0, 0] - points[n, 0], corners[t, 0, 1] - points[n, 1], corners[t, 0, 2] - points[n, 2]
-            bx, by, bz = corners[t, 1, 0] - points[n, 0], corners[t, 1, 1] - points[n, 1], corners[t, 1, 2] - points[n, 2]
-            cx, cy, cz = corners[t, 2, 0] - points[n, 0], corners[t, 2, 1] - points[n, 1], corners[t, 2, 2] - points[n, 2]
-            a, b, c = sqrt(ax * ax + ay * ay + az * az), sqrt(bx * bx + by * by + bz * bz), sqrt(cx * cx + cy * cy + cz * cz)
+            ax, ay, az = (
+                corners[t, 0, 0] - points[n, 0],
+                corners[t, 0, 1] - points[n, 1],
+                corners[t, 0, 2] - points[n, 2],
+            )
+            bx, by, bz = (
+                corners[t, 1, 0] - points[n, 0],
+                corners[t, 1, 1] - points[n, 1],
+                corners[t, 1, 2] - points[n, 2],
+            )
+            cx, cy, cz = (
+                corners[t, 2, 0] - points[n, 0],
+                corners[t, 2, 1] - points[n, 1],
+                corners[t, 2, 2] - points[n, 2],
+            )
+            a, b, c = (
+                sqrt(ax * ax + ay * ay + az * az),
+                sqrt(bx * bx + by * by + bz * bz),
+                sqrt(cx * cx + cy * cy + cz * cz),
+            )
             triple = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
-            ab, bc, ca = ax * bx + ay * by + az * bz, bx * cx + by * cy + bz * cz, cx * ax + cy * ay + cz * az
+            ab, bc, ca = (
+                ax * bx + ay * by + az * bz,
+                bx * cx + by * cy + bz * cz,
+                cx * ax + cy * ay + cz * az,
+            )
             half_angles += atan2(triple, a * b * c + ab * c + bc * a + ca * b)
         windings[n] = half_angles / (2 * pi)
     return windings
@@ -47,8 +67,13 @@ def _separated(v, half):
         e = v[(corner + 1) % 3] - v[corner]
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
-            p, q = e[j] * v[corner, k] - e[k] * v[corner, j], e[j] * v[corner - 1, k] - e[k] * v[corner - 1, j]
-            if min(p, q) > half * (abs(e[j]) + abs(e[k])) or max(p, q) < -half * (abs(e[j]) + abs(e[k])):
+            p, q = (
+                e[j] * v[corner, k] - e[k] * v[corner, j],
+                e[j] * v[corner - 1, k] - e[k] * v[corner - 1, j],
+            )
+            if min(p, q) > half * (abs(e[j]) + abs(e[k])) or max(p, q) < -half * (
+                abs(e[j]) + abs(e[k])
+            ):
                 return True
     normal = np.cross(v[1] - v[0], v[2] - v[0])
     return abs(np.dot(normal, v[0])) > half * np.abs(normal).sum()
@@ -68,6 +93,10 @@ def met_cells(corners, shape, half):
             for y in range(first[1], last[1] + 1):
                 for z in range(first[2], last[2] + 1):
                     if not met[x, y, z]:
-                        v[:, 0], v[:, 1], v[:, 2] = corners[t, :, 0] - (x + 0.5), corners[t, :, 1] - (y + 0.5), corners[t, :, 2] - (z + 0.5)
+                        v[:, 0], v[:, 1], v[:, 2] = (
+                            corners[t, :, 0] - (x + 0.5),
+                            corners[t, :, 1] - (y + 0.5),
+                            corners[t, :, 2] - (z + 0.5),
+                        )
                         met[x, y, z] = not _separated(v, half)
     return met

@@ -18,11 +18,16 @@ TOUCHED = 1e-10
 what `interpolation_matrix` lets a point lie outside."""
 
 
-def _overlapping(surface: Surface, cells: tuple[int, int, int], centres: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _overlapping(
+    surface: Surface, cells: tuple[int, int, int], centres: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Whether each cell (nx, ny, nz) of the surface's bounding box shares volume with the body, for the cells' centres (n_cells, 3)."""
     low, high = surface.bounds
     corners = (surface.points - low) / (high - low) * cells
-    entered, touched = (np.asarray(met_cells(corners[surface.triangles], cells, 0.5 * (1 + sign * TOUCHED))) for sign in (-1, 1))
+    entered, touched = (
+        np.asarray(met_cells(corners[surface.triangles], cells, 0.5 * (1 + sign * TOUCHED)))
+        for sign in (-1, 1)
+    )
     # Cells that no triangle touches and that faces join are all inside or all outside: one of each such part is asked.
     part = label(~touched)[0]
     first = np.unique(part, return_index=True)[1][1 if touched.any() else 0 :]

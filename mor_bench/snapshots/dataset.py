@@ -19,7 +19,15 @@ from mor_bench.snapshots.imported import NodalLoads, nodal_loads, read_samples
 from mor_bench.snapshots.sampling import PatchLoads, n_samples_of, repeated
 from mor_bench.snapshots.split import split_imported, split_samples
 from mor_bench.snapshots.test_sets import SetName, check_regions, spec_of_set
-from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, Split, SplitBy, generated, load_dataset_spec
+from mor_bench.specs import (
+    AnyDatasetSpec,
+    DatasetSpec,
+    ImportedDatasetSpec,
+    Split,
+    SplitBy,
+    generated,
+    load_dataset_spec,
+)
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
@@ -53,9 +61,17 @@ class Snapshots:
 
     def __getitem__(self, index: NDArray[np.int64] | slice) -> Snapshots:
         loads = self.loads[index]
-        for array in (loads.patches, loads.forces if isinstance(loads, NodalLoads) else loads.vectors):
+        for array in (
+            loads.patches,
+            loads.forces if isinstance(loads, NodalLoads) else loads.vectors,
+        ):
             read_only(array)
-        return Snapshots(self.scene, loads, read_only(self.free_displacements[index]), read_only(self.min_det_f[index]))
+        return Snapshots(
+            self.scene,
+            loads,
+            read_only(self.free_displacements[index]),
+            read_only(self.min_det_f[index]),
+        )
 
     @cached_property
     def forces(self) -> NDArray[np.float64]:
@@ -169,35 +185,64 @@ def load_dataset(
         raise InvalidInputError(f"`limit` must be an integer >= 1; got {limit}.")
     check_pool(workers, cluster)
     if split not in (None, *get_args(SplitBy)):
-        raise InvalidInputError(f"`split` must be one of {', '.join(get_args(SplitBy))}; got {split!r}.")
-    spec = source if isinstance(source, DatasetSpec | ImportedDatasetSpec) else load_dataset_spec(source)
+        raise InvalidInputError(
+            f"`split` must be one of {', '.join(get_args(SplitBy))}; got {split!r}."
+        )
+    spec = (
+        source
+        if isinstance(source, DatasetSpec | ImportedDatasetSpec)
+        else load_dataset_spec(source)
+    )
     if isinstance(spec, ImportedDatasetSpec):
         return _imported(spec, limit, split, tests)
     others = {name: spec_of_set(spec, name) for name in tests}
     if "unseen-regions" in others:
         check_regions(spec)
     by = Split(test_fraction=spec.split.test_fraction, by=split or spec.split.by)
-    stores = [_Store(item, generate(item, limit, workers, cache, progress, cluster), limit) for item in (spec, *others.values())]
+    stores = [
+        _Store(item, generate(item, limit, workers, cache, progress, cluster), limit)
+        for item in (spec, *others.values())
+    ]
     if n_repeated := repeated([(store.scene, store.loads) for store in stores]):
-        raise InvalidInputError(f"{spec.name}: {n_repeated} samples repeat others; are `seed` and `magnitude_n` as they should be?")
+        raise InvalidInputError(
+            f"{spec.name}: {n_repeated} samples repeat others; are `seed` and `magnitude_n` as they should be?"
+        )
     main = stores[0]
     valid = np.flatnonzero(main.status == 0)
     parts = split_samples(main.loads[valid], len(main.scene.patch_nodes), by, spec.loads.seed)
     train, test = main.snapshots([valid[part] for part in parts])
     sets: dict[str, Snapshots] = {
-        name: store.snapshots([np.flatnonzero(store.status == 0)])[0] for name, store in zip(others, stores[1:], strict=True)
+        name: store.snapshots([np.flatnonzero(store.status == 0)])[0]
+        for name, store in zip(others, stores[1:], strict=True)
     }
-    return Dataset(main.scene, train, test, len(main.status) - len(valid), len(valid) - len(train) - len(test), sets)
+    return Dataset(
+        main.scene,
+        train,
+        test,
+        len(main.status) - len(valid),
+        len(valid) - len(train) - len(test),
+        sets,
+    )
 
 
-def _imported(spec: ImportedDatasetSpec, limit: int | None, by: SplitBy | None, tests: Sequence[SetName]) -> Dataset:
+def _imported(
+    spec: ImportedDatasetSpec, limit: int | None, by: SplitBy | None, tests: Sequence[SetName]
+) -> Dataset:
     if tests:
-        raise InvalidInputError(f"{spec.name} has no test set {tests[0]!r}: its snapshots were imported.")
+        raise InvalidInputError(
+            f"{spec.name} has no test set {tests[0]!r}: its snapshots were imported."
+        )
     arrays = read_samples(spec, limit)
     scene = imported_scene(spec, arrays)
-    loads, displacements = nodal_loads(arrays), arrays.displacements.reshape(len(arrays.forces), -1)[:, scene.free_dofs]
+    loads, displacements = (
+        nodal_loads(arrays),
+        arrays.displacements.reshape(len(arrays.forces), -1)[:, scene.free_dofs],
+    )
     parts = split_imported(spec, arrays, by)
-    train, test = (Snapshots(scene, loads[part], displacements[part], np.full(len(part), np.nan))[:] for part in parts)
+    train, test = (
+        Snapshots(scene, loads[part], displacements[part], np.full(len(part), np.nan))[:]
+        for part in parts
+    )
     return Dataset(scene, train, test, 0, len(loads) - len(train) - len(test))
 
 
@@ -208,9 +253,20 @@ class _Store:
         self.scene = load_scene(spec)
         whole = n_samples_of(self.scene)
         self._folder, self._total = folder, whole if limit is None else min(limit, whole)
-        shards = [replace(shard, displacements=shard.displacements[:, :0]) for shard in read_shards(folder, self._total)]
-        self.loads = PatchLoads(*(np.concatenate([getattr(shard, name) for shard in shards]) for name in ("patches", "vectors")))
-        self.status, self._min_det_f = (np.concatenate([getattr(shard, name) for shard in shards]) for name in ("status", "min_det_f"))
+        shards = [
+            replace(shard, displacements=shard.displacements[:, :0])
+            for shard in read_shards(folder, self._total)
+        ]
+        self.loads = PatchLoads(
+            *(
+                np.concatenate([getattr(shard, name) for shard in shards])
+                for name in ("patches", "vectors")
+            )
+        )
+        self.status, self._min_det_f = (
+            np.concatenate([getattr(shard, name) for shard in shards])
+            for name in ("status", "min_det_f")
+        )
 
     def snapshots(self, parts: Sequence[NDArray[np.int64]]) -> list[Snapshots]:
         """The samples of some parts, each given by rising numbers; beside them no more than one shard is in memory."""
@@ -219,15 +275,28 @@ class _Store:
             for part, displacements in zip(parts, out, strict=True):
                 first, last = np.searchsorted(part, [shard.start, shard.start + len(shard.status)])
                 displacements[first:last] = shard.displacements[part[first:last] - shard.start]
-        return [Snapshots(self.scene, self.loads[part], u, self._min_det_f[part])[:] for part, u in zip(parts, out, strict=True)]
+        return [
+            Snapshots(self.scene, self.loads[part], u, self._min_det_f[part])[:]
+            for part, u in zip(parts, out, strict=True)
+        ]
 
 
 def stream(
-    source: str | Path | Mapping[str, Any] | AnyDatasetSpec, limit: int | None = None, *, workers: int | None = None, cache: Path | None = None
-) -> Iterator[Snapshots]:  # fmt: skip
+    source: str | Path | Mapping[str, Any] | AnyDatasetSpec,
+    limit: int | None = None,
+    *,
+    workers: int | None = None,
+    cache: Path | None = None,
+) -> Iterator[Snapshots]:
     """The valid samples of a dataset, train and test together, a hundred at a time; parameters as of `load_dataset`."""
-    spec = generated(source if isinstance(source, DatasetSpec | ImportedDatasetSpec) else load_dataset_spec(source))
+    spec = generated(
+        source
+        if isinstance(source, DatasetSpec | ImportedDatasetSpec)
+        else load_dataset_spec(source)
+    )
     scene = load_scene(spec)
     folder = generate(spec, limit, workers, cache)
     for shard in read_shards(folder, n_samples_to_generate(spec, limit)):
-        yield Snapshots(scene, PatchLoads(shard.patches, shard.vectors), shard.displacements, shard.min_det_f)[np.flatnonzero(shard.status == 0)]
+        yield Snapshots(
+            scene, PatchLoads(shard.patches, shard.vectors), shard.displacements, shard.min_det_f
+        )[np.flatnonzero(shard.status == 0)]

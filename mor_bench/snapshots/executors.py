@@ -7,7 +7,14 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    wait,
+)
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -66,9 +73,15 @@ def check_pool(workers: int | None, cluster: str | None) -> None:
     if workers is not None and workers < 1:
         raise InvalidInputError(f"`workers` must be an integer >= 1; got {workers}.")
     if cluster is not None and workers is not None:
-        raise InvalidInputError("`workers` and `cluster` exclude each other: a cluster has as many workers as were started.")
-    if cluster is not None and not re.fullmatch(r"tcp://([^\s:/]+|\[[0-9a-fA-F:.]+\]):\d{1,5}", cluster):
-        raise InvalidInputError(f"`cluster` must be the address of a Dask scheduler, tcp://host:port; got {cluster!r}.")
+        raise InvalidInputError(
+            "`workers` and `cluster` exclude each other: a cluster has as many workers as were started."
+        )
+    if cluster is not None and not re.fullmatch(
+        r"tcp://([^\s:/]+|\[[0-9a-fA-F:.]+\]):\d{1,5}", cluster
+    ):
+        raise InvalidInputError(
+            f"`cluster` must be the address of a Dask scheduler, tcp://host:port; got {cluster!r}."
+        )
 
 
 @contextmanager
@@ -108,7 +121,9 @@ def _wait_for_end_of_parent(parent: int) -> None:
         import ctypes
 
         synchronize, infinite = 0x00100000, 0xFFFFFFFF
-        ctypes.windll.kernel32.WaitForSingleObject(ctypes.windll.kernel32.OpenProcess(synchronize, False, parent), infinite)
+        ctypes.windll.kernel32.WaitForSingleObject(
+            ctypes.windll.kernel32.OpenProcess(synchronize, False, parent), infinite
+        )
     else:
         while os.getppid() == parent:
             sleep(1.0)
@@ -125,12 +140,16 @@ def worker_pool(workers: int) -> Iterator[Pool]:
     """
     from loky import ProcessPoolExecutor
 
-    executor = ProcessPoolExecutor(max_workers=workers, initializer=_end_with, initargs=(os.getpid(),))
+    executor = ProcessPoolExecutor(
+        max_workers=workers, initializer=_end_with, initargs=(os.getpid(),)
+    )
     try:
         yield Pool(executor, lambda: IN_FLIGHT * workers)
     except BrokenExecutor as error:
         executor.shutdown(kill_workers=True)
-        raise WorkerError(f"a worker process was killed; if there was too little memory, take fewer workers than {workers}. {KEPT}") from error
+        raise WorkerError(
+            f"a worker process was killed; if there was too little memory, take fewer workers than {workers}. {KEPT}"
+        ) from error
     except BaseException:
         executor.shutdown(kill_workers=True)
         raise
@@ -152,20 +171,31 @@ def cluster_pool(address: str) -> Iterator[Pool]:
     try:
         from distributed import Client, KilledWorker
     except ModuleNotFoundError as error:
-        raise MissingDependencyError(f"`cluster` needs {error.name}: pip install 'mor-bench[cluster]'") from error
+        raise MissingDependencyError(
+            f"`cluster` needs {error.name}: pip install 'mor-bench[cluster]'"
+        ) from error
 
     client = _connected(address, partial(Client, address, timeout=CONNECT_S, set_as_default=False))
     try:
         try:
             client.wait_for_workers(1, timeout=CONNECT_S)
         except TimeoutError:
-            raise WorkerError(f"the Dask scheduler at {address} has no workers; start some with: dask worker {address}") from None
+            raise WorkerError(
+                f"the Dask scheduler at {address} has no workers; start some with: dask worker {address}"
+            ) from None
         _check_installed(client, address)
-        yield Pool(client.get_executor(pure=False), lambda: IN_FLIGHT * max(1, sum(client.nthreads().values())))
+        yield Pool(
+            client.get_executor(pure=False),
+            lambda: IN_FLIGHT * max(1, sum(client.nthreads().values())),
+        )
     except KilledWorker as error:
-        raise WorkerError(f"workers of {address} died one after the other on the same shard; do they have enough memory? {KEPT}") from error
+        raise WorkerError(
+            f"workers of {address} died one after the other on the same shard; do they have enough memory? {KEPT}"
+        ) from error
     except (CancelledError, OSError) as error:
-        raise WorkerError(f"the connection to the Dask scheduler at {address} was lost. {KEPT}") from error
+        raise WorkerError(
+            f"the connection to the Dask scheduler at {address} was lost. {KEPT}"
+        ) from error
     finally:
         _close(client)
 
@@ -184,7 +214,9 @@ def _connected(address: str, connect: Callable[[], Client]) -> Client:
     try:
         return made.result(CONNECT_S + 2)
     except (OSError, ValueError, TimeoutError) as error:
-        raise WorkerError(f"no Dask scheduler answers at {address} within {CONNECT_S} s.") from error
+        raise WorkerError(
+            f"no Dask scheduler answers at {address} within {CONNECT_S} s."
+        ) from error
 
 
 def _close(client: Client) -> None:
@@ -201,8 +233,13 @@ def _check_installed(client: Client, address: str) -> None:
     """A worker that cannot import what it is sent would be silent for ever."""
     module = "mor_bench.snapshots.solve"
     try:
-        found = [client.run_on_scheduler(find_spec, module), *client.run(find_spec, module).values()]
+        found = [
+            client.run_on_scheduler(find_spec, module),
+            *client.run(find_spec, module).values(),
+        ]
     except ModuleNotFoundError:
         found = [None]
     if None in found:
-        raise WorkerError(f"the scheduler and the workers at {address} must have this version of mor-bench installed; some have not.")
+        raise WorkerError(
+            f"the scheduler and the workers at {address} must have this version of mor-bench installed; some have not."
+        )

@@ -50,4 +50,9 @@ def fresh_test_set(spec: DatasetSpec, scene: Scene, by: SplitBy, seed: int, n: i
     if not solved:
         raise SolverError(f"{spec.name}: no fresh test load has a valid equilibrium.")
     displacements = np.array([answer.displacement for _, answer in solved])
-    return Snapshots(scene, held[np.array([i for i, _ in solved])], displacements, np.array([answer.min_det_f for _, answer in solved]))
+    return Snapshots(
+        scene,
+        held[np.array([i for i, _ in solved])],
+        displacements,
+        np.array([answer.min_det_f for _, answer in solved]),
+    )

@@ -18,7 +18,15 @@ from mor_bench.snapshots.executors import KEPT, check_pool, open_pool
 from mor_bench.snapshots.manifest import Manifest, keep_sources, read_manifest, update_manifest
 from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of
 from mor_bench.snapshots.solve import GENERATOR_VERSION, Solved, Task, pack, solve_task
-from mor_bench.snapshots.store import SCHEMA_VERSION, STATUSES, Shard, read_shard, remove_leftovers, write_atomically, write_shard
+from mor_bench.snapshots.store import (
+    SCHEMA_VERSION,
+    STATUSES,
+    Shard,
+    read_shard,
+    remove_leftovers,
+    write_atomically,
+    write_shard,
+)
 from mor_bench.specs import DatasetSpec
 
 SHARD_SIZE = 100
@@ -110,20 +118,38 @@ class _Plan:
         named = shard.dataset == self.key and shard.start == number * SHARD_SIZE
         if named and self._is_filled(shard) and self._is_loaded(shard, self.loads(number)):
             return True
-        warnings.warn(f"{path}: not the samples that belong there. They are made again.", DamagedFileWarning, stacklevel=3)
+        warnings.warn(
+            f"{path}: not the samples that belong there. They are made again.",
+            DamagedFileWarning,
+            stacklevel=3,
+        )
         return False
 
     def _is_filled(self, shard: Shard) -> bool:
         n = len(shard.status)
-        shapes = shard.displacements.shape == (n, len(self.scene.free_dofs)) and shard.min_det_f.shape == (n,)
+        shapes = shard.displacements.shape == (
+            n,
+            len(self.scene.free_dofs),
+        ) and shard.min_det_f.shape == (n,)
         valid = shard.status == 0
-        return bool(shapes and (shard.status < len(STATUSES)).all() and np.isfinite(shard.displacements[valid]).all())
+        return bool(
+            shapes
+            and (shard.status < len(STATUSES)).all()
+            and np.isfinite(shard.displacements[valid]).all()
+        )
 
     def _is_loaded(self, shard: Shard, loads: PatchLoads) -> bool:
-        if shard.patches.shape != loads.patches.shape or shard.vectors.shape != loads.vectors.shape or len(shard.status) != len(loads):
+        if (
+            shard.patches.shape != loads.patches.shape
+            or shard.vectors.shape != loads.vectors.shape
+            or len(shard.status) != len(loads)
+        ):
             return False
         difference = np.abs(shard.vectors - loads.vectors).max()
-        return bool((shard.patches == loads.patches).all() and difference <= ROUND_OFF * self.scene.generated.loads.magnitude_n[1])
+        return bool(
+            (shard.patches == loads.patches).all()
+            and difference <= ROUND_OFF * self.scene.generated.loads.magnitude_n[1]
+        )
 
 
 @contextmanager
@@ -132,7 +158,9 @@ def _writing(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise StoreError(f"{folder}: cannot be written: {error.strerror or error}. {KEPT}") from error
+        raise StoreError(
+            f"{folder}: cannot be written: {error.strerror or error}. {KEPT}"
+        ) from error
 
 
 def generate(
@@ -190,7 +218,11 @@ def generate(
     missing = [number for number in plan.numbers if not plan.has(number)]
     with _writing(folder):
         keep_sources(folder, spec)
-        update_manifest(folder, Manifest(_owner(folder, spec), GENERATOR_VERSION, whole, SHARD_SIZE), solves=bool(missing))
+        update_manifest(
+            folder,
+            Manifest(_owner(folder, spec), GENERATOR_VERSION, whole, SHARD_SIZE),
+            solves=bool(missing),
+        )
     count = _Count(plan, missing, progress)
     if missing and cluster is None:
         # Compiles the kernels, or reads them from numba's cache, here rather than in every worker at once.
@@ -228,7 +260,9 @@ class _Count:
             self._progress(self._done, self._plan.n_wanted)
 
 
-def _fill(plan: _Plan, missing: list[int], count: _Count, workers: int | None, cluster: str | None = None) -> None:
+def _fill(
+    plan: _Plan, missing: list[int], count: _Count, workers: int | None, cluster: str | None = None
+) -> None:
     """Solve the shards that are missing, and commit each when it is there."""
 
     def tasks() -> Iterator[Task]:
@@ -260,4 +294,8 @@ def generation_seconds(spec: DatasetSpec, cache: Path | None, n_samples: int) ->
     for path in sorted(dataset_folder(spec, cache).glob("seconds-*.txt")):
         with suppress(ValueError, OSError):  # a timing that was lost costs nothing but itself
             times.append(float(path.read_text()))
-    return sum(times) * n_samples / n_samples_to_generate(spec, len(times) * SHARD_SIZE) if times else None
+    return (
+        sum(times) * n_samples / n_samples_to_generate(spec, len(times) * SHARD_SIZE)
+        if times
+        else None
+    )

@@ -53,5 +53,9 @@ def read_samples(spec: ImportedDatasetSpec, limit: int | None = None) -> Importe
 
 def nodal_loads(arrays: ImportedArrays) -> NodalLoads:
     """The loads of imported samples."""
-    regions = np.zeros((len(arrays.forces), 1), dtype=np.int64) if arrays.regions is None else arrays.regions
+    regions = (
+        np.zeros((len(arrays.forces), 1), dtype=np.int64)
+        if arrays.regions is None
+        else arrays.regions
+    )
     return NodalLoads(arrays.forces, regions)

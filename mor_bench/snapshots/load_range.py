@@ -100,25 +100,47 @@ class LoadRange:
             If they are not such arrays.
         """
         if set(arrays) != {"limits", "nodes", "moments"}:
-            raise InvalidInputError(f"the range of the training loads must be the arrays limits, nodes and moments; got {', '.join(sorted(arrays))}.")
+            raise InvalidInputError(
+                f"the range of the training loads must be the arrays limits, nodes and moments; got {', '.join(sorted(arrays))}."
+            )
         limits, nodes, moments = arrays["limits"], arrays["nodes"], arrays["moments"]
-        if limits.dtype != np.float64 or limits.shape != (2,) or not (np.isfinite(limits) & (limits >= 0)).all():
+        if (
+            limits.dtype != np.float64
+            or limits.shape != (2,)
+            or not (np.isfinite(limits) & (limits >= 0)).all()
+        ):
             raise InvalidInputError("`limits` of the range must be two finite numbers >= 0.")
         rising = nodes.dtype.kind == "i" and nodes.ndim == 1 and bool((np.diff(nodes) > 0).all())
         if not rising or (len(nodes) > 0 and not 0 <= nodes[0] <= nodes[-1] < n_nodes):
-            raise InvalidInputError(f"`nodes` of the range must be rising integers in [0, {n_nodes - 1}].")
-        if moments.dtype != np.float64 or moments.shape != (len(nodes), 3, 3) or not _are_moments(moments):
-            raise InvalidInputError(f"`moments` of the range must be {len(nodes)} symmetric 3x3 matrices of unit trace, none negative.")
+            raise InvalidInputError(
+                f"`nodes` of the range must be rising integers in [0, {n_nodes - 1}]."
+            )
+        if (
+            moments.dtype != np.float64
+            or moments.shape != (len(nodes), 3, 3)
+            or not _are_moments(moments)
+        ):
+            raise InvalidInputError(
+                f"`moments` of the range must be {len(nodes)} symmetric 3x3 matrices of unit trace, none negative."
+            )
         return cls(float(limits[0]), float(limits[1]), nodes, moments)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The range as arrays, to be stored."""
-        return {"limits": np.array([self.size_n, self.width]), "nodes": self.nodes, "moments": self.moments}
+        return {
+            "limits": np.array([self.size_n, self.width]),
+            "nodes": self.nodes,
+            "moments": self.moments,
+        }
 
     def excludes(self, forces: NDArray[np.float64]) -> NDArray[np.bool_]:
         """(n,) which of the loads (n, n_nodes, 3), N, are out of range; no force never is."""
         size, width = _sizes_and_widths(forces)
-        return np.asarray((size > LARGER * self.size_n) | (width > WIDER * self.width) | (self.strangeness(forces) > MOST_STRANGE))
+        return np.asarray(
+            (size > LARGER * self.size_n)
+            | (width > WIDER * self.width)
+            | (self.strangeness(forces) > MOST_STRANGE)
+        )
 
     def strangeness(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """Mean over the nodes, weighted by |f_i|, of d_iᵀ (M_i + ε)⁻¹ d_i, with the direction d_i = f_i / |f_i|.
@@ -137,10 +159,14 @@ class LoadRange:
         """
         lengths = np.linalg.norm(forces, axis=2)
         known, known_lengths = forces[:, self.nodes], lengths[:, self.nodes]
-        scores = np.einsum("nai,aij,naj->na", known, self._inverses, known) / np.where(known_lengths > 0, known_lengths, 1.0)
+        scores = np.einsum("nai,aij,naj->na", known, self._inverses, known) / np.where(
+            known_lengths > 0, known_lengths, 1.0
+        )
         total = lengths.sum(axis=1)
         elsewhere = total - known_lengths.sum(axis=1)
-        return np.asarray((scores.sum(axis=1) + elsewhere / REGULARISATION) / np.where(total > 0, total, 1.0))
+        return np.asarray(
+            (scores.sum(axis=1) + elsewhere / REGULARISATION) / np.where(total > 0, total, 1.0)
+        )
 
     @cached_property
     def _inverses(self) -> NDArray[np.float64]:
@@ -160,7 +186,9 @@ def _chunks(snapshots: Snapshots) -> Iterator[tuple[NDArray[np.int64], NDArray[n
             yield np.arange(some.forces.shape[1]), some.forces
 
 
-def _sizes_and_widths(forces: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _sizes_and_widths(
+    forces: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     lengths = np.linalg.norm(forces, axis=2)
     size, squares = lengths.sum(axis=1), (lengths**2).sum(axis=1)
     return size, size**2 / np.where(squares > 0, squares, 1.0)
@@ -171,4 +199,8 @@ def _are_moments(matrices: NDArray[np.float64]) -> bool:
         return False
     symmetric = np.abs(matrices - matrices.transpose(0, 2, 1)) <= 1e-9
     traces = np.trace(matrices, axis1=1, axis2=2)
-    return bool(symmetric.all() and (np.abs(traces - 1) <= 1e-9).all() and (np.linalg.eigvalsh(matrices) >= -1e-9).all())
+    return bool(
+        symmetric.all()
+        and (np.abs(traces - 1) <= 1e-9).all()
+        and (np.linalg.eigvalsh(matrices) >= -1e-9).all()
+    )

@@ -56,7 +56,9 @@ class Manifest:
             "spec": self.spec.model_dump(mode="json"),
             "environments": list(self.environments),
         }
-        return (json.dumps({**content, "sha256": _digest(content)}, indent=1, sort_keys=True) + "\n").encode()
+        return (
+            json.dumps({**content, "sha256": _digest(content)}, indent=1, sort_keys=True) + "\n"
+        ).encode()
 
 
 def _digest(content: dict[str, Any]) -> str:
@@ -92,7 +94,13 @@ def read_manifest(folder: Path) -> Manifest:
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         reason = "damaged" if not isinstance(error, ValidationError) else "its `spec` is not valid"
         raise StoreError(f"{path}: not a manifest of mor-bench, or {reason}.") from None
-    return Manifest(spec, content["generator_version"], content["n_samples"], content["shard_size"], tuple(content["environments"]))
+    return Manifest(
+        spec,
+        content["generator_version"],
+        content["n_samples"],
+        content["shard_size"],
+        tuple(content["environments"]),
+    )
 
 
 def keep_sources(folder: Path, spec: DatasetSpec) -> None:

@@ -69,7 +69,11 @@ class PatchLoads:
 def n_samples_of(scene: Scene) -> int:
     """How many samples a scene's plan has."""
     loads = scene.generated.loads
-    return len(scene.patch_nodes) * loads.samples_per_patch if loads.samples_per_patch else loads.samples or 0
+    return (
+        len(scene.patch_nodes) * loads.samples_per_patch
+        if loads.samples_per_patch
+        else loads.samples or 0
+    )
 
 
 def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
@@ -87,16 +91,28 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
     else:
         patches, turn = chosen[numbers % len(chosen)], numbers // len(chosen)
     if loads.sampling == "random":
-        vectors = np.stack([_random_forces(loads, int(i), scene.patch_normals[p]) for i, p in zip(numbers, patches, strict=True)])
+        vectors = np.stack(
+            [
+                _random_forces(loads, int(i), scene.patch_normals[p])
+                for i, p in zip(numbers, patches, strict=True)
+            ]
+        )
         return PatchLoads(patches, vectors)
     d = 3 * k if loads.kind == "force" else 2 * k if loads.kind == "tangential" else k
     if k == 1:
         assert chosen is not None
         size = -(-n_samples_of(scene) // len(chosen))
-        unit = np.stack([_design(loads.sampling, (loads.seed, int(p[0])), size, d)[t] for p, t in zip(patches, turn, strict=True)])
+        unit = np.stack(
+            [
+                _design(loads.sampling, (loads.seed, int(p[0])), size, d)[t]
+                for p, t in zip(patches, turn, strict=True)
+            ]
+        )
     else:
         unit = _design(loads.sampling, (loads.seed,), n_samples_of(scene), d)[numbers]
-    return PatchLoads(patches, _forces(loads, unit.reshape(len(numbers), k, d // k), scene.patch_normals[patches]))
+    return PatchLoads(
+        patches, _forces(loads, unit.reshape(len(numbers), k, d // k), scene.patch_normals[patches])
+    )
 
 
 def _combinations(scene: Scene) -> NDArray[np.int64] | None:
@@ -105,8 +121,14 @@ def _combinations(scene: Scene) -> NDArray[np.int64] | None:
     n_patches = len(scene.patch_nodes)
     if loads.samples_per_patch:
         return np.arange(n_patches)[:, None]
-    found: NDArray[np.int64] | None = far_apart(scene.patch_centres.tobytes(), loads.simultaneous, loads.min_distance_m or 0.0)
-    return found if found is None else found[np.random.default_rng([loads.seed, 0xC0B1]).permutation(len(found))]
+    found: NDArray[np.int64] | None = far_apart(
+        scene.patch_centres.tobytes(), loads.simultaneous, loads.min_distance_m or 0.0
+    )
+    return (
+        found
+        if found is None
+        else found[np.random.default_rng([loads.seed, 0xC0B1]).permutation(len(found))]
+    )
 
 
 @lru_cache(maxsize=2)
@@ -132,7 +154,9 @@ def far_apart(centres: bytes, k: int, distance: float) -> NDArray[np.int64] | No
         row, new = np.nonzero(allowed)
         sets, allowed = np.hstack([sets[row], new[:, None]]), allowed[row]
     if not len(sets):
-        raise SpecError(f"`min_distance_m` must leave some {k} of the {len(points)} patches that far apart; {distance:g} leaves none.")
+        raise SpecError(
+            f"`min_distance_m` must leave some {k} of the {len(points)} patches that far apart; {distance:g} leaves none."
+        )
     return sets
 
 
@@ -148,14 +172,18 @@ def _apart(scene: Scene, number: int) -> NDArray[np.int64]:
             allowed = allowed[near >= (loads.min_distance_m or 0.0) * (1 - 1e-9)]
         if len(chosen) == loads.simultaneous:
             return np.sort(chosen)
-    raise SpecError(f"`min_distance_m`: in {MAX_DRAWS} tries no {loads.simultaneous} patches were {loads.min_distance_m:g} m apart.")
+    raise SpecError(
+        f"`min_distance_m`: in {MAX_DRAWS} tries no {loads.simultaneous} patches were {loads.min_distance_m:g} m apart."
+    )
 
 
 def _random_forces(loads: Loads, number: int, normals: NDArray[np.float64]) -> NDArray[np.float64]:
     """(k, 3) the forces of one sample on patches with given normals (k, 3)."""
     generator = np.random.default_rng([loads.seed, number])
     if loads.kind != "force":
-        unit = generator.uniform(size=(1, loads.simultaneous, 2 if loads.kind == "tangential" else 1))
+        unit = generator.uniform(
+            size=(1, loads.simultaneous, 2 if loads.kind == "tangential" else 1)
+        )
         return np.asarray(_forces(loads, unit, normals[None])[0])
     vectors = np.empty((loads.simultaneous, 3))
     for vector in vectors:
@@ -167,16 +195,22 @@ def _random_forces(loads: Loads, number: int, normals: NDArray[np.float64]) -> N
 @lru_cache(maxsize=4096)
 def _design(sampling: Sampling, seed: tuple[int, ...], n: int, d: int) -> NDArray[np.float64]:
     """n points of a space-filling design in the d-dimensional unit cube, (n, d)."""
-    from scipy.stats import qmc  # here, since it takes a quarter of the time of importing this package
+    from scipy.stats import (
+        qmc,
+    )  # here, since it takes a quarter of the time of importing this package
 
     generator = np.random.default_rng(seed)
     if sampling == "latin-hypercube":
         return np.asarray(qmc.LatinHypercube(d, rng=generator).random(n))
     # A scrambled Sobol sequence is balanced in whole powers of two; what is beyond n is left out.
-    return np.asarray(qmc.Sobol(d, scramble=True, rng=generator).random_base2(max(0, (n - 1).bit_length()))[:n])
+    return np.asarray(
+        qmc.Sobol(d, scramble=True, rng=generator).random_base2(max(0, (n - 1).bit_length()))[:n]
+    )
 
 
-def _forces(loads: Loads, unit: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+def _forces(
+    loads: Loads, unit: NDArray[np.float64], normals: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Forces (n, k, 3), N, from coordinates (n, k, d) in the unit cube and outward normals (n, k, 3).
 
     d = 3: height and azimuth on the sphere (Archimedes) and magnitude. d = 2: angle in the tangent plane and magnitude.
@@ -185,15 +219,21 @@ def _forces(loads: Loads, unit: NDArray[np.float64], normals: NDArray[np.float64
     low, high = loads.magnitude_n
     if loads.kind == "normal":
         signed = 2 * unit[:, :, 0] - 1
-        return np.asarray((np.sign(signed) * (low + (high - low) * np.abs(signed)))[:, :, None] * normals)
+        return np.asarray(
+            (np.sign(signed) * (low + (high - low) * np.abs(signed)))[:, :, None] * normals
+        )
     magnitude = (low + (high - low) * unit[:, :, -1])[:, :, None]
     angle = 2 * np.pi * unit[:, :, -2]
     if loads.kind == "tangential":
         first, second = _tangents(normals)
-        return np.asarray(magnitude * (np.cos(angle)[:, :, None] * first + np.sin(angle)[:, :, None] * second))
+        return np.asarray(
+            magnitude * (np.cos(angle)[:, :, None] * first + np.sin(angle)[:, :, None] * second)
+        )
     height = 2 * unit[:, :, 0] - 1
     radius = np.sqrt(1 - height**2)
-    return np.asarray(magnitude * np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=2))
+    return np.asarray(
+        magnitude * np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=2)
+    )
 
 
 def _tangents(normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -207,8 +247,13 @@ def _tangents(normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 def repeated(parts: Sequence[tuple[Scene, PatchLoads]]) -> int:
     """How many samples of some sets of loads, all on one body, are there already in the same or an earlier set."""
-    rows = [np.hstack([scene.patch_nodes[loads.patches], loads.vectors.reshape(len(loads), -1)]) for scene, loads in parts]
+    rows = [
+        np.hstack([scene.patch_nodes[loads.patches], loads.vectors.reshape(len(loads), -1)])
+        for scene, loads in parts
+    ]
     widest = max(row.shape[1] for row in rows)
-    together = np.concatenate([np.pad(row, ((0, 0), (0, widest - row.shape[1])), constant_values=np.inf) for row in rows])
+    together = np.concatenate(
+        [np.pad(row, ((0, 0), (0, widest - row.shape[1])), constant_values=np.inf) for row in rows]
+    )
     ordered = together[np.lexsort(together.T)]
     return int((ordered[1:] == ordered[:-1]).all(axis=1).sum())

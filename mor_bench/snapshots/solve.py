@@ -60,7 +60,9 @@ class Solved:
 def pack(scene: Scene) -> bytes:
     """What a worker needs of a scene: mesh, material, supports and the patches' weights, without what it can work out."""
     mesh = replace(scene.mesh)  # a copy without cached properties
-    return pickle.dumps((replace(scene, mesh=mesh, embedded_surface=None, point_sets={}), scene.patch_weights))
+    return pickle.dumps(
+        (replace(scene, mesh=mesh, embedded_surface=None, point_sets={}), scene.patch_weights)
+    )
 
 
 class _Kept(threading.local):
@@ -113,7 +115,9 @@ def solve_task(task: Task) -> Solved:
         If the sender's version of mor-bench generates other samples.
     """
     if task.generator_version != GENERATOR_VERSION:
-        raise WorkerError(f"a worker generates samples of version {GENERATOR_VERSION}, wanted is {task.generator_version}; update its mor-bench.")
+        raise WorkerError(
+            f"a worker generates samples of version {GENERATOR_VERSION}, wanted is {task.generator_version}; update its mor-bench."
+        )
     model, weights = _kept.of(task.problem)
     loads = task.loads
     forces = loads.nodal_forces(weights).reshape(len(loads), -1)[:, model.scene.free_dofs]
@@ -126,6 +130,13 @@ def solve_task(task: Task) -> Solved:
             if isinstance(found, Solution):
                 displacements[row], min_det_f[row] = found.displacement, found.min_det_f
             else:
-                status[row] = STATUSES.index("inverted" if isinstance(found, InvertedElementError) else "no-equilibrium")
+                status[row] = STATUSES.index(
+                    "inverted" if isinstance(found, InvertedElementError) else "no-equilibrium"
+                )
         seconds = perf_counter() - begun
-    return Solved(Shard(task.dataset, task.start, loads.patches, loads.vectors, displacements, min_det_f, status), seconds)
+    return Solved(
+        Shard(
+            task.dataset, task.start, loads.patches, loads.vectors, displacements, min_det_f, status
+        ),
+        seconds,
+    )

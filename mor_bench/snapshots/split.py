@@ -17,7 +17,9 @@ IMPORTED_SEED = 0
 """Of the split of imported samples."""
 
 
-def split_samples(loads: PatchLoads | NodalLoads, n_regions: int, split: Split, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def split_samples(
+    loads: PatchLoads | NodalLoads, n_regions: int, split: Split, seed: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Row numbers of the training and of the test samples, each sorted.
 
     By sample, any go to the test. By region, whole load regions do, chosen independently of how many samples there are;
@@ -43,15 +45,26 @@ def split_samples(loads: PatchLoads | NodalLoads, n_regions: int, split: Split, 
             held = np.isin(loads.patches, generator.permutation(n_regions)[:n_test])
         else:
             axis = generator.normal(size=3)
-            along = loads.vectors @ axis / (np.linalg.norm(axis) * np.maximum(np.linalg.norm(loads.vectors, axis=2), np.finfo(float).tiny))
+            along = (
+                loads.vectors
+                @ axis
+                / (
+                    np.linalg.norm(axis)
+                    * np.maximum(np.linalg.norm(loads.vectors, axis=2), np.finfo(float).tiny)
+                )
+            )
             held = along > 1 - 2 * part
     test, train = held.all(axis=1), ~held.any(axis=1)
     if not train.any() or not test.any():
-        raise InvalidInputError(f"{n} samples cannot be split by {split.by}: the training or the test part would be empty.")
+        raise InvalidInputError(
+            f"{n} samples cannot be split by {split.by}: the training or the test part would be empty."
+        )
     return np.flatnonzero(train), np.flatnonzero(test)
 
 
-def split_imported(spec: ImportedDatasetSpec, arrays: ImportedArrays, by: SplitBy | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def split_imported(
+    spec: ImportedDatasetSpec, arrays: ImportedArrays, by: SplitBy | None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Row numbers of the training and of the test samples, each sorted.
 
     As `split_samples`; the direction of a sample is that of the sum of its forces.
@@ -65,14 +78,20 @@ def split_imported(spec: ImportedDatasetSpec, arrays: ImportedArrays, by: SplitB
     needed = {"file": arrays.test, "region": arrays.regions}
     if by_or_file in needed and needed[by_or_file] is None:
         name = {"file": "test", "region": "regions"}[by_or_file]
-        raise InvalidInputError(f"{spec.name}: a split by {by_or_file} needs the array `{name}` in {spec.snapshots.file.path}; or split by sample.")
+        raise InvalidInputError(
+            f"{spec.name}: a split by {by_or_file} needs the array `{name}` in {spec.snapshots.file.path}; or split by sample."
+        )
     if by_or_file == "file":
         assert arrays.test is not None
         if arrays.test.all() or not arrays.test.any():
-            raise InvalidInputError(f"{spec.name}: `test` must be true for some samples and false for others.")
+            raise InvalidInputError(
+                f"{spec.name}: `test` must be true for some samples and false for others."
+            )
         return np.flatnonzero(~arrays.test), np.flatnonzero(arrays.test)
     loads = nodal_loads(arrays)
     # Ids may have gaps of any size: what is drawn is their rank.
     ids, ranks = np.unique(loads.patches, return_inverse=True)
     split = Split(test_fraction=spec.split.test_fraction, by=by_or_file)
-    return split_samples(replace(loads, patches=ranks.reshape(loads.patches.shape)), len(ids), split, IMPORTED_SEED)
+    return split_samples(
+        replace(loads, patches=ranks.reshape(loads.patches.shape)), len(ids), split, IMPORTED_SEED
+    )

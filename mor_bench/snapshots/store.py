@@ -67,7 +67,13 @@ class Shard:
         return replace(self, **{name: getattr(self, name)[:n] for name in _FIELDS})
 
 
-_FIELDS = {"patches": "<i8", "vectors": "<f8", "displacements": "<f8", "min_det_f": "<f8", "status": "|u1"}
+_FIELDS = {
+    "patches": "<i8",
+    "vectors": "<f8",
+    "displacements": "<f8",
+    "min_det_f": "<f8",
+    "status": "|u1",
+}
 
 
 def _host() -> str:
@@ -99,7 +105,9 @@ def remove_leftovers(folder: Path, of: str = "*") -> None:
 def _writer_is_dead(temporary: Path) -> bool:
     """Whether a file was written by a process of this machine that is no more; False if that cannot be known."""
     named = re.fullmatch(r"\..*\.(?P<host>[^.]*)\.(?P<pid>\d+)\.[0-9a-f]+\.tmp", temporary.name)
-    if named is None or named["host"] != _host() or sys.platform == "win32":  # there, signal 0 is not one that does nothing
+    if (
+        named is None or named["host"] != _host() or sys.platform == "win32"
+    ):  # there, signal 0 is not one that does nothing
         return False
     try:
         os.kill(int(named["pid"]), 0)
@@ -167,12 +175,18 @@ def parse_shard(content: bytes, where: str) -> Shard:
     if not isinstance(length, int) or len(body) > length:
         raise StoreError(f"{where}: damaged: it is not as long as its header says.")
     if len(body) < length:
-        raise StoreError(f"{where}: truncated: {HEADER_BYTES + len(body):,} of {HEADER_BYTES + length:,} bytes are there.")
+        raise StoreError(
+            f"{where}: truncated: {HEADER_BYTES + len(body):,} of {HEADER_BYTES + length:,} bytes are there."
+        )
     if hashlib.sha256(body).hexdigest() != digest:
         raise StoreError(f"{where}: damaged: the checksum does not match.")
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
-            return Shard(str(file.attrs["dataset"]), int(file.attrs["start"]), **{name: file[name][()] for name in _FIELDS})
+            return Shard(
+                str(file.attrs["dataset"]),
+                int(file.attrs["start"]),
+                **{name: file[name][()] for name in _FIELDS},
+            )
     except (OSError, KeyError) as error:
         raise StoreError(f"{where}: its content is not that of a shard: {error}") from None
 
@@ -182,5 +196,11 @@ def check_version(version: object, where: str) -> None:
     if version == SCHEMA_VERSION:
         return
     newer = isinstance(version, int) and version > SCHEMA_VERSION
-    kind, remedy = (NewerSchemaError, "update mor-bench to read it, or remove it") if newer else (StoreError, "generate the dataset again")
-    raise kind(f"{where}: schema version {version}; this version of mor-bench reads version {SCHEMA_VERSION}: {remedy}.")
+    kind, remedy = (
+        (NewerSchemaError, "update mor-bench to read it, or remove it")
+        if newer
+        else (StoreError, "generate the dataset again")
+    )
+    raise kind(
+        f"{where}: schema version {version}; this version of mor-bench reads version {SCHEMA_VERSION}: {remedy}."
+    )

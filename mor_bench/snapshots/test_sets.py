@@ -73,7 +73,11 @@ def spec_of_set(spec: DatasetSpec, name: SetName) -> DatasetSpec:
         raise InvalidInputError(f"{spec.name} has no test set {name!r}: {reason}.")
     loads = spec.loads
     low, high = loads.magnitude_n
-    changed: dict[str, Any] = {"samples_per_patch": None, "samples": spec.tests.samples, "seed": loads.seed + SEED_SHIFT}
+    changed: dict[str, Any] = {
+        "samples_per_patch": None,
+        "samples": spec.tests.samples,
+        "seed": loads.seed + SEED_SHIFT,
+    }
     if name in ("2x", "4x"):
         times = int(name[0])
         changed["magnitude_n"] = times * low, times * high
@@ -83,7 +87,11 @@ def spec_of_set(spec: DatasetSpec, name: SetName) -> DatasetSpec:
         changed["kind"] = "tangential" if loads.kind == "normal" else "normal"
     elif name == "several-forces":
         changed.update(simultaneous=N_SEVERAL, min_distance_m=FAR * _diagonal(load_scene(spec)))
-    content = {**spec.model_dump(), "name": f"{spec.name}--{name}", "loads": {**loads.model_dump(), **changed}}
+    content = {
+        **spec.model_dump(),
+        "name": f"{spec.name}--{name}",
+        "loads": {**loads.model_dump(), **changed},
+    }
     return DatasetSpec.model_validate(content)
 
 
@@ -120,7 +128,9 @@ def check_regions(spec: DatasetSpec) -> None:
     """
     main, other = load_scene(spec), load_scene(spec_of_set(spec, "unseen-regions"))
     shared = np.intersect1d(main.patch_nodes, other.patch_nodes)
-    facets = {tuple(sorted(facet)) for facet in main.loaded_facets.tolist()} & {tuple(sorted(facet)) for facet in other.loaded_facets.tolist()}
+    facets = {tuple(sorted(facet)) for facet in main.loaded_facets.tolist()} & {
+        tuple(sorted(facet)) for facet in other.loaded_facets.tolist()
+    }
     if len(shared) or facets:
         raise InvalidInputError(
             f"{spec.name}: `tests.unseen_region` must lie apart from `loads.region`; they share {len(facets)} facets of the surface "

@@ -69,17 +69,26 @@ class Autoencoder(NetworkRegression):
         self.seed = seed
 
     def _sizes(self, n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, int, int]]:
-        return {"regression": (n_inputs, N_HIDDEN, self.n_latent), "decoder": (self.n_latent, N_HIDDEN, n_outputs)}
+        return {
+            "regression": (n_inputs, N_HIDDEN, self.n_latent),
+            "decoder": (self.n_latent, N_HIDDEN, n_outputs),
+        }
 
     def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         if self.training.start_from is not None:
-            raise InvalidInputError("`start_from`: an autoencoder's file lacks its encoder, so that no training can start from it.")
+            raise InvalidInputError(
+                "`start_from`: an autoencoder's file lacks its encoder, so that no training can start from it."
+            )
         scale = float(np.sqrt((samples.values**2).sum(axis=1).mean()))
-        data = self._on_device({"inputs": samples.z, "outputs": samples.values / scale, "weights": samples.weights})
+        data = self._on_device(
+            {"inputs": samples.z, "outputs": samples.values / scale, "weights": samples.weights}
+        )
         generator = torch.Generator().manual_seed(self.seed)
         n_inputs, n_outputs, m = samples.z.shape[1], samples.values.shape[1], self.n_latent
         sizes = (n_outputs, m), (m, n_outputs), (n_inputs, m)
-        encoder, decoder, regression = networks = [Perceptron(n, N_HIDDEN, to, generator) for n, to in sizes]
+        encoder, decoder, regression = networks = [
+            Perceptron(n, N_HIDDEN, to, generator) for n, to in sizes
+        ]
         together = nn.ModuleList(networks).to(data["inputs"].device)
         known = self._trained(together, _loss(encoder, decoder, regression, data), data, generator)
         to_latent, from_latent = regression.arrays(), decoder.arrays()
@@ -90,7 +99,9 @@ class Autoencoder(NetworkRegression):
         return evaluate(self._networks["decoder"], evaluate(self._networks["regression"], z))
 
 
-def _loss(encoder: nn.Module, decoder: nn.Module, regression: nn.Module, data: dict[str, Tensor]) -> Callable[[Tensor], Tensor]:
+def _loss(
+    encoder: nn.Module, decoder: nn.Module, regression: nn.Module, data: dict[str, Tensor]
+) -> Callable[[Tensor], Tensor]:
     """The sum of the three squared errors."""
     nothing = torch.zeros_like(data["inputs"][:1])
 

@@ -49,13 +49,19 @@ class CoordinateSamples:
     slopes: Array | None = None
 
     def __getitem__(self, rows: NDArray[np.bool_]) -> CoordinateSamples:
-        derived = (None if array is None else array[rows] for array in (self.directions, self.slopes))
+        derived = (
+            None if array is None else array[rows] for array in (self.directions, self.slopes)
+        )
         return CoordinateSamples(self.z[rows], self.values[rows], self.weights[rows], *derived)
 
 
 def _mixed(snapshots: Snapshots) -> Snapshots:
     """Imported snapshots in random order, the same each time: they may come load region by load region, and kernels see the first."""
-    return snapshots if isinstance(snapshots.loads, PatchLoads) else snapshots[np.random.default_rng(0).permutation(len(snapshots))]
+    return (
+        snapshots
+        if isinstance(snapshots.loads, PatchLoads)
+        else snapshots[np.random.default_rng(0).permutation(len(snapshots))]
+    )
 
 
 class CoordinateRegression(Surrogate):
@@ -99,7 +105,9 @@ class CoordinateRegression(Surrogate):
         """Fit g; `axes_` and `modes_` are those of the samples' coordinates."""
 
     @abstractmethod
-    def _shapes(self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, ...]]:
+    def _shapes(
+        self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int
+    ) -> Mapping[str, tuple[int, ...]]:
         """The shapes that the arrays of `_learn` must have."""
 
     @abstractmethod
@@ -117,7 +125,11 @@ class CoordinateRegression(Surrogate):
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             snapshots = _mixed(self._checked_snapshots(snapshots))
-            free, forces, targets = scene.free_dofs, snapshots.inputs.reshape(len(snapshots), -1), snapshots.free_displacements
+            free, forces, targets = (
+                scene.free_dofs,
+                snapshots.inputs.reshape(len(snapshots), -1),
+                snapshots.free_displacements,
+            )
             if self.input == "linear-response":
                 self.compliance_ = linear_response(scene)
                 inputs = self.compliance_.respond(forces)[:, free]
@@ -128,9 +140,13 @@ class CoordinateRegression(Surrogate):
             axes = input_axes(inputs, self.n_input_modes or usual, self.evenness)
             modes = pod(targets, self.n_output_modes).modes
             weights = error_weights(snapshots.free_displacements)[:, None]
-            samples = CoordinateSamples(project(self._to_coordinates(axes), forces), targets @ modes, weights)
+            samples = CoordinateSamples(
+                project(self._to_coordinates(axes), forces), targets @ modes, weights
+            )
             if self.derivatives:
-                known = sensitivities(FullOrderModel(scene), snapshots, axes, modes, of_force=self.input == "force")
+                known = sensitivities(
+                    FullOrderModel(scene), snapshots, axes, modes, of_force=self.input == "force"
+                )
                 samples = replace(samples, directions=known.inputs, slopes=known.outputs)
             self.axes_, self.modes_ = axes, modes
             self._restore({"axes": axes, "modes": modes, **self._learn(samples)})
@@ -163,14 +179,26 @@ class CoordinateRegression(Surrogate):
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         # One memory order, fitted or loaded: BLAS rounds differently in another.
         state = {name: np.ascontiguousarray(array) for name, array in state.items()}
-        n_free, n_inputs, n_outputs = len(self.scene_.free_dofs), state["axes"].shape[1], state["modes"].shape[1]
-        shapes = {"axes": (n_free, n_inputs), "modes": (n_free, n_outputs), **self._shapes(state, n_inputs, n_outputs)}
+        n_free, n_inputs, n_outputs = (
+            len(self.scene_.free_dofs),
+            state["axes"].shape[1],
+            state["modes"].shape[1],
+        )
+        shapes = {
+            "axes": (n_free, n_inputs),
+            "modes": (n_free, n_outputs),
+            **self._shapes(state, n_inputs, n_outputs),
+        }
         if set(state) != set(shapes):
-            raise InvalidInputError(f"the arrays must be {', '.join(sorted(shapes))}; got {', '.join(sorted(state))}.")
+            raise InvalidInputError(
+                f"the arrays must be {', '.join(sorted(shapes))}; got {', '.join(sorted(state))}."
+            )
         for name, shape in shapes.items():
             array, dtype = state[name], np.dtype(np.int32 if name in self.integers else np.float64)
             if array.shape != shape or array.dtype != dtype or not np.isfinite(array).all():
-                raise InvalidInputError(f"`{name}` must be a finite {dtype} array of shape {shape}; got {array.dtype} of shape {array.shape}.")
+                raise InvalidInputError(
+                    f"`{name}` must be a finite {dtype} array of shape {shape}; got {array.dtype} of shape {array.shape}."
+                )
         self._take(state)
         self.axes_, self.modes_ = state["axes"], state["modes"]
         if self.input == "linear-response" and not hasattr(self, "compliance_"):

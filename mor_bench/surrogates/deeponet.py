@@ -14,7 +14,14 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.coordinates import change_of_basis, input_axes
 from mor_bench.scene.mesh import Mesh
-from mor_bench.surrogates.field_network import Arrays, FieldNetwork, FieldSurrogate, Input, n_products, perceptron
+from mor_bench.surrogates.field_network import (
+    Arrays,
+    FieldNetwork,
+    FieldSurrogate,
+    Input,
+    n_products,
+    perceptron,
+)
 
 EVENNESS = 0.0
 """Coordinates of the input keep their sizes, see `input_axes`.
@@ -44,11 +51,21 @@ class DeepONetNetwork(FieldNetwork):
     positions: Tensor
     functions: Tensor | None
 
-    def __init__(self, axes: Tensor, positions: Tensor, modes: Tensor | None, n_functions: int, width: int, depth: int) -> None:
+    def __init__(
+        self,
+        axes: Tensor,
+        positions: Tensor,
+        modes: Tensor | None,
+        n_functions: int,
+        width: int,
+        depth: int,
+    ) -> None:
         super().__init__()
         self.register_buffer("axes", axes, persistent=False)
         self.register_buffer("positions", positions, persistent=False)
-        self.register_buffer("functions", None if modes is None else modes.T.contiguous(), persistent=False)
+        self.register_buffer(
+            "functions", None if modes is None else modes.T.contiguous(), persistent=False
+        )
         self.branch = perceptron(axes.shape[1], *[width] * depth, n_functions)
         self.trunk = perceptron(3, *[width] * depth, 3 * n_functions) if modes is None else None
         self.n_functions = n_functions
@@ -106,7 +123,14 @@ class DeepONet(FieldSurrogate):
         Samples per step, peak of the one-cycle schedule, and seed of the initial weights and of the order of the samples.
     """
 
-    architecture: ClassVar[tuple[str, ...]] = ("input", "trunk", "n_input_modes", "n_functions", "width", "depth")
+    architecture: ClassVar[tuple[str, ...]] = (
+        "input",
+        "trunk",
+        "n_input_modes",
+        "n_functions",
+        "width",
+        "depth",
+    )
 
     def __init__(
         self,
@@ -132,38 +156,66 @@ class DeepONet(FieldSurrogate):
         self.learning_rate = learning_rate
         self.seed = seed
 
-    def _constants(self, inputs: NDArray[np.float64], targets: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        constants = {"axes": input_axes(inputs.reshape(len(inputs), -1), self.n_input_modes, EVENNESS)}
+    def _constants(
+        self, inputs: NDArray[np.float64], targets: NDArray[np.float64]
+    ) -> dict[str, NDArray[np.float64]]:
+        constants = {
+            "axes": input_axes(inputs.reshape(len(inputs), -1), self.n_input_modes, EVENNESS)
+        }
         if self.trunk == "pod":
             flat = targets.reshape(len(targets), -1)
             modes = pod(flat).modes[:, : self.n_functions]
-            constants["modes"] = modes * np.sqrt(((flat @ modes) ** 2).mean(axis=0))  # coefficients of unit size
+            constants["modes"] = modes * np.sqrt(
+                ((flat @ modes) ** 2).mean(axis=0)
+            )  # coefficients of unit size
         return constants
 
     def _network(self, constants: Arrays) -> DeepONetNetwork:
         n_dofs = self.scene_.mesh.n_dofs
-        names = {"axes": self.n_input_modes, "modes": self.n_functions} if self.trunk == "pod" else {"axes": self.n_input_modes}
+        names = (
+            {"axes": self.n_input_modes, "modes": self.n_functions}
+            if self.trunk == "pod"
+            else {"axes": self.n_input_modes}
+        )
         for name, most in names.items():
             if constants[name].shape[:1] != (n_dofs,) or not 1 <= constants[name].shape[1] <= most:
-                raise InvalidInputError(f"`{name}` must have shape ({n_dofs}, at most {most}); got {constants[name].shape}.")
+                raise InvalidInputError(
+                    f"`{name}` must have shape ({n_dofs}, at most {most}); got {constants[name].shape}."
+                )
         single = {name: torch.from_numpy(constants[name].astype(np.float32)) for name in names}
         n_functions = constants["modes"].shape[1] if "modes" in names else self.n_functions
-        return DeepONetNetwork(single["axes"], scaled_positions(self.scene_.mesh), single.get("modes"), n_functions, self.width, self.depth)
+        return DeepONetNetwork(
+            single["axes"],
+            scaled_positions(self.scene_.mesh),
+            single.get("modes"),
+            n_functions,
+            self.width,
+            self.depth,
+        )
 
-    def _turned(self, weights: dict[str, Tensor], constants: Arrays, scales: NDArray[np.float64]) -> dict[str, Tensor]:
+    def _turned(
+        self, weights: dict[str, Tensor], constants: Arrays, scales: NDArray[np.float64]
+    ) -> dict[str, Tensor]:
         """The branch from coordinates of a load, and to coefficients of a displacement, in their own units."""
-        inward = change_of_basis(constants["axes"] / scales[0], self.constants_["axes"] / self.input_scale_)
+        inward = change_of_basis(
+            constants["axes"] / scales[0], self.constants_["axes"] / self.input_scale_
+        )
         outward = np.eye(self.n_functions)
         if self.trunk == "pod":
             outward = change_of_basis(constants["modes"], self.constants_["modes"])
         outward *= scales[1] / self.output_scale_
         first, last = "branch.0.weight", f"branch.{2 * self.depth}"
         turned = {first: weights[first].double() @ torch.from_numpy(inward.T)}
-        turned |= {name: torch.from_numpy(outward) @ weights[name].double() for name in (f"{last}.weight", f"{last}.bias")}
+        turned |= {
+            name: torch.from_numpy(outward) @ weights[name].double()
+            for name in (f"{last}.weight", f"{last}.bias")
+        }
         return weights | {name: value.float() for name, value in turned.items()}
 
 
 def scaled_positions(mesh: Mesh) -> Tensor:
     """(n_nodes, 3) positions from the middle of the bounding box, in halves of its longest edge."""
     low, high = mesh.bounds
-    return torch.from_numpy((2.0 * (mesh.points - (low + high) / 2) / (high - low).max()).astype(np.float32))
+    return torch.from_numpy(
+        (2.0 * (mesh.points - (low + high) / 2) / (high - low).max()).astype(np.float32)
+    )

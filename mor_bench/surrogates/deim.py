@@ -77,7 +77,12 @@ class InterpolatedPOD(Surrogate):
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             known = self._checked_snapshots(snapshots)
-            knobs = size_to_needs(self, scene, known, {"n_modes": MODES, "n_force_modes": FORCE_MODES, "tolerance": TOLERANCES})
+            knobs = size_to_needs(
+                self,
+                scene,
+                known,
+                {"n_modes": MODES, "n_force_modes": FORCE_MODES, "tolerance": TOLERANCES},
+            )
             displacements = known.free_displacements
             modes = pod(displacements, knobs["n_modes"]).modes
             model = FullOrderModel(scene)
@@ -87,16 +92,30 @@ class InterpolatedPOD(Surrogate):
             basis = pod(forces, knobs["n_force_modes"]).modes
             dofs = interpolation_rows(basis, self.selection)
             interpolation = np.linalg.solve(basis[dofs].T, basis.T @ modes)
-            self._restore({"modes": modes, "dofs": dofs, "interpolation": interpolation, "rest": modes.T @ stiff})
+            self._restore(
+                {
+                    "modes": modes,
+                    "dofs": dofs,
+                    "interpolation": interpolation,
+                    "rest": modes.T @ stiff,
+                }
+            )
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
         options = NewtonOptions(self.tolerance_)
-        return self._subspace.answer(batch, lambda load: self.problem_.solve(load, options)).reshape(np.shape(forces))
+        return self._subspace.answer(
+            batch, lambda load: self.problem_.solve(load, options)
+        ).reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        return {"modes": self.modes_, "dofs": self.dofs_, "interpolation": self.interpolation_, "rest": self.rest_}
+        return {
+            "modes": self.modes_,
+            "dofs": self.dofs_,
+            "interpolation": self.interpolation_,
+            "rest": self.rest_,
+        }
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         scene = self.scene_
@@ -104,7 +123,9 @@ class InterpolatedPOD(Surrogate):
         self.modes_ = checked_array(state["modes"], "modes", (n_free, None))
         r = self.modes_.shape[1]
         self.dofs_ = checked_indices(state["dofs"], "dofs", n_free)
-        self.interpolation_ = checked_array(state["interpolation"], "interpolation", (len(self.dofs_), r))
+        self.interpolation_ = checked_array(
+            state["interpolation"], "interpolation", (len(self.dofs_), r)
+        )
         self.rest_ = checked_array(state["rest"], "rest", (r, r))
         self.tolerance_, self._subspace = self._sized("tolerance"), Subspace(scene, self.modes_)
         sampled = np.zeros((n_free, r))
@@ -112,7 +133,13 @@ class InterpolatedPOD(Surrogate):
         touched = np.zeros(scene.mesh.n_nodes, dtype=bool)
         touched[scene.free_dofs[self.dofs_] // 3] = True
         self.cells_ = np.flatnonzero(touched[scene.mesh.cells].any(axis=1))
-        points = reduced_points(scene, self.cells_, np.ones(len(self.cells_)), nodal(scene, self.modes_), nodal(scene, sampled))
+        points = reduced_points(
+            scene,
+            self.cells_,
+            np.ones(len(self.cells_)),
+            nodal(scene, self.modes_),
+            nodal(scene, sampled),
+        )
         try:
             self.problem_ = InterpolatedProblem(points, self.rest_, extent_of(scene))
         except np.linalg.LinAlgError:

@@ -22,7 +22,11 @@ class EmpiricalCubaturePOD(CubatureSurrogate):
     The other parameters are those of `CubatureSurrogate`.
     """
 
-    def _train(self, model: FullOrderModel, modes: Array, q: Array, tolerance: float) -> tuple[NDArray[np.int64], Array]:
-        weights = empirical_cubature(ecsw_system(model.assembler, model.cell_dofs, modes, q), tolerance).weights
+    def _train(
+        self, model: FullOrderModel, modes: Array, q: Array, tolerance: float
+    ) -> tuple[NDArray[np.int64], Array]:
+        weights = empirical_cubature(
+            ecsw_system(model.assembler, model.cell_dofs, modes, q), tolerance
+        ).weights
         cells = np.flatnonzero(weights)
         return cells, weights[cells]

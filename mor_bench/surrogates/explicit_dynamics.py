@@ -55,8 +55,14 @@ class ExplicitDynamics(Surrogate):
         out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
         free = self.scene_.free_dofs
         for row, load in zip(out, batch.reshape(-1, self.scene_.mesh.n_dofs)[:, free], strict=True):
-            start = self.relaxation_.model.rest_factor.solve(load) if self.start == "linear-response" else None
-            row[free] = self.relaxation_.solve(load, self.tolerance, self.max_steps, start).displacement
+            start = (
+                self.relaxation_.model.rest_factor.solve(load)
+                if self.start == "linear-response"
+                else None
+            )
+            row[free] = self.relaxation_.solve(
+                load, self.tolerance, self.max_steps, start
+            ).displacement
         return out.reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:

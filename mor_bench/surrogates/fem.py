@@ -35,12 +35,18 @@ class FullFEM(Surrogate):
     needs_snapshots = False
     takes_observations = True
 
-    def __init__(self, tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8, solver: SolverName | None = None) -> None:
+    def __init__(
+        self,
+        tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8,
+        solver: SolverName | None = None,
+    ) -> None:
         self.tolerance = tolerance
         self.solver = solver
 
     def supports(self, scene: Scene) -> str | None:
-        return unknown_equations(scene, observed=True) or missing_library(self.solver or scene.generated.solver)
+        return unknown_equations(scene, observed=True) or missing_library(
+            self.solver or scene.generated.solver
+        )
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
         """Assemble and factorise the rest-state stiffness; snapshots are not used."""
@@ -53,7 +59,9 @@ class FullFEM(Surrogate):
         out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
         free = self.scene_.free_dofs
         loads = batch.reshape(-1, self.scene_.mesh.n_dofs)[:, free]
-        for row, found in zip(out, self.model_.solve_many(loads, NewtonOptions(self.tolerance)), strict=True):
+        for row, found in zip(
+            out, self.model_.solve_many(loads, NewtonOptions(self.tolerance)), strict=True
+        ):
             if isinstance(found, SolverError):
                 raise found
             row[free] = found.displacement

@@ -34,7 +34,11 @@ class CoarseFEM(Surrogate):
 
     needs_snapshots = False
 
-    def __init__(self, coarsening: Annotated[int, Field(ge=2)] = 2, tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-4) -> None:
+    def __init__(
+        self,
+        coarsening: Annotated[int, Field(ge=2)] = 2,
+        tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-4,
+    ) -> None:
         self.coarsening = coarsening
         self.tolerance = tolerance
 
@@ -70,7 +74,9 @@ class CoarseFEM(Surrogate):
         return None
 
     def _coarse(self, scene: Scene) -> Scene:
-        nx, ny, nz = (ceil(n / self.coarsening) for n in getattr(scene.generated.geometry, "cells", (1, 1, 1)))
+        nx, ny, nz = (
+            ceil(n / self.coarsening) for n in getattr(scene.generated.geometry, "cells", (1, 1, 1))
+        )
         coarse = with_cells(scene, (nx, ny, nz))
         if coarse.mesh.n_cells == scene.mesh.n_cells:
             raise UnsupportedSceneError(f"{scene.name}: a mesh of one cell cannot be made coarser.")

@@ -78,7 +78,13 @@ class WarmFEM(Surrogate):
             linear = model.rest_factor.solve(known.free_forces.T).T
             modes = pod(linear).modes[:, :N_COORDINATES]
             shifts = known.free_displacements - linear
-            self._restore({"shifts": shifts, "to_coordinates": model.rest_factor.solve(modes), "coordinates": linear @ modes})
+            self._restore(
+                {
+                    "shifts": shifts,
+                    "to_coordinates": model.rest_factor.solve(modes),
+                    "coordinates": linear @ modes,
+                }
+            )
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
@@ -88,7 +94,9 @@ class WarmFEM(Surrogate):
         options = NewtonOptions(self.tolerance)
         for row, load in zip(out, batch.reshape(-1, self.scene_.mesh.n_dofs)[:, free], strict=True):
             linear = self.compliance_.solve(load)
-            row[free] = self.model_.solve(load, linear + self._shift(load, linear), options).displacement
+            row[free] = self.model_.solve(
+                load, linear + self._shift(load, linear), options
+            ).displacement
             self._last = linear, row[free] - linear
         return out.reshape(np.shape(forces))
 
@@ -108,18 +116,30 @@ class WarmFEM(Surrogate):
     def _state(self) -> dict[str, NDArray[Any]]:
         if self.start == "previous":
             return {}
-        return {"shifts": self.shifts_, "to_coordinates": self.to_coordinates_, "coordinates": self.coordinates_}
+        return {
+            "shifts": self.shifts_,
+            "to_coordinates": self.to_coordinates_,
+            "coordinates": self.coordinates_,
+        }
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         n_free = len(self.scene_.free_dofs)
         self._last = np.zeros(n_free), np.zeros(n_free)
         if self.start == "nearest":
             n_known, n_coordinates = state["coordinates"].shape
-            shapes = {"shifts": (n_known, n_free), "to_coordinates": (n_free, n_coordinates), "coordinates": (n_known, n_coordinates)}
+            shapes = {
+                "shifts": (n_known, n_free),
+                "to_coordinates": (n_free, n_coordinates),
+                "coordinates": (n_known, n_coordinates),
+            }
             for name, shape in shapes.items():
                 if state[name].shape != shape or not np.isfinite(state[name]).all():
-                    raise InvalidInputError(f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}.")
-            self.shifts_, self.to_coordinates_, self.coordinates_ = (np.ascontiguousarray(state[name]) for name in shapes)
+                    raise InvalidInputError(
+                        f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}."
+                    )
+            self.shifts_, self.to_coordinates_, self.coordinates_ = (
+                np.ascontiguousarray(state[name]) for name in shapes
+            )
             self._tree = cKDTree(self.coordinates_)
         self.model_ = FullOrderModel(self.scene_)
         self.compliance_ = Compliance(self.model_)

@@ -15,7 +15,14 @@ from torch import Tensor, nn
 
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError, StoreError
-from mor_bench.learning.training import Training, TrainingPlan, device_of, fingerprint_of, network_weights, train
+from mor_bench.learning.training import (
+    Training,
+    TrainingPlan,
+    device_of,
+    fingerprint_of,
+    network_weights,
+    train,
+)
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.mechanics.observed import linear_response
 from mor_bench.scene.scene import Scene
@@ -85,7 +92,9 @@ class FieldSurrogate(Surrogate):
     seed: int
 
     @abstractmethod
-    def _constants(self, inputs: NDArray[np.float64], targets: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    def _constants(
+        self, inputs: NDArray[np.float64], targets: NDArray[np.float64]
+    ) -> dict[str, NDArray[np.float64]]:
         """What the network needs beside the scene: arrays learned from scaled inputs and targets, (n_samples, n_nodes, 3)."""
 
     @abstractmethod
@@ -117,13 +126,17 @@ class FieldSurrogate(Surrogate):
             self._finish(network.cpu())
         return self
 
-    def _train(self, network: FieldNetwork, fields: Tensor, targets: Tensor, generator: torch.Generator) -> Training:
+    def _train(
+        self, network: FieldNetwork, fields: Tensor, targets: Tensor, generator: torch.Generator
+    ) -> Training:
         device = device_of(self.training)
         with torch.no_grad():
             features = network.encode(torch.cat([fields, torch.zeros_like(fields[:1])])).to(device)
         fingerprint = ""
         if self.training.checkpoint is not None:
-            fingerprint = fingerprint_of(self.parameters, {"features": features, "targets": targets, **network.state_dict()})
+            fingerprint = fingerprint_of(
+                self.parameters, {"features": features, "targets": targets, **network.state_dict()}
+            )
         network.to(device)
         targets = targets.to(device)
         free = torch.ones(targets.shape[1], 1)
@@ -136,26 +149,49 @@ class FieldSurrogate(Surrogate):
             errors: Tensor = (answers[:-1] - answers[-1:]) * free - targets[rows]
             return errors.square().mean()
 
-        plan = TrainingPlan(self.iterations, self.batch_size, self.learning_rate, second_moment_decay=SECOND_MOMENT_DECAY)
-        return train(network, loss, len(targets), plan, generator, self.training, self.time_limit_s, fingerprint)
+        plan = TrainingPlan(
+            self.iterations,
+            self.batch_size,
+            self.learning_rate,
+            second_moment_decay=SECOND_MOMENT_DECAY,
+        )
+        return train(
+            network,
+            loss,
+            len(targets),
+            plan,
+            generator,
+            self.training,
+            self.time_limit_s,
+            fingerprint,
+        )
 
     def _start_from(self, network: FieldNetwork, path: Path) -> None:
         """Take the weights of a model of this architecture, trained on this scene or another."""
         state = weights_to_start_from(path, self)
-        known = fitting_arrays(path, state, {f"constant.{name}": (len(array), None) for name, array in self.constants_.items()}, np.float64)
+        known = fitting_arrays(
+            path,
+            state,
+            {f"constant.{name}": (len(array), None) for name, array in self.constants_.items()},
+            np.float64,
+        )
         constants = {name.removeprefix("constant."): array for name, array in known.items()}
         try:
             source = self._network(constants)
         except InvalidInputError as error:
             raise InvalidInputError(f"{path}: {error}") from None
-        shapes = {f"network.{name}": tuple(value.shape) for name, value in source.state_dict().items()}
+        shapes = {
+            f"network.{name}": tuple(value.shape) for name, value in source.state_dict().items()
+        }
         weights = network_weights(fitting_arrays(path, state, shapes, np.float32))
         scales = fitting_arrays(path, state, {"scales": (2,)}, np.float64)["scales"]
         if not (scales > 0).all():
             raise StoreError(f"{path}: `scales` must be greater than 0; got {scales}.")
         network.load_state_dict(self._turned(weights, constants, scales))
 
-    def _turned(self, weights: dict[str, Tensor], constants: Arrays, scales: NDArray[np.float64]) -> dict[str, Tensor]:
+    def _turned(
+        self, weights: dict[str, Tensor], constants: Arrays, scales: NDArray[np.float64]
+    ) -> dict[str, Tensor]:
         """Weights of a model of other constants and scales, for this one's own."""
         return weights
 
@@ -165,10 +201,18 @@ class FieldSurrogate(Surrogate):
         if len(batch) == 0:
             return np.zeros(np.shape(forces))
         if counting.running is not None:  # with one scaling of each input and each output
-            counting.running.add(multiply_adds=len(batch) * (self.network_.multiply_adds + 2 * self.scene_.mesh.n_dofs))
+            counting.running.add(
+                multiply_adds=len(batch)
+                * (self.network_.multiply_adds + 2 * self.scene_.mesh.n_dofs)
+            )
         inputs = self._linear_response(batch) if self.input == "linear-response" else batch
-        answers = [self.network_(self.network_.encode(chunk)) for chunk in torch.split(_single(inputs / self.input_scale_), PREDICTION_CHUNK)]
-        learned = (torch.cat(answers) - self._at_rest).to(torch.float64).numpy() * self.output_scale_
+        answers = [
+            self.network_(self.network_.encode(chunk))
+            for chunk in torch.split(_single(inputs / self.input_scale_), PREDICTION_CHUNK)
+        ]
+        learned = (torch.cat(answers) - self._at_rest).to(
+            torch.float64
+        ).numpy() * self.output_scale_
         out = inputs + learned if self.input == "linear-response" else learned
         out[:, self.scene_.fixed_nodes] = 0.0
         out[~batch.any(axis=(1, 2))] = 0.0  # in a batch the network at rest is rounded otherwise
@@ -176,17 +220,24 @@ class FieldSurrogate(Surrogate):
 
     def _linear_response(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """K₀⁻¹f, (n, n_nodes, 3) m of forces (n, n_nodes, 3) N, or the linear extension of observed displacements, m."""
-        return self.compliance_.respond(forces.reshape(len(forces), self.scene_.mesh.n_dofs)).reshape(forces.shape)
+        return self.compliance_.respond(
+            forces.reshape(len(forces), self.scene_.mesh.n_dofs)
+        ).reshape(forces.shape)
 
     def _finish(self, network: FieldNetwork) -> None:
         self.network_ = network.eval().requires_grad_(False)
         with torch.inference_mode():
             network.prepare()
-            self._at_rest: Tensor = network(network.encode(torch.zeros(1, self.scene_.mesh.n_nodes, 3)))
+            self._at_rest: Tensor = network(
+                network.encode(torch.zeros(1, self.scene_.mesh.n_nodes, 3))
+            )
 
     def _state(self) -> dict[str, NDArray[Any]]:
         return {
-            **{f"network.{name}": value.numpy() for name, value in self.network_.state_dict().items()},
+            **{
+                f"network.{name}": value.numpy()
+                for name, value in self.network_.state_dict().items()
+            },
             **{f"constant.{name}": array for name, array in self.constants_.items()},
             "scales": np.array([self.input_scale_, self.output_scale_]),
             "loss_curve": self.loss_curve_,
@@ -196,15 +247,23 @@ class FieldSurrogate(Surrogate):
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         for name, array in state.items():
             if array.dtype.kind not in "fi" or not np.isfinite(array).all():
-                raise InvalidInputError(f"`{name}` must be finite numbers; got {array.dtype}, or NaN or infinity.")
+                raise InvalidInputError(
+                    f"`{name}` must be finite numbers; got {array.dtype}, or NaN or infinity."
+                )
         self.input_scale_, self.output_scale_ = (float(scale) for scale in state["scales"])
         if not min(self.input_scale_, self.output_scale_) > 0:
             raise InvalidInputError(f"`scales` must be greater than 0; got {state['scales']}.")
         self.loss_curve_, self.iterations_ = state["loss_curve"], int(state["iterations"][0])
-        self.constants_ = {name.removeprefix("constant."): array for name, array in state.items() if name.startswith("constant.")}
+        self.constants_ = {
+            name.removeprefix("constant."): array
+            for name, array in state.items()
+            if name.startswith("constant.")
+        }
         network = self._network(self.constants_)
         weights = network_weights(state)
-        expected = {name: (value.shape, value.dtype) for name, value in network.state_dict().items()}
+        expected = {
+            name: (value.shape, value.dtype) for name, value in network.state_dict().items()
+        }
         if expected != {name: (value.shape, value.dtype) for name, value in weights.items()}:
             raise InvalidInputError("the weights do not fit the network.")
         network.load_state_dict(weights, assign=True)

@@ -13,7 +13,16 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mor_bench.scene.grid import grid_map
-from mor_bench.surrogates.field_network import Arrays, FieldNetwork, FieldSurrogate, Input, SelfInitialised, linear, n_products, perceptron
+from mor_bench.surrogates.field_network import (
+    Arrays,
+    FieldNetwork,
+    FieldSurrogate,
+    Input,
+    SelfInitialised,
+    linear,
+    n_products,
+    perceptron,
+)
 from mor_bench.surrogates.umesh.grid import PaddedGrid, padded_grid
 
 PADDING = 4
@@ -56,7 +65,9 @@ class SpectralConvolution(SelfInitialised):
             back = factors.conj().T / n
             if axis == 2:  # each stands for its conjugate too, where that is another one
                 back = back * np.where((2 * numbers) % n == 0, 1.0, 2.0)
-            self.register_buffer(f"backward_{axis}", torch.from_numpy(back.astype(np.complex64)), persistent=False)
+            self.register_buffer(
+                f"backward_{axis}", torch.from_numpy(back.astype(np.complex64)), persistent=False
+            )
         self.counts = (len(kept[0]), len(kept[1]), len(kept[2]))
         self.weight = nn.Parameter(torch.empty(prod(self.counts), channels, channels, 2))
 
@@ -106,28 +117,43 @@ class FNO(FieldNetwork):
 
     positions: Tensor
 
-    def __init__(self, grid: PaddedGrid, spread: bool, channels: int, modes: int, layers: int) -> None:
+    def __init__(
+        self, grid: PaddedGrid, spread: bool, channels: int, modes: int, layers: int
+    ) -> None:
         super().__init__()
         self.grid = grid
         nx, ny, nz = (n + -(-n // PADDING) for n in grid.shape)
         axes = [torch.linspace(-1.0, 1.0, n) for n in grid.shape]
-        self.register_buffer("positions", torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).unsqueeze(3), persistent=False)
+        self.register_buffer(
+            "positions",
+            torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).unsqueeze(3),
+            persistent=False,
+        )
         self.spread = spread
         self.lift = linear(6, channels)
         self.pointwise = nn.ModuleList(linear(channels, channels) for _ in range(layers))
-        self.spectral = nn.ModuleList(SpectralConvolution((nx, ny, nz), modes, channels) for _ in range(layers))
+        self.spectral = nn.ModuleList(
+            SpectralConvolution((nx, ny, nz), modes, channels) for _ in range(layers)
+        )
         self.project = perceptron(channels, 2 * channels, 3)
 
     def encode(self, fields: Tensor) -> Tensor:
-        values = self.grid.to_grid(fields) if self.spread else self.grid.displacements_to_grid(fields)
+        values = (
+            self.grid.to_grid(fields) if self.spread else self.grid.displacements_to_grid(fields)
+        )
         return values.permute(0, 2, 3, 4, 1)
 
     def forward(self, features: Tensor) -> Tensor:
         values = features.permute(1, 2, 3, 0, 4)  # the points first, which the transforms like
         nx, ny, nz, n, _ = values.shape
         values = self.lift(torch.cat([values, self.positions.expand(-1, -1, -1, n, -1)], dim=-1))
-        values = functional.pad(values, [0, 0, 0, 0, *(-(-side // PADDING) * end for side in (nz, ny, nx) for end in (0, 1))])
-        for last, (pointwise, spectral) in enumerate(zip(self.pointwise, self.spectral, strict=True), start=1 - len(self.pointwise)):
+        values = functional.pad(
+            values,
+            [0, 0, 0, 0, *(-(-side // PADDING) * end for side in (nz, ny, nx) for end in (0, 1))],
+        )
+        for last, (pointwise, spectral) in enumerate(
+            zip(self.pointwise, self.spectral, strict=True), start=1 - len(self.pointwise)
+        ):
             values = pointwise(values) + spectral(values)
             if last < 0:
                 values = functional.gelu(values)
@@ -138,8 +164,14 @@ class FNO(FieldNetwork):
     def multiply_adds(self) -> int:
         points = prod(self.grid.shape)
         padded = prod(n + -(-n // PADDING) for n in self.grid.shape)
-        layers = padded * n_products(self.pointwise) + sum(layer.multiply_adds for layer in self.spectral if isinstance(layer, SpectralConvolution))
-        return points * (n_products(self.lift) + n_products(self.project)) + layers + self.grid.multiply_adds
+        layers = padded * n_products(self.pointwise) + sum(
+            layer.multiply_adds for layer in self.spectral if isinstance(layer, SpectralConvolution)
+        )
+        return (
+            points * (n_products(self.lift) + n_products(self.project))
+            + layers
+            + self.grid.multiply_adds
+        )
 
 
 @final
@@ -184,9 +216,17 @@ class FourierNeuralOperator(FieldSurrogate):
         self.learning_rate = learning_rate
         self.seed = seed
 
-    def _constants(self, inputs: NDArray[np.float64], targets: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    def _constants(
+        self, inputs: NDArray[np.float64], targets: NDArray[np.float64]
+    ) -> dict[str, NDArray[np.float64]]:
         return {}
 
     def _network(self, constants: Arrays) -> FNO:
         grid = padded_grid(grid_map(self.scene_.mesh, self.scene_.spec.grid_nodes), 0)
-        return FNO(grid, self.input == "force" and self.scene_.observed_nodes is None, self.channels, self.modes, self.layers)
+        return FNO(
+            grid,
+            self.input == "force" and self.scene_.observed_nodes is None,
+            self.channels,
+            self.modes,
+            self.layers,
+        )

@@ -44,7 +44,11 @@ class GappyPOD(Surrogate):
         self.regularisation = regularisation
 
     def supports(self, scene: Scene) -> str | None:
-        return "it is given forces, and no displacements of a part of the surface to be completed" if scene.observed_nodes is None else None
+        return (
+            "it is given forces, and no displacements of a part of the surface to be completed"
+            if scene.observed_nodes is None
+            else None
+        )
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
@@ -85,7 +89,12 @@ class GappyPOD(Surrogate):
             raise InvalidInputError(reason)
         self._places = self._seen
         n_modes = state["modes"].shape[1]
-        for name, shape in {"modes": (len(self.scene_.free_dofs), n_modes), "fitting": (n_modes, len(self._places))}.items():
+        for name, shape in {
+            "modes": (len(self.scene_.free_dofs), n_modes),
+            "fitting": (n_modes, len(self._places)),
+        }.items():
             if state[name].shape != shape or not np.isfinite(state[name]).all():
-                raise InvalidInputError(f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}.")
+                raise InvalidInputError(
+                    f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}."
+                )
         self.modes_, self.fitting_ = state["modes"], state["fitting"]

@@ -45,7 +45,9 @@ class HyperReducedPOD(CubatureSurrogate):
         super().__init__(n_modes, cubature_tolerance, n_cubature_snapshots, tolerance)
         self.sampling = sampling
 
-    def _train(self, model: FullOrderModel, modes: Array, q: Array, tolerance: float) -> tuple[NDArray[np.int64], Array]:
+    def _train(
+        self, model: FullOrderModel, modes: Array, q: Array, tolerance: float
+    ) -> tuple[NDArray[np.int64], Array]:
         system = ecsw_system(model.assembler, model.cell_dofs, modes, q)
         weights = sparse_nnls(system, system.sum(axis=1), tolerance).weights
         cells = np.flatnonzero(weights)
@@ -53,8 +55,12 @@ class HyperReducedPOD(CubatureSurrogate):
             return cells, weights[cells]
         points = reduced_points(model.scene, cells, np.ones(len(cells)), nodal(model.scene, modes))
         own = np.concatenate([points.point_forces(coordinates).T for coordinates in q])
-        target = np.concatenate([modes.T @ model.force(modes @ coordinates).force for coordinates in q])
+        target = np.concatenate(
+            [modes.T @ model.force(modes @ coordinates).force for coordinates in q]
+        )
         both = triangle(np.column_stack([own, target]))
-        factors = sparse_nnls(np.ascontiguousarray(both[:, :-1]), both[:, -1], tolerance).weights.reshape(len(cells), -1)
+        factors = sparse_nnls(
+            np.ascontiguousarray(both[:, :-1]), both[:, -1], tolerance
+        ).weights.reshape(len(cells), -1)
         used = factors.any(axis=1)
         return cells[used], factors[used]

@@ -42,7 +42,9 @@ def _least_det_f(u, cell_nodes, gradients):  # type: ignore[no-untyped-def]
             for i in range(3):
                 for j in range(3):
                     F[i, j] += u[cell_nodes[k, a], i] * gradients[k, a, j]
-        det = F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1]) - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
+        det = F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1]) - F[0, 1] * (
+            F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0]
+        )
         least = min(least, det + F[0, 2] * (F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0]))
     return least
 
@@ -97,7 +99,9 @@ class Hybrid(Surrogate):
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         """Fit the start, and factorise the rest-state stiffness."""
         if self.steps is not None and self.tolerance is not None:
-            raise InvalidInputError(f"`steps` and `tolerance` exclude each other; got {self.steps} and {self.tolerance}.")
+            raise InvalidInputError(
+                f"`steps` and `tolerance` exclude each other; got {self.steps} and {self.tolerance}."
+            )
         with self._fitting(scene):
             start = self._unfitted()
             if start.needs_snapshots:
@@ -124,20 +128,27 @@ class Hybrid(Surrogate):
             return None
         return guess if np.isfinite(guess).all() else None
 
-    def _solve(self, load: NDArray[np.float64], guess: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    def _solve(
+        self, load: NDArray[np.float64], guess: NDArray[np.float64] | None
+    ) -> NDArray[np.float64]:
         if self.tolerance is not None:
             return self.model_.solve(load, guess, NewtonOptions(self.tolerance)).displacement
         corrected = None if guess is None else self._corrected(load, guess)
         return self.model_.solve(load).displacement if corrected is None else corrected
 
-    def _corrected(self, load: NDArray[np.float64], guess: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def _corrected(
+        self, load: NDArray[np.float64], guess: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
         inverse, memory, u = self.model_.turned_rest, Anderson(len(guess)), guess
         for _ in range(self.steps or 1):
             residual = load - self.model_.force(u).force
             correction = inverse.solve_many([residual], [inverse.turned(u)])[0]
             u = u + memory.advance(u, correction, residual)
         near = float(np.linalg.norm(u - guess)) <= NEAR * float(np.linalg.norm(u))
-        if near and _least_det_f(np.append(u, np.zeros(3)).reshape(-1, 3), *inverse.cells[:2]) >= SURE:
+        if (
+            near
+            and _least_det_f(np.append(u, np.zeros(3)).reshape(-1, 3), *inverse.cells[:2]) >= SURE
+        ):
             return u
         state = self.model_.force(u)
         better = float(np.linalg.norm(load - state.force)) <= WORSE * float(np.linalg.norm(load))
@@ -149,7 +160,13 @@ class Hybrid(Surrogate):
         _ = self.model_.turned_rest
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        return {START + name: array for name, array in {**self.start_._state(), **size_arrays(getattr(self.start_, "sizes_", {}))}.items()}
+        return {
+            START + name: array
+            for name, array in {
+                **self.start_._state(),
+                **size_arrays(getattr(self.start_, "sizes_", {})),
+            }.items()
+        }
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         start = self._unfitted()
@@ -164,4 +181,9 @@ def _all_outputs(scene: Scene) -> Scene:
     """The scene with displacements wanted everywhere: a start must be whole."""
     if len(scene.output_nodes) == scene.mesh.n_nodes:
         return scene
-    return replace(scene, spec=scene.spec.model_copy(update={"needs": scene.spec.needs.model_copy(update={"outputs": "all"})}))
+    return replace(
+        scene,
+        spec=scene.spec.model_copy(
+            update={"needs": scene.spec.needs.model_copy(update={"outputs": "all"})}
+        ),
+    )

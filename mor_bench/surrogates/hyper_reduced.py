@@ -40,16 +40,25 @@ def training_coordinates(displacements: Array, modes: Array, n_snapshots: int) -
 def checked_indices(indices: NDArray[Any], name: str, size: int) -> NDArray[np.int64]:
     """Different integers in [0, size), in one dimension, at least one."""
     good = indices.dtype.kind == "i" and indices.ndim == 1 and len(indices) > 0
-    if not good or indices.min() < 0 or indices.max() >= size or len(np.unique(indices)) != len(indices):
+    if (
+        not good
+        or indices.min() < 0
+        or indices.max() >= size
+        or len(np.unique(indices)) != len(indices)
+    ):
         raise InvalidInputError(f"`{name}` must be different integers in [0, {size - 1}].")
     return indices.astype(np.int64)
 
 
 def checked_array(array: NDArray[Any], name: str, shape: tuple[int | None, ...]) -> Array:
     """A finite float64 array of this shape; None leaves a length open."""
-    fits = array.ndim == len(shape) and all(n in (m, None) or m is None for n, m in zip(array.shape, shape, strict=True))
+    fits = array.ndim == len(shape) and all(
+        n in (m, None) or m is None for n, m in zip(array.shape, shape, strict=True)
+    )
     if array.dtype != np.float64 or not fits or 0 in array.shape or not np.isfinite(array).all():
-        raise InvalidInputError(f"`{name}` must be a finite float64 array of shape {shape}; got {array.dtype} of shape {array.shape}.")
+        raise InvalidInputError(
+            f"`{name}` must be a finite float64 array of shape {shape}; got {array.dtype} of shape {array.shape}."
+        )
     return np.ascontiguousarray(array)
 
 
@@ -61,13 +70,19 @@ def nodal(scene: Scene, rows: Array) -> Array:
 
 
 def reduced_points(
-    scene: Scene, cells: NDArray[np.int64], weights: Array, modes: Array, test_modes: Array | None = None
-) -> ReducedPoints:  # fmt: skip
+    scene: Scene,
+    cells: NDArray[np.int64],
+    weights: Array,
+    modes: Array,
+    test_modes: Array | None = None,
+) -> ReducedPoints:
     """The scene's law over some of its cells, with nodal modes and test modes (n_nodes, 3, r)."""
     if scene.material is None:
         raise UnsupportedSceneError(NO_EQUATIONS)
     mesh = scene.mesh
-    return ReducedPoints(mesh.points, mesh.cells[cells], scene.material, scene.selective, weights, modes, test_modes)
+    return ReducedPoints(
+        mesh.points, mesh.cells[cells], scene.material, scene.selective, weights, modes, test_modes
+    )
 
 
 CUBATURE_TOLERANCES = (3e-2, 1e-2, 3e-3, 1e-3)
@@ -106,27 +121,40 @@ class CubatureSurrogate(Surrogate):
         return unknown_equations(scene)
 
     @abstractmethod
-    def _train(self, model: FullOrderModel, modes: Array, q: Array, tolerance: float) -> tuple[NDArray[np.int64], Array]:
+    def _train(
+        self, model: FullOrderModel, modes: Array, q: Array, tolerance: float
+    ) -> tuple[NDArray[np.int64], Array]:
         """Cells, and their positive weights (n,) or those of their points (n, n_cell_points), from snapshots q in the basis."""
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
             known = self._checked_snapshots(snapshots)
-            rungs = {"n_modes": MODES, "cubature_tolerance": CUBATURE_TOLERANCES, "tolerance": TOLERANCES}
-            displacements, knobs = known.free_displacements, size_to_needs(self, scene, known, rungs)
+            rungs = {
+                "n_modes": MODES,
+                "cubature_tolerance": CUBATURE_TOLERANCES,
+                "tolerance": TOLERANCES,
+            }
+            displacements, knobs = (
+                known.free_displacements,
+                size_to_needs(self, scene, known, rungs),
+            )
             modes = pod(displacements, knobs["n_modes"]).modes
             if knobs["cubature_tolerance"] == 0:
                 cells, weights = np.arange(scene.mesh.n_cells), np.ones(scene.mesh.n_cells)
             else:
                 q = training_coordinates(displacements, modes, self.n_cubature_snapshots)
-                cells, weights = self._train(FullOrderModel(scene), modes, q, knobs["cubature_tolerance"])
+                cells, weights = self._train(
+                    FullOrderModel(scene), modes, q, knobs["cubature_tolerance"]
+                )
             self._restore({"modes": modes, "cells": cells, "weights": weights})
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
         options = NewtonOptions(self.tolerance_)
-        return self._subspace.answer(batch, lambda load: self.problem_.solve(load, options).displacement).reshape(np.shape(forces))
+        return self._subspace.answer(
+            batch, lambda load: self.problem_.solve(load, options).displacement
+        ).reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
         return {"modes": self.modes_, "cells": self.cells_, "weights": self.weights_}
@@ -134,11 +162,20 @@ class CubatureSurrogate(Surrogate):
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         self.modes_ = checked_array(state["modes"], "modes", (len(self.scene_.free_dofs), None))
         self.cells_ = checked_indices(state["cells"], "cells", self.scene_.mesh.n_cells)
-        self.weights_ = checked_array(state["weights"], "weights", (len(self.cells_), None)[: state["weights"].ndim])
-        if not ((self.weights_ >= 0).all() and self.weights_.reshape(len(self.cells_), -1).any(axis=1).all()):
-            raise InvalidInputError("`weights` must be positive for a cell, or for some of its points.")
+        self.weights_ = checked_array(
+            state["weights"], "weights", (len(self.cells_), None)[: state["weights"].ndim]
+        )
+        if not (
+            (self.weights_ >= 0).all()
+            and self.weights_.reshape(len(self.cells_), -1).any(axis=1).all()
+        ):
+            raise InvalidInputError(
+                "`weights` must be positive for a cell, or for some of its points."
+            )
         self.tolerance_ = self._sized("tolerance")
         self._subspace = Subspace(self.scene_, self.modes_)
-        points = reduced_points(self.scene_, self.cells_, self.weights_, nodal(self.scene_, self.modes_))
+        points = reduced_points(
+            self.scene_, self.cells_, self.weights_, nodal(self.scene_, self.modes_)
+        )
         self.problem_ = CubatureProblem(points, extent_of(self.scene_))
         _ = self.problem_.rest_factor

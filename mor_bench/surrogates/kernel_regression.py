@@ -40,19 +40,35 @@ def gaussian_kernel(a: Array, b: Array) -> Array:
 class _GaussianSums(CoordinateRegression):
     """g(z) = Σ_i w_i k(z, z_i) with the Gaussian kernel; one of the z_i is the origin, by whose weight g(0) = 0."""
 
-    def _shapes(self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, ...]]:
+    def _shapes(
+        self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int
+    ) -> Mapping[str, tuple[int, ...]]:
         n_points = len(state["points"])
-        return {"points": (n_points, n_inputs), "weights": (n_points, n_outputs), "lengths": (n_inputs,)}
+        return {
+            "points": (n_points, n_inputs),
+            "weights": (n_points, n_outputs),
+            "lengths": (n_inputs,),
+        }
 
     def _take(self, state: dict[str, NDArray[Any]]) -> None:
-        self.points_, self.weights_, self.lengths_ = state["points"], state["weights"], state["lengths"]
+        self.points_, self.weights_, self.lengths_ = (
+            state["points"],
+            state["weights"],
+            state["lengths"],
+        )
         if not (self.lengths_ >= SHORTEST).all():
             raise InvalidInputError(f"`lengths` must be at least {SHORTEST:g}.")
         scaled = self.points_ / self.lengths_
         if not (np.abs(scaled) < LARGEST).all():
             raise InvalidInputError("`points` must be of moderate size against `lengths`.")
         # [z, 1, -|z|²/2] times these are the exponents, never much above zero.
-        self._exponents = np.vstack([scaled.T / self.lengths_[:, None], -0.5 * (scaled**2).sum(axis=1), np.ones(len(scaled))])
+        self._exponents = np.vstack(
+            [
+                scaled.T / self.lengths_[:, None],
+                -0.5 * (scaled**2).sum(axis=1),
+                np.ones(len(scaled)),
+            ]
+        )
 
     def _learned(self) -> dict[str, NDArray[Any]]:
         return {"points": self.points_, "weights": self.weights_, "lengths": self.lengths_}
@@ -60,7 +76,9 @@ class _GaussianSums(CoordinateRegression):
     def _coefficients(self, z: Array) -> Array:
         if counting.running is not None:  # an exponential as one
             n_points = len(self.points_)
-            per_load = self._exponents.size - n_points + n_points + self.weights_.size + 2 * z.shape[1]
+            per_load = (
+                self._exponents.size - n_points + n_points + self.weights_.size + 2 * z.shape[1]
+            )
             counting.running.add(multiply_adds=len(z) * per_load)
         left = np.empty((len(z), len(self._exponents)))
         left[:, :-2], left[:, -2] = z, 1.0
@@ -121,7 +139,9 @@ class PCAKernelRidge(_GaussianSums):
         scaled = z / length
         to_origin = gaussian_kernel(scaled, origin)
         kernel = gaussian_kernel(scaled, scaled) - to_origin @ to_origin.T
-        weights = KernelRidge(alpha=self.ridge, kernel="precomputed").fit(kernel, targets).dual_coef_
+        weights = (
+            KernelRidge(alpha=self.ridge, kernel="precomputed").fit(kernel, targets).dual_coef_
+        )
         return {
             "points": np.vstack([z, origin]),
             "weights": np.vstack([weights, -to_origin.T @ weights]),
@@ -131,7 +151,14 @@ class PCAKernelRidge(_GaussianSums):
 
 def _optimised(objective: Any, start: Any, bounds: Any) -> tuple[Array, float]:
     """Where the negative likelihood is least, and its value there."""
-    found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": MAX_ITERATIONS})
+    found = minimize(
+        objective,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": MAX_ITERATIONS},
+    )
     return np.asarray(found.x), float(found.fun)
 
 
@@ -180,14 +207,27 @@ class PCAGaussianProcess(_GaussianSums):
         z, targets = samples.z[: self.n_points], samples.values[: self.n_points]
         scale = float(np.sqrt((targets**2).mean(axis=0).max()))
         start = np.full(z.shape[1], LENGTH_SCALES[self.input])
-        kernel = ConstantKernel(100.0, (1e-4, 1e8)) * RBF(start, LENGTHS) + WhiteKernel(1e-5, (LEAST_NOISE, 1e1))
+        kernel = ConstantKernel(100.0, (1e-4, 1e8)) * RBF(start, LENGTHS) + WhiteKernel(
+            1e-5, (LEAST_NOISE, 1e1)
+        )
         chosen = GaussianProcessRegressor(kernel, alpha=0.0, optimizer=_optimised)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # of an input that says nothing the length is at its upper bound
+            warnings.simplefilter(
+                "ignore", ConvergenceWarning
+            )  # of an input that says nothing the length is at its upper bound
             chosen.fit(z[: self.n_optimised], targets[: self.n_optimised, :N_LEADING] / scale)
-        variance, lengths = chosen.kernel_.k1.k1.constant_value, np.atleast_1d(chosen.kernel_.k1.k2.length_scale)
+        variance, lengths = (
+            chosen.kernel_.k1.k1.constant_value,
+            np.atleast_1d(chosen.kernel_.k1.k2.length_scale),
+        )
         noise = np.append(np.full(len(z), chosen.kernel_.k2.noise_level), LEAST_NOISE) / variance
         points = np.vstack([z, np.zeros((1, z.shape[1]))])
-        process = GaussianProcessRegressor(RBF(lengths), alpha=np.maximum(noise, LEAST_NOISE), optimizer=None)
+        process = GaussianProcessRegressor(
+            RBF(lengths), alpha=np.maximum(noise, LEAST_NOISE), optimizer=None
+        )
         process.fit(points, np.vstack([targets, np.zeros((1, targets.shape[1]))]))
-        return {"points": points, "weights": process.alpha_.reshape(len(points), -1), "lengths": lengths}
+        return {
+            "points": points,
+            "weights": process.alpha_.reshape(len(points), -1),
+            "lengths": lengths,
+        }

@@ -37,7 +37,9 @@ class LinearFEM(Surrogate):
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
-        return self.compliance_.respond(batch.reshape(-1, self.scene_.mesh.n_dofs)).reshape(np.shape(forces))
+        return self.compliance_.respond(batch.reshape(-1, self.scene_.mesh.n_dofs)).reshape(
+            np.shape(forces)
+        )
 
     def _state(self) -> dict[str, NDArray[Any]]:
         return {}

@@ -85,19 +85,27 @@ class LocalPOD(Surrogate):
             directions = _directions(coordinates)
             centroids, labels = _clusters(directions, self.n_clusters)
             distances = np.linalg.norm(directions[:, None] - centroids, axis=2)
-            both = np.hstack([snapshots.free_displacements - linear, LINEAR_WEIGHT * linear]).reshape(len(linear), 2, -1)
+            both = np.hstack(
+                [snapshots.free_displacements - linear, LINEAR_WEIGHT * linear]
+            ).reshape(len(linear), 2, -1)
             bases = []
             for cluster in range(len(centroids)):
                 own, others = np.flatnonzero(labels == cluster), np.flatnonzero(labels != cluster)
-                n_near = max(round(OVERLAP * len(own)), self.n_modes - len(own))  # a small cluster still fills its basis
+                n_near = max(
+                    round(OVERLAP * len(own)), self.n_modes - len(own)
+                )  # a small cluster still fills its basis
                 near = others[np.argsort(distances[others, cluster], kind="stable")[:n_near]]
-                bases.append(pod(both[np.append(own, near)].reshape(-1, both.shape[2]), self.n_modes).modes)
+                bases.append(
+                    pod(both[np.append(own, near)].reshape(-1, both.shape[2]), self.n_modes).modes
+                )
             polynomials: dict[str, NDArray[np.float64]] = {}
             for cluster, basis in enumerate(bases):
                 if polynomial_pays(model, basis.shape[1], len(bases)):
                     own = snapshots.free_displacements[labels == cluster][:N_WATCHED]
                     problem = TensorProblem.of_modes(model, basis, own @ basis)
-                    polynomials |= {f"{name}.{cluster}": array for name, array in problem.arrays.items()}
+                    polynomials |= {
+                        f"{name}.{cluster}": array for name, array in problem.arrays.items()
+                    }
             self._restore(
                 {
                     **polynomials,
@@ -114,10 +122,19 @@ class LocalPOD(Surrogate):
         out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
         free = self.scene_.free_dofs
         if counting.running is not None:
-            counting.running.add(multiply_adds=len(batch) * (self.to_coordinates_.size + self.centroids_.size))
+            counting.running.add(
+                multiply_adds=len(batch) * (self.to_coordinates_.size + self.centroids_.size)
+            )
         for row, load in zip(out, batch.reshape(out.shape)[:, free], strict=True):
             nearest = self._nearest(load)
-            row[free] = predict_corrected(self.problems_[nearest], self.bases_[nearest], self.model_, self.compliance_, load[None], self.tolerance)[0]
+            row[free] = predict_corrected(
+                self.problems_[nearest],
+                self.bases_[nearest],
+                self.model_,
+                self.compliance_,
+                load[None],
+                self.tolerance,
+            )[0]
         return out.reshape(np.shape(forces))
 
     def _nearest(self, load: NDArray[np.float64]) -> int:
@@ -142,7 +159,11 @@ class LocalPOD(Surrogate):
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         state = {name: np.ascontiguousarray(array) for name, array in state.items()}
-        n_free, (n_clusters, n_coordinates), sizes = len(self.scene_.free_dofs), state["centroids"].shape, state["sizes"]
+        n_free, (n_clusters, n_coordinates), sizes = (
+            len(self.scene_.free_dofs),
+            state["centroids"].shape,
+            state["sizes"],
+        )
         shapes = {
             "to_coordinates": (n_free, n_coordinates),
             "centroids": (n_clusters, n_coordinates),
@@ -150,25 +171,38 @@ class LocalPOD(Surrogate):
         }
         for name, shape in shapes.items():
             if state[name].shape != shape or not np.isfinite(state[name]).all():
-                raise InvalidInputError(f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}.")
+                raise InvalidInputError(
+                    f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}."
+                )
         if sizes.dtype.kind != "i" or sizes.shape != (n_clusters,) or not (sizes >= 1).all():
             raise InvalidInputError(f"`sizes` must be {n_clusters} positive integers.")
         self.to_coordinates_, self.centroids_ = state["to_coordinates"], state["centroids"]
         self.model_ = FullOrderModel(self.scene_)
-        self.bases_ = [np.ascontiguousarray(basis) for basis in np.split(state["modes"], np.cumsum(sizes)[:-1], axis=1)]
-        self.problems_ = [self._problem(cluster, basis, state) for cluster, basis in enumerate(self.bases_)]
+        self.bases_ = [
+            np.ascontiguousarray(basis)
+            for basis in np.split(state["modes"], np.cumsum(sizes)[:-1], axis=1)
+        ]
+        self.problems_ = [
+            self._problem(cluster, basis, state) for cluster, basis in enumerate(self.bases_)
+        ]
         self.compliance_ = Compliance(self.model_)
         _ = [problem.rest_factor for problem in self.problems_]
 
     def _problem(
         self, cluster: int, basis: NDArray[np.float64], state: dict[str, NDArray[Any]]
-    ) -> GalerkinProblem | TensorProblem:  # fmt: skip
+    ) -> GalerkinProblem | TensorProblem:
         if f"quartic.{cluster}" not in state:
             return GalerkinProblem(self.model_.assembler, basis)
-        own = {name.removesuffix(f".{cluster}"): array for name, array in state.items() if name.endswith(f".{cluster}")}
+        own = {
+            name.removesuffix(f".{cluster}"): array
+            for name, array in state.items()
+            if name.endswith(f".{cluster}")
+        }
         problem = TensorProblem.of_arrays(self.scene_, own)
         if problem.n_unknowns != basis.shape[1]:
-            raise InvalidInputError(f"the polynomial must be that of {basis.shape[1]} modes; got {problem.n_unknowns}.")
+            raise InvalidInputError(
+                f"the polynomial must be that of {basis.shape[1]} modes; got {problem.n_unknowns}."
+            )
         return problem
 
 
@@ -178,7 +212,9 @@ def _directions(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
     return coordinates / np.where(sizes > 0, sizes, 1.0)
 
 
-def _clusters(directions: NDArray[np.float64], n_clusters: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _clusters(
+    directions: NDArray[np.float64], n_clusters: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Centroids (k, n_coordinates) and the number of each direction's nearest, by Lloyd's iteration from k-means++."""
     from sklearn.cluster import KMeans
 

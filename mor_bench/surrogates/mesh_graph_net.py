@@ -12,10 +12,33 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mor_bench.scene.mesh import Mesh
-from mor_bench.surrogates.field_network import Arrays, FieldNetwork, FieldSurrogate, Input, linear, n_products, perceptron
+from mor_bench.surrogates.field_network import (
+    Arrays,
+    FieldNetwork,
+    FieldSurrogate,
+    Input,
+    linear,
+    n_products,
+    perceptron,
+)
 
 EDGES = {
-    8: np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]]),
+    8: np.array(
+        [
+            [0, 1],
+            [1, 2],
+            [2, 3],
+            [3, 0],
+            [4, 5],
+            [5, 6],
+            [6, 7],
+            [7, 4],
+            [0, 4],
+            [1, 5],
+            [2, 6],
+            [3, 7],
+        ]
+    ),
     4: np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]),
 }
 """Node pairs along the edges of a hexahedron and of a tetrahedron, in VTK order."""
@@ -47,7 +70,9 @@ class Graph(nn.Module):
             ("outgoing", _table(senders, mesh.n_nodes)),
             ("incoming", _table(receivers, mesh.n_nodes)),
         ):
-            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)), persistent=False)
+            self.register_buffer(
+                name, torch.from_numpy(np.ascontiguousarray(array)), persistent=False
+            )
 
     @property
     def n_edges(self) -> int:
@@ -126,16 +151,22 @@ class MessagePassing(nn.Module):
 
     def forward(self, edges: Tensor, nodes: Tensor, graph: Graph) -> tuple[Tensor, Tensor]:
         """(n_edges, n or 1, width) and (n_nodes, n, width) → both, with n samples."""
-        hidden = self.edge(edges) + graph.from_senders(self.sender(nodes)) + graph.from_receivers(self.receiver(nodes))
+        hidden = (
+            self.edge(edges)
+            + graph.from_senders(self.sender(nodes))
+            + graph.from_receivers(self.receiver(nodes))
+        )
         edges = edges + self.norms[0](self.message(functional.silu(hidden)))
-        nodes = nodes + self.norms[1](self.node(torch.cat([nodes, graph.to_receivers(edges)], dim=-1)))
+        nodes = nodes + self.norms[1](
+            self.node(torch.cat([nodes, graph.to_receivers(edges)], dim=-1))
+        )
         return edges, nodes
 
     def multiply_adds(self, n_edges: int, n_nodes: int) -> int:
         """For one sample."""
-        return n_edges * n_products(nn.ModuleList([self.edge, self.message])) + n_nodes * n_products(
-            nn.ModuleList([self.sender, self.receiver, self.node])
-        )
+        return n_edges * n_products(
+            nn.ModuleList([self.edge, self.message])
+        ) + n_nodes * n_products(nn.ModuleList([self.sender, self.receiver, self.node]))
 
 
 class GraphNetwork(FieldNetwork):
@@ -157,7 +188,9 @@ class GraphNetwork(FieldNetwork):
         points = torch.from_numpy(mesh.points.astype(np.float32))
         relative = points[self.graph.senders] - points[self.graph.receivers]
         length = relative.norm(dim=1, keepdim=True)
-        self.register_buffer("shapes", torch.cat([relative, length], dim=1) / length.mean(), persistent=False)
+        self.register_buffer(
+            "shapes", torch.cat([relative, length], dim=1) / length.mean(), persistent=False
+        )
         self.node_encoder = perceptron(4, width, width)
         self.edge_encoder = perceptron(4, width, width)
         self.steps = nn.ModuleList(MessagePassing(width) for _ in range(steps))
@@ -171,9 +204,15 @@ class GraphNetwork(FieldNetwork):
         self.encoded = self.edge_encoder(self.shapes).unsqueeze(1)
 
     def forward(self, features: Tensor) -> Tensor:
-        features = features.transpose(0, 1)  # the nodes first: a node's row of all samples is moved in one piece
-        edges = self.edge_encoder(self.shapes).unsqueeze(1) if self.encoded is None else self.encoded
-        nodes = self.node_encoder(torch.cat([features, self.fixed.unsqueeze(1).expand(-1, features.shape[1], -1)], dim=-1))
+        features = features.transpose(
+            0, 1
+        )  # the nodes first: a node's row of all samples is moved in one piece
+        edges = (
+            self.edge_encoder(self.shapes).unsqueeze(1) if self.encoded is None else self.encoded
+        )
+        nodes = self.node_encoder(
+            torch.cat([features, self.fixed.unsqueeze(1).expand(-1, features.shape[1], -1)], dim=-1)
+        )
         for step in self.steps:
             edges, nodes = step(edges, nodes, self.graph)
         answer: Tensor = self.decoder(nodes)
@@ -182,7 +221,11 @@ class GraphNetwork(FieldNetwork):
     @property
     def multiply_adds(self) -> int:
         n_nodes, n_edges = len(self.fixed), self.graph.n_edges
-        steps = sum(step.multiply_adds(n_edges, n_nodes) for step in self.steps if isinstance(step, MessagePassing))
+        steps = sum(
+            step.multiply_adds(n_edges, n_nodes)
+            for step in self.steps
+            if isinstance(step, MessagePassing)
+        )
         return n_nodes * (n_products(self.node_encoder) + n_products(self.decoder)) + steps
 
 
@@ -229,7 +272,9 @@ class MeshGraphNet(FieldSurrogate):
         self.learning_rate = learning_rate
         self.seed = seed
 
-    def _constants(self, inputs: NDArray[np.float64], targets: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    def _constants(
+        self, inputs: NDArray[np.float64], targets: NDArray[np.float64]
+    ) -> dict[str, NDArray[np.float64]]:
         return {}
 
     def _network(self, constants: Arrays) -> GraphNetwork:

@@ -63,9 +63,13 @@ class ModalDerivatives(Surrogate):
             modes = derivative_basis(scene, model, self.n_linear, self.n_modes)
             state = {"modes": modes}
             if polynomial_pays(model, modes.shape[1]):
-                largest = scene.generated.loads.magnitude_n[1] * patch_responses(scene, model) @ modes
+                largest = (
+                    scene.generated.loads.magnitude_n[1] * patch_responses(scene, model) @ modes
+                )
                 chosen = np.unique(np.linspace(0, len(largest) - 1, N_WATCHED // 2).astype(int))
-                state |= TensorProblem.of_modes(model, modes, np.vstack([largest[chosen], -largest[chosen]])).arrays
+                state |= TensorProblem.of_modes(
+                    model, modes, np.vstack([largest[chosen], -largest[chosen]])
+                ).arrays
             self._restore(state)
         return self
 
@@ -74,11 +78,16 @@ class ModalDerivatives(Surrogate):
         out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
         free = self.scene_.free_dofs
         loads = batch.reshape(out.shape)[:, free]
-        out[:, free] = predict_corrected(self.problem_, self.modes_, self.model_, self.compliance_, loads, self.tolerance)
+        out[:, free] = predict_corrected(
+            self.problem_, self.modes_, self.model_, self.compliance_, loads, self.tolerance
+        )
         return out.reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        return {"modes": self.modes_, **(self.problem_.arrays if isinstance(self.problem_, TensorProblem) else {})}
+        return {
+            "modes": self.modes_,
+            **(self.problem_.arrays if isinstance(self.problem_, TensorProblem) else {}),
+        }
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         self.modes_ = checked_array(state["modes"], "modes", (len(self.scene_.free_dofs), None))
@@ -87,7 +96,9 @@ class ModalDerivatives(Surrogate):
         if "quartic" in state:
             self.problem_ = TensorProblem.of_arrays(self.scene_, state)
             if self.problem_.n_unknowns != r:
-                raise InvalidInputError(f"the polynomial must be that of {r} modes; got {self.problem_.n_unknowns}.")
+                raise InvalidInputError(
+                    f"the polynomial must be that of {r} modes; got {self.problem_.n_unknowns}."
+                )
         else:
             self.problem_ = GalerkinProblem(self.model_.assembler, self.modes_)
         self.compliance_ = Compliance(self.model_)

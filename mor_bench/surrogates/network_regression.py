@@ -45,19 +45,47 @@ class NetworkRegression(CoordinateRegression):
 
     def _on_device(self, arrays: Mapping[str, Array]) -> dict[str, Tensor]:
         device = device_of(self.training)
-        return {name: torch.from_numpy(array.astype(np.float32)).to(device) for name, array in arrays.items()}
+        return {
+            name: torch.from_numpy(array.astype(np.float32)).to(device)
+            for name, array in arrays.items()
+        }
 
     def _trained(
-        self, networks: nn.Module, loss: Callable[[Tensor], Tensor], data: dict[str, Tensor], generator: torch.Generator
-    ) -> dict[str, NDArray[Any]]:  # fmt: skip
+        self,
+        networks: nn.Module,
+        loss: Callable[[Tensor], Tensor],
+        data: dict[str, Tensor],
+        generator: torch.Generator,
+    ) -> dict[str, NDArray[Any]]:
         """Train, and give what is to be known of that."""
         plan = TrainingPlan(self.iterations, BATCH_SIZE, LEARNING_RATE)
-        fingerprint = fingerprint_of(self.parameters, {**data, **networks.state_dict()}) if self.training.checkpoint else ""
-        done = train(networks, loss, len(data["inputs"]), plan, generator, self.training, self.time_limit_s, fingerprint)
-        return {"loss_curve": done.loss_curve, "iterations": np.array([done.iterations], dtype=np.int32)}
+        fingerprint = (
+            fingerprint_of(self.parameters, {**data, **networks.state_dict()})
+            if self.training.checkpoint
+            else ""
+        )
+        done = train(
+            networks,
+            loss,
+            len(data["inputs"]),
+            plan,
+            generator,
+            self.training,
+            self.time_limit_s,
+            fingerprint,
+        )
+        return {
+            "loss_curve": done.loss_curve,
+            "iterations": np.array([done.iterations], dtype=np.int32),
+        }
 
-    def _shapes(self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, ...]]:
-        shapes: dict[str, tuple[int, ...]] = {"loss_curve": (state["loss_curve"].size,), "iterations": (1,)}
+    def _shapes(
+        self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int
+    ) -> Mapping[str, tuple[int, ...]]:
+        shapes: dict[str, tuple[int, ...]] = {
+            "loss_curve": (state["loss_curve"].size,),
+            "iterations": (1,),
+        }
         for name, sizes in self._sizes(n_inputs, n_outputs).items():
             shapes |= named_shapes(name, *sizes)
         return shapes
@@ -69,8 +97,16 @@ class NetworkRegression(CoordinateRegression):
         self._at_rest = self._values(np.zeros((1, n_inputs)))
 
     def _learned(self) -> dict[str, NDArray[Any]]:
-        weights = {key: array for name, network in self._networks.items() for key, array in named(name, network).items()}
-        return {"loss_curve": self.loss_curve_, "iterations": np.array([self.iterations_], dtype=np.int32), **weights}
+        weights = {
+            key: array
+            for name, network in self._networks.items()
+            for key, array in named(name, network).items()
+        }
+        return {
+            "loss_curve": self.loss_curve_,
+            "iterations": np.array([self.iterations_], dtype=np.int32),
+            **weights,
+        }
 
     @abstractmethod
     def _values(self, z: Array) -> Array:
@@ -78,7 +114,10 @@ class NetworkRegression(CoordinateRegression):
 
     def _coefficients(self, z: Array) -> Array:
         if counting.running is not None:  # each unit's nonlinearity as one
-            counting.running.add(multiply_adds=len(z) * sum(weight.size for network in self._networks.values() for weight in network))
+            counting.running.add(
+                multiply_adds=len(z)
+                * sum(weight.size for network in self._networks.values() for weight in network)
+            )
         out = self._values(z) - self._at_rest
         out[~z.any(axis=1)] = 0.0  # in a batch the network at rest is rounded otherwise
         return out

@@ -32,7 +32,9 @@ def monomial_indices(n_variables: int, degree: int) -> Levels:
     last = np.arange(n_variables)
     for _ in range(degree - 1):
         parents = np.concatenate([np.flatnonzero(last <= v) for v in range(n_variables)])
-        variables = np.repeat(np.arange(n_variables), [int((last <= v).sum()) for v in range(n_variables)])
+        variables = np.repeat(
+            np.arange(n_variables), [int((last <= v).sum()) for v in range(n_variables)]
+        )
         levels.append((parents, variables))
         last = variables
     return levels
@@ -60,8 +62,15 @@ class Monomials:
 
     def __init__(self, n_variables: int, levels: Levels) -> None:
         starts = np.cumsum([0, n_variables, *(len(parents) for parents, _ in levels)])
-        self._parents = np.concatenate([np.zeros(0, np.int64), *(start + parents for start, (parents, _) in zip(starts, levels, strict=False))])
-        self._variables = np.concatenate([np.zeros(0, np.int64), *(variables for _, variables in levels)])
+        self._parents = np.concatenate(
+            [
+                np.zeros(0, np.int64),
+                *(start + parents for start, (parents, _) in zip(starts, levels, strict=False)),
+            ]
+        )
+        self._variables = np.concatenate(
+            [np.zeros(0, np.int64), *(variables for _, variables in levels)]
+        )
         self.n_products = len(self._parents)
 
     def __call__(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -120,7 +129,9 @@ class PCARegression(CoordinateRegression):
         regression.fit(features / feature_scale, samples.values)
         return {"weights": np.atleast_2d(regression.coef_) / feature_scale}
 
-    def _shapes(self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, ...]]:
+    def _shapes(
+        self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int
+    ) -> Mapping[str, tuple[int, ...]]:
         return {"weights": (n_outputs, n_monomials(n_inputs, self.degree))}
 
     def _take(self, state: dict[str, NDArray[Any]]) -> None:
@@ -133,5 +144,7 @@ class PCARegression(CoordinateRegression):
 
     def _coefficients(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         if counting.running is not None:
-            counting.running.add(multiply_adds=len(z) * (self._monomials.n_products + self.weights_.size))
+            counting.running.add(
+                multiply_adds=len(z) * (self._monomials.n_products + self.weights_.size)
+            )
         return np.asarray(self._monomials(z) @ self.weights_.T)

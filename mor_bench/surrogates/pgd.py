@@ -89,7 +89,9 @@ class SeparatedLoad(Surrogate):
     def supports(self, scene: Scene) -> str | None:
         if not isinstance(scene.spec, ImportedDatasetSpec) and scene.spec.loads.simultaneous > 1:
             return "its coordinates are those of one load patch, and here several act at once"
-        return unknown_equations(scene) if self.base == "linear-response" else super().supports(scene)
+        return (
+            unknown_equations(scene) if self.base == "linear-response" else super().supports(scene)
+        )
 
     @property
     def _degrees(self) -> range:
@@ -102,7 +104,12 @@ class SeparatedLoad(Surrogate):
             targets = snapshots.free_displacements
             if self.base == "linear-response":
                 self.compliance_ = Compliance(FullOrderModel(scene))
-                targets = targets - self.compliance_.respond(snapshots.forces.reshape(len(snapshots), -1))[:, scene.free_dofs]
+                targets = (
+                    targets
+                    - self.compliance_.respond(snapshots.forces.reshape(len(snapshots), -1))[
+                        :, scene.free_dofs
+                    ]
+                )
             positions, vectors = _coordinates(scene.mesh.points, snapshots.forces)
             frame, ends = _frame(positions[vectors.any(axis=1)], scene.mesh.points)
             largest = float(np.linalg.norm(vectors, axis=1).max())
@@ -113,26 +120,42 @@ class SeparatedLoad(Surrogate):
             magnitude = np.linalg.norm(vectors, axis=1) / (largest or 1.0)
             weights = 1.0 / np.maximum(magnitude, LEAST_WEIGHED)
             families: list[Family] = [
-                (position, directions[degree], powers[:, degree - 1 :: 2] * weights[:, None]) for degree in self._degrees
-            ]  # fmt: skip
+                (position, directions[degree], powers[:, degree - 1 :: 2] * weights[:, None])
+                for degree in self._degrees
+            ]
             modes = pod(targets, self.n_output_modes).modes
-            found = separate((targets @ modes) * weights[:, None], families, self.n_terms, self.ridge)
+            found = separate(
+                (targets @ modes) * weights[:, None], families, self.n_terms, self.ridge
+            )
             n_directions = sum(directions[degree].shape[1] for degree in self._degrees)
-            by_position, by_direction = np.zeros((position.shape[1], len(found.terms))), np.zeros((n_directions, len(found.terms)))
+            by_position, by_direction = (
+                np.zeros((position.shape[1], len(found.terms))),
+                np.zeros((n_directions, len(found.terms))),
+            )
             by_power = np.zeros((self.force_degree, len(found.terms)))
             starts = np.cumsum([0, *(directions[degree].shape[1] for degree in self._degrees)])
             for k, term in enumerate(found.terms):
                 degree = self._degrees[term.family]
                 by_position[:, k] = term.coefficients[0]
-                by_direction[starts[term.family] : starts[term.family + 1], k] = term.coefficients[1]
+                by_direction[starts[term.family] : starts[term.family + 1], k] = term.coefficients[
+                    1
+                ]
                 by_power[degree - 1 :: 2, k] = term.coefficients[2]
-            state |= {"modes": modes, "vectors": found.vectors, "by_position": by_position, "by_direction": by_direction, "by_power": by_power}
+            state |= {
+                "modes": modes,
+                "vectors": found.vectors,
+                "by_position": by_position,
+                "by_direction": by_direction,
+                "by_power": by_power,
+            }
             self._restore(state)
         return self
 
     def _functions(self, positions: Array, vectors: Array) -> tuple[Array, list[Array], Array]:
         """Functions of the positions (n, n_functions), of the directions by degree, and powers of the magnitudes (n, force_degree)."""
-        s = np.minimum(np.maximum(positions @ self.frame_[:3] + self.frame_[3], self.ends_[0]), self.ends_[1])
+        s = np.minimum(
+            np.maximum(positions @ self.frame_[:3] + self.frame_[3], self.ends_[0]), self.ends_[1]
+        )
         length = np.linalg.norm(vectors, axis=1)
         d = vectors / np.where(length > 0, length, 1.0)[:, None]
         m = length / (self.largest_ or 1.0)
@@ -145,11 +168,26 @@ class SeparatedLoad(Surrogate):
         scene = self.scene_
         position, directions, powers = self._functions(*_coordinates(scene.mesh.points, batch))
         direction = np.concatenate([directions[degree] for degree in self._degrees], axis=1)
-        terms = (position @ self.by_position_) * (direction @ self.by_direction_) * (powers @ self.by_power_)
+        terms = (
+            (position @ self.by_position_)
+            * (direction @ self.by_direction_)
+            * (powers @ self.by_power_)
+        )
         if counting.running is not None:
-            per_term = self.by_position_.size + self.by_direction_.size + self.by_power_.size + 2 * terms.shape[1]
+            per_term = (
+                self.by_position_.size
+                + self.by_direction_.size
+                + self.by_power_.size
+                + 2 * terms.shape[1]
+            )
             functions = position.shape[1] + direction.shape[1] + powers.shape[1]
-            products = per_term + functions + self.vectors_.size + self.modes_.size + 7 * scene.mesh.n_nodes
+            products = (
+                per_term
+                + functions
+                + self.vectors_.size
+                + self.modes_.size
+                + 7 * scene.mesh.n_nodes
+            )
             counting.running.add(multiply_adds=len(batch) * products)
         out = np.zeros((len(batch), scene.mesh.n_dofs))
         out[:, scene.free_dofs] = (terms @ self.vectors_) @ self.modes_.T
@@ -159,30 +197,59 @@ class SeparatedLoad(Surrogate):
 
     def _state(self) -> dict[str, NDArray[Any]]:
         return {
-            "frame": self.frame_, "ends": self.ends_, "largest": np.array([self.largest_]), "modes": self.modes_, "vectors": self.vectors_,
-            "by_position": self.by_position_, "by_direction": self.by_direction_, "by_power": self.by_power_,
-        }  # fmt: skip
+            "frame": self.frame_,
+            "ends": self.ends_,
+            "largest": np.array([self.largest_]),
+            "modes": self.modes_,
+            "vectors": self.vectors_,
+            "by_position": self.by_position_,
+            "by_direction": self.by_direction_,
+            "by_power": self.by_power_,
+        }
 
     def _take(self, state: dict[str, NDArray[Any]]) -> None:
-        self.frame_, self.ends_, self.largest_ = np.ascontiguousarray(state["frame"]), np.ascontiguousarray(state["ends"]), float(state["largest"][0])
-        self._levels = monomial_indices(self.frame_.shape[1], self.position_degree), monomial_indices(3, self.force_degree)
+        self.frame_, self.ends_, self.largest_ = (
+            np.ascontiguousarray(state["frame"]),
+            np.ascontiguousarray(state["ends"]),
+            float(state["largest"][0]),
+        )
+        self._levels = (
+            monomial_indices(self.frame_.shape[1], self.position_degree),
+            monomial_indices(3, self.force_degree),
+        )
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         # One memory order, fitted or loaded: BLAS rounds differently in another.
         state = {name: np.ascontiguousarray(array) for name, array in state.items()}
-        n_axes, n_modes, n_terms = state["frame"].shape[1], state["modes"].shape[1], state["vectors"].shape[0]
+        n_axes, n_modes, n_terms = (
+            state["frame"].shape[1],
+            state["modes"].shape[1],
+            state["vectors"].shape[0],
+        )
         n_positions = comb(n_axes + self.position_degree, n_axes)
         n_directions = sum(comb(degree + 2, 2) for degree in self._degrees)
         shapes = {
-            "frame": (4, n_axes), "ends": (2, n_axes), "largest": (1,), "modes": (len(self.scene_.free_dofs), n_modes), "vectors": (n_terms, n_modes),
-            "by_position": (n_positions, n_terms), "by_direction": (n_directions, n_terms), "by_power": (self.force_degree, n_terms),
-        }  # fmt: skip
+            "frame": (4, n_axes),
+            "ends": (2, n_axes),
+            "largest": (1,),
+            "modes": (len(self.scene_.free_dofs), n_modes),
+            "vectors": (n_terms, n_modes),
+            "by_position": (n_positions, n_terms),
+            "by_direction": (n_directions, n_terms),
+            "by_power": (self.force_degree, n_terms),
+        }
         for name, shape in shapes.items():
             if state[name].shape != shape or not np.isfinite(state[name]).all():
-                raise InvalidInputError(f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}.")
+                raise InvalidInputError(
+                    f"`{name}` must be a finite array of shape {shape}; got shape {state[name].shape}."
+                )
         self._take(state)
         self.modes_, self.vectors_ = state["modes"], state["vectors"]
-        self.by_position_, self.by_direction_, self.by_power_ = state["by_position"], state["by_direction"], state["by_power"]
+        self.by_position_, self.by_direction_, self.by_power_ = (
+            state["by_position"],
+            state["by_direction"],
+            state["by_power"],
+        )
         if self.base == "linear-response" and not hasattr(self, "compliance_"):
             self.compliance_ = Compliance(FullOrderModel(self.scene_))
 
@@ -195,7 +262,9 @@ def _coordinates(points: Array, forces: Array) -> tuple[Array, Array]:
     """
     lengths = np.sqrt(np.einsum("nai,nai->na", forces, forces))
     total = lengths.sum(axis=1)
-    return (lengths @ points) / np.where(total > 0, total, 1.0)[:, None], (np.ones((1, len(points))) @ forces)[:, 0]
+    return (lengths @ points) / np.where(total > 0, total, 1.0)[:, None], (
+        np.ones((1, len(points))) @ forces
+    )[:, 0]
 
 
 def _frame(positions: Array, points: Array) -> tuple[Array, Array]:

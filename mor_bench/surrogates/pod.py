@@ -71,17 +71,30 @@ class PODGalerkin(Surrogate):
                     f"{self.energy_tolerance} with {self.n_modes!r}."
                 )
             known = self._checked_snapshots(snapshots)
-            chosen = size_to_needs(self, scene, known, {"n_modes": MODES, "tolerance": TOLERANCES})["n_modes"]
+            chosen = size_to_needs(self, scene, known, {"n_modes": MODES, "tolerance": TOLERANCES})[
+                "n_modes"
+            ]
             n_modes = None if chosen == "energy" else chosen
-            product = stiffness_at_rest(FullOrderModel(scene)) if self.inner_product == "stiffness" else None
-            basis = pod(known.free_displacements, n_modes, energy_tolerance=self.energy_tolerance, inner_product=product)
+            product = (
+                stiffness_at_rest(FullOrderModel(scene))
+                if self.inner_product == "stiffness"
+                else None
+            )
+            basis = pod(
+                known.free_displacements,
+                n_modes,
+                energy_tolerance=self.energy_tolerance,
+                inner_product=product,
+            )
             self._restore({"modes": basis.modes})
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces)
         options = NewtonOptions(self.tolerance_)
-        answers = self._subspace.answer(batch, lambda load: solve_equilibrium(self.problem_, load, options=options).displacement)
+        answers = self._subspace.answer(
+            batch, lambda load: solve_equilibrium(self.problem_, load, options=options).displacement
+        )
         return answers.reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:

@@ -13,7 +13,14 @@ from pydantic import Field
 from torch import Tensor
 
 from mor_bench import counting
-from mor_bench.learning.perceptron import Perceptron, evaluate, named, named_shapes, slope_at_rest, taken
+from mor_bench.learning.perceptron import (
+    Perceptron,
+    evaluate,
+    named,
+    named_shapes,
+    slope_at_rest,
+    taken,
+)
 from mor_bench.reduction.coordinates import change_of_basis
 from mor_bench.surrogate import fitting_arrays, weights_to_start_from
 from mor_bench.surrogates.coordinate_regression import CoordinateSamples
@@ -83,7 +90,11 @@ class PODNN(NetworkRegression):
 
     def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         scale = float(np.sqrt((samples.values**2).sum(axis=1).mean()))
-        arrays = {"inputs": samples.z, "outputs": samples.values / scale, "weights": samples.weights}
+        arrays = {
+            "inputs": samples.z,
+            "outputs": samples.values / scale,
+            "weights": samples.weights,
+        }
         if samples.directions is not None and samples.slopes is not None:
             arrays |= {"directions": samples.directions, "slopes": samples.slopes / scale}
         data = self._on_device(arrays)
@@ -100,14 +111,25 @@ class PODNN(NetworkRegression):
     def _weights_of(self, path: Path, scale: float) -> list[Array]:
         """The weights of a model of the same mesh, turned from its bases into those of the samples."""
         state, n_free = weights_to_start_from(path, self), len(self.axes_)
-        axes, modes = fitting_arrays(path, state, {"axes": (n_free, None), "modes": (n_free, None)}, np.float64).values()
+        axes, modes = fitting_arrays(
+            path, state, {"axes": (n_free, None), "modes": (n_free, None)}, np.float64
+        ).values()
         shapes = named_shapes("network", axes.shape[1], self.n_hidden, modes.shape[1])
         first, *between, last = taken(fitting_arrays(path, state, shapes, np.float64), "network")
-        return [change_of_basis(axes, self.axes_) @ first, *between, last @ change_of_basis(modes, self.modes_).T / scale]
+        return [
+            change_of_basis(axes, self.axes_) @ first,
+            *between,
+            last @ change_of_basis(modes, self.modes_).T / scale,
+        ]
 
     def _loss(self, network: Perceptron, data: dict[str, Tensor]) -> Callable[[Tensor], Tensor]:
         """Mean squared errors of the coordinates, and of their derivatives if there are any."""
-        z, wanted, weights, known = data["inputs"], data["outputs"], data["weights"], data.get("directions")
+        z, wanted, weights, known = (
+            data["inputs"],
+            data["outputs"],
+            data["weights"],
+            data.get("directions"),
+        )
         rest = torch.zeros_like(z[:1])
 
         def loss(rows: Tensor) -> Tensor:
@@ -132,7 +154,9 @@ class PODNN(NetworkRegression):
 
     def _take(self, state: dict[str, NDArray[Any]]) -> None:
         super()._take(state)
-        self._slope = slope_at_rest(self._networks["network"]) if self.input == "linear-response" else None
+        self._slope = (
+            slope_at_rest(self._networks["network"]) if self.input == "linear-response" else None
+        )
 
     def _values(self, z: Array) -> Array:
         return evaluate(self._networks["network"], z)

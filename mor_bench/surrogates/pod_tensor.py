@@ -59,10 +59,15 @@ class TensorPOD(Surrogate):
         with self._fitting(scene):
             known = self._checked_snapshots(snapshots)
             rungs = {"n_modes": [r for r in MODES if r <= MOST_MODES], "tolerance": TOLERANCES}
-            displacements, knobs = known.free_displacements, size_to_needs(self, scene, known, rungs)
+            displacements, knobs = (
+                known.free_displacements,
+                size_to_needs(self, scene, known, rungs),
+            )
             modes = pod(displacements, knobs["n_modes"]).modes
             chosen = np.unique(np.linspace(0, len(displacements) - 1, N_WATCHED).astype(int))
-            problem = TensorProblem.of_modes(FullOrderModel(scene), modes, displacements[chosen] @ modes)
+            problem = TensorProblem.of_modes(
+                FullOrderModel(scene), modes, displacements[chosen] @ modes
+            )
             self._restore({"modes": modes, **problem.arrays})
         return self
 
@@ -72,10 +77,16 @@ class TensorPOD(Surrogate):
 
     def _solve(self, load: NDArray[np.float64]) -> NDArray[np.float64]:
         """Reduced coordinates under a reduced load."""
-        q = self.problem_.quick(load, self.tolerance_) if 0 < np.abs(load).max() <= MAX_LOAD_N else None
+        q = (
+            self.problem_.quick(load, self.tolerance_)
+            if 0 < np.abs(load).max() <= MAX_LOAD_N
+            else None
+        )
         if q is not None and not (self.problem_.unlike(q) and self._plain.force(q).min_det_f <= 0):
             return q
-        return solve_equilibrium(self._plain, load, options=NewtonOptions(self.tolerance_)).displacement
+        return solve_equilibrium(
+            self._plain, load, options=NewtonOptions(self.tolerance_)
+        ).displacement
 
     @cached_property
     def _plain(self) -> GalerkinProblem:
@@ -89,7 +100,9 @@ class TensorPOD(Surrogate):
         modes, self.problem_ = state["modes"], TensorProblem.of_arrays(self.scene_, state)
         shape = len(self.scene_.free_dofs), self.problem_.n_unknowns
         if modes.shape != shape or not np.isfinite(modes).all():
-            raise InvalidInputError(f"`modes` must be a finite array of shape {shape}; got shape {modes.shape}.")
+            raise InvalidInputError(
+                f"`modes` must be a finite array of shape {shape}; got shape {modes.shape}."
+            )
         self.modes_, self.tolerance_ = modes, self._sized("tolerance")
         vars(self).pop("_plain", None)
         self._subspace = Subspace(self.scene_, modes)

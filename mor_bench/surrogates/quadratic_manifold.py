@@ -78,23 +78,40 @@ class QuadraticManifoldGalerkin(Surrogate):
                 system = manifold_system(model.assembler, model.cell_dofs, manifold, states)
                 weights = sparse_nnls(system, system.sum(axis=1), self.cubature_tolerance).weights
             cells = np.flatnonzero(weights)
-            self._restore({"modes": modes, "derivatives": manifold.derivatives, "cells": cells, "weights": weights[cells]})
+            self._restore(
+                {
+                    "modes": modes,
+                    "derivatives": manifold.derivatives,
+                    "cells": cells,
+                    "weights": weights[cells],
+                }
+            )
         return self
 
-    def _states_under_loads(self, model: FullOrderModel, manifold: QuadraticManifold) -> list[NDArray[np.float64]]:
+    def _states_under_loads(
+        self, model: FullOrderModel, manifold: QuadraticManifold
+    ) -> list[NDArray[np.float64]]:
         """Equilibria q on the manifold, with all cells, under forces of random direction and size on patches in turn."""
         scene, rng = model.scene, np.random.default_rng(0)
         linear = GalerkinProblem(model.assembler, manifold.modes)
         on_nodes, largest = scene.patch_weights.toarray(), scene.generated.loads.magnitude_n[1]
         chosen = np.linspace(0, len(on_nodes) - 1, N_CUBATURE_LOADS).round().astype(int)
         vectors = rng.normal(size=(len(chosen), 3))
-        vectors *= largest * rng.uniform(0.2, 1.0, (len(chosen), 1)) / np.linalg.norm(vectors, axis=1, keepdims=True)
+        vectors *= (
+            largest
+            * rng.uniform(0.2, 1.0, (len(chosen), 1))
+            / np.linalg.norm(vectors, axis=1, keepdims=True)
+        )
         states = []
         for weights, vector in zip(on_nodes[chosen], vectors, strict=True):
             load = np.outer(weights, vector).ravel()[scene.free_dofs]
             problem = ManifoldProblem(linear, manifold, manifold.curvature(load))
             try:
-                states.append(solve_equilibrium(problem, manifold.modes.T @ load, options=NewtonOptions(1e-4)).displacement)
+                states.append(
+                    solve_equilibrium(
+                        problem, manifold.modes.T @ load, options=NewtonOptions(1e-4)
+                    ).displacement
+                )
             except SolverError as error:
                 failed = error
         if not states:
@@ -109,7 +126,9 @@ class QuadraticManifoldGalerkin(Surrogate):
             problem = ManifoldProblem(self.linear_, self._sampled, self.manifold_.curvature(load))
             if counting.running is not None:
                 counting.running.add(multiply_adds=modes.size)
-            q = solve_equilibrium(problem, modes.T @ load, options=NewtonOptions(self.tolerance)).displacement
+            q = solve_equilibrium(
+                problem, modes.T @ load, options=NewtonOptions(self.tolerance)
+            ).displacement
             # With the stiffness of the sampled cells: what these err at small strains is corrected, too.
             correction = static_correction(self.compliance_, self.linear_.rest_factor, modes, load)
             row[free] = self.manifold_.at(q)[0] + correction
@@ -117,17 +136,26 @@ class QuadraticManifoldGalerkin(Surrogate):
         return out.reshape(np.shape(forces))
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        return {"modes": self.manifold_.modes, "derivatives": self.manifold_.derivatives, "cells": self.cells_, "weights": self.weights_}
+        return {
+            "modes": self.manifold_.modes,
+            "derivatives": self.manifold_.derivatives,
+            "cells": self.cells_,
+            "weights": self.weights_,
+        }
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         scene = self.scene_
         self.cells_, self.weights_ = state["cells"], state["weights"]
         if state["modes"].shape[0] != len(scene.free_dofs):
-            raise InvalidInputError(f"`modes` must have {len(scene.free_dofs)} rows; got {state['modes'].shape[0]}.")
+            raise InvalidInputError(
+                f"`modes` must have {len(scene.free_dofs)} rows; got {state['modes'].shape[0]}."
+            )
         self.manifold_ = QuadraticManifold(state["modes"], state["derivatives"])
         assembler, rows = weighted_cells(scene, self.cells_, self.weights_)
         self.linear_ = GalerkinProblem(assembler, self.manifold_.modes[rows])
-        self._sampled = QuadraticManifold(self.manifold_.modes[rows], self.manifold_.derivatives[rows])
+        self._sampled = QuadraticManifold(
+            self.manifold_.modes[rows], self.manifold_.derivatives[rows]
+        )
         self.model_ = FullOrderModel(scene)
         self.compliance_ = Compliance(self.model_)
         _ = self.linear_.rest_factor

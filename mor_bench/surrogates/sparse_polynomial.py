@@ -84,7 +84,9 @@ class SparsePolynomial(CoordinateRegression):
         self.derivatives = derivatives
 
     def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
-        sizes = np.log10(np.linalg.norm(self.axes_, axis=0))  # the axes divide by the coordinates' root mean squares
+        sizes = np.log10(
+            np.linalg.norm(self.axes_, axis=0)
+        )  # the axes divide by the coordinates' root mean squares
         terms = self._chosen(samples, sizes - sizes[0])
         factor, right, scale = self._system(samples, terms)
         return {"weights": solve_triangular(factor, right).T / scale, "terms": _as_array(terms)}
@@ -100,15 +102,23 @@ class SparsePolynomial(CoordinateRegression):
             return cheapest_terms(smallness + DECADES[-1], min(n, self.max_terms))
         held = np.random.default_rng(0).permutation(n) % HELD_OUT == 0
         fitted, tried = samples[~held], samples[held]
-        n_equations = len(fitted.z) * (1 if fitted.directions is None else 1 + fitted.directions.shape[1])
+        n_equations = len(fitted.z) * (
+            1 if fitted.directions is None else 1 + fitted.directions.shape[1]
+        )
         least, best = np.inf, []
         for decades in DECADES:
             terms = cheapest_terms(decades + smallness, min(self.max_terms, 2 * n_equations))
             factor, coefficients, scale = self._system(fitted, terms)
             levels, places = sparse_levels(terms, samples.z.shape[1])
-            orthogonal = solve_triangular(factor, (Monomials(tried.z.shape[1], levels)(tried.z)[:, places] * tried.weights / scale).T, trans="T")
+            orthogonal = solve_triangular(
+                factor,
+                (Monomials(tried.z.shape[1], levels)(tried.z)[:, places] * tried.weights / scale).T,
+                trans="T",
+            )
             rest = tried.values * tried.weights
-            for number, (column, coefficient) in enumerate(zip(orthogonal, coefficients, strict=True), start=1):
+            for number, (column, coefficient) in enumerate(
+                zip(orthogonal, coefficients, strict=True), start=1
+            ):
                 rest -= np.outer(column, coefficient)
                 error = float((rest**2).sum())
                 if error < least:
@@ -124,17 +134,25 @@ class SparsePolynomial(CoordinateRegression):
         matrix, right = features.T @ features, features.T @ (samples.values * samples.weights)
         if samples.directions is not None and samples.slopes is not None:
             for k in range(samples.directions.shape[1]):
-                slopes = monomial_derivatives(samples.z, samples.directions[:, k], levels)[:, places] * samples.weights / scale
+                slopes = (
+                    monomial_derivatives(samples.z, samples.directions[:, k], levels)[:, places]
+                    * samples.weights
+                    / scale
+                )
                 matrix += DERIVATIVE_WEIGHT * slopes.T @ slopes
                 right += DERIVATIVE_WEIGHT * slopes.T @ (samples.slopes[:, k] * samples.weights)
         matrix[np.diag_indices(len(matrix))] += self.ridge * len(samples.z)
         try:
             factor = cholesky(matrix, overwrite_a=True)
         except np.linalg.LinAlgError:
-            raise InvalidInputError(f"`ridge` of {type(self).__name__} is too small for these samples; got {self.ridge:g}.") from None
+            raise InvalidInputError(
+                f"`ridge` of {type(self).__name__} is too small for these samples; got {self.ridge:g}."
+            ) from None
         return factor, solve_triangular(factor, right, trans="T"), scale
 
-    def _shapes(self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, ...]]:
+    def _shapes(
+        self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int
+    ) -> Mapping[str, tuple[int, ...]]:
         return {"weights": (n_outputs, len(state["terms"])), "terms": state["terms"].shape}
 
     def _take(self, state: dict[str, NDArray[Any]]) -> None:
@@ -150,7 +168,9 @@ class SparsePolynomial(CoordinateRegression):
 
     def _coefficients(self, z: Array) -> Array:
         if counting.running is not None:
-            counting.running.add(multiply_adds=len(z) * (self._monomials.n_products + self._weights.size))
+            counting.running.add(
+                multiply_adds=len(z) * (self._monomials.n_products + self._weights.size)
+            )
         return np.asarray(self._monomials(z) @ self._weights.T)
 
 
@@ -162,13 +182,26 @@ def _as_array(terms: list[Term]) -> NDArray[np.int32]:
 
 def _checked_terms(array: NDArray[Any], n_variables: int) -> list[Term]:
     """The terms of `_as_array`; raises `InvalidInputError` unless each is rising, there once and has its divisors among them."""
-    right = array.ndim == 2 and array.dtype == np.int32 and 1 <= array.shape[1] <= MAX_DEGREE and array.size > 0
+    right = (
+        array.ndim == 2
+        and array.dtype == np.int32
+        and 1 <= array.shape[1] <= MAX_DEGREE
+        and array.size > 0
+    )
     terms = [tuple(int(v) for v in row if v >= 0) for row in array] if right else []
     known = set(terms)
     right = right and len(known) == len(terms) and np.array_equal(_as_array(terms), array)
-    right = right and all(term == tuple(sorted(term)) and term[-1] < n_variables and (len(term) == 1 or term[:-1] in known) for term in terms if term)
+    right = right and all(
+        term == tuple(sorted(term))
+        and term[-1] < n_variables
+        and (len(term) == 1 or term[:-1] in known)
+        for term in terms
+        if term
+    )
     if not right or () in known:
-        raise InvalidInputError(f"`terms` must hold monomials of {n_variables} variables with all that they are products of.")
+        raise InvalidInputError(
+            f"`terms` must hold monomials of {n_variables} variables with all that they are products of."
+        )
     return terms
 
 
@@ -187,7 +220,9 @@ def cheapest_terms(costs: Array, n_terms: int) -> list[Term]:
         if degree < MAX_DEGREE:
             heappush(heap, (cost + float(costs[last]), degree + 1, (*term, last)))
         if last + 1 < len(costs):
-            heappush(heap, (cost + float(costs[last + 1] - costs[last]), degree, (*term[:-1], last + 1)))
+            heappush(
+                heap, (cost + float(costs[last + 1] - costs[last]), degree, (*term[:-1], last + 1))
+            )
     return found
 
 
@@ -200,7 +235,9 @@ def sparse_levels(terms: list[Term], n_variables: int) -> tuple[Levels, NDArray[
     levels = []
     for below, own in pairwise(by_degree):
         numbers = {term: i for i, term in enumerate(below)}
-        levels.append((np.array([numbers[term[:-1]] for term in own]), np.array([term[-1] for term in own])))
+        levels.append(
+            (np.array([numbers[term[:-1]] for term in own]), np.array([term[-1] for term in own]))
+        )
     places = {term: i for i, term in enumerate(term for own in by_degree for term in own)}
     return levels, np.array([places[term] for term in terms])
 

@@ -27,7 +27,11 @@ def _mean_of_leaves(features, thresholds, children, roots, values, z, out):  # t
         for tree in range(len(roots)):
             node = roots[tree]
             while features[node] >= 0:
-                node = children[node, 0] if row[features[node]] <= thresholds[node] else children[node, 1]
+                node = (
+                    children[node, 0]
+                    if row[features[node]] <= thresholds[node]
+                    else children[node, 1]
+                )
             leaf = values[children[node, 0]]
             for k in range(len(answer)):
                 answer[k] += leaf[k]
@@ -81,12 +85,20 @@ class TreeRegression(CoordinateRegression):
 
     def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         z, targets = samples.z, samples.values
-        trees = [estimator.tree_ for estimator in self._ensemble().fit(z, targets if targets.shape[1] > 1 else targets[:, 0]).estimators_]
+        trees = [
+            estimator.tree_
+            for estimator in self._ensemble()
+            .fit(z, targets if targets.shape[1] > 1 else targets[:, 0])
+            .estimators_
+        ]
         features = np.concatenate([tree.feature for tree in trees])
         roots = np.cumsum([0, *(tree.node_count for tree in trees)])[:-1]
         leaves = features < 0
         children = np.concatenate(
-            [root + np.stack([tree.children_left, tree.children_right], axis=1) for root, tree in zip(roots, trees, strict=True)]
+            [
+                root + np.stack([tree.children_left, tree.children_right], axis=1)
+                for root, tree in zip(roots, trees, strict=True)
+            ]
         )
         children[leaves] = np.arange(leaves.sum())[:, None]
         return {
@@ -97,18 +109,26 @@ class TreeRegression(CoordinateRegression):
             "values": np.concatenate([tree.value[:, :, 0] for tree in trees])[leaves],
         }
 
-    def _shapes(self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, ...]]:
+    def _shapes(
+        self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int
+    ) -> Mapping[str, tuple[int, ...]]:
         n_nodes, n_leaves = len(state["features"]), len(state["values"])
         return {
-            "features": (n_nodes,), "thresholds": (n_nodes,), "children": (n_nodes, 2), "roots": (self.n_trees,), "values": (n_leaves, n_outputs),
-        }  # fmt: skip
+            "features": (n_nodes,),
+            "thresholds": (n_nodes,),
+            "children": (n_nodes, 2),
+            "roots": (self.n_trees,),
+            "values": (n_leaves, n_outputs),
+        }
 
     def _take(self, state: dict[str, NDArray[Any]]) -> None:
         features, children, roots = state["features"], state["children"], state["roots"]
         n_nodes, inner = len(features), features >= 0
         if not ((features >= -1) & (features < state["axes"].shape[1])).all():
             raise InvalidInputError(f"`features` must be in [-1, {state['axes'].shape[1] - 1}].")
-        if not ((children[inner] > np.flatnonzero(inner)[:, None]) & (children[inner] < n_nodes)).all():
+        if not (
+            (children[inner] > np.flatnonzero(inner)[:, None]) & (children[inner] < n_nodes)
+        ).all():
             raise InvalidInputError("`children` of an inner node must be nodes behind it.")
         if not ((children[~inner] >= 0) & (children[~inner] < len(state["values"]))).all():
             raise InvalidInputError("`children` of a leaf must be a row of `values`.")
@@ -120,13 +140,19 @@ class TreeRegression(CoordinateRegression):
 
     def _learned(self) -> dict[str, NDArray[Any]]:
         return {
-            "features": self.features_, "thresholds": self.thresholds_, "children": self.children_, "roots": self.roots_, "values": self.values_,
-        }  # fmt: skip
+            "features": self.features_,
+            "thresholds": self.thresholds_,
+            "children": self.children_,
+            "roots": self.roots_,
+            "values": self.values_,
+        }
 
     def _means(self, z: Array) -> Array:
         out = np.empty((len(z), self.values_.shape[1]))
         single = np.clip(z, -1e38, 1e38).astype(np.float32)
-        _mean_of_leaves(self.features_, self.thresholds_, self.children_, self.roots_, self.values_, single, out)
+        _mean_of_leaves(
+            self.features_, self.thresholds_, self.children_, self.roots_, self.values_, single, out
+        )
         return out
 
     def _coefficients(self, z: Array) -> Array:
@@ -141,7 +167,9 @@ class PCARandomForest(TreeRegression):
     def _ensemble(self) -> Any:
         from sklearn.ensemble import RandomForestRegressor
 
-        return RandomForestRegressor(self.n_trees, min_samples_leaf=self.min_samples_leaf, random_state=self.seed, n_jobs=1)
+        return RandomForestRegressor(
+            self.n_trees, min_samples_leaf=self.min_samples_leaf, random_state=self.seed, n_jobs=1
+        )
 
 
 class PCAExtraTrees(TreeRegression):
@@ -154,4 +182,6 @@ class PCAExtraTrees(TreeRegression):
     def _ensemble(self) -> Any:
         from sklearn.ensemble import ExtraTreesRegressor
 
-        return ExtraTreesRegressor(self.n_trees, min_samples_leaf=self.min_samples_leaf, random_state=self.seed, n_jobs=1)
+        return ExtraTreesRegressor(
+            self.n_trees, min_samples_leaf=self.min_samples_leaf, random_state=self.seed, n_jobs=1
+        )

@@ -42,7 +42,9 @@ class FullOrder:
         try:
             self.solve_once(dataset)
         except (TypeError, AttributeError) as error:
-            raise NotImplementedError(f"a commit from before this interface of the full-order model: {error}") from None
+            raise NotImplementedError(
+                f"a commit from before this interface of the full-order model: {error}"
+            ) from None
 
     def solve_once(self, dataset: str) -> None:
         scene = mor_bench.load_scene(dataset)
@@ -80,7 +82,9 @@ class FullOrder:
 
     def track_relative_error(self, dataset: str) -> float:
         """Relative l2 difference from a solution to a residual of `REFERENCE_TOLERANCE`."""
-        reference = self.model.solve(self.load, options=NewtonOptions(REFERENCE_TOLERANCE)).displacement
+        reference = self.model.solve(
+            self.load, options=NewtonOptions(REFERENCE_TOLERANCE)
+        ).displacement
         return float(np.linalg.norm(self.state - reference) / np.linalg.norm(reference))
 
     track_relative_error.unit = "relative l2"  # type: ignore[attr-defined]

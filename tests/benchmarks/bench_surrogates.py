@@ -40,7 +40,13 @@ METHODS: dict[str, dict[str, Any]] = {
     "explicit-dynamics": {"tolerance": 1e-2},
     "pgd": {"n_terms": 60, "position_degree": 3},
     "pgd-force": {"n_terms": 60, "position_degree": 3},
-    "umesh": {"channels": 8, "steps": 2, "iterations": 200, "batch_size": 16, "learning_rate": 3e-3},
+    "umesh": {
+        "channels": 8,
+        "steps": 2,
+        "iterations": 200,
+        "batch_size": 16,
+        "learning_rate": 3e-3,
+    },
     "umesh-small": {"channels": 8, "iterations": 200},
     "umesh-linear": {"channels": 8, "iterations": 200},
     "pca-ridge": {},
@@ -92,7 +98,11 @@ def measure(data: Dataset, method: str, model: Path) -> dict[str, Any]:
     reference = data.test.displacements
     difference = surrogate.predict(data.test.forces) - reference
     relative = np.linalg.norm(difference, axis=(1, 2)) / np.linalg.norm(reference, axis=(1, 2))
-    return {"bytes": model.stat().st_size, "mean_dof_m": float(np.abs(difference).mean()), "relative": float(np.median(relative))}
+    return {
+        "bytes": model.stat().st_size,
+        "mean_dof_m": float(np.abs(difference).mean()),
+        "relative": float(np.median(relative)),
+    }
 
 
 class _Fitted:
@@ -154,7 +164,10 @@ class NetworkQuery(_Fitted):
             surrogate: Any = mor_bench.load_surrogate(model_file(dataset, "umesh-small"))
             backend: Any = method
             surrogate.inference_ = Inference(surrogate.network_, backend)
-        except (ImportError, MorBenchError) as error:  # the commit is from before, or the machine lacks it
+        except (
+            ImportError,
+            MorBenchError,
+        ) as error:  # the commit is from before, or the machine lacks it
             raise NotImplementedError(str(error)) from None
         self.surrogate = surrogate
         self.force = load_limited(dataset).test.forces[0]

@@ -37,7 +37,13 @@ def measure(dataset: str, samples: int, workers: int) -> dict[str, Any]:
     times: list[tuple[int, float]] = []
     with TemporaryDirectory() as cache:
         begun = perf_counter()
-        generate(spec, samples, workers, Path(cache), lambda done, _: times.append((done, perf_counter() - begun)))
+        generate(
+            spec,
+            samples,
+            workers,
+            Path(cache),
+            lambda done, _: times.append((done, perf_counter() - begun)),
+        )
         seconds = perf_counter() - begun
         folder = dataset_folder(spec, Path(cache))
         megabytes = sum(path.stat().st_size for path in folder.iterdir()) / 2**20
@@ -55,7 +61,10 @@ def measure(dataset: str, samples: int, workers: int) -> dict[str, Any]:
 
 
 def main(
-    samples: Annotated[list[int] | None, typer.Option(min=1, help=f"Repeat for more. By default {SIZES}.", show_default=False)] = None,
+    samples: Annotated[
+        list[int] | None,
+        typer.Option(min=1, help=f"Repeat for more. By default {SIZES}.", show_default=False),
+    ] = None,
     dataset: Annotated[str, typer.Option(help="Name or TOML file.")] = "beam-fine",
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
     one: Annotated[bool, typer.Option(hidden=True)] = False,
@@ -64,16 +73,40 @@ def main(
     if one:
         print(json.dumps(measure(dataset, (samples or SIZES)[0], workers)))
         return
-    pinned = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    table = Table("samples", "seconds", "samples/s", "long run/s", "ms/sample", "disk MB", "parent MB", "worker MB")
+    pinned = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "NUMBA_NUM_THREADS": "1",
+    }
+    table = Table(
+        "samples",
+        "seconds",
+        "samples/s",
+        "long run/s",
+        "ms/sample",
+        "disk MB",
+        "parent MB",
+        "worker MB",
+    )
     for size in samples or SIZES:
         options = ["--one", "--samples", str(size), "--dataset", dataset, "--workers", str(workers)]
         command = [sys.executable, "-m", "tests.benchmarks.generation", *options]
-        row = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=pinned).stdout)
+        row = json.loads(
+            subprocess.run(
+                command, check=True, stdout=subprocess.PIPE, text=True, env=pinned
+            ).stdout
+        )
         table.add_row(
-            f"{row['samples']:,}", f"{row['seconds']:.1f}", f"{row['rate']:.1f}", _number(row["rate_beyond"], ".1f"),
-            f"{1e3 / row['rate']:.1f}", f"{row['disk_mb']:.0f}", f"{row['parent_mb']:.0f}", _number(row["worker_mb"], ".0f"),
-        )  # fmt: skip
+            f"{row['samples']:,}",
+            f"{row['seconds']:.1f}",
+            f"{row['rate']:.1f}",
+            _number(row["rate_beyond"], ".1f"),
+            f"{1e3 / row['rate']:.1f}",
+            f"{row['disk_mb']:.0f}",
+            f"{row['parent_mb']:.0f}",
+            _number(row["worker_mb"], ".0f"),
+        )
     console = Console(width=100)
     console.print(f"{dataset}, {workers} workers of one thread", highlight=False)
     console.print(table)

@@ -11,5 +11,7 @@ def peak_mb(of_children: bool = False) -> float:
         return float("nan")
     import resource
 
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN if of_children else resource.RUSAGE_SELF).ru_maxrss
+    peak = resource.getrusage(
+        resource.RUSAGE_CHILDREN if of_children else resource.RUSAGE_SELF
+    ).ru_maxrss
     return peak / (2**20 if sys.platform == "darwin" else 2**10)

@@ -28,16 +28,31 @@ from mor_bench.surrogates.umesh.grid import padded_grid
 from mor_bench.surrogates.umesh.network import new_network
 
 SCENES = ("beam-coarse", "beam-fine", "l-shape", "liver-hex")
-COLUMNS = ("scene", "grid", "channels", "steps", "threads", "backend", "median_ms", "p95_ms", "shortest_ms", "queries")
+COLUMNS = (
+    "scene",
+    "grid",
+    "channels",
+    "steps",
+    "threads",
+    "backend",
+    "median_ms",
+    "p95_ms",
+    "shortest_ms",
+    "queries",
+)
 
 
-def latencies(shape: tuple[int, int, int], channels: int, steps: int, threads: int, turns: int, queries: int) -> dict[str, list[float]]:
+def latencies(
+    shape: tuple[int, int, int], channels: int, steps: int, threads: int, turns: int, queries: int
+) -> dict[str, list[float]]:
     """Milliseconds of single queries by each back end, in turns."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
         network = new_network(channels, steps, torch.Generator().manual_seed(0)).eval()
-        inputs = torch.randn(1, *shape, 3, generator=torch.Generator().manual_seed(1)).permute(0, 4, 1, 2, 3)
+        inputs = torch.randn(1, *shape, 3, generator=torch.Generator().manual_seed(1)).permute(
+            0, 4, 1, 2, 3
+        )
         found: dict[str, list[float]] = {}
         functions = {}
         for backend in BACKENDS:
@@ -60,7 +75,14 @@ def latencies(shape: tuple[int, int, int], channels: int, steps: int, threads: i
         torch.set_num_threads(before)
 
 
-def table(scenes: list[str], channels: list[int], steps: list[int], threads: list[int], turns: int, queries: int) -> Iterator[dict[str, Any]]:
+def table(
+    scenes: list[str],
+    channels: list[int],
+    steps: list[int],
+    threads: list[int],
+    turns: int,
+    queries: int,
+) -> Iterator[dict[str, Any]]:
     """Rows of `COLUMNS`."""
     for scene in scenes:
         loaded = load_scene(load_dataset_spec(scene))
@@ -72,25 +94,47 @@ def table(scenes: list[str], channels: list[int], steps: list[int], threads: lis
                     for backend, each in latencies(shape, c, k, n_threads, turns, queries).items():
                         median, late = np.percentile(each, [50, 95])
                         size = "x".join(str(n) for n in shape)
-                        values = scene, size, c, k, n_threads, backend, *(f"{v:.3f}" for v in (median, late, min(each))), len(each)
+                        values = (
+                            scene,
+                            size,
+                            c,
+                            k,
+                            n_threads,
+                            backend,
+                            *(f"{v:.3f}" for v in (median, late, min(each))),
+                            len(each),
+                        )
                         yield dict(zip(COLUMNS, values, strict=True))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", action="append", choices=SCENES, help="repeat for more; all by default")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--scene", action="append", choices=SCENES, help="repeat for more; all by default"
+    )
     parser.add_argument("--channels", type=int, nargs="+", default=[8, 16, 32, 64])
     parser.add_argument("--steps", type=int, nargs="+", default=[2, 3, 4])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--turns", type=int, default=20)
     parser.add_argument("--queries", type=int, default=5, help="of a back end in each turn")
-    parser.add_argument("--quick", action="store_true", help="small networks, one thread, three turns")
+    parser.add_argument(
+        "--quick", action="store_true", help="small networks, one thread, three turns"
+    )
     parser.add_argument("--out", type=Path, help="CSV file to write")
     options = parser.parse_args()
     if options.quick:
         options.channels, options.steps, options.threads, options.turns = [8, 16], [2, 3], [1], 3
     rows = []
-    for row in table(options.scene or list(SCENES), options.channels, options.steps, options.threads, options.turns, options.queries):
+    for row in table(
+        options.scene or list(SCENES),
+        options.channels,
+        options.steps,
+        options.threads,
+        options.turns,
+        options.queries,
+    ):
         rows.append(row)
         print("  ".join(f"{row[column]!s:>15}" for column in COLUMNS), flush=True)
     if options.out is not None:

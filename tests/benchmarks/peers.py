@@ -70,7 +70,12 @@ MAX_RESIDUAL = 1.01 * TOLERANCE
 MAX_DIFFERENCE = 1e-6
 MAX_STEPS = 30
 OWN_SOLVERS: tuple[SolverName, ...] = ("auto", "rotated-pcg", "cholesky", "pardiso")
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
 
 
 class DisagreementError(RuntimeError):
@@ -117,8 +122,14 @@ class Ours(Contender):
 
 def common_material(scene: Scene) -> SaintVenantKirchhoff:
     """The law of a scene that all sides can solve."""
-    if not isinstance(scene.material, SaintVenantKirchhoff) or scene.selective or scene.mesh.cells.shape[1] != 8:
-        raise ValueError(f"{scene.name}: the peers are set up for Saint Venant-Kirchhoff in fully integrated 8-node hexahedra only.")
+    if (
+        not isinstance(scene.material, SaintVenantKirchhoff)
+        or scene.selective
+        or scene.mesh.cells.shape[1] != 8
+    ):
+        raise ValueError(
+            f"{scene.name}: the peers are set up for Saint Venant-Kirchhoff in fully integrated 8-node hexahedra only."
+        )
     return scene.material
 
 
@@ -188,8 +199,15 @@ class Felupe(Contender):
         mesh = felupe.Mesh(scene.mesh.points, scene.mesh.cells, "hexahedron")
         self._field = felupe.FieldContainer([felupe.Field(felupe.RegionHexahedron(mesh), dim=3)])
         fixed = np.isin(np.arange(scene.mesh.n_nodes), scene.fixed_nodes)
-        self._dof0, self._dof1 = felupe.dof.partition(self._field, {"fixed": felupe.Boundary(self._field[0], mask=fixed)})
-        law = felupe.Material(*(partial(function, material.lame_mu, material.lame_lambda) for function in (stress, elasticity)))
+        self._dof0, self._dof1 = felupe.dof.partition(
+            self._field, {"fixed": felupe.Boundary(self._field[0], mask=fixed)}
+        )
+        law = felupe.Material(
+            *(
+                partial(function, material.lame_mu, material.lame_lambda)
+                for function in (stress, elasticity)
+            )
+        )
         self._body = felupe.SolidBody(law, self._field)
         self._load = felupe.PointLoad(self._field, np.arange(scene.mesh.n_nodes))
 
@@ -198,7 +216,17 @@ class Felupe(Contender):
         self._load.update(forces)
         self._size = float(np.linalg.norm(forces.ravel()[self._free]))
 
-    def _check(self, dx: Array, x: Any, f: Array, xtol: float, ftol: float, dof1: Any, dof0: Any, items: Any) -> tuple[float, float, bool]:
+    def _check(
+        self,
+        dx: Array,
+        x: Any,
+        f: Array,
+        xtol: float,
+        ftol: float,
+        dof1: Any,
+        dof0: Any,
+        items: Any,
+    ) -> tuple[float, float, bool]:
         residual = float(np.linalg.norm(f[dof1])) / self._size
         return float(np.linalg.norm(dx)), residual, residual <= ftol
 
@@ -238,12 +266,17 @@ def silent() -> Iterator[None]:
 def kratos_modules() -> tuple[Any, Any]:
     """KratosMultiphysics and its StructuralMechanicsApplication, without their banners."""
     with silent():
-        km, sma = map(import_module, ("KratosMultiphysics", "KratosMultiphysics.StructuralMechanicsApplication"))
+        km, sma = map(
+            import_module,
+            ("KratosMultiphysics", "KratosMultiphysics.StructuralMechanicsApplication"),
+        )
     km.Logger.GetDefaultOutput().SetSeverity(km.Logger.Severity.WARNING)
     return km, sma
 
 
-def kratos_solid(scene: Scene, cells: NDArray[np.int64], loaded: NDArray[np.int64]) -> tuple[Any, Any]:
+def kratos_solid(
+    scene: Scene, cells: NDArray[np.int64], loaded: NDArray[np.int64]
+) -> tuple[Any, Any]:
     """A Kratos model and its part with some cells of a scene, a point load on each of some nodes, and the nodes of both.
 
     Numbers in Kratos are those of the scene plus one.
@@ -278,7 +311,9 @@ def kratos_newton(part: Any, criterion: Any, builder: Any) -> Any:
     km, _ = kratos_modules()
     scheme = km.ResidualBasedIncrementalUpdateStaticScheme()
     reactions, new_dofs, move_mesh = False, False, True  # this element takes F from the moved mesh
-    strategy = km.ResidualBasedNewtonRaphsonStrategy(part, scheme, criterion, builder, MAX_STEPS, reactions, new_dofs, move_mesh)
+    strategy = km.ResidualBasedNewtonRaphsonStrategy(
+        part, scheme, criterion, builder, MAX_STEPS, reactions, new_dofs, move_mesh
+    )
     for part_of_solver in (criterion, builder, strategy):
         part_of_solver.SetEchoLevel(0)
     strategy.Initialize()
@@ -294,9 +329,15 @@ class Kratos(Contender):
         km = self._km
         self.name = f"Kratos, {name}"
         self._load_variable, self._utilities = sma.POINT_LOAD, km.VariableUtils()
-        self._model, self._part = kratos_solid(scene, np.arange(scene.mesh.n_cells), np.arange(scene.mesh.n_nodes))
+        self._model, self._part = kratos_solid(
+            scene, np.arange(scene.mesh.n_cells), np.arange(scene.mesh.n_nodes)
+        )
         solver = km.LinearSolverFactory().Create(km.Parameters(json.dumps(linear_solver)))
-        self._strategy = kratos_newton(self._part, km.ResidualCriteria(TOLERANCE, 0.0), km.ResidualBasedBlockBuilderAndSolver(solver))
+        self._strategy = kratos_newton(
+            self._part,
+            km.ResidualCriteria(TOLERANCE, 0.0),
+            km.ResidualBasedBlockBuilderAndSolver(solver),
+        )
 
     def prepare(self, forces: Array) -> None:
         for node, force in zip(self._part.Nodes, forces.tolist(), strict=True):
@@ -314,7 +355,11 @@ class Kratos(Contender):
         return int(self._part.ProcessInfo[self._km.NL_ITERATION_NUMBER])
 
     def displacement(self) -> Array:
-        return np.array(self._utilities.GetSolutionStepValuesVector(self._part.Nodes, self._km.DISPLACEMENT, 0, 3)).reshape(-1, 3)
+        return np.array(
+            self._utilities.GetSolutionStepValuesVector(
+                self._part.Nodes, self._km.DISPLACEMENT, 0, 3
+            )
+        ).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -350,15 +395,31 @@ TUNED_AMGCL = {
 }
 PEERS = (
     Entry("felupe, SuperLU", ("felupe",), lambda scene: Felupe(scene, "SuperLU", lambda: spsolve)),
-    Entry("felupe, Pardiso", ("felupe", "pypardiso"), lambda scene: Felupe(scene, "Pardiso", default_pardiso)),
-    Entry("felupe, tuned Pardiso", ("felupe", "pypardiso"), lambda scene: Felupe(scene, "tuned Pardiso", TunedPardiso)),
-    Entry("Kratos, amgcl", KRATOS, lambda scene: Kratos(scene, "amgcl", {"solver_type": "amgcl", "verbosity": 0})),
+    Entry(
+        "felupe, Pardiso",
+        ("felupe", "pypardiso"),
+        lambda scene: Felupe(scene, "Pardiso", default_pardiso),
+    ),
+    Entry(
+        "felupe, tuned Pardiso",
+        ("felupe", "pypardiso"),
+        lambda scene: Felupe(scene, "tuned Pardiso", TunedPardiso),
+    ),
+    Entry(
+        "Kratos, amgcl",
+        KRATOS,
+        lambda scene: Kratos(scene, "amgcl", {"solver_type": "amgcl", "verbosity": 0}),
+    ),
     Entry("Kratos, tuned amgcl", KRATOS, lambda scene: Kratos(scene, "tuned amgcl", TUNED_AMGCL)),
 )
 
 
 def own_entry(solver: SolverName) -> Entry:
-    return Entry(f"mor-bench, {solver}", ("pypardiso",) if solver == "pardiso" else (), lambda scene: Ours(scene, solver))
+    return Entry(
+        f"mor-bench, {solver}",
+        ("pypardiso",) if solver == "pardiso" else (),
+        lambda scene: Ours(scene, solver),
+    )
 
 
 def pick_loads(scene: Scene, n: int) -> tuple[list[int], Array]:
@@ -438,9 +499,17 @@ def compare(scene: Scene, forces: Array, contenders: Sequence[Contender], rounds
                 if turn == 0:
                     row.steps.append(steps)
                     u = contender.displacement().ravel()[free]
-                    row.residuals.append(float(np.linalg.norm(target - model.force(u).force) / np.linalg.norm(target)))
-                    row.differences.append(float(np.linalg.norm(u - reference) / np.linalg.norm(reference)))
-                    if not (row.residuals[-1] <= MAX_RESIDUAL and row.differences[-1] <= MAX_DIFFERENCE):
+                    row.residuals.append(
+                        float(
+                            np.linalg.norm(target - model.force(u).force) / np.linalg.norm(target)
+                        )
+                    )
+                    row.differences.append(
+                        float(np.linalg.norm(u - reference) / np.linalg.norm(reference))
+                    )
+                    if not (
+                        row.residuals[-1] <= MAX_RESIDUAL and row.differences[-1] <= MAX_DIFFERENCE
+                    ):
                         raise DisagreementError(
                             f"{row.name} solves another problem: its relative residual is {row.residuals[-1]:.2g} (at most {TOLERANCE:g} is "
                             f"asked for), its displacement differs by {row.differences[-1]:.2g} (at most {MAX_DIFFERENCE:g})."
@@ -452,58 +521,102 @@ def print_rows(console: Console, rows: Sequence[Row]) -> None:
     """Times with their checks, and how many times as long as the first contender each takes."""
     times = Table(title="One solve, from rest")
     ratios = Table(title=f"Times as long as {rows[0].name}, per load")
-    for table, columns in ((times, ("median ms", "min ms", "steps", "residual", "difference")), (ratios, ("median", "min", "max"))):
+    for table, columns in (
+        (times, ("median ms", "min ms", "steps", "residual", "difference")),
+        (ratios, ("median", "min", "max")),
+    ):
         table.add_column("contender")
         for column in columns:
             table.add_column(column, justify="right")
     for row in rows:
         steps = "-".join(map(str, sorted({min(row.steps), max(row.steps)})))
         checks = (f"{max(row.residuals):.1e}", f"{max(row.differences):.1e}")
-        times.add_row(row.name, f"{np.median(row.medians_ms):.2f}", f"{np.min(row.times_ms):.2f}", steps, *checks)
+        times.add_row(
+            row.name,
+            f"{np.median(row.medians_ms):.2f}",
+            f"{np.min(row.times_ms):.2f}",
+            steps,
+            *checks,
+        )
         ratio = row.medians_ms / rows[0].medians_ms
-        ratios.add_row(row.name, *(f"{value:.2f}" for value in (np.median(ratio), ratio.min(), ratio.max())))
+        ratios.add_row(
+            row.name, *(f"{value:.2f}" for value in (np.median(ratio), ratio.min(), ratio.max()))
+        )
     console.print(times, ratios)
 
 
 def pin_threads(module: str, threads: int) -> None:
     """Start the running module anew with this many threads in every library, unless it has been."""
     pinned = dict.fromkeys(THREAD_VARIABLES, str(threads))
-    if any(os.environ.get(name) != value for name, value in pinned.items()):  # libraries read them when they are loaded
-        os.execve(sys.executable, [sys.executable, "-m", module, *sys.argv[1:]], {**os.environ, **pinned})
+    if any(
+        os.environ.get(name) != value for name, value in pinned.items()
+    ):  # libraries read them when they are loaded
+        os.execve(
+            sys.executable, [sys.executable, "-m", module, *sys.argv[1:]], {**os.environ, **pinned}
+        )
 
 
 def main(
-    dataset: Annotated[list[str] | None, typer.Option(help="Repeat for more; by default beam-coarse and beam-fine.", show_default=False)] = None,
+    dataset: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Repeat for more; by default beam-coarse and beam-fine.", show_default=False
+        ),
+    ] = None,
     loads: Annotated[int, typer.Option(min=1, help="Loads of each dataset.")] = 5,
     rounds: Annotated[int, typer.Option(min=1, help="Solves of each load.")] = 3,
     threads: Annotated[int, typer.Option(min=1, help="Threads of every contender.")] = 1,
-    solver: Annotated[list[str] | None, typer.Option(help=f"Our solvers; by default {', '.join(OWN_SOLVERS)}.", show_default=False)] = None,
-    as_json: Annotated[Path | None, typer.Option("--json", help="Also write everything to this file.")] = None,
+    solver: Annotated[
+        list[str] | None,
+        typer.Option(help=f"Our solvers; by default {', '.join(OWN_SOLVERS)}.", show_default=False),
+    ] = None,
+    as_json: Annotated[
+        Path | None, typer.Option("--json", help="Also write everything to this file.")
+    ] = None,
 ) -> None:
     """Time the full-order model beside other finite-element codes."""
     pin_threads("tests.benchmarks.peers", threads)
     console = Console()
     unknown = set(solver or ()) - set(SOLVERS)
     if unknown:
-        raise typer.BadParameter(f"--solver must be one of {', '.join(SOLVERS)}; got {', '.join(sorted(unknown))}.")
+        raise typer.BadParameter(
+            f"--solver must be one of {', '.join(SOLVERS)}; got {', '.join(sorted(unknown))}."
+        )
     entries = [*(own_entry(name) for name in SOLVERS if name in (solver or OWN_SOLVERS)), *PEERS]
     for entry in entries:
         if entry.missing:
-            console.print(f"{entry.label}: skipped, not installed: pip install {' '.join(entry.missing)}", markup=False)
+            console.print(
+                f"{entry.label}: skipped, not installed: pip install {' '.join(entry.missing)}",
+                markup=False,
+            )
     report: dict[str, Any] = {"machine": describe_machine(), "threads": threads, "datasets": {}}
     for name in dataset or ("beam-coarse", "beam-fine"):
         scene = mor_bench.load_scene(name)
         samples, forces = pick_loads(scene, loads)
         norms = [float(np.linalg.norm(load.ravel()[scene.free_dofs])) for load in forces]
-        console.rule(f"{name}: {scene.mesh.n_cells} cells, {len(scene.free_dofs)} unknowns, {threads} thread(s)")
-        console.print("Loads: " + ", ".join(f"sample {i} |f| = {norm:.3g} N" for i, norm in zip(samples, norms, strict=True)), highlight=False)
+        console.rule(
+            f"{name}: {scene.mesh.n_cells} cells, {len(scene.free_dofs)} unknowns, {threads} thread(s)"
+        )
+        console.print(
+            "Loads: "
+            + ", ".join(
+                f"sample {i} |f| = {norm:.3g} N" for i, norm in zip(samples, norms, strict=True)
+            ),
+            highlight=False,
+        )
         try:
-            rows = compare(scene, forces, [entry.make(scene) for entry in entries if not entry.missing], rounds)
+            rows = compare(
+                scene, forces, [entry.make(scene) for entry in entries if not entry.missing], rounds
+            )
         except DisagreementError as error:
             console.print(f"no comparison: {error}", style="red", markup=False)
             raise typer.Exit(1) from None
         print_rows(console, rows)
-        report["datasets"][name] = {"samples": samples, "load_norms_n": norms, "contenders": [vars(row) for row in rows]}
+        report["datasets"][name] = {
+            "samples": samples,
+            "load_norms_n": norms,
+            "contenders": [vars(row) for row in rows],
+        }
     if as_json:
         as_json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 

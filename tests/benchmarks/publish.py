@@ -33,7 +33,9 @@ LOCAL = {
 }
 """What the page loads, and the file in `COPIES` that stands in for it."""
 
-_TAG = re.compile(r'<(?P<tag>script|link)\b[^>]*?\b(?P<where>src|href)="(?P<url>(?:https?:)?//[^"]+)"[^>]*>')
+_TAG = re.compile(
+    r'<(?P<tag>script|link)\b[^>]*?\b(?P<where>src|href)="(?P<url>(?:https?:)?//[^"]+)"[^>]*>'
+)
 
 
 def make_offline(folder: Path) -> None:
@@ -48,7 +50,9 @@ def make_offline(folder: Path) -> None:
 
     def local(match: re.Match[str]) -> str:
         if match["url"] not in LOCAL:
-            raise MorBenchError(f"{page}: loads {match['url']}, of which {COPIES} has no copy; add one, and its licence.")
+            raise MorBenchError(
+                f"{page}: loads {match['url']}, of which {COPIES} has no copy; add one, and its licence."
+            )
         kind = 'rel="stylesheet" ' if match["tag"] == "link" else 'onerror="js_load_failure()" '
         return f'<{match["tag"]} {kind}{match["where"]}="offline/{LOCAL[match["url"]]}">'
 

@@ -152,7 +152,12 @@ class KratosReduced(Reduced):
         with silent():
             self._rom = import_module("KratosMultiphysics.RomApplication")
         km = self._km
-        self.name, self.twin, self._scene, self._builder = f"Kratos {name}, {builder}", twin, scene, BUILDERS[builder]
+        self.name, self.twin, self._scene, self._builder = (
+            f"Kratos {name}, {builder}",
+            twin,
+            scene,
+            BUILDERS[builder],
+        )
         self._load_variable, self._utilities = sma.POINT_LOAD, km.VariableUtils()
         modes = np.zeros((scene.mesh.n_dofs, twin.modes_.shape[1]))
         modes[scene.free_dofs] = twin.modes_
@@ -186,7 +191,9 @@ class KratosReduced(Reduced):
         for i in loaded.tolist():
             self._part.GetNode(i + 1).SetSolutionStepValue(self._load_variable, forces[i].tolist())
         settings = {"nodal_unknowns": UNKNOWNS, "number_of_rom_dofs": self._modes.shape[2]}
-        solver = km.LinearSolverFactory().Create(km.Parameters('{"solver_type": "skyline_lu_factorization"}'))  # asked for, not used
+        solver = km.LinearSolverFactory().Create(
+            km.Parameters('{"solver_type": "skyline_lu_factorization"}')
+        )  # asked for, not used
         builder = getattr(rom, self._builder)(solver, km.Parameters(json.dumps(settings)))
         never = km.DisplacementCriteria(0.0, 0.0)
         self._strategy = kratos_newton(self._part, never, builder)
@@ -216,23 +223,34 @@ class KratosReduced(Reduced):
 
     def displacement(self) -> Array:
         part = self._part if self._weights is None else self._all
-        return np.array(self._utilities.GetSolutionStepValuesVector(part.Nodes, self._km.DISPLACEMENT, 0, 3)).reshape(-1, 3)
+        return np.array(
+            self._utilities.GetSolutionStepValuesVector(part.Nodes, self._km.DISPLACEMENT, 0, 3)
+        ).reshape(-1, 3)
 
 
 def reduced_residual(model: Twin, displacement: Array, forces: Array) -> float:
     """‖Φᵀ(f - f_int)‖ / ‖Φᵀf‖ of displacements (n_nodes, 3), m, in the span of Φ, with the cells and weights of a model."""
     free, modes = model.scene_.free_dofs, model.modes_
     load = modes.T @ forces.ravel()[free]
-    return float(np.linalg.norm(load - model.problem_.force(modes.T @ displacement.ravel()[free]).force) / np.linalg.norm(load))
+    return float(
+        np.linalg.norm(load - model.problem_.force(modes.T @ displacement.ravel()[free]).force)
+        / np.linalg.norm(load)
+    )
 
 
 def kratos_cubature(hpod: HyperReducedPOD, snapshots: Snapshots) -> HyperReducedPOD | None:
     """Our hyper-reduced model with the cells and weights that Kratos' empirical cubature selects; None if it leaves out none."""
     with silent():
-        method = import_module("KratosMultiphysics.RomApplication.empirical_cubature_method").EmpiricalCubatureMethod
+        method = import_module(
+            "KratosMultiphysics.RomApplication.empirical_cubature_method"
+        ).EmpiricalCubatureMethod
     model, displacements = FullOrderModel(hpod.scene_), snapshots.free_displacements
-    chosen = np.unique(np.linspace(0, len(displacements) - 1, hpod.n_cubature_snapshots).astype(int))
-    system = ecsw_system(model.assembler, model.cell_dofs, hpod.modes_, displacements[chosen] @ hpod.modes_)
+    chosen = np.unique(
+        np.linspace(0, len(displacements) - 1, hpod.n_cubature_snapshots).astype(int)
+    )
+    system = ecsw_system(
+        model.assembler, model.cell_dofs, hpod.modes_, displacements[chosen] @ hpod.modes_
+    )
     _, values, vectors = np.linalg.svd(system, full_matrices=False)
     left_out = np.sqrt(np.cumsum(values[::-1] ** 2))[::-1]
     kept = int((left_out >= hpod.cubature_tolerance * left_out[0]).sum())
@@ -246,11 +264,19 @@ def kratos_cubature(hpod: HyperReducedPOD, snapshots: Snapshots) -> HyperReduced
         return None
     order = np.argsort(selector.z)
     ours = copy(hpod)
-    ours._restore({"modes": hpod.modes_, "cells": selector.z[order], "weights": selector.w.ravel()[order]})
+    ours._restore(
+        {"modes": hpod.modes_, "cells": selector.z[order], "weights": selector.w.ravel()[order]}
+    )
     return ours
 
 
-def own_methods(scene: Scene, snapshots: Snapshots, names: Sequence[str], n_modes: int, say: Callable[[str], None]) -> dict[str, Surrogate]:
+def own_methods(
+    scene: Scene,
+    snapshots: Snapshots,
+    names: Sequence[str],
+    n_modes: int,
+    say: Callable[[str], None],
+) -> dict[str, Surrogate]:
     """Fitted methods by name; those that cannot take part are left out with a line that says why."""
     fitted = {}
     for name in names:
@@ -263,15 +289,21 @@ def own_methods(scene: Scene, snapshots: Snapshots, names: Sequence[str], n_mode
                 say(f"{name}: skipped, it has no parameter `n_modes`")
                 continue
             tolerance = {"tolerance": TOLERANCE} if "tolerance" in knobs else {}
-            fitted[name] = mor_bench.load_method(name, n_modes=n_modes, **tolerance).fit(scene, snapshots)
+            fitted[name] = mor_bench.load_method(name, n_modes=n_modes, **tolerance).fit(
+                scene, snapshots
+            )
         except (MissingDependencyError, UnsupportedSceneError) as error:
             say(f"{name}: skipped, {error}")
     return fitted
 
 
 def make_contenders(
-    scene: Scene, snapshots: Snapshots, n_modes: int, methods: Sequence[str] = METHODS, say: Callable[[str], None] = print
-) -> list[Reduced]:  # fmt: skip
+    scene: Scene,
+    snapshots: Snapshots,
+    n_modes: int,
+    methods: Sequence[str] = METHODS,
+    say: Callable[[str], None] = print,
+) -> list[Reduced]:
     """Our methods, and Kratos' models if it is installed.
 
     Parameters
@@ -291,10 +323,19 @@ def make_contenders(
         If the scene is none that both sides can solve.
     """
     fitted = own_methods(scene, snapshots, list(dict.fromkeys(("pod", *methods))), n_modes, say)
-    pod, hpod = fitted["pod"], mor_bench.load_method("hpod", n_modes=n_modes, tolerance=TOLERANCE, sampling="cells").fit(scene, snapshots)
+    pod, hpod = (
+        fitted["pod"],
+        mor_bench.load_method("hpod", n_modes=n_modes, tolerance=TOLERANCE, sampling="cells").fit(
+            scene, snapshots
+        ),
+    )
     assert isinstance(pod, PODGalerkin)
     assert isinstance(hpod, HyperReducedPOD)
-    own: list[Reduced] = [Ours(name, fitted[name], pod if name in SAME_AS_POD else None) for name in methods if name in fitted]
+    own: list[Reduced] = [
+        Ours(name, fitted[name], pod if name in SAME_AS_POD else None)
+        for name in methods
+        if name in fitted
+    ]
     own.append(Ours("hpod, whole cells", hpod, None))
     missing = [name for name in KRATOS_ROM if not installed(name)]
     if missing:
@@ -332,7 +373,9 @@ class Row:
         return np.asarray(np.min(self.times_ms, axis=1))
 
 
-def compare(forces: Array, references: Array, contenders: Sequence[Reduced], rounds: int) -> list[Row]:
+def compare(
+    forces: Array, references: Array, contenders: Sequence[Reduced], rounds: int
+) -> list[Row]:
     """Time the contenders and check what they answer.
 
     Parameters
@@ -372,7 +415,9 @@ def compare(forces: Array, references: Array, contenders: Sequence[Reduced], rou
                 if turn == 0:
                     row.steps.append(steps)
                     row.errors_m.append(float(np.linalg.norm(u - reference, axis=1).mean()))
-                    row.relative_l2.append(float(sample_errors(u[None], reference[None]).relative_l2[0]))
+                    row.relative_l2.append(
+                        float(sample_errors(u[None], reference[None]).relative_l2[0])
+                    )
     return rows
 
 
@@ -381,7 +426,9 @@ def _turn(contender: Reduced, load: Array) -> tuple[float, int]:
     time_ms, steps = timed(contender, load)
     if time_ms >= TURN_MS:
         return time_ms, steps
-    return float(np.median([timed(contender, load)[0] for _ in range(int(TURN_MS / time_ms) + 1)])), steps
+    return float(
+        np.median([timed(contender, load)[0] for _ in range(int(TURN_MS / time_ms) + 1)])
+    ), steps
 
 
 def _check(row: Row, twin: Twin, u: Array, load: Array) -> None:
@@ -428,20 +475,32 @@ def print_rows(console: Console, rows: Sequence[Row], n_modes: int) -> None:
             _digits(float(np.min(row.times_ms))),
             "" if faster is None else _digits(float(np.median(faster[i]))),
         )
-        checks = [f"{max(values):.1e}" if values else "" for values in (row.residuals, row.differences)]
-        errors.add_row(row.name, *checks, f"{np.mean(row.errors_m):.3g}", f"{np.median(row.relative_l2):.3g}")
+        checks = [
+            f"{max(values):.1e}" if values else "" for values in (row.residuals, row.differences)
+        ]
+        errors.add_row(
+            row.name, *checks, f"{np.mean(row.errors_m):.3g}", f"{np.median(row.relative_l2):.3g}"
+        )
     console.print(times, errors)
 
 
 def main(
     dataset: Annotated[str, typer.Option(help="Name, or path of a TOML.")] = "beam-fine",
-    modes: Annotated[list[int] | None, typer.Option(min=1, help="Repeat for more; by default 3, 10 and 20.", show_default=False)] = None,
+    modes: Annotated[
+        list[int] | None,
+        typer.Option(min=1, help="Repeat for more; by default 3, 10 and 20.", show_default=False),
+    ] = None,
     train: Annotated[int, typer.Option(min=1, help="Training snapshots.")] = 300,
     loads: Annotated[int, typer.Option(min=1, help="Test loads.")] = 5,
     rounds: Annotated[int, typer.Option(min=1, help="Solves of each load.")] = 3,
     threads: Annotated[int, typer.Option(min=1, help="Threads of every contender.")] = 1,
-    method: Annotated[list[str] | None, typer.Option(help=f"Our methods; by default {', '.join(METHODS)}.", show_default=False)] = None,
-    as_json: Annotated[Path | None, typer.Option("--json", help="Also write everything to this file.")] = None,
+    method: Annotated[
+        list[str] | None,
+        typer.Option(help=f"Our methods; by default {', '.join(METHODS)}.", show_default=False),
+    ] = None,
+    as_json: Annotated[
+        Path | None, typer.Option("--json", help="Also write everything to this file.")
+    ] = None,
 ) -> None:
     """Time reduced-order models beside those of Kratos."""
     pin_threads("tests.benchmarks.reduced_peers", threads)
@@ -455,8 +514,15 @@ def main(
     scene, snapshots = data.scene, data.train[:train]
     chosen = np.linspace(0, len(data.test) - 1, loads).astype(int)
     forces, references = data.test[chosen].forces, data.test[chosen].displacements
-    console.rule(f"{dataset}: {scene.mesh.n_cells} cells, {len(scene.free_dofs)} unknowns, {train} training snapshots, {threads} thread(s)")
-    report: dict[str, Any] = {"machine": describe_machine(), "threads": threads, "dataset": dataset, "train": train}
+    console.rule(
+        f"{dataset}: {scene.mesh.n_cells} cells, {len(scene.free_dofs)} unknowns, {train} training snapshots, {threads} thread(s)"
+    )
+    report: dict[str, Any] = {
+        "machine": describe_machine(),
+        "threads": threads,
+        "dataset": dataset,
+        "train": train,
+    }
     report |= {"test_samples": chosen.tolist(), "modes": {}}
     said: set[str] = set()
 

@@ -63,24 +63,43 @@ def measure(across: int) -> dict[str, Any]:
 
 
 def main(
-    size: Annotated[list[int] | None, typer.Option(min=2, help=f"Cells across; repeat for more. By default {SIZES}.", show_default=False)] = None,
+    size: Annotated[
+        list[int] | None,
+        typer.Option(
+            min=2, help=f"Cells across; repeat for more. By default {SIZES}.", show_default=False
+        ),
+    ] = None,
     one: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
     """Measure seconds and memory of the full-order solve against the number of unknowns."""
     if one:
         print(json.dumps(measure((size or SIZES)[0])))
         return
-    pinned = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    table = Table("cells", "unknowns", "rest state", "set-up s", "solve ms", "iterations", "peak MB")
+    pinned = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "NUMBA_NUM_THREADS": "1",
+    }
+    table = Table(
+        "cells", "unknowns", "rest state", "set-up s", "solve ms", "iterations", "peak MB"
+    )
     rows = []
     for across in size or SIZES:
         command = [sys.executable, "-m", "tests.benchmarks.scaling", "--one", "--size", str(across)]
-        row = json.loads(subprocess.run(command, check=True, capture_output=True, text=True, env=pinned).stdout)
+        row = json.loads(
+            subprocess.run(command, check=True, capture_output=True, text=True, env=pinned).stdout
+        )
         rows.append(row)
         table.add_row(
-            f"{4 * across} x {across} x {across}", f"{row['unknowns']:,}", row["rest_state"], f"{row['set_up_s']:.2f}",
-            f"{1e3 * row['solve_s']:.2f}", f"{row['iterations']:.0f}", f"{row['peak_mb']:.0f}",
-        )  # fmt: skip
+            f"{4 * across} x {across} x {across}",
+            f"{row['unknowns']:,}",
+            row["rest_state"],
+            f"{row['set_up_s']:.2f}",
+            f"{1e3 * row['solve_s']:.2f}",
+            f"{row['iterations']:.0f}",
+            f"{row['peak_mb']:.0f}",
+        )
     console = Console()
     console.print(table)
     if len(rows) > 1:

@@ -52,7 +52,13 @@ def main(
             least, worst = min(least, state.min_det_f), max(worst, residual)
             iterations.append(found.iterations)
             cuts += found.cuts
-            problem = "inverted" if not state.min_det_f > 0 else "residual too large" if residual > 1.01 * TOLERANCE else ""
+            problem = (
+                "inverted"
+                if not state.min_det_f > 0
+                else "residual too large"
+                if residual > 1.01 * TOLERANCE
+                else ""
+            )
             try:
                 cholesky.factor(tangent)
             except NotPositiveDefiniteError:
@@ -62,7 +68,9 @@ def main(
         print(f"{outcome}: {count}")
     if iterations:
         print(f"least det F {least:.3f}, largest residual {worst:.1e} of the load")
-        print(f"iterations: median {np.median(iterations):.0f}, 99 % {np.percentile(iterations, 99):.0f}, most {max(iterations)}; cut-backs: {cuts}")
+        print(
+            f"iterations: median {np.median(iterations):.0f}, 99 % {np.percentile(iterations, 99):.0f}, most {max(iterations)}; cut-backs: {cuts}"
+        )
     if any(outcome.startswith("INVALID") for outcome in outcomes):
         raise typer.Exit(1)
 

@@ -12,9 +12,23 @@ import pytest
 from numpy.typing import NDArray
 
 import mor_bench
-from mor_bench.errors import IllConditionedWarning, InvalidInputError, LockingWarning, SolverError, SpecError
+from mor_bench.errors import (
+    IllConditionedWarning,
+    InvalidInputError,
+    LockingWarning,
+    SolverError,
+    SpecError,
+)
 from mor_bench.harness.check import check_file
-from mor_bench.harness.stress.setups import LAW, LIMIT_PA, Bars, confined_column, free_assembler, make_bars, material_table
+from mor_bench.harness.stress.setups import (
+    LAW,
+    LIMIT_PA,
+    Bars,
+    confined_column,
+    free_assembler,
+    make_bars,
+    material_table,
+)
 from mor_bench.mechanics.linear import BandedCholesky
 from mor_bench.mechanics.model import SOLVERS, FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
@@ -27,22 +41,32 @@ from .test_elements_and_laws import ELEMENTS, EVERY, LAWS, piola
 Array = NDArray[np.float64]
 
 
-def scene_of(law: str, kind: tuple[str, bool], poisson: float = 0.4, base: str = "beam-tiny") -> Scene:
+def scene_of(
+    law: str, kind: tuple[str, bool], poisson: float = 0.4, base: str = "beam-tiny"
+) -> Scene:
     """A shipped scene with another law, element and Poisson's ratio."""
     spec = mor_bench.load_scene(base).spec.model_dump(mode="json")
     discretisation = {"element": kind[0], "integration": "selective" if kind[1] else "full"}
-    return load_scene({**spec, "discretisation": discretisation, "material": material_table(law, 500.0, poisson)})
+    return load_scene(
+        {**spec, "discretisation": discretisation, "material": material_table(law, 500.0, poisson)}
+    )
 
 
 def patch_load(scene: Scene, patch: int, force: list[float]) -> Array:
     """A force, N, on a patch, over the free dofs."""
-    return np.asarray((scene.patch_weights[[patch]].toarray()[0][:, None] * np.array(force)).ravel()[scene.free_dofs])
+    return np.asarray(
+        (scene.patch_weights[[patch]].toarray()[0][:, None] * np.array(force)).ravel()[
+            scene.free_dofs
+        ]
+    )
 
 
 @pytest.mark.parametrize("kind", ELEMENTS)
 @pytest.mark.parametrize("steps", [1, 10])
 @pytest.mark.parametrize("factor", [0.99, 1.01, 1.5, 3.0])
-def test_confined_compression_ends_at_the_limit_point(kind: tuple[str, bool], steps: int, factor: float) -> None:
+def test_confined_compression_ends_at_the_limit_point(
+    kind: tuple[str, bool], steps: int, factor: float
+) -> None:
     """Beyond it plain Newton 'converges' to a mirrored element, with a residual of round-off."""
     column, q = confined_column(LAW, kind[0] == "tetrahedron", kind[1]), None
     for step in range(1, steps + 1):
@@ -62,20 +86,32 @@ def test_confined_compression_ends_at_the_limit_point(kind: tuple[str, bool], st
 @pytest.mark.parametrize("kind", ELEMENTS)
 def test_an_unstable_equilibrium_is_never_returned(kind: tuple[str, bool]) -> None:
     """Under 0.9 of the limit load the residual vanishes at two stretches; started at the unstable one, the other is found."""
-    column, ratio = confined_column(LAW, kind[0] == "tetrahedron", kind[1]), 0.9 * 2 / (3 * np.sqrt(3))
-    unstable, stable = sorted(root.real for root in np.roots([1.0, 0.0, -1.0, ratio]) if root.real > 0)
+    column, ratio = (
+        confined_column(LAW, kind[0] == "tetrahedron", kind[1]),
+        0.9 * 2 / (3 * np.sqrt(3)),
+    )
+    unstable, stable = sorted(
+        root.real for root in np.roots([1.0, 0.0, -1.0, ratio]) if root.real > 0
+    )
     load = column.force(np.array([unstable - 1])).force
     assert load == pytest.approx([0.9 * LIMIT_PA], rel=1e-7)
     solution = solve_equilibrium(column, load, np.array([unstable - 1]))
     assert 1 + solution.displacement[0] == pytest.approx(stable, abs=1e-6)
 
 
-@pytest.mark.parametrize(("law", "kind"), [pair for pair in EVERY if pair[0] != "saint-venant-kirchhoff"])
+@pytest.mark.parametrize(
+    ("law", "kind"), [pair for pair in EVERY if pair[0] != "saint-venant-kirchhoff"]
+)
 def test_laws_without_a_limit_point_carry_more(law: str, kind: tuple[str, bool]) -> None:
     for factor in (1.01, 3.0):
-        solution = solve_equilibrium(confined_column(LAWS[law], kind[0] == "tetrahedron", kind[1]), np.array([factor * LIMIT_PA]))
+        solution = solve_equilibrium(
+            confined_column(LAWS[law], kind[0] == "tetrahedron", kind[1]),
+            np.array([factor * LIMIT_PA]),
+        )
         alpha = 1 + solution.displacement[0]
-        assert piola(LAWS[law], np.diag([alpha, 1.0, 1.0]))[0, 0] == pytest.approx(factor * LIMIT_PA, rel=1e-7)
+        assert piola(LAWS[law], np.diag([alpha, 1.0, 1.0]))[0, 0] == pytest.approx(
+            factor * LIMIT_PA, rel=1e-7
+        )
         assert solution.min_det_f == pytest.approx(alpha, rel=1e-12)
 
 
@@ -85,24 +121,38 @@ def test_newton_converges_quadratically_near_the_solution(law: str, kind: tuple[
     load = np.zeros(model.n_unknowns)
     load[-1] = 2.0
     exact = model.solve(load, options=NewtonOptions(tolerance=1e-12)).displacement
-    u, errors = exact + 1e-2 * np.random.default_rng(0).normal(size=len(exact)) * np.abs(exact).max(), []
+    u, errors = (
+        exact + 1e-2 * np.random.default_rng(0).normal(size=len(exact)) * np.abs(exact).max(),
+        [],
+    )
     for _ in range(4):
         errors.append(float(np.linalg.norm(u - exact)))
         state, tangent = model.linearise(u)
         u = u + model.factor(tangent).solve(load - state.force)
-    orders = [np.log(c / b) / np.log(b / a) for a, b, c in zip(errors, errors[1:], errors[2:], strict=False) if c > 1e-12 * np.linalg.norm(exact)]
+    orders = [
+        np.log(c / b) / np.log(b / a)
+        for a, b, c in zip(errors, errors[1:], errors[2:], strict=False)
+        if c > 1e-12 * np.linalg.norm(exact)
+    ]
     assert max(orders) >= 1.8
 
 
 @pytest.mark.parametrize(("law", "kind"), EVERY)
-def test_work_of_loading_is_the_stored_energy_and_unloading_returns_to_rest(law: str, kind: tuple[str, bool]) -> None:
+def test_work_of_loading_is_the_stored_energy_and_unloading_returns_to_rest(
+    law: str, kind: tuple[str, bool]
+) -> None:
     model = FullOrderModel(scene_of(law, kind))
     load = patch_load(model.scene, -1, [0.2, -1.0, 2.0])
     levels = np.linspace(0, 1, 41)
     states = [np.zeros(model.n_unknowns)]
     for level in levels[1:]:
         states.append(model.solve(level * load, start=states[-1]).displacement)
-    work = sum(0.5 * (a + b) * load @ (v - u) for (a, b), (u, v) in zip(itertools.pairwise(levels), itertools.pairwise(states), strict=True))
+    work = sum(
+        0.5 * (a + b) * load @ (v - u)
+        for (a, b), (u, v) in zip(
+            itertools.pairwise(levels), itertools.pairwise(states), strict=True
+        )
+    )
     assert work == pytest.approx(model.force(states[-1]).energy_j, rel=1e-3)
     u = model.solve(levels[1] * load, start=states[-1]).displacement
     np.testing.assert_allclose(u, states[1], atol=1e-6 * np.abs(states[1]).max())
@@ -117,14 +167,23 @@ def test_mirrored_load_gives_the_mirrored_answer(law: str, selective: bool) -> N
     """H8 only: the split into T4 is not symmetric."""
     scene = scene_of(law, ("hexahedron", selective), base="beam-coarse")
     model, points = FullOrderModel(scene), scene.mesh.points
-    mirror = np.array([int(np.linalg.norm(points - (p * [1, -1, 1] + [0, 1, 0]), axis=1).argmin()) for p in points])
+    mirror = np.array(
+        [
+            int(np.linalg.norm(points - (p * [1, -1, 1] + [0, 1, 0]), axis=1).argmin())
+            for p in points
+        ]
+    )
     forces = scene.patch_weights[[30]].toarray()[0][:, None] * np.array([0.3, 0.5, -0.4])
     answers = []
     for load in (forces, forces[mirror] * [1, -1, 1]):
         u = np.zeros(scene.mesh.n_dofs)
-        u[scene.free_dofs] = model.solve(load.ravel()[scene.free_dofs], options=NewtonOptions(tolerance=1e-13)).displacement
+        u[scene.free_dofs] = model.solve(
+            load.ravel()[scene.free_dofs], options=NewtonOptions(tolerance=1e-13)
+        ).displacement
         answers.append(u.reshape(-1, 3))
-    assert np.linalg.norm(answers[1] - answers[0][mirror] * [1, -1, 1]) <= 1e-12 * np.linalg.norm(answers[0])
+    assert np.linalg.norm(answers[1] - answers[0][mirror] * [1, -1, 1]) <= 1e-12 * np.linalg.norm(
+        answers[0]
+    )
     assert np.abs(answers[1] - answers[0]).max() > 0.1 * np.abs(answers[0]).max()
 
 
@@ -132,10 +191,17 @@ def test_mirrored_load_gives_the_mirrored_answer(law: str, selective: bool) -> N
 def test_two_runs_are_identical(law: str, kind: tuple[str, bool]) -> None:
     first, second = (FullOrderModel(scene_of(law, kind)) for _ in range(2))
     loads = [patch_load(first.scene, patch, [0.3, -1.0, 1.5]) for patch in (-1, 3)]
-    once, again = [first.solve(load) for load in loads], [second.solve(load) for load in reversed(loads)]
+    once, again = (
+        [first.solve(load) for load in loads],
+        [second.solve(load) for load in reversed(loads)],
+    )
     for one, other in zip(once, reversed(again), strict=True):
         np.testing.assert_array_equal(one.displacement, other.displacement)
-        assert (one.min_det_f, one.iterations, one.cuts) == (other.min_det_f, other.iterations, other.cuts)
+        assert (one.min_det_f, one.iterations, one.cuts) == (
+            other.min_det_f,
+            other.iterations,
+            other.cuts,
+        )
 
 
 @pytest.mark.filterwarnings("ignore::mor_bench.errors.LockingWarning")
@@ -147,14 +213,19 @@ def test_nearly_incompressible_converges(law: str, kind: tuple[str, bool], poiss
     assert scene.material is not None
     assert scene.material.poisson_at_rest == pytest.approx(poisson, rel=1e-9)
     solution = model.solve(load)
-    assert np.linalg.norm(load - model.force(solution.displacement).force) <= 1e-8 * np.linalg.norm(load)
+    assert np.linalg.norm(load - model.force(solution.displacement).force) <= 1e-8 * np.linalg.norm(
+        load
+    )
     assert solution.min_det_f > 0
 
 
 @pytest.mark.parametrize("kind", [kind for kind in ELEMENTS if not kind[1]])
 @pytest.mark.parametrize("law", list(LAWS))
 def test_a_scene_that_locks_is_warned_of(law: str, kind: tuple[str, bool]) -> None:
-    with pytest.warns(LockingWarning, match=r"beam-tiny: with Poisson's ratio 0\.46 at rest.*integration = \"selective\"") as caught:
+    with pytest.warns(
+        LockingWarning,
+        match=r"beam-tiny: with Poisson's ratio 0\.46 at rest.*integration = \"selective\"",
+    ) as caught:
         FullOrderModel(scene_of(law, kind, 0.46))
     assert len(caught) == 1
     assert ('element = "hexahedron"' in str(caught[0].message)) == (kind[0] == "tetrahedron")
@@ -163,7 +234,11 @@ def test_a_scene_that_locks_is_warned_of(law: str, kind: tuple[str, bool]) -> No
 @pytest.mark.filterwarnings("error::mor_bench.errors.LockingWarning")
 @pytest.mark.parametrize("law", list(LAWS))
 def test_a_scene_that_does_not_lock_is_not_warned_of(law: str) -> None:
-    for kind, poisson in ((("hexahedron", True), 0.4999), (("hexahedron", False), 0.449), (("tetrahedron", False), 0.449)):
+    for kind, poisson in (
+        (("hexahedron", True), 0.4999),
+        (("hexahedron", False), 0.449),
+        (("tetrahedron", False), 0.449),
+    ):
         FullOrderModel(scene_of(law, kind, poisson))
 
 
@@ -212,20 +287,38 @@ def test_forces_that_are_not_real_numbers_of_the_right_shape_are_refused(bad: st
 
 
 @pytest.mark.parametrize("name", ["load 0", "`start`"])
-@pytest.mark.parametrize("bad", ["nan", "inf", "short", "empty", "column", "complex", "text", "huge"])
+@pytest.mark.parametrize(
+    "bad", ["nan", "inf", "short", "empty", "column", "complex", "text", "huge"]
+)
 def test_the_solver_itself_refuses_what_is_not_a_finite_vector(bad: str, name: str) -> None:
     model = FullOrderModel(mor_bench.load_scene("beam-tiny"))
     good = np.linspace(0.0, 1e-3, model.n_unknowns)
-    wrong: Any = {"short": good[:-3], "empty": good[:0], "column": good[:, None], "complex": good + 1j, "text": good.astype(str)}.get(bad)
+    wrong: Any = {
+        "short": good[:-3],
+        "empty": good[:0],
+        "column": good[:, None],
+        "complex": good + 1j,
+        "text": good.astype(str),
+    }.get(bad)
     if wrong is None:
         wrong = good.copy()
         wrong[3] = {"huge": 1e160}.get(bad) or float(bad)
     load, start = (wrong, None) if name == "load 0" else (good, wrong)
-    if bad == "huge" and start is not None:  # no shape or kind of number is wrong, and the start does not matter
-        np.testing.assert_allclose(model.solve(load, start).displacement, model.solve(load).displacement, rtol=0, atol=1e-9)
+    if (
+        bad == "huge" and start is not None
+    ):  # no shape or kind of number is wrong, and the start does not matter
+        np.testing.assert_allclose(
+            model.solve(load, start).displacement, model.solve(load).displacement, rtol=0, atol=1e-9
+        )
         return
     with pytest.raises(
-        InvalidInputError, match=name + (" must be within ±1e\\+30 N; got 1e\\+160" if bad == "huge" else " must be finite real numbers")
+        InvalidInputError,
+        match=name
+        + (
+            " must be within ±1e\\+30 N; got 1e\\+160"
+            if bad == "huge"
+            else " must be finite real numbers"
+        ),
     ):
         model.solve(load, start)
 
@@ -241,7 +334,9 @@ def test_solvers_and_tolerances_that_do_not_exist_are_refused(solver: str) -> No
 
 @pytest.mark.parametrize("law", ["saint-venant-kirchhoff", "neo-hookean"])
 @pytest.mark.parametrize("solver", ["auto", "rotated-pcg", "jacobi-pcg"])
-def test_a_column_beyond_its_buckling_load_is_never_called_stable_when_straight(law: str, solver: SolverName) -> None:
+def test_a_column_beyond_its_buckling_load_is_never_called_stable_when_straight(
+    law: str, solver: SolverName
+) -> None:
     """Euler's load is about 1 N; the residual of the straight column vanishes, whether or not it is pushed aside a little."""
     spec = mor_bench.load_scene("beam-coarse").spec.model_dump(mode="json")
     spec["geometry"] = {"shape": "box", "size_m": [10.0, 1.0, 1.0], "cells": [30, 2, 2]}
@@ -255,14 +350,18 @@ def test_a_column_beyond_its_buckling_load_is_never_called_stable_when_straight(
             solution = model.solve(load)
         except SolverError:
             continue
-        assert np.linalg.norm(load - model.force(solution.displacement).force) <= 1e-8 * np.linalg.norm(load)
+        assert np.linalg.norm(
+            load - model.force(solution.displacement).force
+        ) <= 1e-8 * np.linalg.norm(load)
         BandedCholesky(model.assembler.pattern).factor(model.linearise(solution.displacement)[1])
 
 
 @pytest.mark.parametrize("kind", ELEMENTS)
 def test_stiffness_contrast_of_a_million(kind: tuple[str, bool]) -> None:
     """Two bars in series, the second a million times softer: all of the stretch is in it."""
-    np.testing.assert_allclose(make_bars(kind[0] == "tetrahedron", kind[1]).end_displacement(), Bars.stretch - 1, rtol=2e-6)
+    np.testing.assert_allclose(
+        make_bars(kind[0] == "tetrahedron", kind[1]).end_displacement(), Bars.stretch - 1, rtol=2e-6
+    )
 
 
 @pytest.mark.parametrize(("law", "kind"), EVERY)

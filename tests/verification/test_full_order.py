@@ -11,10 +11,20 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import mor_bench
-from mor_bench.errors import IllConditionedWarning, InvalidInputError, SolverError, UnconstrainedBodyError
+from mor_bench.errors import (
+    IllConditionedWarning,
+    InvalidInputError,
+    SolverError,
+    UnconstrainedBodyError,
+)
 from mor_bench.harness.stress.setups import LAW, dense, distorted_box, free_assembler
 from mor_bench.mechanics.assembly import Assembler
-from mor_bench.mechanics.linear import BandedCholesky, MultigridFactor, NotPositiveDefiniteError, SparseLU
+from mor_bench.mechanics.linear import (
+    BandedCholesky,
+    MultigridFactor,
+    NotPositiveDefiniteError,
+    SparseLU,
+)
 from mor_bench.mechanics.model import SOLVERS, FullOrderModel
 from mor_bench.mechanics.rotated import BlockJacobi, conjugate_gradients
 from mor_bench.scene.materials import SaintVenantKirchhoff
@@ -43,7 +53,9 @@ def test_patch_of_distorted_cells() -> None:
     u = np.where(outer[:, None], exact, 0.0).ravel()
     for _ in range(12):
         state, values = assembler.force_and_tangent(u)
-        u[inner] -= np.linalg.solve(dense(assembler, values)[np.ix_(inner, inner)], state.force[inner])
+        u[inner] -= np.linalg.solve(
+            dense(assembler, values)[np.ix_(inner, inner)], state.force[inner]
+        )
     assert np.abs(u.reshape(-1, 3) - exact).max() <= 1e-12
 
 
@@ -91,7 +103,9 @@ def test_rigid_rotations_cost_nothing() -> None:
     for rotation in Rotation.random(100, random_state=0).as_matrix():
         u = (mesh.points @ rotation.T - mesh.points).ravel()
         state = assembler.force(u)
-        assert np.linalg.norm(state.force) <= 1e-12 * np.linalg.norm(stiffness, 2) * np.linalg.norm(u)
+        assert np.linalg.norm(state.force) <= 1e-12 * np.linalg.norm(stiffness, 2) * np.linalg.norm(
+            u
+        )
         assert state.min_det_f == pytest.approx(1.0, abs=1e-12)
 
 
@@ -138,7 +152,9 @@ def test_both_direct_solvers_agree_and_notice_an_indefinite_matrix() -> None:
     rhs = np.random.default_rng(0).normal(size=(pattern.n, 2))
     answers = [solver(pattern).factor(values).solve(rhs) for solver in (BandedCholesky, SparseLU)]
     np.testing.assert_allclose(answers[0], answers[1], rtol=1e-9, atol=1e-12)
-    assert np.linalg.norm(dense(model.assembler, values) @ answers[0] - rhs) <= 1e-9 * np.linalg.norm(rhs)
+    assert np.linalg.norm(
+        dense(model.assembler, values) @ answers[0] - rhs
+    ) <= 1e-9 * np.linalg.norm(rhs)
     spoilt = np.where(pattern.rows == pattern.indices, values - 0.5 * values.max(), values)
     for solver in (BandedCholesky, SparseLU):
         with pytest.raises(NotPositiveDefiniteError):
@@ -158,20 +174,30 @@ def test_banded_solver_reorders_a_badly_numbered_mesh() -> None:
     solver = BandedCholesky(assembler.pattern)
     assert solver.bandwidth < assembler.n_dofs // 3
     rhs = np.random.default_rng(1).normal(size=assembler.n_dofs)
-    np.testing.assert_allclose(dense(assembler, values) @ solver.factor(values).solve(rhs), rhs, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        dense(assembler, values) @ solver.factor(values).solve(rhs), rhs, rtol=0, atol=1e-9
+    )
 
 
 def test_an_inverted_cell_is_refused() -> None:
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
-    with pytest.raises(InvalidInputError, match=r"cell 0 is inverted or degenerate.*det J must be > 0"):
+    with pytest.raises(
+        InvalidInputError, match=r"cell 0 is inverted or degenerate.*det J must be > 0"
+    ):
         free_assembler(Mesh(mesh.points, mesh.cells[:, [4, 5, 6, 7, 0, 1, 2, 3]]))
 
 
 @pytest.mark.parametrize(
     ("supports", "named"),
     [
-        ([], "translation x, translation y, translation z, rotation about x, rotation about y, rotation about z"),
-        ([{"region": {"sphere_m": [[0.0, 0.0, 0.0], 0.01]}}], "rotation about x, rotation about y, rotation about z"),
+        (
+            [],
+            "translation x, translation y, translation z, rotation about x, rotation about y, rotation about z",
+        ),
+        (
+            [{"region": {"sphere_m": [[0.0, 0.0, 0.0], 0.01]}}],
+            "rotation about x, rotation about y, rotation about z",
+        ),
         ([{"region": {"box_m": [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]}}], "rotation about z"),
     ],
 )
@@ -179,37 +205,58 @@ def test_free_rigid_modes_are_named(supports: list[dict[str, object]], named: st
     spec = {**mor_bench.load_scene("beam-tiny").spec.model_dump(mode="json"), "supports": supports}
     with pytest.raises(UnconstrainedBodyError) as caught:
         FullOrderModel(mor_bench.load_scene(spec))
-    assert set(named.split(", ")) <= set(str(caught.value).split("free: ")[1].split("; ")[0].split(", "))
+    assert set(named.split(", ")) <= set(
+        str(caught.value).split("free: ")[1].split("; ")[0].split(", ")
+    )
 
 
 @pytest.fixture(scope="module")
 def large() -> FullOrderModel:
     """A beam large enough for conjugate gradients."""
     spec = mor_bench.load_scene("beam-coarse").spec.model_dump(mode="json")
-    return FullOrderModel(mor_bench.load_scene({**spec, "geometry": {"shape": "box", "size_m": [4.0, 1.0, 1.0], "cells": [18, 7, 7]}}))
+    return FullOrderModel(
+        mor_bench.load_scene(
+            {**spec, "geometry": {"shape": "box", "size_m": [4.0, 1.0, 1.0], "cells": [18, 7, 7]}}
+        )
+    )
 
 
 def tip_load(scene: Scene, newton: float) -> Array:
-    tip = int(np.linalg.norm(scene.mesh.points[scene.patch_nodes] - [4.0, 0.5, 1.0], axis=1).argmin())
+    tip = int(
+        np.linalg.norm(scene.mesh.points[scene.patch_nodes] - [4.0, 0.5, 1.0], axis=1).argmin()
+    )
     force = scene.patch_weights.toarray()[tip][:, None] * np.array([0.0, 0.0, -newton])
     return np.asarray(force.ravel()[scene.free_dofs])
 
 
 @pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "auto"])
-def test_every_solver_ends_at_the_same_equilibrium(large: FullOrderModel, solver: SolverName) -> None:
+def test_every_solver_ends_at_the_same_equilibrium(
+    large: FullOrderModel, solver: SolverName
+) -> None:
     if solver == "pardiso":
         pytest.importorskip("pypardiso", reason="MKL is an extra")
     other, rng = FullOrderModel(large.scene, solver), np.random.default_rng(0)
     for patch in rng.integers(0, len(large.scene.patch_nodes), 3):
         direction = rng.normal(size=3)
-        force = large.scene.patch_weights.toarray()[patch][:, None] * direction / np.linalg.norm(direction)
+        force = (
+            large.scene.patch_weights.toarray()[patch][:, None]
+            * direction
+            / np.linalg.norm(direction)
+        )
         load = force.ravel()[large.scene.free_dofs]
         ours, theirs = large.solve(load), other.solve(load)
         assert ours.iterations <= 20
         assert theirs.iterations <= 8
         for solution in (ours, theirs):
-            assert np.linalg.norm(load - large.force(solution.displacement).force) <= 1e-8 * np.linalg.norm(load)
-        np.testing.assert_allclose(ours.displacement, theirs.displacement, rtol=0, atol=1e-6 * np.abs(ours.displacement).max())
+            assert np.linalg.norm(
+                load - large.force(solution.displacement).force
+            ) <= 1e-8 * np.linalg.norm(load)
+        np.testing.assert_allclose(
+            ours.displacement,
+            theirs.displacement,
+            rtol=0,
+            atol=1e-6 * np.abs(ours.displacement).max(),
+        )
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -232,11 +279,16 @@ def test_the_turned_factor_needs_few_iterations_far_from_rest(large: FullOrderMo
     x, turned = conjugate_gradients(large.assembler.pattern, tangent, rotated.at(u), rhs, 1e-8)
     assert np.linalg.norm(dense(large.assembler, tangent) @ x - rhs) <= 2e-8 * np.linalg.norm(rhs)
     assert turned <= 30
-    assert conjugate_gradients(large.assembler.pattern, tangent, rotated.at(None), rhs, 1e-8)[1] >= 2 * turned
+    assert (
+        conjugate_gradients(large.assembler.pattern, tangent, rotated.at(None), rhs, 1e-8)[1]
+        >= 2 * turned
+    )
 
 
 @pytest.mark.parametrize("plain", [False, True])
-def test_conjugate_gradients_notice_an_indefinite_tangent(large: FullOrderModel, plain: bool) -> None:
+def test_conjugate_gradients_notice_an_indefinite_tangent(
+    large: FullOrderModel, plain: bool
+) -> None:
     """One negative eigenvalue: without a look at the curvature they would converge."""
     pattern, values = large.assembler.pattern, large.rest_tangent
     spoilt = values.copy()
@@ -249,25 +301,41 @@ def test_conjugate_gradients_notice_an_indefinite_tangent(large: FullOrderModel,
         conjugate_gradients(pattern, spoilt, preconditioner, np.ones(large.n_unknowns), 1e-6)
 
 
-def test_multigrid_solves_as_the_banded_factor_does_and_accelerates(large: FullOrderModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_multigrid_solves_as_the_banded_factor_does_and_accelerates(
+    large: FullOrderModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("mor_bench.mechanics.linear.MAX_BAND_ENTRIES", 0)
     model = FullOrderModel(large.scene)
     rhs = np.random.default_rng(0).normal(size=(large.n_unknowns, 2))
     assert isinstance(model.rest_factor, MultigridFactor)
     expected = large.rest_factor.solve(rhs)
-    np.testing.assert_allclose(model.rest_factor.solve(rhs), expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        model.rest_factor.solve(rhs), expected, rtol=0, atol=1e-8 * np.abs(expected).max()
+    )
     load = tip_load(large.scene, 1.0)
     solution = model.solve(load)
     assert solution.iterations <= 40
-    np.testing.assert_allclose(solution.displacement, large.solve(load).displacement, rtol=0, atol=1e-6 * np.abs(solution.displacement).max())
+    np.testing.assert_allclose(
+        solution.displacement,
+        large.solve(load).displacement,
+        rtol=0,
+        atol=1e-6 * np.abs(solution.displacement).max(),
+    )
 
 
 @pytest.mark.parametrize(("thickness", "may_fail"), [(0.1, False), (0.01, True)])
-def test_multigrid_bears_plates_or_says_why_not(thickness: float, may_fail: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_multigrid_bears_plates_or_says_why_not(
+    thickness: float, may_fail: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The coarsest matrix of the thinner one is not definite in single precision."""
     spec = mor_bench.load_scene("beam-coarse").spec.model_dump(mode="json")
     spec["loads"]["patch_area_m2"] = 1.0
-    scene = mor_bench.load_scene({**spec, "geometry": {"shape": "box", "size_m": [4.0, 1.0, thickness], "cells": [40, 20, 2]}})
+    scene = mor_bench.load_scene(
+        {
+            **spec,
+            "geometry": {"shape": "box", "size_m": [4.0, 1.0, thickness], "cells": [40, 20, 2]},
+        }
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IllConditionedWarning)
         expected = FullOrderModel(scene).rest_factor.solve(np.ones(len(scene.free_dofs)))
@@ -284,7 +352,12 @@ def test_multigrid_bears_plates_or_says_why_not(thickness: float, may_fail: bool
 
 def test_a_load_has_the_same_answer_alone_and_among_others(large: FullOrderModel) -> None:
     rng = np.random.default_rng(0)
-    loads = np.stack([tip_load(large.scene, newton) for newton in (0.1, 0.0, 1.0, 3.0, 200.0, *rng.uniform(0.0, 2.0, 20))])
+    loads = np.stack(
+        [
+            tip_load(large.scene, newton)
+            for newton in (0.1, 0.0, 1.0, 3.0, 200.0, *rng.uniform(0.0, 2.0, 20))
+        ]
+    )
     refused = 0
     for load, among in zip(loads, large.solve_many(loads), strict=True):
         if isinstance(among, SolverError):
@@ -294,5 +367,9 @@ def test_a_load_has_the_same_answer_alone_and_among_others(large: FullOrderModel
             continue
         alone = large.solve(load)
         assert (alone.displacement == among.displacement).all()
-        assert (alone.min_det_f, alone.iterations, alone.cuts) == (among.min_det_f, among.iterations, among.cuts)
+        assert (alone.min_det_f, alone.iterations, alone.cuts) == (
+            among.min_det_f,
+            among.iterations,
+            among.cuts,
+        )
     assert refused == 1

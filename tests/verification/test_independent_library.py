@@ -47,24 +47,42 @@ def felupe_solution(scene: Scene, forces: Array) -> Array:
     """Displacements, (n_nodes, 3) m."""
     tetrahedra = scene.mesh.cells.shape[1] == 4
     mesh = felupe.Mesh(scene.mesh.points, scene.mesh.cells, "tetra" if tetrahedra else "hexahedron")
-    field = felupe.FieldContainer([felupe.Field((felupe.RegionTetra if tetrahedra else felupe.RegionHexahedron)(mesh), dim=3)])
-    fixed = {"support": felupe.Boundary(field[0], mask=np.isin(np.arange(scene.mesh.n_nodes), scene.fixed_nodes))}
+    field = felupe.FieldContainer(
+        [felupe.Field((felupe.RegionTetra if tetrahedra else felupe.RegionHexahedron)(mesh), dim=3)]
+    )
+    fixed = {
+        "support": felupe.Boundary(
+            field[0], mask=np.isin(np.arange(scene.mesh.n_nodes), scene.fixed_nodes)
+        )
+    }
     dof0, dof1 = felupe.dof.partition(field, fixed)
     load = felupe.PointLoad(field, np.arange(scene.mesh.n_nodes), forces)
-    result = felupe.newtonraphson(items=[felupe.SolidBody(felupe_law(scene), field), load], dof0=dof0, dof1=dof1, tol=1e-11, verbose=0)
+    result = felupe.newtonraphson(
+        items=[felupe.SolidBody(felupe_law(scene), field), load],
+        dof0=dof0,
+        dof1=dof1,
+        tol=1e-11,
+        verbose=0,
+    )
     return np.asarray(result.x[0].values)
 
 
 def compare(scene: Scene, n_loads: int) -> None:
     """Solve random loads on random patches by both; 1e-8 is the largest relative difference allowed."""
-    model, rng, weights = FullOrderModel(scene), np.random.default_rng(7), scene.patch_weights.toarray()
+    model, rng, weights = (
+        FullOrderModel(scene),
+        np.random.default_rng(7),
+        scene.patch_weights.toarray(),
+    )
     for _ in range(n_loads):
         direction = rng.normal(size=3)
         vector = direction / np.linalg.norm(direction) * rng.uniform(0.2, 1.0)
         forces = weights[rng.integers(len(weights))][:, None] * vector
         ours = np.zeros(scene.mesh.n_dofs)
         load = forces.ravel()[scene.free_dofs]
-        ours[scene.free_dofs] = model.solve(load, options=NewtonOptions(tolerance=1e-10)).displacement
+        ours[scene.free_dofs] = model.solve(
+            load, options=NewtonOptions(tolerance=1e-10)
+        ).displacement
         theirs = felupe_solution(scene, forces).ravel()
         assert np.linalg.norm(ours - theirs) <= 1e-8 * np.linalg.norm(theirs)
 
@@ -80,4 +98,9 @@ def test_agrees_with_felupe_on_every_law_and_element(law: str, element: str) -> 
     material = material_table(law, 500.0, 0.4)
     if law == "ogden":
         material |= {"alpha": [2.0, -2.0], "mu_pa": [140.0, -35.0]}
-    compare(mor_bench.load_scene({**spec, "discretisation": {"element": element}, "material": material}), 5)
+    compare(
+        mor_bench.load_scene(
+            {**spec, "discretisation": {"element": element}, "material": material}
+        ),
+        5,
+    )

@@ -13,7 +13,12 @@ from mor_bench.errors import NoEquilibriumError, SolverError
 from mor_bench.harness.stress.setups import LAW, LIMIT_PA, Arch, confined_column, dense, make_arch
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import solve_equilibrium
-from mor_bench.mechanics.stability import LimitPoint, limit_load, lowest_tangent_eigenvalue, solve_on_path
+from mor_bench.mechanics.stability import (
+    LimitPoint,
+    limit_load,
+    lowest_tangent_eigenvalue,
+    solve_on_path,
+)
 from mor_bench.scene.scene import Scene
 
 Array = NDArray[np.float64]
@@ -23,7 +28,9 @@ def test_limit_of_confined_compression() -> None:
     """At stretch α the tangent is (3α² - 1)/2 of that at rest: it vanishes at α = 1/√3."""
     problem = confined_column()
     for alpha in (0.7, 0.9, 1.2):
-        assert lowest_tangent_eigenvalue(problem, np.array([alpha - 1])) == pytest.approx((3 * alpha**2 - 1) / 2, rel=1e-12)
+        assert lowest_tangent_eigenvalue(problem, np.array([alpha - 1])) == pytest.approx(
+            (3 * alpha**2 - 1) / 2, rel=1e-12
+        )
     limit = limit_load(problem, np.array([3 * LIMIT_PA]))
     assert limit is not None
     assert limit.factor == pytest.approx(1 / 3, rel=1e-7)
@@ -33,7 +40,9 @@ def test_limit_of_confined_compression() -> None:
 
 def named(error: NoEquilibriumError) -> tuple[float, float]:
     """The limit's factor and the eigenvalue that the message names."""
-    found = re.search(r"ends at (\S+) of the load, where the lowest tangent eigenvalue is (\S+) of", str(error))
+    found = re.search(
+        r"ends at (\S+) of the load, where the lowest tangent eigenvalue is (\S+) of", str(error)
+    )
     assert found is not None
     return float(found[1]), float(found[2])
 
@@ -45,15 +54,21 @@ def test_asked_for_more_the_path_ends_in_an_error_that_names_the_limit() -> None
     assert factor == pytest.approx(1 / 1.5, abs=1e-6)
     assert 0 < eigenvalue < 1e-3
     assert limit_load(confined_column(), np.array([0.99 * LIMIT_PA])) is None
-    np.testing.assert_allclose(1 + solve_on_path(confined_column(), np.array([0.99 * LIMIT_PA])), 0.6238701392, atol=1e-8)
+    np.testing.assert_allclose(
+        1 + solve_on_path(confined_column(), np.array([0.99 * LIMIT_PA])), 0.6238701392, atol=1e-8
+    )
 
 
 def test_lowest_eigenvalue_of_a_large_tangent_is_that_of_the_dense_matrices() -> None:
     scene = mor_bench.load_scene("beam-coarse")
     model = FullOrderModel(scene)
-    load = (scene.patch_weights[[62]].toarray()[0][:, None] * np.array([-2.0, 0.5, 1.0])).ravel()[scene.free_dofs]
+    load = (scene.patch_weights[[62]].toarray()[0][:, None] * np.array([-2.0, 0.5, 1.0])).ravel()[
+        scene.free_dofs
+    ]
     u = model.solve(load).displacement
-    tangent, rest = (dense(model.assembler, values) for values in (model.linearise(u)[1], model.rest_tangent))
+    tangent, rest = (
+        dense(model.assembler, values) for values in (model.linearise(u)[1], model.rest_tangent)
+    )
     expected = np.linalg.eigvals(np.linalg.solve(rest, tangent)).real.min()
     assert lowest_tangent_eigenvalue(model, u) == pytest.approx(expected, rel=1e-6)
     assert lowest_tangent_eigenvalue(model, 0 * u) == pytest.approx(1.0, rel=1e-10)
@@ -71,14 +86,18 @@ def limit(arch: Arch) -> LimitPoint:
     return found
 
 
-def test_limit_of_the_arch_is_the_greatest_reaction_to_a_prescribed_displacement(arch: Arch, limit: LimitPoint) -> None:
+def test_limit_of_the_arch_is_the_greatest_reaction_to_a_prescribed_displacement(
+    arch: Arch, limit: LimitPoint
+) -> None:
     assert limit.factor == pytest.approx(arch.greatest_reaction(), rel=1e-6)
     assert 0 < limit.lowest_eigenvalue < 1e-3
     assert arch.reactions(np.linspace(0.0, 0.4, 81))[-1] < limit.factor
 
 
 @pytest.mark.parametrize("factor", [1.01, 1.5, 3.0])
-def test_beyond_its_limit_the_arch_snaps_to_a_stable_state_or_says_why_not(arch: Arch, limit: LimitPoint, factor: float) -> None:
+def test_beyond_its_limit_the_arch_snaps_to_a_stable_state_or_says_why_not(
+    arch: Arch, limit: LimitPoint, factor: float
+) -> None:
     load = factor * limit.factor * arch.load
     with pytest.raises(NoEquilibriumError) as caught:
         solve_on_path(arch.problem, load)
@@ -97,17 +116,23 @@ def test_beyond_its_limit_the_arch_snaps_to_a_stable_state_or_says_why_not(arch:
 def test_an_unstable_equilibrium_is_never_returned_by_the_accelerated_pass() -> None:
     """The arch as a whole model, held on the falling part of its path: the residual vanishes, the tangent is indefinite."""
     arch = make_arch()
-    model = FullOrderModel(Scene(mor_bench.load_scene("beam-tiny").spec, arch.mesh, LAW, np.flatnonzero(arch.fixed)))
+    model = FullOrderModel(
+        Scene(mor_bench.load_scene("beam-tiny").spec, arch.mesh, LAW, np.flatnonzero(arch.fixed))
+    )
     crown = arch.crown
     others, q = np.setdiff1d(np.arange(model.n_unknowns), crown), np.zeros(model.n_unknowns)
     for depth in np.linspace(0.0, 0.35, 71):
         q[crown] = -depth
         for _ in range(8):
             state, values = model.linearise(q)
-            q[others] -= np.linalg.solve(dense(model.assembler, values)[np.ix_(others, others)], state.force[others])
+            q[others] -= np.linalg.solve(
+                dense(model.assembler, values)[np.ix_(others, others)], state.force[others]
+            )
     assert lowest_tangent_eigenvalue(model, q) < 0
     load = model.force(q).force
     for start in (None, q, q * (1 + 1e-6)):
         solution = model.solve(load, start)
         assert lowest_tangent_eigenvalue(model, solution.displacement) > 0
-        assert np.linalg.norm(load - model.force(solution.displacement).force) <= 1e-8 * np.linalg.norm(load)
+        assert np.linalg.norm(
+            load - model.force(solution.displacement).force
+        ) <= 1e-8 * np.linalg.norm(load)

@@ -53,8 +53,15 @@ class _Method:
         worker = Worker(self.scene, [], nursery=nursery)
         model = self.folder / "model.safetensors"
         worker.ask(
-            "fit", 60.0, surrogate=self.surrogate, parameters=self.parameters, train=self.folder, model=model, threads=1, limit_s=60.0
-        )  # fmt: skip
+            "fit",
+            60.0,
+            surrogate=self.surrogate,
+            parameters=self.parameters,
+            train=self.folder,
+            model=model,
+            threads=1,
+            limit_s=60.0,
+        )
         return worker
 
 
@@ -63,9 +70,19 @@ def _queries(scene: Scene, folder: Path) -> Queries:
     return Queries(forces, np.ones_like(forces), np.arange(forces.shape[1]), folder)
 
 
-def _measured(scene: Scene, folder: Path, methods: dict[str, tuple[str, dict[str, Any]]], seed: int, processes: str = "full") -> dict[str, Timing]:
-    openers = {name: Opener(_Method(scene, folder, *method), 1e8) for name, method in methods.items()}
-    timings = measure(openers, _queries(scene, folder), PROTOCOLS[processes], 1, seed=seed, single_only=True)
+def _measured(
+    scene: Scene,
+    folder: Path,
+    methods: dict[str, tuple[str, dict[str, Any]]],
+    seed: int,
+    processes: str = "full",
+) -> dict[str, Timing]:
+    openers = {
+        name: Opener(_Method(scene, folder, *method), 1e8) for name, method in methods.items()
+    }
+    timings = measure(
+        openers, _queries(scene, folder), PROTOCOLS[processes], 1, seed=seed, single_only=True
+    )
     failed = {name: timing.failed for name, timing in timings.items() if timing.failed}
     if failed:
         raise SystemExit(f"failed: {failed}")
@@ -76,16 +93,29 @@ def _matrix(timings: dict[str, Timing], folder: Path) -> dict[tuple[str, str], s
     """The verdicts that the report's matrix gives on methods of equal errors, at the error of 1 % that all meet."""
     comparison = Comparison(folder / "run", {}, settings={})
     regions = np.repeat(np.arange(13), 20)[:, None]
-    comparison.add_dataset(DATASET, {"needs": {"error": 0.01, "latency_ms": 3.0}}, {"test_regions": regions})
+    comparison.add_dataset(
+        DATASET, {"needs": {"error": 0.01, "latency_ms": 3.0}}, {"test_regions": regions}
+    )
     errors = 1e-3 * np.random.default_rng(0).uniform(0.5, 2.0, len(regions))
     for name, timing in timings.items():
         row = {
-            "dataset": DATASET, "method": name, "label": name, "parameters": {}, "status": "ok", "split": "region", "n_failed": 0,
-            "error": {"rel_l2_median": float(np.median(errors)), "mean_dof_m": 1e-4}, "latency_ms": {"median": float(np.median(timing.latency_ms))},
+            "dataset": DATASET,
+            "method": name,
+            "label": name,
+            "parameters": {},
+            "status": "ok",
+            "split": "region",
+            "n_failed": 0,
+            "error": {"rel_l2_median": float(np.median(errors)), "mean_dof_m": 1e-4},
+            "latency_ms": {"median": float(np.median(timing.latency_ms))},
             "offline_s": {"data": 0.0, "fit": 0.0},
-        }  # fmt: skip
+        }
         comparison.put(row, {**timing.samples, "relative_l2": errors, "mean_dof_m": 0.1 * errors})
-    return {(r["a"], r["b"]): r["verdict"] for r in analyse(comparison)["pairwise"] if r["target_rel_l2_median"] == 0.01}
+    return {
+        (r["a"], r["b"]): r["verdict"]
+        for r in analyse(comparison)["pairwise"]
+        if r["target_rel_l2_median"] == 0.01
+    }
 
 
 def comparisons(n: int, scene: Scene, folder: Path) -> tuple[list[int], list[int]]:
@@ -103,22 +133,36 @@ def comparisons(n: int, scene: Scene, folder: Path) -> tuple[list[int], list[int
         timings = _measured(scene, folder, methods, start)
         matrix = _matrix(timings, folder)
         for i in range(start, min(n, start + AT_ONCE)):
-            one, same, slowed = (timings[f"{name}{i}"].samples for name in ("one", "same", "slowed"))
+            one, same, slowed = (
+                timings[f"{name}{i}"].samples for name in ("one", "same", "slowed")
+            )
             false[0] += compare_latency(one, same)["verdict"] != "undecided"
             found[0] += compare_latency(slowed, one)["verdict"] == "slower"
             false[1] += matrix[f"one{i}", f"same{i}"] != "undecided"
             found[1] += matrix[f"slowed{i}", f"one{i}"] == "slower"
-        print(f"{min(n, start + AT_ONCE)} comparisons: {false} identical called different, {found} slowed found", flush=True)
+        print(
+            f"{min(n, start + AT_ONCE)} comparisons: {false} identical called different, {found} slowed found",
+            flush=True,
+        )
     return false, found
 
 
 def reruns(scene: Scene, folder: Path, protocol: str) -> float:
     """The share of medians, measured again, in the interval that the measurement before states."""
-    runs = [{name: timing.samples for name, timing in _measured(scene, folder, RERUN_METHODS, seed, protocol).items()} for seed in range(RERUNS)]
+    runs = [
+        {
+            name: timing.samples
+            for name, timing in _measured(scene, folder, RERUN_METHODS, seed, protocol).items()
+        }
+        for seed in range(RERUNS)
+    ]
     inside = []
     for before, after in pairwise(runs):
         stated = intervals_of(before)
-        inside += [stated[name][0] <= np.median(after[name]["latency_ms"]) <= stated[name][1] for name in after]
+        inside += [
+            stated[name][0] <= np.median(after[name]["latency_ms"]) <= stated[name][1]
+            for name in after
+        ]
     return float(np.mean(inside))
 
 
@@ -143,13 +187,22 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         marked = beside_a_busy_process(scene, folder)
-        print(f"a timing beside a busy process is marked, and a quiet one is not: {marked}", flush=True)
+        print(
+            f"a timing beside a busy process is marked, and a quiet one is not: {marked}",
+            flush=True,
+        )
         shares = {protocol: reruns(scene, folder, protocol) for protocol in PROTOCOLS}
-        print(f"medians measured again inside the stated interval (target 90 %): {shares}", flush=True)
+        print(
+            f"medians measured again inside the stated interval (target 90 %): {shares}", flush=True
+        )
         false, found = comparisons(n, scene, folder)
-    print(f"by compare_latency and by the report's matrix: identical code called different in {false} of {n} (target at most 5 %)")
+    print(
+        f"by compare_latency and by the report's matrix: identical code called different in {false} of {n} (target at most 5 %)"
+    )
     print(f"slowed by a tenth found in {found} of {n} (target at least 95 %)")
-    if not (marked and min(shares.values()) >= 0.9 and max(false) <= 0.05 * n and min(found) >= 0.95 * n):
+    if not (
+        marked and min(shares.values()) >= 0.9 and max(false) <= 0.05 * n and min(found) >= 0.95 * n
+    ):
         raise SystemExit(1)
 
 

@@ -14,7 +14,13 @@ from time import perf_counter
 from typing import Any
 
 from mor_bench import __version__
-from mor_bench.errors import InvalidInputError, MissingDependencyError, MorBenchError, OutOfTimeError, UnsupportedSceneError
+from mor_bench.errors import (
+    InvalidInputError,
+    MissingDependencyError,
+    MorBenchError,
+    OutOfTimeError,
+    UnsupportedSceneError,
+)
 from mor_bench.harness.isolation import Worker, default_memory_limit_bytes
 from mor_bench.harness.stress import mechanics, methods, reduction
 from mor_bench.harness.stress.case import LONGEST, Case, Outcome, Scenes, Subject, Verdict, every
@@ -92,7 +98,12 @@ class Stress:
     def write(self, path: Path) -> None:
         """Write `as_dict` as JSON."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, (json.dumps(self.as_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode())
+        write_atomically(
+            path,
+            (
+                json.dumps(self.as_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+            ).encode(),
+        )
 
 
 def stress(
@@ -141,20 +152,34 @@ def stress(
         if name not in CASE_NAMES:
             near = get_close_matches(name, CASE_NAMES, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else "."
-            raise InvalidInputError(f"`cases` must be of {', '.join(CASE_NAMES)}; got {name!r}{hint}")
+            raise InvalidInputError(
+                f"`cases` must be of {', '.join(CASE_NAMES)}; got {name!r}{hint}"
+            )
     if methods is not None and (isinstance(methods, str | Path) or not methods):
-        raise InvalidInputError(f"`methods` must be a list of names or paths, not empty; got {methods!r}.")
+        raise InvalidInputError(
+            f"`methods` must be a list of names or paths, not empty; got {methods!r}."
+        )
     scenes = Scenes(cache)
     _ = scenes.tiny  # what keeps it from being read is no method's fault
     wanted = [case.name for case in CASES if not cases or case.name in cases]
-    specs = [load_method_spec(method, suite) for method in (list_suite("methods", suite) if methods is None else methods)]
+    specs = [
+        load_method_spec(method, suite)
+        for method in (list_suite("methods", suite) if methods is None else methods)
+    ]
     with ExitStack() as stack:
-        tried = [_Here(spec, profile, wanted, scenes) if spec.folder is None else _Apart(spec, profile, wanted, cache) for spec in specs]
+        tried = [
+            _Here(spec, profile, wanted, scenes)
+            if spec.folder is None
+            else _Apart(spec, profile, wanted, cache)
+            for spec in specs
+        ]
         for trial in tried:
             stack.callback(trial.end)
         total = sum(len(trial.cases) for trial in tried)
         if total == 0:
-            raise InvalidInputError(f"none of the cases {', '.join(cases or ())} concerns {', '.join(spec.name for spec in specs)}.")
+            raise InvalidInputError(
+                f"none of the cases {', '.join(cases or ())} concerns {', '.join(spec.name for spec in specs)}."
+            )
         rows: list[Row] = []
         for trial in tried:
             for number, (name, part) in enumerate(trial.cases):
@@ -178,7 +203,9 @@ def concerning(subject: Subject, names: Sequence[str]) -> list[tuple[Case, str |
 class _Here:
     """A method of the suite, tried in this process."""
 
-    def __init__(self, spec: MethodSpec, profile: str, names: Sequence[str], scenes: Scenes) -> None:
+    def __init__(
+        self, spec: MethodSpec, profile: str, names: Sequence[str], scenes: Scenes
+    ) -> None:
         self.name = spec.name
         self._subject = Subject(spec, profile, scenes)
         with suppress(MissingDependencyError):
@@ -197,7 +224,9 @@ class _Here:
 class _Apart:
     """A third party's method, tried in a process of its own, which is started again after a case that ended it."""
 
-    def __init__(self, spec: MethodSpec, profile: str, names: Sequence[str], cache: Path | None) -> None:
+    def __init__(
+        self, spec: MethodSpec, profile: str, names: Sequence[str], cache: Path | None
+    ) -> None:
         self.name = spec.name
         self._spec, self._profile, self._names, self._cache = spec, profile, list(names), cache
         self._worker: Worker | None = None
@@ -205,9 +234,20 @@ class _Apart:
 
     def _start(self) -> list[tuple[str, str]]:
         self._worker = Worker(None, [], self._spec.folder, default_memory_limit_bytes())
-        asked = {"method": self._spec, "profile": self._profile, "cases": self._names, "cache": self._cache}
+        asked = {
+            "method": self._spec,
+            "profile": self._profile,
+            "cases": self._names,
+            "cache": self._cache,
+        }
         where = f"method {self._spec.name}"
-        self._worker.ask("check", CASE_S, surrogate=self._spec.surrogate, configurations=[self._spec.parameters_of(self._profile)], where=where)
+        self._worker.ask(
+            "check",
+            CASE_S,
+            surrogate=self._spec.surrogate,
+            configurations=[self._spec.parameters_of(self._profile)],
+            where=where,
+        )
         return [(name, part) for name, part in self._worker.ask("stress", CASE_S, **asked)["cases"]]
 
     def row(self, number: int) -> Row:
@@ -221,7 +261,16 @@ class _Apart:
             return Row(**self._worker.ask("stress_case", CASE_S, number=number)["row"])
         except MorBenchError as error:
             self.end()
-            return Row(name, part, self.name, case.expected, str(error), "fall short", {}, perf_counter() - begun)
+            return Row(
+                name,
+                part,
+                self.name,
+                case.expected,
+                str(error),
+                "fall short",
+                {},
+                perf_counter() - begun,
+            )
 
     def end(self) -> None:
         """End the process."""
@@ -248,7 +297,16 @@ def attempt(case: Case, subject: Subject, missing: str | None) -> Row:
         except (Exception, SystemExit) as error:  # third parties' code runs here
             outcome = Outcome("fall short", f"crashed with {type(error).__name__}: {error}")
     measured = {name: _for_json(value) for name, value in outcome.measured.items()}
-    return Row(case.name, case.part, subject.name, case.expected, outcome.happened, outcome.verdict, measured, perf_counter() - begun)
+    return Row(
+        case.name,
+        case.part,
+        subject.name,
+        case.expected,
+        outcome.happened,
+        outcome.verdict,
+        measured,
+        perf_counter() - begun,
+    )
 
 
 def _for_json(value: Any) -> Any:

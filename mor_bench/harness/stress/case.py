@@ -64,13 +64,23 @@ class Scenes:
     @cached_property
     def tiny(self) -> Dataset:
         """beam-tiny with the test sets that it has."""
-        return load_dataset(self.spec, tests=["in-range", "2x", "4x", "unseen-regions", "several-forces"], cache=self._cache)
+        return load_dataset(
+            self.spec,
+            tests=["in-range", "2x", "4x", "unseen-regions", "several-forces"],
+            cache=self._cache,
+        )
 
     @cached_property
     def pressed(self) -> Dataset:
         """beam-tiny under forces along the surface's normal only, so that there are directions that training never saw."""
         content = self.spec.model_dump()
-        spec = DatasetSpec.model_validate({**content, "name": f"{self.spec.name}-pressed", "loads": {**content["loads"], "kind": "normal"}})
+        spec = DatasetSpec.model_validate(
+            {
+                **content,
+                "name": f"{self.spec.name}-pressed",
+                "loads": {**content["loads"], "kind": "normal"},
+            }
+        )
         return load_dataset(spec, tests=["in-range", "unseen-directions"], cache=self._cache)
 
     @cached_property
@@ -185,7 +195,9 @@ def with_samples(snapshots: Snapshots, rows: NDArray[np.int64], zeros: int = 0) 
     assert isinstance(chosen.loads, PatchLoads)
     kept = np.arange(len(rows)) < len(rows) - zeros
     loads = replace(chosen.loads, vectors=chosen.loads.vectors * kept[:, None, None])
-    return replace(chosen, loads=loads, free_displacements=chosen.free_displacements * kept[:, None])
+    return replace(
+        chosen, loads=loads, free_displacements=chosen.free_displacements * kept[:, None]
+    )
 
 
 def rms(values: NDArray[np.float64]) -> float:

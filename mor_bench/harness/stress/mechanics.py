@@ -92,12 +92,18 @@ def inversion(subject: Subject) -> Outcome:
                     try:
                         q = solve_equilibrium(column, np.array([level * LIMIT_PA]), q).displacement
                     except SolverError as error:
-                        counts["inverted" if isinstance(error, InvertedElementError) else "no equilibrium"] += 1
+                        counts[
+                            "inverted"
+                            if isinstance(error, InvertedElementError)
+                            else "no equilibrium"
+                        ] += 1
                         if level <= 1:
                             wrong.append(f"{kind}: refused at {level:.3g} of the limit")
                     else:
                         if level > 1:
-                            wrong.append(f"{kind}: answered at {level:.3g} of the limit with stretch {1 + q[0]:.3g}")
+                            wrong.append(
+                                f"{kind}: answered at {level:.3g} of the limit with stretch {1 + q[0]:.3g}"
+                            )
     told = f"{counts['inverted']} loads beyond the limit ended as inverted, {counts['no equilibrium']} as no-equilibrium"
     return judged(not wrong, "; ".join([told, *wrong[:3]]), **counts, wrong=len(wrong))
 
@@ -112,12 +118,21 @@ def snap_through(subject: Subject) -> Outcome:
         solve_on_path(arch.problem, 1.5 * limit.factor * arch.load)
     except NoEquilibriumError as error:
         beyond = str(error)
-    named = re.search(r"ends at \S+ of the load, where the lowest tangent eigenvalue is \S+ of", beyond) is not None
+    named = (
+        re.search(r"ends at \S+ of the load, where the lowest tangent eigenvalue is \S+ of", beyond)
+        is not None
+    )
     off = abs(limit.factor / exact - 1)
     happened = f"limit {limit.factor:.6g} N, {off:.0e} from the top of the displacement-driven path; lowest eigenvalue {limit.lowest_eigenvalue:.1e}"
     good = off <= 1e-6 and 0 < limit.lowest_eigenvalue < 1e-3 and named
     happened += "" if named else f"; beyond it: {beyond}"
-    return judged(good, happened, limit_n=limit.factor, exact_n=exact, lowest_eigenvalue=limit.lowest_eigenvalue)
+    return judged(
+        good,
+        happened,
+        limit_n=limit.factor,
+        exact_n=exact,
+        lowest_eigenvalue=limit.lowest_eigenvalue,
+    )
 
 
 def near_incompressible(subject: Subject) -> Outcome:
@@ -131,13 +146,24 @@ def near_incompressible(subject: Subject) -> Outcome:
                 model = cantilever(size, cells, poisson, integration, solver=solver)
             load = tip_load(model, -50.0)
             solution = model.solve(load)
-            residual = float(np.linalg.norm(load - model.force(solution.displacement).force) / np.linalg.norm(load))
-            good &= residual <= 1e-8 and solution.min_det_f > 0 and bool(locking) == (integration == "full")
+            residual = float(
+                np.linalg.norm(load - model.force(solution.displacement).force)
+                / np.linalg.norm(load)
+            )
+            good &= (
+                residual <= 1e-8
+                and solution.min_det_f > 0
+                and bool(locking) == (integration == "full")
+            )
             ratios.append(float(tip(model, -50.0)[2] / reference))
         good &= abs(ratios[1] - 1) <= 0.08
         told.append(f"{poisson}: {ratios[0]:.2f}, {ratios[1]:.2f}")
         measured[f"full_{poisson}"], measured[f"selective_{poisson}"] = ratios
-    return judged(good, f"tip deflection over that of ν = 0.3, full and selective integration, by ν: {'; '.join(told)}", **measured)
+    return judged(
+        good,
+        f"tip deflection over that of ν = 0.3, full and selective integration, by ν: {'; '.join(told)}",
+        **measured,
+    )
 
 
 def slender(subject: Subject) -> Outcome:
@@ -154,7 +180,10 @@ def slender(subject: Subject) -> Outcome:
     actual = 1 - deflections[0] / SLENDER_EXACT
     happened = f"w/L {', '.join(f'{w:.4f}' for w in deflections)} with 50, 100, 200 cells along it; exact {SLENDER_EXACT}; "
     happened += f"locking of the first {actual:.0%}, reported by refinement {reported:.0%}"
-    good = deflections[0] < deflections[1] < deflections[2] < 1.02 * SLENDER_EXACT and reported >= 0.5 * actual
+    good = (
+        deflections[0] < deflections[1] < deflections[2] < 1.02 * SLENDER_EXACT
+        and reported >= 0.5 * actual
+    )
     return judged(good, happened, deflections=deflections, exact=SLENDER_EXACT, reported=reported)
 
 
@@ -171,21 +200,36 @@ def huge_step(subject: Subject) -> Outcome:
     happened = f"{solution.iterations} iterations and {solution.cuts} cut-backs to within {off:.0e} of 20 small steps"
     said = _told_beyond_the_limit(3)
     good = off <= 1e-6 and "4 cut-backs" in said
-    return judged(good, f"{happened}; beyond the limit load: {said}", off=off, iterations=solution.iterations, cuts=solution.cuts)
+    return judged(
+        good,
+        f"{happened}; beyond the limit load: {said}",
+        off=off,
+        iterations=solution.iterations,
+        cuts=solution.cuts,
+    )
 
 
 def _told_beyond_the_limit(max_cuts: int) -> str:
     try:
-        solve_equilibrium(confined_column(), np.array([3 * LIMIT_PA]), options=NewtonOptions(max_cuts=max_cuts))
+        solve_equilibrium(
+            confined_column(), np.array([3 * LIMIT_PA]), options=NewtonOptions(max_cuts=max_cuts)
+        )
     except SolverError as error:
         return str(error)
     return "answered"
 
 
 def distortion(subject: Subject) -> Outcome:
-    errors = {kind: patch_test_error(distorted_box((3, 3, 3), tetrahedra), selective=selective) for kind, (tetrahedra, selective) in KINDS.items()}
+    errors = {
+        kind: patch_test_error(distorted_box((3, 3, 3), tetrahedra), selective=selective)
+        for kind, (tetrahedra, selective) in KINDS.items()
+    }
     told = ", ".join(f"{kind} {error:.1e}" for kind, error in errors.items())
-    return judged(max(errors.values()) <= 1e-12, f"largest error of the patch test on 1 m, m: {told}", **errors)
+    return judged(
+        max(errors.values()) <= 1e-12,
+        f"largest error of the patch test on 1 m, m: {told}",
+        **errors,
+    )
 
 
 def stiffness_contrast(subject: Subject) -> Outcome:
@@ -203,17 +247,26 @@ def stiffness_contrast(subject: Subject) -> Outcome:
         said.append(bool(found))
     warned = ["warned" if found else "not warned" for found in said]
     happened = f"stretch of the soft bar right to {worst:.1e}; condition number told as up to {max(told):.1e}, {min(conditions):.2f} to "
-    happened += (
-        f"{max(conditions):.2f} of the true one, which leaves {int(15.9 - np.log10(max(told)))} digits and no warning; {warned[0]} of a beam 20 "
-    )
+    happened += f"{max(conditions):.2f} of the true one, which leaves {int(15.9 - np.log10(max(told)))} digits and no warning; {warned[0]} of a beam 20 "
     happened += f"times as long as high, {warned[1]} of one 1,000 times"
-    good = worst <= 2e-6 and min(conditions) >= 0.1 and max(conditions) <= 1.01 and said == [False, True]
+    good = (
+        worst <= 2e-6
+        and min(conditions) >= 0.1
+        and max(conditions) <= 1.01
+        and said == [False, True]
+    )
     return judged(good, happened, relative_error=worst, condition_ratios=conditions)
 
 
 FREE = {
-    "no support": ([], "translation x, translation y, translation z, rotation about x, rotation about y, rotation about z"),
-    "one node": ([{"region": {"sphere_m": [[0.0, 0.0, 0.0], 0.01]}}], "rotation about x, rotation about y, rotation about z"),
+    "no support": (
+        [],
+        "translation x, translation y, translation z, rotation about x, rotation about y, rotation about z",
+    ),
+    "one node": (
+        [{"region": {"sphere_m": [[0.0, 0.0, 0.0], 0.01]}}],
+        "rotation about x, rotation about y, rotation about z",
+    ),
     "one edge": ([{"region": {"box_m": [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]}}], "rotation about z"),
 }
 """Supports that leave rigid motions free, and which."""
@@ -227,8 +280,14 @@ def unconstrained(subject: Subject) -> Outcome:
             FullOrderModel(scene)
             wrong.append(f"{held}: taken")
         except UnconstrainedBodyError as error:
-            wrong += [f"{held}: {mode} not named" for mode in modes.split(", ") if mode not in str(error)]
-    return judged(not wrong, "; ".join(wrong) or f"{', '.join(FREE)}: refused, every free motion named", wrong=len(wrong))
+            wrong += [
+                f"{held}: {mode} not named" for mode in modes.split(", ") if mode not in str(error)
+            ]
+    return judged(
+        not wrong,
+        "; ".join(wrong) or f"{', '.join(FREE)}: refused, every free motion named",
+        wrong=len(wrong),
+    )
 
 
 def _bad_meshes() -> dict[str, Callable[[], object]]:
@@ -243,7 +302,12 @@ def _bad_meshes() -> dict[str, Callable[[], object]]:
     turned = replace(mesh, cells=mesh.cells[:, [4, 5, 6, 7, 0, 1, 2, 3]])
     short = replace(mesh, cells=mesh.cells[:, :5])
     found: dict[str, Callable[[], object]] = {}
-    for name, bad in {"NaN": with_point(np.nan), "infinity": with_point(np.inf), "flat cells": flat, "five-noded cells": short}.items():
+    for name, bad in {
+        "NaN": with_point(np.nan),
+        "infinity": with_point(np.inf),
+        "flat cells": flat,
+        "five-noded cells": short,
+    }.items():
         found[f"{name}, in a model"] = lambda bad=bad: free_assembler(bad)  # type: ignore[misc]
         found[f"{name}, in a file"] = lambda bad=bad: tidied(bad.points, bad.cells)  # type: ignore[misc]
     found["cells inside out, in a model"] = lambda: free_assembler(turned)
@@ -254,18 +318,57 @@ def _bad_meshes() -> dict[str, Callable[[], object]]:
 def bad_mesh(subject: Subject) -> Outcome:
     bad = _bad_meshes()
     with np.errstate(invalid="ignore"):
-        wrong = [f"{name} {what}" for name, attempt in bad.items() if (what := refused(attempt, MorBenchError))]
-    return judged(not wrong, "; ".join(wrong) or f"{len(bad)} of {len(bad)} refused with a typed error: {'; '.join(bad)}", wrong=len(wrong))
+        wrong = [
+            f"{name} {what}"
+            for name, attempt in bad.items()
+            if (what := refused(attempt, MorBenchError))
+        ]
+    return judged(
+        not wrong,
+        "; ".join(wrong)
+        or f"{len(bad)} of {len(bad)} refused with a typed error: {'; '.join(bad)}",
+        wrong=len(wrong),
+    )
 
 
 CASES = (
-    Case("inversion", "", "inverted or no-equilibrium beyond the limit load, never ok", as_shipped, inversion),
-    Case("snap-through", "", "limit point reported, lowest tangent eigenvalue given", as_shipped, snap_through),
-    Case("near-incompressible", "", "converges; locking reported, selective integration cures it", full_order, near_incompressible),
+    Case(
+        "inversion",
+        "",
+        "inverted or no-equilibrium beyond the limit load, never ok",
+        as_shipped,
+        inversion,
+    ),
+    Case(
+        "snap-through",
+        "",
+        "limit point reported, lowest tangent eigenvalue given",
+        as_shipped,
+        snap_through,
+    ),
+    Case(
+        "near-incompressible",
+        "",
+        "converges; locking reported, selective integration cures it",
+        full_order,
+        near_incompressible,
+    ),
     Case("slender", "", "terminates; locking reported", full_order, slender),
     Case("huge-step", "", "converges or cuts back; cut-backs counted", full_order, huge_step),
     Case("distortion", "", "patch test within 1e-12", as_shipped, distortion),
-    Case("stiffness-contrast", "", "right answer; condition number told, and warned of where few digits are left", as_shipped, stiffness_contrast),
-    Case("unconstrained", "", "clear error that names the free rigid modes", as_shipped, unconstrained),
+    Case(
+        "stiffness-contrast",
+        "",
+        "right answer; condition number told, and warned of where few digits are left",
+        as_shipped,
+        stiffness_contrast,
+    ),
+    Case(
+        "unconstrained",
+        "",
+        "clear error that names the free rigid modes",
+        as_shipped,
+        unconstrained,
+    ),
     Case("bad-mesh", "", "typed error", as_shipped, bad_mesh),
 )

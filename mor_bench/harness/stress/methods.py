@@ -15,7 +15,17 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import MorBenchError, NotFittedError, UnknownRangeError
 from mor_bench.harness.metrics import sample_errors
-from mor_bench.harness.stress.case import Case, Outcome, Subject, answers, every, judged, learner, refused, rms
+from mor_bench.harness.stress.case import (
+    Case,
+    Outcome,
+    Subject,
+    answers,
+    every,
+    judged,
+    learner,
+    refused,
+    rms,
+)
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.surrogate import Surrogate
@@ -69,10 +79,19 @@ def bad_forces(subject: Subject) -> Outcome:
     before = method.predict(good)
     bad = _bad_forces(good)
     with np.errstate(all="ignore"):
-        wrong = [f"{name} {what}" for name, force in bad.items() if (what := refused(partial(method.predict, force), MorBenchError))]
+        wrong = [
+            f"{name} {what}"
+            for name, force in bad.items()
+            if (what := refused(partial(method.predict, force), MorBenchError))
+        ]
     if np.abs(method.predict(good) - before).max() > ROUND_OFF * np.abs(before).max():
         wrong.append("later answers differ")
-    return judged(not wrong, "; ".join(wrong) or f"{len(bad)} of {len(bad)} refused with a typed error, later answers unchanged", wrong=len(wrong))
+    return judged(
+        not wrong,
+        "; ".join(wrong)
+        or f"{len(bad)} of {len(bad)} refused with a typed error, later answers unchanged",
+        wrong=len(wrong),
+    )
 
 
 def _bad_snapshots(good: Snapshots) -> dict[str, Snapshots | None]:
@@ -92,7 +111,9 @@ def _bad_snapshots(good: Snapshots) -> dict[str, Snapshots | None]:
         "no sample": good[:0],
         "NaN in a displacement": displacements(with_value(u, np.nan)),
         "infinity in a displacement": displacements(with_value(u, np.inf)),
-        "NaN in a force": replace(good, loads=replace(loads, vectors=with_value(loads.vectors, np.nan))),
+        "NaN in a force": replace(
+            good, loads=replace(loads, vectors=with_value(loads.vectors, np.nan))
+        ),
         "a dof too few": displacements(u[:, :-1]),
         "a displacement too few": displacements(u[:-1]),
         "displacements per node": displacements(u.reshape(len(u), -1, 3)),
@@ -116,7 +137,11 @@ def bad_snapshots(subject: Subject) -> Outcome:
             wrong.append(f"saving after a refused fit {what}")
         if path.exists():
             wrong.append("a file was left")
-    return judged(not wrong, "; ".join(wrong) or f"{len(bad)} of {len(bad)} refused with a typed error, nothing kept", wrong=len(wrong))
+    return judged(
+        not wrong,
+        "; ".join(wrong) or f"{len(bad)} of {len(bad)} refused with a typed error, nothing kept",
+        wrong=len(wrong),
+    )
 
 
 def _published(method: Surrogate, snapshots: Snapshots) -> tuple[bool, str, dict[str, Any]]:
@@ -126,7 +151,13 @@ def _published(method: Surrogate, snapshots: Snapshots) -> tuple[bool, str, dict
     sound = bool(np.isfinite(predicted[~failed]).all())
     relative = sample_errors(predicted, snapshots.displacements).relative_l2
     p95, most = float(np.percentile(relative, 95, method="higher")), float(relative.max())
-    numbers = {"n": len(relative), "n_failed": int(failed.sum()), "rel_l2_median": float(np.median(relative)), "rel_l2_p95": p95, "rel_l2_max": most}
+    numbers = {
+        "n": len(relative),
+        "n_failed": int(failed.sum()),
+        "rel_l2_median": float(np.median(relative)),
+        "rel_l2_p95": p95,
+        "rel_l2_max": most,
+    }
     told = f"relative l2 {numbers['rel_l2_median']:.2g} median, {p95:.2g} p95, {most:.2g} max"
     told += f", {numbers['n_failed']} of {len(relative)} without an answer" if failed.any() else ""
     return sound, told if sound else f"{told}, some not finite", numbers
@@ -150,20 +181,30 @@ def out_of_distribution(name: str, subject: Subject) -> Outcome:
         return judged(sound, f"{told}; it has no training range", **numbers)
     unlike = _unlike(name, data)
     try:
-        flags, alarms = (np.asarray(method.out_of_range(data.tests[part].forces)) for part in (name, "in-range"))
+        flags, alarms = (
+            np.asarray(method.out_of_range(data.tests[part].forces)) for part in (name, "in-range")
+        )
     except UnknownRangeError as error:
         return judged(False, f"{told}; no flag: {error}", **numbers)
     share, false = float(flags[unlike].mean()), float(alarms.mean())
     told += f"; flagged {int(flags[unlike].sum())} of {int(unlike.sum())}{' larger than any of training' if name in ('2x', '4x') else ''}"
     told += f", in range {false:.0%}"
     needed = 1.0 if name in ("2x", "4x") else FLAGGED
-    return judged(sound and share >= needed and false <= FALSE_ALARMS, told, **numbers, flagged=share, flagged_in_range=false)
+    return judged(
+        sound and share >= needed and false <= FALSE_ALARMS,
+        told,
+        **numbers,
+        flagged=share,
+        flagged_in_range=false,
+    )
 
 
 def zero_force(subject: Subject) -> Outcome:
     answer = subject.fitted.predict(np.zeros((subject.data.scene.mesh.n_nodes, 3)))
     ratio = float(np.linalg.norm(answer)) / rms(subject.data.train.displacements)
-    return judged(ratio <= ZERO_FORCE, f"‖u‖ is {ratio:.2g} of the training root mean square", ratio=ratio)
+    return judged(
+        ratio <= ZERO_FORCE, f"‖u‖ is {ratio:.2g} of the training root mean square", ratio=ratio
+    )
 
 
 def symmetry(subject: Subject) -> Outcome:
@@ -171,39 +212,71 @@ def symmetry(subject: Subject) -> Outcome:
     data, exact = subject.data, isinstance(subject.fresh(), FullFEM)
     method = subject.fit(data, tolerance=1e-13) if exact else subject.fitted
     points, flip = data.scene.mesh.points, np.array([1.0, -1.0, 1.0])
-    mirror = np.array([int(np.linalg.norm(points - (p * flip + [0, 1, 0]), axis=1).argmin()) for p in points])
+    mirror = np.array(
+        [int(np.linalg.norm(points - (p * flip + [0, 1, 0]), axis=1).argmin()) for p in points]
+    )
     forces = data.test.forces[:20]
-    plain, mirrored = answers(method, forces), answers(method, np.ascontiguousarray(forces[:, mirror] * flip))
+    plain, mirrored = (
+        answers(method, forces),
+        answers(method, np.ascontiguousarray(forces[:, mirror] * flip)),
+    )
     size = np.linalg.norm(plain, axis=(1, 2))
     off = np.linalg.norm(mirrored - plain[:, mirror] * flip, axis=(1, 2)) / size
     median, most = float(np.median(off)), float(off.max())
-    happened = f"relative l2 between an answer and its mirror image {median:.2g} median, {most:.2g} max"
-    return judged(bool(np.isfinite(off).all()) and (not exact or most <= MIRRORED), happened, median=median, max=most)
+    happened = (
+        f"relative l2 between an answer and its mirror image {median:.2g} median, {most:.2g} max"
+    )
+    return judged(
+        bool(np.isfinite(off).all()) and (not exact or most <= MIRRORED),
+        happened,
+        median=median,
+        max=most,
+    )
 
 
 def two_runs(subject: Subject) -> Outcome:
     forces = subject.data.test.forces[:8]
     first, second = (subject.fit(subject.data, brief=True) for _ in range(2))
     once, again, other = first.predict(forces), first.predict(forces), second.predict(forces)
-    differences = {"asked again": float(np.abs(again - once).max()), "fitted again": float(np.abs(other - once).max())}
-    wrong = [f"{name}: {difference:.2g} m" for name, difference in differences.items() if difference != 0]
-    return judged(not wrong, "; ".join(wrong) or "identical to the last bit, asked again and fitted again", **differences)
+    differences = {
+        "asked again": float(np.abs(again - once).max()),
+        "fitted again": float(np.abs(other - once).max()),
+    }
+    wrong = [
+        f"{name}: {difference:.2g} m" for name, difference in differences.items() if difference != 0
+    ]
+    return judged(
+        not wrong,
+        "; ".join(wrong) or "identical to the last bit, asked again and fitted again",
+        **differences,
+    )
 
 
 def batches(subject: Subject) -> Outcome:
     forces = subject.data.test.forces[:8]
-    together, alone = subject.fitted.predict(forces), np.stack([subject.fitted.predict(force) for force in forces])
+    together, alone = (
+        subject.fitted.predict(forces),
+        np.stack([subject.fitted.predict(force) for force in forces]),
+    )
     off = float(np.abs(together - alone).max() / np.abs(alone).max())
-    return judged(off <= ROUND_OFF, "identical" if off == 0 else f"differ by {off:.1e} of the largest displacement", off=off)
+    return judged(
+        off <= ROUND_OFF,
+        "identical" if off == 0 else f"differ by {off:.1e} of the largest displacement",
+        off=off,
+    )
 
 
 def float32_forces(subject: Subject) -> Outcome:
-    return _low_precision(subject, lambda method, forces: answers(method, forces.astype(np.float32)))
+    return _low_precision(
+        subject, lambda method, forces: answers(method, forces.astype(np.float32))
+    )
 
 
 def bfloat16_inference(subject: Subject) -> Outcome:
     method, torch = subject.fitted, sys.modules.get("torch")
-    if torch is None or not any(isinstance(value, torch.nn.Module) for value in vars(method).values()):
+    if torch is None or not any(
+        isinstance(value, torch.nn.Module) for value in vars(method).values()
+    ):
         return Outcome("not applicable", "it has no network to be cast, and offers none of it")
 
     def cast(method: Surrogate, forces: Array) -> Array:
@@ -221,10 +294,17 @@ def _low_precision(subject: Subject, predict: Callable[[Surrogate, Array], Array
     method, test = subject.fitted, subject.data.test
     plain, low = answers(method, test.forces), predict(method, test.forces)
     size = np.linalg.norm(test.displacements, axis=(1, 2))
-    added, error = (float(np.median(np.linalg.norm(x, axis=(1, 2)) / size)) for x in (low - plain, plain - test.displacements))
+    added, error = (
+        float(np.median(np.linalg.norm(x, axis=(1, 2)) / size))
+        for x in (low - plain, plain - test.displacements)
+    )
     mesh = subject.scenes.discretisation_error
-    told = f"adds {added:.1e} to a relative l2 of {error:.1e} (the mesh's own is {mesh:.1e}), medians"
-    return judged(added <= ADDED * max(error, mesh), told, added=added, error=error, discretisation=mesh)
+    told = (
+        f"adds {added:.1e} to a relative l2 of {error:.1e} (the mesh's own is {mesh:.1e}), medians"
+    )
+    return judged(
+        added <= ADDED * max(error, mesh), told, added=added, error=error, discretisation=mesh
+    )
 
 
 FLAG = "error published with p95 and max; flagged as out of range"
@@ -236,10 +316,32 @@ CASES = (
         Case("out-of-distribution", part, FLAG, every, partial(out_of_distribution, part))
         for part in ("2x", "4x", "unseen-regions", "unseen-directions", "several-forces")
     ),
-    Case("zero-force", "", f"‖u‖ <= {ZERO_FORCE:g} of the training root mean square", every, zero_force),
-    Case("symmetry", "", f"full-order {MIRRORED:g}; others measured and published", every, symmetry),
+    Case(
+        "zero-force",
+        "",
+        f"‖u‖ <= {ZERO_FORCE:g} of the training root mean square",
+        every,
+        zero_force,
+    ),
+    Case(
+        "symmetry", "", f"full-order {MIRRORED:g}; others measured and published", every, symmetry
+    ),
     Case("determinism", "two runs", "identical", every, two_runs),
-    Case("determinism", "batch of 1 and of 8", "identical, or the difference stated and round-off", every, batches),
-    Case("low-precision", "float32 forces", "adds at most 10 % of the error", every, float32_forces),
-    Case("low-precision", "bfloat16 inference", "adds at most 10 % of the error, or refused", every, bfloat16_inference),
+    Case(
+        "determinism",
+        "batch of 1 and of 8",
+        "identical, or the difference stated and round-off",
+        every,
+        batches,
+    ),
+    Case(
+        "low-precision", "float32 forces", "adds at most 10 % of the error", every, float32_forces
+    ),
+    Case(
+        "low-precision",
+        "bfloat16 inference",
+        "adds at most 10 % of the error, or refused",
+        every,
+        bfloat16_inference,
+    ),
 )

@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import MorBenchError
-from mor_bench.harness.stress.case import Case, Outcome, Subject, answers, judged, learner, with_samples
+from mor_bench.harness.stress.case import (
+    Case,
+    Outcome,
+    Subject,
+    answers,
+    judged,
+    learner,
+    with_samples,
+)
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.cubature import CubatureError, SparseWeights, sparse_nnls
 from mor_bench.snapshots.dataset import Snapshots
@@ -51,7 +59,11 @@ def poor_snapshots(subject: Subject) -> Outcome:
         said = any("rank" in str(warning.message) for warning in caught)
         wrong += [f"{kind}: {what}" for what in _faults(method, snapshots, said)]
         modes = getattr(method, "modes_", None)
-        kept = f", {modes.shape[1]} modes kept of rank {_rank(snapshots)}" if isinstance(modes, np.ndarray) else ""
+        kept = (
+            f", {modes.shape[1]} modes kept of rank {_rank(snapshots)}"
+            if isinstance(modes, np.ndarray)
+            else ""
+        )
         told.append(f"{kind}: fitted{kept}{', with a warning' if said else ''}")
     return judged(not wrong, "; ".join(wrong or told), wrong=len(wrong))
 
@@ -64,7 +76,11 @@ def _faults(method: Surrogate, snapshots: Snapshots, said: bool) -> list[str]:
     """What is wrong with a method that was fitted to poor snapshots; ``said`` is whether it warned of their rank."""
     faults = []
     rank = _rank(snapshots)
-    asked = [value for name, value in method.parameters.items() if name.startswith("n_") and name.endswith("modes") and isinstance(value, int)]
+    asked = [
+        value
+        for name, value in method.parameters.items()
+        if name.startswith("n_") and name.endswith("modes") and isinstance(value, int)
+    ]
     if asked and max(asked) > rank and not said:
         faults.append(f"{max(asked)} modes asked for of rank {rank}, and no warning")
     modes = getattr(method, "modes_", None)
@@ -100,21 +116,39 @@ def _optimality(matrix: Array, target: Array, found: SparseWeights) -> tuple[flo
     x = found.weights
     residual, norms = target - matrix @ x, np.linalg.norm(matrix, axis=0)
     gradient = matrix.T @ residual / (np.where(norms > 0, norms, 1.0) * np.linalg.norm(target))
-    return float(np.linalg.norm(residual) / np.linalg.norm(target)), float(np.abs(gradient[x > 0]).max(initial=0.0)), float(x.min())
+    return (
+        float(np.linalg.norm(residual) / np.linalg.norm(target)),
+        float(np.abs(gradient[x > 0]).max(initial=0.0)),
+        float(x.min()),
+    )
 
 
 def nnls_columns(subject: Subject) -> Outcome:
-    worst = {"residual_over_tolerance": 0.0, "gradient": 0.0, "least_weight": 0.0, "misreported": 0.0}
+    worst = {
+        "residual_over_tolerance": 0.0,
+        "gradient": 0.0,
+        "least_weight": 0.0,
+        "misreported": 0.0,
+    }
     for seed in range(5):
         matrix, target = _hard_columns(seed)
         for tolerance in (1e-1, 1e-3, 1e-8):
             found = sparse_nnls(matrix, target, tolerance)
             residual, gradient, least = _optimality(matrix, target, found)
-            worst["residual_over_tolerance"] = max(worst["residual_over_tolerance"], residual / tolerance)
+            worst["residual_over_tolerance"] = max(
+                worst["residual_over_tolerance"], residual / tolerance
+            )
             worst["gradient"] = max(worst["gradient"], gradient)
             worst["least_weight"] = min(worst["least_weight"], least)
-            worst["misreported"] = max(worst["misreported"], abs(found.relative_residual - residual) / tolerance)
-    good = worst["residual_over_tolerance"] <= 1 + 1e-9 and worst["gradient"] <= 1e-10 and worst["least_weight"] >= 0 and worst["misreported"] <= 1e-6
+            worst["misreported"] = max(
+                worst["misreported"], abs(found.relative_residual - residual) / tolerance
+            )
+    good = (
+        worst["residual_over_tolerance"] <= 1 + 1e-9
+        and worst["gradient"] <= 1e-10
+        and worst["least_weight"] >= 0
+        and worst["misreported"] <= 1e-6
+    )
     happened = f"15 systems, recomputed: residual at most {worst['residual_over_tolerance']:.2f} of the tolerance, gradient on positive weights "
     happened += f"at most {worst['gradient']:.0e}, no weight below {worst['least_weight']:g}"
     return judged(good, happened, **worst)
@@ -126,7 +160,9 @@ def nnls_cap(subject: Subject) -> Outcome:
         found = sparse_nnls(matrix, matrix.sum(axis=1), 1e-6, max_iterations=1)
     except CubatureError as error:
         return judged("1e-06" in str(error), f"refused: {error}")
-    return judged(False, f"taken with a residual of {_optimality(matrix, matrix.sum(axis=1), found)[0]:.2g}")
+    return judged(
+        False, f"taken with a residual of {_optimality(matrix, matrix.sum(axis=1), found)[0]:.2g}"
+    )
 
 
 def ecsw_all_cells(subject: Subject) -> Outcome:
@@ -136,12 +172,28 @@ def ecsw_all_cells(subject: Subject) -> Outcome:
     plain = PODGalerkin(whole.n_modes, 1e-12).fit(data.scene, data.train).predict(forces)
     off = float(np.abs(whole.predict(forces) - plain).max() / np.abs(plain).max())
     kept = len(whole.cells_) == data.scene.mesh.n_cells and bool((whole.weights_ == 1).all())
-    return judged(off <= 1e-10 and kept, f"{len(whole.cells_)} of {data.scene.mesh.n_cells} cells, {off:.1e} from plain POD", off=off)
+    return judged(
+        off <= 1e-10 and kept,
+        f"{len(whole.cells_)} of {data.scene.mesh.n_cells} cells, {off:.1e} from plain POD",
+        off=off,
+    )
 
 
 CASES = (
-    Case("poor-snapshots", "", "cut to the rank with a warning, basis orthonormal to 1e-12, or a typed error", learner, poor_snapshots),
-    Case("nnls", "duplicated and badly scaled columns", "residual and optimality hold when recomputed", hyper_reduced, nnls_columns),
+    Case(
+        "poor-snapshots",
+        "",
+        "cut to the rank with a warning, basis orthonormal to 1e-12, or a typed error",
+        learner,
+        poor_snapshots,
+    ),
+    Case(
+        "nnls",
+        "duplicated and badly scaled columns",
+        "residual and optimality hold when recomputed",
+        hyper_reduced,
+        nnls_columns,
+    ),
     Case("nnls", "one iteration only", "honest failure", hyper_reduced, nnls_cap),
     Case("ecsw-all-cells", "", "equals plain POD to 1e-10", hyper_reduced, ecsw_all_cells),
 )

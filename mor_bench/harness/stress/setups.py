@@ -29,13 +29,22 @@ LIMIT_PA = -206.19652
 def dense(assembler: Assembler, values: Array) -> Array:
     """The whole tangent as a dense matrix."""
     pattern = assembler.pattern
-    upper = sp.csr_array((values, pattern.indices, pattern.indptr), shape=(pattern.n, pattern.n)).toarray()
+    upper = sp.csr_array(
+        (values, pattern.indices, pattern.indptr), shape=(pattern.n, pattern.n)
+    ).toarray()
     return np.asarray(upper + np.triu(upper, 1).T)
 
 
 def free_assembler(mesh: Mesh, law: Material = LAW, selective: bool = False) -> Assembler:
     """All dofs free, numbered as in the mesh."""
-    return Assembler(mesh.points, mesh.cells, np.arange(mesh.n_dofs).reshape(-1, 3), mesh.n_dofs, law, selective=selective)
+    return Assembler(
+        mesh.points,
+        mesh.cells,
+        np.arange(mesh.n_dofs).reshape(-1, 3),
+        mesh.n_dofs,
+        law,
+        selective=selective,
+    )
 
 
 def distorted_box(cells: tuple[int, int, int], tetrahedra: bool = False, seed: int = 0) -> Mesh:
@@ -43,7 +52,11 @@ def distorted_box(cells: tuple[int, int, int], tetrahedra: bool = False, seed: i
     mesh = box_mesh((1.0, 1.0, 1.0), cells, tetrahedra)
     inner = np.all((mesh.points > 1e-9) & (mesh.points < 1 - 1e-9), axis=1)
     points = mesh.points.copy()
-    points[inner] += np.random.default_rng(seed).uniform(-1, 1, (int(inner.sum()), 3)) * (0.15 if tetrahedra else 0.3) / np.array(cells)
+    points[inner] += (
+        np.random.default_rng(seed).uniform(-1, 1, (int(inner.sum()), 3))
+        * (0.15 if tetrahedra else 0.3)
+        / np.array(cells)
+    )
     return Mesh(points, mesh.cells)
 
 
@@ -62,12 +75,16 @@ def patch_test_error(mesh: Mesh, law: Material = LAW, selective: bool = False) -
     return float(np.abs(u.reshape(-1, 3) - exact).max())
 
 
-def confined_column(law: Material = LAW, tetrahedra: bool = False, selective: bool = False) -> GalerkinProblem:
+def confined_column(
+    law: Material = LAW, tetrahedra: bool = False, selective: bool = False
+) -> GalerkinProblem:
     """One cube between rigid lateral walls whose top moves along the axis as one: a single unknown."""
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1), tetrahedra)
     dofs = np.full((8, 3), 4)
     dofs[mesh.points[:, 0] == 1.0, 0] = np.arange(4)
-    return GalerkinProblem(Assembler(mesh.points, mesh.cells, dofs, 4, law, selective=selective), np.ones((4, 1)))
+    return GalerkinProblem(
+        Assembler(mesh.points, mesh.cells, dofs, 4, law, selective=selective), np.ones((4, 1))
+    )
 
 
 @dataclass(frozen=True)
@@ -108,7 +125,9 @@ class Arch:
         """The top of the path under a prescribed displacement, N: the load at which the arch snaps through."""
         found = self.reactions(np.linspace(0.0, 0.4, 81))
         most = int(np.argmax(found))
-        top = np.polynomial.Polynomial.fit(np.arange(most - 2, most + 3), found[most - 2 : most + 3], 4)
+        top = np.polynomial.Polynomial.fit(
+            np.arange(most - 2, most + 3), found[most - 2 : most + 3], 4
+        )
         return float(top(np.linspace(most - 1, most + 1, 2001)).max())
 
 
@@ -146,7 +165,9 @@ class Bars:
         u = np.zeros(self.assembler.n_dofs)
         for _ in range(12):
             state, values = self.assembler.force_and_tangent(u)
-            u += BandedCholesky(self.assembler.pattern).factor(values).solve(self.load - state.force)
+            u += (
+                BandedCholesky(self.assembler.pattern).factor(values).solve(self.load - state.force)
+            )
         return np.asarray(u.reshape(-1, 3)[self.end, 0])
 
 
@@ -156,9 +177,19 @@ def make_bars(tetrahedra: bool = False, selective: bool = False, contrast: float
     free = mesh.points[:, 0] > 0
     dofs, n = _numbered(mesh, free)
     stiff = mesh.points[mesh.cells].mean(axis=1)[:, 0] < 1
-    assembler = Assembler(mesh.points, mesh.cells, dofs, n, SaintVenantKirchhoff(1.0, 0.0), np.where(stiff, contrast, 1.0), selective)
+    assembler = Assembler(
+        mesh.points,
+        mesh.cells,
+        dofs,
+        n,
+        SaintVenantKirchhoff(1.0, 0.0),
+        np.where(stiff, contrast, 1.0),
+        selective,
+    )
     load = np.zeros((mesh.n_nodes, 3))
-    for facet in mesh.boundary_facets[(mesh.points[mesh.boundary_facets][:, :, 0] == 2.0).all(axis=1)]:
+    for facet in mesh.boundary_facets[
+        (mesh.points[mesh.boundary_facets][:, :, 0] == 2.0).all(axis=1)
+    ]:
         load[facet, 0] += 0.5 * (Bars.stretch**3 - Bars.stretch) / (4 if len(facet) == 4 else 6)
     return Bars(assembler, load[free].ravel(), mesh.points[free][:, 0] == 2.0)
 
@@ -177,20 +208,35 @@ def material_table(law: str, young: float, poisson: float) -> dict[str, Any]:
     if law == "mooney-rivlin":
         return {"law": law, "c10_pa": 0.4 * shear, "c01_pa": 0.1 * shear, "bulk_pa": bulk}
     if law == "ogden":
-        return {"law": law, "mu_pa": [1.6 * shear / 2.1, -0.4 * shear / 1.7], "alpha": [2.1, -1.7], "bulk_pa": bulk}
+        return {
+            "law": law,
+            "mu_pa": [1.6 * shear / 2.1, -0.4 * shear / 1.7],
+            "alpha": [2.1, -1.7],
+            "bulk_pa": bulk,
+        }
     return {"law": law, "young_pa": young, "poisson": poisson}
 
 
 def cantilever_spec(
-    size: list[float], cells: list[int], poisson: float, integration: str = "full", law: str = "saint-venant-kirchhoff"
-) -> dict[str, Any]:  # fmt: skip
+    size: list[float],
+    cells: list[int],
+    poisson: float,
+    integration: str = "full",
+    law: str = "saint-venant-kirchhoff",
+) -> dict[str, Any]:
     """A beam of Y = 12 kPa along x, clamped at its start, a force on the whole of its end: EI = 1000 N m² if it is 1 m wide and high."""
     return {
         "geometry": {"shape": "box", "size_m": size, "cells": cells},
         "discretisation": {"integration": integration},
         "material": material_table(law, 12e3, poisson),
         "supports": [{"region": "x-min"}],
-        "loads": {"region": "x-max", "kind": "force", "patch_area_m2": size[1] * size[2], "samples_per_patch": 1, "magnitude_n": [0.0, 1.0]},
+        "loads": {
+            "region": "x-max",
+            "kind": "force",
+            "patch_area_m2": size[1] * size[2],
+            "samples_per_patch": 1,
+            "magnitude_n": [0.0, 1.0],
+        },
         "needs": {"error": 0.01, "latency_ms": 1.0},
     }
 
@@ -204,7 +250,9 @@ def cantilever(
     solver: SolverName | None = None,
 ) -> FullOrderModel:
     """The full-order model of `cantilever_spec`."""
-    return FullOrderModel(load_scene(cantilever_spec(size, cells, poisson, integration, law)), solver)
+    return FullOrderModel(
+        load_scene(cantilever_spec(size, cells, poisson, integration, law)), solver
+    )
 
 
 def tip_load(model: FullOrderModel, force_z: float) -> Array:

@@ -48,9 +48,13 @@ class PaddedGrid:
     def to_grid(self, forces: Tensor) -> Tensor:
         """Nᵀ f: (n, n_nodes, 3) → (n, 3, x, y, z) with zeros at padding, channels-last in memory."""
         if self.places is None:
-            flat = torch.from_numpy(self.grid.forces_to_grid(forces.cpu().numpy())).to(forces.device)
+            flat = torch.from_numpy(self.grid.forces_to_grid(forces.cpu().numpy())).to(
+                forces.device
+            )
         else:
-            flat = forces.new_zeros(len(forces), self.grid.weights.shape[1], 3).index_copy_(1, self.places.to(forces.device), forces)
+            flat = forces.new_zeros(len(forces), self.grid.weights.shape[1], 3).index_copy_(
+                1, self.places.to(forces.device), forces
+            )
         return flat.view(-1, *self.shape, 3).permute(0, 4, 1, 2, 3)
 
     def displacements_to_grid(self, displacements: Tensor) -> Tensor:
@@ -83,9 +87,15 @@ class _ToNodes(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, padded: PaddedGrid) -> Tensor:
         ctx.padded = padded
-        flat = values.detach().permute(0, 2, 3, 4, 1).reshape(len(values), padded.grid.weights.shape[1], 3)
+        flat = (
+            values.detach()
+            .permute(0, 2, 3, 4, 1)
+            .reshape(len(values), padded.grid.weights.shape[1], 3)
+        )
         if padded.places is None:
-            return torch.from_numpy(padded.grid.displacements_to_nodes(flat.cpu().numpy())).to(values.device)
+            return torch.from_numpy(padded.grid.displacements_to_nodes(flat.cpu().numpy())).to(
+                values.device
+            )
         return flat.index_select(1, padded.places.to(values.device))
 
     @staticmethod
@@ -99,6 +109,15 @@ def padded_grid(grid: GridMap, steps: int) -> PaddedGrid:
     nx, ny, nz = (-(-n // multiple) * multiple for n in grid.shape)
     entries = grid.weights.astype(np.float32).tocoo()
     columns = np.ravel_multi_index(np.unravel_index(entries.col, grid.shape), (nx, ny, nz))
-    weights = sp.csr_array((entries.data, (entries.row, columns)), shape=(entries.shape[0], nx * ny * nz))
-    on_points = (np.diff(weights.indptr) == 1).all() and (weights.data == 1).all() and len(np.unique(columns)) == len(columns)
-    return PaddedGrid(GridMap((nx, ny, nz), weights), torch.from_numpy(weights.indices.astype(np.int64)) if on_points else None)
+    weights = sp.csr_array(
+        (entries.data, (entries.row, columns)), shape=(entries.shape[0], nx * ny * nz)
+    )
+    on_points = (
+        (np.diff(weights.indptr) == 1).all()
+        and (weights.data == 1).all()
+        and len(np.unique(columns)) == len(columns)
+    )
+    return PaddedGrid(
+        GridMap((nx, ny, nz), weights),
+        torch.from_numpy(weights.indices.astype(np.int64)) if on_points else None,
+    )

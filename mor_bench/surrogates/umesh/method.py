@@ -16,7 +16,15 @@ from torch import Tensor
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.learning.inference import Backend, choose_inference, inference_or_eager
-from mor_bench.learning.training import Precision, Schedule, TrainingPlan, device_of, fingerprint_of, network_weights, train
+from mor_bench.learning.training import (
+    Precision,
+    Schedule,
+    TrainingPlan,
+    device_of,
+    fingerprint_of,
+    network_weights,
+    train,
+)
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.mechanics.observed import linear_response
 from mor_bench.scene.grid import grid_map
@@ -137,7 +145,14 @@ class UMesh(Surrogate):
     """
 
     takes_observations = True
-    architecture: ClassVar[tuple[str, ...]] = ("channels", "steps", "normalisation", "input", "activation", "zero_at_rest")
+    architecture: ClassVar[tuple[str, ...]] = (
+        "channels",
+        "steps",
+        "normalisation",
+        "input",
+        "activation",
+        "zero_at_rest",
+    )
 
     def __init__(
         self,
@@ -180,7 +195,11 @@ class UMesh(Surrogate):
     def supports(self, scene: Scene) -> str | None:
         if self.mirrored and scene.observed_nodes is not None:
             return "the mirror image of a node that is observed need not be"
-        return unknown_equations(scene, observed=True) if self.input == "linear-response" or self.mirrored else None
+        return (
+            unknown_equations(scene, observed=True)
+            if self.input == "linear-response" or self.mirrored
+            else None
+        )
 
     def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
         with self._fitting(scene):
@@ -189,7 +208,9 @@ class UMesh(Surrogate):
             given, wanted = self._given(samples.inputs), samples.displacements
             if self.input == "linear-response":
                 wanted = wanted - given
-            self.input_scale_, self.output_scale_ = (_scale(values, self.normalisation) for values in (given, wanted))
+            self.input_scale_, self.output_scale_ = (
+                _scale(values, self.normalisation) for values in (given, wanted)
+            )
             device = device_of(self.training)
             generator = torch.Generator().manual_seed(self.seed)
             self.network_: UNet = new_network(self.channels, self.steps, generator, self.activation)
@@ -198,28 +219,56 @@ class UMesh(Surrogate):
             self.network_.to(device)
             inputs = torch.from_numpy((given / self.input_scale_).astype(np.float32)).to(device)
             targets = torch.from_numpy((wanted / self.output_scale_).astype(np.float32)).to(device)
-            images = [Image.of(mirror, device) for mirror in (mirrors(scene) if self.mirrored else [])]
+            images = [
+                Image.of(mirror, device) for mirror in (mirrors(scene) if self.mirrored else [])
+            ]
             zero = torch.zeros_like(inputs[:1])
             weights = self._sample_weights(targets)
 
             def loss(rows: Tensor) -> Tensor:
                 x, y = inputs[rows], targets[rows]
                 for image in images if self.network_.training else []:
-                    turned = torch.randint(2, (len(rows), 1, 1), generator=generator).bool().to(device)
+                    turned = (
+                        torch.randint(2, (len(rows), 1, 1), generator=generator).bool().to(device)
+                    )
                     x, y = torch.where(turned, image(x), x), torch.where(turned, image(y), y)
-                answer = self._answer(x) - self._answer(zero) if self.zero_at_rest else self._answer(x)
+                answer = (
+                    self._answer(x) - self._answer(zero) if self.zero_at_rest else self._answer(x)
+                )
                 errors = (answer - y).square().sum(dim=(1, 2))
-                return (errors * weights[rows]).sum() * (1.0 / y.numel())  # autocast would round a product of vectors
+                return (errors * weights[rows]).sum() * (
+                    1.0 / y.numel()
+                )  # autocast would round a product of vectors
 
             plan = TrainingPlan(
-                self.iterations, self.batch_size, self.learning_rate, self.schedule, self.second_moment_decay,
-                precision=self.precision, validation_fraction=self.validation_fraction,
-            )  # fmt: skip
+                self.iterations,
+                self.batch_size,
+                self.learning_rate,
+                self.schedule,
+                self.second_moment_decay,
+                precision=self.precision,
+                validation_fraction=self.validation_fraction,
+            )
             arrays = {"inputs": inputs, "targets": targets, **self.network_.state_dict()}
-            fingerprint = fingerprint_of(self.parameters, arrays) if self.training.checkpoint else ""
-            done = train(self.network_, loss, len(samples), plan, generator, self.training, self.time_limit_s, fingerprint)
+            fingerprint = (
+                fingerprint_of(self.parameters, arrays) if self.training.checkpoint else ""
+            )
+            done = train(
+                self.network_,
+                loss,
+                len(samples),
+                plan,
+                generator,
+                self.training,
+                self.time_limit_s,
+                fingerprint,
+            )
             self.network_.cpu()
-            self.loss_curve_, self.validation_curve_, self.iterations_ = done.loss_curve, done.validation_curve, done.iterations
+            self.loss_curve_, self.validation_curve_, self.iterations_ = (
+                done.loss_curve,
+                done.validation_curve,
+                done.iterations,
+            )
             self._choose_inference(inputs.cpu(), targets.cpu())
             self._come_to_rest()
         return self
@@ -228,22 +277,35 @@ class UMesh(Surrogate):
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         checked = self._checked_forces(forces)
         if counting.running is not None:  # with one scaling of each input and each output
-            products = self.network_.multiply_adds(self.grid_.shape) + self.grid_.multiply_adds + 2 * self.scene_.mesh.n_dofs
+            products = (
+                self.network_.multiply_adds(self.grid_.shape)
+                + self.grid_.multiply_adds
+                + 2 * self.scene_.mesh.n_dofs
+            )
             counting.running.add(multiply_adds=len(checked) * products)
         given = self._given(checked)
         scaled = torch.from_numpy((given / self.input_scale_).astype(np.float32))
-        answers = torch.cat([self._answer(chunk, self.inference_) for chunk in torch.split(scaled, PREDICTION_CHUNK)]).numpy()
+        answers = torch.cat(
+            [
+                self._answer(chunk, self.inference_)
+                for chunk in torch.split(scaled, PREDICTION_CHUNK)
+            ]
+        ).numpy()
         displacements = (answers - self._at_rest).astype(np.float64) * self.output_scale_
         if self.input == "linear-response":
             displacements += given
         displacements[:, self.scene_.fixed_nodes] = 0.0
         if self.zero_at_rest:
-            displacements[~checked.any(axis=(1, 2))] = 0.0  # in a batch the network at rest is rounded otherwise
+            displacements[~checked.any(axis=(1, 2))] = (
+                0.0  # in a batch the network at rest is rounded otherwise
+            )
         return displacements.reshape(np.shape(forces))
 
     def _prepare(self) -> None:
         """What the scene gives, before anything is learned."""
-        self.grid_: PaddedGrid = padded_grid(grid_map(self.scene_.mesh, self.scene_.spec.grid_nodes), self.steps)
+        self.grid_: PaddedGrid = padded_grid(
+            grid_map(self.scene_.mesh, self.scene_.spec.grid_nodes), self.steps
+        )
         if self.input == "linear-response":
             self.compliance_ = linear_response(self.scene_)
 
@@ -251,7 +313,9 @@ class UMesh(Surrogate):
         """(n, n_nodes, 3) what the network is given: the forces, N, or displacements of observed nodes, m; or the linear response to them, m."""
         if self.input == "force":
             return forces
-        return self.compliance_.respond(forces.reshape(len(forces), self.scene_.mesh.n_dofs)).reshape(forces.shape)
+        return self.compliance_.respond(
+            forces.reshape(len(forces), self.scene_.mesh.n_dofs)
+        ).reshape(forces.shape)
 
     def _answer(self, given: Tensor, network: Callable[[Tensor], Tensor] | None = None) -> Tensor:
         """The network, or what computes it, from nodes to nodes, (n, n_nodes, 3) float32, scaled."""
@@ -266,7 +330,9 @@ class UMesh(Surrogate):
         if self.loss == "absolute":
             return targets.new_ones(len(targets))
         size = targets.square().mean(dim=(1, 2))
-        weights = 1.0 / size.clamp(min=max(SMALLEST_SIZE**2 * float(size.mean()), torch.finfo(size.dtype).tiny))
+        weights = 1.0 / size.clamp(
+            min=max(SMALLEST_SIZE**2 * float(size.mean()), torch.finfo(size.dtype).tiny)
+        )
         return weights / weights.mean()
 
     def _come_to_rest(self) -> None:
@@ -274,7 +340,9 @@ class UMesh(Surrogate):
         self._at_rest = np.zeros((1, self.scene_.mesh.n_nodes, 3), dtype=np.float32)
         if self.zero_at_rest:
             with torch.inference_mode():
-                self._at_rest = self._answer(torch.zeros(1, self.scene_.mesh.n_nodes, 3), self.inference_).numpy()
+                self._at_rest = self._answer(
+                    torch.zeros(1, self.scene_.mesh.n_nodes, 3), self.inference_
+                ).numpy()
 
     def _choose_inference(self, inputs: Tensor, targets: Tensor) -> None:
         """Set ``inference_``, by training samples where it is to be chosen; both (n_samples, n_nodes, 3), scaled."""
@@ -286,7 +354,9 @@ class UMesh(Surrogate):
         given, wanted = inputs[rows], targets[rows]
 
         def errors(network: Callable[[Tensor], Tensor]) -> Tensor:
-            at_rest = self._answer(torch.zeros_like(given[:1]), network) if self.zero_at_rest else 0.0
+            at_rest = (
+                self._answer(torch.zeros_like(given[:1]), network) if self.zero_at_rest else 0.0
+            )
             return self._answer(given, network) - at_rest - wanted
 
         choice = choose_inference(self.network_, self._on_grid(given), errors)
@@ -296,19 +366,40 @@ class UMesh(Surrogate):
 
     def _start_from(self, path: Path) -> None:
         """Take the weights of a network that was trained on this scene or another; grids of any size share them."""
-        shapes = {f"network.{name}": tuple(value.shape) for name, value in self.network_.state_dict().items()}
-        self.network_.load_state_dict(network_weights(fitting_arrays(path, weights_to_start_from(path, self), shapes, np.float32)))
+        shapes = {
+            f"network.{name}": tuple(value.shape)
+            for name, value in self.network_.state_dict().items()
+        }
+        self.network_.load_state_dict(
+            network_weights(
+                fitting_arrays(path, weights_to_start_from(path, self), shapes, np.float32)
+            )
+        )
 
     def _onnx_model(self) -> onnx.ModelProto:
         from mor_bench.surrogates.umesh.onnx_model import umesh_graph
 
         with torch.inference_mode():
-            at_rest = self._answer(torch.zeros(1, self.scene_.mesh.n_nodes, 3)).numpy()[0] if self.zero_at_rest else None
+            at_rest = (
+                self._answer(torch.zeros(1, self.scene_.mesh.n_nodes, 3)).numpy()[0]
+                if self.zero_at_rest
+                else None
+            )
         response = self.compliance_ if self.input == "linear-response" else None
-        return umesh_graph(self.scene_, self.grid_, self.network_, self.input_scale_, self.output_scale_, at_rest, response)
+        return umesh_graph(
+            self.scene_,
+            self.grid_,
+            self.network_,
+            self.input_scale_,
+            self.output_scale_,
+            at_rest,
+            response,
+        )
 
     def _state(self) -> dict[str, NDArray[Any]]:
-        weights = {f"network.{name}": value.numpy() for name, value in self.network_.state_dict().items()}
+        weights = {
+            f"network.{name}": value.numpy() for name, value in self.network_.state_dict().items()
+        }
         scales = np.array([self.input_scale_, self.output_scale_])
         curves = {"loss_curve": self.loss_curve_, "validation_curve": self.validation_curve_}
         return {**weights, "scales": scales, **curves, "iterations": np.array([self.iterations_])}
@@ -316,17 +407,25 @@ class UMesh(Surrogate):
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         network = empty_network(self.channels, self.steps, self.activation)
         expected: dict[str, tuple[tuple[int, ...], type]] = {
-            f"network.{name}": (tuple(value.shape), np.float32) for name, value in network.state_dict().items()
+            f"network.{name}": (tuple(value.shape), np.float32)
+            for name, value in network.state_dict().items()
         }
-        expected |= {name: (np.shape(state[name])[:1], np.float64) for name in ("loss_curve", "validation_curve")}
+        expected |= {
+            name: (np.shape(state[name])[:1], np.float64)
+            for name in ("loss_curve", "validation_curve")
+        }
         expected |= {"scales": ((2,), np.float64), "iterations": ((1,), np.int64)}
         for name in sorted(expected.keys() | state.keys()):
             if name not in state or name not in expected:
-                raise InvalidInputError(f"the weights do not fit the network: `{name}` is {'missing' if name in expected else 'not expected'}.")
+                raise InvalidInputError(
+                    f"the weights do not fit the network: `{name}` is {'missing' if name in expected else 'not expected'}."
+                )
             array, (shape, dtype) = state[name], expected[name]
             if array.shape != shape or array.dtype != dtype:
                 wanted = f"{np.dtype(dtype)} of shape {shape}"
-                raise InvalidInputError(f"the weights do not fit the network: `{name}` must be {wanted}; got {array.dtype} of shape {array.shape}.")
+                raise InvalidInputError(
+                    f"the weights do not fit the network: `{name}` must be {wanted}; got {array.dtype} of shape {array.shape}."
+                )
             if not np.isfinite(array).all():
                 raise InvalidInputError(f"`{name}` must be finite; got NaN or infinity.")
         if not (state["scales"] > 0).all() or not state["iterations"][0] > 0:
@@ -351,7 +450,10 @@ class Image:
 
     @classmethod
     def of(cls, mirror: Mirror, device: torch.device) -> Image:
-        return cls(torch.from_numpy(mirror.nodes).to(device), torch.from_numpy(mirror.signs.astype(np.float32)).to(device))
+        return cls(
+            torch.from_numpy(mirror.nodes).to(device),
+            torch.from_numpy(mirror.signs.astype(np.float32)).to(device),
+        )
 
     def __call__(self, vectors: Tensor) -> Tensor:
         """(n, n_nodes, 3) → the same shape."""
@@ -362,4 +464,9 @@ def _scale(values: NDArray[np.float64], normalisation: str) -> float:
     """What values are divided by, over all samples, nodes and components; 1 where all are zero."""
     if normalisation == "none":
         return 1.0
-    return float(np.abs(values).max() if normalisation == "max" else np.sqrt(np.mean(np.square(values)))) or 1.0
+    return (
+        float(
+            np.abs(values).max() if normalisation == "max" else np.sqrt(np.mean(np.square(values)))
+        )
+        or 1.0
+    )

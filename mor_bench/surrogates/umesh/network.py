@@ -59,16 +59,25 @@ class UNet(nn.Module):
         super().__init__()
         widths = [channels * 2**level for level in range(steps + 1)]
         levels = list(pairwise(widths))
-        self.encoder = nn.ModuleList(DoubleConvolution(c_in, c_out, activation) for c_in, c_out in zip([3, *widths[:-2]], widths[:-1], strict=True))
+        self.encoder = nn.ModuleList(
+            DoubleConvolution(c_in, c_out, activation)
+            for c_in, c_out in zip([3, *widths[:-2]], widths[:-1], strict=True)
+        )
         self.pool = nn.MaxPool3d(2)
         self.bottom = DoubleConvolution(widths[-2], widths[-1], activation)
-        self.up = nn.ModuleList(nn.ConvTranspose3d(below, here, 2, stride=2) for here, below in reversed(levels))
-        self.decoder = nn.ModuleList(DoubleConvolution(2 * here, here, activation) for here, _ in reversed(levels))
+        self.up = nn.ModuleList(
+            nn.ConvTranspose3d(below, here, 2, stride=2) for here, below in reversed(levels)
+        )
+        self.decoder = nn.ModuleList(
+            DoubleConvolution(2 * here, here, activation) for here, _ in reversed(levels)
+        )
         self.head = nn.Conv3d(channels, 3, 1)
 
     def multiply_adds(self, shape: tuple[int, int, int]) -> int:
         """Of the convolutions for one sample on a grid of this shape, their zero padding included."""
-        points: list[int] = [prod(shape) // 8**level for level in range(len(self.up) + 1)]  # from the finest level down
+        points: list[int] = [
+            prod(shape) // 8**level for level in range(len(self.up) + 1)
+        ]  # from the finest level down
         total = points[0] * _n_weights(self.head)
         for block, n in zip([*self.encoder, self.bottom], points, strict=True):
             total += n * _n_weights(block)
@@ -97,7 +106,9 @@ def empty_network(channels: int, steps: int, activation: Activation = "relu") ->
         return UNet(channels, steps, activation)
 
 
-def new_network(channels: int, steps: int, generator: torch.Generator, activation: Activation = "relu") -> UNet:
+def new_network(
+    channels: int, steps: int, generator: torch.Generator, activation: Activation = "relu"
+) -> UNet:
     """A U-Net with He-normal weights and zero biases, drawn from the given generator only.
 
     The paper names no initialisation. torch's default shrinks the signal by sqrt(6) in each of the eleven layers: the coarse
@@ -107,7 +118,11 @@ def new_network(channels: int, steps: int, generator: torch.Generator, activatio
     network.to_empty(device="cpu")
     for layer in network.modules():
         if isinstance(layer, nn.Conv3d | nn.ConvTranspose3d):
-            nn.init.kaiming_normal_(layer.weight, nonlinearity="linear" if layer is network.head else "relu", generator=generator)
+            nn.init.kaiming_normal_(
+                layer.weight,
+                nonlinearity="linear" if layer is network.head else "relu",
+                generator=generator,
+            )
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)
     return network

@@ -54,7 +54,9 @@ def umesh_graph(
     if scene.observed_nodes is not None:
         seen = np.zeros((n_nodes, 1), dtype=np.bool_)
         seen[scene.observed_nodes] = True
-        given = graph.add("Where", graph.constant(seen), given, graph.constant(np.zeros(1, dtype=np.float32)))
+        given = graph.add(
+            "Where", graph.constant(seen), given, graph.constant(np.zeros(1, dtype=np.float32))
+        )
     loads = given
     if response is not None:
         if n_dofs > MAX_RESPONSE_DOFS:
@@ -73,7 +75,9 @@ def umesh_graph(
     x = graph.add("Reshape", x, graph.constant(np.array([-1, *grid.shape, 3])))
     x = graph.network(network, graph.add("Transpose", x, perm=[0, 4, 1, 2, 3]))
     x = graph.add("Transpose", x, perm=[0, 2, 3, 4, 1])
-    x = _sparse_product(graph, weights, graph.add("Reshape", x, graph.constant(np.array([-1, weights.shape[1], 3]))))
+    x = _sparse_product(
+        graph, weights, graph.add("Reshape", x, graph.constant(np.array([-1, weights.shape[1], 3])))
+    )
     if at_rest is not None:
         x = graph.add("Sub", x, graph.constant(at_rest))
     if response is not None:
@@ -82,17 +86,25 @@ def umesh_graph(
     free_nodes = np.full((n_nodes, 1), output_scale if response is None else 1.0, dtype=np.float32)
     free_nodes[scene.fixed_nodes] = 0.0
     if at_rest is not None:  # another runtime rounds the network at rest otherwise
-        loaded = graph.add("Sign", graph.add("ReduceMax", graph.add("Abs", loads), axes=[1, 2], keepdims=1))
+        loaded = graph.add(
+            "Sign", graph.add("ReduceMax", graph.add("Abs", loads), axes=[1, 2], keepdims=1)
+        )
         x = graph.add("Mul", x, loaded)
     graph.add("Mul", x, graph.constant(free_nodes), name="displacements")
-    given_in = "forces in N" if scene.observed_nodes is None else "`forces` are displacements of the observed nodes in m"
+    given_in = (
+        "forces in N"
+        if scene.observed_nodes is None
+        else "`forces` are displacements of the observed nodes in m"
+    )
     described = {
         "scene": scene.name,
         "scene_spec": scene.spec.model_dump_json(),
         "units": f"{given_in}, displacements in m, one row per node of the scene's mesh",
     }
     shape = ["n", n_nodes, 3]
-    return graph.model(f"U-Mesh of {scene.name}", ("forces", shape), ("displacements", shape), described)
+    return graph.model(
+        f"U-Mesh of {scene.name}", ("forces", shape), ("displacements", shape), described
+    )
 
 
 def _sparse_product(graph: GraphBuilder, matrix: sp.csr_array[np.float32], values: str) -> str:
@@ -102,7 +114,9 @@ def _sparse_product(graph: GraphBuilder, matrix: sp.csr_array[np.float32], value
     """
     lengths = np.diff(matrix.indptr)
     longest, n_columns = max(int(lengths.max()), 1), matrix.shape[1]
-    places: NDArray[np.int64] = np.full((matrix.shape[0], longest), n_columns)  # a row of zeros that is put behind the last
+    places: NDArray[np.int64] = np.full(
+        (matrix.shape[0], longest), n_columns
+    )  # a row of zeros that is put behind the last
     weights: NDArray[np.float32] = np.zeros((matrix.shape[0], longest, 1), dtype=np.float32)
     entry = np.arange(matrix.nnz) - np.repeat(matrix.indptr[:-1], lengths)
     row = np.repeat(np.arange(matrix.shape[0]), lengths)
