@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mor_bench.errors import MorBenchError
-    from mor_bench.harness.pick import Pick, pick
-    from mor_bench.harness.results import Comparison
-    from mor_bench.harness.run import run
-    from mor_bench.harness.training import Fit, fit
+    from mor_bench.results.comparison import Comparison
+    from mor_bench.run.compare import run
+    from mor_bench.run.pick import Pick, pick
+    from mor_bench.run.single_fit import Fit, fit
     from mor_bench.scene.scene import Scene, load_scene
     from mor_bench.snapshots.dataset import Snapshots, load_dataset
     from mor_bench.surrogate import Surrogate, load_method, load_surrogate
@@ -43,20 +43,20 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Comparison": "mor_bench.harness.results",
-    "Fit": "mor_bench.harness.training",
+    "Comparison": "mor_bench.results.comparison",
+    "Fit": "mor_bench.run.single_fit",
     "MorBenchError": "mor_bench.errors",
-    "Pick": "mor_bench.harness.pick",
+    "Pick": "mor_bench.run.pick",
     "Scene": "mor_bench.scene.scene",
     "Snapshots": "mor_bench.snapshots.dataset",
     "Surrogate": "mor_bench.surrogate",
-    "fit": "mor_bench.harness.training",
+    "fit": "mor_bench.run.single_fit",
     "load_dataset": "mor_bench.snapshots.dataset",
     "load_method": "mor_bench.surrogate",
     "load_scene": "mor_bench.scene.scene",
     "load_surrogate": "mor_bench.surrogate",
-    "pick": "mor_bench.harness.pick",
-    "run": "mor_bench.harness.run",
+    "pick": "mor_bench.run.pick",
+    "run": "mor_bench.run.compare",
 }
 
 

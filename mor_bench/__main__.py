@@ -1,6 +1,6 @@
 """`python -m mor_bench` is `mor-bench`."""
 
-from mor_bench.cli import app
+from mor_bench.cli.app import app
 
 if __name__ == "__main__":
     app(prog_name="mor-bench")

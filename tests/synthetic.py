@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.harness.metrics import SampleErrors, summary
-from mor_bench.harness.results import Comparison, label_of
+from mor_bench.measure.error_metrics import SampleErrors, summary
+from mor_bench.results.comparison import Comparison, label_of
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.specs import load_dataset_spec
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mor_bench.harness.analysis import (
+from mor_bench.analysis.analyse import (
     analyse,
     break_even,
     hidden,
@@ -20,7 +20,7 @@ from mor_bench.harness.analysis import (
     share_within,
     tuning,
 )
-from mor_bench.harness.frontier import (
+from mor_bench.analysis.frontier import (
     EXACT,
     TARGET_ERRORS,
     TARGET_TIMES_MS,
@@ -29,8 +29,8 @@ from mor_bench.harness.frontier import (
     frontier_draws,
     time_at_error,
 )
-from mor_bench.harness.results import Comparison
 from mor_bench.report.summary import entries_of
+from mor_bench.results.comparison import Comparison
 from tests.synthetic import (
     METHODS,
     N_PROCESSES,

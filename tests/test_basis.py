@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.errors import InvalidInputError
-from mor_bench.harness.stress.reduction import _faults
+from mor_bench.hard_cases.reduction_cases import _faults
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction import basis
 from mor_bench.reduction.basis import Basis, pod, pod_streamed, remembering

@@ -35,7 +35,7 @@ def test_help_imports_nothing_heavy() -> None:
     code = f"""
 import sys
 from typer.testing import CliRunner
-from mor_bench.cli import app
+from mor_bench.cli.app import app
 assert CliRunner().invoke(app, ["--help"]).exit_code == 0
 print([name for name in {heavy} if name in sys.modules])
 """

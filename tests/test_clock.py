@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mor_bench.harness.clock import (
+from mor_bench.measure.error_metrics import sample_errors
+from mor_bench.measure.latency import (
     BATCHES,
     CHUNK_S,
     LEAST_QUERIES,
@@ -25,9 +26,8 @@ from mor_bench.harness.clock import (
     summary_of_timing,
     why_unstable,
 )
-from mor_bench.harness.isolation import MethodFailedError, Worker
-from mor_bench.harness.metrics import sample_errors
-from mor_bench.harness.nursery import Nursery
+from mor_bench.sandbox.fork_server import Nursery
+from mor_bench.sandbox.process import MethodFailedError, Worker
 from mor_bench.snapshots.dataset import Dataset
 from tests.third_party import Slowed
 

@@ -13,7 +13,7 @@ from safetensors.numpy import save as serialise
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, MissingDependencyError, NotFittedError, StoreError
-from mor_bench.harness.metrics import sample_errors
+from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import list_suite
 from mor_bench.surrogate import Surrogate

@@ -22,7 +22,7 @@ from mor_bench.counting import (
     uncounted,
 )
 from mor_bench.errors import SolverError
-from mor_bench.harness.cost import cost_of
+from mor_bench.measure.query_cost import cost_of
 from mor_bench.mechanics import kernels, laws
 from mor_bench.mechanics.linear import BandedCholesky, MultigridFactor, Pardiso, SparseLU
 from mor_bench.mechanics.model import FullOrderModel

@@ -20,9 +20,9 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, MorBenchError, StoreError
-from mor_bench.harness.export_asv import describe, export_asv
-from mor_bench.harness.results import Comparison
-from mor_bench.harness.timing import describe_machine
+from mor_bench.export.asv_results import describe, export_asv
+from mor_bench.machine import describe_machine
+from mor_bench.results.comparison import Comparison
 from mor_bench.specs import list_suite
 from tests.benchmarks.bench_full_order import FullOrder
 from tests.benchmarks.bench_surrogates import METHODS

@@ -13,7 +13,7 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import InvalidInputError
-from mor_bench.harness.export import export_numpy, export_vtu
+from mor_bench.export.data import export_numpy, export_vtu
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets

@@ -18,9 +18,9 @@ from mor_bench.errors import (
     StoreError,
     UnsupportedSceneError,
 )
-from mor_bench.harness.discretisation import chosen_samples, limit_of, measured, refine
+from mor_bench.measure.discretisation_error import chosen_samples, limit_of, measured, refine
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.report.html import render
+from mor_bench.report.page import render
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import Scene, load_scene, with_cells

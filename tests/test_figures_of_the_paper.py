@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import mor_bench
-from mor_bench.harness.metrics import sample_errors
+from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import SplitBy, load_method_spec
 

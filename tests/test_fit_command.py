@@ -18,9 +18,9 @@ import pytest
 from safetensors import safe_open
 
 import mor_bench
-from mor_bench.cli import _knobs
+from mor_bench.cli.app import _knobs
 from mor_bench.errors import InvalidInputError, MorBenchError, SpecError
-from mor_bench.harness.on_dataset import Listener
+from mor_bench.run.dataset_run import Listener
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots, load_dataset
 from mor_bench.specs import load_generated_spec
@@ -144,7 +144,7 @@ def test_a_killed_training_of_u_mesh_goes_on_too(cache: Path, tmp_path: Path) ->
         "--checkpoint",
         str(checkpoint),
     ]
-    often = "import mor_bench.learning.training as t; t.CHECKPOINT_EVERY_S = 0.0; from mor_bench.cli import app; app()"
+    often = "import mor_bench.learning.training as t; t.CHECKPOINT_EVERY_S = 0.0; from mor_bench.cli.app import app; app()"
     command = [sys.executable, "-c", often, "fit", "beam-tiny", "-m", "umesh-small", *options]
     command += [f"--set={name}={value}" for name, value in knobs.items()]
 

@@ -13,14 +13,14 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import mor_bench
+from mor_bench.analysis.frontier import Point, error_at_time, non_dominated, time_at_error
 from mor_bench.errors import InvalidInputError, SpecError, StoreError
-from mor_bench.harness import clock
-from mor_bench.harness.clock import LEAST_QUERIES, MOST_S
-from mor_bench.harness.frontier import Point, error_at_time, non_dominated, time_at_error
-from mor_bench.harness.metrics import sample_errors, summary
-from mor_bench.harness.on_dataset import Listener
-from mor_bench.harness.results import Comparison
-from mor_bench.harness.timing import pinned_threads
+from mor_bench.machine import pinned_threads
+from mor_bench.measure import latency as clock
+from mor_bench.measure.error_metrics import sample_errors, summary
+from mor_bench.measure.latency import LEAST_QUERIES, MOST_S
+from mor_bench.results.comparison import Comparison
+from mor_bench.run.dataset_run import Listener
 from mor_bench.snapshots.generate import generation_seconds
 from mor_bench.specs import list_suite, load_generated_spec
 

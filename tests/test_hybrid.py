@@ -11,7 +11,7 @@ from scipy.stats import spearmanr
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, SolverError, SpecError
-from mor_bench.harness.metrics import sample_errors
+from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogate import Surrogate

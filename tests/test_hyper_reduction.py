@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import mor_bench
 from mor_bench.counting import Cost, counted
 from mor_bench.errors import InvalidInputError, SolverError
-from mor_bench.harness.stress.setups import LAW
+from mor_bench.hard_cases.setups import LAW
 from mor_bench.mechanics.assembly import Assembler, quadrature_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
@@ -27,9 +27,9 @@ from mor_bench.reduction.cubature import (
     ecsw_system,
     sparse_nnls,
 )
+from mor_bench.reduction.discrete_interpolation import Selection, interpolation_rows
 from mor_bench.reduction.empirical_cubature import cell_basis, empirical_cubature
 from mor_bench.reduction.galerkin import CubatureProblem, GalerkinProblem
-from mor_bench.reduction.interpolation import Selection, interpolation_rows
 from mor_bench.reduction.points import ReducedPoints
 from mor_bench.reduction.subspace import extent_of
 from mor_bench.scene.interpolation import interpolation_matrix

@@ -22,7 +22,7 @@ from mor_bench.errors import (
     StoreError,
     UnavailableBackendError,
 )
-from mor_bench.harness.export import export_onnx
+from mor_bench.export.data import export_onnx
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogate import Surrogate, _digest, _read_model
 

@@ -14,10 +14,10 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, SpecError
-from mor_bench.harness.contestants import CORE_METHODS, checked_specs
-from mor_bench.harness.isolation import MethodFailedError, Worker
-from mor_bench.harness.nursery import CAN_FORK, Nursery
-from mor_bench.harness.results import Comparison
+from mor_bench.results.comparison import Comparison
+from mor_bench.run.configurations import CORE_METHODS, checked_specs
+from mor_bench.sandbox.fork_server import CAN_FORK, Nursery
+from mor_bench.sandbox.process import MethodFailedError, Worker
 from mor_bench.snapshots.dataset import Dataset
 from tests.third_party import Peeker
 
@@ -206,7 +206,7 @@ def test_what_a_method_prints_is_no_answer(broken: Comparison) -> None:
 def test_no_process_is_left(broken: Comparison) -> None:
     time.sleep(0.5)
     left = [process.cmdline() for process in psutil.Process().children(recursive=True)]
-    assert not [command for command in left if "mor_bench.harness.worker" in command]
+    assert not [command for command in left if "mor_bench.sandbox.worker" in command]
 
 
 def test_a_module_beside_its_file_competes(cache: Path, tmp_path: Path) -> None:
@@ -338,7 +338,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     import subprocess
 
     script = (
-        "from tests.third_party import *\nfrom mor_bench.harness.isolation import Worker\nfrom mor_bench.harness.nursery import CAN_FORK, Nursery\n"
+        "from tests.third_party import *\nfrom mor_bench.sandbox.process import Worker\nfrom mor_bench.sandbox.fork_server import CAN_FORK, Nursery\n"
         "n = Nursery() if CAN_FORK else None\nw = Worker(None, [], nursery=n)\nprint(w._watched.pid, flush=True)\ntime.sleep(60)"
     )
     parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)

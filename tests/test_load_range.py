@@ -18,7 +18,7 @@ from mor_bench.errors import InvalidInputError, NotFittedError, StoreError, Unkn
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots import load_range
 from mor_bench.snapshots.dataset import Dataset, Snapshots
-from mor_bench.snapshots.imported import NodalLoads
+from mor_bench.snapshots.imported_dataset import NodalLoads
 from mor_bench.snapshots.load_range import LoadRange
 from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.surrogate import Surrogate

@@ -12,15 +12,15 @@ import mor_bench
 from mor_bench.errors import InvalidInputError, SolverError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
-from mor_bench.reduction import modal_derivatives as derivatives_module
-from mor_bench.reduction.galerkin import GalerkinProblem
-from mor_bench.reduction.manifold import ManifoldProblem, QuadraticManifold
-from mor_bench.reduction.modal_derivatives import (
+from mor_bench.reduction import derivative_modes as derivatives_module
+from mor_bench.reduction.derivative_modes import (
     derivative_basis,
     linear_modes,
     modal_derivatives,
     pairs,
 )
+from mor_bench.reduction.galerkin import GalerkinProblem
+from mor_bench.reduction.manifold import ManifoldProblem, QuadraticManifold
 from mor_bench.reduction.tensors import polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset

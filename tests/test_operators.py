@@ -28,7 +28,7 @@ torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]
 from mor_bench.surrogates.field_network import initialise  # noqa: E402 - after the check that torch is there
 from mor_bench.surrogates.fno import FNO, SpectralConvolution  # noqa: E402
 from mor_bench.surrogates.mesh_graph_net import Graph, GraphNetwork, MessagePassing  # noqa: E402
-from mor_bench.surrogates.umesh.grid import padded_grid  # noqa: E402
+from mor_bench.surrogates.umesh.padded_grid import padded_grid  # noqa: E402
 
 SMALL: dict[str, dict[str, Any]] = {
     "deeponet": {"width": 16, "depth": 2, "n_functions": 8},

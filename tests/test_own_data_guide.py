@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import mor_bench
-from mor_bench.harness.check import check_file
+from mor_bench.run.file_check import check_file
 
 GUIDE = (Path(__file__).parent.parent / "docs" / "own-data.md").read_text(encoding="utf-8")
 
@@ -34,6 +34,6 @@ def test_the_guide_s_examples_work(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_every_array_of_the_schema_is_in_the_guide() -> None:
-    from mor_bench.scene.imported import OPTIONAL, REQUIRED
+    from mor_bench.scene.snapshot_file import OPTIONAL, REQUIRED
 
     assert re.findall(r"^\| `(\w+)` \| \(", GUIDE, re.MULTILINE) == [*REQUIRED, *OPTIONAL]

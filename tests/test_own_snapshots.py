@@ -20,13 +20,13 @@ from mor_bench.errors import (
     StoreError,
     UnsupportedSceneError,
 )
-from mor_bench.harness.check import check_file
-from mor_bench.harness.contestants import CORE_METHODS, DATA_METHODS, checked_specs
-from mor_bench.harness.discretisation import refine
-from mor_bench.harness.export import snapshot_arrays
+from mor_bench.export.data import snapshot_arrays
+from mor_bench.measure.discretisation_error import refine
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.scene.imported import MAX_SIZE
+from mor_bench.run.configurations import CORE_METHODS, DATA_METHODS, checked_specs
+from mor_bench.run.file_check import check_file
 from mor_bench.scene.mesh import box_mesh
+from mor_bench.scene.snapshot_file import MAX_SIZE
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import ImportedDatasetSpec, list_suite, load_generated_spec
 from mor_bench.surrogate import MAX_FORCE_N

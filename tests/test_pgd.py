@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 import mor_bench
-from mor_bench.harness.metrics import sample_errors
+from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.reduction.separated import Separation, separate
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.pgd import SeparatedLoad, _coordinates

@@ -8,9 +8,9 @@ import pytest
 from typer.testing import CliRunner
 
 import mor_bench
-from mor_bench.cli import app
-from mor_bench.harness.code import _closure, code_digest
-from mor_bench.harness.plan import plan
+from mor_bench.cli.app import app
+from mor_bench.run.code_digest import _closure, code_digest
+from mor_bench.run.plan import plan
 from mor_bench.specs import MethodSpec
 
 
@@ -49,9 +49,7 @@ def test_a_digest_follows_what_a_method_imports(name: str) -> None:
     modules = set(_closure(surrogate.partition(":")[0], None))
     assert "mor_bench.surrogate" in modules
     assert ("mor_bench.surrogates.umesh.network" in modules) == (name == "umesh")
-    assert not any(
-        module.startswith(("mor_bench.harness", "mor_bench.report")) for module in modules
-    )
+    assert not any(module.startswith(("mor_bench.run", "mor_bench.report")) for module in modules)
     assert code_digest(surrogate) == code_digest(surrogate)
 
 

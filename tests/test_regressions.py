@@ -22,7 +22,7 @@ from mor_bench.mechanics.linear import BandedCholesky, BandedFactor
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
-from mor_bench.snapshots.imported import NodalLoads
+from mor_bench.snapshots.imported_dataset import NodalLoads
 from mor_bench.specs import SolverName, load_generated_spec
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogate import _digest as file_digest

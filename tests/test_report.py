@@ -14,11 +14,11 @@ import pytest
 from matplotlib.image import imread
 from rich.console import Console
 
-from mor_bench.harness.analysis import analyse
-from mor_bench.harness.metrics import SampleErrors, sample_errors, summary
-from mor_bench.harness.results import Comparison, label_of
+from mor_bench.analysis.analyse import analyse
+from mor_bench.measure.error_metrics import SampleErrors, sample_errors, summary
+from mor_bench.report.console_tables import NOT_REACHED, pairwise_cells, print_tables, target_cells
 from mor_bench.report.details import dataset_details
-from mor_bench.report.html import render, write_report
+from mor_bench.report.page import render, write_report
 from mor_bench.report.paper import PUBLISHED, error_measures, same_error, same_time
 from mor_bench.report.summary import (
     Entry,
@@ -32,7 +32,7 @@ from mor_bench.report.summary import (
     size_of,
     warnings_of,
 )
-from mor_bench.report.tables import NOT_REACHED, pairwise_cells, print_tables, target_cells
+from mor_bench.results.comparison import Comparison, label_of
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.specs import load_dataset_spec
 from tests.synthetic import synthetic_comparison

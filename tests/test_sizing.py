@@ -16,14 +16,14 @@ from safetensors.numpy import save as serialise
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, StoreError, UnsupportedSceneError
-from mor_bench.harness.fits import Entry, Material
-from mor_bench.harness.handover import write_snapshots
-from mor_bench.harness.worker import Session
 from mor_bench.reduction import sizing
 from mor_bench.reduction.sizing import MODES, Score, Trials, size_to_needs, validation_folds
+from mor_bench.run.fit_cache import Entry, Material
+from mor_bench.sandbox.handover import write_snapshots
+from mor_bench.sandbox.worker import Session
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
-from mor_bench.snapshots.imported import NodalLoads
+from mor_bench.snapshots.imported_dataset import NodalLoads
 from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.specs import load_method_spec
 from mor_bench.surrogate import _digest as file_digest

@@ -19,7 +19,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 import mor_bench
 from mor_bench.errors import MissingDependencyError, UnsupportedSceneError
-from mor_bench.harness.timing import pinned_threads
+from mor_bench.machine import pinned_threads
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import list_suite

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mor_bench.errors import InvalidInputError
-from mor_bench.harness.statistics import (
+from mor_bench.analysis.intervals import (
     TYPICAL_SPREAD,
     Spread,
     clusters_of,
@@ -27,6 +26,7 @@ from mor_bench.harness.statistics import (
     widened,
     widening,
 )
+from mor_bench.errors import InvalidInputError
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,15 @@ from rich.console import Console
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, MissingDependencyError, SpecError
-from mor_bench.harness.stress import CASES, Row, Stress, mechanics, reduction, setups, stress
-from mor_bench.harness.stress import case as case_module
+from mor_bench.hard_cases.suite import CASES, Row, Stress, mechanics, reduction, setups, stress
+from mor_bench.hard_cases.suite import case as case_module
 from mor_bench.mechanics import model as model_module
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.newton import Solution
 from mor_bench.mechanics.stability import limit_load
 from mor_bench.reduction.basis import Basis, pod
 from mor_bench.reduction.cubature import SparseWeights
-from mor_bench.report.hard_cases import print_stress
+from mor_bench.report.hard_case_table import print_stress
 from mor_bench.scene import soundness
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots

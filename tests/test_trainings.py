@@ -19,14 +19,14 @@ from rich.console import Console
 
 import mor_bench
 from mor_bench.errors import InvalidInputError
-from mor_bench.harness import fits
-from mor_bench.harness.fits import Entry, Job, Material, fit
-from mor_bench.harness.isolation import MethodFailedError
-from mor_bench.harness.on_dataset import place_of
-from mor_bench.harness.out_of_range import flags_of
-from mor_bench.harness.plan import plan
-from mor_bench.harness.results import Comparison
+from mor_bench.measure.range_flags import flags_of
 from mor_bench.report import print_tables, render
+from mor_bench.results.comparison import Comparison
+from mor_bench.run import fit_cache as fits
+from mor_bench.run.dataset_run import place_of
+from mor_bench.run.fit_cache import Entry, Job, Material, fit
+from mor_bench.run.plan import plan
+from mor_bench.sandbox.process import MethodFailedError
 from mor_bench.specs import load_method_spec
 from mor_bench.surrogate import TrainingOptions
 from tests.test_fit_command import LIMIT, descent_file, wait_for
@@ -344,7 +344,7 @@ def test_of_a_sealed_cache_only_the_folder_of_the_own_checkpoint_is_open(tmp_pat
     (own / "link").symlink_to(own.parent / "score.h5")
     code = f"""
 from pathlib import Path
-from mor_bench.harness.worker import seal
+from mor_bench.sandbox.worker import seal
 from mor_bench.snapshots.store import write_atomically
 own = Path({str(own)!r})
 seal([{str(tmp_path / "fits")!r}], str(own))

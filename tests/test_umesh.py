@@ -27,8 +27,8 @@ torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]
 from mor_bench.learning import training  # noqa: E402 - after the check that torch is there
 from mor_bench.learning.training import rate_factor  # noqa: E402
 from mor_bench.scene.symmetry import mirrors  # noqa: E402
-from mor_bench.surrogates.umesh.grid import padded_grid  # noqa: E402
 from mor_bench.surrogates.umesh.network import DoubleConvolution, UNet, new_network  # noqa: E402
+from mor_bench.surrogates.umesh.padded_grid import padded_grid  # noqa: E402
 
 SMALL = {
     "channels": 8,

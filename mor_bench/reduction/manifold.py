@@ -12,8 +12,8 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.linear import Factor
 from mor_bench.reduction.cubature import triangle
+from mor_bench.reduction.derivative_modes import pairs
 from mor_bench.reduction.galerkin import DenseProblem, GalerkinProblem, stiffness_times
-from mor_bench.reduction.modal_derivatives import pairs
 
 
 class QuadraticManifold:

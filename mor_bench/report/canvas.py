@@ -20,7 +20,7 @@ from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
-from mor_bench.harness.results import Comparison
+from mor_bench.results.comparison import Comparison
 from mor_bench.snapshots.store import write_atomically
 
 DPI = 150

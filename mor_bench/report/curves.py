@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from mor_bench.harness.results import Comparison
 from mor_bench.report.canvas import (
     COLOURS,
     INK,
@@ -22,6 +21,7 @@ from mor_bench.report.canvas import (
     shortened,
 )
 from mor_bench.report.details import profile_note
+from mor_bench.results.comparison import Comparison
 
 ALL = "all datasets"
 """In the place of a dataset's name, of a figure over all of them."""

@@ -13,7 +13,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from mor_bench.harness.results import Comparison
 from mor_bench.report.canvas import (
     GREY,
     INK,
@@ -33,6 +32,7 @@ from mor_bench.report.summary import (
     percent,
     short_swept,
 )
+from mor_bench.results.comparison import Comparison
 from mor_bench.scene.mesh import Mesh
 
 REFERENCE, PREDICTION, FORCE = "#7fb2d6", "#D55E00", "#222222"

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from mor_bench.harness.analysis import share_within
-from mor_bench.harness.frontier import TARGET_ERRORS
-from mor_bench.harness.results import Comparison
+from mor_bench.analysis.analyse import share_within
+from mor_bench.analysis.frontier import TARGET_ERRORS
+from mor_bench.report.console_tables import PAIRWISE_LEGEND, pairwise_cells
 from mor_bench.report.paper import Grid, error_measures, same_error, same_time
 from mor_bench.report.summary import (
     Entry,
@@ -19,8 +19,8 @@ from mor_bench.report.summary import (
     size_of,
     span,
 )
-from mor_bench.report.tables import PAIRWISE_LEGEND, pairwise_cells
 from mor_bench.report.trained import out_of_range, seeds, training
+from mor_bench.results.comparison import Comparison
 
 FACTORS = (1.0, 1.5, 2.0, 5.0, 10.0, 100.0)
 """Columns of the performance profile's table."""

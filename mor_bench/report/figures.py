@@ -14,7 +14,6 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from mor_bench.harness.results import Comparison
 from mor_bench.report.canvas import (
     GREY,
     INK,
@@ -43,6 +42,7 @@ from mor_bench.report.summary import (
     short_names_used,
     short_swept,
 )
+from mor_bench.results.comparison import Comparison
 
 FLOOR_PERCENT = 1e-4
 """Errors below stand at this floor: the round-off of the full-order model would squash all else."""
@@ -58,7 +58,7 @@ def write_figures(comparison: Comparison, analysis: Mapping[str, Any]) -> list[D
     ----------
     comparison : Comparison
     analysis : dict
-        From `mor_bench.harness.analysis.analyse`.
+        From `mor_bench.analysis.analyse.analyse`.
 
     Returns
     -------

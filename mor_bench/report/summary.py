@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from math import inf, isfinite, isnan
 from typing import Any
 
-from mor_bench.harness.frontier import Point, non_dominated
-from mor_bench.harness.results import Comparison
+from mor_bench.analysis.frontier import Point, non_dominated
+from mor_bench.results.comparison import Comparison
 
 SHORT_NAMES = {
     "n_modes": "r",
@@ -138,7 +138,7 @@ def entries_of(
     dataset : str
         Its name.
     analysis : dict, optional
-        From `mor_bench.harness.analysis.analyse`, for the intervals.
+        From `mor_bench.analysis.analyse.analyse`, for the intervals.
     """
     needs = needs_of(comparison, dataset)
     rows = [row for row in comparison.rows if row["dataset"] == dataset]

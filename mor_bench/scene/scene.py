@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
-from mor_bench.scene.imported import ImportedArrays, read_arrays
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets, Patches, cut_patches, spread_out
 from mor_bench.scene.materials import Material, make_material
 from mor_bench.scene.mesh import Mesh, box_mesh, l_mesh
 from mor_bench.scene.regions import Cloud, region_points
+from mor_bench.scene.snapshot_file import ImportedArrays, read_arrays
 from mor_bench.scene.subdivision import subdivide
 from mor_bench.specs import (
     AnyDatasetSpec,

@@ -15,7 +15,7 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene, imported_scene, load_scene
 from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import Progress, generate, n_samples_to_generate, read_shards
-from mor_bench.snapshots.imported import NodalLoads, nodal_loads, read_samples
+from mor_bench.snapshots.imported_dataset import NodalLoads, nodal_loads, read_samples
 from mor_bench.snapshots.sampling import PatchLoads, n_samples_of, repeated
 from mor_bench.snapshots.split import split_imported, split_samples
 from mor_bench.snapshots.test_sets import SetName, check_regions, spec_of_set

@@ -12,8 +12,8 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.reduction.basis import pod
+from mor_bench.reduction.discrete_interpolation import Selection, interpolation_rows
 from mor_bench.reduction.galerkin import stiffness_times
-from mor_bench.reduction.interpolation import Selection, interpolation_rows
 from mor_bench.reduction.petrov import InterpolatedProblem
 from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto, size_to_needs
 from mor_bench.reduction.subspace import Subspace, extent_of

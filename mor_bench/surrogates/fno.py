@@ -23,7 +23,7 @@ from mor_bench.surrogates.field_network import (
     n_products,
     perceptron,
 )
-from mor_bench.surrogates.umesh.grid import PaddedGrid, padded_grid
+from mor_bench.surrogates.umesh.padded_grid import PaddedGrid, padded_grid
 
 PADDING = 4
 """A side of n points gets n / PADDING more, rounded up, so that the circular convolutions do not join opposite ends of the body."""

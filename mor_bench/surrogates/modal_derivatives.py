@@ -11,8 +11,8 @@ from pydantic import Field
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
+from mor_bench.reduction.derivative_modes import derivative_basis, patch_responses
 from mor_bench.reduction.galerkin import GalerkinProblem
-from mor_bench.reduction.modal_derivatives import derivative_basis, patch_responses
 from mor_bench.reduction.static_correction import predict_corrected
 from mor_bench.reduction.tensors import TensorProblem, polynomial_pays
 from mor_bench.scene.scene import Scene

@@ -14,9 +14,9 @@ from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.cubature import sparse_nnls
+from mor_bench.reduction.derivative_modes import linear_modes, modal_derivatives
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.manifold import ManifoldProblem, QuadraticManifold, manifold_system
-from mor_bench.reduction.modal_derivatives import linear_modes, modal_derivatives
 from mor_bench.reduction.static_correction import refuse_inverted, static_correction
 from mor_bench.reduction.weighted_cells import weighted_cells
 from mor_bench.scene.scene import Scene

@@ -24,8 +24,8 @@ from mor_bench.learning.inference import BACKENDS, Inference
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.scene import load_scene
 from mor_bench.specs import load_dataset_spec
-from mor_bench.surrogates.umesh.grid import padded_grid
 from mor_bench.surrogates.umesh.network import new_network
+from mor_bench.surrogates.umesh.padded_grid import padded_grid
 
 SCENES = ("beam-coarse", "beam-fine", "l-shape", "liver-hex")
 COLUMNS = (

@@ -52,7 +52,7 @@ from rich.table import Table
 from scipy.sparse.linalg import spsolve
 
 import mor_bench
-from mor_bench.harness.timing import describe_machine
+from mor_bench.machine import describe_machine
 from mor_bench.mechanics.model import SOLVERS, FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.materials import SaintVenantKirchhoff

@@ -66,7 +66,7 @@ def publish(configuration: Path) -> Path:
     from asv.commands.publish import Publish
     from asv.config import Config
 
-    from mor_bench.harness.export_asv import describe
+    from mor_bench.export.asv_results import describe
 
     config = Config.load(str(configuration))
     describe(config.results_dir)

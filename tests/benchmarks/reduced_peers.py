@@ -58,8 +58,8 @@ from rich.table import Table
 import mor_bench
 from mor_bench import counting
 from mor_bench.errors import MissingDependencyError, UnsupportedSceneError
-from mor_bench.harness.metrics import sample_errors
-from mor_bench.harness.timing import describe_machine
+from mor_bench.machine import describe_machine
+from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.cubature import ecsw_system
 from mor_bench.scene.scene import Scene

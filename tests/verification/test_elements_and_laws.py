@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, SolverError
-from mor_bench.harness.stress.setups import (
+from mor_bench.hard_cases.setups import (
     cantilever,
     dense,
     distorted_box,

@@ -17,7 +17,7 @@ from mor_bench.errors import (
     SolverError,
     UnconstrainedBodyError,
 )
-from mor_bench.harness.stress.setups import LAW, dense, distorted_box, free_assembler
+from mor_bench.hard_cases.setups import LAW, dense, distorted_box, free_assembler
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.linear import (
     BandedCholesky,

@@ -13,7 +13,7 @@ from tensortrax.math import log, sqrt, trace
 from tensortrax.math.linalg import det
 
 import mor_bench
-from mor_bench.harness.stress.setups import material_table
+from mor_bench.hard_cases.setups import material_table
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.scene import Scene

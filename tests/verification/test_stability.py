@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.errors import NoEquilibriumError, SolverError
-from mor_bench.harness.stress.setups import LAW, LIMIT_PA, Arch, confined_column, dense, make_arch
+from mor_bench.hard_cases.setups import LAW, LIMIT_PA, Arch, confined_column, dense, make_arch
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import solve_equilibrium
 from mor_bench.mechanics.stability import (

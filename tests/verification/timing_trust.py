@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from mor_bench.harness.analysis import analyse
-from mor_bench.harness.clock import PROTOCOLS, Opener, Queries, Timing, measure, why_unstable
-from mor_bench.harness.isolation import Worker
-from mor_bench.harness.nursery import Nursery
-from mor_bench.harness.results import Comparison
-from mor_bench.harness.statistics import compare_latency, intervals_of
+from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.intervals import compare_latency, intervals_of
+from mor_bench.measure.latency import PROTOCOLS, Opener, Queries, Timing, measure, why_unstable
+from mor_bench.results.comparison import Comparison
+from mor_bench.sandbox.fork_server import Nursery
+from mor_bench.sandbox.process import Worker
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.sampling import draw_loads
 

@@ -32,8 +32,8 @@ from mor_bench.scene.scene import Scene
 from mor_bench.scene.symmetry import Mirror, mirrors
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate, fitting_arrays, weights_to_start_from
-from mor_bench.surrogates.umesh.grid import PaddedGrid, padded_grid
 from mor_bench.surrogates.umesh.network import Activation, UNet, empty_network, new_network
+from mor_bench.surrogates.umesh.padded_grid import PaddedGrid, padded_grid
 
 if TYPE_CHECKING:
     import onnx

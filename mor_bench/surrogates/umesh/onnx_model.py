@@ -12,8 +12,8 @@ from mor_bench.errors import UnavailableBackendError
 from mor_bench.learning.onnx_graph import GraphBuilder
 from mor_bench.mechanics.observed import LinearResponse
 from mor_bench.scene.scene import Scene
-from mor_bench.surrogates.umesh.grid import PaddedGrid
 from mor_bench.surrogates.umesh.network import UNet
+from mor_bench.surrogates.umesh.padded_grid import PaddedGrid
 
 if TYPE_CHECKING:
     import onnx

@@ -1,0 +1,347 @@
+"""Hard cases of any method, through its interface alone."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.errors import MorBenchError, NotFittedError, UnknownRangeError
+from mor_bench.hard_cases.case import (
+    Case,
+    Outcome,
+    Subject,
+    answers,
+    every,
+    judged,
+    learner,
+    refused,
+    rms,
+)
+from mor_bench.measure.error_metrics import sample_errors
+from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.snapshots.sampling import PatchLoads
+from mor_bench.surrogate import Surrogate
+from mor_bench.surrogates.fem import FullFEM
+
+Array = NDArray[np.float64]
+
+ZERO_FORCE = 1e-3
+"""Largest norm of the answer to no force, over the root mean square of the training displacements."""
+
+MIRRORED = 1e-12
+"""Largest asymmetry of the full-order model, at a tolerance of 1e-13; of others it is published."""
+
+ROUND_OFF = 2e-6
+"""Largest difference between a query alone and among eight, over the largest displacement: that of float32."""
+
+ADDED = 0.1
+"""Error that low precision may add, over the error that the method has."""
+
+FLAGGED = 0.9
+"""Share of the loads of an unseen kind that must be flagged."""
+
+FALSE_ALARMS = 0.02
+"""Share of the loads in range that may be."""
+
+
+def _bad_forces(good: Array) -> dict[str, Any]:
+    def with_value(value: float) -> Array:
+        force = good.copy()
+        force[3, 1] = value
+        return force
+
+    return {
+        "NaN": with_value(np.nan),
+        "infinity": with_value(np.inf),
+        "1e155 N": with_value(1e155),
+        "a node too few": good[:-1],
+        "a flat array": good.ravel(),
+        "four axes": good[None, None],
+        "ragged rows": [[1.0, 2.0], [3.0]],
+        "complex numbers": good + 1j,
+        "text": good.astype(str),
+        "objects": good.astype(object),
+        "truth values": good > 0,
+        "nothing": None,
+    }
+
+
+def bad_forces(subject: Subject) -> Outcome:
+    method, good = subject.fitted, subject.data.test.forces[0]
+    before = method.predict(good)
+    bad = _bad_forces(good)
+    with np.errstate(all="ignore"):
+        wrong = [
+            f"{name} {what}"
+            for name, force in bad.items()
+            if (what := refused(partial(method.predict, force), MorBenchError))
+        ]
+    if np.abs(method.predict(good) - before).max() > ROUND_OFF * np.abs(before).max():
+        wrong.append("later answers differ")
+    return judged(
+        not wrong,
+        "; ".join(wrong)
+        or f"{len(bad)} of {len(bad)} refused with a typed error, later answers unchanged",
+        wrong=len(wrong),
+    )
+
+
+def _bad_snapshots(good: Snapshots) -> dict[str, Snapshots | None]:
+    u, loads = good.free_displacements, good.loads
+    assert isinstance(loads, PatchLoads)
+
+    def with_value(array: Array, value: float) -> Array:
+        spoilt = array.copy()
+        spoilt[(1,) * array.ndim if array.ndim == 2 else (1, 0, 1)] = value
+        return spoilt
+
+    def displacements(array: Any) -> Snapshots:
+        return replace(good, free_displacements=array)
+
+    return {
+        "none at all": None,
+        "no sample": good[:0],
+        "NaN in a displacement": displacements(with_value(u, np.nan)),
+        "infinity in a displacement": displacements(with_value(u, np.inf)),
+        "NaN in a force": replace(
+            good, loads=replace(loads, vectors=with_value(loads.vectors, np.nan))
+        ),
+        "a dof too few": displacements(u[:, :-1]),
+        "a displacement too few": displacements(u[:-1]),
+        "displacements per node": displacements(u.reshape(len(u), -1, 3)),
+        "complex displacements": displacements(u + 1j),
+        "displacements as text": displacements(u.astype(str)),
+    }
+
+
+def bad_snapshots(subject: Subject) -> Outcome:
+    data, wrong = subject.data, []
+    method = subject.fit(data, brief=True)
+    bad = _bad_snapshots(data.train[:20])
+    for name, snapshots in bad.items():
+        if what := refused(partial(method.fit, data.scene, snapshots), MorBenchError):
+            wrong.append(f"{name} {what}")
+    if what := refused(partial(method.predict, data.test.forces[0]), NotFittedError):
+        wrong.append(f"a prediction after a refused fit {what}")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.safetensors"
+        if what := refused(partial(method.save, path), MorBenchError):
+            wrong.append(f"saving after a refused fit {what}")
+        if path.exists():
+            wrong.append("a file was left")
+    return judged(
+        not wrong,
+        "; ".join(wrong) or f"{len(bad)} of {len(bad)} refused with a typed error, nothing kept",
+        wrong=len(wrong),
+    )
+
+
+def _published(method: Surrogate, snapshots: Snapshots) -> tuple[bool, str, dict[str, Any]]:
+    """Whether all answers are finite or typed failures, the errors in words, and their numbers."""
+    predicted = answers(method, snapshots.forces)
+    failed = np.isnan(predicted).all(axis=(1, 2))
+    sound = bool(np.isfinite(predicted[~failed]).all())
+    relative = sample_errors(predicted, snapshots.displacements).relative_l2
+    p95, most = float(np.percentile(relative, 95, method="higher")), float(relative.max())
+    numbers = {
+        "n": len(relative),
+        "n_failed": int(failed.sum()),
+        "rel_l2_median": float(np.median(relative)),
+        "rel_l2_p95": p95,
+        "rel_l2_max": most,
+    }
+    told = f"relative l2 {numbers['rel_l2_median']:.2g} median, {p95:.2g} p95, {most:.2g} max"
+    told += f", {numbers['n_failed']} of {len(relative)} without an answer" if failed.any() else ""
+    return sound, told if sound else f"{told}, some not finite", numbers
+
+
+def _unlike(name: str, data: Dataset) -> NDArray[np.bool_]:
+    """Which loads of a test set are not as those of training."""
+    forces = data.tests[name].forces
+    if name not in ("2x", "4x"):
+        return np.ones(len(forces), dtype=bool)
+    sizes, known = (np.linalg.norm(f, axis=2).sum(axis=1) for f in (forces, data.train.forces))
+    return np.asarray(sizes > 1.01 * known.max())
+
+
+def out_of_distribution(name: str, subject: Subject) -> Outcome:
+    pressed = name == "unseen-directions"
+    data = subject.scenes.pressed if pressed else subject.data
+    method = subject.fitted_on_pressed if pressed else subject.fitted
+    sound, told, numbers = _published(method, data.tests[name])
+    if not method.needs_snapshots:
+        return judged(sound, f"{told}; it has no training range", **numbers)
+    unlike = _unlike(name, data)
+    try:
+        flags, alarms = (
+            np.asarray(method.out_of_range(data.tests[part].forces)) for part in (name, "in-range")
+        )
+    except UnknownRangeError as error:
+        return judged(False, f"{told}; no flag: {error}", **numbers)
+    share, false = float(flags[unlike].mean()), float(alarms.mean())
+    told += f"; flagged {int(flags[unlike].sum())} of {int(unlike.sum())}{' larger than any of training' if name in ('2x', '4x') else ''}"
+    told += f", in range {false:.0%}"
+    needed = 1.0 if name in ("2x", "4x") else FLAGGED
+    return judged(
+        sound and share >= needed and false <= FALSE_ALARMS,
+        told,
+        **numbers,
+        flagged=share,
+        flagged_in_range=false,
+    )
+
+
+def zero_force(subject: Subject) -> Outcome:
+    answer = subject.fitted.predict(np.zeros((subject.data.scene.mesh.n_nodes, 3)))
+    ratio = float(np.linalg.norm(answer)) / rms(subject.data.train.displacements)
+    return judged(
+        ratio <= ZERO_FORCE, f"‖u‖ is {ratio:.2g} of the training root mean square", ratio=ratio
+    )
+
+
+def symmetry(subject: Subject) -> Outcome:
+    """y → 1 m - y takes beam-tiny and its support to themselves."""
+    data, exact = subject.data, isinstance(subject.fresh(), FullFEM)
+    method = subject.fit(data, tolerance=1e-13) if exact else subject.fitted
+    points, flip = data.scene.mesh.points, np.array([1.0, -1.0, 1.0])
+    mirror = np.array(
+        [int(np.linalg.norm(points - (p * flip + [0, 1, 0]), axis=1).argmin()) for p in points]
+    )
+    forces = data.test.forces[:20]
+    plain, mirrored = (
+        answers(method, forces),
+        answers(method, np.ascontiguousarray(forces[:, mirror] * flip)),
+    )
+    size = np.linalg.norm(plain, axis=(1, 2))
+    off = np.linalg.norm(mirrored - plain[:, mirror] * flip, axis=(1, 2)) / size
+    median, most = float(np.median(off)), float(off.max())
+    happened = (
+        f"relative l2 between an answer and its mirror image {median:.2g} median, {most:.2g} max"
+    )
+    return judged(
+        bool(np.isfinite(off).all()) and (not exact or most <= MIRRORED),
+        happened,
+        median=median,
+        max=most,
+    )
+
+
+def two_runs(subject: Subject) -> Outcome:
+    forces = subject.data.test.forces[:8]
+    first, second = (subject.fit(subject.data, brief=True) for _ in range(2))
+    once, again, other = first.predict(forces), first.predict(forces), second.predict(forces)
+    differences = {
+        "asked again": float(np.abs(again - once).max()),
+        "fitted again": float(np.abs(other - once).max()),
+    }
+    wrong = [
+        f"{name}: {difference:.2g} m" for name, difference in differences.items() if difference != 0
+    ]
+    return judged(
+        not wrong,
+        "; ".join(wrong) or "identical to the last bit, asked again and fitted again",
+        **differences,
+    )
+
+
+def batches(subject: Subject) -> Outcome:
+    forces = subject.data.test.forces[:8]
+    together, alone = (
+        subject.fitted.predict(forces),
+        np.stack([subject.fitted.predict(force) for force in forces]),
+    )
+    off = float(np.abs(together - alone).max() / np.abs(alone).max())
+    return judged(
+        off <= ROUND_OFF,
+        "identical" if off == 0 else f"differ by {off:.1e} of the largest displacement",
+        off=off,
+    )
+
+
+def float32_forces(subject: Subject) -> Outcome:
+    return _low_precision(
+        subject, lambda method, forces: answers(method, forces.astype(np.float32))
+    )
+
+
+def bfloat16_inference(subject: Subject) -> Outcome:
+    method, torch = subject.fitted, sys.modules.get("torch")
+    if torch is None or not any(
+        isinstance(value, torch.nn.Module) for value in vars(method).values()
+    ):
+        return Outcome("not applicable", "it has no network to be cast, and offers none of it")
+
+    def cast(method: Surrogate, forces: Array) -> Array:
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            return answers(method, forces)
+
+    try:
+        return _low_precision(subject, cast)
+    except (TypeError, RuntimeError, MorBenchError) as error:
+        return judged(True, f"refused with {type(error).__name__}: {error}")
+
+
+def _low_precision(subject: Subject, predict: Callable[[Surrogate, Array], Array]) -> Outcome:
+    """What a lower precision adds to the error of the method, which is never less than that of the mesh."""
+    method, test = subject.fitted, subject.data.test
+    plain, low = answers(method, test.forces), predict(method, test.forces)
+    size = np.linalg.norm(test.displacements, axis=(1, 2))
+    added, error = (
+        float(np.median(np.linalg.norm(x, axis=(1, 2)) / size))
+        for x in (low - plain, plain - test.displacements)
+    )
+    mesh = subject.scenes.discretisation_error
+    told = (
+        f"adds {added:.1e} to a relative l2 of {error:.1e} (the mesh's own is {mesh:.1e}), medians"
+    )
+    return judged(
+        added <= ADDED * max(error, mesh), told, added=added, error=error, discretisation=mesh
+    )
+
+
+FLAG = "error published with p95 and max; flagged as out of range"
+
+CASES = (
+    Case("bad-forces", "", "typed error, nothing kept", every, bad_forces),
+    Case("bad-snapshots", "", "typed error, nothing kept", learner, bad_snapshots),
+    *(
+        Case("out-of-distribution", part, FLAG, every, partial(out_of_distribution, part))
+        for part in ("2x", "4x", "unseen-regions", "unseen-directions", "several-forces")
+    ),
+    Case(
+        "zero-force",
+        "",
+        f"‖u‖ <= {ZERO_FORCE:g} of the training root mean square",
+        every,
+        zero_force,
+    ),
+    Case(
+        "symmetry", "", f"full-order {MIRRORED:g}; others measured and published", every, symmetry
+    ),
+    Case("determinism", "two runs", "identical", every, two_runs),
+    Case(
+        "determinism",
+        "batch of 1 and of 8",
+        "identical, or the difference stated and round-off",
+        every,
+        batches,
+    ),
+    Case(
+        "low-precision", "float32 forces", "adds at most 10 % of the error", every, float32_forces
+    ),
+    Case(
+        "low-precision",
+        "bfloat16 inference",
+        "adds at most 10 % of the error, or refused",
+        every,
+        bfloat16_inference,
+    ),
+)

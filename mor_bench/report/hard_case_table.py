@@ -1,0 +1,53 @@
+"""The hard cases on the console: a table, and how many fell short."""
+
+from __future__ import annotations
+
+from itertools import groupby
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from mor_bench.hard_cases.suite import CASES, Row, Stress
+
+STYLES = {"pass": "green", "fall short": "bold red", "not applicable": "dim"}
+
+
+def ordered(found: Stress) -> list[Row]:
+    """The rows by case, and within one in the order in which methods were tried."""
+    places = {(case.name, case.part): number for number, case in enumerate(CASES)}
+    return sorted(found.rows, key=lambda row: places[row.case, row.part])
+
+
+def print_stress(found: Stress, console: Console) -> None:
+    """Print all rows, then those that fell short once more by name, and the counts."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    longest = max((len(row.method) for row in found.rows), default=0)
+    for heading, width in (
+        ("case", 19),
+        ("method", max(20, longest)),
+        ("expected", 20),
+        ("what happened", None),
+        ("", 14),
+    ):
+        table.add_column(heading, width=width, overflow="fold")
+    for _, group in groupby(ordered(found), key=lambda row: (row.case, row.part)):
+        for number, row in enumerate(group):
+            name = f"{row.case}: {row.part}" if row.part else row.case
+            first = (name, row.expected) if number == 0 else ("", "")
+            verdict = Text(row.verdict, STYLES[row.verdict])
+            table.add_row(
+                Text(first[0]), Text(row.method), Text(first[1]), Text(row.happened), verdict
+            )
+        table.add_section()
+    console.print(table)
+    short = [
+        f"{row.case}{f' ({row.part})' if row.part else ''} of {row.method}"
+        for row in ordered(found)
+        if row.verdict == "fall short"
+    ]
+    counts = f"{len(found.rows)} tried: {found.count('pass')} pass, {len(short)} fall short, {found.count('not applicable')} not applicable."
+    console.print(counts, highlight=False)
+    if short:
+        console.print(f"Fall short: {', '.join(short)}.", highlight=False, markup=False)

@@ -1,0 +1,61 @@
+"""A dataset whose snapshots come from another program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.scene.snapshot_file import ImportedArrays, read_arrays
+from mor_bench.specs import ImportedDatasetSpec
+
+
+@dataclass(frozen=True)
+class NodalLoads:
+    """Loads as the forces on all nodes.
+
+    Attributes
+    ----------
+    forces : (n_samples, n_nodes, 3) float64
+        N.
+    patches : (n_samples, k) int64
+        Load-region ids; zeros where the file has none.
+    """
+
+    forces: NDArray[np.float64]
+    patches: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.forces)
+
+    def __getitem__(self, index: NDArray[np.int64] | slice) -> NodalLoads:
+        return NodalLoads(self.forces[index], self.patches[index])
+
+    @property
+    def vectors(self) -> NDArray[np.float64]:
+        """(n_samples, 1, 3) sums of the forces, N."""
+        return np.asarray(self.forces.sum(axis=1, keepdims=True))
+
+
+def read_samples(spec: ImportedDatasetSpec, limit: int | None = None) -> ImportedArrays:
+    """The first samples of an imported dataset, or all; raises `SpecError`."""
+    arrays = read_arrays(spec.snapshots.file)
+    first = slice(limit)
+    return replace(
+        arrays,
+        forces=arrays.forces[first],
+        displacements=arrays.displacements[first],
+        regions=None if arrays.regions is None else arrays.regions[first],
+        test=None if arrays.test is None else arrays.test[first],
+    )
+
+
+def nodal_loads(arrays: ImportedArrays) -> NodalLoads:
+    """The loads of imported samples."""
+    regions = (
+        np.zeros((len(arrays.forces), 1), dtype=np.int64)
+        if arrays.regions is None
+        else arrays.regions
+    )
+    return NodalLoads(arrays.forces, regions)
