@@ -20,6 +20,7 @@ from mor_bench.mechanics import linear
 from mor_bench.mechanics.compliance import Compliance, project
 from mor_bench.mechanics.linear import BandedCholesky, BandedFactor
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.imported_dataset import NodalLoads
@@ -122,7 +123,7 @@ def test_more_columns_than_pay_are_not_used_or_not_kept(monkeypatch: pytest.Monk
     model = FullOrderModel(scene)
     n, bandwidth = len(scene.free_dofs), BandedCholesky(model.assembler.pattern).bandwidth
     few = triangular_multiply_adds(n, bandwidth) // n
-    touched = (3 * np.unique(scene.patch_weights.indices)[:, None] + np.arange(3)).ravel()
+    touched = dofs_of_nodes(np.unique(scene.patch_weights.indices))
     touched = touched[np.isin(touched, scene.free_dofs)]
     loads = np.zeros((2, scene.mesh.n_dofs))
     loads[0, touched[:few]] = loads[1, touched[: few + 1]] = 1.0

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mor_bench import counting
 from mor_bench.mechanics.linear import BandedFactor, SparseFactor
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.scene.dofs import dofs_of_nodes
 
 Array = NDArray[np.float64]
 
@@ -114,7 +115,7 @@ class Compliance:
     def __init__(self, model: FullOrderModel) -> None:
         self._factor, self._free = model.rest_factor, model.scene.free_dofs
         n_dofs, n_free = model.scene.mesh.n_dofs, len(self._free)
-        kept = (3 * np.unique(model.scene.patch_weights.indices)[:, None] + np.arange(3)).ravel()
+        kept = dofs_of_nodes(np.unique(model.scene.patch_weights.indices))
         kept = kept[np.isin(kept, self._free)]
         if (
             not isinstance(self._factor, BandedFactor | SparseFactor)

@@ -24,6 +24,7 @@ from mor_bench import counting
 from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
 from mor_bench.errors import SolverError
 from mor_bench.mechanics.assembly import Pattern
+from mor_bench.scene.dofs import dofs_of_nodes
 
 MAX_BAND_ENTRIES = 1e8
 """Entries of a band (0.8 GB) up to which a banded factor of the rest state is kept; multigrid serves larger meshes."""
@@ -232,8 +233,8 @@ class BandedCholesky:
         a, b = graph.nonzero()
         natural, reordered = int(np.abs(a - b).max()), int(np.abs(place[a] - place[b]).max())
         self.bandwidth = 3 * min(natural, reordered) + 2
-        self._order = (3 * order[:, None] + np.arange(3)).ravel() if reordered < natural else None
-        self._place = (3 * place[:, None] + np.arange(3)).ravel() if reordered < natural else None
+        self._order = dofs_of_nodes(order) if reordered < natural else None
+        self._place = dofs_of_nodes(place) if reordered < natural else None
         self._pattern = pattern
 
     @property
@@ -247,7 +248,8 @@ class BandedCholesky:
                 factorisations=1,
                 multiply_adds=cholesky_multiply_adds(self._pattern.n, self.bandwidth),
             )
-        rows, columns = self._pattern.rows, self._pattern.indices
+        rows: NDArray[np.integer] = self._pattern.rows
+        columns: NDArray[np.integer] = self._pattern.indices
         if self._place is not None:
             rows, columns = self._place[rows], self._place[columns]
         low, high = np.minimum(rows, columns), np.maximum(rows, columns)

@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mor_bench import counting
+from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.scene import Scene
 
 Array = NDArray[np.float64]
@@ -49,11 +50,7 @@ class Subspace:
         self._modes = np.zeros((scene.mesh.n_dofs, self.n_modes))
         self._modes[scene.free_dofs] = modes
         nodes = scene.output_nodes
-        self._wanted = (
-            None
-            if len(nodes) == scene.mesh.n_nodes
-            else (3 * nodes[:, None] + np.arange(3)).ravel()
-        )
+        self._wanted = None if len(nodes) == scene.mesh.n_nodes else dofs_of_nodes(nodes)
         self._expanding = self._modes if self._wanted is None else self._modes[self._wanted]
 
     def project(self, load: Array) -> Array:

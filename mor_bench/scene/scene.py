@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
+from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets, Patches, cut_patches, spread_out
 from mor_bench.scene.materials import Material, make_material
@@ -80,7 +81,7 @@ class Scene:
     @cached_property
     def free_dofs(self) -> NDArray[np.int64]:
         """(n_free,) dof = 3 * node + axis, without those of fixed nodes."""
-        fixed = (3 * self.fixed_nodes[:, None] + np.arange(3)).ravel()
+        fixed = dofs_of_nodes(self.fixed_nodes)
         return np.setdiff1d(np.arange(self.mesh.n_dofs), fixed)
 
     @cached_property

@@ -11,6 +11,7 @@ from pydantic import Field
 from mor_bench import counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.reduction.basis import pod
+from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
@@ -68,7 +69,7 @@ class GappyPOD(Surrogate):
         """Places of the observed dofs among the free ones."""
         nodes = self.scene_.observed_nodes
         assert nodes is not None
-        return np.searchsorted(self.scene_.free_dofs, (3 * nodes[:, None] + np.arange(3)).ravel())
+        return np.searchsorted(self.scene_.free_dofs, dofs_of_nodes(nodes))
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = self._checked_forces(forces).reshape(-1, self.scene_.mesh.n_dofs)

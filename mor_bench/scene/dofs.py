@@ -1,0 +1,11 @@
+"""Numbering of the degrees of freedom: node n has the dofs 3n, 3n + 1 and 3n + 2, for x, y and z."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def dofs_of_nodes(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the dofs (3 n,) of nodes (n,), in the order of the nodes."""
+    return (3 * nodes[:, None] + np.arange(3)).ravel()
