@@ -1,12 +1,16 @@
-"""The work of a prediction in units that no machine changes: what is factorised, solved with, integrated and multiplied.
+"""Count the work of a prediction in units that do not depend on the machine.
 
-Whoever does such work says so where it is done, and only while someone counts; otherwise that costs one comparison:
+The units are factorisations, back-solves, integrated cells and multiplications. Code reports
+countable work where it happens, and `count` ignores the report unless a counter is active:
 
-    if counting.running is not None:
-        counting.running.add(back_solves=1, multiply_adds=2 * n_nonzeros)
+    count(back_solves=1, multiply_adds=2 * n_nonzeros)
 
-What is counted follows from sizes, sparsity patterns and numbers of iterations, never from a clock or a hardware counter. It
-differs between machines or numbers of threads only where their round-off changes a number of iterations.
+Counts follow from sizes, sparsity patterns and numbers of iterations, never from a clock or a
+hardware counter. They differ between machines or numbers of threads only where round-off changes
+a number of iterations.
+
+A report that is ignored takes about 0.13 µs besides its arguments. Where that is more than 1 % of
+a query, or where an argument is costly, the report stands under `if is_counting():` (0.04 µs).
 """
 
 from __future__ import annotations
@@ -23,20 +27,22 @@ class Cost:
     Attributes
     ----------
     factorisations : int
-        Matrices factorised, of any size; `multiply_adds` tells how large they were. Inverses of 3x3 blocks do not count.
+        Factorised matrices of any size; `multiply_adds` tells how large they were. Inverses of
+        3x3 blocks do not count.
     back_solves : int
-        Right-hand sides taken through both triangular factors of a matrix, of any size, or through one multigrid cycle in
-        their place. A sweep that serves eight right-hand sides counts as eight.
+        Right-hand sides solved with both triangular factors of a matrix of any size, or by one
+        multigrid cycle. A sweep that serves eight right-hand sides counts as eight.
     reduced_factorisations, reduced_back_solves : int
-        The part of the above that was done with dense matrices of a reduced basis; the rest was done with sparse matrices
-        of a mesh.
+        The part of the above that used dense matrices of a reduced basis. The rest used sparse
+        matrices of a mesh.
     element_evaluations : int
-        Cells whose internal force, or force and tangent, were integrated, times how often.
+        Cells whose internal force, or force and tangent, was integrated, times the number of
+        integrations.
     multiply_adds : int
-        Multiplications, with or without an addition, of all of the above and of every product of matrices and vectors.
-        A division, root, power or logarithm counts as one, in single precision as in double; an addition or comparison
-        alone does not count, nor do norms and sums in the loop around (less than 1 % of the whole), padding, and the
-        zeros that a dense format stores.
+        Multiplications, with or without an addition, of all of the above and of every product of
+        matrices and vectors. A division, root, power or logarithm counts as one, in single and
+        double precision. These do not count: additions and comparisons alone; norms and sums in
+        the surrounding loop (below 1 % of the whole); padding; stored zeros.
     """
 
     factorisations: int = 0
@@ -46,63 +52,70 @@ class Cost:
     element_evaluations: int = 0
     multiply_adds: int = 0
 
-    def add(
-        self,
-        *,
-        factorisations: int = 0,
-        back_solves: int = 0,
-        reduced_factorisations: int = 0,
-        reduced_back_solves: int = 0,
-        element_evaluations: int = 0,
-        multiply_adds: int = 0,
-    ) -> None:
-        """Count more work; what is reduced must be in the totals as well."""
-        self.factorisations += factorisations
-        self.back_solves += back_solves
-        self.reduced_factorisations += reduced_factorisations
-        self.reduced_back_solves += reduced_back_solves
-        self.element_evaluations += element_evaluations
-        self.multiply_adds += multiply_adds
+
+_running: Cost | None = None
 
 
-running: Cost | None = None
-"""What this process counts into; None while nobody counts."""
+def is_counting() -> bool:
+    """Return whether a counter is active; ask before computing costly arguments of `count`."""
+    return _running is not None
+
+
+def count(
+    *,
+    factorisations: int = 0,
+    back_solves: int = 0,
+    reduced_factorisations: int = 0,
+    reduced_back_solves: int = 0,
+    element_evaluations: int = 0,
+    multiply_adds: int = 0,
+) -> None:
+    """Add work to the active counter, if there is one. Reduced work is counted in the totals too."""
+    if _running is None:
+        return
+    _running.factorisations += factorisations
+    _running.back_solves += back_solves
+    _running.reduced_factorisations += reduced_factorisations
+    _running.reduced_back_solves += reduced_back_solves
+    _running.element_evaluations += element_evaluations
+    _running.multiply_adds += multiply_adds
 
 
 @contextmanager
 def counted() -> Iterator[Cost]:
-    """Count the work of this process that is done inside; a count around this one gets it too."""
-    global running
-    around, running = running, Cost()
-    cost = running
+    """Count the work of this process inside the block; an enclosing counter gets it too."""
+    global _running
+    enclosing, _running = _running, Cost()
+    cost = _running
     try:
         yield cost
     finally:
-        running = around
-        if around is not None:
-            around.add(**asdict(cost))
+        _running = enclosing
+        count(**asdict(cost))
 
 
 @contextmanager
 def uncounted() -> Iterator[None]:
-    """Leave out what is computed once and kept: it is no part of a query, whichever comes first."""
-    global running
-    around, running = running, None
+    """Leave out work that is done once and kept: it belongs to no query."""
+    global _running
+    enclosing, _running = _running, None
     try:
         yield
     finally:
-        running = around
+        _running = enclosing
 
 
 def cholesky_multiply_adds(n: int, bandwidth: int) -> int:
-    """Of a Cholesky factorisation: (n, n) with ``bandwidth`` entries beside the diagonal, n - 1 for a dense matrix."""
+    """Return the multiplications of a Cholesky factorisation of an (n, n) matrix.
+
+    ``bandwidth`` is the number of entries beside the diagonal, n - 1 for a dense matrix.
+    """
     below = n * bandwidth - bandwidth * (bandwidth + 1) // 2
-    updates = (n - bandwidth) * bandwidth * (bandwidth + 1) // 2 + (bandwidth - 1) * bandwidth * (
-        bandwidth + 1
-    ) // 6
+    pairs = bandwidth * (bandwidth + 1)
+    updates = (n - bandwidth) * pairs // 2 + (bandwidth - 1) * pairs // 6
     return n + below + updates
 
 
 def triangular_multiply_adds(n: int, bandwidth: int) -> int:
-    """Of a forward and a backward substitution with such a factor."""
+    """Return the multiplications of a forward and a backward substitution with such a factor."""
     return 2 * (n + n * bandwidth - bandwidth * (bandwidth + 1) // 2)

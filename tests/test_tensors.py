@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mor_bench
-from mor_bench import counting
+from mor_bench.counting import counted
 from mor_bench.errors import InvalidInputError, SolverError, UnsupportedSceneError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.galerkin import GalerkinProblem
@@ -150,7 +150,7 @@ def test_a_query_does_not_see_the_mesh(coarse: Dataset) -> None:
     for scene in (coarse.scene, fine):
         galerkin, tensor = problems(scene, 5)
         load = 0.01 * galerkin.rest_tangent @ np.ones(5)
-        with counting.counted() as cost:
+        with counted() as cost:
             assert tensor.quick(load, 1e-6) is not None
         counts.append((cost.multiply_adds - tensor.sentinels.size) / max(1, cost.factorisations))
         assert cost.element_evaluations == 0

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mor_bench import counting
+from mor_bench.counting import count
 
 Array = NDArray[np.float64]
 
@@ -88,10 +88,7 @@ class Anderson:
             self._count += 1
             self._held = min(self._count, WINDOW)
         self._last = q, correction, residual
-        if counting.running is not None:
-            counting.running.add(
-                multiply_adds=len(q) * (self._held * (self._held + 4) + (self._held > 0))
-            )
+        count(multiply_adds=len(q) * (self._held * (self._held + 4) + (self._held > 0)))
         step = np.empty_like(q)
         _combine(correction, self._steps, self._changes, self._held, self._basis, step)
         return step

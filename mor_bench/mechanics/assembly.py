@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mor_bench import counting
+from mor_bench.counting import count
 from mor_bench.mechanics.elements import H8, element_of, shape_gradients
 from mor_bench.mechanics.kernels import (
     ADVANCE_MULTIPLY_ADDS,
@@ -243,10 +243,7 @@ class Assembler:
         self, u: Array, dofs: NDArray[np.int32], force: Array, values: Array
     ) -> tuple[float, float]:
         """Add the cells' forces and, where ``values`` is not empty, tangents; returns energy and min det F."""
-        if counting.running is not None:
-            counting.running.add(
-                element_evaluations=self.n_cells, multiply_adds=self._multiply_adds[len(values) > 0]
-            )
+        count(element_evaluations=self.n_cells, multiply_adds=self._multiply_adds[len(values) > 0])
         if not self._vectorised:
             law, parameters = self.material.law, self._parameters
             return general_force(
@@ -290,18 +287,16 @@ class Assembler:
         if self._vectorised:
             cells = self._dofs, self._gradients, self._w_lam, self._w_mu
             done, status, min_det = relax(padded, v, before, load, mass, control, n_steps, *cells)
-            if counting.running is not None:
-                counting.running.add(
-                    element_evaluations=done * self.n_cells,
-                    multiply_adds=done * self._multiply_adds[0],
-                )
+            count(
+                element_evaluations=done * self.n_cells,
+                multiply_adds=done * self._multiply_adds[0],
+            )
         else:
             force, none = np.zeros(self.n_dofs + 1), np.zeros(0)
             while done < n_steps and status == RUNNING:
                 min_det = self._sum(padded, self._dofs, force, none)[1]
                 status = advance(padded, v, force, before, load, mass, control)
                 done += 1
-        if counting.running is not None:
-            counting.running.add(multiply_adds=done * ADVANCE_MULTIPLY_ADDS * self.n_dofs)
+        count(multiply_adds=done * ADVANCE_MULTIPLY_ADDS * self.n_dofs)
         u[:] = padded[:-1]
         return done, status, min_det

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mor_bench import counting
+from mor_bench.counting import count, counted, is_counting, uncounted
 from mor_bench.mechanics.linear import BandedFactor, SparseFactor
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.dofs import dofs_of_nodes
@@ -90,8 +90,8 @@ def project(matrix: Array, loads: Array) -> Array:
     """
     out = np.empty((len(loads), matrix.shape[1]))
     n_loaded = int(_project(matrix, np.ascontiguousarray(loads), out))
-    if counting.running is not None:
-        counting.running.add(multiply_adds=n_loaded * matrix.shape[1])
+    if is_counting():
+        count(multiply_adds=n_loaded * matrix.shape[1])
     return out
 
 
@@ -128,10 +128,10 @@ class Compliance:
         units = np.zeros((n_free, len(kept)))
         units[np.searchsorted(self._free, kept), np.arange(len(kept))] = 1.0
         self.columns = np.zeros((len(kept), n_dofs))
-        with counting.uncounted():
+        with uncounted():
             if len(kept):
                 self.columns[:, self._free] = self._factor.solve(units).T
-            with counting.counted() as one:
+            with counted() as one:
                 self._factor.solve(np.ones(n_free))
         self._most = min(len(kept), one.multiply_adds // n_free)
 
@@ -152,8 +152,8 @@ class Compliance:
         out, used = np.empty(loads.shape), np.empty(len(loads), dtype=np.int64)
         _respond(self.columns, self._place, self._most, loads, out, used)
         others = used < 0
-        if counting.running is not None:
-            counting.running.add(multiply_adds=int(used[~others].sum()) * len(self._free))
+        if is_counting():
+            count(multiply_adds=int(used[~others].sum()) * len(self._free))
         if others.any():
             rows = np.flatnonzero(others)
             out[rows[:, None], self._free] = self._factor.solve(
@@ -180,6 +180,6 @@ class Compliance:
         (n_dofs, r) float64
         """
         out = np.zeros((len(self._place), axes.shape[1]))
-        with counting.uncounted():
+        with uncounted():
             out[self._free] = self._factor.solve(axes)
         return out

@@ -20,8 +20,7 @@ from scipy.linalg.lapack import dpbtrf, dpbtrs
 from scipy.sparse import linalg as sp_linalg
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from mor_bench import counting
-from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
+from mor_bench.counting import cholesky_multiply_adds, count, is_counting, triangular_multiply_adds
 from mor_bench.errors import SolverError
 from mor_bench.mechanics.assembly import Pattern
 from mor_bench.scene.dofs import dofs_of_nodes
@@ -143,11 +142,8 @@ class BandedFactor:
         self._band, self._order = band, order
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        if counting.running is not None:
-            (width, n), m = self._band.shape, _n_columns(rhs)
-            counting.running.add(
-                back_solves=m, multiply_adds=m * triangular_multiply_adds(n, width - 1)
-            )
+        (width, n), m = self._band.shape, _n_columns(rhs)
+        count(back_solves=m, multiply_adds=m * triangular_multiply_adds(n, width - 1))
         solve = (
             self._solve_many
             if _n_columns(rhs) >= MANY and len(self._band) >= WIDE
@@ -214,11 +210,8 @@ class SingleBandedFactor:
 
     def solve_in_place(self, x: NDArray[np.float32]) -> None:
         """Overwrite the right-hand sides x (m, n), in the factor's order, by the solutions."""
-        if counting.running is not None:
-            n, width = self._columns.shape
-            counting.running.add(
-                back_solves=len(x), multiply_adds=len(x) * triangular_multiply_adds(n, width - 1)
-            )
+        n, width = self._columns.shape
+        count(back_solves=len(x), multiply_adds=len(x) * triangular_multiply_adds(n, width - 1))
         banded_solve(self._columns, x)
 
 
@@ -243,11 +236,10 @@ class BandedCholesky:
         return self._pattern.n * (self.bandwidth + 1)
 
     def factor(self, values: NDArray[np.float64]) -> BandedFactor:
-        if counting.running is not None:
-            counting.running.add(
-                factorisations=1,
-                multiply_adds=cholesky_multiply_adds(self._pattern.n, self.bandwidth),
-            )
+        count(
+            factorisations=1,
+            multiply_adds=cholesky_multiply_adds(self._pattern.n, self.bandwidth),
+        )
         rows: NDArray[np.integer] = self._pattern.rows
         columns: NDArray[np.integer] = self._pattern.indices
         if self._place is not None:
@@ -269,9 +261,9 @@ class SparseFactor:
     solver: SparseLU
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        if counting.running is not None:
+        if is_counting():  # the first count factorises once more
             m = _n_columns(rhs)
-            counting.running.add(back_solves=m, multiply_adds=m * self.solver.multiply_adds[1])
+            count(back_solves=m, multiply_adds=m * self.solver.multiply_adds[1])
         return np.asarray(self.lu.solve(rhs))
 
 
@@ -311,8 +303,8 @@ class SparseLU:
         return int((below * (1 + right)).sum()), int((below + right + 1).sum())
 
     def factor(self, values: NDArray[np.float64]) -> SparseFactor:
-        if counting.running is not None:
-            counting.running.add(factorisations=1, multiply_adds=self.multiply_adds[0])
+        if is_counting():  # the first count factorises once more
+            count(factorisations=1, multiply_adds=self.multiply_adds[0])
         try:
             lu = self._splu(values[self._gather])
         except RuntimeError as error:
@@ -352,13 +344,13 @@ class Pardiso:
             self._phase(22, np.zeros(len(self._matrix.indptr) - 1))
         except self._error as error:
             raise NotPositiveDefiniteError from error
-        if counting.running is not None:
-            # MKL reports millions of operations; that L's columns are equally long is the least that its entries allow.
-            least = self._entries**2 // (2 * self._matrix.shape[0])
-            counting.running.add(
-                factorisations=1,
-                multiply_adds=max(500_000 * int(self._solver.get_iparm(19)), least),
-            )
+        # MKL reports millions of operations. The least number for its entries has columns
+        # of equal length.
+        least = self._entries**2 // (2 * self._matrix.shape[0])
+        count(
+            factorisations=1,
+            multiply_adds=max(500_000 * int(self._solver.get_iparm(19)), least),
+        )
         return self
 
     @property
@@ -367,9 +359,8 @@ class Pardiso:
         return int(self._solver.get_iparm(18))
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        if counting.running is not None:
-            m = _n_columns(rhs)
-            counting.running.add(back_solves=m, multiply_adds=m * 2 * self._entries)
+        m = _n_columns(rhs)
+        count(back_solves=m, multiply_adds=m * 2 * self._entries)
         return self._phase(33, rhs)
 
 
@@ -388,8 +379,7 @@ class Multigrid:
 
     def factor(self, values: NDArray[np.float64]) -> MultigridFactor:
         """Build the hierarchy, which counts as a factorisation without arithmetic; that the matrix is positive definite is not noticed."""
-        if counting.running is not None:
-            counting.running.add(factorisations=1)
+        count(factorisations=1)
         return MultigridFactor(self._pattern, values, self._points)
 
 
@@ -444,10 +434,7 @@ class MultigridFactor:
         return self
 
     def solve_in_place(self, x: NDArray[np.float32]) -> None:
-        if counting.running is not None:
-            counting.running.add(
-                back_solves=len(x), multiply_adds=len(x) * self._cycle_multiply_adds
-            )
+        count(back_solves=len(x), multiply_adds=len(x) * self._cycle_multiply_adds)
         for row in x:
             row[:] = self._cycle @ row.astype(self._dtype)
 
@@ -457,13 +444,11 @@ class MultigridFactor:
         scale = float(np.abs(rhs).max()) or 1.0
 
         def one_cycle(residual: NDArray[np.float64]) -> NDArray[Any]:
-            if (
-                counting.running is not None
-            ):  # a cycle, a product with the matrix, and six with vectors
-                counting.running.add(
-                    back_solves=1,
-                    multiply_adds=self._cycle_multiply_adds + self._matrix.nnz + 6 * len(rhs),
-                )
+            # A cycle, a product with the matrix, and six with vectors.
+            count(
+                back_solves=1,
+                multiply_adds=self._cycle_multiply_adds + self._matrix.nnz + 6 * len(rhs),
+            )
             return np.asarray(self._cycle @ residual.astype(self._dtype))
 
         cycle = sp_linalg.LinearOperator(self._matrix.shape, one_cycle, dtype=np.float64)

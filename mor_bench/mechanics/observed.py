@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mor_bench import counting
+from mor_bench.counting import count, uncounted
 from mor_bench.errors import LockingWarning, NoEquilibriumError, SolverError, UnsupportedSceneError
 from mor_bench.mechanics.assembly import State
 from mor_bench.mechanics.compliance import Compliance
@@ -63,10 +63,7 @@ class _HiddenRest(RotatedRest):
             u[self._hidden] += q
         rotations = np.empty((len(u) // 3, 3, 3))
         iterations = nodal_rotations(u.reshape(-1, 3), *self.cells, rotations)
-        if counting.running is not None:
-            counting.running.add(
-                multiply_adds=4 * self.cells[1].size + 20 * len(rotations) + 40 * int(iterations)
-            )
+        count(multiply_adds=4 * self.cells[1].size + 20 * len(rotations) + 40 * int(iterations))
         return np.asarray(rotations[self._rows])
 
 
@@ -181,8 +178,7 @@ class ObservedModel:
         """
         out = np.empty(observed.shape)
         out[:, self._seen] = observed[:, self._seen]
-        if counting.running is not None:
-            counting.running.add(multiply_adds=len(out) * self._coupling.nnz)
+        count(multiply_adds=len(out) * self._coupling.nnz)
         out[:, self._model.hidden] = -self._model.rest_factor.solve(
             np.asarray(self._coupling @ out[:, self._seen].T)
         ).T
@@ -208,7 +204,7 @@ class ObservedModel:
         (n_dofs, r) float64
         """
         out = np.zeros((self.scene.mesh.n_dofs, axes.shape[1]))
-        with counting.uncounted():
+        with uncounted():
             hidden = self._model.rest_factor.solve(np.ascontiguousarray(axes[self._model.hidden]))
         out[self.scene.free_dofs[self._seen]] = axes[self._seen] - self._coupling.T @ hidden
         return out

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mor_bench import counting
+from mor_bench.counting import count, uncounted
 from mor_bench.mechanics.assembly import Pattern
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
 
@@ -221,10 +221,8 @@ class RotatedRest:
         iterations = nodal_rotations(
             np.append(q, np.zeros(3)).reshape(-1, 3), *self.cells, rotations
         )
-        if counting.running is not None:  # per component of a cell's nodes, per node, per iteration
-            counting.running.add(
-                multiply_adds=4 * self.cells[1].size + 20 * len(self._place) + 40 * int(iterations)
-            )
+        # Per component of a cell's nodes, per node, per iteration.
+        count(multiply_adds=4 * self.cells[1].size + 20 * len(self._place) + 40 * int(iterations))
         return rotations
 
     def solve_many(self, residuals: Sequence[Array], rotations: Sequence[Array]) -> Array:
@@ -238,8 +236,7 @@ class RotatedRest:
         for row, residual, Q, scale in zip(work, residuals, rotations, scales, strict=True):
             _turn_back(self._place, Q, scale, residual, row)
         self._factor.solve_in_place(work)
-        if counting.running is not None:
-            counting.running.add(multiply_adds=8 * work.size)
+        count(multiply_adds=8 * work.size)
         z = np.empty(work.shape)
         for out, row, Q, scale in zip(z, work, rotations, scales, strict=True):
             _turn(self._place, Q, scale, row, out)
@@ -250,14 +247,13 @@ class RotatedRest:
         response = (
             np.random.default_rng(0).normal(size=(1, 3 * len(self._place))).astype(np.float32)
         )
-        with counting.uncounted():
+        with uncounted():
             self._factor.solve_in_place(response)
         return np.asarray(response[0] / np.abs(response).max())
 
     def soft(self, rotations: Array) -> Array:
         """The response at rest to a random force, of size one, turned."""
-        if counting.running is not None:
-            counting.running.add(multiply_adds=4 * len(self._soft))
+        count(multiply_adds=4 * len(self._soft))
         z = np.empty(len(self._soft))
         _turn(self._place, rotations, 1.0, self._soft, z)
         return z
@@ -301,16 +297,14 @@ class BlockJacobi:
 
     def take(self, values: Array) -> None:
         """Invert the diagonal blocks of a tangent."""
-        if counting.running is not None:
-            counting.running.add(multiply_adds=27 * len(self._places))
+        count(multiply_adds=27 * len(self._places))
         try:
             self._inverse = np.linalg.inv(values[self._places].reshape(-1, 3, 3))
         except np.linalg.LinAlgError as error:
             raise NotPositiveDefiniteError from error
 
     def solve(self, residual: Array) -> Array:
-        if counting.running is not None:
-            counting.running.add(multiply_adds=9 * len(self._places))
+        count(multiply_adds=9 * len(self._places))
         return np.asarray((self._inverse @ residual.reshape(-1, 3, 1)).ravel())
 
 
@@ -358,10 +352,8 @@ def conjugate_gradients(
         rz, before = float(r @ z), rz
         p = z + (rz / before) * p
         multiply(pattern.indptr, pattern.indices, values, p, q)
-        if (
-            counting.running is not None
-        ):  # the product with K, of which one triangle is stored, and six with vectors
-            counting.running.add(multiply_adds=2 * len(values) + 5 * len(p))
+        # The product with K, of which one triangle is stored, and six with vectors.
+        count(multiply_adds=2 * len(values) + 5 * len(p))
         curvature = float(p @ q)
         if not curvature > 0.0:
             raise NotPositiveDefiniteError

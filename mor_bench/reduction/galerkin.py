@@ -11,8 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs
 
-from mor_bench import counting
-from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
+from mor_bench.counting import cholesky_multiply_adds, count, triangular_multiply_adds
 from mor_bench.errors import InvalidInputError, SolverError
 from mor_bench.mechanics.assembly import Assembler, Pattern, State
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
@@ -53,25 +52,23 @@ class _DenseFactor:
         self._cholesky = cholesky
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        if counting.running is not None:
-            r, m = len(rhs), 1 if rhs.ndim == 1 else rhs.shape[1]
-            counting.running.add(
-                back_solves=m,
-                reduced_back_solves=m,
-                multiply_adds=m * triangular_multiply_adds(r, r - 1),
-            )
+        r, m = len(rhs), 1 if rhs.ndim == 1 else rhs.shape[1]
+        count(
+            back_solves=m,
+            reduced_back_solves=m,
+            multiply_adds=m * triangular_multiply_adds(r, r - 1),
+        )
         return np.asarray(dpotrs(self._cholesky, rhs)[0]).reshape(rhs.shape)
 
 
 def dense_factor(tangent: NDArray[np.float64]) -> Factor:
     """Cholesky factor of a reduced tangent (r, r); raises `NotPositiveDefiniteError`."""
-    if counting.running is not None:
-        r = len(tangent)
-        counting.running.add(
-            factorisations=1,
-            reduced_factorisations=1,
-            multiply_adds=cholesky_multiply_adds(r, r - 1),
-        )
+    r = len(tangent)
+    count(
+        factorisations=1,
+        reduced_factorisations=1,
+        multiply_adds=cholesky_multiply_adds(r, r - 1),
+    )
     cholesky, info = dpotrf(tangent)
     if info != 0:
         raise NotPositiveDefiniteError
@@ -152,17 +149,14 @@ class GalerkinProblem(DenseProblem):
         return State(self.modes.T @ state.force, state.energy_j, state.min_det_f)
 
     def force(self, q: NDArray[np.float64]) -> State:
-        if counting.running is not None:
-            counting.running.add(multiply_adds=2 * self.modes.size)
+        count(multiply_adds=2 * self.modes.size)
         return self._project(self.assembler.force(self.modes @ q))
 
     def linearise(self, q: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
         state, values = self.assembler.force_and_tangent(self.modes @ q)
-        if (
-            counting.running is not None
-        ):  # Φq, Φᵀf, KΦ with the K of which one triangle is stored, ΦᵀKΦ
-            n, r = self.modes.shape
-            counting.running.add(multiply_adds=2 * n * r + (2 * len(values) - n) * r + n * r**2)
+        # Φq, Φᵀf, KΦ with the K of which one triangle is stored, ΦᵀKΦ.
+        n, r = self.modes.shape
+        count(multiply_adds=2 * n * r + (2 * len(values) - n) * r + n * r**2)
         return self._project(state), self.modes.T @ stiffness_times(
             self.assembler.pattern, values, self.modes
         )

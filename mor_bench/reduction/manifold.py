@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench import counting
+from mor_bench.counting import count
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.linear import Factor
@@ -51,16 +51,14 @@ class QuadraticManifold:
 
     def at(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The displacement u(q), (n,), and the tangent space T(q), (n, r)."""
-        if counting.running is not None:
-            counting.running.add(multiply_adds=self._bend.size + self.modes.size)
+        count(multiply_adds=self._bend.size + self.modes.size)
         bent: NDArray[np.float64] = (self._bend.reshape(-1, len(q)) @ q).reshape(self.modes.shape)
         tangents = self.modes + bent
         return 0.5 * ((self.modes + tangents) @ q), tangents
 
     def curvature(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
         """Σₐ fₐ ∂²uₐ/∂q², (r, r): the part of a tangent that comes of the manifold's own curvature."""
-        if counting.running is not None:
-            counting.running.add(multiply_adds=self._bend.size)
+        count(multiply_adds=self._bend.size)
         r = self.modes.shape[1]
         return (force @ self._bend.reshape(-1, r * r)).reshape(r, r)
 
@@ -130,8 +128,7 @@ class ManifoldProblem(DenseProblem):
         return self._linear.rest_factor
 
     def _state(self, q: NDArray[np.float64], state: State, tangents: NDArray[np.float64]) -> State:
-        if counting.running is not None:
-            counting.running.add(multiply_adds=tangents.size)
+        count(multiply_adds=tangents.size)
         done = self._bending_load @ q
         return State(
             tangents.T @ state.force - done, state.energy_j - 0.5 * float(done @ q), state.min_det_f
@@ -144,9 +141,9 @@ class ManifoldProblem(DenseProblem):
     def linearise(self, q: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
         u, tangents = self._manifold.at(q)
         state, values = self._linear.assembler.force_and_tangent(u)
-        if counting.running is not None:  # KT with the K of which one triangle is stored, TᵀKT
-            n, r = tangents.shape
-            counting.running.add(multiply_adds=(2 * len(values) - n) * r + n * r**2)
+        # KT with the K of which one triangle is stored, TᵀKT.
+        n, r = tangents.shape
+        count(multiply_adds=(2 * len(values) - n) * r + n * r**2)
         product = stiffness_times(self._linear.assembler.pattern, values, tangents)
         bending = self._manifold.curvature(state.force) - self._bending_load
         return self._state(q, state, tangents), tangents.T @ product + bending

@@ -13,8 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench import counting
-from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
+from mor_bench.counting import cholesky_multiply_adds, count, triangular_multiply_adds
 from mor_bench.mechanics.assembly import State, quadrature_of
 from mor_bench.mechanics.laws import SAINT_VENANT_KIRCHHOFF, point_multiply_adds, point_stresses
 from mor_bench.mechanics.newton import HOPELESS, PLAIN_ITERATIONS, ROUND_OFF, Solution
@@ -113,11 +112,8 @@ class ReducedPoints:
 
     def count(self, forces: int, tangents: int) -> None:
         """Count evaluations of the force alone, and of force and tangent."""
-        if counting.running is not None:
-            work = forces * self._multiply_adds[0] + tangents * self._multiply_adds[1]
-            counting.running.add(
-                element_evaluations=(forces + tangents) * self.n_cells, multiply_adds=work
-            )
+        work = forces * self._multiply_adds[0] + tangents * self._multiply_adds[1]
+        count(element_evaluations=(forces + tangents) * self.n_cells, multiply_adds=work)
 
     def _sum(self, q: Array, tangent: Array) -> State:
         force = np.zeros(self.n_unknowns)
@@ -182,16 +178,15 @@ class ReducedPoints:
             PLAIN_ITERATIONS,
         )
         self.count(forces, tangents)
-        if counting.running is not None:
-            r = self.n_unknowns
-            dense = factors * cholesky_multiply_adds(r, r - 1) + solves * triangular_multiply_adds(
-                r, r - 1
-            )
-            counting.running.add(
-                factorisations=factors,
-                reduced_factorisations=factors,
-                back_solves=solves,
-                reduced_back_solves=solves,
-                multiply_adds=dense,
-            )
+        r = self.n_unknowns
+        dense = factors * cholesky_multiply_adds(r, r - 1) + solves * triangular_multiply_adds(
+            r, r - 1
+        )
+        count(
+            factorisations=factors,
+            reduced_factorisations=factors,
+            back_solves=solves,
+            reduced_back_solves=solves,
+            multiply_adds=dense,
+        )
         return Solution(q, min_det, iterations, 0) if converged and min_det > 0 else None

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench import counting
+from mor_bench.counting import count
 from mor_bench.errors import InvertedElementError
 from mor_bench.mechanics.linear import Factor
 from mor_bench.mechanics.model import FullOrderModel
@@ -46,8 +46,7 @@ def static_correction(
     (n_free,) float64
         m.
     """
-    if counting.running is not None:
-        counting.running.add(multiply_adds=2 * modes.size)
+    count(multiply_adds=2 * modes.size)
     return rest_factor.solve(load) - modes @ reduced_factor.solve(modes.T @ load)
 
 
@@ -65,8 +64,7 @@ def predict_corrected(
     if the reduced model has no valid equilibrium, or its correction inverts cells.
     """
     out = np.empty(loads.shape)
-    if counting.running is not None:
-        counting.running.add(multiply_adds=2 * modes.size * len(loads))
+    count(multiply_adds=2 * modes.size * len(loads))
     for row, load in zip(out, loads, strict=True):
         reduced = modes.T @ load
         if isinstance(problem, TensorProblem):

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mor_bench import counting
+from mor_bench.counting import count, is_counting
 from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.scene import Scene
 
@@ -57,14 +57,14 @@ class Subspace:
         """Φᵀf (r,) of nodal forces (n_dofs,), N."""
         reduced = np.empty(self.n_modes)
         loaded = int(_project(self._modes, load, reduced))
-        if counting.running is not None:
-            counting.running.add(multiply_adds=loaded * self.n_modes)
+        if is_counting():
+            count(multiply_adds=loaded * self.n_modes)
         return reduced
 
     def expand(self, q: Array, out: Array) -> None:
         """Write Φq into ``out`` (n_dofs,), m; NaN where no output is wanted."""
-        if counting.running is not None:
-            counting.running.add(multiply_adds=self._expanding.size)
+        if is_counting():
+            count(multiply_adds=self._expanding.size)
         if self._wanted is None:
             np.dot(self._expanding, q, out=out)
         else:

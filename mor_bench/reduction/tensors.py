@@ -20,8 +20,13 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cholesky
 
-from mor_bench import counting
-from mor_bench.counting import cholesky_multiply_adds, triangular_multiply_adds
+from mor_bench.counting import (
+    cholesky_multiply_adds,
+    count,
+    counted,
+    is_counting,
+    triangular_multiply_adds,
+)
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.assembly import State, quadrature_of
 from mor_bench.mechanics.model import FullOrderModel
@@ -354,7 +359,7 @@ def polynomial_pays(model: FullOrderModel, n_modes: int, n_bases: int = 1) -> bo
     """
     if not has_polynomial(model.scene) or 8 * n_bases * n_pairs(n_modes) ** 2 > MOST_BYTES:
         return False
-    with counting.counted() as mesh:
+    with counted() as mesh:
         model.assembler.force_and_tangent(np.zeros(model.n_unknowns))
     products = 2 * len(model.assembler.pattern.indices) * n_modes + model.n_unknowns * n_modes**2
     return 3 * n_pairs(n_modes) ** 2 <= mesh.multiply_adds + products
@@ -451,17 +456,16 @@ class TensorProblem(DenseProblem):
         q = np.empty(self.n_unknowns)
         quadratic, cubic, quartic = self._arrays
         iterations: int = _equilibrium(quadratic, cubic, quartic, self._rest, load, tolerance, q)
-        if counting.running is not None:
+        if is_counting():
             r, times = self.n_unknowns, abs(iterations)
-            work = (
-                self._evaluation
-                + cholesky_multiply_adds(r, r - 1)
-                + triangular_multiply_adds(r, r - 1)
+            dense = cholesky_multiply_adds(r, r - 1) + triangular_multiply_adds(r, r - 1)
+            count(
+                factorisations=times,
+                reduced_factorisations=times,
+                back_solves=times,
+                reduced_back_solves=times,
+                multiply_adds=times * (self._evaluation + dense),
             )
-            counting.running.add(
-                factorisations=times, reduced_factorisations=times, multiply_adds=times * work
-            )
-            counting.running.add(back_solves=times, reduced_back_solves=times)
         return q if iterations > 0 and self.min_det_f(q) > 0 else None
 
     @property
@@ -472,15 +476,14 @@ class TensorProblem(DenseProblem):
 
     def min_det_f(self, q: Array) -> float:
         """The smallest det F at the watched points."""
-        if counting.running is not None:
-            counting.running.add(multiply_adds=self.sentinels.size)
+        if is_counting():
+            count(multiply_adds=self.sentinels.size)
         return float(_min_det_f(self.sentinels, q))
 
     def linearise(self, q: Array) -> tuple[State, Array]:
         r = self.n_unknowns
         products, force, hessian = np.empty(n_pairs(r)), np.empty(r), np.empty((r, r))
-        if counting.running is not None:
-            counting.running.add(multiply_adds=self._evaluation)
+        count(multiply_adds=self._evaluation)
         quadratic, cubic, quartic = self._arrays
         energy = _evaluate(quadratic, cubic, quartic, q, products, force, hessian)
         return State(force, energy, self.min_det_f(q)), np.tril(hessian) + np.tril(hessian, -1).T

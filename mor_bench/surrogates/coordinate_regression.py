@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mor_bench import counting
+from mor_bench.counting import count, is_counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.compliance import project
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
@@ -166,8 +166,8 @@ class CoordinateRegression(Surrogate):
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         loads = self._checked_forces(forces).reshape(-1, self.scene_.mesh.n_dofs)
         coefficients = self._coefficients(project(self._from_forces, loads))
-        if counting.running is not None:
-            counting.running.add(multiply_adds=len(loads) * self.modes_.size)
+        if is_counting():
+            count(multiply_adds=len(loads) * self.modes_.size)
         out = coefficients @ self._expanding
         if self.input == "linear-response":
             out += self.compliance_.respond(loads)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from mor_bench import counting
+from mor_bench.counting import count
 from mor_bench.errors import UnconstrainedBodyError, UnsupportedSceneError
 from mor_bench.mechanics.model import FullOrderModel, check_supports, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
@@ -52,8 +52,7 @@ class CoarseFEM(Surrogate):
         batch = self._checked_forces(forces)
         coarse = self.model_.scene
         out = np.zeros_like(batch)
-        if counting.running is not None:
-            counting.running.add(multiply_adds=6 * self.interpolation_.nnz * len(batch))
+        count(multiply_adds=6 * self.interpolation_.nnz * len(batch))
         for row, load in zip(out, batch, strict=True):
             displacement = np.zeros(coarse.mesh.n_dofs)
             displacement[coarse.free_dofs] = self.model_.solve(

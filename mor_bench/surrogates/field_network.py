@@ -13,7 +13,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from mor_bench import counting
+from mor_bench.counting import count
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.learning.training import (
     Training,
@@ -200,11 +200,10 @@ class FieldSurrogate(Surrogate):
         batch = self._checked_forces(forces)
         if len(batch) == 0:
             return np.zeros(np.shape(forces))
-        if counting.running is not None:  # with one scaling of each input and each output
-            counting.running.add(
-                multiply_adds=len(batch)
-                * (self.network_.multiply_adds + 2 * self.scene_.mesh.n_dofs)
-            )
+        # With one scaling of each input and each output.
+        count(
+            multiply_adds=len(batch) * (self.network_.multiply_adds + 2 * self.scene_.mesh.n_dofs)
+        )
         inputs = self._linear_response(batch) if self.input == "linear-response" else batch
         answers = [
             self.network_(self.network_.encode(chunk))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.optimize import minimize
 
-from mor_bench import counting
+from mor_bench.counting import count
 from mor_bench.errors import InvalidInputError
 from mor_bench.surrogates.coordinate_regression import CoordinateRegression, CoordinateSamples
 
@@ -74,12 +74,9 @@ class _GaussianSums(CoordinateRegression):
         return {"points": self.points_, "weights": self.weights_, "lengths": self.lengths_}
 
     def _coefficients(self, z: Array) -> Array:
-        if counting.running is not None:  # an exponential as one
-            n_points = len(self.points_)
-            per_load = (
-                self._exponents.size - n_points + n_points + self.weights_.size + 2 * z.shape[1]
-            )
-            counting.running.add(multiply_adds=len(z) * per_load)
+        # An exponential as one.
+        per_load = self._exponents.size + self.weights_.size + 2 * z.shape[1]
+        count(multiply_adds=len(z) * per_load)
         left = np.empty((len(z), len(self._exponents)))
         left[:, :-2], left[:, -2] = z, 1.0
         left[:, -1] = -0.5 * ((z / self.lengths_) ** 2).sum(axis=1)

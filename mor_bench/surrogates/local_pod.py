@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from mor_bench import counting
+from mor_bench.counting import count
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
@@ -121,10 +121,7 @@ class LocalPOD(Surrogate):
         batch = self._checked_forces(forces)
         out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
         free = self.scene_.free_dofs
-        if counting.running is not None:
-            counting.running.add(
-                multiply_adds=len(batch) * (self.to_coordinates_.size + self.centroids_.size)
-            )
+        count(multiply_adds=len(batch) * (self.to_coordinates_.size + self.centroids_.size))
         for row, load in zip(out, batch.reshape(out.shape)[:, free], strict=True):
             nearest = self._nearest(load)
             row[free] = predict_corrected(

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mor_bench import counting
+from mor_bench.counting import count
 from mor_bench.learning.perceptron import named, named_shapes, taken
 from mor_bench.learning.training import TrainingPlan, device_of, fingerprint_of, train
 from mor_bench.surrogates.coordinate_regression import CoordinateRegression
@@ -113,11 +113,11 @@ class NetworkRegression(CoordinateRegression):
         """What the networks answer at z (n, n_inputs), (n, n_outputs)."""
 
     def _coefficients(self, z: Array) -> Array:
-        if counting.running is not None:  # each unit's nonlinearity as one
-            counting.running.add(
-                multiply_adds=len(z)
-                * sum(weight.size for network in self._networks.values() for weight in network)
-            )
+        # Each unit's nonlinearity as one.
+        count(
+            multiply_adds=len(z)
+            * sum(weight.size for network in self._networks.values() for weight in network)
+        )
         out = self._values(z) - self._at_rest
         out[~z.any(axis=1)] = 0.0  # in a batch the network at rest is rounded otherwise
         return out

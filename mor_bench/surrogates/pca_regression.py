@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mor_bench import counting
+from mor_bench.counting import count, is_counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.surrogates.coordinate_regression import CoordinateRegression, CoordinateSamples
 
@@ -143,8 +143,6 @@ class PCARegression(CoordinateRegression):
         return {"weights": self.weights_}
 
     def _coefficients(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
-        if counting.running is not None:
-            counting.running.add(
-                multiply_adds=len(z) * (self._monomials.n_products + self.weights_.size)
-            )
+        if is_counting():
+            count(multiply_adds=len(z) * (self._monomials.n_products + self.weights_.size))
         return np.asarray(self._monomials(z) @ self.weights_.T)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from mor_bench import counting
+from mor_bench.counting import count
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
@@ -173,22 +173,17 @@ class SeparatedLoad(Surrogate):
             * (direction @ self.by_direction_)
             * (powers @ self.by_power_)
         )
-        if counting.running is not None:
-            per_term = (
-                self.by_position_.size
-                + self.by_direction_.size
-                + self.by_power_.size
-                + 2 * terms.shape[1]
-            )
-            functions = position.shape[1] + direction.shape[1] + powers.shape[1]
-            products = (
-                per_term
-                + functions
-                + self.vectors_.size
-                + self.modes_.size
-                + 7 * scene.mesh.n_nodes
-            )
-            counting.running.add(multiply_adds=len(batch) * products)
+        per_term = (
+            self.by_position_.size
+            + self.by_direction_.size
+            + self.by_power_.size
+            + 2 * terms.shape[1]
+        )
+        functions = position.shape[1] + direction.shape[1] + powers.shape[1]
+        products = (
+            per_term + functions + self.vectors_.size + self.modes_.size + 7 * scene.mesh.n_nodes
+        )
+        count(multiply_adds=len(batch) * products)
         out = np.zeros((len(batch), scene.mesh.n_dofs))
         out[:, scene.free_dofs] = (terms @ self.vectors_) @ self.modes_.T
         if self.base == "linear-response":

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
-from mor_bench import counting
+from mor_bench.counting import count
 from mor_bench.learning.perceptron import (
     Perceptron,
     evaluate,
@@ -164,7 +164,6 @@ class PODNN(NetworkRegression):
     def _coefficients(self, z: Array) -> Array:
         out = super()._coefficients(z)
         if self._slope is not None:
-            if counting.running is not None:
-                counting.running.add(multiply_adds=len(z) * self._slope.size)
+            count(multiply_adds=len(z) * self._slope.size)
             out -= z @ self._slope
         return out

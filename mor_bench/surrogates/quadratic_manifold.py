@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from mor_bench import counting
+from mor_bench.counting import count
 from mor_bench.errors import InvalidInputError, SolverError
 from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
@@ -124,8 +124,7 @@ class QuadraticManifoldGalerkin(Surrogate):
         free, modes = self.scene_.free_dofs, self.manifold_.modes
         for row, load in zip(out, batch.reshape(out.shape)[:, free], strict=True):
             problem = ManifoldProblem(self.linear_, self._sampled, self.manifold_.curvature(load))
-            if counting.running is not None:
-                counting.running.add(multiply_adds=modes.size)
+            count(multiply_adds=modes.size)
             q = solve_equilibrium(
                 problem, modes.T @ load, options=NewtonOptions(self.tolerance)
             ).displacement

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.linalg import cholesky, solve_triangular
 
-from mor_bench import counting
+from mor_bench.counting import count, is_counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.surrogates.coordinate_regression import CoordinateRegression, CoordinateSamples
 from mor_bench.surrogates.pca_regression import Levels, Monomials
@@ -167,10 +167,8 @@ class SparsePolynomial(CoordinateRegression):
         return {"weights": self.weights_, "terms": _as_array(self.terms_)}
 
     def _coefficients(self, z: Array) -> Array:
-        if counting.running is not None:
-            counting.running.add(
-                multiply_adds=len(z) * (self._monomials.n_products + self._weights.size)
-            )
+        if is_counting():
+            count(multiply_adds=len(z) * (self._monomials.n_products + self._weights.size))
         return np.asarray(self._monomials(z) @ self._weights.T)
 
 

@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mor_bench import counting
+from mor_bench.counting import count
 from mor_bench.errors import InvalidInputError
 from mor_bench.surrogates.coordinate_regression import CoordinateRegression, CoordinateSamples
 
@@ -156,8 +156,8 @@ class TreeRegression(CoordinateRegression):
         return out
 
     def _coefficients(self, z: Array) -> Array:
-        if counting.running is not None:  # comparisons and sums alone do not count
-            counting.running.add(multiply_adds=z.shape[0] * self.values_.shape[1])
+        # Comparisons and sums alone do not count.
+        count(multiply_adds=z.shape[0] * self.values_.shape[1])
         return self._means(z) - self._at_rest
 
 

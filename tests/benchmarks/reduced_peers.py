@@ -56,7 +56,7 @@ from rich.console import Console
 from rich.table import Table
 
 import mor_bench
-from mor_bench import counting
+from mor_bench.counting import counted
 from mor_bench.errors import MissingDependencyError, UnsupportedSceneError
 from mor_bench.machine import describe_machine
 from mor_bench.measure.error_metrics import sample_errors
@@ -127,7 +127,7 @@ class Ours(Reduced):
         self.n_cells = None if integrated is None else integrated.n_cells
 
     def set_up(self, forces: Array) -> None:
-        with counting.counted() as cost:
+        with counted() as cost:
             self._method.predict(forces)
         self._steps = cost.reduced_back_solves
 

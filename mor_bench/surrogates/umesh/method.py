@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from torch import Tensor
 
-from mor_bench import counting
+from mor_bench.counting import count, is_counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.learning.inference import Backend, choose_inference, inference_or_eager
 from mor_bench.learning.training import (
@@ -276,13 +276,13 @@ class UMesh(Surrogate):
     @torch.inference_mode()
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         checked = self._checked_forces(forces)
-        if counting.running is not None:  # with one scaling of each input and each output
+        if is_counting():  # the sum walks over the layers
             products = (
                 self.network_.multiply_adds(self.grid_.shape)
                 + self.grid_.multiply_adds
-                + 2 * self.scene_.mesh.n_dofs
+                + 2 * self.scene_.mesh.n_dofs  # each input and output is scaled
             )
-            counting.running.add(multiply_adds=len(checked) * products)
+            count(multiply_adds=len(checked) * products)
         given = self._given(checked)
         scaled = torch.from_numpy((given / self.input_scale_).astype(np.float32))
         answers = torch.cat(
