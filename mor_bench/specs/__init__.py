@@ -1,110 +1,91 @@
-"""Dataset and method files: TOML read into validated, frozen specs."""
+"""Specifications: dataset and method files, read from TOML, validated and frozen.
 
-from mor_bench.specs.all_specs import (
-    NO_EQUATIONS as NO_EQUATIONS,
+Here live the keys that a file may hold, their ranges and defaults, where files are found, and the
+one-line message for each mistake. Nothing here builds a mesh or imports a method, except to check
+the hyperparameters of a method against its class.
+
+Start reading with `dataset_spec.py` and `method_spec.py`; `spec_files.py` reads the files.
+"""
+
+from mor_bench.specs.battery import Battery, Race
+from mor_bench.specs.dataset_spec import (
+    NO_EQUATIONS,
+    NO_FORCES,
+    AnyDatasetSpec,
+    DatasetSpec,
+    ImportedDatasetSpec,
+    generated,
 )
-from mor_bench.specs.all_specs import (
-    NO_FORCES as NO_FORCES,
+from mor_bench.specs.geometry_spec import (
+    BoxGeometry,
+    FileGeometry,
+    LShapeGeometry,
+    TetrahedraGeometry,
+    VoxelsGeometry,
 )
-from mor_bench.specs.all_specs import (
-    AnyDatasetSpec as AnyDatasetSpec,
+from mor_bench.specs.loads_spec import Loads, Sampling, Split, SplitBy
+from mor_bench.specs.material_spec import (
+    MooneyRivlinMaterial,
+    OgdenMaterial,
+    SolverName,
+    TwoLameMaterial,
 )
-from mor_bench.specs.all_specs import (
-    BoxGeometry as BoxGeometry,
+from mor_bench.specs.method_spec import MethodSpec, check_method
+from mor_bench.specs.parameters import check_parameters, load_class
+from mor_bench.specs.region_spec import (
+    BoxRegion,
+    NearestRegion,
+    NearSurfaceRegion,
+    PointSetRegion,
+    Region,
+    SphereRegion,
 )
-from mor_bench.specs.all_specs import (
-    BoxRegion as BoxRegion,
+from mor_bench.specs.source_file import SourceFile
+from mor_bench.specs.spec_files import (
+    is_method_file,
+    load_dataset_spec,
+    load_generated_spec,
+    load_method_spec,
 )
-from mor_bench.specs.all_specs import (
-    DatasetSpec as DatasetSpec,
-)
-from mor_bench.specs.all_specs import (
-    FileGeometry as FileGeometry,
-)
-from mor_bench.specs.all_specs import (
-    ImportedDatasetSpec as ImportedDatasetSpec,
-)
-from mor_bench.specs.all_specs import (
-    Loads as Loads,
-)
-from mor_bench.specs.all_specs import (
-    LShapeGeometry as LShapeGeometry,
-)
-from mor_bench.specs.all_specs import (
-    MethodSpec as MethodSpec,
-)
-from mor_bench.specs.all_specs import (
-    MooneyRivlinMaterial as MooneyRivlinMaterial,
-)
-from mor_bench.specs.all_specs import (
-    NearestRegion as NearestRegion,
-)
-from mor_bench.specs.all_specs import (
-    NearSurfaceRegion as NearSurfaceRegion,
-)
-from mor_bench.specs.all_specs import (
-    OgdenMaterial as OgdenMaterial,
-)
-from mor_bench.specs.all_specs import (
-    PointSetRegion as PointSetRegion,
-)
-from mor_bench.specs.all_specs import (
-    Region as Region,
-)
-from mor_bench.specs.all_specs import (
-    Sampling as Sampling,
-)
-from mor_bench.specs.all_specs import (
-    SolverName as SolverName,
-)
-from mor_bench.specs.all_specs import (
-    SourceFile as SourceFile,
-)
-from mor_bench.specs.all_specs import (
-    SphereRegion as SphereRegion,
-)
-from mor_bench.specs.all_specs import (
-    Split as Split,
-)
-from mor_bench.specs.all_specs import (
-    SplitBy as SplitBy,
-)
-from mor_bench.specs.all_specs import (
-    TetrahedraGeometry as TetrahedraGeometry,
-)
-from mor_bench.specs.all_specs import (
-    TwoLameMaterial as TwoLameMaterial,
-)
-from mor_bench.specs.all_specs import (
-    VoxelsGeometry as VoxelsGeometry,
-)
-from mor_bench.specs.all_specs import (
-    check_method as check_method,
-)
-from mor_bench.specs.all_specs import (
-    check_parameters as check_parameters,
-)
-from mor_bench.specs.all_specs import (
-    find_suite as find_suite,
-)
-from mor_bench.specs.all_specs import (
-    generated as generated,
-)
-from mor_bench.specs.all_specs import (
-    is_method_file as is_method_file,
-)
-from mor_bench.specs.all_specs import (
-    list_suite as list_suite,
-)
-from mor_bench.specs.all_specs import (
-    load_class as load_class,
-)
-from mor_bench.specs.all_specs import (
-    load_dataset_spec as load_dataset_spec,
-)
-from mor_bench.specs.all_specs import (
-    load_generated_spec as load_generated_spec,
-)
-from mor_bench.specs.all_specs import (
-    load_method_spec as load_method_spec,
-)
+from mor_bench.specs.suite_folder import find_suite, list_suite
+
+__all__ = [
+    "NO_EQUATIONS",
+    "NO_FORCES",
+    "AnyDatasetSpec",
+    "Battery",
+    "BoxGeometry",
+    "BoxRegion",
+    "DatasetSpec",
+    "FileGeometry",
+    "ImportedDatasetSpec",
+    "LShapeGeometry",
+    "Loads",
+    "MethodSpec",
+    "MooneyRivlinMaterial",
+    "NearSurfaceRegion",
+    "NearestRegion",
+    "OgdenMaterial",
+    "PointSetRegion",
+    "Race",
+    "Region",
+    "Sampling",
+    "SolverName",
+    "SourceFile",
+    "SphereRegion",
+    "Split",
+    "SplitBy",
+    "TetrahedraGeometry",
+    "TwoLameMaterial",
+    "VoxelsGeometry",
+    "check_method",
+    "check_parameters",
+    "find_suite",
+    "generated",
+    "is_method_file",
+    "list_suite",
+    "load_class",
+    "load_dataset_spec",
+    "load_generated_spec",
+    "load_method_spec",
+]

@@ -1,8 +1,9 @@
-"""Every method of the suite on one thread: latency of a single query, error on the test loads, memory, fit and size of the model."""
+"""Latency, error, memory, fitting time and model size of every method, on one thread."""
 
 from __future__ import annotations
 
 import json
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,62 +20,23 @@ LIMITS = {"beam-tiny": 210, "beam-coarse": 400}
 """Samples of each dataset: few, so that generating and fitting everything takes seconds."""
 
 METHODS: dict[str, dict[str, Any]] = {
-    "fem": {"tolerance": 1e-4},
-    "fem-coarse": {"coarsening": 2, "tolerance": 1e-4},
-    "fem-jacobi-pcg": {"tolerance": 1e-4},
-    "fem-pardiso": {"tolerance": 1e-4},
-    "fem-warm": {"start": "nearest", "tolerance": 1e-4},
-    "linear-fem": {},
-    "pod": {"n_modes": 20},
-    "hpod": {"n_modes": 20, "cubature_tolerance": 1e-2},
-    "hybrid": {"start_parameters": {"n_modes": 20}, "steps": 1},
-    "pod-tensor": {"n_modes": 20},
-    "autoencoder": {"n_latent": 10, "iterations": 500},
-    "local-pod": {"n_clusters": 8, "n_modes": 10},
-    "modal-derivatives": {"n_linear": 5, "n_modes": 20},
-    "quadratic-manifold": {"n_modes": 5},
-    "ecm": {"n_modes": 20, "cubature_tolerance": 1e-2},
-    "deim": {"n_modes": 20, "n_force_modes": 40},
-    "pca-regression": {"n_input_modes": 10},
-    "pca-regression-force": {"n_input_modes": 20, "n_output_modes": 20},
-    "explicit-dynamics": {"tolerance": 1e-2},
-    "pgd": {"n_terms": 60, "position_degree": 3},
-    "pgd-force": {"n_terms": 60, "position_degree": 3},
-    "umesh": {
-        "channels": 8,
-        "steps": 2,
-        "iterations": 200,
-        "batch_size": 16,
-        "learning_rate": 3e-3,
-    },
-    "umesh-small": {"channels": 8, "iterations": 200},
-    "umesh-linear": {"channels": 8, "iterations": 200},
-    "pca-ridge": {},
-    "pca-kernel-ridge": {},
-    "pca-gaussian-process": {"n_input_modes": 10},
-    "pca-random-forest": {},
-    "pca-extra-trees": {},
-    "pca-polynomial-force": {"n_input_modes": 40},
-    "pod-nn-force": {"iterations": 500},
-    "sparse-polynomial-force": {"max_terms": 500},
-    "pod-nn": {"iterations": 500},
-    "pod-nn-derivative": {"iterations": 500},
-    "sparse-polynomial": {"max_terms": 500},
-    "sparse-polynomial-derivative": {"max_terms": 500},
-    "deeponet": {"input": "linear-response", "iterations": 500},
-    "pod-deeponet": {"input": "linear-response", "iterations": 500},
-    "fno": {"input": "linear-response", "iterations": 100},
-    "mesh-graph-net": {"input": "linear-response", "iterations": 30},
-    "gappy-pod": {"n_modes": 20},
+    path.stem: tomllib.loads(path.read_text(encoding="utf-8"))
+    .get("battery", {})
+    .get("benchmark", {})
+    for path in sorted((Path(__file__).parents[2] / "methods").glob("*.toml"))
 }
-"""Methods and their knobs. U-Mesh's latency does not depend on how long it was trained; the error of so short a training says little."""
+"""Methods of the working tree and their hyperparameters, from the table `[battery]` of each file.
+
+The files are read here because the library may be of a commit before this table. The latency of
+U-Mesh does not depend on the length of its training; the error of so short a training says little.
+"""
 
 UNAVAILABLE = (MissingDependencyError, UnsupportedSceneError, SpecError)
 """An extra is missing, or the commit is from before the method or one of its knobs."""
 
 
 def load_limited(dataset: str) -> Dataset:
-    """The first samples of a dataset, from a cache in the working folder, which asv throws away afterwards."""
+    """Load the first samples of a dataset, cached in the working folder that asv deletes."""
     return mor_bench.load_dataset(dataset, limit=LIMITS[dataset], cache=Path("cache"), workers=1)
 
 
@@ -106,7 +68,7 @@ def measure(data: Dataset, method: str, model: Path) -> dict[str, Any]:
 
 
 class _Fitted:
-    """What all measurements share: every method fitted on every dataset by one `setup_cache`, then read back."""
+    """Base of all measurements: `setup_cache` fits every method once; each measurement loads it."""
 
     params = (tuple(LIMITS), tuple(METHODS))
     param_names = ("dataset", "method")
@@ -203,7 +165,7 @@ class Fit(_Fitted):
 
 
 class Error(_Fitted):
-    """Against the full-order solutions of the test loads, which share no load region with training."""
+    """Error on the test loads, which share no load region with training."""
 
     def track_mean_dof_error(self, dataset: str, method: str) -> float:
         """The mean over samples of the mean absolute error per degree of freedom."""

@@ -1,0 +1,139 @@
+"""A dataset file as a whole: generated samples, or samples imported from another program."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from mor_bench.errors import UnsupportedSceneError
+from mor_bench.specs.base import Positive, StrictModel
+from mor_bench.specs.geometry_spec import Geometry
+from mor_bench.specs.loads_spec import ExtraTests, ImportedSplit, Loads, Split, Support
+from mor_bench.specs.material_spec import Discretisation, MaterialSpec, SolverName
+from mor_bench.specs.region_spec import Outputs, Region
+from mor_bench.specs.source_file import File, without_paths
+
+NO_EQUATIONS = "its snapshots were imported, so its equations are not known"
+NO_FORCES = "its forces are not known, only the displacements of a part of its surface"
+
+Side = Annotated[int, Field(ge=2, le=1024)]
+
+
+class Needs(StrictModel):
+    """What the user of the scene needs.
+
+    Attributes
+    ----------
+    outputs : "all" or Region
+        The nodes whose displacements are wanted. Errors count these nodes alone, and a reduced
+        method computes no others.
+    error : float
+        Relative l2 error over the wanted nodes, median over the test set.
+    latency_ms : float
+        Median latency of one query, ms.
+    """
+
+    outputs: Outputs = "all"
+    error: Positive
+    latency_ms: Positive
+
+
+class Observed(StrictModel):
+    """The part of the surface whose displacements are known where the forces are not.
+
+    Attributes
+    ----------
+    region : Region
+        Its nodes that lie on the surface and are free to move are observed.
+    """
+
+    region: Region
+
+
+class CommonDatasetSpec(StrictModel):
+    """The keys of every dataset file.
+
+    Attributes
+    ----------
+    needs : Needs
+    grid_nodes : three ints, optional
+        Nodes per axis of the regular grid for methods that need one, if the mesh is not a part of
+        a regular grid.
+    observed : Observed, optional
+        If given, methods receive displacements of some nodes instead of forces. The samples
+        stay the same.
+    """
+
+    name: str
+    title: str
+    source: str
+    needs: Needs
+    grid_nodes: Annotated[tuple[Side, Side, Side], Field(strict=False)] | None = None
+    observed: Observed | None = Field(default=None, exclude_if=lambda value: value is None)
+
+    def physics(self) -> dict[str, Any]:
+        """Return all that decides the samples: equal physics gives equal snapshots."""
+        raise NotImplementedError
+
+    def digest(self) -> str:
+        """Return twelve hexadecimal digits of the SHA-256 of `physics`."""
+        return hashlib.sha256(json.dumps(self.physics(), sort_keys=True).encode()).hexdigest()[:12]
+
+
+class DatasetSpec(CommonDatasetSpec):
+    """A dataset file whose samples the full-order model generates."""
+
+    geometry: Geometry
+    discretisation: Discretisation = Discretisation()
+    solver: SolverName = "auto"
+    material: MaterialSpec
+    supports: Annotated[tuple[Support, ...], Field(strict=False)] = ()
+    loads: Loads
+    split: Split = Split()
+    tests: ExtraTests = ExtraTests()
+
+    def physics(self) -> dict[str, Any]:
+        dumped = self.model_dump(
+            mode="json",
+            include={"geometry", "discretisation", "material", "supports", "loads"},
+            exclude_none=True,
+        )
+        physics: dict[str, Any] = without_paths(dumped)
+        # Solvers agree only to the tolerance. The default solver stays out of the digest.
+        return physics if self.solver == "auto" else {**physics, "solver": self.solver}
+
+
+class SnapshotsFile(StrictModel):
+    """A file with snapshots of another program, see `mor_bench.scene.snapshot_file`."""
+
+    file: File
+
+
+class ImportedDatasetSpec(CommonDatasetSpec):
+    """A dataset file whose samples come from another program."""
+
+    snapshots: SnapshotsFile
+    split: ImportedSplit = ImportedSplit()
+
+    def physics(self) -> dict[str, Any]:
+        physics: dict[str, Any] = without_paths(self.model_dump(mode="json", include={"snapshots"}))
+        return physics
+
+
+AnyDatasetSpec = DatasetSpec | ImportedDatasetSpec
+
+
+def generated(spec: AnyDatasetSpec) -> DatasetSpec:
+    """Return the specification if its samples are generated here.
+
+    Raises
+    ------
+    UnsupportedSceneError
+        If the samples were imported.
+    """
+    if isinstance(spec, ImportedDatasetSpec):
+        raise UnsupportedSceneError(f"{spec.name}: {NO_EQUATIONS}.")
+    return spec

@@ -1,0 +1,98 @@
+"""Table `[geometry]` of a dataset file: the shapes that can be meshed."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
+
+from mor_bench.specs.base import Count, Positive, StrictModel
+from mor_bench.specs.source_file import File, SourceFile, read_source_file
+
+MAX_CELLS = 10_000_000
+"""Most cells of a grid. More is a typing mistake: such a model does not fit into memory."""
+
+
+def _fits_in_memory(value: tuple[int, int, int]) -> tuple[int, int, int]:
+    if value[0] * value[1] * value[2] > MAX_CELLS:
+        raise ValueError(f"there must be at most {MAX_CELLS:,} cells in all")
+    return value
+
+
+Cells = Annotated[tuple[Count, Count, Count], Field(strict=False), AfterValidator(_fits_in_memory)]
+Size = Annotated[tuple[Positive, Positive, Positive], Field(strict=False)]
+
+
+class BoxGeometry(StrictModel):
+    """A box of H8 cells with its lowest corner at the origin."""
+
+    shape: Literal["box"]
+    size_m: Size
+    cells: Cells
+
+
+class LShapeGeometry(BoxGeometry):
+    """A box without the cells in its corner of highest x and highest z."""
+
+    shape: Literal["l-shape"]  # type: ignore[assignment]
+    cut_cells: Annotated[tuple[Count, Count], Field(strict=False)]
+
+    @model_validator(mode="after")
+    def _leaves_an_l(self) -> LShapeGeometry:
+        if self.cut_cells[0] >= self.cells[0] or self.cut_cells[1] >= self.cells[2]:
+            raise ValueError(
+                f"`cut_cells` must be less than the {self.cells[0]} cells along x and "
+                f"the {self.cells[2]} along z; got {self.cut_cells}"
+            )
+        return self
+
+
+def _surface(value: Any, info: ValidationInfo) -> Any:
+    return value if value == "liver" else read_source_file(value, info)
+
+
+class VoxelsGeometry(StrictModel):
+    """The H8 cells of a regular grid that overlap the inside of a closed surface.
+
+    Attributes
+    ----------
+    surface : "liver" or SourceFile
+        The two-lobed liver that comes with the package, or an STL or OBJ file.
+    cells : three ints
+        Cells of the whole grid over the surface's bounding box, per axis.
+    unit_m : float
+        Length of the file's unit, m.
+    """
+
+    shape: Literal["voxels"]
+    surface: Annotated[Literal["liver"] | SourceFile, BeforeValidator(_surface)]
+    cells: Cells
+    unit_m: Positive = 1.0
+
+
+class TetrahedraGeometry(StrictModel):
+    """The two-lobed liver that comes with the package, meshed with T4 of about one size."""
+
+    shape: Literal["tetrahedra"]
+    surface: Literal["liver"]
+
+
+class FileGeometry(StrictModel):
+    """The H8 or T4 cells of a mesh file that meshio reads: Gmsh, VTK, VTU, Abaqus and others.
+
+    Attributes
+    ----------
+    file : SourceFile
+    unit_m : float
+        Length of the file's unit, m.
+    """
+
+    shape: Literal["file"]
+    file: File
+    unit_m: Positive = 1.0
+
+
+Geometry = Annotated[
+    BoxGeometry | LShapeGeometry | VoxelsGeometry | TetrahedraGeometry | FileGeometry,
+    Field(discriminator="shape"),
+]

@@ -1,0 +1,126 @@
+"""Tables `[loads]`, `[[supports]]`, `[split]` and `[tests]` of a dataset file."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from mor_bench.specs.base import Count, Positive, StrictModel
+from mor_bench.specs.region_spec import Region
+
+LoadKind = Literal["force", "normal", "tangential"]
+Sampling = Literal["random", "latin-hypercube", "sobol"]
+SplitBy = Literal["region", "sample", "direction"]
+Fraction = Annotated[float, Field(gt=0, lt=1)]
+
+
+class Support(StrictModel):
+    """A region whose nodes do not move."""
+
+    region: Region
+
+
+class Loads(StrictModel):
+    """Forces on patches of the surface and how to draw them; see `mor_bench.snapshots.sampling`.
+
+    Attributes
+    ----------
+    region : Region
+        Where patches may lie.
+    kind : str
+        `force`: directions uniform on the sphere. `normal`: along the surface normal, inwards
+        or outwards. `tangential`: perpendicular to the normal.
+    patch_area_m2 : float
+        Area of each patch, m².
+    n_patches : int, optional
+        Number of patches, spread evenly over the region away from the supports.
+        Default: one patch around each node of the region.
+    simultaneous : int
+        Number of patches that are loaded at once.
+    min_distance_m : float, optional
+        Least distance between the centres of patches that are loaded at once, m.
+        Required with `simultaneous` > 1.
+    samples_per_patch, samples : int, optional
+        Number of samples; give exactly one of them. With `samples`, patches (or combinations of
+        them) come in random order, each as often as the others.
+    magnitude_n : two floats
+        Range of each force, N.
+    sampling : str
+        Plan for directions and magnitudes.
+    seed : int
+    """
+
+    region: Region
+    kind: LoadKind
+    patch_area_m2: Positive
+    n_patches: Count | None = None
+    simultaneous: Annotated[int, Field(ge=1, le=8)] = 1
+    min_distance_m: Positive | None = None
+    samples_per_patch: Count | None = None
+    samples: Count | None = None
+    magnitude_n: Annotated[
+        tuple[
+            Annotated[float, Field(ge=0, allow_inf_nan=False)],
+            Annotated[float, Field(ge=1e-12, le=1e12)],
+        ],
+        Field(strict=False),
+    ]
+    sampling: Sampling = "random"
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @field_validator("magnitude_n")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[0] > value[1]:
+            raise ValueError("the lower bound must not exceed the upper one")
+        return value
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Loads:
+        if (self.samples_per_patch is None) == (self.samples is None):
+            raise ValueError("exactly one of `samples_per_patch` and `samples` must be given")
+        if self.simultaneous > 1 and self.samples is None:
+            raise ValueError(
+                "with `simultaneous` > 1 `samples` must be given, not `samples_per_patch`"
+            )
+        if (self.simultaneous > 1) != (self.min_distance_m is not None):
+            raise ValueError(
+                "`min_distance_m` must be given with `simultaneous` > 1 and only then; "
+                f"got `simultaneous` {self.simultaneous}"
+            )
+        if self.kind == "normal" and self.magnitude_n[0] == self.magnitude_n[1]:
+            raise ValueError(
+                "`magnitude_n` of normal forces must be a range, or samples would repeat; "
+                f"got {self.magnitude_n}"
+            )
+        return self
+
+
+class Split(StrictModel):
+    """Which samples are kept for the test; see `mor_bench.snapshots.split`."""
+
+    test_fraction: Fraction = 0.2
+    by: SplitBy = "region"
+
+
+class ImportedSplit(StrictModel):
+    """Which imported samples are kept for the test: as `Split`, or by the file's array `test`."""
+
+    test_fraction: Fraction = 0.2
+    by: Literal["region", "sample", "direction", "file"] = "region"
+
+
+class ExtraTests(StrictModel):
+    """The named test sets beside the main one; see `mor_bench.snapshots.test_sets`.
+
+    Attributes
+    ----------
+    samples : int
+        Number of samples in each set.
+    unseen_region : Region, optional
+        A part of the surface where no load of the main set acts.
+    """
+
+    samples: Count = 200
+    unseen_region: Region | None = None

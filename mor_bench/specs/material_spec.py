@@ -1,0 +1,76 @@
+"""Tables `[material]` and `[discretisation]` of a dataset file, and the names of the solvers."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from mor_bench.specs.base import Finite, Positive, StrictModel
+
+SolverName = Literal["auto", "rotated-pcg", "jacobi-pcg", "cholesky", "superlu", "pardiso"]
+"""How equilibria are solved, see `mor_bench.mechanics.model`."""
+
+
+class Discretisation(StrictModel):
+    """The elements and their quadrature.
+
+    Selective integration takes the volumetric energy from the mean gradient of each hexahedron.
+    """
+
+    element: Literal["hexahedron", "tetrahedron"] = "hexahedron"
+    integration: Literal["full", "selective"] = "full"
+
+    @model_validator(mode="after")
+    def _has_points_to_spare(self) -> Discretisation:
+        if self.element == "tetrahedron" and self.integration == "selective":
+            raise ValueError(
+                "`integration` of tetrahedra must be 'full', since they have one quadrature "
+                "point; got 'selective'"
+            )
+        return self
+
+
+class TwoLameMaterial(StrictModel):
+    """Saint Venant-Kirchhoff or neo-Hookean, from Young's modulus and Poisson's ratio."""
+
+    law: Literal["saint-venant-kirchhoff", "neo-hookean"]
+    young_pa: Positive
+    poisson: Annotated[float, Field(gt=-1, lt=0.5)]
+
+
+class MooneyRivlinMaterial(StrictModel):
+    """Mooney-Rivlin with a quadratic volumetric energy."""
+
+    law: Literal["mooney-rivlin"]
+    c10_pa: Positive
+    c01_pa: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    bulk_pa: Positive
+
+
+class OgdenMaterial(StrictModel):
+    """Ogden with a quadratic volumetric energy; every term needs mu_p alpha_p > 0."""
+
+    law: Literal["ogden"]
+    mu_pa: Annotated[tuple[Finite, ...], Field(strict=False, min_length=1)]
+    alpha: Annotated[tuple[Finite, ...], Field(strict=False, min_length=1)]
+    bulk_pa: Positive
+
+    @model_validator(mode="after")
+    def _stable_terms(self) -> OgdenMaterial:
+        if len(self.mu_pa) != len(self.alpha):
+            raise ValueError(
+                "`mu_pa` and `alpha` must have equal lengths; "
+                f"got {len(self.mu_pa)} and {len(self.alpha)}"
+            )
+        if not all(mu * alpha > 0 for mu, alpha in zip(self.mu_pa, self.alpha, strict=True)):
+            raise ValueError(
+                "every product of `mu_pa` and `alpha` must be > 0; "
+                f"got {self.mu_pa} and {self.alpha}"
+            )
+        return self
+
+
+MaterialSpec = Annotated[
+    TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial, Field(discriminator="law")
+]

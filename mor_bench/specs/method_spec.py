@@ -1,0 +1,142 @@
+"""A method file: the class, its hyperparameters, sweeps and profiles."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from mor_bench.specs.base import Count, Positive, StrictModel
+from mor_bench.specs.battery import Battery
+from mor_bench.specs.loads_spec import SplitBy
+from mor_bench.specs.parameters import check_parameters, load_class
+
+
+class Profile(StrictModel):
+    """Changes that a profile makes: replaced parameters, replaced sweeps, seconds of a fit."""
+
+    parameters: dict[str, Any] = Field(default_factory=dict)
+    sweep: dict[str, list[Any]] = Field(default_factory=dict)
+    fit_s: Positive | None = None
+
+
+class Regime(StrictModel):
+    """The conditions that a method was built for.
+
+    A comparison under other conditions says nothing final about the method.
+
+    Attributes
+    ----------
+    says : str
+        The conditions in words.
+    min_dofs, min_train, min_iterations : int, optional
+        Least numbers of degrees of freedom, training samples and iterations.
+    split : str, optional
+        How training and test samples are separated.
+    gpu : bool
+        Whether the method needs a graphics processor.
+    """
+
+    says: str
+    min_dofs: Count | None = None
+    min_train: Count | None = None
+    min_iterations: Count | None = None
+    split: SplitBy | None = None
+    gpu: bool = False
+
+
+class MethodSpec(StrictModel):
+    """A method file.
+
+    Attributes
+    ----------
+    surrogate : str
+        The class, ``package.module:Class``.
+    limits : str
+        Where the method fails, in plain words.
+    folder : Path, optional
+        Folder of the file, which may also hold the module. None for the suite's own methods.
+    fit_s : float, optional
+        Approximate time of a fit on beam-coarse with two cores, s.
+    battery : Battery
+        What shared tests and benchmarks must know.
+    """
+
+    name: str
+    title: str
+    surrogate: str
+    source: str
+    limits: str = ""
+    regime: Regime | None = None
+    folder: Path | None = None
+    fit_s: Positive | None = None
+    parameters: dict[str, Any] = Field(default_factory=dict)
+    sweep: dict[str, list[Any]] = Field(default_factory=dict)
+    profiles: dict[Literal["quick", "full"], Profile] = Field(default_factory=dict)
+    battery: Battery = Field(default=Battery(), exclude=True)
+
+    @field_validator("surrogate")
+    @classmethod
+    def _importable(cls, value: str) -> str:
+        module, _, name = value.partition(":")
+        if not module or not name:
+            raise ValueError("it must read `package.module:Class`")
+        return value
+
+    @model_validator(mode="after")
+    def _no_empty_sweep(self) -> MethodSpec:
+        for sweep in (self.sweep, *(profile.sweep for profile in self.profiles.values())):
+            for key, values in sweep.items():
+                if not values:
+                    raise ValueError(f"the sweep of `{key}` is empty")
+        return self
+
+    def load_class(self) -> type[Any]:
+        """Import the class of the method, from the folder of its file if it lies there."""
+        return load_class(self.surrogate, self.folder)
+
+    def parameters_of(self, profile: str) -> dict[str, Any]:
+        """Return the parameters of the file, replaced by those of the profile, without sweeps."""
+        return {**self.parameters, **self._profile(profile).parameters}
+
+    def fit_seconds(self, profile: str) -> float | None:
+        """Return the approximate time of a fit on beam-coarse, s, if the file has it."""
+        return self._profile(profile).fit_s or self.fit_s
+
+    def swept_keys(self, profile: str) -> list[str]:
+        """Return the parameters that the sweep of the profile, or else of the file, varies."""
+        return list(self._sweep_of(profile))
+
+    def configurations(self, profile: str) -> list[dict[str, Any]]:
+        """Return the parameters of every swept configuration; the first key varies slowest."""
+        sweep = self._sweep_of(profile)
+        return [
+            {**self.parameters_of(profile), **dict(zip(sweep, row, strict=True))}
+            for row in itertools.product(*sweep.values())
+        ]
+
+    def _profile(self, name: str) -> Profile:
+        return self.profiles.get(name, Profile())  # type: ignore[call-overload, no-any-return]
+
+    def _sweep_of(self, profile: str) -> dict[str, list[Any]]:
+        return self._profile(profile).sweep or self.sweep
+
+
+def check_method(spec: MethodSpec) -> None:
+    """Check every configuration of a method, in both profiles, and what its tests use.
+
+    Raises
+    ------
+    SpecError, MissingDependencyError
+    """
+    surrogate = spec.load_class()
+    for profile in ("quick", "full"):
+        for configuration in spec.configurations(profile):
+            check_parameters(surrogate, configuration, f"method {spec.name} ({profile})")
+    battery = spec.battery
+    races = [race.parameters for race in battery.races]
+    observed = battery.parameters_for(observed=True)
+    for cheap in (battery.parameters, observed, battery.benchmark, *races):
+        check_parameters(surrogate, {**spec.parameters, **cheap}, f"method {spec.name} (battery)")

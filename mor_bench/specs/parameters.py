@@ -1,0 +1,103 @@
+"""Hyperparameters of a method, checked against the annotations of its class."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import sys
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, get_type_hints
+
+from pydantic import ConfigDict, create_model
+
+from mor_bench.errors import MissingDependencyError, SpecError
+from mor_bench.specs.one_line_errors import nearest_name, validated
+
+
+def load_class(target: str, folder: Path | None = None) -> type[Any]:
+    """Import ``package.module:Class``, also from a folder that is not on the import path.
+
+    Raises
+    ------
+    MissingDependencyError
+        If an optional dependency is not installed; the message names the extra.
+    SpecError
+        If the module or the class does not exist.
+    """
+    module, _, name = target.partition(":")
+    if folder is not None and str(folder) not in sys.path:
+        sys.path.append(str(folder))
+    try:
+        loaded = import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name == "torch":
+            raise MissingDependencyError(
+                f"{target} needs torch: pip install 'mor-bench[learn]'"
+            ) from error
+        raise SpecError(f"surrogate {target!r} cannot be imported: {error}") from error
+    if not hasattr(loaded, name):
+        raise SpecError(
+            f"surrogate {target!r}: module {module!r} has no class {name!r}"
+            f"{nearest_name(name, dir(loaded))}"
+        )
+    found = getattr(loaded, name)
+    if not isinstance(found, type):
+        raise SpecError(f"surrogate {target!r} is not a class.")
+    return found
+
+
+def check_parameters(
+    surrogate: type[Any], parameters: Mapping[str, Any], where: str | None = None
+) -> dict[str, Any]:
+    """Check hyperparameters against the annotations of a class and fill in its defaults.
+
+    The annotations of a dataclass, or of ``__init__``, may carry pydantic's `Field` constraints:
+    ``Annotated[int, Field(ge=1)]``.
+
+    Raises
+    ------
+    SpecError
+        If a hyperparameter is unknown, of the wrong type, or out of range.
+    """
+    model = create_model(
+        surrogate.__name__,
+        __config__=ConfigDict(extra="forbid", strict=True),
+        **_annotated_defaults(surrogate),
+    )
+    return validated(model, parameters, where or surrogate.__name__).model_dump()
+
+
+def _annotated_defaults(surrogate: type[Any]) -> dict[str, Any]:
+    """Return annotation and default of each parameter of ``__init__``; ``...`` for no default."""
+    if surrogate.__init__ is object.__init__:
+        return {}
+    owner = next(base for base in surrogate.__mro__ if "__init__" in vars(base))
+    hints, factories = {}, {}
+    if "__dataclass_fields__" in vars(owner):
+        knobs = dataclasses.fields(owner)
+        hints = _field_hints(owner, {knob.name for knob in knobs})
+        factories = {k.name: k.default_factory for k in knobs if callable(k.default_factory)}
+    else:
+        hints = get_type_hints(surrogate.__init__, include_extras=True)
+    found: dict[str, Any] = {}
+    for knob in list(inspect.signature(surrogate.__init__).parameters.values())[1:]:
+        default = factories[knob.name]() if knob.name in factories else knob.default
+        found[knob.name] = hints.get(knob.name, Any), ... if default is knob.empty else default
+    return found
+
+
+def _field_hints(owner: type[Any], names: set[str]) -> dict[str, Any]:
+    """Resolve the annotations of dataclass fields, each in the module of the class that has it.
+
+    `get_type_hints` of the class would resolve every annotation, also of attributes whose types
+    are imported for type checkers only.
+    """
+    hints: dict[str, Any] = {}
+    for base in reversed(owner.__mro__):
+        own = {k: v for k, v in vars(base).get("__annotations__", {}).items() if k in names}
+        scope = vars(sys.modules[base.__module__])
+        hints |= get_type_hints(SimpleNamespace(__annotations__=own), scope, include_extras=True)
+    return hints

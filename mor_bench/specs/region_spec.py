@@ -1,0 +1,75 @@
+"""Regions: how a dataset file selects nodes of the mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, Discriminator, Field, Tag
+
+from mor_bench.specs.base import Count, Positive, StrictModel, Triple
+from mor_bench.specs.source_file import File
+
+
+class BoxRegion(StrictModel):
+    """The nodes inside an axis-aligned box, from its lowest to its highest corner, m."""
+
+    box_m: Annotated[tuple[Triple, Triple], Field(strict=False)]
+
+
+class SphereRegion(StrictModel):
+    """The nodes inside a sphere: centre and radius, m."""
+
+    sphere_m: Annotated[tuple[Triple, Positive], Field(strict=False)]
+
+
+class NearestRegion(StrictModel):
+    """The surface nodes nearest to a point: its position, m, and the number of nodes."""
+
+    nearest_m: Annotated[tuple[Triple, Count], Field(strict=False)]
+
+
+class PointSetRegion(StrictModel):
+    """A named set of nodes of the mesh file."""
+
+    point_set: str
+
+
+class NearSurfaceRegion(StrictModel):
+    """The surface nodes near another surface, open or closed, of an STL or OBJ file."""
+
+    near_surface: File
+    within_m: Positive
+    unit_m: Positive = 1.0
+
+
+NamedRegion = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max", "surface"]
+
+REGIONS: dict[str, type[BaseModel]] = {
+    "box_m": BoxRegion,
+    "sphere_m": SphereRegion,
+    "nearest_m": NearestRegion,
+    "point_set": PointSetRegion,
+    "near_surface": NearSurfaceRegion,
+}
+"""The key by which each kind of region is recognised."""
+
+
+def _kind_of_region(value: Any) -> str:
+    for key, kind in REGIONS.items():
+        if isinstance(value, kind) or (isinstance(value, Mapping) and key in value):
+            return f"by {key}"
+    return "by box_m" if isinstance(value, Mapping) else "name"
+
+
+_Placed = (
+    Annotated[BoxRegion, Tag("by box_m")]
+    | Annotated[SphereRegion, Tag("by sphere_m")]
+    | Annotated[NearestRegion, Tag("by nearest_m")]
+    | Annotated[PointSetRegion, Tag("by point_set")]
+    | Annotated[NearSurfaceRegion, Tag("by near_surface")]
+)
+Region = Annotated[Annotated[NamedRegion, Tag("name")] | _Placed, Discriminator(_kind_of_region)]
+Outputs = Annotated[
+    Annotated[Literal["all", NamedRegion], Tag("name")] | _Placed, Discriminator(_kind_of_region)
+]

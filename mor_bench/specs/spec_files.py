@@ -1,0 +1,89 @@
+"""Reading dataset and method files into validated specifications."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mor_bench.errors import SpecError
+from mor_bench.specs.dataset_spec import (
+    AnyDatasetSpec,
+    DatasetSpec,
+    ImportedDatasetSpec,
+    generated,
+)
+from mor_bench.specs.method_spec import MethodSpec
+from mor_bench.specs.one_line_errors import validated
+from mor_bench.specs.suite_folder import find_file, read_toml
+
+
+def load_dataset_spec(
+    source: str | Path | Mapping[str, Any], suite: Path | None = None
+) -> AnyDatasetSpec:
+    """Read and validate a dataset. A table `snapshots` makes it an imported one.
+
+    Parameters
+    ----------
+    source : str, Path or mapping
+        A name in the suite, the path of a TOML, or a dict with the same keys.
+    suite : Path, optional
+        Folder to look in first.
+
+    Raises
+    ------
+    SpecError
+        If the dataset is unknown or not valid.
+    """
+    if isinstance(source, Mapping):
+        content = {"name": "scene", **source}
+        return _validated_dataset({"title": content["name"], "source": "", **content}, "scene")
+    if not isinstance(source, str | Path):
+        raise SpecError(
+            f"a dataset must be a name, the path of a TOML or a dict; got {type(source).__name__}."
+        )
+    path = find_file("datasets", source, suite)
+    return _validated_dataset({**read_toml(path), "name": path.stem}, str(path), path.parent)
+
+
+def _validated_dataset(
+    content: Mapping[str, Any], where: str, folder: Path | None = None
+) -> AnyDatasetSpec:
+    if "snapshots" in content:
+        return validated(ImportedDatasetSpec, content, where, folder)
+    return validated(DatasetSpec, content, where, folder)
+
+
+def load_generated_spec(
+    source: str | Path | Mapping[str, Any], suite: Path | None = None
+) -> DatasetSpec:
+    """Read a dataset whose samples are generated here; otherwise as `load_dataset_spec`.
+
+    Raises
+    ------
+    SpecError
+        If the dataset is unknown or not valid.
+    UnsupportedSceneError
+        If its samples were imported.
+    """
+    return generated(load_dataset_spec(source, suite))
+
+
+def is_method_file(path: Path) -> bool:
+    """Tell whether a TOML describes a method, which names a `surrogate`, or a dataset."""
+    return "surrogate" in read_toml(path) or path.resolve().parent.name == "methods"
+
+
+def load_method_spec(source: str | Path, suite: Path | None = None) -> MethodSpec:
+    """Read and validate a method: a name in the suite or the path of a TOML.
+
+    Raises
+    ------
+    SpecError
+        If the method is unknown or its file is not valid.
+    """
+    path = find_file("methods", source, suite)
+    content = read_toml(path)
+    own = str(content.get("surrogate", "")).startswith("mor_bench.")
+    folder = None if own else path.parent.resolve()
+    return validated(MethodSpec, {**content, "name": path.stem, "folder": folder}, str(path))

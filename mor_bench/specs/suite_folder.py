@@ -1,0 +1,80 @@
+"""Where dataset and method files are found: the suite of the package, or a folder of the user."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from mor_bench.errors import SpecError
+from mor_bench.specs.one_line_errors import nearest_name
+
+Kind = Literal["datasets", "methods"]
+
+
+def find_suite(suite: Path | None = None) -> Path:
+    """Return the folder that holds ``datasets/`` and ``methods/``.
+
+    Parameters
+    ----------
+    suite : Path, optional
+        The folder to use. Default: the folder of the installed package, or of the checkout.
+
+    Raises
+    ------
+    SpecError
+        If the folder holds neither.
+    """
+    package = Path(__file__).parents[1]
+    folders = [suite] if suite is not None else [package / "suite", package.parent]
+    for folder in folders:
+        if (folder / "datasets").is_dir() or (folder / "methods").is_dir():
+            return folder
+    raise SpecError(f"{folders[0]}: a suite must hold a folder `datasets` or `methods`.")
+
+
+def list_suite(kind: Kind, suite: Path | None = None) -> dict[str, Path]:
+    """Return names and files of the suite's datasets or methods, sorted by name."""
+    return {
+        path.stem: path
+        for path in sorted((find_suite(suite) / kind).glob("*.toml"), key=lambda path: path.stem)
+    }
+
+
+def find_file(kind: Kind, source: str | Path, suite: Path | None) -> Path:
+    """Return the file of a name in the suite, or the path itself if one is given.
+
+    Raises
+    ------
+    SpecError
+        If the name is unknown; the message gives the nearest name.
+    """
+    if isinstance(source, Path) or source.endswith(".toml"):
+        return Path(source)
+    known = list_suite(kind, suite)
+    if source not in known and suite is not None:
+        known = {**list_suite(kind), **known}
+    if source not in known:
+        raise SpecError(
+            f"unknown {kind[:-1]} {source!r}{nearest_name(source, known)} "
+            f"Known: {', '.join(known)}."
+        )
+    return known[source]
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read or is not valid TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise SpecError(f"{path}: no such file.") from None
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read: {error.strerror}.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SpecError(f"{path}: not valid TOML: {error}") from None
