@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mor_bench.errors import MorBenchError
     from mor_bench.results.comparison import Comparison
-    from mor_bench.run.compare import run
-    from mor_bench.run.pick import Pick, pick
-    from mor_bench.run.single_fit import Fit, fit
+    from mor_bench.runs.compare import run
+    from mor_bench.runs.pick import Pick, pick
+    from mor_bench.runs.single_fit import Fit, fit
     from mor_bench.scene.scene import Scene, load_scene
     from mor_bench.snapshots.dataset import Snapshots, load_dataset
     from mor_bench.surrogate import Surrogate, load_method, load_surrogate
@@ -44,19 +44,19 @@ __all__ = [
 
 _HOMES = {
     "Comparison": "mor_bench.results.comparison",
-    "Fit": "mor_bench.run.single_fit",
+    "Fit": "mor_bench.runs.single_fit",
     "MorBenchError": "mor_bench.errors",
-    "Pick": "mor_bench.run.pick",
+    "Pick": "mor_bench.runs.pick",
     "Scene": "mor_bench.scene.scene",
     "Snapshots": "mor_bench.snapshots.dataset",
     "Surrogate": "mor_bench.surrogate",
-    "fit": "mor_bench.run.single_fit",
+    "fit": "mor_bench.runs.single_fit",
     "load_dataset": "mor_bench.snapshots.dataset",
     "load_method": "mor_bench.surrogate",
     "load_scene": "mor_bench.scene.scene",
     "load_surrogate": "mor_bench.surrogate",
-    "pick": "mor_bench.run.pick",
-    "run": "mor_bench.run.compare",
+    "pick": "mor_bench.runs.pick",
+    "run": "mor_bench.runs.compare",
 }
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.measure.error_metrics import SampleErrors, summary
-from mor_bench.results.comparison import Comparison, label_of
+from mor_bench.results.comparison import Comparison
+from mor_bench.results.row import LearningPoint, Row, label_of
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.specs import load_dataset_spec
 
@@ -99,7 +100,7 @@ def add_configuration(
     errors: SampleErrors,
     timed: dict[str, NDArray[Any]],
     **more: Any,
-) -> dict[str, Any]:
+) -> Row:
     """Add a row and its raw samples; `more` replaces entries of the row."""
     times, parameters = timed["latency_ms"], {**METHODS.get(method, ({},))[0], **swept}
     median = float(np.median(times))
@@ -188,8 +189,9 @@ def add_configuration(
         "worst_prediction": reference
         * (1 + min(errors.relative_l2.max(), 1.0) * generator.random()),
     }
-    comparison.put(row, samples)
-    return row
+    made = Row.model_validate(row)
+    comparison.put(made, samples)
+    return made
 
 
 def synthetic_comparison(
@@ -233,20 +235,22 @@ def synthetic_comparison(
             for n_train in (320, 1280, 5120):
                 figures = {"rel_l2_median": error * (5120 / n_train) ** 0.4, "mean_dof_m": 1e-3}
                 comparison.learning.append(
-                    {
-                        "dataset": dataset,
-                        "method": method,
-                        "label": method,
-                        "n_train": n_train,
-                        "fit_s": 1.0,
-                        "error": figures,
-                        "status": "ok",
-                        "reason": None,
-                    }
+                    LearningPoint(
+                        dataset=dataset,
+                        method=method,
+                        label=method,
+                        n_train=n_train,
+                        fit_s=1.0,
+                        error=figures,
+                        status="ok",
+                        reason=None,
+                    )
                 )
     unsteady = next(row for row in comparison.rows if row["method"] == "linear-fem")
-    unsteady["latency_ms"] |= {"stable": False, "unstable_because": ["processes differ by 14 %"]}
+    latency = {**unsteady["latency_ms"], "stable": False}
+    latency["unstable_because"] = ["processes differ by 14 %"]
+    comparison.put(Row(**{**unsteady.as_dict(), "latency_ms": latency}))
     worse = next(row for row in comparison.rows if row["method"] == "pca-regression")
-    worse["hidden"]["rel_l2_median"] *= 4
-    comparison.write()
+    hidden = {**worse["hidden"], "rel_l2_median": 4 * worse["hidden"]["rel_l2_median"]}
+    comparison.put(Row(**{**worse.as_dict(), "hidden": hidden}))
     return comparison

@@ -25,11 +25,13 @@ from mor_bench.analysis.frontier import (
     TARGET_ERRORS,
     TARGET_TIMES_MS,
     Point,
+    compare,
     error_at_time,
     frontier_draws,
     time_at_error,
 )
 from mor_bench.report.summary import entries_of
+from mor_bench.results import row as results_row
 from mor_bench.results.comparison import Comparison
 from tests.synthetic import (
     METHODS,
@@ -106,7 +108,7 @@ def test_it_is_json_repeatable_and_leaves_its_input_alone(
     assert json.dumps(again, allow_nan=False) == json.dumps(analysis, allow_nan=False)
     assert comparison.rows == rows
     assert analyse(comparison, n_resamples=500, seed=1)["rows"] != analysis["rows"]
-    plain = comparison.frontier
+    plain = compare(comparison.rows)
     for kind in (
         "time_at_error",
         "error_at_time",
@@ -143,7 +145,8 @@ def test_a_measured_interval_of_the_latency_is_kept(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     errors = region_errors(generator, regions, 0.01, np.zeros(13))
     row = add_configuration(made, "d", "a", {}, errors, timings(generator, np.zeros((5, 4)), 1.0))
-    row["latency_ms"] |= {"low": 0.5, "high": 2.0}
+    latency = {**row["latency_ms"], "low": 0.5, "high": 2.0}
+    made.rows[0] = results_row.Row(**{**row.as_dict(), "latency_ms": latency})
     found = analyse(made, n_resamples=50)["rows"][0]["latency_ms"]
     assert (found["low"], found["high"]) == (0.5, 2.0)
 
@@ -290,7 +293,7 @@ def test_rows_without_samples_failed_samples_and_none_anywhere(tmp_path: Path) -
     add_configuration(made, "d", "failing", {}, failing, timed)
     add_configuration(made, "d", "plain", {}, errors, {"latency_ms": timed["latency_ms"]})
     lost = add_configuration(made, "d", "lost", {}, errors, timed)
-    made._samples_path(f"d--{lost['label']}").unlink()
+    made.samples_path(lost).unlink()
     bare = {
         **lost,
         "method": "bare",
@@ -299,7 +302,6 @@ def test_rows_without_samples_failed_samples_and_none_anywhere(tmp_path: Path) -
         "latency_ms": None,
         "offline_s": None,
         "hidden": None,
-        "n_dofs": None,
     }
     made.rows += [
         bare,

@@ -15,7 +15,7 @@ import pytest
 import mor_bench
 from mor_bench.errors import InvalidInputError, SpecError
 from mor_bench.results.comparison import Comparison
-from mor_bench.run.configurations import CORE_METHODS, checked_specs
+from mor_bench.runs.configurations import CORE_METHODS, checked_specs
 from mor_bench.sandbox.fork_server import CAN_FORK, Nursery
 from mor_bench.sandbox.process import MethodFailedError, Worker
 from mor_bench.snapshots.dataset import Dataset

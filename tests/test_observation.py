@@ -22,8 +22,8 @@ from mor_bench.export.data import export_numpy, export_onnx, export_vtu
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.observed import ObservedModel
-from mor_bench.run.configurations import OBSERVATION_METHODS, checked_specs
-from mor_bench.run.fit_cache import Material
+from mor_bench.runs.configurations import OBSERVATION_METHODS, checked_specs
+from mor_bench.runs.fit_cache import Material
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.generate import dataset_folder

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import mor_bench
-from mor_bench.run.file_check import check_file
+from mor_bench.runs.file_check import check_file
 
 GUIDE = (Path(__file__).parent.parent / "docs" / "own-data.md").read_text(encoding="utf-8")
 

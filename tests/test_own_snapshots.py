@@ -23,8 +23,8 @@ from mor_bench.errors import (
 from mor_bench.export.data import snapshot_arrays
 from mor_bench.measure.discretisation_error import refine
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.run.configurations import CORE_METHODS, DATA_METHODS, checked_specs
-from mor_bench.run.file_check import check_file
+from mor_bench.runs.configurations import CORE_METHODS, DATA_METHODS, checked_specs
+from mor_bench.runs.file_check import check_file
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.scene.snapshot_file import MAX_SIZE
 from mor_bench.snapshots.dataset import Dataset

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 import mor_bench
 from mor_bench.errors import InvalidInputError
 from mor_bench.results.comparison import Comparison
-from mor_bench.run.pick import Requirements, choose, figure, newest_run, offline_rank
+from mor_bench.runs.pick import Requirements, choose, figure, newest_run, offline_rank
 from mor_bench.specs import load_dataset_spec
 
 NAMES = ("error", "latency_ms", "memory_bytes", "offline_s")
@@ -413,7 +413,7 @@ def test_without_evidence_the_comparison_is_run(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("mor_bench.run.configurations.CORE_METHODS", ("fem", "linear-fem"))
+    monkeypatch.setattr("mor_bench.runs.configurations.CORE_METHODS", ("fem", "linear-fem"))
     chosen = mor_bench.pick("beam-tiny", latency_ms=1e4, cache=cache)
     assert chosen.run is not None
     assert chosen.run.parent == Path("reports") / "runs"

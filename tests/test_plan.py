@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 import mor_bench
 from mor_bench.cli.app import app
-from mor_bench.run.code_digest import _closure, code_digest
-from mor_bench.run.plan import plan
+from mor_bench.runs.code_digest import _closure, code_digest
+from mor_bench.runs.plan import plan
 from mor_bench.specs import MethodSpec
 
 

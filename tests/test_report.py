@@ -32,7 +32,8 @@ from mor_bench.report.summary import (
     size_of,
     warnings_of,
 )
-from mor_bench.results.comparison import Comparison, label_of
+from mor_bench.results.comparison import Comparison
+from mor_bench.results.row import ErrorSummary, label_of
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.specs import load_dataset_spec
 from tests.synthetic import synthetic_comparison
@@ -363,7 +364,7 @@ def test_one_row(tmp_path: Path) -> None:
     assert discretisation_error(entries_of(made, "beam-tiny")).startswith(
         "1.2e-02 m; methods' errors below it"
     )
-    made.rows[0]["discretisation_rel_l2"] = 0.205
+    made.rows[0] = made.rows[0].with_parts(discretisation_rel_l2=0.205)
     assert discretisation_error(entries_of(made, "beam-tiny")).startswith(
         "1.2e-02 m, relative L2 (median) 20.5 %; "
     )
@@ -393,8 +394,9 @@ def test_no_rows_at_all(tmp_path: Path) -> None:
 def test_a_row_without_a_number_is_not_good(tmp_path: Path) -> None:
     made = Comparison(tmp_path, {})
     add_tiny(made)
-    row = add_row(made, "pod", {"n_modes": 5}, 0.005, 1.0)
-    row["error"] = dict.fromkeys(row["error"], float("nan"))
+    add_row(made, "pod", {"n_modes": 5}, 0.005, 1.0)
+    unknown = ErrorSummary(**dict.fromkeys(ErrorSummary.model_fields, float("nan")))
+    made.rows[0] = made.rows[0].with_parts(error=unknown)
     assert not entries_of(made, "beam-tiny")[0].meets_needs
     assert "No configuration gave a usable result" in write_report(made).read_text(encoding="utf-8")
     assert "nan" in console_text(made)

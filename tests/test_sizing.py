@@ -18,7 +18,7 @@ import mor_bench
 from mor_bench.errors import InvalidInputError, StoreError, UnsupportedSceneError
 from mor_bench.reduction import sizing
 from mor_bench.reduction.sizing import MODES, Score, Trials, size_to_needs, validation_folds
-from mor_bench.run.fit_cache import Entry, Material
+from mor_bench.runs.fit_cache import Entry, Material
 from mor_bench.sandbox.handover import write_snapshots
 from mor_bench.sandbox.worker import Session
 from mor_bench.scene.scene import Scene

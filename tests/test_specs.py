@@ -10,7 +10,7 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import MissingDependencyError, MorBenchError, SpecError
-from mor_bench.run.file_check import check_file
+from mor_bench.runs.file_check import check_file
 from mor_bench.specs import list_suite, load_generated_spec, load_method_spec
 
 SHIPPED = {

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mor_bench.run import fit_cache as fits
 from rich.console import Console
 
 import mor_bench
@@ -22,10 +23,9 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.measure.range_flags import flags_of
 from mor_bench.report import print_tables, render
 from mor_bench.results.comparison import Comparison
-from mor_bench.run import fit_cache as fits
-from mor_bench.run.dataset_run import place_of
-from mor_bench.run.fit_cache import Entry, Job, Material, fit
-from mor_bench.run.plan import plan
+from mor_bench.runs.dataset_run import place_of
+from mor_bench.runs.fit_cache import Entry, Job, Material, fit
+from mor_bench.runs.plan import plan
 from mor_bench.sandbox.process import MethodFailedError
 from mor_bench.specs import load_method_spec
 from mor_bench.surrogate import TrainingOptions

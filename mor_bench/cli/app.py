@@ -17,7 +17,8 @@ import typer
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from mor_bench.run.dataset_run import Listener
+    from mor_bench.results.row import Row
+    from mor_bench.runs.dataset_run import Listener
     from mor_bench.snapshots.dataset import Dataset
     from mor_bench.snapshots.test_sets import SetName
 
@@ -132,7 +133,8 @@ def _progress(console: Console) -> Iterator[Listener]:
         TimeRemainingColumn,
     )
 
-    from mor_bench.run.dataset_run import Listener
+    from mor_bench.results.row import Row
+    from mor_bench.runs.dataset_run import Listener
 
     texts = TextColumn("{task.description}"), TextColumn("{task.fields[rate]}")
     columns = (
@@ -181,14 +183,16 @@ def _progress(console: Console) -> Iterator[Listener]:
                 tasks["run"], description=escape(f"{dataset}: {label}"), completed=number - 1
             )
 
-        def fitted(row: dict[str, Any]) -> None:
-            if row["status"] == "ok":
-                error = row["error"]
-                text = f"ē {error['mean_dof_m']:.2e} m   rel. l2 {error['rel_l2_median']:.3%}   fit {row['offline_s']['fit']:.3g} s"
+        def fitted(row: Row) -> None:
+            if row.ok and row.error and row.offline_s:
+                text = (
+                    f"ē {row.error.mean_dof_m:.2e} m   rel. l2 {row.error.rel_l2_median:.3%}   "
+                    f"fit {row.offline_s.fit:.3g} s"
+                )
             else:
-                text = f"{row['status']}: {row['reason']}"
+                text = f"{row.status}: {row.reason}"
             bars.console.print(
-                f"[bold]{escape(row['label']):<46}[/bold] {escape(text)}", highlight=False
+                f"[bold]{escape(row.label):<46}[/bold] {escape(text)}", highlight=False
             )
 
         def timing(dataset: str, done: int, total: int) -> None:
@@ -307,7 +311,7 @@ def run(
         console = _console(stderr=as_json)
         if dry_run:
             from mor_bench.report.console_tables import print_plan
-            from mor_bench.run.plan import plan
+            from mor_bench.runs.plan import plan
 
             planned = plan(
                 datasets or ["beam-coarse"],
@@ -506,7 +510,7 @@ def check(
     """Validate dataset and method files, down to regions that must not be empty and parameters in range."""
     with _clear_errors():
         from mor_bench.errors import MissingDependencyError, MorBenchError
-        from mor_bench.run.file_check import check_file
+        from mor_bench.runs.file_check import check_file
         from mor_bench.specs import list_suite
 
         paths = files or [
@@ -615,10 +619,12 @@ def report(out: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> Non
     """Print the tables of a finished run and draw its figures and report again."""
     with _clear_errors():
         import mor_bench
+        from mor_bench.analysis.analyse import analyse
         from mor_bench.report import print_tables, render
 
         comparison = mor_bench.Comparison.read(out)
-        analysis = comparison.finish()
+        analysis = analyse(comparison)
+        comparison.finish(analysis)
         print_tables(comparison, _console(), analysis)
         for path in render(comparison, analysis):
             print(path)

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.frontier import compare
 from mor_bench.report.summary import (
     Entry,
     basis_of,
@@ -36,7 +37,7 @@ from mor_bench.report.trained import out_of_range
 from mor_bench.results.comparison import Comparison
 
 if TYPE_CHECKING:
-    from mor_bench.run.plan import Plan
+    from mor_bench.runs.plan import Plan
 
 Analysis = Mapping[str, Any]
 """The content of comparison.json, from `mor_bench.analysis.analyse.analyse`."""
@@ -198,7 +199,9 @@ def target_cells(
         From `mor_bench.analysis.analyse.analyse`, for the intervals.
     """
     wanted: list[dict[str, Any]] = [
-        record for record in (analysis or comparison.frontier)[kind] if record["dataset"] == dataset
+        record
+        for record in (analysis or compare(comparison.rows))[kind]
+        if record["dataset"] == dataset
     ]
     swept = {entry.label: short_swept(entry.swept) for entry in entries_of(comparison, dataset)}
     of_time = kind == "time_at_error"

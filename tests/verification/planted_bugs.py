@@ -56,7 +56,7 @@ LOCKING, GALERKIN, SURROGATE = (
     "mor_bench/reduction/galerkin.py",
     "mor_bench/surrogate.py",
 )
-CHECK, ANDERSON = "mor_bench/run/file_check.py", "mor_bench/mechanics/anderson.py"
+CHECK, ANDERSON = "mor_bench/runs/file_check.py", "mor_bench/mechanics/anderson.py"
 
 BUGS = (
     # Saint Venant-Kirchhoff on H8

@@ -31,7 +31,7 @@ from mor_bench.hard_cases.setups import (
 from mor_bench.mechanics.linear import BandedCholesky
 from mor_bench.mechanics.model import SOLVERS, FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
-from mor_bench.run.file_check import check_file
+from mor_bench.runs.file_check import check_file
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.specs import SolverName

@@ -41,8 +41,9 @@ from mor_bench.measure.latency import (
 from mor_bench.measure.range_flags import flags_of
 from mor_bench.reduction.basis import pod
 from mor_bench.results.comparison import Comparison
-from mor_bench.run.configurations import Budget, sealed_folders
-from mor_bench.run.fit_cache import (
+from mor_bench.results.row import LearningPoint, Memory, Row, SeedSpread, SetErrors
+from mor_bench.runs.configurations import Budget, sealed_folders
+from mor_bench.runs.fit_cache import (
     Entry,
     Job,
     Material,
@@ -111,9 +112,9 @@ class Listener:
 
     generating: Callable[[str, int, int], None] = lambda *_: None
     starting: Callable[[str, str, int, int], None] = lambda *_: None
-    fitted: Callable[[dict[str, Any]], None] = lambda *_: None
+    fitted: Callable[[Row], None] = lambda *_: None
     timing: Callable[[str, int, int], None] = lambda *_: None
-    finished: Callable[[dict[str, Any]], None] = lambda *_: None
+    finished: Callable[[Row], None] = lambda *_: None
     training: Callable[[int, int, float], None] = lambda *_: None
 
 
@@ -246,9 +247,9 @@ class DatasetRun:
                 ):
                     self.comparison.put(row, samples)
                     self.settings.listener.fitted(row)
-                    if entry is not None and row["status"] == "ok":
-                        entries[row["label"]] = entry
-                    elif row["status"] == "failed" and self.settings.fail_fast:
+                    if entry is not None and row.ok:
+                        entries[row.label] = entry
+                    elif row.status == "failed" and self.settings.fail_fast:
                         raise StopRunError
         return entries
 
@@ -287,18 +288,16 @@ class DatasetRun:
                 self.spent[method] = self.spent.get(method, 0.0) + spent
         return entry, {**row, "tuning_s": spent}
 
-    def _score_one(
-        self, fitted: tuple[Entry | None, dict[str, Any]]
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+    def _score_one(self, fitted: tuple[Entry | None, dict[str, Any]]) -> tuple[Row, dict[str, Any]]:
         """A configuration's row with its errors, and the raw samples."""
         entry, row = fitted
         if entry is None:
-            return row, {}
+            return Row(**row), {}
         try:
             found, samples = self._scored(entry.job, score(entry, self.settings.budget.seconds))
         except MorBenchError as error:
-            return {**row, **_failure(error)}, {}
-        return {**row, **found}, samples
+            return Row(**{**row, **_failure(error)}), {}
+        return Row(**{**row, **found}), samples
 
     def _remote(self, pool: Pool | None, job: Job) -> RemoteFit | None:
         """Fitting on the cluster; a third party's class is not installed there."""
@@ -328,8 +327,8 @@ class DatasetRun:
             "method": job.method.name,
             "label": job.label,
             "parameters": job.parameters,
+            "swept": job.swept,
             "sizes": {},
-            "status": "",
             "reason": None,
             "n_train": len(data.train),
             "n_test": len(data.test),
@@ -400,8 +399,8 @@ class DatasetRun:
             trainings = [
                 {
                     "seed": seed,
-                    "fit_s": row["offline_s"]["fit"],
-                    **{name: row["error"][name] for name in SPREAD},
+                    "fit_s": row.offline_s and row.offline_s.fit,
+                    **{name: getattr(row.error, name) for name in SPREAD},
                     "failed": None,
                 }
             ]
@@ -429,18 +428,14 @@ class DatasetRun:
                         "failed": None,
                     }
                 )
-            row["seeds"] = seeds_summary(trainings)
-            row["warnings"] = [*row["warnings"], *row["seeds"]["failed"]]
+            seeds = SeedSpread(**seeds_summary(trainings))
+            row = row.with_parts(seeds=seeds, warnings=[*row.warnings, *seeds.failed])
+            self.comparison.put(row)
             if errors:
                 self.comparison.add_samples(row, {"seeds_relative_l2": np.array(errors)})
-        self.comparison.write()
 
-    def _row(self, label: str) -> dict[str, Any]:
-        return next(
-            row
-            for row in self.comparison.rows
-            if (row["dataset"], row["label"]) == (self.spec.name, label)
-        )
+    def _row(self, label: str) -> Row:
+        return self.comparison.row(self.spec.name, label)
 
     def _time(self, entries: Mapping[str, Entry]) -> None:
         """Time all configurations that have no timing from this machine at this speed, and complete the rows."""
@@ -490,12 +485,14 @@ class DatasetRun:
         for label in entries:
             row, timing = self._row(label), timings[label]
             if timing.failed:
-                row.update(status="failed", reason=timing.failed)
+                row = row.with_parts(status="failed", reason=timing.failed)
             else:
-                row.update(summary_of_timing(timing, intervals[label], settings.threads))
-                row["memory_bytes"]["predict"] = timing.memory_bytes
+                figures = summary_of_timing(timing, intervals[label], settings.threads)
+                assert row.memory_bytes is not None
+                memory = Memory(fit=row.memory_bytes.fit, predict=timing.memory_bytes)
+                row = Row(**{**row.as_dict(), **figures, "memory_bytes": memory})
                 self.comparison.add_samples(row, timing.samples)
-        self.comparison.write()
+            self.comparison.put(row)
         for label in entries:
             settings.listener.finished(self._row(label))
         if settings.fail_fast and any(timing.failed for timing in timings.values()):
@@ -504,7 +501,7 @@ class DatasetRun:
     def _learning_curves(self, entries: Mapping[str, Entry]) -> None:
         """Errors over the number of training samples, of the most accurate configuration of each method that learns."""
         self.comparison.learning = [
-            record for record in self.comparison.learning if record["dataset"] != self.spec.name
+            point for point in self.comparison.learning if point.dataset != self.spec.name
         ]
         for method in dict.fromkeys(entry.job.method.name for entry in entries.values()):
             rows = [
@@ -514,12 +511,13 @@ class DatasetRun:
             ]
             if not rows:
                 continue
-            best = min(rows, key=lambda row: row["error"]["rel_l2_median"])
+            best = min(rows, key=lambda row: row.error.rel_l2_median if row.error else np.inf)
             for n in _learning_sizes(self.material.n_train):
-                self.comparison.learning.append(self._learnt(entries[best["label"]], n, best))
+                point = LearningPoint(**self._learnt(entries[best.label], n, best))
+                self.comparison.learning.append(point)
                 self.comparison.write()
 
-    def _learnt(self, entry: Entry, n: int, row: Mapping[str, Any]) -> dict[str, Any]:
+    def _learnt(self, entry: Entry, n: int, row: Row) -> dict[str, Any]:
         record = {
             "dataset": self.spec.name,
             "method": entry.job.method.name,
@@ -529,7 +527,7 @@ class DatasetRun:
             "reason": None,
         }
         if n == self.material.n_train:
-            return {**record, "fit_s": row["offline_s"]["fit"], "error": row["error"]}
+            return {**record, "fit_s": row.offline_s and row.offline_s.fit, "error": row.error}
         try:
             outcome = evaluate(
                 Entry(entry.settled, self.material.first(n), self.place),
@@ -563,23 +561,22 @@ class DatasetRun:
                 )
             except MorBenchError as error:
                 # No answer is an infinite error here as everywhere: who fails on what is fresh does not get away with it.
-                row["warnings"] = [*row["warnings"], f"no score on the fresh test set: {error}"]
+                warning = f"no score on the fresh test set: {error}"
                 lost = dict.fromkeys(
                     ("mean_dof_m", "rel_l2_median", "rel_l2_p95", "rel_l2_max"), float("inf")
                 )
-                row["hidden"] = {
-                    "seed": seed,
-                    "n": len(fresh),
-                    "n_failed": len(fresh),
-                    "n_flagged": None,
-                    **lost,
-                }
+                failed = SetErrors(
+                    seed=seed, n=len(fresh), n_failed=len(fresh), n_flagged=None, **lost
+                )
+                self.comparison.put(
+                    row.with_parts(hidden=failed, warnings=[*row.warnings, warning])
+                )
                 continue
-            row["hidden"] = {"seed": seed, **set_summary(outcome.scores["hidden"])}
+            found = SetErrors(seed=seed, **set_summary(outcome.scores["hidden"]))
+            self.comparison.put(row.with_parts(hidden=found))
             self.comparison.add_samples(
                 row, {"hidden_relative_l2": outcome.scores["hidden"]["relative_l2"]}
             )
-        self.comparison.write()
 
 
 def place_of(

@@ -18,9 +18,10 @@ from typing import Any
 
 from mor_bench.analysis.analyse import analyse
 from mor_bench.errors import InvalidInputError, StoreError
-from mor_bench.results.comparison import Comparison, _plain
-from mor_bench.run.compare import run
-from mor_bench.run.dataset_run import Listener
+from mor_bench.results.comparison import Comparison
+from mor_bench.results.json_file import without_nan
+from mor_bench.runs.compare import run
+from mor_bench.runs.dataset_run import Listener
 from mor_bench.specs import AnyDatasetSpec, load_dataset_spec
 
 Row = Mapping[str, Any]
@@ -128,7 +129,7 @@ class Pick:
 
     def as_json(self) -> dict[str, Any]:
         """Everything, for `json.dumps`; infinite errors are strings."""
-        content: dict[str, Any] = _plain(asdict(self))
+        content: dict[str, Any] = without_nan(asdict(self))
         run = None if self.run is None else str(self.run)
         return {
             **content,
@@ -384,7 +385,7 @@ def _with_intervals(comparison: Comparison) -> list[Row]:
         for record in analyse(comparison)["rows"]
     }
 
-    def extended(row: Row) -> Row:
+    def extended(row: Any) -> Row:
         bound = high.get((row["dataset"], row["label"]))
         return (
             row
@@ -392,7 +393,7 @@ def _with_intervals(comparison: Comparison) -> list[Row]:
             else {**row, "error": {**row["error"], "rel_l2_median_high": bound}}
         )
 
-    return [extended(row) for row in comparison.rows]
+    return [extended(row) for row in (row.as_dict() for row in comparison.rows)]
 
 
 def _is_of(comparison: Comparison, spec: AnyDatasetSpec) -> bool:

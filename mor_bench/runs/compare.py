@@ -14,11 +14,12 @@ from typing import Any, get_args
 import psutil
 
 from mor_bench import __version__
+from mor_bench.analysis.analyse import analyse
 from mor_bench.errors import InvalidInputError, MissingDependencyError
 from mor_bench.machine import describe_machine, gpu_name
 from mor_bench.results.comparison import Comparison
-from mor_bench.run.configurations import BUDGETS, checked_specs, jobs_of
-from mor_bench.run.dataset_run import SEEDS, DatasetRun, Listener, Settings, StopRunError
+from mor_bench.runs.configurations import BUDGETS, checked_specs, jobs_of
+from mor_bench.runs.dataset_run import SEEDS, DatasetRun, Listener, Settings, StopRunError
 from mor_bench.sandbox.fork_server import CAN_FORK, Nursery
 from mor_bench.sandbox.process import default_memory_limit_bytes
 from mor_bench.snapshots.executors import check_pool
@@ -168,7 +169,7 @@ def run(
             DatasetRun(
                 spec, jobs_of_all, comparison, settings, scratch, nursery, suite, number, len(specs)
             ).go()
-    comparison.finish()
+    comparison.finish(analyse(comparison))
     return comparison
 
 

@@ -15,10 +15,10 @@ from typing import Any
 
 from mor_bench.measure.latency import PROTOCOLS
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.run.compare import checked_seeds, training_options
-from mor_bench.run.configurations import BUDGETS, checked_specs, jobs_of, may_draw
-from mor_bench.run.dataset_run import LEARNING_STEP, place_of
-from mor_bench.run.fit_cache import Entry, Job, Material
+from mor_bench.runs.compare import checked_seeds, training_options
+from mor_bench.runs.configurations import BUDGETS, checked_specs, jobs_of, may_draw
+from mor_bench.runs.dataset_run import LEARNING_STEP, place_of
+from mor_bench.runs.fit_cache import Entry, Job, Material
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import load_dataset
 from mor_bench.snapshots.generate import (

@@ -11,8 +11,8 @@ from typing import Any
 
 from mor_bench.errors import InvalidInputError, MissingDependencyError
 from mor_bench.mechanics.model import check_supports
-from mor_bench.results.comparison import label_of
-from mor_bench.run.fit_cache import Job
+from mor_bench.results.row import label_of
+from mor_bench.runs.fit_cache import Job
 from mor_bench.sandbox.process import (
     START_LIMIT_S,
     MethodFailedError,
@@ -68,6 +68,7 @@ def jobs_of(
                     parameters,
                     label_of(method.name, {key: parameters[key] for key in swept}),
                     options,
+                    {key: parameters[key] for key in swept},
                 )
             )
     return jobs

@@ -19,7 +19,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from time import monotonic, time
@@ -33,8 +33,8 @@ from mor_bench.machine import gpu_name
 from mor_bench.measure.error_metrics import SampleErrors, sample_errors
 from mor_bench.measure.indicator_quality import Indicated
 from mor_bench.mechanics.indicator import ErrorIndicator
-from mor_bench.results.comparison import read_arrays, write_arrays
-from mor_bench.run.code_digest import code_digest
+from mor_bench.results.arrays import read_arrays, write_arrays
+from mor_bench.runs.code_digest import code_digest
 from mor_bench.sandbox.fork_server import Nursery
 from mor_bench.sandbox.handover import arrays_of, write_snapshots
 from mor_bench.sandbox.process import MethodFailedError, Worker
@@ -83,6 +83,7 @@ class Job:
     parameters: dict[str, Any]
     label: str
     training: TrainingOptions | None = None
+    swept: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

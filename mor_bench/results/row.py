@@ -1,0 +1,376 @@
+"""The typed rows of results.json: one `Row` per configuration, one `LearningPoint` per point of a learning curve.
+
+None means that a figure was not measured. A float in a part that is present but unknown is NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import nan
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, WithJsonSchema
+
+Real = Annotated[
+    float,
+    WithJsonSchema({"anyOf": [{"type": "number"}, {"enum": ["nan", "inf", "-inf"]}]}),
+]
+"""A float; JSON has no NaN or infinity, so a file holds them as strings."""
+
+Status = Literal["ok", "failed", "skipped"]
+
+
+class Part(BaseModel):
+    """A frozen group of figures."""
+
+    model_config = ConfigDict(frozen=True, ser_json_inf_nan="constants")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the JSON content; parts leave out what was not set."""
+        return self.model_dump(exclude_unset=True)
+
+    # Readers that still treat a row as a dict; to be removed with the last of them.
+    def __getitem__(self, key: str) -> Any:
+        return self.as_dict()[key]
+
+    def get(self, key: str, default: Any = None) -> Any:
+        return self.as_dict().get(key, default)
+
+    def keys(self) -> Iterator[str]:
+        return iter(self.as_dict())
+
+
+class ErrorSummary(Part):
+    """Errors of a test set, as `mor_bench.measure.error_metrics.summary` gives them.
+
+    Attributes
+    ----------
+    mean_dof_m, std_dof_m, max_dof_m : float
+        Mean, standard deviation and maximum of the mean absolute error per degree of freedom, m.
+    rel_l2_median, rel_l2_p95, rel_l2_max : float
+        Relative l2 error: median, 95th percentile and maximum.
+    max_nodal_m : float
+        Largest nodal error, m.
+    slope : float
+        Slope of the error over the largest displacement, through the origin.
+    """
+
+    mean_dof_m: Real = nan
+    std_dof_m: Real = nan
+    max_dof_m: Real = nan
+    rel_l2_median: Real = nan
+    rel_l2_p95: Real = nan
+    rel_l2_max: Real = nan
+    max_nodal_m: Real = nan
+    slope: Real = nan
+
+
+class SetErrors(Part):
+    """Errors and range flags of a named test set.
+
+    Attributes
+    ----------
+    n, n_failed : int
+        Samples, and samples without a prediction.
+    n_flagged : int or None
+        Samples that the method flagged as out of range; None if it cannot tell.
+    mean_dof_m, rel_l2_median, rel_l2_p95, rel_l2_max : float
+        As in `ErrorSummary`.
+    n_unusual, n_unusual_flagged : int or None
+        Samples with an unusually large error, and those of them that were flagged.
+    recall : float or None
+        Flagged share of the unusual samples.
+    seed : int or None
+        Seed of a test set that was drawn anew.
+    """
+
+    seed: int | None = None
+    n: int
+    n_failed: int = 0
+    n_flagged: int | None = None
+    mean_dof_m: Real = nan
+    rel_l2_median: Real = nan
+    rel_l2_p95: Real = nan
+    rel_l2_max: Real = nan
+    n_unusual: int | None = None
+    n_unusual_flagged: int | None = None
+    recall: Real | None = None
+
+
+class Latency(Part):
+    """Latency of single queries, ms.
+
+    Attributes
+    ----------
+    median, p95, p99 : float
+        Percentiles over all queries.
+    low, high : float or None
+        95 % prediction interval for the median of a rerun.
+    gc : float
+        Mean time of the garbage collector per query.
+    n_queries, n_processes : int
+        Timed queries, and fresh processes that answered them.
+    stable : bool or None
+        Whether the timing can be relied on.
+    unstable_because : list of str
+        Why it cannot.
+    """
+
+    median: Real
+    p95: Real = nan
+    p99: Real = nan
+    low: Real | None = None
+    high: Real | None = None
+    gc: Real = nan
+    n_queries: int = 0
+    n_processes: int = 0
+    stable: bool | None = None
+    unstable_because: list[str] = []
+
+
+class AllThreadsLatency(Part):
+    """Median latency of single queries on all cores, ms."""
+
+    median: Real
+
+
+class Offline(Part):
+    """Offline cost, s: core-seconds of data generation (None if unknown) and seconds of fitting."""
+
+    data: Real | None
+    fit: Real
+
+
+class Memory(Part):
+    """Peak resident memory of a process while fitting and while predicting, bytes."""
+
+    fit: int | float
+    predict: int | float | None = None
+
+
+class IndicatorQuality(Part):
+    """How well errors estimated from the equilibrium residual agree with measured errors.
+
+    Attributes
+    ----------
+    n : int
+        Compared samples.
+    rank_correlation, residual_rank_correlation : float
+        Spearman correlation of the measured error with the estimated correction and with the residual.
+    ratio_p5, ratio_median, ratio_p95 : float
+        Percentiles of estimated over measured error.
+    """
+
+    n: int
+    rank_correlation: Real
+    residual_rank_correlation: Real
+    ratio_p5: Real
+    ratio_median: Real
+    ratio_p95: Real
+
+
+class FlagCounts(Part):
+    """Range flags of the main test set; the fields are those of `SetErrors`."""
+
+    n: int
+    n_flagged: int
+    n_unusual: int
+    n_unusual_flagged: int
+    recall: Real | None
+
+
+class RangeFlags(Part):
+    """How well the method's range flags find large errors.
+
+    Attributes
+    ----------
+    in_range : str
+        Test set that defines the usual error.
+    usual_rel_l2 : float
+        95th percentile of the relative l2 error there.
+    n, n_flagged : int
+        Samples there, and false alarms among them.
+    false_alarms : float
+        Share of false alarms.
+    test : FlagCounts
+        Counts on the main test set.
+    """
+
+    in_range: str
+    usual_rel_l2: Real
+    n: int
+    n_flagged: int
+    false_alarms: Real
+    test: FlagCounts
+
+
+class TrainingRecord(Part):
+    """Device, time limit (s), iterations and last losses of a training; None where unknown."""
+
+    device: str
+    fit_seconds: Real | None = None
+    iterations: int | None = None
+    loss: Real | None = None
+    validation_loss: Real | None = None
+
+
+class Spread(Part):
+    """Scatter of one figure over the seeds of a training."""
+
+    median: Real
+    min: Real
+    max: Real
+    std: Real
+
+
+class SeedTraining(Part):
+    """One training: its seed, its seconds, its errors and, if it failed, why."""
+
+    seed: int
+    fit_s: Real | None
+    mean_dof_m: Real
+    rel_l2_median: Real
+    failed: str | None = None
+
+
+class SeedSpread(Part):
+    """Errors over the seeds of a training; a failed training has an infinite error.
+
+    Attributes
+    ----------
+    n, asked : int
+        Trainings that succeeded, and trainings that were started.
+    failed : list of str
+        Reasons of the failures.
+    mean_dof_m, rel_l2_median : Spread
+    trainings : list of SeedTraining
+    """
+
+    n: int
+    asked: int = 0
+    failed: list[str] = []
+    mean_dof_m: Spread | None = None
+    rel_l2_median: Spread | None = None
+    trainings: list[SeedTraining] = []
+
+
+class Row(Part):
+    """One configuration of one method on one dataset.
+
+    Attributes
+    ----------
+    dataset, split, method, label : str
+        What ran; the label names the swept parameters.
+    parameters, swept : dict
+        All given parameters, and those that the sweep varies.
+    sizes : dict
+        Values chosen for parameters that were "auto".
+    status, reason : str
+        "ok", "failed" or "skipped", and why.
+    n_train, n_test, n_unused, n_failed : int
+        Samples; `n_failed` test samples have no prediction.
+    n_dofs, threads : int
+        Degrees of freedom of the mesh, and threads of a prediction.
+    error : ErrorSummary or None
+        On the main test set.
+    latency_ms, all_threads_ms : Latency, AllThreadsLatency or None
+    throughput : dict or None
+        Queries per second by batch size.
+    offline_s : Offline or None
+    memory_bytes : Memory or None
+    model_bytes : int or None
+        Size of the saved model.
+    cost : dict or None
+        Mean work per query, see `mor_bench.counting.Cost`.
+    indicator : IndicatorQuality or None
+    sets : dict of SetErrors
+        Named test sets.
+    range : RangeFlags or None
+    hidden : SetErrors or None
+        A test set that was drawn after all fits.
+    training : TrainingRecord or None
+    seeds : SeedSpread or None
+    discretisation_error_m, discretisation_rel_l2 : float or None
+        Error of the dataset's mesh against the limit of fine meshes: mean in m, and relative median.
+    warnings : list of str
+    tuning_s : float or None
+        Seconds of the tuning budget that the configuration used.
+    """
+
+    dataset: str
+    split: str
+    method: str
+    label: str
+    parameters: dict[str, Any] = {}
+    swept: dict[str, Any] = {}
+    sizes: dict[str, Any] = {}
+    status: Status
+    reason: str | None = None
+    n_train: int
+    n_test: int
+    n_unused: int = 0
+    n_failed: int | None = None
+    n_dofs: int = 0
+    threads: int = 1
+    error: ErrorSummary | None = None
+    latency_ms: Latency | None = None
+    all_threads_ms: AllThreadsLatency | None = None
+    throughput: dict[Annotated[str, BeforeValidator(str)], Real | None] | None = None
+    offline_s: Offline | None = None
+    memory_bytes: Memory | None = None
+    model_bytes: int | None = None
+    cost: dict[str, Real] | None = None
+    indicator: IndicatorQuality | None = None
+    sets: dict[str, SetErrors] = {}
+    range: RangeFlags | None = None
+    hidden: SetErrors | None = None
+    training: TrainingRecord | None = None
+    seeds: SeedSpread | None = None
+    discretisation_error_m: Real | None = None
+    discretisation_rel_l2: Real | None = None
+    warnings: list[str] = []
+    tuning_s: Real | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether the configuration ran to the end."""
+        return self.status == "ok"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the JSON content with every key of a row."""
+        return {**self.model_dump(), **self.model_dump(exclude_unset=True)}
+
+    def with_parts(self, **changes: Any) -> Row:
+        """Return a copy in which some fields are replaced."""
+        return self.model_copy(update=changes)
+
+
+class LearningPoint(Part):
+    """One point of a learning curve: number of training samples, seconds of the fit and error."""
+
+    dataset: str
+    method: str
+    label: str
+    n_train: int
+    status: Status
+    reason: str | None = None
+    fit_s: Real | None = None
+    error: ErrorSummary | None = None
+
+
+class ResultsFile(Part):
+    """The content of results.json."""
+
+    schema_version: int
+    machine: dict[str, Any]
+    settings: dict[str, Any]
+    datasets: dict[str, dict[str, Any]]
+    methods: dict[str, dict[str, Any]]
+    rows: list[Row]
+    learning: list[LearningPoint]
+
+
+def label_of(method: str, swept: dict[str, Any]) -> str:
+    """Return a configuration's name: the method, and the swept parameters in brackets."""
+    inside = ", ".join(f"{key}={value}" for key, value in swept.items())
+    return f"{method} [{inside}]" if inside else method
