@@ -303,10 +303,9 @@ def test_rows_without_samples_failed_samples_and_none_anywhere(tmp_path: Path) -
         "offline_s": None,
         "hidden": None,
     }
-    made.rows += [
-        bare,
-        {**bare, "method": "broken", "label": "broken", "status": "failed", "reason": "no memory"},
-    ]
+    broken = {"method": "broken", "label": "broken", "status": "failed", "reason": "no memory"}
+    for row in (bare, {**bare, **broken}):
+        made.put(results_row.Row.model_validate(row))
     found = analyse(made, n_resamples=100)
     json.dumps(found, allow_nan=False)
     by_label = {record["label"]: record for record in found["rows"]}
