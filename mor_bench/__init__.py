@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from mor_bench.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from mor_bench.errors import MorBenchError
     from mor_bench.results.comparison import Comparison
@@ -22,8 +24,6 @@ if TYPE_CHECKING:
     from mor_bench.scene.scene import Scene, load_scene
     from mor_bench.snapshots.dataset import Snapshots, load_dataset
     from mor_bench.surrogate import Surrogate, load_method, load_surrogate
-
-__version__ = "0.1.0"
 
 __all__ = [
     "Comparison",
@@ -61,7 +61,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used, so that `import mor_bench` and the command line start at once."""
+    """Import a public name at its first use, so that `import mor_bench` is fast."""
     if name not in _HOMES:
         raise AttributeError(f"module 'mor_bench' has no attribute {name!r}")
     from importlib import import_module

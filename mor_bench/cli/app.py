@@ -133,7 +133,6 @@ def _progress(console: Console) -> Iterator[Listener]:
         TimeRemainingColumn,
     )
 
-    from mor_bench.results.row import Row
     from mor_bench.runs.dataset_run import Listener
 
     texts = TextColumn("{task.description}"), TextColumn("{task.fields[rate]}")
@@ -874,7 +873,7 @@ def main(
         ):  # Windows' encodings of files and pipes lack letters such as ē
             stream.reconfigure(errors="replace")
     if version:
-        from mor_bench import __version__
+        from mor_bench.version import __version__
 
         print(__version__)
         sys.exit(0)

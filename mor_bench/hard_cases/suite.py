@@ -13,7 +13,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from mor_bench import __version__
 from mor_bench.errors import (
     InvalidInputError,
     MissingDependencyError,
@@ -27,6 +26,7 @@ from mor_bench.machine import describe_machine, pinned_threads
 from mor_bench.sandbox.process import Worker, default_memory_limit_bytes
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import MethodSpec, check_parameters, list_suite, load_method_spec
+from mor_bench.version import __version__
 
 CASES: tuple[Case, ...] = (*mechanics_cases.CASES, *reduction_cases.CASES, *method_cases.CASES)
 """All of them, in the order in which they are tried."""

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor, nn
 
-from mor_bench import __version__
 from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, StoreError
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.surrogate import TrainingOptions
+from mor_bench.version import __version__
 
 Schedule = Literal["constant", "one-cycle"]
 Precision = Literal["float32", "bfloat16"]

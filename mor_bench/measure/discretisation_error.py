@@ -17,7 +17,6 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mor_bench import __version__
 from mor_bench.errors import InvalidInputError, SolverError, SpecError, StoreError
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
@@ -27,6 +26,7 @@ from mor_bench.snapshots.generate import dataset_folder
 from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import DatasetSpec, find_suite, load_generated_spec
+from mor_bench.version import __version__
 
 FORMAT = "mor-bench discretisation error"
 SCHEMA_VERSION = 1

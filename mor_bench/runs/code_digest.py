@@ -11,7 +11,6 @@ from importlib.machinery import PathFinder
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import mor_bench
 
 LIBRARIES = (
     "numpy",
@@ -119,7 +118,7 @@ def _file_of(name: str, folder: Path | None, installed: bool) -> Path | None:
     """The source of a module, found without importing anything: beside the method's file, or an installed one that is its own."""
     parts = name.split(".")
     roots = (
-        [Path(mor_bench.__file__).parent.parent]
+        [Path(__file__).parents[2]]
         if parts[0] == "mor_bench"
         else [folder]
         if folder

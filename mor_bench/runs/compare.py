@@ -13,7 +13,6 @@ from typing import Any, get_args
 
 import psutil
 
-from mor_bench import __version__
 from mor_bench.analysis.analyse import analyse
 from mor_bench.errors import InvalidInputError, MissingDependencyError
 from mor_bench.machine import describe_machine, gpu_name
@@ -31,6 +30,7 @@ from mor_bench.specs import (
     SplitBy,
 )
 from mor_bench.surrogate import Device, TrainingOptions
+from mor_bench.version import __version__
 
 MOST_SEEDS = 100
 

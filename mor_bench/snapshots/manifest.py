@@ -13,10 +13,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from mor_bench import __version__
 from mor_bench.errors import NewerSchemaError, StoreError
 from mor_bench.snapshots.store import SCHEMA_VERSION, check_version, write_atomically
 from mor_bench.specs import DatasetSpec, SourceFile
+from mor_bench.version import __version__
 
 FORMAT = "mor-bench dataset"
 NAME = "manifest.json"
