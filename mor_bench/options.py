@@ -1,0 +1,245 @@
+"""Every option of a run and of a single fit, declared once with its range, default and description.
+
+`mor_bench.run`, `mor_bench.fit`, the dry run, the check of a resumed run and the command line all
+read these models. A bad value or an unknown name raises one clear `InvalidInputError`.
+
+>>> RunOptions(seeds=0)
+Traceback (most recent call last):
+mor_bench.errors.InvalidInputError: `seeds` must be an integer in [1, 100]; got 0.
+>>> RunOptions(sed=3)
+Traceback (most recent call last):
+mor_bench.errors.InvalidInputError: unknown option `sed`; did you mean 'seeds'?
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+from annotated_types import Ge, Gt, Le
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
+
+from mor_bench.errors import InvalidInputError
+
+Device = Literal["auto", "cpu", "cuda"]
+Profile = Literal["quick", "full"]
+SplitBy = Literal["region", "sample", "direction"]
+
+CORES = os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class CommandLine:
+    """How the command line shows an option.
+
+    Attributes
+    ----------
+    flag : str
+        By default the option's name with hyphens.
+    metavar : str or None
+        Placeholder of the value in the help.
+    default : str or None
+        Description of a default that depends on something else.
+    scale : float
+        The option's value is this factor times the number on the command line.
+    """
+
+    flag: str = ""
+    metavar: str | None = None
+    default: str | None = None
+    scale: float = 1.0
+
+
+Cluster = Annotated[
+    str | None,
+    Field(description="Dask scheduler whose workers generate samples and fit: tcp://host:port."),
+    CommandLine(metavar="ADDRESS"),
+]
+
+
+class Options(BaseModel):
+    """A frozen group of options, checked when it is made."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def __init__(self, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            problem = error.errors(include_url=False)[0]
+            raise InvalidInputError(self._message(str(problem["loc"][0]), values)) from None
+
+    @classmethod
+    def _message(cls, name: str, values: dict[str, Any]) -> str:
+        field = cls.model_fields.get(name)
+        if field is None:
+            near = difflib.get_close_matches(name, cls.model_fields, n=1)
+            hint = (
+                f"did you mean {near[0]!r}?" if near else f"options: {', '.join(cls.model_fields)}."
+            )
+            return f"unknown option `{name}`; {hint}"
+        return f"`{name}` must be {allowed_values(field)}; got {values[name]!r}."
+
+
+class DataOptions(Options):
+    """Options of everything that reads a dataset."""
+
+    limit: Annotated[
+        int | None,
+        Field(ge=1, description="Use only the first samples; they cover the load regions evenly."),
+        CommandLine(metavar="N", default="all samples"),
+    ] = None
+    workers: Annotated[
+        int | None,
+        Field(ge=1, description="Number of processes for data generation."),
+        CommandLine(metavar="N", default="all cores"),
+    ] = None
+    cache: Annotated[
+        Path | None,
+        Field(description="Folder for generated datasets and finished fits."),
+        CommandLine(metavar="DIR", default="the user's cache folder"),
+    ] = None
+    suite: Annotated[
+        Path | None,
+        Field(description="Folder with datasets/ and methods/ to search first."),
+        CommandLine(metavar="DIR"),
+    ] = None
+
+
+class TrainOptions(DataOptions):
+    """Options of everything that fits."""
+
+    split: Annotated[
+        SplitBy | None,
+        Field(description="Property that separates test samples from training samples."),
+        CommandLine(default="as the dataset says"),
+    ] = None
+    device: Annotated[
+        Device,
+        Field(description="Device for training; auto selects a CUDA device if there is one."),
+    ] = "cpu"
+    fit_seconds: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            description="Train for about this many seconds, not for a fixed number of iterations.",
+        ),
+        CommandLine(metavar="SECONDS"),
+    ] = None
+
+
+class FitOptions(TrainOptions):
+    """Options of `mor_bench.fit`."""
+
+    threads: Annotated[
+        int | None,
+        Field(
+            ge=1,
+            le=CORES,
+            description="Threads of the fit; another number may change the last bits.",
+        ),
+        CommandLine(metavar="N", default="all cores"),
+    ] = None
+    checkpoint: Annotated[
+        Path | None,
+        Field(description="Checkpoint to write during training and to resume from."),
+        CommandLine(metavar="FILE", default=".NAME.checkpoint beside --out"),
+    ] = None
+    start_from: Annotated[
+        Path | None,
+        Field(description="Model of the same method whose weights initialise the training."),
+        CommandLine(metavar="FILE"),
+    ] = None
+
+
+class RunOptions(TrainOptions):
+    """Options of `mor_bench.run`."""
+
+    profile: Annotated[
+        Profile,
+        Field(description="Parameter sweep and budget; full adds test sets and learning curves."),
+    ] = "quick"
+    threads: Annotated[
+        int,
+        Field(ge=1, le=CORES, description="Threads of a prediction; fitting uses all cores."),
+        CommandLine(metavar="N"),
+    ] = 1
+    jobs: Annotated[
+        int,
+        Field(ge=1, le=CORES, description="Number of fits at once, which share the cores."),
+        CommandLine(metavar="N"),
+    ] = 1
+    cluster: Cluster = None
+    test_seed: Annotated[
+        Literal["fresh"] | Annotated[int, Field(ge=0)] | None,
+        Field(
+            description="Also score on a test set drawn after all fits, by this seed or a new one."
+        ),
+        CommandLine(metavar="N|fresh"),
+    ] = None
+    seeds: Annotated[
+        int | None,
+        Field(ge=1, le=100, description="Trainings of each configuration that has a seed."),
+        CommandLine(metavar="N", default="1; full: 3"),
+    ] = None
+    time_limit_s: Annotated[
+        float | None,
+        Field(gt=0, description="Total fitting time per method and dataset."),
+        CommandLine("--time-limit", metavar="SECONDS", default="1200; full: 1800"),
+    ] = None
+    memory_limit_bytes: Annotated[
+        float | None,
+        Field(ge=1e8, description="Memory limit of a method's process."),
+        CommandLine("--memory-limit", metavar="GB", default="3/4 of the memory", scale=1e9),
+    ] = None
+    retime: Annotated[
+        bool, Field(description="Repeat timings instead of reading them from the cache.")
+    ] = False
+    fail_fast: Annotated[bool, Field(description="Stop at the first row that fails.")] = False
+
+
+def command_line(options: type[Options]) -> Iterator[tuple[str, FieldInfo, CommandLine]]:
+    """Yield each option's name, its field and how the command line shows it."""
+    for name, field in options.model_fields.items():
+        shown = next((item for item in field.metadata if isinstance(item, CommandLine)), None)
+        shown = shown or CommandLine()
+        yield name, field, shown if shown.flag else _with_flag(shown, name)
+
+
+def _with_flag(shown: CommandLine, name: str) -> CommandLine:
+    return CommandLine(f"--{name.replace('_', '-')}", shown.metavar, shown.default, shown.scale)
+
+
+def allowed_values(field: FieldInfo) -> str:
+    """Describe the values that an option may have, such as "an integer in [1, 100]"."""
+    return " or ".join(_described(field.annotation, field.metadata))
+
+
+def _described(annotation: Any, metadata: list[Any]) -> Iterator[str]:
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Literal:
+        yield " or ".join(map(repr, parts))
+    elif origin is Annotated:
+        inner = [item for extra in parts[1:] for item in getattr(extra, "metadata", [])]
+        yield from _described(parts[0], inner)
+    elif parts:
+        for part in parts:
+            yield from _described(part, metadata)
+    elif annotation is not NoneType:
+        names = {int: "an integer", float: "a number", bool: "true or false", Path: "a path"}
+        yield names.get(annotation, "a text") + _bounds(metadata)
+
+
+def _bounds(metadata: list[Any]) -> str:
+    least = next((item.ge for item in metadata if isinstance(item, Ge)), None)
+    above = next((item.gt for item in metadata if isinstance(item, Gt)), None)
+    most = next((item.le for item in metadata if isinstance(item, Le)), None)
+    if least is not None:
+        return f" of at least {least:g}" if most is None else f" in [{least}, {most}]"
+    return "" if above is None else f" above {above:g}"
