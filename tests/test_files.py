@@ -525,7 +525,7 @@ BAD: list[tuple[str, str | bytes | meshio.Mesh, str]] = [
     (
         "mesh.vtu",
         two_parts(2.0),
-        r"4 nodes lie in the place of others, as at \[2.0, 0.0, 0.0\] m; merge them",
+        r"4 nodes coincide with others, as at \[2.0, 0.0, 0.0\] m; merge them",
     ),
     ("mesh.vtu", two_parts(5.0), r"it is 2 parts that no face joins"),
     *(

@@ -401,7 +401,7 @@ BAD: list[tuple[Callable[[Arrays], Arrays], str]] = [
     ),
     (
         with_(points=lambda x: np.vstack([x[:1], x[:1], x[2:]])),
-        "1 nodes lie in the place of others",
+        "1 nodes coincide with others",
     ),
     (with_(cells=lambda c: np.vstack([c, c[:1]])), "some cells are there twice"),
     (

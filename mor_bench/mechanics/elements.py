@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
+from mor_bench.scene.interpolation import trilinear
+from mor_bench.scene.mesh import HEX_CORNERS
 
 Array = NDArray[np.float64]
 
@@ -36,31 +38,11 @@ class Element:
         return int(self.derivatives.shape[1])
 
 
-_CORNERS = np.array(
-    [
-        [-1, -1, -1],
-        [1, -1, -1],
-        [1, 1, -1],
-        [-1, 1, -1],
-        [-1, -1, 1],
-        [1, -1, 1],
-        [1, 1, 1],
-        [-1, 1, 1],
-    ],
-    dtype=float,
-)
-
-
-def _trilinear(points: Array) -> Array:
-    terms = 1 + points[:, None, :] * _CORNERS[None, :, :]
-    return 0.125 * np.stack(
-        [_CORNERS[:, i] * np.prod(np.delete(terms, i, axis=2), axis=2) for i in range(3)], axis=2
-    )
-
-
 _LINEAR = np.array([[-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
-H8 = Element("H8", _trilinear(_CORNERS / np.sqrt(3.0)), np.ones(8), _trilinear(np.zeros((1, 3)))[0])
+_GAUSS = (2.0 * HEX_CORNERS - 1.0) / np.sqrt(3.0)
+
+H8 = Element("H8", trilinear(_GAUSS)[1], np.ones(8), trilinear(np.zeros((1, 3)))[1][0])
 T4 = Element("T4", _LINEAR[None], np.array([1.0 / 6.0]), _LINEAR)
 
 

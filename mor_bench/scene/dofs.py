@@ -1,4 +1,4 @@
-"""Numbering of the degrees of freedom: node n has the dofs 3n, 3n + 1 and 3n + 2, for x, y and z."""
+"""Numbering of degrees of freedom: node n has dofs 3n, 3n + 1 and 3n + 2 (x, y, z)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Meshes and surfaces of other programs, read from files."""
+"""Readers for mesh and surface files of other programs."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.point_sets import PointSets, check_abaqus, named_point_sets
 from mor_bench.scene.soundness import tidied
 
-CELLS = {"hexahedron": 8, "tetra": 4}
-"""Cells that are computed with, in meshio's words, and their nodes."""
+CELLS = ("hexahedron", "tetra")
+"""Supported volume cells, by meshio's names."""
 
 
 def read_mesh(path: Path, unit_m: float) -> tuple[Mesh, PointSets]:
-    """Read the H8 or T4 cells of a mesh file, whatever its format, and its named sets of nodes.
+    """Read the H8 or T4 cells of a mesh file, and its named sets of nodes.
 
-    Cells of fewer dimensions only name nodes, see `mor_bench.scene.point_sets`. Nodes that no cell uses are dropped, cells
-    are turned outwards, and nodes may be numbered anew, see `mor_bench.scene.soundness`.
+    Cells of fewer dimensions only name nodes, see `mor_bench.scene.point_sets`. Unused nodes are
+    dropped, cells are oriented and nodes may be renumbered, see `mor_bench.scene.soundness`.
 
     Parameters
     ----------
     path : Path
-        Of a format that meshio reads, or of Gmsh's first one.
+        A file that meshio reads, or one in version 1 of Gmsh's format.
     unit_m : float
         Length of the file's unit, m.
 
@@ -42,21 +42,20 @@ def read_mesh(path: Path, unit_m: float) -> tuple[Mesh, PointSets]:
     Raises
     ------
     SpecError
-        If the file is missing, cannot be read, or holds no such mesh that is sound.
+        If the file is missing or unreadable, or its mesh is not valid.
     """
     raw = read_with_meshio(path)
     point_sets = named_point_sets(raw, path)
     kinds = {block.type for block in raw.cells if block.dim == 3}
-    if len(kinds) != 1 or not kinds <= CELLS.keys():
-        came = " and ".join(sorted(kinds)) or "no volume cells"
+    if len(kinds) != 1 or not kinds <= {*CELLS}:
+        found = " and ".join(sorted(kinds)) or "no volume cells"
         raise SpecError(
-            f"{path}: the cells must all be linear hexahedra or all linear tetrahedra, {' or '.join(CELLS)}; got {came}."
+            f"{path}: the cells must all be linear hexahedra or all linear tetrahedra, "
+            f"{' or '.join(CELLS)}; got {found}."
         )
-    cells = np.concatenate(
-        [np.asarray(block.data, dtype=np.int64) for block in raw.cells if block.type in kinds]
-    )
+    blocks = [np.asarray(block.data, np.int64) for block in raw.cells if block.type in kinds]
     try:
-        mesh, place = tidied(_positions(raw, unit_m), cells)
+        mesh, place = tidied(_positions(raw, unit_m), np.concatenate(blocks))
     except SpecError as error:
         raise SpecError(f"{path}: {error}") from None
     renumbered = {name: np.sort(place[nodes]) for name, nodes in point_sets.items()}
@@ -64,11 +63,12 @@ def read_mesh(path: Path, unit_m: float) -> tuple[Mesh, PointSets]:
 
 
 def read_triangles(path: Path, unit_m: float) -> NDArray[np.float64]:
-    """The triangles of a surface, open or closed, of an STL or OBJ file; polygons are cut from their first corner.
+    """Read the triangles of an open or closed surface. Polygons become fans of triangles.
 
     Parameters
     ----------
     path : Path
+        An STL or OBJ file.
     unit_m : float
         Length of the file's unit, m.
 
@@ -80,7 +80,7 @@ def read_triangles(path: Path, unit_m: float) -> NDArray[np.float64]:
     Raises
     ------
     SpecError
-        If the file is missing, cannot be read, or holds no triangle or a position that is not finite.
+        If the file is missing or unreadable, has no triangle, or has a position that is not finite.
     """
     if path.suffix.lower() not in (".stl", ".obj"):
         raise SpecError(f"{path}: a surface must be an .stl or .obj file; got {path.suffix!r}.")
@@ -93,7 +93,8 @@ def read_triangles(path: Path, unit_m: float) -> NDArray[np.float64]:
     numbers = np.concatenate(triangles)
     if numbers.min() < 0 or numbers.max() >= len(points):
         raise SpecError(
-            f"{path}: triangles must have points in [1, {len(points)}]; got {numbers.min() + 1} to {numbers.max() + 1}."
+            f"{path}: triangles must have points in [1, {len(points)}]; "
+            f"got {numbers.min() + 1} to {numbers.max() + 1}."
         )
     corners: NDArray[np.float64] = points[numbers]
     if not np.isfinite(corners).all():
@@ -107,12 +108,12 @@ def _positions(raw: meshio.Mesh, unit_m: float) -> NDArray[np.float64]:
 
 
 def read_with_meshio(path: Path) -> meshio.Mesh:
-    """Read a file; what meshio prints is swallowed, and where it would end the process it raises.
+    """Read a file silently: discard what meshio prints, and raise where it would exit.
 
     Raises
     ------
     SpecError
-        If the file is missing, cannot be read, or has positions that are not three-dimensional.
+        If the file is missing or unreadable, or its positions are not three-dimensional.
     """
     try:
         with path.open("rb") as file:
@@ -121,37 +122,36 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
         raise SpecError(f"{path}: no such file.") from None
     except OSError as error:
         raise SpecError(f"{path}: cannot be read: {error.strerror}.") from None
+    suffix = path.suffix.lower()
     if is_gmsh1(head):
         return read_gmsh1(path)
-    if path.suffix.lower() == ".inp":
+    if suffix == ".inp":
         check_abaqus(path)
-    # Both Ansys and Gmsh write .msh; told which, meshio says what is wrong rather than that neither fits.
-    file_format = "gmsh" if path.suffix.lower() == ".msh" and head.startswith(b"$") else None
+    # Ansys and Gmsh both write .msh. If the format is given, meshio says what is wrong with the
+    # file.
+    file_format = "gmsh" if suffix == ".msh" and head.startswith(b"$") else None
     printed = StringIO()
     try:
         with redirect_stdout(printed), redirect_stderr(printed), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             raw = meshio.read(path, file_format)
-    except UnicodeDecodeError:
-        broken = (
-            "neither text nor a binary file of the length that it names"
-            if path.suffix.lower() == ".stl"
-            else "damaged, or of another format"
-        )
-        raise SpecError(
-            f"{path}: cannot be read as {path.suffix[1:].upper()}: it is {broken}."
-        ) from None
     except (Exception, SystemExit) as error:
-        if "need at least one array" in str(error):
-            raise SpecError(f"{path}: the file is empty or holds no mesh.") from None
-        said = " ".join(
-            (printed.getvalue() if isinstance(error, SystemExit) else str(error)).split()
-        )
-        raise SpecError(
-            f"{path}: meshio cannot read it ({said or type(error).__name__})."
-        ) from None
+        text = printed.getvalue() if isinstance(error, SystemExit) else str(error)
+        raise SpecError(f"{path}: {_reason(error, text, suffix)}.") from None
     if raw.points.size and (raw.points.ndim != 2 or raw.points.shape[1] != 3):
+        shape = raw.points.shape
         raise SpecError(
-            f"{path}: positions must have three coordinates; got an array of shape {raw.points.shape}."
+            f"{path}: positions must have three coordinates; got an array of shape {shape}."
         )
     return raw
+
+
+def _reason(error: BaseException, text: str, suffix: str) -> str:
+    """Return why meshio could not read a file."""
+    if isinstance(error, UnicodeDecodeError):
+        binary = "neither text nor a binary file of the length given in its header"
+        broken = binary if suffix == ".stl" else "damaged, or in another format"
+        return f"cannot be read as {suffix[1:].upper()}: it is {broken}"
+    if "need at least one array" in text:
+        return "the file is empty or holds no mesh"
+    return f"meshio cannot read it ({' '.join(text.split()) or type(error).__name__})"

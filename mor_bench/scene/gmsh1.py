@@ -1,6 +1,6 @@
-"""Gmsh's first file format, ASCII with `$NOD` and `$ELM`, which meshio does not read.
+"""Reader for version 1 of Gmsh's format (ASCII, `$NOD` and `$ELM`), which meshio does not read.
 
-Gmsh reference manual, "MSH file format version 1": a node is `number x y z`, an element
+Gmsh reference manual, "MSH file format version 1": a node is `number x y z`, an element is
 `number type physical elementary n_nodes nodes…`.
 """
 
@@ -14,40 +14,26 @@ import numpy as np
 
 from mor_bench.errors import SpecError
 
-_TYPES = {
-    1: "line",
-    2: "triangle",
-    3: "quad",
-    4: "tetra",
-    5: "hexahedron",
-    6: "wedge",
-    7: "pyramid",
-    8: "line3",
-    9: "triangle6",
-    10: "quad9",
-    11: "tetra10",
-    12: "hexahedron27",
-    13: "wedge18",
-    14: "pyramid14",
-    15: "vertex",
-    16: "quad8",
-    17: "hexahedron20",
-}
-"""Numbers of element types; linear ones have the node order of VTK."""
+_NAMES = (
+    "line triangle quad tetra hexahedron wedge pyramid line3 triangle6 quad9 tetra10 hexahedron27 "
+    "wedge18 pyramid14 vertex quad8 hexahedron20"
+)
+_TYPES = dict(enumerate(_NAMES.split(), start=1))
+"""meshio's name for each element type. Linear elements have VTK's node order."""
 
 
 def is_gmsh1(head: bytes) -> bool:
-    """Whether a file that begins like this is in Gmsh's first format."""
+    """Whether a file that begins with these bytes is in version 1 of Gmsh's format."""
     return head.lstrip().startswith(b"$NOD")
 
 
 def read_gmsh1(path: Path) -> meshio.Mesh:
-    """Read a file in Gmsh's first format; numbers of physical groups become cell data `gmsh:physical`.
+    """Read a file; the numbers of physical groups become cell data `gmsh:physical`.
 
     Raises
     ------
     SpecError
-        If a section is missing or short, a line is not as it must be, or an element names a node that is not there.
+        If a section is missing or short, a line is malformed, or an element has an unknown node.
     """
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     try:
@@ -70,22 +56,19 @@ def read_gmsh1(path: Path) -> meshio.Mesh:
         )
     except KeyError as error:
         raise SpecError(
-            f"{path}: not a sound Gmsh 1 file: there is no node, or no element type, {error}."
+            f"{path}: invalid Gmsh 1 file: there is no node, or no element type, {error}."
         ) from None
     except ValueError as error:
-        raise SpecError(f"{path}: not a sound Gmsh 1 file: {error}.") from None
+        raise SpecError(f"{path}: invalid Gmsh 1 file: {error}.") from None
 
 
 def _section(lines: Sequence[str], name: str) -> list[list[str]]:
-    """The words of each line between `$NAME`, which is followed by their number, and `$ENDNAME`."""
+    """Return the words of each line between `$NAME` with the number of lines, and `$ENDNAME`."""
     stripped = [line.strip() for line in lines]
     if f"${name}" not in stripped or f"$END{name}" not in stripped:
         raise ValueError(f"${name} or $END{name} is missing")
-    found = [
-        line.split()
-        for line in stripped[stripped.index(f"${name}") + 1 : stripped.index(f"$END{name}")]
-        if line
-    ]
+    content = stripped[stripped.index(f"${name}") + 1 : stripped.index(f"$END{name}")]
+    found = [line.split() for line in content if line]
     if not found or int(found[0][0]) != len(found) - 1:
-        raise ValueError(f"${name} must hold as many lines as its first says")
+        raise ValueError(f"the first line of ${name} must give the number of lines that follow")
     return found[1:]

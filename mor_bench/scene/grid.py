@@ -1,4 +1,4 @@
-"""A regular grid for any mesh: nodal forces to the grid and displacements back, by the grid's trilinear shape functions."""
+"""A regular grid over any mesh: maps forces to grid points, and displacements to nodes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.mesh import KUHN, Mesh, box_mesh
 
 MAX_POINTS = 1_000_000
-"""Points of a grid; one sample at the first 128 channels of a network on more than these needs half a gigabyte."""
+"""Largest number of grid points. With more, 128 channels of one sample need half a gigabyte."""
 
 
 @dataclass(frozen=True)
 class GridMap:
-    """A regular grid, and the values of its shape functions N at the nodes of a mesh.
+    """A regular grid, and the values N of its trilinear shape functions at the nodes of a mesh.
 
     Attributes
     ----------
@@ -38,28 +38,38 @@ class GridMap:
         return sp.csr_array(self.weights.T)
 
     def forces_to_grid(self, forces: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Nᵀ f: (n, n_nodes, 3) nodal forces, N → (n, n_grid, 3) forces at the grid's points with the same sum and moment.
+        """Return Nᵀ f, forces (n, n_grid, 3) at the grid points with the same sum and moment, N.
+
+        Parameters
+        ----------
+        forces : (n, n_nodes, 3) float
+            Nodal forces, N.
 
         Raises
         ------
         InvalidInputError
-            On another shape.
+            If the shape is wrong.
         """
         return _product(self._transposed, forces)
 
     def displacements_to_nodes(self, displacements: NDArray[np.floating]) -> NDArray[np.floating]:
-        """N u: (n, n_grid, 3) displacements of the grid's points, m → (n, n_nodes, 3) at the nodes, m.
+        """Return N u, displacements (n, n_nodes, 3) of the nodes, m.
+
+        Parameters
+        ----------
+        displacements : (n, n_grid, 3) float
+            Displacements of the grid points, m.
 
         Raises
         ------
         InvalidInputError
-            On another shape.
+            If the shape is wrong.
         """
         return _product(self.weights, displacements)
 
 
 def _product(matrix: sp.csr_array, values: NDArray[np.floating]) -> NDArray[np.floating]:
-    """(n, columns, 3) → (n, rows, 3); scipy adds in the same order on any number of threads."""
+    """Map (n, columns, 3) to (n, rows, 3). The order of summation does not depend on threads."""
     rows, columns = matrix.shape
     if values.ndim != 3 or values.shape[1:] != (columns, 3):
         raise InvalidInputError(
@@ -70,64 +80,48 @@ def _product(matrix: sp.csr_array, values: NDArray[np.floating]) -> NDArray[np.f
 
 
 def grid_map(mesh: Mesh, shape: tuple[int, int, int] | None = None) -> GridMap:
-    """The regular grid of a mesh that lies in one; for any other mesh, or another shape, one over its bounding box.
+    """Return the mesh's own regular grid, or a grid over its bounding box.
 
     Parameters
     ----------
     mesh : Mesh
-        Of H8 or T4.
     shape : three ints, optional
-        Points per axis. By default those of the mesh's own grid, or `default_shape`.
+        Points per axis. Default: those of the mesh's own grid, or else `default_shape`.
 
     Returns
     -------
     GridMap
-        Onto the mesh's own grid every weight is exactly 1.
+        On the mesh's own grid every weight is exactly 1.
 
     Raises
     ------
     SpecError
-        If the grid has less than 2 points along an axis, or more than `MAX_POINTS`.
+        If the grid has fewer than 2 points along an axis, or more than `MAX_POINTS`.
     InvalidInputError
-        If the shape is left to `default_shape` and the body has no volume.
+        If `default_shape` is needed and the body has no volume.
     """
-    if (
-        mesh.grid_shape is not None
-        and mesh.grid_index is not None
-        and shape in (None, mesh.grid_shape)
-    ):
-        places = (np.ones(mesh.n_nodes), (np.arange(mesh.n_nodes), mesh.grid_index))
-        return GridMap(
-            mesh.grid_shape, sp.csr_array(places, shape=(mesh.n_nodes, prod(mesh.grid_shape)))
-        )
+    own, index = mesh.grid_shape, mesh.grid_index
+    if own is not None and index is not None and shape in (None, own):
+        ones = np.ones(mesh.n_nodes), (np.arange(mesh.n_nodes), index)
+        return GridMap(own, sp.csr_array(ones, shape=(mesh.n_nodes, prod(own))))
     nx, ny, nz = default_shape(mesh) if shape is None else shape
     if min(nx, ny, nz) < 2 or nx * ny * nz > MAX_POINTS:
         raise SpecError(
-            f"a regular grid must have at least 2 points per axis and at most {MAX_POINTS:,} in all; got {nx} x {ny} x {nz}."
+            f"a regular grid must have at least 2 points per axis and at most {MAX_POINTS:,} "
+            f"in all; got {nx} x {ny} x {nz}."
         )
     low, high = mesh.bounds
     length_x, length_y, length_z = (float(length) for length in high - low)
-    # Nodes on the bounding box lie inside: rounding is monotone, so that no difference exceeds that of the bounds.
+    # Rounding is monotone, so nodes on the bounding box do not fall outside of this box.
     box = box_mesh((length_x, length_y, length_z), (nx - 1, ny - 1, nz - 1))
     return GridMap((nx, ny, nz), interpolation_matrix(box, mesh.points - low))
 
 
 def default_shape(mesh: Mesh) -> tuple[int, int, int]:
-    """So many points per axis that the grid holds about as many per volume as the body holds nodes.
+    """Return the points per axis of a grid about as dense as the nodes of the body.
 
-    Each node owns a cube of edge h = (volume of the body / n_nodes)^(1/3); an axis of length L gets round(L / h) points,
-    at least 2.
-
-    Parameters
-    ----------
-    mesh : Mesh
-
-    Notes
-    -----
-    256 nodes of a beam of irregular T4 (4 × 1 × 1 m) get 16 × 4 × 4 points, on which every displacement can be met. On 0.8 and
-    0.6 times as many per axis the best fit misses 0.3 % and 0.7 % (relative l²), and yet U-Mesh (c = 16, k = 2, 900 iterations,
-    one training each) erred less: 7.9 % and 6.2 % against 8.7 %. 1.3 and 1.6 times as many gave 9.6 % and 12.4 %, at several
-    times the cost. A grid finer than the nodes gains nothing; a coarser one may pay where training is short.
+    Each node owns a cube of edge h = (volume of the body / n_nodes)^(1/3). An axis of length L gets
+    round(L / h) points, at least 2. A coarser grid may pay where training is short.
 
     Raises
     ------
@@ -143,7 +137,7 @@ def default_shape(mesh: Mesh) -> tuple[int, int, int]:
 
 
 def _volume(mesh: Mesh) -> float:
-    """Volume of the body, m³; a hexahedron counts as six tetrahedra."""
+    """Return the volume of the body, m³, with each hexahedron cut into six tetrahedra."""
     tetrahedra = mesh.cells if mesh.cells.shape[1] == 4 else mesh.cells[:, KUHN].reshape(-1, 4)
     corners = mesh.points[tetrahedra]
     return float(np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 6)

@@ -1,6 +1,8 @@
-"""Interpolation from the nodes of a mesh to points of its body, by the shape functions of the cells that hold them."""
+"""Interpolation from the nodes of a mesh to points of its body, by shape functions of the cells."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -8,85 +10,85 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mor_bench.errors import OutsideMeshError
-from mor_bench.scene.mesh import Mesh
+from mor_bench.scene.mesh import HEX_CORNERS, Mesh
 
 OUTSIDE = 1e-9
-"""How far outside its cell a point may lie, in the cell's own coordinates; round-off is far less."""
+"""Tolerance for a point outside its cell, in reference coordinates; far above round-off."""
 
 NEWTON_STEPS = 30
 ROUND_OFF = 1e-14
 FIRST_CANDIDATES = 8
 
-_CORNERS = np.array(
-    [
-        [-1, -1, -1],
-        [1, -1, -1],
-        [1, 1, -1],
-        [-1, 1, -1],
-        [-1, -1, 1],
-        [1, -1, 1],
-        [1, 1, 1],
-        [-1, 1, 1],
-    ],
-    dtype=float,
-)
+
+def trilinear(xi: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a hexahedron's shape functions (n, 8) at xi (n, 3), and derivatives (n, 8, 3)."""
+    corners = 2.0 * HEX_CORNERS - 1.0
+    x, y, z = np.moveaxis(1 + xi[:, None, :] * corners, 2, 0)
+    return x * y * z / 8, corners * np.stack([y * z, x * z, x * y], axis=2) / 8
 
 
 def _tetrahedron(
     corners: NDArray[np.float64], points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Barycentric coordinates (n, 4) of points (n, 3) in tetrahedra (n, 4, 3), and how far outside each lies."""
+    """Return barycentric coordinates of points in tetrahedra (n, 4, 3), and distances outside."""
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
     inner = np.linalg.solve(edges, (points - corners[:, 0])[:, :, None])[:, :, 0]
     shape = np.concatenate([1 - inner.sum(axis=1, keepdims=True), inner], axis=1)
     return shape, np.maximum(-shape.min(axis=1), 0)
 
 
-def _trilinear(xi: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Shape functions (n, 8) of a hexahedron at xi (n, 3), and their derivatives (n, 8, 3)."""
-    terms = 1 + xi[:, None, :] * _CORNERS
-    others = np.stack(
-        [
-            terms[:, :, 1] * terms[:, :, 2],
-            terms[:, :, 0] * terms[:, :, 2],
-            terms[:, :, 0] * terms[:, :, 1],
-        ],
-        axis=2,
-    )
-    return terms.prod(axis=2) / 8, _CORNERS * others / 8
-
-
 def _hexahedron(
     corners: NDArray[np.float64], points: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Shape functions (n, 8) at points (n, 3) of hexahedra (n, 8, 3), by Newton's method, and how far outside each lies."""
+    """Return shape functions (n, 8) at points in hexahedra (n, 8, 3), and distances outside.
+
+    Newton's method finds the reference coordinates.
+    """
     xi = np.zeros_like(points)
     size = np.linalg.norm(np.ptp(corners, axis=1), axis=1)
     for _ in range(NEWTON_STEPS):
-        shape, derivatives = _trilinear(xi)
+        shape, derivatives = trilinear(xi)
         miss = points - np.einsum("na,nai->ni", shape, corners)
         jacobian = np.einsum("nai,nad->nid", corners, derivatives)
-        # Outside its cell, where the map may fold, a point must only be seen to be outside.
+        # The map may fold outside the cell. There it is enough to see that the point is outside.
         folded = np.abs(np.linalg.det(jacobian)) <= 1e-12 * size**3
         jacobian[folded] = np.eye(3) * size[folded, None, None]
         step = np.linalg.solve(jacobian, miss[:, :, None])[:, :, 0]
         xi = np.clip(xi + step, -2, 2)
         if (np.abs(step) <= ROUND_OFF).all():
             break
-    shape, _ = _trilinear(xi)
+    shape, _ = trilinear(xi)
     missed = np.linalg.norm(points - np.einsum("na,nai->ni", shape, corners), axis=1) / size
     return shape, np.where(missed > 1e-12, np.inf, np.maximum(np.abs(xi).max(axis=1) - 1, 0))
 
 
-def interpolation_matrix(mesh: Mesh, points: NDArray[np.float64]) -> sp.csr_array:
-    """The matrix that takes nodal values of a mesh to values at points.
+class _Cells(NamedTuple):
+    """Corners (n_cells, 4 or 8, 3) of cells, bounding boxes with a margin, and centres."""
 
-    Its transpose takes forces at the points to nodal forces with the same sum and the same moment.
+    corners: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    tree: cKDTree
+    reach: float
+
+
+def _searchable(mesh: Mesh) -> _Cells:
+    corners = mesh.points[mesh.cells]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    margin = 1e-6 * np.linalg.norm(high - low, axis=1).max()
+    centres = corners.mean(axis=1)
+    reach = float(np.linalg.norm(corners - centres[:, None], axis=2).max()) + margin
+    return _Cells(corners, low - margin, high + margin, cKDTree(centres), reach)
+
+
+def interpolation_matrix(mesh: Mesh, points: NDArray[np.float64]) -> sp.csr_array:
+    """Return the matrix that maps nodal values of a mesh to values at points.
+
+    Its transpose maps forces at the points to nodal forces with the same sum and the same moment.
 
     Parameters
     ----------
     mesh : Mesh
-        Of H8 or T4.
     points : (n_points, 3) float64
         Positions in the body, m.
 
@@ -100,46 +102,43 @@ def interpolation_matrix(mesh: Mesh, points: NDArray[np.float64]) -> sp.csr_arra
     OutsideMeshError
         If a point lies in no cell.
     """
+    cells = _searchable(mesh)
     locate = _tetrahedron if mesh.cells.shape[1] == 4 else _hexahedron
-    corners = mesh.points[mesh.cells]
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    margin = 1e-6 * np.linalg.norm(high - low, axis=1).max()
-    centres = corners.mean(axis=1)
-    reach = float(np.linalg.norm(corners - centres[:, None], axis=2).max()) + margin
-    tree = cKDTree(centres)
     cell_of = np.zeros(len(points), dtype=np.int64)
     shape_of = np.zeros((len(points), mesh.cells.shape[1]))
     searched = np.arange(len(points))
     n_candidates = min(FIRST_CANDIDATES, mesh.n_cells)
     while len(searched):
-        distance, candidates = (
-            np.asarray(found)
-            for found in tree.query(points[searched], k=[*range(1, n_candidates + 1)])
-        )
+        wanted = range(1, n_candidates + 1)
+        distance, candidates = map(np.asarray, cells.tree.query(points[searched], k=[*wanted]))
         x = points[searched][:, None]
-        row, column = np.nonzero(
-            ((x >= low[candidates] - margin) & (x <= high[candidates] + margin)).all(axis=2)
-        )
-        cells = candidates[row, column]
-        shape, outside = locate(corners[cells], points[searched[row]])
-        # Of the cells that hold a point the one that holds it best; the last written wins.
+        in_box = (x >= cells.low[candidates]) & (x <= cells.high[candidates])
+        row, column = np.nonzero(in_box.all(axis=2))
+        tried = candidates[row, column]
+        shape, outside = locate(cells.corners[tried], points[searched[row]])
+        # If several cells contain a point, the best one is written last and stays.
         order = np.argsort(-outside, kind="stable")
         order = order[outside[order] <= OUTSIDE]
-        cell_of[searched[row[order]]], shape_of[searched[row[order]]] = cells[order], shape[order]
+        cell_of[searched[row[order]]], shape_of[searched[row[order]]] = tried[order], shape[order]
         found = np.zeros(len(searched), dtype=bool)
         found[row[order]] = True
-        lost = ~found & ((distance[:, -1] > reach) | (n_candidates == mesh.n_cells))
-        if lost.any():
-            raise OutsideMeshError(
-                f"{'a point lies' if lost.sum() == 1 else f'{lost.sum()} points lie'} outside the mesh, whose bounds are "
-                f"{mesh.bounds[0].tolist()} to {mesh.bounds[1].tolist()} m; the first is {points[searched[lost][0]].tolist()} m."
-            )
+        exhausted = (distance[:, -1] > cells.reach) | (n_candidates == mesh.n_cells)
+        if (lost := ~found & exhausted).any():
+            raise _outside(mesh, points[searched[lost]])
         searched = searched[~found]
         n_candidates = min(4 * n_candidates, mesh.n_cells)
     shape_of[np.abs(shape_of) <= ROUND_OFF] = 0
     rows = np.repeat(np.arange(len(points)), mesh.cells.shape[1])
-    matrix = sp.csr_array(
-        (shape_of.ravel(), (rows, mesh.cells[cell_of].ravel())), shape=(len(points), mesh.n_nodes)
-    )
+    at = rows, mesh.cells[cell_of].ravel()
+    matrix = sp.csr_array((shape_of.ravel(), at), shape=(len(points), mesh.n_nodes))
     matrix.eliminate_zeros()
     return matrix
+
+
+def _outside(mesh: Mesh, lost: NDArray[np.float64]) -> OutsideMeshError:
+    low, high = mesh.bounds.tolist()
+    which = "a point lies" if len(lost) == 1 else f"{len(lost)} points lie"
+    return OutsideMeshError(
+        f"{which} outside the mesh, whose bounds are {low} to {high} m; "
+        f"the first is {lost[0].tolist()} m."
+    )

@@ -1,8 +1,9 @@
-"""The suite's liver: a smooth body of two lobes, given by an equation, so that it can be meshed at any fineness.
+"""The suite's liver: a smooth body of two lobes, given by an equation, for meshes of any size.
 
-Two ellipsoids, a large right and a flat left lobe, are blended, and a third is cut out between them. With the quadratic
-forms q = |A(x - c)|² - 1, negative inside an ellipsoid, and a softened minimum, min_k(q) = -log Σ exp(-k q) / k, the body
-is where max_k(min_k(q_right, q_left), -q_notch) < 0. That function is smooth everywhere, and so is the body's surface.
+Two ellipsoids, a large right and a flat left lobe, are blended; a third ellipsoid is cut out
+between them. Each has a quadratic form q = |A(x - c)|² - 1 that is negative inside. With the
+softened minimum min_k(q) = -log Σ exp(-k q) / k the body is where max_k(min_k(q_right, q_left),
+-q_notch) < 0. That function is smooth everywhere, and so is the surface.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from mor_bench.scene.surfaces import Surface
 from mor_bench.scene.tetrahedra import tetrahedral_mesh
 
 _UNIT_M = 0.0101966
-"""Metres per unit of the figures below, with which the body is 0.2 m long."""
+"""Unit of the lengths below, m. It makes the body 0.2 m long."""
 
 _ELLIPSOIDS = np.array(
     [
@@ -27,34 +28,26 @@ _ELLIPSOIDS = np.array(
         [1.05, -5.38, -2.55, 2.0, 3.19, 4.21, 2.05, 2.15, -18.29],
     ]
 )
-"""Centre, semi-axes and turns about x, y and z in degrees of the right lobe, the left lobe and the notch."""
+"""Right lobe, left lobe and notch: centre, semi-axes, and rotations about x, y and z in degrees."""
 
 _POSE = np.array([-28.36, -26.55, -38.02])
-"""Turns of the whole body about x, y and z, degrees."""
+"""Rotations of the whole body about x, y and z, degrees."""
 
 _SHARPNESS = 1.5
-"""k of the blends: the larger, the sharper."""
+"""k of the blends. Larger values give sharper blends."""
 
 _BOUNDS = np.array([[-0.13] * 3, [0.13] * 3])
 _SURFACE_SPACING_M = 0.0092
 _TETRAHEDRA_SPACING_M = 0.013
 
 BETWEEN_LOBES = (0.000115, -0.022708, 0.009457)
-"""A point of the surface, m: the floor of the notch between the lobes, where one may hold the body."""
+"""Surface point on the floor of the notch between the lobes, m. The support is there."""
 
 
 def liver_level(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The smooth function that is negative inside the liver and 0 on its surface.
+    """Return a smooth function of positions (n, 3), m: negative inside, 0 on the surface.
 
-    Parameters
-    ----------
-    points : (n, 3) float64
-        Positions, m.
-
-    Returns
-    -------
-    (n,) float64
-        Without unit, and no distance.
+    It has no unit and is no distance.
     """
     pose = Rotation.from_euler("xyz", _POSE, degrees=True).as_matrix()
     own = points / _UNIT_M @ pose
@@ -69,10 +62,11 @@ def liver_level(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=1)
 def liver_surface() -> Surface:
-    """The closed surface of the liver, 0.2 m long along x, its vertices on the level set to round-off.
+    """Return the closed surface of the liver, 0.2 m long along x.
 
-    It is the boundary of a mesh of finer tetrahedra, which has no slivers. In 15 x 14 x 15 cells it has 726 H8 and 1,118
-    nodes; U-Mesh's liver has 732 and 1,109.
+    It is the boundary of a mesh of finer tetrahedra without slivers; its vertices are on the level
+    set to round-off. In 15 x 14 x 15 cells it has 726 H8 and 1,118 nodes; U-Mesh's liver has 732
+    and 1,109.
     """
     mesh = tetrahedral_mesh(liver_level, _BOUNDS, _SURFACE_SPACING_M)
     used, number = np.unique(mesh.boundary_facets, return_inverse=True)
@@ -81,5 +75,5 @@ def liver_surface() -> Surface:
 
 @lru_cache(maxsize=1)
 def liver_tetrahedra() -> Mesh:
-    """The liver in 4,567 T4 cells with 1,118 nodes; U-Mesh's has 4,859 and 1,059, with fewer of them on the boundary."""
+    """Return the liver in 4,567 T4 cells with 1,118 nodes. U-Mesh's liver has 4,859 and 1,059."""
     return tetrahedral_mesh(liver_level, _BOUNDS, _TETRAHEDRA_SPACING_M)

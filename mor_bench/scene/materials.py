@@ -1,6 +1,6 @@
-"""Hyperelastic laws: their parameters, and how each splits into a volumetric part and the rest.
+"""Hyperelastic laws: their parameters, split into a volumetric part and the rest.
 
-The split serves selective integration: the volumetric part alone is taken from the cell's mean gradient.
+Selective integration needs the split: it takes the volumetric part from the cell's mean gradient.
 """
 
 from __future__ import annotations
@@ -23,30 +23,39 @@ class Material(ABC):
 
     law: ClassVar[int]
 
-    @property
     @abstractmethod
-    def parameters(self) -> tuple[float, ...]:
-        """What the law's function takes."""
-
-    @property
-    @abstractmethod
-    def shape_parameters(self) -> tuple[float, ...]:
-        """The parameters without the volumetric part."""
-
-    @property
-    @abstractmethod
-    def volume_parameters(self) -> tuple[float, ...]:
-        """The parameters of the volumetric part alone."""
+    def _scaled(self, volume: float, shape: float) -> tuple[float, ...]:
+        """Return the parameters with a factor for the volumetric part and one for the rest."""
 
     @property
     @abstractmethod
     def poisson_at_rest(self) -> float:
-        """Poisson's ratio of small strains."""
+        """Poisson's ratio at small strains."""
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """Parameters of the law's function."""
+        return self._scaled(1.0, 1.0)
+
+    @property
+    def shape_parameters(self) -> tuple[float, ...]:
+        """The parameters without the volumetric part."""
+        return self._scaled(0.0, 1.0)
+
+    @property
+    def volume_parameters(self) -> tuple[float, ...]:
+        """The parameters of the volumetric part alone."""
+        return self._scaled(1.0, 0.0)
 
 
 def lame_parameters(young_pa: float, poisson: float) -> tuple[float, float]:
-    """λ = Yν / ((1 + ν)(1 - 2ν)) and μ = Y / (2(1 + ν)), Pa."""
+    """Return λ = Yν / ((1 + ν)(1 - 2ν)) and μ = Y / (2(1 + ν)), Pa."""
     return young_pa * poisson / ((1 + poisson) * (1 - 2 * poisson)), young_pa / (2 * (1 + poisson))
+
+
+def poisson_of(bulk_pa: float, shear_pa: float) -> float:
+    """Return ν = (3κ - 2μ) / (2 (3κ + μ))."""
+    return (3 * bulk_pa - 2 * shear_pa) / (2 * (3 * bulk_pa + shear_pa))
 
 
 @dataclass(frozen=True)
@@ -70,24 +79,16 @@ class _TwoLame(Material):
         """μ, Pa."""
         return lame_parameters(self.young_pa, self.poisson)[1]
 
-    @property
-    def parameters(self) -> tuple[float, ...]:
-        return (self.lame_lambda, self.lame_mu)
-
-    @property
-    def shape_parameters(self) -> tuple[float, ...]:
-        return (0.0, self.lame_mu)
-
-    @property
-    def volume_parameters(self) -> tuple[float, ...]:
-        return (self.lame_lambda, 0.0)
+    def _scaled(self, volume: float, shape: float) -> tuple[float, ...]:
+        return volume * self.lame_lambda, shape * self.lame_mu
 
 
 class SaintVenantKirchhoff(_TwoLame):
-    """W(E) = λ/2 tr(E)² + μ tr(E²), with E the Green-Lagrange strain.
+    """W(E) = λ/2 tr(E)² + μ tr(E²), with the Green-Lagrange strain E.
 
-    Exact in large rotations, wrong in large strains: it softens in compression (limit point at stretch 1/√3), and a
-    mirrored element, diag(-1, 1, 1), stores no energy, so that only det F shows an inversion.
+    Exact in large rotations, wrong in large strains: it softens in compression (limit point at
+    stretch 1/√3). A mirrored element, diag(-1, 1, 1), stores no energy, so only det F shows an
+    inversion.
     """
 
     law = 0
@@ -116,17 +117,8 @@ class MooneyRivlin(Material):
     bulk_pa: float
     law: ClassVar[int] = 2
 
-    @property
-    def parameters(self) -> tuple[float, ...]:
-        return (self.c10_pa, self.c01_pa, self.bulk_pa)
-
-    @property
-    def shape_parameters(self) -> tuple[float, ...]:
-        return (self.c10_pa, self.c01_pa, 0.0)
-
-    @property
-    def volume_parameters(self) -> tuple[float, ...]:
-        return (0.0, 0.0, self.bulk_pa)
+    def _scaled(self, volume: float, shape: float) -> tuple[float, ...]:
+        return shape * self.c10_pa, shape * self.c01_pa, volume * self.bulk_pa
 
     @property
     def poisson_at_rest(self) -> float:
@@ -152,41 +144,19 @@ class Ogden(Material):
     bulk_pa: float
     law: ClassVar[int] = 3
 
-    def _with(self, bulk: float, factor: float) -> tuple[float, ...]:
-        pairs = [
-            value
-            for mu, alpha in zip(self.mu_pa, self.alpha, strict=True)
-            for value in (factor * mu, alpha)
-        ]
-        return (bulk, *pairs)
-
-    @property
-    def parameters(self) -> tuple[float, ...]:
-        return self._with(self.bulk_pa, 1.0)
-
-    @property
-    def shape_parameters(self) -> tuple[float, ...]:
-        return self._with(0.0, 1.0)
-
-    @property
-    def volume_parameters(self) -> tuple[float, ...]:
-        return self._with(self.bulk_pa, 0.0)
+    def _scaled(self, volume: float, shape: float) -> tuple[float, ...]:
+        terms = zip(self.mu_pa, self.alpha, strict=True)
+        pairs = [value for mu, alpha in terms for value in (shape * mu, alpha)]
+        return (volume * self.bulk_pa, *pairs)
 
     @property
     def poisson_at_rest(self) -> float:
-        return poisson_of(
-            self.bulk_pa,
-            0.5 * sum(mu * alpha for mu, alpha in zip(self.mu_pa, self.alpha, strict=True)),
-        )
-
-
-def poisson_of(bulk_pa: float, shear_pa: float) -> float:
-    """ν = (3κ - 2μ) / (2 (3κ + μ))."""
-    return (3 * bulk_pa - 2 * shear_pa) / (2 * (3 * bulk_pa + shear_pa))
+        twice_shear = sum(mu * alpha for mu, alpha in zip(self.mu_pa, self.alpha, strict=True))
+        return poisson_of(self.bulk_pa, 0.5 * twice_shear)
 
 
 def make_material(spec: TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial) -> Material:
-    """The law that a dataset file asks for."""
+    """Return the law that a dataset file names."""
     if isinstance(spec, MooneyRivlinMaterial):
         return MooneyRivlin(spec.c10_pa, spec.c01_pa, spec.bulk_pa)
     if isinstance(spec, OgdenMaterial):

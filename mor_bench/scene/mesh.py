@@ -1,4 +1,4 @@
-"""Hexahedral meshes: points, cells, boundary facets and, where there is one, the regular grid under them."""
+"""Meshes of hexahedra (H8) or tetrahedra (T4), with the regular grid they lie in, if any."""
 
 from __future__ import annotations
 
@@ -8,18 +8,23 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+HEX_CORNERS = np.array(
+    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
+)
+"""Corners of the unit cube, in VTK order."""
+
 FACES = {
     8: np.array(
         [[0, 4, 7, 3], [1, 2, 6, 5], [0, 1, 5, 4], [3, 7, 6, 2], [0, 3, 2, 1], [4, 5, 6, 7]]
     ),
     4: np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]),
 }
-"""The faces of a hexahedron and of a tetrahedron in VTK node order, each turned outwards."""
+"""Faces of a hexahedron (8) and a tetrahedron (4) in VTK order, oriented outwards."""
 
 KUHN = np.array(
     [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]]
 )
-"""Six tetrahedra around a hexahedron's diagonal 0-6; those of neighbouring cells fit together."""
+"""Six tetrahedra around a hexahedron's diagonal 0-6. They match across faces of cells."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +38,9 @@ class Mesh:
     cells : (n_cells, 8) or (n_cells, 4) int64
         Node numbers in VTK order.
     grid_shape : (int, int, int) or None
-        Nodes per axis of the regular grid in which the mesh lies.
+        Nodes per axis of the regular grid that contains the mesh.
     grid_index : (n_nodes,) int64 or None
-        Place of each node in that grid, flattened in C order.
+        Index of each node in that grid, flattened in C order.
     """
 
     points: NDArray[np.float64]
@@ -57,7 +62,7 @@ class Mesh:
 
     @cached_property
     def boundary_facets(self) -> NDArray[np.int64]:
-        """(n_facets, 4 or 3) node numbers of the faces that belong to one cell only, turned outwards."""
+        """(n_facets, 4 or 3) node numbers of the faces of a single cell, oriented outwards."""
         faces = FACES[self.cells.shape[1]]
         faces = self.cells[:, faces].reshape(-1, faces.shape[1])
         _, first, count = np.unique(
@@ -67,43 +72,35 @@ class Mesh:
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
-        """(2, 3) lowest and highest corner, m."""
+        """(2, 3) lowest and highest corner of the bounding box, m."""
         return np.array([self.points.min(axis=0), self.points.max(axis=0)])
 
 
 def box_mesh(
     size_m: tuple[float, float, float], cells: tuple[int, int, int], tetrahedra: bool = False
 ) -> Mesh:
-    """A box of equal H8 cells, or of six T4 in the place of each, with its lowest corner at the origin.
+    """Return a box of equal cells with its lowest corner at the origin.
 
-    Nodes are numbered with z fastest and x slowest, which keeps the bandwidth of a beam along x small.
+    Nodes are numbered with z fastest and x slowest. This keeps the bandwidth of a beam along x
+    small.
 
     Parameters
     ----------
     size_m : three floats
         Edge lengths, m.
     cells : three ints
-        Cells per axis.
-    tetrahedra : bool
+        Hexahedra per axis.
+    tetrahedra : bool, default False
+        Cut each hexahedron into six T4.
     """
-    nx, ny, nz = (n + 1 for n in cells)
-    axes = [np.linspace(0.0, length, n + 1) for length, n in zip(size_m, cells, strict=True)]
+    shape = cells[0] + 1, cells[1] + 1, cells[2] + 1
+    axes = [np.linspace(0.0, length, n) for length, n in zip(size_m, shape, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    node = np.arange(nx * ny * nz).reshape(nx, ny, nz)
-    low, high = slice(None, -1), slice(1, None)
-    corners = [
-        (low, low, low),
-        (high, low, low),
-        (high, high, low),
-        (low, high, low),
-        (low, low, high),
-        (high, low, high),
-        (high, high, high),
-        (low, high, high),
-    ]
+    node = np.arange(len(points)).reshape(shape)
+    corners = [tuple(slice(c, c + n) for c, n in zip(at, cells, strict=True)) for at in HEX_CORNERS]
     hexes = np.stack([node[corner].ravel() for corner in corners], axis=1)
     cell_nodes = hexes[:, KUHN].reshape(-1, 4) if tetrahedra else hexes
-    return Mesh(points, cell_nodes, (nx, ny, nz), np.arange(len(points)))
+    return Mesh(points, cell_nodes, shape, np.arange(len(points)))
 
 
 def l_mesh(
@@ -112,14 +109,14 @@ def l_mesh(
     cut_cells: tuple[int, int],
     tetrahedra: bool = False,
 ) -> Mesh:
-    """A box without the cells in its corner of highest x and highest z, in the box's regular grid.
+    """Return a box without the cells in its corner of highest x and highest z.
 
     Parameters
     ----------
     size_m, cells, tetrahedra
-        Of the box; see `box_mesh`.
+        Of the box, see `box_mesh`. Its regular grid is kept.
     cut_cells : two ints
-        Cells that are missing along x and along z.
+        Hexahedra to remove along x and along z.
     """
     box = box_mesh(size_m, cells, tetrahedra)
     x, _, z = np.unravel_index(np.arange(box.n_cells) // (len(KUHN) if tetrahedra else 1), cells)
@@ -127,16 +124,23 @@ def l_mesh(
 
 
 def along_longest_axis(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The order (n,) of points (n, 3) along the longest axis of their bounding box, then the second, then the shortest.
+    """Return the order (n,) of points (n, 3) along the longest axis, then the second, the third.
 
-    Nodes of a slender body that are numbered so have a small bandwidth.
+    This numbering gives a slender body a small bandwidth.
     """
     axes = np.argsort(-np.ptp(points, axis=0))
     return np.lexsort(np.round(points / np.ptp(points), 9)[:, axes[::-1]].T)
 
 
+def inverse_of(order: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the inverse (n,) of a permutation (n,)."""
+    inverse = np.empty_like(order)
+    inverse[order] = np.arange(len(order))
+    return inverse
+
+
 def part_of(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
-    """The cells (n_cells,) that are kept, with their nodes, in the order and the grid that they had."""
+    """Return some cells (n_cells,) of a mesh with their nodes, in the same order and grid."""
     nodes, cells = np.unique(mesh.cells[kept], return_inverse=True)
     index = None if mesh.grid_index is None else mesh.grid_index[nodes]
     return Mesh(mesh.points[nodes], cells.reshape(-1, mesh.cells.shape[1]), mesh.grid_shape, index)

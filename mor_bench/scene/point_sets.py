@@ -1,4 +1,4 @@
-"""Named sets of nodes, from what mesh formats call sets, physical groups and point data."""
+"""Named sets of nodes, from the sets, physical groups and point data of mesh formats."""
 
 from __future__ import annotations
 
@@ -13,64 +13,51 @@ from mor_bench.errors import SpecError
 
 PointSets = dict[str, NDArray[np.int64]]
 
+_Rows = list[NDArray[np.int64]]
+"""The chosen rows of each block of cells."""
+
+_DIMENSIONS = ("point", "line", "surface", "volume")
+"""Gmsh's names of groups, by dimension."""
+
+_NO_ROWS = np.zeros(0, dtype=np.int64)
+
 
 def named_point_sets(mesh: meshio.Mesh, path: Path) -> PointSets:
-    """The sets of nodes that a file names; those of the same name are joined.
+    """Return the sets of nodes that a file names; sets with the same name are joined.
 
-    They are point sets (Abaqus NSET, also in a line `*NODE, NSET=…`), the nodes of cell sets (ELSET) and of Gmsh's physical
-    groups of any dimension, a group without a name under its number, with its dimension before it where others have it too,
-    and point data of zeros and ones (VTK). An Abaqus file is taken to have passed `check_abaqus`.
+    Sources: point sets (Abaqus NSET, also in `*NODE, NSET=…`), the nodes of cell sets (ELSET) and
+    of Gmsh's physical groups of any dimension, and point data of zeros and ones (VTK). A group
+    without a name goes by its number, after its dimension if groups of other dimensions have that
+    number. An Abaqus file must have passed `check_abaqus`.
     """
     found: dict[str, list[NDArray[np.int64]]] = {}
     abaqus = path.suffix.lower() == ".inp"
     if abaqus:
-        found |= {
-            name: [np.arange(len(mesh.points))]
-            for name in _keywords(path, "NODE", "NSET")
-            if name is not None
-        }
+        for name in _keywords(path, "NODE", "NSET"):
+            if name is not None:
+                found[name] = [np.arange(len(mesh.points))]
     for name, nodes in mesh.point_sets.items():
         found.setdefault(name, []).append(np.asarray(nodes, dtype=np.int64))
-    for name, chosen in (
-        (_abaqus_blocks(mesh, path) if abaqus else []) + _cell_sets(mesh) + _physical_groups(mesh)
-    ):
-        nodes = [
-            np.asarray(block.data)[rows].ravel()
-            for block, rows in zip(mesh.cells, chosen, strict=True)
-            if len(rows)
-        ]
-        found.setdefault(name, []).extend(np.asarray(part, dtype=np.int64) for part in nodes)
+    cell_sets = (_abaqus_blocks(mesh, path) if abaqus else []) + _cell_sets(mesh)
+    for name, chosen in cell_sets + _physical_groups(mesh):
+        parts = found.setdefault(name, [])
+        for block, rows in zip(mesh.cells, chosen, strict=True):
+            if len(rows):
+                parts.append(np.asarray(np.asarray(block.data)[rows].ravel(), dtype=np.int64))
     for name, values in mesh.point_data.items():
-        if (
-            values.ndim == 1
-            and values.dtype.kind in "biuf"
-            and np.isin(values, [0, 1]).all()
-            and values.any()
-        ):
+        numbers = values.ndim == 1 and values.dtype.kind in "biuf"
+        if numbers and np.isin(values, [0, 1]).all() and values.any():
             found.setdefault(name, []).append(np.flatnonzero(values))
-    return {
-        name: np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *parts]))
-        for name, parts in found.items()
-    }
-
-
-_Rows = list[NDArray[np.int64]]
-"""For each block of cells the rows that are chosen."""
-
-_DIMENSIONS = ("point", "line", "surface", "volume")
-"""Gmsh's words for groups, by dimension."""
-
-_NO_ROWS = np.zeros(0, dtype=np.int64)
+    return {name: np.unique(np.concatenate([_NO_ROWS, *parts])) for name, parts in found.items()}
 
 
 def _cell_sets(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
     sets = []
     for name, members in mesh.cell_sets.items():
-        if name.startswith("gmsh:"):
-            continue
-        rows = [_NO_ROWS if part is None else np.asarray(part, dtype=np.int64) for part in members]
-        # A set that was defined before later cells has no part in them.
-        sets.append((name, (rows + [_NO_ROWS] * len(mesh.cells))[: len(mesh.cells)]))
+        if not name.startswith("gmsh:"):
+            rows = [_NO_ROWS if part is None else np.asarray(part, np.int64) for part in members]
+            # A set that was defined before later cells has no entry for them.
+            sets.append((name, (rows + [_NO_ROWS] * len(mesh.cells))[: len(mesh.cells)]))
     return sets
 
 
@@ -78,35 +65,27 @@ def _physical_groups(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
     data = mesh.cell_data.get("gmsh:physical")
     if data is None:
         return []
-    tags = [np.abs(values) for values in data]  # negative where a group holds a surface turned over
+    # A tag is negative if the group holds a surface with reversed orientation.
+    blocks = [(block.dim, np.abs(tags)) for block, tags in zip(mesh.cells, data, strict=True)]
     names = {(int(tag), int(dimension)): name for name, (tag, dimension) in mesh.field_data.items()}
-    keys = sorted(
-        {
-            (int(tag), block.dim)
-            for block, values in zip(mesh.cells, tags, strict=True)
-            for tag in np.unique(values)
-            if tag != 0
-        }
-    )
-    unnamed = [tag for tag, dimension in keys if (tag, dimension) not in names]
-    numbers = {
-        (tag, dim): str(tag) if unnamed.count(tag) == 1 else f"{_DIMENSIONS[dim]} {tag}"
-        for tag, dim in keys
-    }
+    keys = sorted({(int(tag), dim) for dim, tags in blocks for tag in np.unique(tags) if tag != 0})
+    unnamed = [key[0] for key in keys if key not in names]
+
+    def name_of(tag: int, dim: int) -> str:
+        number = str(tag) if unnamed.count(tag) == 1 else f"{_DIMENSIONS[dim]} {tag}"
+        return str(names.get((tag, dim), number))
+
     return [
         (
-            names.get(key, numbers[key]),
-            [
-                np.flatnonzero(values == key[0]) if block.dim == key[1] else _NO_ROWS
-                for block, values in zip(mesh.cells, tags, strict=True)
-            ],
+            name_of(tag, dim),
+            [np.flatnonzero(tags == tag) if d == dim else _NO_ROWS for d, tags in blocks],
         )
-        for key in keys
+        for tag, dim in keys
     ]
 
 
 def _keywords(path: Path, keyword: str, parameter: str) -> list[str | None]:
-    """For each line of a keyword in an Abaqus file the value of one of its parameters."""
+    """Return the value of a parameter in each line of a keyword in an Abaqus file."""
     lines = re.findall(
         rf"^\*{keyword}\s*((?:,.*)?)$",
         path.read_text(encoding="utf-8", errors="replace"),
@@ -117,7 +96,10 @@ def _keywords(path: Path, keyword: str, parameter: str) -> list[str | None]:
 
 
 def check_abaqus(path: Path) -> None:
-    """Raise `SpecError` if an Abaqus file has two NSET of one name, or two NODE, of which only one would be read."""
+    """Raise `SpecError` if an Abaqus file has two NSET of one name, or two NODE blocks.
+
+    meshio would read only one of them.
+    """
     names = _keywords(path, "NSET", "NSET")
     repeated = sorted({name for name in names if name is not None and names.count(name) > 1})
     if repeated:
@@ -126,29 +108,25 @@ def check_abaqus(path: Path) -> None:
         )
     if (n_blocks := len(_keywords(path, "NODE", "NSET"))) > 1:
         raise SpecError(
-            f"{path}: the nodes must stand under one line *NODE; there are {n_blocks}, of which only the last would be read."
+            f"{path}: all nodes must stand under one line *NODE; there are {n_blocks}, "
+            "and only the last would be read."
         )
 
 
 def _abaqus_blocks(mesh: meshio.Mesh, path: Path) -> list[tuple[str, _Rows]]:
-    """Sets named in lines `*ELEMENT, ELSET=…`, which meshio gives to the wrong cells where a line has none.
+    """Return the sets named in lines `*ELEMENT, ELSET=…`, and remove meshio's version of them.
 
-    What meshio made of them is removed from the mesh.
+    meshio assigns these sets to wrong cells if a line has none.
     """
     names = _keywords(path, "ELEMENT", "ELSET")
-    for name in {name for name in names if name is not None} - set(
-        _keywords(path, "ELSET", "ELSET")
-    ):
+    for name in {*names} - {None, *_keywords(path, "ELSET", "ELSET")}:
         mesh.cell_sets.pop(name, None)
-    if len(names) != len(
-        mesh.cells
-    ):  # an included file brought cells: which ones are whose is not known
+    n_blocks = len(mesh.cells)
+    if len(names) != n_blocks:  # an included file has cells: their owners are not known
         return []
+    every = [np.arange(len(block)) for block in mesh.cells]
     return [
-        (
-            name,
-            [np.arange(len(block)) if i == k else _NO_ROWS for i, block in enumerate(mesh.cells)],
-        )
+        (name, [every[i] if i == k else _NO_ROWS for i in range(n_blocks)])
         for k, name in enumerate(names)
         if name is not None
     ]

@@ -1,8 +1,8 @@
 """Snapshots of another program: arrays in an NPZ or HDF5 file.
 
-`points` (n_nodes, 3), m; `cells` (n_cells, 8 or 4), in VTK order, counted from 0; `forces` and `displacements`
-(n, n_nodes, 3), N and m; and, where there are any, `fixed_nodes` (n_fixed,); `regions` (n,), or (n, k) with k forces at
-once, load-region ids from 0; `test` (n,), true, or 1, for the samples that are kept for the test.
+Required: `points` (n_nodes, 3), m; `cells` (n_cells, 8 or 4) in VTK order, counted from 0; `forces`
+and `displacements` (n, n_nodes, 3), N and m. Optional: `fixed_nodes` (n_fixed,); `regions` (n,), or
+(n, k) with k forces at once, load-region ids from 0; `test` (n,), true or 1 for test samples.
 """
 
 from __future__ import annotations
@@ -26,20 +26,30 @@ from mor_bench.scene.soundness import check_numbers, in_grid, sound_cells
 from mor_bench.specs import SourceFile
 
 STILL = 1e-9
-"""Displacement of a fixed node, as a fraction of the largest of all, that is taken for zero."""
+"""Displacement of a fixed node that counts as zero, as a fraction of the largest displacement."""
 
 MAX_SIZE = {"forces": 1e30, "displacements": 1e30}
-"""N and m; squares and products of what is no larger are far from overflow."""
+"""Largest allowed values, N and m. Their squares and products are far from overflow."""
 
 REQUIRED = ("points", "cells", "forces", "displacements")
 OPTIONAL = ("fixed_nodes", "regions", "test")
 _KINDS = {"cells": "iu", "fixed_nodes": "iu", "regions": "iu", "test": "biu"}
 _WORDS = {"iu": "integers", "biu": "booleans, or 0 and 1 as integers", "fiu": "real numbers"}
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    EOFError,
+    TypeError,
+    KeyError,
+    AttributeError,
+    zipfile.BadZipFile,
+    UnpicklingError,
+)
 
 
 @dataclass(frozen=True)
 class ImportedArrays:
-    """What a file of snapshots holds, checked.
+    """The checked content of a file of snapshots.
 
     Attributes
     ----------
@@ -68,7 +78,7 @@ def read_arrays(file: SourceFile) -> ImportedArrays:
     Raises
     ------
     SpecError
-        If the file is missing, has changed or cannot be read, or an array is missing, unknown, or not as it must be.
+        If the file is missing, changed or unreadable, or an array is missing, unknown or not valid.
     """
     path = file.checked()
     try:
@@ -78,11 +88,13 @@ def read_arrays(file: SourceFile) -> ImportedArrays:
 
 
 def _read(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a file; objects, which would have to be unpickled, are refused."""
+    """Return the arrays of a file. Pickled objects are refused."""
     suffix = path.suffix.lower()
     try:
         if suffix == ".npz":
-            with zipfile.ZipFile(path):  # anything else that numpy reads holds no named arrays
+            with zipfile.ZipFile(
+                path
+            ):  # numpy reads other files too, but they hold no named arrays
                 pass
             with np.load(path, allow_pickle=False) as content:
                 _check_names(content.files)
@@ -93,19 +105,9 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
                 return {name: _entry(content, name) for name in content}
     except SpecError:
         raise
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        TypeError,
-        KeyError,
-        AttributeError,
-        zipfile.BadZipFile,
-        UnpicklingError,
-    ) as error:
-        raise SpecError(
-            f"not a readable {suffix} file of arrays: {' '.join(str(error).split())}"
-        ) from None
+    except _UNREADABLE as error:
+        reason = " ".join(str(error).split())
+        raise SpecError(f"not a readable {suffix} file of arrays: {reason}") from None
     raise SpecError(f"snapshots must be in an .npz, .h5 or .hdf5 file; got {suffix!r}.")
 
 
@@ -116,9 +118,8 @@ def _entry(content: h5py.File, name: str) -> NDArray[Any]:
             return np.asarray(entry[()] if entry.shape is not None else np.zeros(0))
     except (OSError, KeyError, RuntimeError) as error:
         raise SpecError(f"`{name}` cannot be read: {' '.join(str(error).split())}") from None
-    raise SpecError(
-        f"`{name}` must be an array of numbers; got {'text' if isinstance(entry, h5py.Dataset) else 'a group'}."
-    )
+    kind = "text" if isinstance(entry, h5py.Dataset) else "a group"
+    raise SpecError(f"`{name}` must be an array of numbers; got {kind}.")
 
 
 def _check_names(names: list[str]) -> None:
@@ -126,9 +127,8 @@ def _check_names(names: list[str]) -> None:
     for name in names:
         if name not in known:
             close = difflib.get_close_matches(name, known, n=1)
-            raise SpecError(
-                f"unknown array `{name}`{f'; did you mean {close[0]!r}?' if close else '.'} Allowed: {', '.join(known)}."
-            )
+            hint = f"; did you mean {close[0]!r}?" if close else "."
+            raise SpecError(f"unknown array `{name}`{hint} Allowed: {', '.join(known)}.")
     for name in REQUIRED:
         if name not in names:
             raise SpecError(f"array `{name}` is missing.")
@@ -136,30 +136,35 @@ def _check_names(names: list[str]) -> None:
 
 def _checked(arrays: Mapping[str, NDArray[Any]]) -> ImportedArrays:
     _check_shapes(arrays)
-    points, cells = arrays["points"].astype(np.float64), _integers(arrays["cells"])
-    fixed = np.unique(_integers(arrays.get("fixed_nodes", np.zeros(0))))
+    points, cells = arrays["points"].astype(np.float64), arrays["cells"].astype(np.int64)
+    fixed = np.unique(arrays.get("fixed_nodes", np.zeros(0)).astype(np.int64))
     forces, displacements = (_in_range(name, arrays[name]) for name in ("forces", "displacements"))
     n, n_nodes = forces.shape[:2]
     if n == 0:
         raise SpecError("there must be samples; got none.")
-    regions = _integers(arrays["regions"]).reshape(n, -1) if "regions" in arrays else None
+    regions, test = arrays.get("regions"), arrays.get("test")
     check_numbers(points, cells)
     if (unused := n_nodes - len(np.unique(cells))) > 0:
         raise SpecError(f"every node must belong to a cell; {unused} of {n_nodes} do not.")
-    cells = sound_cells(points, cells)
-    _check_samples(forces, displacements, fixed, regions)
-    return ImportedArrays(
-        in_grid(Mesh(points, cells)),
-        forces,
-        displacements,
-        fixed,
-        regions,
-        _truths(arrays.get("test")),
-    )
+    mesh = Mesh(points, sound_cells(points, cells))
+    _check_fixed(displacements, fixed)
+    if regions is not None:
+        regions = regions.astype(np.int64).reshape(n, -1)
+        if not regions.size or regions.min() < 0:
+            raise SpecError("`regions` must be ids from 0 on.")
+    # Adding zero makes -0.0 and 0.0 the same bytes.
+    seen = {hashlib.sha256((force + 0.0).tobytes()).digest() for force in forces}
+    if len(seen) < n:
+        raise SpecError(f"`forces`: {n - len(seen)} samples repeat others.")
+    if test is not None:
+        if not np.isin(test, [0, 1]).all():
+            raise SpecError(f"`test` must hold {_WORDS['biu']}; got {test.min()} to {test.max()}.")
+        test = test.astype(np.bool_)
+    return ImportedArrays(in_grid(mesh), forces, displacements, fixed, regions, test)
 
 
 def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Raise `SpecError` for the first array of a wrong type or shape, or with an entry that is not finite."""
+    """Raise `SpecError` for an array with a wrong type or shape, or a non-finite entry."""
     n, n_nodes = len(np.atleast_1d(arrays["forces"])), len(np.atleast_1d(arrays["points"]))
     shapes: dict[str, tuple[tuple[int | None, ...], ...]] = {
         "points": ((None, 3),),
@@ -172,9 +177,7 @@ def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
     }
     for name in (*REQUIRED, *OPTIONAL):
         array = arrays.get(name)
-        if array is None or (
-            name == "fixed_nodes" and array.size == 0
-        ):  # what is empty may have any type
+        if array is None or (name == "fixed_nodes" and array.size == 0):  # empty: any type will do
             continue
         kinds = _KINDS.get(name, "fiu")
         if array.dtype.kind not in kinds:
@@ -193,39 +196,27 @@ def _has_shape(array: NDArray[Any], shape: tuple[int | None, ...]) -> bool:
     )
 
 
-def _integers(array: NDArray[Any]) -> NDArray[np.int64]:
-    return np.asarray(array).astype(np.int64)
-
-
 def _in_range(name: str, array: NDArray[Any]) -> NDArray[np.float64]:
-    with np.errstate(over="ignore"):  # a longer type may hold what is infinite here
+    with np.errstate(over="ignore"):  # a value of a longer type may become infinite
         numbers = np.ascontiguousarray(array, dtype=np.float64)
-    size, unit = np.abs(numbers), {"forces": "N", "displacements": "m"}[name]
-    if not (size <= MAX_SIZE[name]).all():
+    size, largest = np.abs(numbers), MAX_SIZE[name]
+    unit = {"forces": "N", "displacements": "m"}[name]
+    if not (size <= largest).all():
         worst = [int(i) for i in np.unravel_index(size.argmax(), size.shape)]
         raise SpecError(
-            f"`{name}` must be in [-{MAX_SIZE[name]:g}, {MAX_SIZE[name]:g}] {unit}; entry {worst} is {numbers[tuple(worst)]:g}."
+            f"`{name}` must be in [-{largest:g}, {largest:g}] {unit}; "
+            f"entry {worst} is {numbers[tuple(worst)]:g}."
         )
     if size.size and not size.any():
         raise SpecError(
-            f"`{name}` must differ from zero somewhere, and be at most {MAX_SIZE[name]:g} {unit}; got zeros only."
+            f"`{name}` must differ from zero somewhere, and be at most {largest:g} {unit}; "
+            "got zeros only."
         )
     return numbers
 
 
-def _truths(array: NDArray[Any] | None) -> NDArray[np.bool_] | None:
-    if array is not None and not np.isin(array, [0, 1]).all():
-        raise SpecError(f"`test` must hold {_WORDS['biu']}; got {array.min()} to {array.max()}.")
-    return None if array is None else array.astype(np.bool_)
-
-
-def _check_samples(
-    forces: NDArray[np.float64],
-    displacements: NDArray[np.float64],
-    fixed: NDArray[np.int64],
-    regions: NDArray[np.int64] | None,
-) -> None:
-    n, n_nodes = forces.shape[:2]
+def _check_fixed(displacements: NDArray[np.float64], fixed: NDArray[np.int64]) -> None:
+    n_nodes = displacements.shape[1]
     if len(fixed) and (fixed[0] < 0 or fixed[-1] >= n_nodes):
         raise SpecError(
             f"`fixed_nodes` must be in [0, {n_nodes - 1}]; got {fixed[0]} to {fixed[-1]}."
@@ -235,11 +226,6 @@ def _check_samples(
     moved = np.abs(displacements[:, fixed]).max(axis=(1, 2), initial=0.0)
     if (moved > STILL * np.abs(displacements).max()).any():
         raise SpecError(
-            f"`displacements` must be zero at `fixed_nodes`; sample {int(moved.argmax())} has {moved.max():.3g} m."
+            f"`displacements` must be zero at `fixed_nodes`; "
+            f"sample {int(moved.argmax())} has {moved.max():.3g} m."
         )
-    if regions is not None and (not regions.size or regions.min() < 0):
-        raise SpecError("`regions` must be ids from 0 on.")
-    # 0.0 and -0.0 are one number and two patterns of bits.
-    seen = {hashlib.sha256((force + 0.0).tobytes()).digest() for force in forces}
-    if len(seen) < n:
-        raise SpecError(f"`forces`: {n - len(seen)} samples repeat others.")

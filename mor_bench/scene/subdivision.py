@@ -1,4 +1,4 @@
-"""Uniform refinement of any mesh: eight cells in the place of one, the body unchanged."""
+"""Uniform refinement of any mesh: each cell becomes eight, and the body stays the same."""
 
 from __future__ import annotations
 
@@ -7,28 +7,23 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.scene.mesh import Mesh, along_longest_axis
-
-_HEX = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
-"""Places of a hexahedron's corners along its own axes, in VTK order."""
+from mor_bench.scene.mesh import HEX_CORNERS, Mesh, along_longest_axis, inverse_of
 
 _THIRDS = list(product(range(3), repeat=3))
+"""Places of the 27 nodes of a hexahedron that is cut in eight, in half edges along its axes."""
 
 HEX_PARENTS = [
     [
-        c
-        for c, place in enumerate(_HEX)
-        if all(t == 1 or t == 2 * p for t, p in zip(third, place, strict=True))
+        corner
+        for corner, place in enumerate(HEX_CORNERS)
+        if all(t in (1, 2 * p) for t, p in zip(third, place, strict=True))
     ]
     for third in _THIRDS
 ]
-"""The corners whose mean each of the 27 nodes of a hexahedron cut in eight is."""
+"""The corners whose mean each of the 27 nodes is."""
 
 HEX_CHILDREN = np.array(
-    [
-        [_THIRDS.index(tuple(o + p for o, p in zip(origin, place, strict=True))) for place in _HEX]
-        for origin in _HEX
-    ]
+    [[_THIRDS.index(tuple(origin + place)) for place in HEX_CORNERS] for origin in HEX_CORNERS]
 )
 
 TET_PARENTS = [[0], [1], [2], [3], [0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]]
@@ -44,16 +39,17 @@ _TET_INNER = {
 
 
 def subdivide(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
-    """A mesh with eight cells in the place of each, in no grid.
+    """Return a mesh with eight cells for each, without a grid.
 
-    Tetrahedra are cut along the shortest diagonal of the octahedron that is left when the corners are cut off.
+    Cutting the corners off a tetrahedron leaves an octahedron. It is cut along its shortest
+    diagonal.
 
     Returns
     -------
     mesh : Mesh
         Nodes are numbered along the body's longest axis, which keeps the bandwidth small.
     parents : (n_nodes, 8) int64
-        For each new node the old ones whose mean it is, each as often as the others.
+        Each new node is the mean of these old nodes, which occur equally often.
     """
     hexahedra = mesh.cells.shape[1] == 8
     local = HEX_PARENTS if hexahedra else TET_PARENTS
@@ -64,27 +60,16 @@ def subdivide(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
     points = mesh.points[parents].mean(axis=1)
     cells = numbers[:, HEX_CHILDREN].reshape(-1, 8) if hexahedra else _tetrahedra(points, numbers)
     order = along_longest_axis(points)
-    place = np.empty(len(order), dtype=np.int64)
-    place[order] = np.arange(len(order))
-    return Mesh(points[order], place[cells]), parents[order]
+    return Mesh(points[order], inverse_of(order)[cells]), parents[order]
 
 
 def _tetrahedra(points: NDArray[np.float64], numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(8 n, 4) the parts of tetrahedra, from the numbers (n, 10) of their corners and midpoints."""
-    diagonals = list(_TET_INNER)
-    lengths = np.stack(
-        [
-            np.linalg.norm(points[numbers[:, a]] - points[numbers[:, b]], axis=1)
-            for a, b in diagonals
-        ],
-        axis=1,
-    )
-    shortest = lengths.argmin(axis=1)
+    """Return the parts (8 n, 4) of tetrahedra with corners and midpoints (n, 10)."""
+    ends = [points[numbers[:, [a, b]]] for a, b in _TET_INNER]
+    shortest = np.argmin([np.linalg.norm(e[:, 0] - e[:, 1], axis=1) for e in ends], axis=0)
     parts = [numbers[:, _TET_CORNERS].reshape(-1, 4)]
-    parts += [
-        numbers[shortest == i][:, inner].reshape(-1, 4)
-        for i, inner in enumerate(_TET_INNER.values())
-    ]
+    for i, inner in enumerate(_TET_INNER.values()):
+        parts.append(numbers[shortest == i][:, inner].reshape(-1, 4))
     cells = np.concatenate(parts)
     edges = points[cells[:, 1:]] - points[cells[:, :1]]
     turned = np.linalg.det(edges) < 0

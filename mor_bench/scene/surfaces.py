@@ -1,4 +1,4 @@
-"""Closed triangulated surfaces: read from STL or OBJ, checked, and asked which points they enclose."""
+"""Closed triangulated surfaces: reading from STL or OBJ, checks, and a test for enclosed points."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mor_bench.scene.files import read_triangles
 from mor_bench.scene.triangles import winding_numbers
 
 FLAT = 1e-12
-"""Volumes below this part of the cubed diagonal of the bounding box are round-off."""
+"""Volume that counts as round-off, as a fraction of the cubed diagonal of the bounding box."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Surface:
     points : (n, 3) float64
         Positions, m.
     triangles : (m, 3) int64
-        Point numbers, turned outwards: counter-clockwise as seen from outside the body.
+        Point numbers, counter-clockwise as seen from outside the body.
     """
 
     points: NDArray[np.float64]
@@ -34,86 +34,72 @@ class Surface:
 
     @cached_property
     def volume_m3(self) -> float:
-        """Volume of the body, m³, by the divergence theorem; negative if the triangles are turned inwards."""
+        """Volume of the body by the divergence theorem, m³; negative if oriented inwards."""
         a, b, c = np.moveaxis(self.points[self.triangles] - self.bounds.mean(axis=0), 1, 0)
         return float((a * np.cross(b, c)).sum() / 6)
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
-        """(2, 3) lowest and highest corner, m."""
+        """(2, 3) lowest and highest corner of the bounding box, m."""
         return np.array([self.points.min(axis=0), self.points.max(axis=0)])
 
 
 def inside(surface: Surface, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether each point lies in the body, by the surface's winding number around it.
+    """Return whether each point (n, 3), m, lies in the body, by the surface's winding number.
 
-    Parameters
-    ----------
-    surface : Surface
-    points : (n, 3) float64
-        Positions, m. On the surface itself, to round-off, the answer is either.
-
-    Returns
-    -------
-    (n,) bool
+    For a point on the surface itself, to round-off, the answer may be either.
     """
-    windings = winding_numbers(
-        surface.points[surface.triangles], np.ascontiguousarray(points, dtype=np.float64)
-    )
-    return np.asarray(windings > 0.5)
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    return np.asarray(winding_numbers(surface.points[surface.triangles], points) > 0.5)
 
 
 def read_surface(path: str | Path, unit_m: float = 1.0) -> Surface:
-    """A closed surface from an STL or OBJ file.
+    """Read a closed surface from an STL or OBJ file.
 
-    Equal vertices become one, polygons become fans of triangles, and a surface that is turned inwards is turned outwards.
-    That parts of the surface do not cross each other is not checked.
+    Equal vertices are merged, polygons become fans of triangles, and a surface that is oriented
+    inwards is reversed. Crossings of the surface with itself are not detected.
 
     Parameters
     ----------
     path : str or Path
         Ends in .stl or .obj.
     unit_m : float, default 1
-        The file's unit of length, m; 0.01 if it is in centimetres.
+        The file's unit of length, m; 0.01 for centimetres.
 
     Raises
     ------
     SpecError
-        If there is no such file, it cannot be read or holds no triangles or NaN, or its surface is not closed, not
-        consistently oriented or encloses nothing. The message names the file.
+        If the file is missing or unreadable, has no triangles or a NaN, or its surface is not
+        closed, not consistently oriented or encloses nothing. The message names the file.
     """
     corners = read_triangles(Path(path), unit_m)
-    # Adding zero turns -0.0, which other triangles may have as 0.0, into it.
+    # Adding zero turns -0.0 into 0.0, so that vertices of neighbouring triangles are equal.
     vertices, number = np.unique(corners.reshape(-1, 3) + 0.0, axis=0, return_inverse=True)
     triangles = number.reshape(-1, 3)
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
     if len(triangles) == 0:
         raise SpecError(f"{path}: a surface must hold triangles; got only points and lines.")
-    return _turned_outwards(Surface(vertices, triangles), str(path))
+    try:
+        return _turned_outwards(Surface(vertices, triangles))
+    except SpecError as error:
+        raise SpecError(f"{path}: {error}") from None
 
 
-def _turned_outwards(surface: Surface, name: str) -> Surface:
-    """The surface, turned outwards if it is turned inwards.
-
-    Raises
-    ------
-    SpecError
-        If the surface is not closed, not consistently oriented or encloses nothing; the message begins with the name.
-    """
+def _turned_outwards(surface: Surface) -> Surface:
     edges = surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     sharing = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]
     if n_open := int((sharing != 2).sum()):
         raise SpecError(
-            f"{name}: the surface is not closed: {n_open} of its {len(sharing)} edges are not shared by exactly two triangles."
+            f"the surface is not closed: {n_open} of its {len(sharing)} edges "
+            "are not shared by exactly two triangles."
         )
     if n_twisted := len(edges) - len(np.unique(edges, axis=0)):
         raise SpecError(
-            f"{name}: the triangles are not consistently oriented: across {n_twisted} of {len(sharing)} edges they turn over."
+            "the triangles are not consistently oriented: "
+            f"across {n_twisted} of {len(sharing)} edges they turn over."
         )
     if abs(surface.volume_m3) <= FLAT * np.linalg.norm(np.diff(surface.bounds, axis=0)) ** 3:
-        raise SpecError(f"{name}: the surface encloses no volume.")
-    return (
-        surface
-        if surface.volume_m3 > 0
-        else Surface(surface.points, surface.triangles[:, ::-1].copy())
-    )
+        raise SpecError("the surface encloses no volume.")
+    if surface.volume_m3 > 0:
+        return surface
+    return Surface(surface.points, surface.triangles[:, ::-1].copy())

@@ -1,4 +1,4 @@
-"""Mirror planes under which a scene is its own image: what is solved on one side is solved on the other."""
+"""Mirror planes of a scene: the mirror image of a solution solves the mirrored load."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from mor_bench.scene.scene import Scene
 
 SAME_PLACE = 1e-6
-"""Distance, as a part of the body's diagonal, within which a mirrored node is another one."""
+"""Distance below which a mirrored node matches another, as a fraction of the body's diagonal."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Mirror:
     ----------
     axis : int
     nodes : (n_nodes,) int64
-        The node of which each node is the image; its own inverse.
+        The node at the mirror image of each node; its own inverse.
     """
 
     axis: int
@@ -30,42 +30,41 @@ class Mirror:
 
     @property
     def signs(self) -> NDArray[np.float64]:
-        """(3,): what vectors are multiplied by."""
+        """(3,) factors of a vector's components."""
         return np.where(np.arange(3) == self.axis, -1.0, 1.0)
 
     def __call__(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Image of nodal vectors (…, n_nodes, 3)."""
+        """Return the image of nodal vectors (…, n_nodes, 3)."""
         return vectors[..., self.nodes, :] * self.signs
 
 
 def mirrors(scene: Scene) -> list[Mirror]:
-    """The planes, at most one per axis, that map mesh, supports and the nodes that loads act on onto themselves.
+    """Return the mirror planes of mesh, supports and loaded nodes, at most one per axis.
 
-    The materials are isotropic and have no directions of their own. If u answers f, the image of u answers the image of f.
+    All materials are isotropic, so the image of a solution solves the image of its load.
     """
     points, cells = scene.mesh.points, scene.mesh.cells
     low, high = points.min(axis=0), points.max(axis=0)
+    near = SAME_PLACE * np.linalg.norm(high - low)
     tree = cKDTree(points)
     own_cells = _rows(cells)
-    loaded = np.unique(scene.patch_weights.indices)
+    kept = scene.fixed_nodes, np.unique(scene.patch_weights.indices)
     found = []
     for axis in range(3):
         images = points.copy()
         images[:, axis] = low[axis] + high[axis] - points[:, axis]
         distance, nodes = (np.asarray(part) for part in tree.query(images))
-        if distance.max() > SAME_PLACE * np.linalg.norm(high - low) or len(np.unique(nodes)) < len(
-            nodes
+        if (
+            distance.max() <= near
+            and len(np.unique(nodes)) == len(nodes)
+            and np.array_equal(_rows(nodes[cells]), own_cells)
+            and all(np.array_equal(np.sort(nodes[part]), np.sort(part)) for part in kept)
         ):
-            continue
-        same = np.array_equal(_rows(nodes[cells]), own_cells)
-        for kept in (scene.fixed_nodes, loaded):
-            same = same and np.array_equal(np.sort(nodes[kept]), np.sort(kept))
-        if same:
             found.append(Mirror(axis, nodes.astype(np.int64)))
     return found
 
 
 def _rows(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Cells as sets of nodes, in an order of their own."""
+    """Return the cells as sorted sets of nodes, in lexical order."""
     cells = np.sort(cells, axis=1)
     return cells[np.lexsort(cells.T)]

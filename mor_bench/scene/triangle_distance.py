@@ -1,4 +1,4 @@
-"""Distance from points to triangles."""
+"""Kernel for the distance from points to triangles."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def _dot(ax, ay, az, bx, by, bz):
 
 @njit(cache=True, inline="always")
 def _to_segment(px, py, pz, ax, ay, az, bx, by, bz):
-    """Squared distance from p to the segment a-b (Ericson, "Real-Time Collision Detection", section 5.1.2)."""
+    """Squared distance from p to a segment (Ericson, Real-Time Collision Detection, 5.1.2)."""
     dx, dy, dz = bx - ax, by - ay, bz - az
     length = _dot(dx, dy, dz, dx, dy, dz)
     t = _dot(px - ax, py - ay, pz - az, dx, dy, dz)
-    # A segment without length is its end.
+    # A segment of zero length is a point.
     t = min(max(t / length, 0.0), 1.0) if length > 0.0 else 0.0
     rx, ry, rz = px - ax - t * dx, py - ay - t * dy, pz - az - t * dz
     return _dot(rx, ry, rz, rx, ry, rz)
@@ -64,10 +64,10 @@ def _distances(corners, points, out):
 
 
 def distances(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance (n,) of points (n, 3) from the nearest of some triangles (m, 3, 3), in their unit.
+    """Return the distance (n,) of points (n, 3) from the nearest triangle (m, 3, 3).
 
-    The nearest point of a triangle lies inside it, where its prism holds the point, or else on an edge. A triangle without
-    area counts as its edges.
+    The nearest point of a triangle is in its interior if the prism over it contains the point, and
+    otherwise on an edge. A triangle without area counts as its edges.
     """
     out = np.empty(len(points))
     _distances(

@@ -1,4 +1,4 @@
-"""Hexahedral meshes of any closed surface: the cells of a regular grid that overlap its body."""
+"""Hexahedral mesh of any closed surface: the cells of a regular grid that overlap its body."""
 
 from __future__ import annotations
 
@@ -14,35 +14,40 @@ from mor_bench.scene.surfaces import Surface, inside
 from mor_bench.scene.triangles import met_cells
 
 TOUCHED = 1e-10
-"""How deep, in half edges of a cell, a surface may enter it and still only touch it: well above round-off, and a tenth of
-what `interpolation_matrix` lets a point lie outside."""
+"""Depth, in half edges of a cell, up to which a surface only touches the cell.
+
+It is well above round-off, and a tenth of the tolerance of `interpolation_matrix`.
+"""
 
 
 def _overlapping(
     surface: Surface, cells: tuple[int, int, int], centres: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Whether each cell (nx, ny, nz) of the surface's bounding box shares volume with the body, for the cells' centres (n_cells, 3)."""
+    """Return whether each cell (nx, ny, nz) of the bounding box shares volume with the body.
+
+    The cells' centres are (n_cells, 3).
+    """
     low, high = surface.bounds
-    corners = (surface.points - low) / (high - low) * cells
+    corners = ((surface.points - low) / (high - low) * cells)[surface.triangles]
     entered, touched = (
-        np.asarray(met_cells(corners[surface.triangles], cells, 0.5 * (1 + sign * TOUCHED)))
-        for sign in (-1, 1)
+        np.asarray(met_cells(corners, cells, 0.5 * (1 + sign * TOUCHED))) for sign in (-1, 1)
     )
-    # Cells that no triangle touches and that faces join are all inside or all outside: one of each such part is asked.
+    # Cells that no triangle touches and that share faces are all inside or all outside. So one test
+    # for each connected part is enough.
     part = label(~touched)[0]
     first = np.unique(part, return_index=True)[1][1 if touched.any() else 0 :]
     overlaps = entered | np.append(False, inside(surface, centres[first]))[part]
-    # Of those that are touched and not entered each is asked by itself.
+    # Cells that are touched but not entered need a test each.
     only_touched = touched & ~entered
     overlaps[only_touched] = inside(surface, centres[only_touched.ravel()])
     return np.asarray(overlaps)
 
 
 def voxel_mesh(surface: Surface, cells: tuple[int, int, int]) -> Mesh:
-    """The H8 cells of a regular grid over a surface's bounding box that overlap its body.
+    """Return the H8 cells of a regular grid over a surface's bounding box that overlap its body.
 
-    Every point of the surface lies in a cell: near it there are points of the body, and the cell that holds them is kept.
-    A cell that the body only touches, as if with a face in a plane of the grid, is not.
+    Every point of the surface lies in a cell, since points of the body are near it. A cell that the
+    body only touches, as with a face in a plane of the grid, is left out.
 
     Parameters
     ----------
@@ -53,12 +58,12 @@ def voxel_mesh(surface: Surface, cells: tuple[int, int, int]) -> Mesh:
     Returns
     -------
     Mesh
-        In the grid, its nodes and cells in the order that they have in `box_mesh`; the body's faces are stairs.
+        In the grid, with nodes and cells in the order of `box_mesh`. Its surface has steps.
 
     Raises
     ------
     SpecError
-        If the cells do not hang together through faces: joined at an edge or a corner, they are a hinge.
+        If some cells are not connected through faces. An edge or a corner alone would be a hinge.
     """
     low, high = surface.bounds
     box = box_mesh(tuple((high - low).tolist()), cells)
@@ -67,7 +72,7 @@ def voxel_mesh(surface: Surface, cells: tuple[int, int, int]) -> Mesh:
     n_parts = label(kept)[1]
     if n_parts > 1:
         raise SpecError(
-            f"the {kept.sum()} cells that the body has in a grid of {' x '.join(map(str, cells))} fall into {n_parts} parts "
-            "that no face joins; use more cells."
+            f"the {kept.sum()} cells of the body in a grid of {' x '.join(map(str, cells))} "
+            f"form {n_parts} parts that no face joins; use more cells."
         )
     return part_of(box, kept.ravel())
