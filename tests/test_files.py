@@ -599,13 +599,13 @@ BAD: list[tuple[str, str | bytes | meshio.Mesh, str]] = [
     (
         "mesh.msh",
         GMSH1.replace("4 1 2 3 4\n", "4 1 2 3 9\n"),
-        "not a sound Gmsh 1 file: there is no node, or no element type, 9",
+        "invalid Gmsh 1 file: there is no node, or no element type, 9",
     ),
     ("mesh.msh", GMSH1.replace("1 4 1 1", "1 44 1 1"), "no element type, 44"),
     (
         "mesh.msh",
         GMSH1.replace("$ELM\n1\n", "$ELM\n2\n"),
-        r"\$ELM must hold as many lines as its first says",
+        r"the first line of \$ELM must give the number of lines",
     ),
     ("mesh.msh", GMSH1.replace("$ENDELM", ""), r"\$ELM or \$ENDELM is missing"),
     ("mesh.msh", GMSH1.replace("4 0 0 1", "4 0 0 x"), "could not convert string to float"),
@@ -657,7 +657,7 @@ def test_half_a_binary_surface_is_one_clear_line(folder: Path) -> None:
     (folder / "half.stl").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(
         SpecError,
-        match=r"half.stl: cannot be read as STL: it is neither text nor a binary file of the length that it names\.$",
+        match=r"half.stl: cannot be read as STL: it is neither text nor a binary file of the length given in its header\.$",
     ):
         read_triangles(folder / "half.stl", 1.0)
 

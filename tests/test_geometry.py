@@ -336,7 +336,7 @@ def test_cells_that_only_an_edge_joins_are_refused() -> None:
     )
     with pytest.raises(
         SpecError,
-        match=r"^the 16 cells that the body has in a grid of 4 x 4 x 2 fall into 2 parts that no face joins; use more cells\.$",
+        match=r"^the 16 cells of the body in a grid of 4 x 4 x 2 form 2 parts that no face joins; use more cells\.$",
     ):
         voxel_mesh(both, (4, 4, 2))
 
@@ -418,7 +418,7 @@ def test_a_body_that_the_lattice_misses_or_that_reaches_out_of_it_is_refused() -
             lambda x: sphere_level(x + CENTRE + 0.25), np.array([[-1.0] * 3, [1.0] * 3]), 1.0
         )
     with pytest.raises(
-        SpecError, match=r"^the body reaches out of its bounds, \[.*\] to \[.*\] m\.$"
+        SpecError, match=r"^the body exceeds its bounds, \[.*\] to \[.*\] m\.$"
     ):
         tetrahedral_mesh(sphere_level, ALL_AROUND + np.array([[0.08], [0.0]]), 0.01)
 

@@ -188,7 +188,7 @@ def test_the_three_forces_of_the_paper() -> None:
         ),
         (
             {"n_patches": 22},
-            r"`n_patches` must be in \[1, \d+\], the points of the load region that are away from the supports; got 22",
+            r"`n_patches` must be in \[1, \d+\], the number of points of the load region away from the supports; got 22",
         ),
     ],
 )

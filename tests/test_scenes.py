@@ -87,8 +87,8 @@ def test_a_cut_that_leaves_no_l_is_refused(cut: list[int], message: str) -> None
 
 def mean_lengths(scene: Scene) -> NDArray[np.float64]:
     """Length of the mean normal of each patch: 1 where it is flat."""
-    areas = scene._patches.areas
-    return np.asarray(np.linalg.norm(areas @ scene._patches.normals, axis=1) / areas.sum(axis=1))
+    areas = scene.patches.areas
+    return np.asarray(np.linalg.norm(areas @ scene.patches.normals, axis=1) / areas.sum(axis=1))
 
 
 @pytest.fixture(scope="module")
@@ -244,14 +244,14 @@ def test_patches_on_a_surface_of_long_triangles(tmp_path: Path) -> None:
     scene = load_scene(
         {**base, "geometry": geometry, "loads": {**base["loads"], "region": "surface"}}
     )
-    np.testing.assert_allclose(scene._patches.areas.sum(axis=1), 2e-4, rtol=1e-12)
+    np.testing.assert_allclose(scene.patches.areas.sum(axis=1), 2e-4, rtol=1e-12)
     points, shares = scene.patch_points(np.arange(len(scene.patch_nodes)))
     np.testing.assert_allclose(
         scene.patch_weights @ scene.mesh.points, shares @ points, rtol=0, atol=1e-13
     )
-    values = scene._patches.values
+    values = scene.patches.values
     np.testing.assert_allclose(
-        values @ scene.surface.points, scene._patches.points, rtol=0, atol=1e-15
+        values @ scene.surface.points, scene.patches.points, rtol=0, atol=1e-15
     )
     corners = scene.surface.points[scene.surface.facets]
     area = (
