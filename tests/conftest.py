@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,7 +16,9 @@ from mor_bench.snapshots.dataset import Dataset
 
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> Iterator[None]:
-    """On a busy machine the threads of a small factorisation wait for each other: up to a hundred times slower."""
+    """Small products are up to 100 times slower if their threads wait for each other."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
     with threadpool_limits(1, user_api="blas"):
         yield
 

@@ -28,7 +28,7 @@ from mor_bench.surrogate import Surrogate, _digest, _read_model
 
 torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
 
-from mor_bench.learning import inference  # noqa: E402 - after the check that torch is there
+from mor_bench.learning import inference, packed_network  # noqa: E402 - after the check that torch is there
 from mor_bench.learning.inference import Inference, choose_inference, inference_or_eager  # noqa: E402
 from mor_bench.surrogates.umesh.network import Activation, UNet, new_network  # noqa: E402
 
@@ -124,7 +124,7 @@ def choose(
 ) -> inference.Choice:
     """The choice where queries take these times and the network errs so much, relative to its output."""
     monkeypatch.setattr(
-        inference, "_fastest_ms", lambda able, inputs: {name: times[name] for name in able}
+        inference, "fastest_ms", lambda able, inputs: {name: times[name] for name in able}
     )
     net = network()
     x = torch.randn(4, 3, 8, 4, 4, generator=torch.Generator().manual_seed(0))
@@ -164,7 +164,7 @@ def test_what_was_chosen_and_measured_is_saved_and_not_measured_again(
     assert method.timings_ms_["eager"] > 0
     path = tmp_path / "model.safetensors"
     method.save(path)
-    monkeypatch.delattr(inference, "_fastest_ms")
+    monkeypatch.delattr(inference, "fastest_ms")
     loaded: Any = mor_bench.load_surrogate(path)
     assert (loaded.sizes_, loaded.timings_ms_, loaded.inference_.backend) == (
         method.sizes_,
@@ -183,13 +183,13 @@ def test_another_machine_answers_by_torch_with_a_warning(
     other: Any = copy.copy(fitted)
     other.inference = "packed-bfloat16"
     other.save(path)
-    monkeypatch.setattr(inference, "_processor_has_bfloat16", lambda: False)
-    inference._reason_against_packing.cache_clear()
+    monkeypatch.setattr(packed_network, "processor_has_bfloat16", lambda: False)
+    packed_network.reason_against_packing.cache_clear()
     try:
         with pytest.warns(FallbackWarning, match="packed-bfloat16.*no bfloat16"):
             loaded: Any = mor_bench.load_surrogate(path)
     finally:
-        inference._reason_against_packing.cache_clear()
+        packed_network.reason_against_packing.cache_clear()
     assert loaded.inference_.backend == "eager"
     other.inference_ = Inference(other.network_)
     np.testing.assert_array_equal(

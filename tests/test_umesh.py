@@ -25,7 +25,6 @@ from tests.irregular import irregular_box
 torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
 
 from mor_bench.learning import training  # noqa: E402 - after the check that torch is there
-from mor_bench.learning.training import rate_factor  # noqa: E402
 from mor_bench.scene.symmetry import mirrors  # noqa: E402
 from mor_bench.surrogates.umesh.network import DoubleConvolution, UNet, new_network  # noqa: E402
 from mor_bench.surrogates.umesh.padded_grid import padded_grid  # noqa: E402
@@ -204,15 +203,6 @@ def test_normalisation_divides_by_what_it_says(data: Dataset) -> None:
             "umesh", channels=2, steps=1, iterations=1, normalisation=normalisation
         ).fit(data.scene, data.train)
         assert (method.input_scale_, method.output_scale_) == pytest.approx(scales)
-
-
-def test_one_cycle_rises_falls_and_stays_in_range() -> None:
-    rates = np.array([rate_factor("one-cycle", i, 1000) for i in range(1000)])
-    assert rates.argmax() == pytest.approx(100, abs=2)
-    assert rates.max() == pytest.approx(1.0, abs=0.01)
-    assert 0 < rates.min() < 0.02
-    assert rates[-1] < 1e-4
-    assert {rate_factor("constant", i, 1000) for i in range(1000)} == {1.0}
 
 
 def test_training_beats_predicting_zero(fitted: Surrogate, data: Dataset) -> None:

@@ -1,4 +1,4 @@
-"""A multilayer perceptron: as a torch module that is trained, and by its arrays that answer."""
+"""A multilayer perceptron, as a torch module that is trained, and as arrays that answer."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ from torch import Tensor, nn
 
 Array = NDArray[np.float64]
 
+NAMES = ("first", "first_bias", "second", "second_bias", "last")
+
 
 class Perceptron(nn.Module):
-    """x ↦ W₃ᵀ s(W₂ᵀ s(W₁ᵀ x + b₁) + b₂) with s(x) = x / (1 + exp(-x)): two hidden layers of equal width, and no bias at the end.
+    """x ↦ W₃ᵀ s(W₂ᵀ s(W₁ᵀ x + b₁) + b₂) with s(x) = x / (1 + exp(-x)).
 
-    The weights are drawn with variance 1 / inputs, and the biases are zero, in the order of the parameters.
+    Both hidden layers have the same width, and the last layer has no bias. The weights are drawn
+    with variance 1 / inputs, in the order of the parameters; the biases are zero.
     """
 
     def __init__(
@@ -25,11 +28,9 @@ class Perceptron(nn.Module):
         super().__init__()
         self.weights = nn.ParameterList()
         for shape in _shapes(n_inputs, n_hidden, n_outputs):
-            drawn = (
-                torch.randn(shape, generator=generator) / shape[0] ** 0.5
-                if len(shape) == 2
-                else torch.zeros(shape)
-            )
+            drawn = torch.zeros(shape)
+            if len(shape) == 2:
+                drawn = torch.randn(shape, generator=generator) / shape[0] ** 0.5
             self.weights.append(nn.Parameter(drawn))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -39,7 +40,18 @@ class Perceptron(nn.Module):
         return result
 
     def with_derivatives(self, x: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (n, n_outputs) at x (n, n_inputs), and derivatives (n, d, n_outputs) along directions (n, d, n_inputs)."""
+        """Return values and directional derivatives.
+
+        Parameters
+        ----------
+        x : (n, n_inputs)
+        directions : (n, d, n_inputs)
+
+        Returns
+        -------
+        values : (n, n_outputs)
+        derivatives : (n, d, n_outputs)
+        """
         first, first_bias, second, second_bias, last = self.weights
         for weight, bias in ((first, first_bias), (second, second_bias)):
             x = x @ weight + bias
@@ -49,24 +61,24 @@ class Perceptron(nn.Module):
         return x @ last, directions @ last
 
     def take(self, arrays: Sequence[Array]) -> None:
-        """Replace the weights by those of `arrays`."""
+        """Replace the weights."""
         with torch.no_grad():
             for weight, array in zip(self.weights, arrays, strict=True):
                 weight.copy_(torch.from_numpy(array))
 
     def arrays(self) -> list[Array]:
-        """Weights and biases, from input to output, float64."""
+        """Return weights and biases from input to output, float64."""
         return [weight.detach().cpu().numpy().astype(np.float64) for weight in self.weights]
 
 
 def evaluate(weights: Sequence[Array], x: Array) -> Array:
-    """What the network of some `Perceptron.arrays` answers at x (n, n_inputs)."""
+    """Return the values at x (n, n_inputs) of a network given by `Perceptron.arrays`."""
     first, first_bias, second, second_bias, last = weights
     return _silu(_silu(x @ first + first_bias) @ second + second_bias) @ last
 
 
 def slope_at_rest(weights: Sequence[Array]) -> Array:
-    """The derivative at x = 0, (n_inputs, n_outputs)."""
+    """Return the derivative at x = 0, (n_inputs, n_outputs)."""
     first, first_bias, second, second_bias, last = weights
     before = first_bias
     slope = first * _silu_slope(before)
@@ -74,31 +86,26 @@ def slope_at_rest(weights: Sequence[Array]) -> Array:
     return (slope @ second * _silu_slope(before)) @ last
 
 
-NAMES = ("first", "first_bias", "second", "second_bias", "last")
-
-
 def named(prefix: str, weights: Sequence[Array]) -> dict[str, Array]:
-    """Weights as arrays of a model."""
+    """Return weights as arrays of a model."""
     return {f"{prefix}.{name}": weight for name, weight in zip(NAMES, weights, strict=True)}
 
 
 def named_shapes(
     prefix: str, n_inputs: int, n_hidden: int, n_outputs: int
 ) -> dict[str, tuple[int, ...]]:
-    """Of the arrays of `named`."""
-    return {
-        f"{prefix}.{name}": shape
-        for name, shape in zip(NAMES, _shapes(n_inputs, n_hidden, n_outputs), strict=True)
-    }
+    """Return the shapes of the arrays of `named`."""
+    shapes = _shapes(n_inputs, n_hidden, n_outputs)
+    return {f"{prefix}.{name}": shape for name, shape in zip(NAMES, shapes, strict=True)}
 
 
-def taken(state: Mapping[str, Array], prefix: str) -> list[Array]:
-    """The weights that `named` gave a name."""
-    return [state[f"{prefix}.{name}"] for name in NAMES]
+def taken(model: Mapping[str, Array], prefix: str) -> list[Array]:
+    """Return the weights that `named` put into a model."""
+    return [model[f"{prefix}.{name}"] for name in NAMES]
 
 
 def _shapes(n_inputs: int, n_hidden: int, n_outputs: int) -> list[tuple[int, ...]]:
-    """Of the weights (inputs, outputs) and biases."""
+    """Shapes of weights (inputs, outputs) and biases (outputs,)."""
     layers = pairwise((n_inputs, n_hidden, n_hidden, n_outputs))
     shapes: list[tuple[int, ...]] = [shape for n, m in layers for shape in ((n, m), (m,))]
     return shapes[:-1]

@@ -15,14 +15,8 @@ from torch import Tensor, nn
 
 from mor_bench.counting import count
 from mor_bench.errors import InvalidInputError, StoreError
-from mor_bench.learning.training import (
-    Training,
-    TrainingPlan,
-    device_of,
-    fingerprint_of,
-    network_weights,
-    train,
-)
+from mor_bench.learning.training import Training, device_of, train
+from mor_bench.learning.training_plan import LearningProblem, TrainingPlan
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.mechanics.observed import linear_response
 from mor_bench.scene.scene import Scene
@@ -132,11 +126,6 @@ class FieldSurrogate(Surrogate):
         device = device_of(self.training)
         with torch.no_grad():
             features = network.encode(torch.cat([fields, torch.zeros_like(fields[:1])])).to(device)
-        fingerprint = ""
-        if self.training.checkpoint is not None:
-            fingerprint = fingerprint_of(
-                self.parameters, {"features": features, "targets": targets, **network.state_dict()}
-            )
         network.to(device)
         targets = targets.to(device)
         free = torch.ones(targets.shape[1], 1)
@@ -155,16 +144,11 @@ class FieldSurrogate(Surrogate):
             self.learning_rate,
             second_moment_decay=SECOND_MOMENT_DECAY,
         )
-        return train(
-            network,
-            loss,
-            len(targets),
-            plan,
-            generator,
-            self.training,
-            self.time_limit_s,
-            fingerprint,
+        arrays = {"features": features, "targets": targets}
+        problem = LearningProblem(
+            network, loss, len(targets), generator, arrays, self.parameters
         )
+        return train(problem, plan, self.training, self.time_limit_s)
 
     def _start_from(self, network: FieldNetwork, path: Path) -> None:
         """Take the weights of a model of this architecture, trained on this scene or another."""
@@ -306,6 +290,15 @@ def initialise(network: nn.Module, generator: torch.Generator) -> None:
             nn.init.zeros_(layer.bias)
         elif isinstance(layer, SelfInitialised):
             layer.initialise(generator)
+
+
+def network_weights(state: Arrays) -> dict[str, Tensor]:
+    """Return the weights among the arrays of a model, by their names in the network."""
+    return {
+        name.removeprefix("network."): torch.from_numpy(array)
+        for name, array in state.items()
+        if name.startswith("network.")
+    }
 
 
 def _single(fields: NDArray[np.float64]) -> Tensor:

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from mor_bench.counting import count
 from mor_bench.learning.perceptron import named, named_shapes, taken
-from mor_bench.learning.training import TrainingPlan, device_of, fingerprint_of, train
+from mor_bench.learning.training import device_of, train
+from mor_bench.learning.training_plan import LearningProblem, TrainingPlan
 from mor_bench.surrogates.coordinate_regression import CoordinateRegression
 
 Array = NDArray[np.float64]
@@ -59,21 +60,10 @@ class NetworkRegression(CoordinateRegression):
     ) -> dict[str, NDArray[Any]]:
         """Train, and give what is to be known of that."""
         plan = TrainingPlan(self.iterations, BATCH_SIZE, LEARNING_RATE)
-        fingerprint = (
-            fingerprint_of(self.parameters, {**data, **networks.state_dict()})
-            if self.training.checkpoint
-            else ""
+        problem = LearningProblem(
+            networks, loss, len(data["inputs"]), generator, data, self.parameters
         )
-        done = train(
-            networks,
-            loss,
-            len(data["inputs"]),
-            plan,
-            generator,
-            self.training,
-            self.time_limit_s,
-            fingerprint,
-        )
+        done = train(problem, plan, self.training, self.time_limit_s)
         return {
             "loss_curve": done.loss_curve,
             "iterations": np.array([done.iterations], dtype=np.int32),

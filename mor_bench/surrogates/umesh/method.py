@@ -16,14 +16,12 @@ from torch import Tensor
 from mor_bench.counting import count, is_counting
 from mor_bench.errors import InvalidInputError
 from mor_bench.learning.inference import Backend, choose_inference, inference_or_eager
-from mor_bench.learning.training import (
+from mor_bench.learning.training import device_of, train
+from mor_bench.learning.training_plan import (
+    LearningProblem,
     Precision,
     Schedule,
     TrainingPlan,
-    device_of,
-    fingerprint_of,
-    network_weights,
-    train,
 )
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.mechanics.observed import linear_response
@@ -32,6 +30,7 @@ from mor_bench.scene.scene import Scene
 from mor_bench.scene.symmetry import Mirror, mirrors
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate, fitting_arrays, weights_to_start_from
+from mor_bench.surrogates.field_network import network_weights
 from mor_bench.surrogates.umesh.network import Activation, UNet, empty_network, new_network
 from mor_bench.surrogates.umesh.padded_grid import PaddedGrid, padded_grid
 
@@ -249,20 +248,11 @@ class UMesh(Surrogate):
                 precision=self.precision,
                 validation_fraction=self.validation_fraction,
             )
-            arrays = {"inputs": inputs, "targets": targets, **self.network_.state_dict()}
-            fingerprint = (
-                fingerprint_of(self.parameters, arrays) if self.training.checkpoint else ""
+            arrays = {"inputs": inputs, "targets": targets}
+            problem = LearningProblem(
+                self.network_, loss, len(samples), generator, arrays, self.parameters
             )
-            done = train(
-                self.network_,
-                loss,
-                len(samples),
-                plan,
-                generator,
-                self.training,
-                self.time_limit_s,
-                fingerprint,
-            )
+            done = train(problem, plan, self.training, self.time_limit_s)
             self.network_.cpu()
             self.loss_curve_, self.validation_curve_, self.iterations_ = (
                 done.loss_curve,

@@ -1,0 +1,201 @@
+"""The training loop: Adam steps, losses, early stopping, and iterations sized to a given time."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from copy import deepcopy
+from math import isfinite
+from time import perf_counter
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mor_bench.errors import MorBenchError
+from mor_bench.learning.training_plan import LearningProblem, TrainingPlan, rate_factor
+from mor_bench.surrogate import TrainingOptions
+
+LOSS_INTERVAL = 50
+"""Iterations per point of the loss curve; more points would cost time and show mostly noise."""
+
+VALIDATIONS, PATIENCE = 50, 15
+"""Validations in a whole training, and how many in a row without a lower loss stop it."""
+
+TRIAL_ITERATIONS, TRIAL_SHARE = 20, 0.1
+"""Iterations of the trial that sizes a training to seconds, and the share that it may take.
+
+The trial has three iterations at least.
+"""
+
+
+class TrainingLoop:
+    """A training under way, with everything that decides how it goes on.
+
+    Attributes
+    ----------
+    iterations, iteration : int
+        Planned and done.
+    curve, validated : list of float
+        Mean losses per `LOSS_INTERVAL`, and losses of the held-out samples.
+    total, n_summed
+        Sum and number of the losses since the last point of the curve.
+    rows, held, order : (n,) int64
+        Indices of the samples to learn from, of the held-out ones, and of those left in this epoch.
+    best : dict of Tensor
+        Weights with the lowest validation loss.
+    """
+
+    def __init__(
+        self,
+        problem: LearningProblem,
+        plan: TrainingPlan,
+        options: TrainingOptions,
+        device: torch.device,
+    ) -> None:
+        self.problem, self.plan, self.options, self.device = problem, plan, options, device
+        self.network, self.generator = problem.network, problem.generator
+        self.optimiser = torch.optim.Adam(
+            self.network.parameters(),
+            lr=plan.learning_rate,
+            betas=(0.9, plan.second_moment_decay),
+            fused=True,
+        )
+        self.iterations = self.iteration = self.n_summed = 0
+        self.curve: list[float] = []
+        self.validated: list[float] = []
+        self.rows = torch.arange(problem.n_samples)
+        self.held = torch.empty(0, dtype=torch.int64)
+        self.order = torch.empty(0, dtype=torch.int64)
+        self.total = torch.zeros((), device=device)
+        self.best: dict[str, Tensor] = {}
+        self.network.train()
+
+    @property
+    def n_held(self) -> int:
+        """Number of held-out samples."""
+        fraction, n = self.plan.validation_fraction, self.problem.n_samples
+        return max(1, round(fraction * n)) if fraction > 0 and n > 1 else 0
+
+    @property
+    def validation_interval(self) -> int:
+        """Iterations between two validations."""
+        return max(1, self.iterations // VALIDATIONS)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the validation loss has not fallen for `PATIENCE` validations."""
+        if not self.validated:
+            return False
+        return len(self.validated) - 1 - int(np.argmin(self.validated)) >= PATIENCE
+
+    def begin(self) -> None:
+        """Draw the held-out samples and set the number of iterations."""
+        if self.n_held:
+            order = torch.randperm(self.problem.n_samples, generator=self.generator)
+            self.held = order[: self.n_held].sort().values
+            self.rows = order[self.n_held :].sort().values
+        self.iterations = self.plan.iterations
+        if self.options.fit_seconds is not None:
+            self.iterations = self._iterations_in(self.options.fit_seconds)
+
+    def _iterations_in(self, seconds: float) -> int:
+        """Return how many iterations fit in the given time, from a trial that is undone."""
+        weights, drawn = deepcopy(self.network.state_dict()), self.generator.get_state()
+        trial_options = TrainingOptions(device=self.options.device)
+        trial = TrainingLoop(self.problem, self.plan, trial_options, self.device)
+        trial.iterations, trial.rows = self.plan.iterations, self.rows
+        trial.step()  # the first step builds what the others reuse
+        start = now = self._now()
+        done = 0
+        while done < 3 or (done < TRIAL_ITERATIONS and now - start < TRIAL_SHARE * seconds):
+            trial.step()
+            done, now = done + 1, self._now()
+        each, validation = (now - start) / done, 0.0
+        if len(self.held):
+            trial.held = self.held
+            trial.validate()
+            validation = self._now() - now
+        self.network.load_state_dict(weights)
+        self.generator.set_state(drawn)
+        left = seconds - (self._now() - start)
+        # With fewer iterations than `VALIDATIONS`, every iteration is followed by a validation.
+        if left > VALIDATIONS * (validation + each):
+            return max(1, int((left - VALIDATIONS * validation) / each))
+        return max(1, int(left / (validation + each)))
+
+    def _now(self) -> float:
+        """Return the wall time after synchronising the device."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize()
+        return perf_counter()
+
+    def step(self) -> None:
+        """Take one optimiser step; record and validate where an interval ends."""
+        plan = self.plan
+        batch_size = min(plan.batch_size, len(self.rows))
+        if len(self.order) < batch_size:
+            self.order = self.rows[torch.randperm(len(self.rows), generator=self.generator)]
+        rows, self.order = self.order[:batch_size], self.order[batch_size:]
+        factor = rate_factor(plan.schedule, self.iteration, self.iterations)
+        for group in self.optimiser.param_groups:
+            group["lr"] = plan.learning_rate * factor
+        with self._products():
+            loss = self.problem.loss(rows.to(self.device))
+        self.optimiser.zero_grad()
+        torch.autograd.backward(loss)
+        self.optimiser.step()
+        self.iteration += 1
+        self.total, self.n_summed = self.total + loss.detach().float(), self.n_summed + 1
+        last = self.iteration == self.iterations
+        if self.n_summed == LOSS_INTERVAL or last:
+            self._record()
+        if len(self.held) and (self.iteration % self.validation_interval == 0 or last):
+            self.validate()
+
+    def _products(self) -> AbstractContextManager[object]:
+        """Set the precision of the products."""
+        if self.plan.precision == "bfloat16":
+            return torch.autocast(self.device.type, torch.bfloat16)
+        return nullcontext()
+
+    def _record(self) -> None:
+        """Append the mean loss since the last point of the curve."""
+        self.curve.append(float(self.total) / self.n_summed)
+        self._check_finite(self.curve[-1])
+        self.total, self.n_summed = torch.zeros((), device=self.device), 0
+        if self.options.progress is not None:
+            self.options.progress(self.iteration, self.iterations, self.curve[-1])
+
+    def validate(self) -> None:
+        """Append the loss of the held-out samples, and keep the weights if it is the lowest."""
+        self.network.eval()
+        with torch.no_grad(), self._products():
+            parts = [
+                (len(rows), self.problem.loss(rows.to(self.device)))
+                for rows in torch.split(self.held, self.plan.batch_size)
+            ]
+        self.network.train()
+        self.validated.append(sum(n * float(part) for n, part in parts) / len(self.held))
+        self._check_finite(self.validated[-1])
+        if self.validated[-1] <= min(self.validated):
+            weights = self.network.state_dict()
+            self.best = {name: value.detach().clone() for name, value in weights.items()}
+
+    def _check_finite(self, loss: float) -> None:
+        if not isfinite(loss):
+            plan = self.plan
+            remedy = "a lower rate" + " or float32" * (plan.precision != "float32")
+            raise MorBenchError(
+                f"training diverged before iteration {self.iteration}: the loss is {loss}, with a "
+                f"learning rate of {plan.learning_rate} and products in {plan.precision}; {remedy} "
+                "may help."
+            )
+
+    def finish(self) -> None:
+        """Record the losses left over by an early stop, and take the best validated weights."""
+        if self.n_summed:
+            self.curve.append(float(self.total) / self.n_summed)
+            self._check_finite(self.curve[-1])
+        if self.best:
+            self.network.load_state_dict(self.best)
+        self.network.eval()

@@ -1,0 +1,93 @@
+"""Input of a training: the network, the loss, the samples, and the settings of the optimiser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from math import cos, pi
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+Schedule = Literal["constant", "one-cycle"]
+Precision = Literal["float32", "bfloat16"]
+Loss = Callable[[Tensor], Tensor]
+"""Mean loss of the samples with the given indices, (n,) int64 on the device of the training."""
+
+WARM_UP = 0.1
+"""Share of a one-cycle schedule during which the learning rate rises."""
+
+
+@dataclass(frozen=True)
+class TrainingPlan:
+    """Settings of the optimiser.
+
+    Attributes
+    ----------
+    iterations, batch_size : int
+        Optimiser steps, and samples per step; a batch holds at most all samples.
+    learning_rate : float
+        Peak learning rate.
+    schedule : {"constant", "one-cycle"}
+        See `rate_factor`.
+    second_moment_decay : float
+        Adam's β₂.
+    precision : {"float32", "bfloat16"}
+        Precision of the products in the forward and backward pass. Weights and their updates are
+        float32.
+    validation_fraction : float
+        Share of the training samples that is held out, at random, to stop the training early; 0 for
+        none.
+    """
+
+    iterations: int
+    batch_size: int
+    learning_rate: float
+    schedule: Schedule = "one-cycle"
+    second_moment_decay: float = 0.999
+    precision: Precision = "float32"
+    validation_fraction: float = 0.0
+
+
+@dataclass(frozen=True)
+class LearningProblem:
+    """A network, and the loss that its training lowers.
+
+    Attributes
+    ----------
+    network : nn.Module
+        On the device of the training.
+    loss : Loss
+        Taken with the network in training mode in a step, and in evaluation mode on held-out
+        samples.
+    n_samples : int
+        Number of training samples, including held-out ones.
+    generator : torch.Generator
+        On the processor. It draws the order of the samples, and whatever the loss draws from it.
+    arrays : mapping of Tensor
+        What the loss computes with. It identifies a training: a checkpoint of other arrays is
+        refused.
+    knobs : mapping
+        Parameters of the method, which identify a training too; JSON must be able to hold them.
+    """
+
+    network: nn.Module
+    loss: Loss
+    n_samples: int
+    generator: torch.Generator
+    arrays: Mapping[str, Tensor] = field(default_factory=dict)
+    knobs: Mapping[str, object] = field(default_factory=dict)
+
+
+def rate_factor(schedule: Schedule, iteration: int, iterations: int) -> float:
+    """Return the learning rate of an iteration, counted from 0, as a fraction of the peak.
+
+    Constant: 1. One-cycle: a linear rise during the first tenth, then half a cosine down to zero.
+    """
+    if schedule == "constant":
+        return 1.0
+    progress = (iteration + 1) / (iterations + 1)
+    if progress < WARM_UP:
+        return progress / WARM_UP
+    return 0.5 * (1.0 + cos(pi * (progress - WARM_UP) / (1.0 - WARM_UP)))
