@@ -31,7 +31,7 @@ from mor_bench.learning.training_plan import (  # noqa: E402
 )
 
 PLAN = TrainingPlan(120, 8, 1e-2, second_moment_decay=0.9, validation_fraction=0.2)
-NOISY = {"noise": 2.0, "width": 200}
+NOISY: dict[str, Any] = {"noise": 2.0, "width": 200}
 EARLY = replace(PLAN, iterations=1000, schedule="constant", validation_fraction=0.5)
 """With `NOISY`, a training whose held-out samples soon gain nothing."""
 
@@ -100,7 +100,8 @@ class Regression:
 
     @property
     def weights(self) -> np.ndarray:
-        return torch.cat([p.detach().ravel() for p in self.network.parameters()]).numpy()
+        flat = torch.cat([p.detach().ravel() for p in self.network.parameters()])
+        return np.asarray(flat)
 
 
 class KilledError(Exception):
@@ -139,7 +140,7 @@ def test_a_finished_training_resumes_after_its_last_iteration(
     problem: dict[str, Any], plan: TrainingPlan, seconds: float | None, tmp_path: Path
 ) -> None:
     whole, resumed = Regression(**problem), Regression(**problem)
-    options = {"checkpoint": tmp_path / "checkpoint", "fit_seconds": seconds}
+    options: dict[str, Any] = {"checkpoint": tmp_path / "checkpoint", "fit_seconds": seconds}
     expected = whole.train(plan, **options)
     done = resumed.train(plan, **options)
     assert resumed.calls == 0

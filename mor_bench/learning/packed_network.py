@@ -97,9 +97,9 @@ class _Upsampling(nn.Module):
         super().__init__()
         c_in, self.c_out, *self.kernel = layer.weight.shape
         self.weight = layer.weight.detach().movedim((0, 1), (-1, -2)).reshape(-1, c_in).contiguous()
-        self.bias = layer.bias
-        if layer.bias is not None:
-            self.bias = layer.bias.detach().repeat(len(self.weight) // self.c_out)
+        bias = layer.bias
+        n_repeats = len(self.weight) // self.c_out
+        self.bias = None if bias is None else bias.detach().repeat(n_repeats)
 
     def forward(self, x: Tensor) -> Tensor:
         n, c_in, *shape = x.shape
