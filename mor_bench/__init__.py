@@ -17,13 +17,14 @@ from mor_bench.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from mor_bench.errors import MorBenchError
+    from mor_bench.method_loading import load_method, load_surrogate
     from mor_bench.results.comparison import Comparison
     from mor_bench.runs.compare import run
     from mor_bench.runs.pick import Pick, pick
     from mor_bench.runs.single_fit import Fit, fit
     from mor_bench.scene.scene import Scene, load_scene
     from mor_bench.snapshots.dataset import Snapshots, load_dataset
-    from mor_bench.surrogate import Surrogate, load_method, load_surrogate
+    from mor_bench.surrogate import Surrogate
 
 __all__ = [
     "Comparison",
@@ -52,9 +53,9 @@ _HOMES = {
     "Surrogate": "mor_bench.surrogate",
     "fit": "mor_bench.runs.single_fit",
     "load_dataset": "mor_bench.snapshots.dataset",
-    "load_method": "mor_bench.surrogate",
+    "load_method": "mor_bench.method_loading",
     "load_scene": "mor_bench.scene.scene",
-    "load_surrogate": "mor_bench.surrogate",
+    "load_surrogate": "mor_bench.method_loading",
     "pick": "mor_bench.runs.pick",
     "run": "mor_bench.runs.compare",
 }

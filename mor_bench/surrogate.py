@@ -1,16 +1,13 @@
-"""The interface that every method implements, and how methods are made by name, saved and loaded."""
+"""The interface that every method implements."""
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 import json
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,155 +16,185 @@ from mor_bench.errors import (
     InvalidInputError,
     MorBenchError,
     NotFittedError,
-    StoreError,
     UnknownRangeError,
     UnsupportedSceneError,
 )
-from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.legacy_hooks import LegacyHooks
+from mor_bench.mechanics.indicator import ErrorIndicator, Indication
+from mor_bench.model_arrays import check_finite
+from mor_bench.model_file import StoredModel, class_path, write_model
+from mor_bench.reduction.sizing import choose_sizes
+from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.given import Given, ObservedDisplacements, checked_given
 from mor_bench.snapshots.load_range import LoadRange
-from mor_bench.snapshots.store import write_atomically
-from mor_bench.specs import NO_FORCES, check_parameters, list_suite, load_class, load_method_spec
+from mor_bench.specs import NO_FORCES, check_parameters
+from mor_bench.training_options import TrainingOptions
 
 if TYPE_CHECKING:
     import onnx
 
-    from mor_bench.mechanics.indicator import ErrorIndicator, Indication
-
-SCHEMA_VERSION = 1
-
-MAX_FORCE_N = 1e30
-"""Largest nodal force component; its cube must not overflow."""
-
-RANGE = "range."
-"""Beginning of the names of the arrays that hold the range of the training loads; `_state` has none such."""
-
-SIZE = "size."
-"""Beginning of the names of the arrays that hold the values chosen for knobs set to "auto"; `_state` has none such."""
+Array = NDArray[np.float64]
 
 
-Device = Literal["auto", "cpu", "cuda"]
+class Surrogate(LegacyHooks):
+    """A map from what is given, nodal forces or observed displacements, to nodal displacements.
 
-
-@dataclass(frozen=True)
-class TrainingOptions:
-    """How a method that trains does so; methods that do not train ignore it.
-
-    These are no knobs: a model's file does not hold them, and `predict` does not depend on them but through what was learned.
-
-    Attributes
-    ----------
-    device : str
-        Where the training computes; "auto" is a CUDA device if there is one.
-    fit_seconds : float or None
-        Seconds that the training is to fill: the number of iterations is chosen after the first ones and reported as ``iterations_``;
-        the knob ``iterations`` with that number gives the same model again. None: as many as the knob says.
-    checkpoint : Path or None
-        File that the training is written to now and then. If it is there at the start, the training goes on from it and ends with
-        the same bits as one that was never stopped. It is written at the end too, and whoever has kept the model deletes it, as
-        `mor_bench.fit` and `mor_bench.run` do: what `fit` does after the training, and `save`, may be stopped as well.
-    start_from : Path or None
-        A model of the same class and `Surrogate.architecture`, saved by `Surrogate.save`, whose weights the training starts from.
-    progress : callable or None
-        Called now and then with the iterations done, all, and the loss.
+    A subclass is a dataclass of hyperparameters, ``@dataclass(eq=False)``, with three verbs: `learn`
+    returns the arrays that are the model, `prepare` makes what a query needs from them, and `answer`
+    predicts. Pydantic's `Field` in the annotations gives the range of a hyperparameter. This base
+    class checks all input, saves, loads, and forgets an earlier fit.
     """
-
-    device: Device = "cpu"
-    fit_seconds: float | None = None
-    checkpoint: Path | None = None
-    start_from: Path | None = None
-    progress: Callable[[int, int, float], None] | None = None
-
-
-TIMING = "timing."
-"""Beginning of the names of the arrays that hold times measured in a fit; `_state` has none such."""
-
-
-def size_arrays(sizes: dict[str, Any]) -> dict[str, NDArray[Any]]:
-    """Values chosen for knobs, as arrays that a file can hold: words as the bytes of their letters."""
-    return {
-        SIZE + name: np.frombuffer(value.encode(), np.uint8)
-        if isinstance(value, str)
-        else np.array([value])
-        for name, value in sizes.items()
-    }
-
-
-def take_sizes(state: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    """The values that `size_arrays` wrote, which are taken out of a model's arrays."""
-    found = {
-        name.removeprefix(SIZE): state.pop(name) for name in list(state) if name.startswith(SIZE)
-    }
-    return {
-        name: array.tobytes().decode() if array.dtype == np.uint8 else array.item()
-        for name, array in found.items()
-    }
-
-
-class Surrogate(ABC):
-    """A map from nodal forces to nodal displacements of one scene.
-
-    In a scene with observed nodes, `Scene.observed_nodes`, the displacements of these, m, stand everywhere in the place of the
-    forces: what other nodes hold is not looked at, and may be NaN. Only a class with `takes_observations` is given such a scene.
-
-    A subclass stores its knobs in ``__init__`` under their own names and nothing else, annotates them (pydantic `Field`
-    constraints give their range), fits inside ``with self._fitting(scene)``, takes its samples from `_checked_snapshots`, and
-    begins `predict` with `_checked_forces`.
-    What it learns ends in an underscore.
-    """
-
-    scene_: Scene
-    range_: LoadRange
-    _indicator: tuple[Scene, ErrorIndicator]
-    sizes_: dict[str, Any]
-    """Values chosen for the knobs set to "auto"; missing where there are none."""
-
-    timings_ms_: dict[str, float]
-    """Times by which the fit chose between ways to the same answer, where it did; they hold on the machine of the fit."""
 
     needs_snapshots: ClassVar[bool] = True
-    """Whether `fit` learns from snapshots; their cost is charged only to methods that do."""
+    """Whether `learn` uses snapshots; their cost is charged only to methods that do."""
 
     takes_observations: ClassVar[bool] = False
-    """Whether it can be given displacements of a part of the surface in the place of forces, by `Snapshots.inputs`."""
+    """Whether displacements of a part of the surface can be given instead of forces; true of a
+    class with `answer_observed`."""
 
     architecture: ClassVar[tuple[str, ...]] = ()
-    """Knobs that decide names, shapes or meaning of the weights: a training starts only from a model that has the same."""
+    """Hyperparameters that decide names, shapes or meaning of the weights: a training starts only
+    from a model with the same values."""
+
+    sized: ClassVar[Mapping[str, Sequence[Any]]] = {}
+    """Values that a hyperparameter set to "auto" may take, from cheap to accurate; see
+    `mor_bench.reduction.sizing`."""
 
     time_limit_s: float | None = None
-    """Seconds that a comparison leaves to `fit`; a method that sees early that they will not do raises `OutOfTimeError`."""
+    """Time limit for `fit`, s. A method that predicts that it will exceed it raises
+    `OutOfTimeError`."""
 
     training: TrainingOptions = TrainingOptions()
-    """Device, seconds, checkpoint and starting weights of a training; set before `fit`, and no knob."""
+    """Options of the training, set before `fit`."""
 
-    @abstractmethod
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
+    scene_: Scene
+    arrays_: dict[str, NDArray[Any]]
+    range_: LoadRange
+    sizes_: dict[str, Any]
+    """Values chosen for hyperparameters set to "auto"."""
+
+    timings_ms_: dict[str, float]
+    """Times by which the fit chose between equivalent ways to predict, on the machine of the fit."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "answer_observed" in vars(cls):
+            cls.takes_observations = True
+
+    def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
+        """Return the arrays that are the model.
+
+        Parameters
+        ----------
+        scene : Scene
+        samples : Snapshots
+            Checked training samples; empty for a method that needs none.
+        """
+        return {}
+
+    def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
+        """Make what a query needs; called after `learn` and after loading.
+
+        Raises
+        ------
+        InvalidInputError
+            If the arrays are not those of such a model, see `mor_bench.model_arrays`.
+        """
+        if hasattr(self, "_restore"):
+            self._restore(dict(model))
+
+    def answer(self, forces: Array) -> Array:
+        """Return displacements, m, under checked forces (n, n_nodes, 3), N, in the same shape."""
+        raise MorBenchError(f"{type(self).__name__} has neither `answer` nor `predict`.")
+
+    def answer_observed(self, observed: ObservedDisplacements) -> Array:
+        """As `answer`, from displacements of the observed nodes; they are zero at all others."""
+        raise UnsupportedSceneError(f"{type(self).__name__} cannot be used: {NO_FORCES}.")
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
         """Learn from snapshots, forgetting earlier fits.
 
         Parameters
         ----------
         scene : Scene
-        snapshots : Snapshots or None
-            Training samples; None for methods that need none.
+        snapshots : Snapshots, optional
+            Training samples; ignored by methods that need none.
 
-        Returns
-        -------
-        self
+        Raises
+        ------
+        SpecError
+            If a hyperparameter is out of its range.
+        UnsupportedSceneError
+            If the method cannot handle the scene.
+        InvalidInputError
+            If training samples are needed and missing, not finite, or all zero.
         """
+        check_parameters(type(self), self.parameters)
+        if reason := self.supports(scene) or Surrogate.supports(self, scene):
+            raise UnsupportedSceneError(
+                f"{type(self).__name__} cannot handle {scene.name}: {reason}"
+            )
+        self.forget()
+        try:
+            self._become(scene, {})
+            samples = Snapshots.empty(scene)
+            if self.needs_snapshots:
+                samples = checked_samples(type(self).__name__, scene, snapshots)
+                if scene.observed_nodes is None:
+                    self.range_ = LoadRange.of(samples)
+            self.sizes_ = choose_sizes(self, scene, samples, self.sized)
+            self.arrays_ = self.learn(scene, samples)
+            check_finite(type(self).__name__, self.arrays_)
+            self.prepare(scene, self.arrays_)
+        except BaseException:
+            self.forget()
+            raise
+        return self
 
-    @abstractmethod
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        """Displacements under nodal forces.
+    def restore(
+        self,
+        scene: Scene,
+        model: Mapping[str, NDArray[Any]],
+        sizes: Mapping[str, Any] | None = None,
+    ) -> Self:
+        """Become fitted from the arrays of a fitted model, ``arrays_``.
 
         Parameters
         ----------
-        forces : (n_nodes, 3) or (n, n_nodes, 3)
-            Nodal forces, N; in a scene with observed nodes, displacements of these, m.
+        sizes : dict of str to Any, optional
+            Values chosen for hyperparameters set to "auto".
+
+        Raises
+        ------
+        MorBenchError
+            If they are not those of such a model.
+        """
+        sizes = sizes or {}
+        if any(self.parameters.get(name) != "auto" for name in sizes):
+            raise InvalidInputError(
+                f"values are given for {', '.join(sorted(sizes))}, but not all of these are "
+                'set to "auto".'
+            )
+        check_parameters(type(self), {**self.parameters, **sizes})
+        self.forget()
+        self._become(scene, dict(sizes))
+        self.arrays_ = dict(model)
+        self.prepare(scene, self.arrays_)
+        return self
+
+    def predict(self, forces: ArrayLike) -> Array:
+        """Predict displacements.
+
+        Parameters
+        ----------
+        forces : (n_nodes, 3) or (n, n_nodes, 3), or ObservedDisplacements
+            Nodal forces, N; or displacements of a part of the surface, m.
 
         Returns
         -------
         array of the same shape, float64
-            Nodal displacements, m, on the host. Nodes that the scene's ``needs.outputs`` leaves out may hold NaN.
+            Nodal displacements, m. Nodes outside the scene's ``needs.outputs`` may hold NaN.
 
         Raises
         ------
@@ -178,25 +205,39 @@ class Surrogate(ABC):
         SolverError
             If a method that solves equations finds no valid equilibrium.
         """
+        given = self._checked(forces)
+        found = (
+            self.answer_observed(given)
+            if isinstance(given, ObservedDisplacements)
+            else self.answer(given.values)
+        )
+        if found.shape != given.values.shape:
+            raise InvalidInputError(
+                f"`answer` must return an array of shape {given.values.shape}; got {found.shape}."
+            )
+        return found.reshape(np.shape(forces))
 
     @classmethod
     def trains(cls) -> bool:
-        """Whether `fit` heeds `training`. A method that does has the knobs ``iterations`` and ``seed``."""
+        """Whether `fit` uses `training`: true of methods with ``iterations`` and ``seed``."""
         return {"iterations", "seed"} <= inspect.signature(cls.__init__).parameters.keys()
 
     def supports(self, scene: Scene) -> str | None:
-        """None, or the reason why the method cannot handle a scene."""
-        return self._needs_forces(scene)
-
-    def _needs_forces(self, scene: Scene) -> str | None:
-        """The reason why a method that is given forces cannot handle a scene where they are not known."""
+        """Return None, or the reason why the method cannot handle a scene."""
         return None if self.takes_observations or scene.observed_nodes is None else NO_FORCES
 
-    def out_of_range(self, forces: ArrayLike) -> NDArray[np.bool_]:
-        """Which loads lie out of the range of the training loads.
+    def value(self, name: str) -> Any:
+        """Return the value of a hyperparameter, or the value chosen for it if it is "auto"."""
+        value = self.sizes_.get(name, getattr(self, name))
+        if value == "auto":
+            raise InvalidInputError(f"no value was chosen for `{name}`.")
+        return value
 
-        A flag says that training held nothing like the load, see `mor_bench.snapshots.load_range`; it is no bound on the
-        error. A method that needs no snapshots has no such range and flags nothing.
+    def out_of_range(self, forces: ArrayLike) -> NDArray[np.bool_]:
+        """Flag loads outside the range of the training loads.
+
+        A flag is no bound on the error, see `mor_bench.snapshots.load_range`. A method that needs
+        no snapshots flags nothing.
 
         Parameters
         ----------
@@ -209,37 +250,35 @@ class Surrogate(ABC):
 
         Raises
         ------
-        InvalidInputError
-            On a wrong shape or dtype, NaN or infinity.
-        NotFittedError
-            Before `fit`.
+        InvalidInputError, NotFittedError
+            As `predict`.
         UnknownRangeError
-            If the method learns but its range is not known: its `fit` does not check its snapshots by `_checked_snapshots`,
-            or it was loaded from a file that was written before ranges were; and where it is given displacements, not loads.
+            If the range is not known: the class overrides `fit`, the model's file is of an older
+            version, or displacements are given instead of forces.
         """
-        batch = self._checked_forces(forces)
+        given = self._checked(forces)
         if not self.needs_snapshots:
-            flags = np.zeros(len(batch), dtype=bool)
+            flags = np.zeros(len(given), dtype=bool)
         elif hasattr(self, "range_"):
-            flags = self.range_.excludes(batch)
+            flags = self.range_.excludes(given.values)
         elif self.scene_.observed_nodes is not None:
             raise UnknownRangeError(
-                f"{self.scene_.name}: which loads are like those of training cannot be told: {NO_FORCES}."
+                f"{self.scene_.name}: the range of the training loads is not known: {NO_FORCES}."
             )
         else:
             raise UnknownRangeError(
-                f"the loads that this {type(self).__name__} was trained on are not known: its `fit` does not check them by `_checked_snapshots`, "
-                "or its file is of an older version; then fit it again."
+                f"the range of the training loads of this {type(self).__name__} is not known: its "
+                "class overrides `fit`, or its file is of an older version; then fit it again."
             )
         return flags.reshape(np.shape(forces)[:-2])
 
     def indicate_error(self, forces: ArrayLike, displacements: ArrayLike) -> Indication:
-        """Indicate how wrong predictions are, by what they leave of the equations; see `mor_bench.mechanics.indicator`.
+        """Estimate the error of predictions from the equilibrium residual.
 
         Parameters
         ----------
         forces, displacements : (n_nodes, 3) or (n, n_nodes, 3)
-            Loads, N, and what `predict` answered, m, at all nodes.
+            Loads, N, and predictions, m, at all nodes.
 
         Returns
         -------
@@ -248,398 +287,110 @@ class Surrogate(ABC):
 
         Raises
         ------
-        InvalidInputError
-            On a wrong shape or dtype, forces that are not finite, or displacements that are only there where outputs are wanted.
-        NotFittedError
-            Before `fit`.
+        InvalidInputError, NotFittedError
+            As `predict`; also if displacements are only given where outputs are wanted.
         UnsupportedSceneError
             If the scene's equations, or the forces, are not known.
         """
-        from mor_bench.mechanics.indicator import ErrorIndicator
-
-        batch = self._checked_forces(forces)
+        given = self._checked(forces)
         if self.scene_.observed_nodes is not None:
             raise UnsupportedSceneError(
-                f"{self.scene_.name}: no error can be indicated, for {NO_FORCES}."
+                f"{self.scene_.name}: no error can be indicated: {NO_FORCES}."
             )
         predicted = np.asarray(displacements)
         if predicted.dtype.kind != "f" or predicted.shape != np.shape(forces):
             raise InvalidInputError(
-                f"`displacements` must be floats of shape {np.shape(forces)}; got {predicted.dtype} of shape {predicted.shape}."
+                f"`displacements` must be floats of shape {np.shape(forces)}; "
+                f"got {predicted.dtype} of shape {predicted.shape}."
             )
-        predicted = predicted.reshape(batch.shape).astype(np.float64, copy=False)
+        predicted = predicted.reshape(given.values.shape).astype(np.float64, copy=False)
         left_out = np.delete(predicted, self.scene_.output_nodes, axis=1)
         if np.isnan(left_out).any():
             raise InvalidInputError(
-                "`displacements` must be given at all nodes; those that `needs.outputs` leaves out hold NaN."
+                "`displacements` must be given at all nodes; "
+                "those that `needs.outputs` leaves out hold NaN."
             )
-        if not hasattr(self, "_indicator") or self._indicator[0] is not self.scene_:
-            self._indicator = self.scene_, ErrorIndicator(self.scene_)
-        return self._indicator[1](batch, predicted)
+        return self._indicator(given.values, predicted)
+
+    @cached_property
+    def _indicator(self) -> ErrorIndicator:
+        return ErrorIndicator(self.scene_)
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The knobs and their values."""
+        """The hyperparameters and their values."""
         if type(self).__init__ is object.__init__:
             return {}
-        return {
-            name: getattr(self, name)
-            for name in list(inspect.signature(type(self).__init__).parameters)[1:]
-        }
+        names = list(inspect.signature(type(self).__init__).parameters)[1:]
+        return {name: getattr(self, name) for name in names}
 
     def save(self, path: str | Path) -> None:
-        """Write the fitted model to one safetensors file: arrays, and a JSON header with class, knobs and scene.
+        """Write the fitted model to one safetensors file, see `mor_bench.model_file`.
 
         Raises
         ------
         NotFittedError
             Before `fit`.
+        MorBenchError
+            If the class overrides `fit`, so that its model is not known.
         """
-        from safetensors.numpy import save as serialise
-
         if not hasattr(self, "scene_"):
             raise NotFittedError(f"{type(self).__name__} must be fitted before it is saved.")
-        header = {
-            "format": "mor-bench surrogate",
-            "schema_version": str(SCHEMA_VERSION),
-            "surrogate": f"{type(self).__module__}:{type(self).__qualname__}",
-            "parameters": json.dumps(self.parameters),
-            "scene": self.scene_.spec.model_dump_json(),
-        }
-        known = (
-            {RANGE + name: array for name, array in self.range_.arrays().items()}
-            if hasattr(self, "range_")
-            else {}
+        model = StoredModel(
+            class_path(type(self)),
+            json.dumps(self.parameters),
+            self.scene_.spec.model_dump_json(),
+            self.model_arrays(),
+            self.range_.arrays() if hasattr(self, "range_") else {},
+            self.sizes_,
+            self.timings_ms_,
         )
-        sizes = size_arrays(getattr(self, "sizes_", {}))
-        timings = {
-            TIMING + name: np.array([value])
-            for name, value in getattr(self, "timings_ms_", {}).items()
-        }
-        arrays = {
-            name: np.ascontiguousarray(array)
-            for name, array in {**self._state(), **known, **sizes, **timings}.items()
-        }
-        header["sha256"] = _digest(header, arrays)
-        write_atomically(Path(path), _in_order(serialise(arrays, metadata=header)))
+        write_model(path, model)
 
-    def _state(self) -> dict[str, NDArray[Any]]:
-        """The arrays that make up a fitted model."""
-        raise MorBenchError(f"{type(self).__name__} does not support saving.")
+    def onnx_model(self) -> onnx.ModelProto:
+        """Return the network as an ONNX graph from `forces` to `displacements`.
 
-    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Become fitted from the arrays of `_state`; ``scene_`` is already set."""
-        raise MorBenchError(f"{type(self).__name__} does not support loading.")
-
-    def _onnx_model(self) -> onnx.ModelProto:
-        """The fitted map as an ONNX graph from `forces` to `displacements`, (n, n_nodes, 3) float32 each; see `export_onnx`."""
+        Both are (n, n_nodes, 3) float32; see `mor_bench.export`.
+        """
         raise MorBenchError(f"{type(self).__name__} has no network that could be written as ONNX.")
 
-    def _sized(self, name: str) -> Any:
-        """The value of a knob, or what was chosen for it if it is set to "auto"."""
-        value = getattr(self, "sizes_", {}).get(name, getattr(self, name))
-        if value == "auto":
-            raise InvalidInputError(f"no value was chosen for `{name}`.")
-        return value
-
-    @contextmanager
-    def _fitting(self, scene: Scene) -> Iterator[None]:
-        """Check the knobs and the scene, forget an earlier fit, and stay unfitted if the body fails."""
-        check_parameters(type(self), self.parameters)
-        reason = self.supports(scene) or self._needs_forces(scene)
-        if reason is not None:
-            raise UnsupportedSceneError(
-                f"{type(self).__name__} cannot handle {scene.name}: {reason}"
-            )
-        for name in [name for name in vars(self) if name.endswith("_")]:
+    def forget(self) -> None:
+        """Become unfitted: drop every attribute but hyperparameters and options."""
+        for name in vars(self).keys() - {*self.parameters, "training", "time_limit_s"}:
             delattr(self, name)
-        self.scene_ = scene
-        try:
-            yield
-        except BaseException:
-            del self.scene_
-            raise
 
-    def _checked_snapshots(self, snapshots: Snapshots | None) -> Snapshots:
-        """The training samples, which this method cannot do without; the range of their loads is remembered."""
-        if snapshots is None or len(snapshots) == 0:
-            raise InvalidInputError(
-                f"{type(self).__name__} needs at least one training sample; got none."
-            )
-        displacements, vectors = snapshots.free_displacements, snapshots.loads.vectors
-        shape = (len(snapshots), len(self.scene_.free_dofs))
-        if displacements.shape != shape or not {
-            displacements.dtype.kind,
-            vectors.dtype.kind,
-        } <= set("fiu"):
-            raise InvalidInputError(
-                f"the training samples must be real numbers, displacements of shape {shape}; got {displacements.dtype} of shape "
-                f"{displacements.shape} and forces in {vectors.dtype}."
-            )
-        if not np.isfinite(displacements).all() or not np.isfinite(vectors).all():
-            raise InvalidInputError("the training snapshots hold NaN or infinity.")
-        if not displacements.any() or not vectors.any():
-            raise InvalidInputError(
-                "the training snapshots are all zero: nothing can be learned from them."
-            )
-        if self.scene_.observed_nodes is None:
-            self.range_ = LoadRange.of(snapshots)
-        return snapshots
+    def _become(self, scene: Scene, sizes: dict[str, Any]) -> None:
+        self.scene_, self.sizes_, self.timings_ms_ = scene, sizes, {}
 
-    def _checked_forces(self, forces: ArrayLike) -> NDArray[np.float64]:
-        """Forces, or displacements of observed nodes and zeros elsewhere, as (n, n_nodes, 3) float64; the first line of every `predict`."""
+    def _checked(self, forces: ArrayLike) -> Given:
         if not hasattr(self, "scene_"):
             raise NotFittedError(f"{type(self).__name__} must be fitted before it predicts.")
-        try:
-            array = np.asarray(forces)
-        except (ValueError, TypeError) as error:
-            raise InvalidInputError(f"`forces` must be an array of real numbers: {error}") from None
-        n_nodes = self.scene_.mesh.n_nodes
-        if array.dtype.kind not in "fiu":
-            raise InvalidInputError(f"`forces` must hold real numbers; got dtype {array.dtype}.")
-        if array.ndim not in (2, 3) or array.shape[-2:] != (n_nodes, 3):
-            raise InvalidInputError(
-                f"`forces` must have shape ({n_nodes}, 3) or (n, {n_nodes}, 3); got {array.shape}."
-            )
-        observed, unit = self.scene_.observed_nodes, "N"
-        if observed is not None:
-            seen, unit = np.zeros(array.shape, dtype=array.dtype), "m at the observed nodes"
-            seen[..., observed, :] = array[..., observed, :]
-            array = seen
-        if not (np.abs(array) <= MAX_FORCE_N).all():
-            raise InvalidInputError(
-                f"`forces` must be finite and at most {MAX_FORCE_N:g} {unit}; got {np.abs(array).max():g}."
-            )
-        return array.astype(np.float64, copy=False).reshape(-1, n_nodes, 3)
+        return checked_given(self.scene_, forces)
 
 
-def _in_order(content: bytes) -> bytes:
-    """A safetensors file with its metadata sorted: safetensors writes them in an order that changes from call to call."""
-    end = 8 + int.from_bytes(content[:8], "little")
-    header = json.loads(content[8:end])
-    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
-    text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)  # the arrays stay aligned
-    return len(text).to_bytes(8, "little") + text + content[end:]
-
-
-def _digest(header: dict[str, str], arrays: dict[str, NDArray[Any]]) -> str:
-    """SHA-256 of all that a surrogate's file holds."""
-    digest = hashlib.sha256(
-        json.dumps({key: header[key] for key in sorted(header) if key != "sha256"}).encode()
-    )
-    for name in sorted(arrays):
-        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
-    return digest.hexdigest()
-
-
-def load_method(source: str | Path, **parameters: Any) -> Surrogate:
-    """Make an unfitted method.
-
-    Parameters
-    ----------
-    source : str or Path
-        A name in ``methods/``, or the path of a TOML.
-    **parameters
-        Replace the file's parameters.
+def checked_samples(owner: str, scene: Scene, snapshots: Snapshots | None) -> Snapshots:
+    """Check training samples.
 
     Raises
     ------
-    SpecError
-        If the method is unknown, or a parameter is unknown, of the wrong type or out of range.
-    MissingDependencyError
-        If the method needs an extra that is not installed.
-    """
-    spec = load_method_spec(source)
-    surrogate = spec.load_class()
-    return make_surrogate(surrogate, {**spec.parameters, **parameters})
-
-
-def make_surrogate(surrogate: type[Any], parameters: dict[str, Any]) -> Surrogate:
-    """Check the knobs and construct."""
-    if not issubclass(surrogate, Surrogate):
-        raise MorBenchError(
-            f"{surrogate.__module__}:{surrogate.__name__} is not a subclass of mor_bench.Surrogate."
-        )
-    return surrogate(**check_parameters(surrogate, parameters))
-
-
-def load_surrogate(path: str | Path) -> Surrogate:
-    """Read a fitted model written by `Surrogate.save`.
-
-    Only a class that a method of the suite names is ever imported: a file cannot make this run code of its own.
-
-    Raises
-    ------
-    StoreError
-        If the file is missing, damaged, foreign or of a newer schema, or names a class that no method names.
-    """
-    header, state = _read_model(path)
-    known = {load_method_spec(file).surrogate for file in list_suite("methods").values()}
-    if header.get("surrogate") not in known:
-        raise StoreError(
-            f"{path}: class {header.get('surrogate')!r} is not named by any method of the suite."
-        )
-    return _fitted(path, load_class(header["surrogate"]), None, header, state)
-
-
-def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surrogate:
-    """Read a fitted model of a class and a scene that are at hand; otherwise as `load_surrogate`."""
-    header, state = _read_model(path)
-    expected = f"{surrogate.__module__}:{surrogate.__qualname__}"
-    if header.get("surrogate") != expected:
-        raise StoreError(
-            f"{path}: a model of class {header.get('surrogate')!r}; expected {expected!r}."
-        )
-    return _fitted(path, surrogate, scene, header, state)
-
-
-def weights_to_start_from(path: str | Path, method: Surrogate) -> dict[str, NDArray[Any]]:
-    """The arrays of a saved model of a method's class and architecture, on whatever scene it was trained; see `fitting_arrays`.
-
-    Raises
-    ------
-    StoreError
-        If the file is missing, damaged or of a newer schema.
     InvalidInputError
-        If it is of another class or architecture.
+        If there are none, or they are of a wrong shape or dtype, not finite, or all zero.
     """
-    header, state = _read_model(path)
-    surrogate = type(method)
-    expected = f"{surrogate.__module__}:{surrogate.__qualname__}"
-    if header.get("surrogate") != expected:
+    if snapshots is None or len(snapshots) == 0:
+        raise InvalidInputError(f"{owner} needs at least one training sample; got none.")
+    displacements, vectors = snapshots.free_displacements, snapshots.loads.vectors
+    shape = (len(snapshots), len(scene.free_dofs))
+    kinds = {displacements.dtype.kind, vectors.dtype.kind}
+    if displacements.shape != shape or not kinds <= set("fiu"):
         raise InvalidInputError(
-            f"{path}: `start_from` must be a model of class {expected!r}; got one of {header.get('surrogate')!r}."
+            f"the training samples must be real numbers, displacements of shape {shape}; "
+            f"got {displacements.dtype} of shape {displacements.shape} and forces in "
+            f"{vectors.dtype}."
         )
-    try:
-        saved = check_parameters(surrogate, json.loads(header["parameters"]))
-    except (MorBenchError, KeyError, ValueError, TypeError, RecursionError) as error:
-        raise StoreError(
-            f"{path}: its knobs are not those of a {surrogate.__qualname__}: {error}"
-        ) from None
-    unlike = [name for name in surrogate.architecture if saved[name] != method.parameters[name]]
-    if unlike:
-        wanted, got = (
-            ", ".join(f"`{name}` {knobs[name]!r}" for name in unlike)
-            for knobs in (method.parameters, saved)
-        )
+    if not np.isfinite(displacements).all() or not np.isfinite(vectors).all():
+        raise InvalidInputError("the training snapshots hold NaN or infinity.")
+    if not displacements.any() or not vectors.any():
         raise InvalidInputError(
-            f"{path}: `start_from` must be a model with {wanted}; got one with {got}."
+            "the training snapshots are all zero: nothing can be learned from them."
         )
-    return state
-
-
-def fitting_arrays(
-    path: str | Path,
-    state: Mapping[str, NDArray[Any]],
-    shapes: Mapping[str, tuple[int | None, ...]],
-    dtype: type[np.floating[Any]],
-) -> dict[str, NDArray[Any]]:
-    """Of the arrays of `weights_to_start_from` those of these names, which must be finite and of these shapes; None is any length but 0.
-
-    Raises
-    ------
-    StoreError
-        If one is missing, of another dtype, or not finite.
-    InvalidInputError
-        If one is of another shape.
-    """
-    for name, shape in shapes.items():
-        if name not in state or state[name].dtype != dtype:
-            got = f"got {state[name].dtype}" if name in state else "it is missing"
-            raise StoreError(f"{path}: `{name}` must be {np.dtype(dtype)}; {got}.")
-        array, wanted = (
-            state[name],
-            ", ".join("at least 1" if length is None else str(length) for length in shape),
-        )
-        if (
-            array.ndim != len(shape)
-            or 0 in array.shape
-            or any(length not in (None, n) for n, length in zip(array.shape, shape, strict=True))
-        ):
-            raise InvalidInputError(
-                f"{path}: to start from it here, `{name}` must be of shape ({wanted}); got {array.shape}."
-            )
-        if not np.isfinite(array).all():
-            raise StoreError(f"{path}: `{name}` holds NaN or infinity.")
-    return {name: state[name] for name in shapes}
-
-
-def _read_model(path: str | Path) -> tuple[dict[str, str], dict[str, NDArray[Any]]]:
-    """Header and arrays of a model's file, checked."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(str(path), framework="numpy") as file:
-            header = file.metadata() or {}
-            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except (
-        SafetensorError,
-        OSError,
-        ValueError,
-        AttributeError,
-        TypeError,
-    ) as error:  # the last ones of a dtype that NumPy has not
-        raise StoreError(f"{path}: not a readable safetensors file: {error}") from None
-    if header.get("format") != "mor-bench surrogate":
-        raise StoreError(f"{path}: not a surrogate of mor-bench.")
-    if header.get("schema_version") != str(SCHEMA_VERSION):
-        raise StoreError(
-            f"{path}: schema version {header.get('schema_version')}; this version of mor-bench reads version {SCHEMA_VERSION}."
-        )
-    if header.get("sha256") != _digest(header, state):
-        raise StoreError(f"{path}: damaged: the checksum does not match.")
-    return header, state
-
-
-def _fitted(
-    path: str | Path,
-    surrogate: type[Any],
-    scene: Scene | None,
-    header: dict[str, str],
-    state: dict[str, NDArray[Any]],
-) -> Surrogate:
-    """The model that a file's content makes; without a scene at hand, of the scene in its header."""
-    try:
-        method = make_surrogate(surrogate, json.loads(header["parameters"]))
-        method.scene_ = scene or load_scene(json.loads(header["scene"]))
-        ranges = {
-            name.removeprefix(RANGE): state.pop(name)
-            for name in list(state)
-            if name.startswith(RANGE)
-        }
-        sizes = take_sizes(state)
-        timings = {
-            name.removeprefix(TIMING): state.pop(name).item()
-            for name in list(state)
-            if name.startswith(TIMING)
-        }
-        if not all(isinstance(value, float) and value > 0 for value in timings.values()):
-            raise InvalidInputError(f"its times must be positive numbers; got {timings}.")
-        if timings:
-            method.timings_ms_ = timings
-        if any(method.parameters.get(name) != "auto" for name in sizes):
-            raise InvalidInputError(
-                f"it holds values for {', '.join(sorted(sizes))}, of which not all are to be chosen."
-            )
-        if sizes:
-            check_parameters(surrogate, {**method.parameters, **sizes})
-            method.sizes_ = sizes
-        method._restore(state)
-        if ranges:
-            method.range_ = LoadRange.from_arrays(ranges, method.scene_.mesh.n_nodes)
-    except (
-        MorBenchError,
-        ArithmeticError,
-        KeyError,
-        ValueError,
-        IndexError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-    ) as error:
-        raise StoreError(
-            f"{path}: its content does not make a {header['surrogate'].partition(':')[2]}: {error}"
-        ) from None
-    return method
+    return snapshots

@@ -14,10 +14,10 @@ from safetensors.numpy import save as serialise
 import mor_bench
 from mor_bench.errors import InvalidInputError, MissingDependencyError, NotFittedError, StoreError
 from mor_bench.measure.error_metrics import sample_errors
+from mor_bench.model_file import model_digest as file_digest
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import list_suite
 from mor_bench.surrogate import Surrogate
-from mor_bench.surrogate import _digest as file_digest
 
 CHEAP_UMESH = {
     "channels": 8,

@@ -381,7 +381,7 @@ def test_a_method_that_does_not_train_is_fitted_too_and_a_swept_knob_has_its_fir
 class Unheeding(Descent):
     """Trains as many iterations as its knob says, whatever the seconds."""
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Unheeding:
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Unheeding:
         self.training = replace(self.training, fit_seconds=None)
         super().fit(scene, snapshots)
         del self.iterations_

@@ -23,8 +23,10 @@ from mor_bench.errors import (
     UnavailableBackendError,
 )
 from mor_bench.export.data import export_onnx
+from mor_bench.model_file import model_digest as _digest
+from mor_bench.model_file import read_header_and_arrays as _read_model
 from mor_bench.snapshots.dataset import Dataset
-from mor_bench.surrogate import Surrogate, _digest, _read_model
+from mor_bench.surrogate import Surrogate
 
 torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
 
@@ -243,14 +245,14 @@ def test_what_cannot_be_written_as_onnx(
         export_onnx(tmp_path / "linear.safetensors", tmp_path / "linear.txt")
     pytest.importorskip("onnxruntime")
     fitted.save(tmp_path / "umesh.safetensors")
-    real = type(fitted)._onnx_model
+    real = type(fitted).onnx_model
 
     def wrong(self: Any) -> Any:
         other = copy.copy(self)
         other.output_scale_ = 1.001 * self.output_scale_
         return real(other)
 
-    monkeypatch.setattr(type(fitted), "_onnx_model", wrong)
+    monkeypatch.setattr(type(fitted), "onnx_model", wrong)
     with pytest.raises(MorBenchError, match="differ from the method's"):
         export_onnx(tmp_path / "umesh.safetensors", tmp_path / "umesh.onnx")
     assert not (tmp_path / "umesh.onnx").exists()

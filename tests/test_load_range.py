@@ -15,6 +15,7 @@ from safetensors.numpy import save as serialise
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, NotFittedError, StoreError, UnknownRangeError
+from mor_bench.model_file import model_digest as file_digest
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots import load_range
 from mor_bench.snapshots.dataset import Dataset, Snapshots
@@ -22,7 +23,6 @@ from mor_bench.snapshots.imported_dataset import NodalLoads
 from mor_bench.snapshots.load_range import LoadRange
 from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.surrogate import Surrogate
-from mor_bench.surrogate import _digest as file_digest
 
 Array = NDArray[np.float64]
 
@@ -155,7 +155,7 @@ class Third(Surrogate):
     def __init__(self) -> None:
         pass
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
         with self._fitting(scene):
             return self
 

@@ -14,7 +14,7 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, SpecError, StoreError
-from mor_bench.surrogate import TrainingOptions
+from mor_bench.training_options import TrainingOptions
 
 if TYPE_CHECKING:
     from torch import Tensor

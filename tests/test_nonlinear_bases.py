@@ -26,9 +26,9 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import load_generated_spec
-from mor_bench.surrogate import TrainingOptions
 from mor_bench.surrogates.local_pod import LocalPOD
 from mor_bench.surrogates.quadratic_manifold import QuadraticManifoldGalerkin
+from mor_bench.training_options import TrainingOptions
 
 LAWS: dict[str, dict[str, Any]] = {
     "saint-venant-kirchhoff": {"young_pa": 500.0, "poisson": 0.4},

@@ -20,7 +20,8 @@ from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import load_dataset_spec
-from mor_bench.surrogate import Surrogate, TrainingOptions
+from mor_bench.surrogate import Surrogate
+from mor_bench.training_options import TrainingOptions
 from tests.irregular import irregular_box
 
 torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")

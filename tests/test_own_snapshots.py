@@ -28,8 +28,8 @@ from mor_bench.runs.file_check import check_file
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.scene.snapshot_file import MAX_SIZE
 from mor_bench.snapshots.dataset import Dataset
+from mor_bench.snapshots.given import MAX_FORCE_N
 from mor_bench.specs import ImportedDatasetSpec, list_suite, load_generated_spec
-from mor_bench.surrogate import MAX_FORCE_N
 from tests.test_cli import mor_bench as command
 
 Arrays = dict[str, NDArray[Any]]

@@ -16,7 +16,7 @@ from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.reduction.coordinates import error_weights, input_axes
 from mor_bench.reduction.sensitivity import sensitivities
 from mor_bench.snapshots.dataset import Dataset, Snapshots
-from mor_bench.surrogate import TrainingOptions
+from mor_bench.training_options import TrainingOptions
 
 torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
 

@@ -20,13 +20,13 @@ from mor_bench.mechanics import linear
 from mor_bench.mechanics.compliance import Compliance, project
 from mor_bench.mechanics.linear import BandedCholesky, BandedFactor
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.model_file import model_digest as file_digest
 from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.imported_dataset import NodalLoads
 from mor_bench.specs import SolverName, load_generated_spec
 from mor_bench.surrogate import Surrogate
-from mor_bench.surrogate import _digest as file_digest
 from mor_bench.surrogates import pca_regression
 from mor_bench.surrogates.kernel_regression import LENGTH_SCALES
 

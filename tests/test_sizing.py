@@ -16,6 +16,7 @@ from safetensors.numpy import save as serialise
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, StoreError, UnsupportedSceneError
+from mor_bench.model_file import model_digest as file_digest
 from mor_bench.reduction import sizing
 from mor_bench.reduction.sizing import MODES, Score, Trials, size_to_needs, validation_folds
 from mor_bench.runs.fit_cache import Entry, Material
@@ -26,7 +27,6 @@ from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.imported_dataset import NodalLoads
 from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.specs import load_method_spec
-from mor_bench.surrogate import _digest as file_digest
 from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.pca_regression import PCARegression
 from mor_bench.surrogates.pod import PODGalerkin

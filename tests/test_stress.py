@@ -253,7 +253,7 @@ class Rounding(PODGalerkin):
 class Unchecked(PODGalerkin):
     """Learns whatever it is given, and does not know its range."""
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
         with self._fitting(scene):
             assert snapshots is not None
             self._restore(
@@ -271,7 +271,7 @@ class Unchecked(PODGalerkin):
 class Unfit(PODGalerkin):
     """Cannot be fitted."""
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
         raise ZeroDivisionError("on purpose")
 
 

@@ -28,7 +28,7 @@ from mor_bench.runs.fit_cache import Entry, Job, Material, fit
 from mor_bench.runs.plan import plan
 from mor_bench.sandbox.process import MethodFailedError
 from mor_bench.specs import load_method_spec
-from mor_bench.surrogate import TrainingOptions
+from mor_bench.training_options import TrainingOptions
 from tests.test_fit_command import LIMIT, descent_file, wait_for
 
 

@@ -12,11 +12,13 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, StoreError
+from mor_bench.model_file import weights_to_start_from
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import list_suite, load_method_spec
-from mor_bench.surrogate import Surrogate, TrainingOptions, weights_to_start_from
+from mor_bench.surrogate import Surrogate
+from mor_bench.training_options import TrainingOptions
 
 pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
 

@@ -34,7 +34,7 @@ class Zero(mor_bench.Surrogate):
 
     needs_snapshots = False
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Zero:
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Zero:
         with self._fitting(scene):
             pass
         return self
@@ -72,7 +72,7 @@ class Recorder(mor_bench.Surrogate):
         self.notes = notes
         self.spoil = spoil
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Recorder:
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Recorder:
         with self._fitting(scene):
             assert snapshots is not None
             content = {
@@ -99,7 +99,7 @@ class Broken(Zero):
     def __init__(self, how: str = "crash") -> None:
         self.how = how
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Broken:
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Broken:
         super().fit(scene, snapshots)
         if self.how == "hang":
             time.sleep(3600)
@@ -147,7 +147,7 @@ class Broken(Zero):
 class Poison(mor_bench.Surrogate):
     """Writes over the training samples where they lie."""
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Poison:
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Poison:
         with self._fitting(scene):
             assert snapshots is not None
             array: Any = snapshots.free_displacements
@@ -165,7 +165,7 @@ class Leaky(Zero):
         self.path = path
         self.n = n
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Leaky:
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Leaky:
         if Path(self.path).exists():
             warnings.warn("saw forces of the test set", stacklevel=2)
         super().fit(scene, snapshots)
@@ -183,7 +183,7 @@ class Peeker(Zero):
         self.folders = folders
         self.dataset = dataset
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Peeker:
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Peeker:
         with self._fitting(scene):
             found = [*self._in_memory(snapshots), *self._on_disk()]
             warnings.warn(f"saw {json.dumps(found)}", stacklevel=2)
@@ -273,7 +273,7 @@ class Descent(mor_bench.Surrogate):
         self.steps = steps
         self.fails = fails
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Descent:
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Descent:
         with self._fitting(scene):
             samples = self._checked_snapshots(snapshots)
             if self.seed == self.fails:

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError, MorBenchError
+from mor_bench.method_loading import load_surrogate, make_surrogate
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.imported_dataset import NodalLoads
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.snapshots.test_sets import SET_NAMES, SetName
-from mor_bench.surrogate import Surrogate, load_surrogate, make_surrogate
+from mor_bench.surrogate import Surrogate
 
 Part = Literal["train", "test"] | SetName
 
@@ -250,7 +251,7 @@ def export_onnx(model: str | Path, out: str | Path) -> tuple[Path, float | None]
             f"`out`: {out} exists and is not overwritten; remove it or choose another name."
         )
     surrogate = load_surrogate(model)
-    written = surrogate._onnx_model().SerializeToString()
+    written = surrogate.onnx_model().SerializeToString()
     difference = _onnx_difference(surrogate, written)
     if difference is not None and not difference <= ONNX_AGREES:
         raise MorBenchError(
@@ -268,9 +269,7 @@ def _onnx_difference(surrogate: Surrogate, written: bytes) -> float | None:
         return None
     if surrogate.parameters.get("inference", "eager") != "eager":
         plain = make_surrogate(type(surrogate), {**surrogate.parameters, "inference": "eager"})
-        plain.scene_ = surrogate.scene_
-        plain._restore(surrogate._state())
-        surrogate = plain
+        surrogate = plain.restore(surrogate.scene_, surrogate.model_arrays())
     shape = (3, surrogate.scene_.mesh.n_nodes, 3)
     forces = np.random.default_rng(0).normal(scale=1.0, size=shape).astype(np.float32)
     forces[0] = 0.0

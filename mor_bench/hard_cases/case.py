@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import SolverError
 from mor_bench.measure.discretisation_error import measured
+from mor_bench.method_loading import make_surrogate
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots, load_dataset
 from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.specs import DatasetSpec, MethodSpec, load_generated_spec
-from mor_bench.surrogate import Surrogate, make_surrogate
+from mor_bench.surrogate import Surrogate
 
 Verdict = Literal["pass", "fall short", "not applicable"]
 

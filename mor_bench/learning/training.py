@@ -13,7 +13,7 @@ from mor_bench.errors import InvalidInputError, OutOfTimeError
 from mor_bench.learning.checkpoint import fingerprint_of, resume, write_checkpoint
 from mor_bench.learning.training_loop import TrainingLoop
 from mor_bench.learning.training_plan import LearningProblem, TrainingPlan
-from mor_bench.surrogate import TrainingOptions
+from mor_bench.training_options import TrainingOptions
 from mor_bench.version import __version__
 
 TIME_CHECKS = {5: 3.0, 100: 1.0}

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mor_bench.errors import MorBenchError
 from mor_bench.learning.training_plan import LearningProblem, TrainingPlan, rate_factor
-from mor_bench.surrogate import TrainingOptions
+from mor_bench.training_options import TrainingOptions
 
 LOSS_INTERVAL = 50
 """Iterations per point of the loss curve; more points would cost time and show mostly noise."""

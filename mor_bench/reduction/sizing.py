@@ -194,6 +194,15 @@ def _first_that_meets(
 def size_to_needs(
     method: Sizeable, scene: Scene, snapshots: Snapshots, rungs: Mapping[str, Sequence[Any]]
 ) -> dict[str, Any]:
+    """As `choose_sizes`, for methods that are not written as `learn` and `prepare` yet."""
+    if sizes := choose_sizes(method, scene, snapshots, rungs):
+        method.sizes_ = sizes
+    return {**method.parameters, **sizes}
+
+
+def choose_sizes(
+    method: Sizeable, scene: Scene, snapshots: Snapshots, rungs: Mapping[str, Sequence[Any]]
+) -> dict[str, Any]:
     """The knobs of a method, those set to ``"auto"`` at the least work that meets the scene's need.
 
     Candidates are cross-validated: fitted to the training samples but for a fifth of the load regions, scored on these, and so
@@ -237,7 +246,7 @@ def size_to_needs(
         name: values for name, values in rungs.items() if method.parameters[name] == "auto"
     }
     if not open_rungs:
-        return method.parameters
+        return {}
     need = scene.spec.needs.error
     (climbed, values), *others = open_rungs.items()
     trials = Trials(method, scene, snapshots)
@@ -269,5 +278,4 @@ def size_to_needs(
             "training samples held out.",
             stacklevel=3,
         )
-    method.sizes_ = best
-    return {**method.parameters, **best}
+    return best

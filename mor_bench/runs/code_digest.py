@@ -11,7 +11,6 @@ from importlib.machinery import PathFinder
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-
 LIBRARIES = (
     "numpy",
     "scipy",
@@ -117,13 +116,7 @@ def _closure(module: str, folder: Path | None) -> dict[str, Path]:
 def _file_of(name: str, folder: Path | None, installed: bool) -> Path | None:
     """The source of a module, found without importing anything: beside the method's file, or an installed one that is its own."""
     parts = name.split(".")
-    roots = (
-        [Path(__file__).parents[2]]
-        if parts[0] == "mor_bench"
-        else [folder]
-        if folder
-        else []
-    )
+    roots = [Path(__file__).parents[2]] if parts[0] == "mor_bench" else [folder] if folder else []
     for root in roots:
         stem = root.joinpath(*parts)
         for path in (stem.with_suffix(".py"), stem / "__init__.py"):

@@ -29,7 +29,7 @@ from mor_bench.specs import (
     MethodSpec,
     SplitBy,
 )
-from mor_bench.surrogate import Device, TrainingOptions
+from mor_bench.training_options import Device, TrainingOptions
 from mor_bench.version import __version__
 
 MOST_SEEDS = 100

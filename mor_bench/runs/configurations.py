@@ -31,7 +31,7 @@ from mor_bench.specs import (
     load_dataset_spec,
     load_method_spec,
 )
-from mor_bench.surrogate import TrainingOptions
+from mor_bench.training_options import TrainingOptions
 
 CORE_METHODS = ("fem", "pod", "hpod", "pca-regression", "umesh")
 """What is compared when nothing else is asked for."""

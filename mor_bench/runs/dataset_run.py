@@ -71,7 +71,7 @@ from mor_bench.specs import (
     ImportedDatasetSpec,
     SplitBy,
 )
-from mor_bench.surrogate import TrainingOptions
+from mor_bench.training_options import TrainingOptions
 
 MOST_QUERIES = 400
 """Loads of the test set from which a timing's queries are drawn."""

@@ -42,7 +42,7 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.store import remove_leftovers, write_atomically
 from mor_bench.specs import MethodSpec, list_suite, load_method_spec
-from mor_bench.surrogate import TrainingOptions
+from mor_bench.training_options import TrainingOptions
 
 N_COUNTED = 32
 """Test loads over which the cost of a query is averaged."""

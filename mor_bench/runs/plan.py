@@ -30,7 +30,7 @@ from mor_bench.snapshots.generate import (
 )
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import AnyDatasetSpec, DatasetSpec, SplitBy
-from mor_bench.surrogate import Device
+from mor_bench.training_options import Device
 
 SEES = 100
 """Iterations after which a training that would take too long is ended, see `mor_bench.learning.training`."""

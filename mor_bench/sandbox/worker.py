@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from mor_bench.hard_cases.case import Case, Subject
     from mor_bench.scene.scene import Scene
     from mor_bench.specs import MethodSpec
-    from mor_bench.surrogate import Surrogate, TrainingOptions
+    from mor_bench.surrogate import Surrogate
+    from mor_bench.training_options import TrainingOptions
 
 SETTLE_QUERIES = 3
 """Untimed queries before each round, after which the caches are the method's own again."""
@@ -189,9 +190,9 @@ class Session:
     ) -> dict[str, Any]:
         """Fit on the snapshots of a folder and save."""
         from mor_bench.machine import pinned_threads
+        from mor_bench.method_loading import make_surrogate
         from mor_bench.sandbox.handover import read_snapshots
         from mor_bench.specs import load_class
-        from mor_bench.surrogate import make_surrogate
 
         method = make_surrogate(load_class(surrogate), parameters)
         method.time_limit_s = limit_s
@@ -220,8 +221,8 @@ class Session:
 
     def load(self, surrogate: str, model: Path) -> dict[str, Any]:
         """Read a fitted model."""
+        from mor_bench.method_loading import load_fitted
         from mor_bench.specs import load_class
-        from mor_bench.surrogate import load_fitted
 
         self.method = load_fitted(model, load_class(surrogate), self.scene)
         return {}

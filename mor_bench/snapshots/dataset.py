@@ -15,6 +15,7 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene, imported_scene, load_scene
 from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import Progress, generate, n_samples_to_generate, read_shards
+from mor_bench.snapshots.given import Given, given_of
 from mor_bench.snapshots.imported_dataset import NodalLoads, nodal_loads, read_samples
 from mor_bench.snapshots.sampling import PatchLoads, n_samples_of, repeated
 from mor_bench.snapshots.split import split_imported, split_samples
@@ -56,6 +57,12 @@ class Snapshots:
     free_displacements: NDArray[np.float64]
     min_det_f: NDArray[np.float64]
 
+    @classmethod
+    def empty(cls, scene: Scene) -> Snapshots:
+        """No samples of a scene."""
+        loads = NodalLoads(np.zeros((0, scene.mesh.n_nodes, 3)), np.zeros((0, 1), dtype=np.int64))
+        return cls(scene, loads, np.zeros((0, len(scene.free_dofs))), np.zeros(0))
+
     def __len__(self) -> int:
         return len(self.loads)
 
@@ -92,6 +99,11 @@ class Snapshots:
         seen = np.zeros_like(self.displacements)
         seen[:, nodes] = self.displacements[:, nodes]
         return read_only(seen)
+
+    @property
+    def given(self) -> Given:
+        """What methods are given for these samples."""
+        return given_of(self.scene, self.inputs)
 
     @property
     def free_inputs(self) -> NDArray[np.float64]:

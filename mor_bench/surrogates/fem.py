@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Self
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field
 
 from mor_bench.errors import SolverError
@@ -13,62 +15,49 @@ from mor_bench.mechanics.model import missing_library, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.mechanics.observed import forward_model
 from mor_bench.scene.scene import Scene
-from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.specs import SolverName
 from mor_bench.surrogate import Surrogate
 
 
+@dataclass(eq=False)
 class FullFEM(Surrogate):
     """The nonlinear solve on the whole mesh.
 
-    Given displacements of a part of the surface it holds these and leaves all other nodes without a force: exact where
-    every loaded node is seen, see `mor_bench.mechanics.observed`.
+    Observed nodes are held at their displacements, and all other nodes carry no force. That is
+    exact if every loaded node is observed, see `mor_bench.mechanics.observed`.
 
     Parameters
     ----------
     tolerance : float
-        Norm of the residual relative to that of the load at which the solve stops.
+        Norm of the residual relative to that of the load at which the solve stops, in (0, 1].
     solver : str, optional
-        One of `mor_bench.mechanics.model.SOLVERS`; by default as the scene says.
+        One of `mor_bench.mechanics.model.SOLVERS`; by default the scene's.
     """
 
-    needs_snapshots = False
-    takes_observations = True
+    tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8
+    solver: SolverName | None = None
 
-    def __init__(
-        self,
-        tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8,
-        solver: SolverName | None = None,
-    ) -> None:
-        self.tolerance = tolerance
-        self.solver = solver
+    needs_snapshots: ClassVar = False
 
     def supports(self, scene: Scene) -> str | None:
         return unknown_equations(scene, observed=True) or missing_library(
             self.solver or scene.generated.solver
         )
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
-        """Assemble and factorise the rest-state stiffness; snapshots are not used."""
-        with self._fitting(scene):
-            self._restore({})
-        return self
+    def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
+        self.model_ = forward_model(scene, self.solver)
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        batch = self._checked_forces(forces)
-        out = np.zeros((len(batch), self.scene_.mesh.n_dofs))
+    def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        out = np.zeros((len(forces), self.scene_.mesh.n_dofs))
         free = self.scene_.free_dofs
-        loads = batch.reshape(-1, self.scene_.mesh.n_dofs)[:, free]
-        for row, found in zip(
-            out, self.model_.solve_many(loads, NewtonOptions(self.tolerance)), strict=True
-        ):
+        loads = forces.reshape(out.shape)[:, free]
+        solutions = self.model_.solve_many(loads, NewtonOptions(self.tolerance))
+        for row, found in zip(out, solutions, strict=True):
             if isinstance(found, SolverError):
                 raise found
             row[free] = found.displacement
-        return out.reshape(np.shape(forces))
+        return out.reshape(forces.shape)
 
-    def _state(self) -> dict[str, NDArray[Any]]:
-        return {}
-
-    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        self.model_ = forward_model(self.scene_, self.solver)
+    def answer_observed(self, observed: ObservedDisplacements) -> NDArray[np.float64]:
+        return self.answer(observed.values)

@@ -19,9 +19,10 @@ from mor_bench.learning.training import Training, device_of, train
 from mor_bench.learning.training_plan import LearningProblem, TrainingPlan
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.mechanics.observed import linear_response
+from mor_bench.model_file import fitting_arrays, weights_to_start_from
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogate import Surrogate, fitting_arrays, weights_to_start_from
+from mor_bench.surrogate import Surrogate
 
 Input = Literal["force", "linear-response"]
 

@@ -14,9 +14,11 @@ from mor_bench.errors import InvalidInputError, SolverError
 from mor_bench.mechanics.anderson import Anderson
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.method_loading import load_method
+from mor_bench.model_file import size_arrays, take_sizes
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogate import Surrogate, load_method, size_arrays, take_sizes
+from mor_bench.surrogate import Surrogate
 
 START = "start."
 """Beginning of the names of the arrays that belong to the start's model."""
@@ -107,7 +109,7 @@ class Hybrid(Surrogate):
             if start.needs_snapshots:
                 self._checked_snapshots(snapshots)
             start.time_limit_s = self.time_limit_s
-            self._become(start.fit(_all_outputs(scene), snapshots))
+            self._take(start.fit(_all_outputs(scene), snapshots))
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
@@ -154,7 +156,7 @@ class Hybrid(Surrogate):
         better = float(np.linalg.norm(load - state.force)) <= WORSE * float(np.linalg.norm(load))
         return u if better and state.min_det_f > 0 else None
 
-    def _become(self, start: Surrogate) -> None:
+    def _take(self, start: Surrogate) -> None:
         self.start_ = start
         self.model_ = FullOrderModel(self.scene_, "auto")
         _ = self.model_.turned_rest
@@ -163,18 +165,16 @@ class Hybrid(Surrogate):
         return {
             START + name: array
             for name, array in {
-                **self.start_._state(),
+                **self.start_.model_arrays(),
                 **size_arrays(getattr(self.start_, "sizes_", {})),
             }.items()
         }
 
     def _restore(self, state: dict[str, NDArray[Any]]) -> None:
         start = self._unfitted()
-        start.scene_ = _all_outputs(self.scene_)
         arrays = {name.removeprefix(START): array for name, array in state.items()}
-        start.sizes_ = take_sizes(arrays)
-        start._restore(arrays)
-        self._become(start)
+        sizes = take_sizes(arrays)
+        self._take(start.restore(_all_outputs(self.scene_), arrays, sizes))
 
 
 def _all_outputs(scene: Scene) -> Scene:

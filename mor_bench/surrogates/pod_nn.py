@@ -21,8 +21,8 @@ from mor_bench.learning.perceptron import (
     slope_at_rest,
     taken,
 )
+from mor_bench.model_file import fitting_arrays, weights_to_start_from
 from mor_bench.reduction.coordinates import change_of_basis
-from mor_bench.surrogate import fitting_arrays, weights_to_start_from
 from mor_bench.surrogates.coordinate_regression import CoordinateSamples
 from mor_bench.surrogates.network_regression import NetworkRegression
 

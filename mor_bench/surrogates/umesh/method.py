@@ -25,11 +25,12 @@ from mor_bench.learning.training_plan import (
 )
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.mechanics.observed import linear_response
+from mor_bench.model_file import fitting_arrays, weights_to_start_from
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.scene import Scene
 from mor_bench.scene.symmetry import Mirror, mirrors
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.surrogate import Surrogate, fitting_arrays, weights_to_start_from
+from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates.field_network import network_weights
 from mor_bench.surrogates.umesh.network import Activation, UNet, empty_network, new_network
 from mor_bench.surrogates.umesh.padded_grid import PaddedGrid, padded_grid
@@ -366,7 +367,7 @@ class UMesh(Surrogate):
             )
         )
 
-    def _onnx_model(self) -> onnx.ModelProto:
+    def onnx_model(self) -> onnx.ModelProto:
         from mor_bench.surrogates.umesh.onnx_model import umesh_graph
 
         with torch.inference_mode():

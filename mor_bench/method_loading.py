@@ -1,0 +1,164 @@
+"""Make methods by name, and read fitted ones from their files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mor_bench.errors import MorBenchError, NotFittedError, StoreError, UnsupportedSceneError
+from mor_bench.model_file import StoredModel, class_path, read_model
+from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.load_range import LoadRange
+from mor_bench.specs import check_parameters, list_suite, load_class, load_method_spec
+from mor_bench.surrogate import Surrogate
+
+
+def load_method(source: str | Path, **parameters: Any) -> Surrogate:
+    """Make an unfitted method.
+
+    Parameters
+    ----------
+    source : str or Path
+        A name in ``methods/``, or the path of a TOML file.
+    **parameters
+        Replace the file's hyperparameters.
+
+    Raises
+    ------
+    SpecError
+        If the method or a hyperparameter is unknown, or a value is of the wrong type or range.
+    MissingDependencyError
+        If the method needs an extra that is not installed.
+    """
+    spec = load_method_spec(source)
+    surrogate = spec.load_class()
+    return make_surrogate(surrogate, {**spec.parameters, **parameters})
+
+
+def make_surrogate(surrogate: type[Any], parameters: Mapping[str, Any]) -> Surrogate:
+    """Check hyperparameters and construct; a class of `fit` and `predict` alone is adapted.
+
+    Raises
+    ------
+    SpecError
+        If a hyperparameter is unknown, or its value is of the wrong type or range.
+    MorBenchError
+        If the class has no `fit` and `predict`.
+    """
+    if issubclass(surrogate, Surrogate):
+        return surrogate(**check_parameters(surrogate, parameters))
+    if not all(callable(getattr(surrogate, verb, None)) for verb in ("fit", "predict")):
+        raise MorBenchError(
+            f"{class_path(surrogate)} is not a subclass of mor_bench.Surrogate, "
+            "and has no methods `fit` and `predict`."
+        )
+    return AdaptedMethod(surrogate, check_parameters(surrogate, parameters))
+
+
+class AdaptedMethod(Surrogate):
+    """A class that knows nothing of `Surrogate` and has the methods ``fit(scene, snapshots)`` and
+    ``predict(forces)``; it cannot be saved.
+
+    Parameters
+    ----------
+    adapted : type
+        The class. Its attributes `needs_snapshots`, True by default, and `takes_observations`,
+        False by default, are used.
+    parameters : dict
+        Its checked hyperparameters.
+    """
+
+    def __init__(self, adapted: type[Any], parameters: dict[str, Any]) -> None:
+        self._class, self._parameters = adapted, parameters
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        return self._parameters
+
+    @property
+    def needs_snapshots(self) -> bool:  # type: ignore[override]
+        return bool(getattr(self._class, "needs_snapshots", True))
+
+    @property
+    def takes_observations(self) -> bool:  # type: ignore[override]
+        return bool(getattr(self._class, "takes_observations", False))
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
+        if reason := self.supports(scene):
+            raise UnsupportedSceneError(f"{class_path(self._class)}: {scene.name}: {reason}")
+        method = self._class(**self._parameters)
+        method.fit(scene, snapshots)
+        self.method_, self.scene_, self.sizes_ = method, scene, {}
+        if snapshots is not None and scene.observed_nodes is None:
+            self.range_ = LoadRange.of(snapshots)
+        return self
+
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+        if not hasattr(self, "method_"):
+            raise NotFittedError(f"{class_path(self._class)} must be fitted before it predicts.")
+        return np.asarray(self.method_.predict(forces))
+
+    def save(self, path: str | Path) -> None:
+        raise MorBenchError(f"{class_path(self._class)} is no Surrogate and cannot be saved.")
+
+
+def load_surrogate(path: str | Path) -> Surrogate:
+    """Read a fitted model written by `Surrogate.save`.
+
+    Only classes that a method of the suite names are imported: a file cannot run its own code.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing, damaged, of another format or a newer schema, or names a class
+        that no method names.
+    """
+    model = read_model(path)
+    known = {load_method_spec(file).surrogate for file in list_suite("methods").values()}
+    if model.surrogate not in known:
+        raise StoreError(
+            f"{path}: class {model.surrogate!r} is not named by any method of the suite."
+        )
+    return _fitted(path, load_class(model.surrogate), None, model)
+
+
+def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surrogate:
+    """Read a fitted model of a known class and scene; otherwise as `load_surrogate`."""
+    model = read_model(path)
+    expected = class_path(surrogate)
+    if model.surrogate != expected:
+        raise StoreError(f"{path}: a model of class {model.surrogate!r}; expected {expected!r}.")
+    return _fitted(path, surrogate, scene, model)
+
+
+def _fitted(
+    path: str | Path, surrogate: type[Any], scene: Scene | None, model: StoredModel
+) -> Surrogate:
+    """Make the method of a file's content; without a scene, for the scene of its header."""
+    try:
+        method = make_surrogate(surrogate, json.loads(model.parameters))
+        scene = scene or load_scene(json.loads(model.scene))
+        method.restore(scene, model.arrays, model.sizes)
+        method.timings_ms_.update(model.timings_ms)
+        if model.load_range:
+            method.range_ = LoadRange.from_arrays(model.load_range, scene.mesh.n_nodes)
+    except (
+        MorBenchError,
+        ArithmeticError,
+        KeyError,
+        ValueError,
+        IndexError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:
+        raise StoreError(
+            f"{path}: its content does not make a {model.surrogate.partition(':')[2]}: {error}"
+        ) from None
+    return method

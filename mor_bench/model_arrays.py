@@ -1,0 +1,83 @@
+"""Check the arrays that a model consists of, whether they were learned or read from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from mor_bench.errors import InvalidInputError
+
+
+def take_array(
+    model: Mapping[str, NDArray[Any]],
+    name: str,
+    shape: tuple[int | None, ...],
+    dtype: DTypeLike = np.float64,
+) -> NDArray[Any]:
+    """Return one array of a model in C order, checked.
+
+    Parameters
+    ----------
+    shape : tuple of int or None
+        The shape it must have; None stands for any length but 0.
+    dtype : dtype
+        The type it must have.
+
+    Raises
+    ------
+    InvalidInputError
+        If the array is missing, has another shape or type, or holds NaN or infinity.
+    """
+    if name not in model:
+        raise InvalidInputError(f"the array `{name}` is missing.")
+    array = model[name]
+    fits = array.ndim == len(shape) and all(
+        n == m if m is not None else n > 0 for n, m in zip(array.shape, shape, strict=True)
+    )
+    if array.dtype != dtype or not fits or not np.isfinite(array).all():
+        wanted = ", ".join("any" if length is None else str(length) for length in shape)
+        raise InvalidInputError(
+            f"`{name}` must be a finite {np.dtype(dtype)} array of shape ({wanted}); "
+            f"got {array.dtype} of shape {array.shape}."
+        )
+    return np.ascontiguousarray(array)
+
+
+def take_indices(model: Mapping[str, NDArray[Any]], name: str, size: int) -> NDArray[np.int64]:
+    """Return one array of different integers in [0, size), at least one of them.
+
+    Raises
+    ------
+    InvalidInputError
+        If the array is missing or not of this kind.
+    """
+    if name not in model:
+        raise InvalidInputError(f"the array `{name}` is missing.")
+    indices = model[name]
+    good = indices.dtype.kind == "i" and indices.ndim == 1 and len(indices) > 0
+    if (
+        not good
+        or indices.min() < 0
+        or indices.max() >= size
+        or len(np.unique(indices)) != len(indices)
+    ):
+        raise InvalidInputError(f"`{name}` must be different integers in [0, {size - 1}].")
+    return indices.astype(np.int64)
+
+
+def check_finite(owner: str, model: Mapping[str, NDArray[Any]]) -> None:
+    """Check that a learned model is made of finite arrays.
+
+    Raises
+    ------
+    InvalidInputError
+        Otherwise.
+    """
+    for name, array in model.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
+            raise InvalidInputError(f"`{name}` of a {owner} must be an array of numbers.")
+        if not np.isfinite(array).all():
+            raise InvalidInputError(f"`{name}` of a {owner} holds NaN or infinity.")

@@ -1,0 +1,268 @@
+"""The file of a fitted model: safetensors arrays, and a JSON header with class and scene."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.errors import InvalidInputError, MorBenchError, StoreError
+from mor_bench.snapshots.store import write_atomically
+from mor_bench.specs import check_parameters
+
+FORMAT = "mor-bench surrogate"
+SCHEMA_VERSION = 1
+
+RANGE, SIZE, TIMING = "range.", "size.", "timing."
+"""Prefixes of array names: range of the training loads, chosen values, measured times."""
+
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class StoredModel:
+    """Content of a model file.
+
+    Attributes
+    ----------
+    surrogate : str
+        Class, as ``module:Class``.
+    parameters, scene : str
+        Hyperparameters and the dataset's file, as JSON.
+    arrays : dict of str to array
+        The model itself.
+    load_range : dict of str to array
+        Range of the training loads, as `LoadRange.arrays`; empty if it is not known.
+    sizes : dict of str to Any
+        Values chosen for hyperparameters set to "auto".
+    timings_ms : dict of str to float
+        Times by which the fit chose between equivalent ways to predict.
+    """
+
+    surrogate: str
+    parameters: str
+    scene: str
+    arrays: Arrays
+    load_range: Arrays = field(default_factory=dict)
+    sizes: dict[str, Any] = field(default_factory=dict)
+    timings_ms: dict[str, float] = field(default_factory=dict)
+
+
+class Startable(Protocol):
+    """What `weights_to_start_from` needs of a `mor_bench.Surrogate`."""
+
+    @property
+    def architecture(self) -> tuple[str, ...]: ...
+    @property
+    def parameters(self) -> dict[str, Any]: ...
+
+
+def class_path(surrogate: type[Any]) -> str:
+    """Return ``module:Class``, by which files name a class."""
+    return f"{surrogate.__module__}:{surrogate.__qualname__}"
+
+
+def write_model(path: str | Path, model: StoredModel) -> None:
+    """Write a model file, the same bytes for the same model."""
+    from safetensors.numpy import save as serialise
+
+    arrays = {
+        **model.arrays,
+        **_prefixed(RANGE, model.load_range),
+        **size_arrays(model.sizes),
+        **_prefixed(TIMING, {name: np.array([t]) for name, t in model.timings_ms.items()}),
+    }
+    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    header = {
+        "format": FORMAT,
+        "schema_version": str(SCHEMA_VERSION),
+        "surrogate": model.surrogate,
+        "parameters": model.parameters,
+        "scene": model.scene,
+    }
+    header["sha256"] = model_digest(header, arrays)
+    write_atomically(Path(path), _in_order(serialise(arrays, metadata=header)))
+
+
+def read_model(path: str | Path) -> StoredModel:
+    """Read a model file.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing, damaged, of another format or of a newer schema.
+    """
+    header, arrays = read_header_and_arrays(path)
+    load_range, timings = _taken(RANGE, arrays), _taken(TIMING, arrays)
+    try:
+        return StoredModel(
+            header["surrogate"],
+            header["parameters"],
+            header["scene"],
+            arrays,
+            load_range,
+            take_sizes(arrays),
+            {name: _positive(time) for name, time in timings.items()},
+        )
+    except (InvalidInputError, KeyError, ValueError) as error:
+        raise StoreError(
+            f"{path}: its header or its chosen values are not valid: {error}"
+        ) from None
+
+
+def read_header_and_arrays(path: str | Path) -> tuple[dict[str, str], Arrays]:
+    """Read a model file as it is stored, with the checksum verified; raises as `read_model`."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(str(path), framework="numpy") as file:
+            header = file.metadata() or {}
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+    # AttributeError and TypeError: a dtype that NumPy does not have.
+    except (SafetensorError, OSError, ValueError, AttributeError, TypeError) as error:
+        raise StoreError(f"{path}: not a readable safetensors file: {error}") from None
+    if header.get("format") != FORMAT:
+        raise StoreError(f"{path}: not a surrogate of mor-bench.")
+    if header.get("schema_version") != str(SCHEMA_VERSION):
+        raise StoreError(
+            f"{path}: schema version {header.get('schema_version')}; "
+            f"this version of mor-bench reads version {SCHEMA_VERSION}."
+        )
+    if header.get("sha256") != model_digest(header, arrays):
+        raise StoreError(f"{path}: damaged: the checksum does not match.")
+    return header, arrays
+
+
+def model_digest(header: Mapping[str, str], arrays: Mapping[str, NDArray[Any]]) -> str:
+    """SHA-256 of all that a model file holds, except the digest itself."""
+    digest = hashlib.sha256(
+        json.dumps({key: header[key] for key in sorted(header) if key != "sha256"}).encode()
+    )
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
+        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
+    return digest.hexdigest()
+
+
+def size_arrays(sizes: Mapping[str, Any]) -> Arrays:
+    """Return chosen values as arrays that a file can hold; words as the bytes of their letters."""
+    return {
+        SIZE + name: np.frombuffer(value.encode(), np.uint8)
+        if isinstance(value, str)
+        else np.array([value])
+        for name, value in sizes.items()
+    }
+
+
+def take_sizes(arrays: Arrays) -> dict[str, Any]:
+    """Take the arrays of `size_arrays` out of a model's arrays and return the chosen values."""
+    return {
+        name: array.tobytes().decode() if array.dtype == np.uint8 else array.item()
+        for name, array in _taken(SIZE, arrays).items()
+    }
+
+
+def weights_to_start_from(path: str | Path, method: Startable) -> Arrays:
+    """Read the arrays of a saved model of a method's class and architecture, from any scene.
+
+    Raises
+    ------
+    StoreError
+        If the file is missing, damaged or of a newer schema.
+    InvalidInputError
+        If it is of another class or architecture.
+    """
+    header, arrays = read_header_and_arrays(path)
+    surrogate = type(method)
+    expected = class_path(surrogate)
+    if header.get("surrogate") != expected:
+        raise InvalidInputError(
+            f"{path}: `start_from` must be a model of class {expected!r}; "
+            f"got one of {header.get('surrogate')!r}."
+        )
+    try:
+        saved = check_parameters(surrogate, json.loads(header["parameters"]))
+    except (MorBenchError, KeyError, ValueError, TypeError, RecursionError) as error:
+        raise StoreError(
+            f"{path}: its parameters are not those of a {surrogate.__qualname__}: {error}"
+        ) from None
+    unlike = [name for name in method.architecture if saved[name] != method.parameters[name]]
+    if unlike:
+        wanted, got = (
+            ", ".join(f"`{name}` {knobs[name]!r}" for name in unlike)
+            for knobs in (method.parameters, saved)
+        )
+        raise InvalidInputError(
+            f"{path}: `start_from` must be a model with {wanted}; got one with {got}."
+        )
+    return arrays
+
+
+def fitting_arrays(
+    path: str | Path,
+    arrays: Mapping[str, NDArray[Any]],
+    shapes: Mapping[str, tuple[int | None, ...]],
+    dtype: type[np.floating[Any]],
+) -> Arrays:
+    """Return those arrays of `weights_to_start_from` that have the given names, checked.
+
+    They must be finite and of the given shapes, where None stands for any length but 0.
+
+    Raises
+    ------
+    StoreError
+        If one is missing, of another dtype, or not finite.
+    InvalidInputError
+        If one is of another shape.
+    """
+    for name, shape in shapes.items():
+        if name not in arrays or arrays[name].dtype != dtype:
+            got = f"got {arrays[name].dtype}" if name in arrays else "it is missing"
+            raise StoreError(f"{path}: `{name}` must be {np.dtype(dtype)}; {got}.")
+        array = arrays[name]
+        if (
+            array.ndim != len(shape)
+            or 0 in array.shape
+            or any(length not in (None, n) for n, length in zip(array.shape, shape, strict=True))
+        ):
+            wanted = ", ".join("at least 1" if n is None else str(n) for n in shape)
+            raise InvalidInputError(
+                f"{path}: to start from it here, `{name}` must be of shape ({wanted}); "
+                f"got {array.shape}."
+            )
+        if not np.isfinite(array).all():
+            raise StoreError(f"{path}: `{name}` holds NaN or infinity.")
+    return {name: arrays[name] for name in shapes}
+
+
+def _prefixed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    return {prefix + name: array for name, array in arrays.items()}
+
+
+def _taken(prefix: str, arrays: Arrays) -> Arrays:
+    """Take the arrays whose names begin with a prefix out of a model's arrays."""
+    names = [name for name in arrays if name.startswith(prefix)]
+    return {name.removeprefix(prefix): arrays.pop(name) for name in names}
+
+
+def _positive(time: NDArray[Any]) -> float:
+    value = time.item()
+    if not isinstance(value, float) or not value > 0:
+        raise InvalidInputError(f"measured times must be positive numbers; got {value}.")
+    return value
+
+
+def _in_order(content: bytes) -> bytes:
+    """Sort the metadata of a safetensors file: the library writes it in a changing order."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)  # the arrays stay aligned
+    return len(text).to_bytes(8, "little") + text + content[end:]
