@@ -1,4 +1,4 @@
-"""Threads, the summary of latencies, and the machine that they hold for; light enough to be imported by a method's process."""
+"""Threads, memory, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -29,6 +29,17 @@ def pinned_threads(threads: int) -> Iterator[None]:
                 torch.set_num_threads(before)
 
 
+def peak_memory_bytes() -> int:
+    """Return the most memory that this process has had resident."""
+    # getrusage would report the parent's peak where that is higher.
+    try:
+        with open("/proc/self/status", encoding="ascii") as status:
+            return next(int(line.split()[1]) * 1024 for line in status if line.startswith("VmHWM:"))
+    except (OSError, StopIteration):
+        info = psutil.Process().memory_info()
+        return int(getattr(info, "peak_wset", info.rss))
+
+
 def _processor() -> str:
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as file:
@@ -40,14 +51,17 @@ def _processor() -> str:
 
 
 def gpu_name() -> str:
-    """Of the CUDA device that trains."""
+    """Return the name of the CUDA device that trains."""
     import torch
 
     return str(torch.cuda.get_device_name(0))
 
 
 def describe_machine() -> dict[str, Any]:
-    """Processor, cores, memory, load over the last 1, 5 and 15 minutes, system and the versions that timings depend on."""
+    """Return processor, cores, memory, load, system, and the versions that timings depend on.
+
+    ``load`` is the mean number of running processes over the last 1, 5 and 15 minutes.
+    """
     versions = {}
     for package in ("mor-bench", "numpy", "scipy", "numba", "scikit-learn", "torch"):
         try:

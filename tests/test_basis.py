@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.errors import InvalidInputError
-from mor_bench.hard_cases.reduction_cases import _faults
+from mor_bench.hard_cases.reduction_cases import basis_faults
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction import basis
 from mor_bench.reduction.basis import Basis, pod, pod_streamed, remembering
@@ -295,7 +295,7 @@ def test_the_inner_product_of_a_basis_does_not_change_what_its_span_answers(
         np.abs(plain.predict(forces) - weighted.predict(forces)).max()
         <= 1e-8 * np.abs(few.displacements).max()
     )
-    assert _faults(weighted, few, said=True) == []
+    assert basis_faults(weighted, few, said=True) == []
     tangent = weighted.problem_.rest_tangent
     assert np.abs(tangent - np.eye(12)).max() <= 1e-9
     # Unknowns as large as the body, in either basis.

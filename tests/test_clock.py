@@ -26,8 +26,9 @@ from mor_bench.measure.latency import (
     summary_of_timing,
     why_unstable,
 )
-from mor_bench.sandbox.fork_server import Nursery
-from mor_bench.sandbox.process import MethodFailedError, Worker
+from mor_bench.measure.method_session import FitRequest, MethodSession
+from mor_bench.sandbox.fork_server import ForkServer
+from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
 from mor_bench.snapshots.dataset import Dataset
 from tests.third_party import Slowed
 
@@ -93,7 +94,7 @@ def test_groups_fit_into_memory() -> None:
 
     half = 0.5 * virtual_memory().available
     openers = {
-        name: Opener(lambda nursery: pytest.fail("not opened"), size * half)
+        name: Opener(lambda fork_server: pytest.fail("not opened"), size * half)
         for name, size in (("a", 0.3), ("b", 0.3), ("c", 0.9), ("d", 5.0))
     }
     assert _groups(openers) == [["a", "b"], ["c"], ["d"]]
@@ -104,24 +105,19 @@ def opened(
     surrogate: str,
     parameters: dict[str, object],
     folder: Path,
-    nursery: Nursery | None,
-) -> Worker:
-    worker = Worker(tiny.scene, [], nursery=nursery)
+    fork_server: ForkServer | None,
+) -> SandboxedProcess:
+    worker = SandboxedProcess(MethodSession, fork_server=fork_server, scene=tiny.scene)
     worker.ask(
         "fit",
         60.0,
-        surrogate=surrogate,
-        parameters=parameters,
-        train=folder,
-        model=folder / "model.safetensors",
-        threads=1,
-        limit_s=60.0,
+        request=FitRequest(surrogate, parameters, folder, folder / "model.safetensors", 1, 60.0),
     )
     return worker
 
 
 def test_configurations_are_timed_in_turn_and_fail_alone(tiny: Dataset, tmp_path: Path) -> None:
-    def dead(nursery: Nursery | None) -> Worker:
+    def dead(fork_server: ForkServer | None) -> SandboxedProcess:
         raise MethodFailedError("it does not open")
 
     queries = Queries(tiny.test.forces, tiny.test.displacements, tiny.scene.output_nodes, tmp_path)

@@ -14,10 +14,11 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, SpecError
+from mor_bench.measure.method_session import MethodSession
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.configurations import CORE_METHODS, checked_specs
-from mor_bench.sandbox.fork_server import CAN_FORK, Nursery
-from mor_bench.sandbox.process import MethodFailedError, Worker
+from mor_bench.sandbox.fork_server import CAN_FORK, ForkServer
+from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
 from mor_bench.snapshots.dataset import Dataset
 from tests.third_party import Peeker
 
@@ -206,7 +207,7 @@ def test_what_a_method_prints_is_no_answer(broken: Comparison) -> None:
 def test_no_process_is_left(broken: Comparison) -> None:
     time.sleep(0.5)
     left = [process.cmdline() for process in psutil.Process().children(recursive=True)]
-    assert not [command for command in left if "mor_bench.sandbox.worker" in command]
+    assert not [command for command in left if "mor_bench.sandbox.child" in command]
 
 
 def test_a_module_beside_its_file_competes(cache: Path, tmp_path: Path) -> None:
@@ -314,9 +315,9 @@ def test_a_damaged_fit_is_made_again(cache: Path, tmp_path: Path) -> None:
     ],
 )
 def test_a_worker_says_how_it_failed(forked: bool, tiny: Dataset) -> None:
-    nursery = Nursery() if forked else None
+    server = ForkServer(MethodSession) if forked else None
     try:
-        with Worker(tiny.scene, [], nursery=nursery) as worker:
+        with SandboxedProcess(MethodSession, fork_server=server) as worker:
             with pytest.raises(SpecError, match="unknown key `n_mode`"):
                 worker.ask(
                     "check",
@@ -328,8 +329,8 @@ def test_a_worker_says_how_it_failed(forked: bool, tiny: Dataset) -> None:
             with pytest.raises(MethodFailedError, match="crashed with AttributeError"):
                 worker.ask("no such request", 60.0)
     finally:
-        if nursery:
-            nursery.close()
+        if server:
+            server.close()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKILL")
@@ -338,8 +339,8 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     import subprocess
 
     script = (
-        "from tests.third_party import *\nfrom mor_bench.sandbox.process import Worker\nfrom mor_bench.sandbox.fork_server import CAN_FORK, Nursery\n"
-        "n = Nursery() if CAN_FORK else None\nw = Worker(None, [], nursery=n)\nprint(w._watched.pid, flush=True)\ntime.sleep(60)"
+        "from tests.third_party import *\nfrom mor_bench.sandbox.process import SandboxedProcess\nfrom mor_bench.measure.method_session import MethodSession\nfrom mor_bench.sandbox.fork_server import CAN_FORK, ForkServer\n"
+        "n = ForkServer(MethodSession) if CAN_FORK else None\nw = SandboxedProcess(MethodSession, fork_server=n)\nprint(w.pid, flush=True)\ntime.sleep(60)"
     )
     parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
     assert parent.stdout

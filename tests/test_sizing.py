@@ -16,12 +16,12 @@ from safetensors.numpy import save as serialise
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, StoreError, UnsupportedSceneError
+from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.model_file import model_digest as file_digest
 from mor_bench.reduction import sizing
 from mor_bench.reduction.sizing import MODES, Score, Trials, size_to_needs, validation_folds
 from mor_bench.runs.fit_cache import Entry, Material
 from mor_bench.sandbox.handover import write_snapshots
-from mor_bench.sandbox.worker import Session
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.imported_dataset import NodalLoads
@@ -274,14 +274,14 @@ SIZED = 'title = "POD"\nsurrogate = "mor_bench.surrogates.pod:PODGalerkin"\nsour
 
 def test_the_record_of_a_fit_shows_what_was_chosen(tmp_path: Path, tiny: Dataset) -> None:
     write_snapshots(tmp_path / "train", tiny.train)
-    session = Session()
-    session.scene = tiny.scene
+    session = MethodSession(tiny.scene)
     surrogate = "mor_bench.surrogates.pod:PODGalerkin"
     shown = []
     for knobs in ({"n_modes": "auto", "tolerance": 1e-3}, {"n_modes": 3}):
-        answer = session.fit(
+        request = FitRequest(
             surrogate, knobs, tmp_path / "train", tmp_path / "model.safetensors", 1, 60.0
         )
+        answer = session.fit(request)
         assert answer["parameters"].items() >= knobs.items()
         shown.append(answer["sizes"])
     assert shown == [PODGalerkin("auto", 1e-3).fit(tiny.scene, tiny.train).sizes_, {}]

@@ -18,8 +18,12 @@ from rich.console import Console
 
 import mor_bench
 from mor_bench.errors import InvalidInputError, MissingDependencyError, SpecError
-from mor_bench.hard_cases.suite import CASES, Row, Stress, mechanics, reduction, setups, stress
-from mor_bench.hard_cases.suite import case as case_module
+from mor_bench.hard_cases import case as case_module
+from mor_bench.hard_cases import mechanics_cases as mechanics
+from mor_bench.hard_cases import reduction_cases as reduction
+from mor_bench.hard_cases import setups
+from mor_bench.hard_cases.catalogue import CASES, CaseResult
+from mor_bench.hard_cases.suite import StressResults, stress
 from mor_bench.mechanics import model as model_module
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.newton import Solution
@@ -137,7 +141,7 @@ def brief() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def everything(cache: Path) -> Stress:
+def everything(cache: Path) -> StressResults:
     return stress(cache=cache)
 
 
@@ -147,7 +151,7 @@ def test_every_hard_case_is_there() -> None:
     }
 
 
-def test_every_case_is_tried_on_every_method_that_it_concerns(everything: Stress) -> None:
+def test_every_case_is_tried_on_every_method_that_it_concerns(everything: StressResults) -> None:
     """A new method file must be added here, with what concerns it."""
     assert set(CONCERNED) == set(list_suite("methods"))
     expected = {
@@ -159,7 +163,7 @@ def test_every_case_is_tried_on_every_method_that_it_concerns(everything: Stress
     assert sorted((row.case, row.part, row.method) for row in everything.rows) == sorted(expected)
 
 
-def test_the_suite_falls_short_where_its_limits_say_so_only(everything: Stress) -> None:
+def test_the_suite_falls_short_where_its_limits_say_so_only(everything: StressResults) -> None:
     short = {
         (row.case, row.part, row.method, row.happened)
         for row in everything.rows
@@ -177,7 +181,7 @@ def test_the_suite_falls_short_where_its_limits_say_so_only(everything: Stress) 
     assert skipped == {("low-precision", "bfloat16 inference")}
 
 
-def test_errors_out_of_distribution_are_published_and_flagged(everything: Stress) -> None:
+def test_errors_out_of_distribution_are_published_and_flagged(everything: StressResults) -> None:
     for row in everything.rows:
         if row.case == "out-of-distribution" and row.verdict != "not applicable":
             measured = row.measured
@@ -193,7 +197,7 @@ def test_errors_out_of_distribution_are_published_and_flagged(everything: Stress
             assert ("flagged" in measured) == (CONCERNED[row.method] >= LEARNERS)
 
 
-def test_the_table_has_every_row_and_the_count(everything: Stress, tmp_path: Path) -> None:
+def test_the_table_has_every_row_and_the_count(everything: StressResults, tmp_path: Path) -> None:
     console = Console(width=160, record=True, file=(tmp_path / "out").open("w"))
     print_stress(everything, console)
     text = console.export_text()
@@ -213,11 +217,11 @@ def method_file(folder: Path, name: str, surrogate: str = "", parameters: str = 
     return path
 
 
-def tried(found: Stress) -> dict[tuple[str, str], Row]:
+def tried(found: StressResults) -> dict[tuple[str, str], CaseResult]:
     return {(row.case, row.part): row for row in found.rows}
 
 
-def short_of(found: Stress) -> set[tuple[str, str]]:
+def short_of(found: StressResults) -> set[tuple[str, str]]:
     return {key for key, row in tried(found).items() if row.verdict == "fall short"}
 
 
@@ -510,7 +514,7 @@ PLANTS: dict[str, tuple[str, str, str, Any, str, Any]] = {
 
 @pytest.mark.parametrize("plant", list(PLANTS))
 def test_what_goes_wrong_is_seen(
-    plant: str, everything: Stress, cache: Path, monkeypatch: pytest.MonkeyPatch
+    plant: str, everything: StressResults, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     method, name, part, where, what, wrong = PLANTS[plant]
     assert [
@@ -551,8 +555,8 @@ def test_bad_arguments_are_refused(bad: str, cache: Path) -> None:
 
 
 def test_numbers_that_are_not_finite_can_be_written(tmp_path: Path) -> None:
-    rows = [Row("zero-force", "", "m", "e", "h", "pass", {"ratio": None}, 0.1)]
-    Stress(rows, "quick", {}).write(tmp_path / "new" / "stress.json")
+    rows = [CaseResult("zero-force", "", "m", "e", "h", "pass", {"ratio": None}, 0.1)]
+    StressResults(rows, "quick", {}).write(tmp_path / "new" / "stress.json")
     assert json.loads((tmp_path / "new" / "stress.json").read_text())["rows"][0]["measured"] == {
         "ratio": None
     }

@@ -344,7 +344,7 @@ def test_of_a_sealed_cache_only_the_folder_of_the_own_checkpoint_is_open(tmp_pat
     (own / "link").symlink_to(own.parent / "score.h5")
     code = f"""
 from pathlib import Path
-from mor_bench.sandbox.worker import seal
+from mor_bench.sandbox.seal import seal
 from mor_bench.snapshots.store import write_atomically
 own = Path({str(own)!r})
 seal([{str(tmp_path / "fits")!r}], str(own))

@@ -1,0 +1,9 @@
+"""The stress suite: situations in which simulations and surrogates usually go wrong, each with the correct behaviour.
+
+Here live the cases, bodies with a known answer, and the code that tries every case on every method
+that it concerns. A case judges what it computed; it never looks at a method's name. Measuring for a
+comparison lives in `mor_bench.measure`.
+
+Start reading at `case` (what a case is), then `method_cases`. To add a case, write a function from
+a `Subject` to an `Outcome` and append it to the ``CASES`` of its file.
+"""

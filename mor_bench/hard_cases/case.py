@@ -17,7 +17,7 @@ from mor_bench.method_loading import make_surrogate
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots, load_dataset
 from mor_bench.snapshots.sampling import PatchLoads
-from mor_bench.specs import DatasetSpec, MethodSpec, load_generated_spec
+from mor_bench.specs import DatasetSpec, MethodSpec, check_parameters, load_generated_spec
 from mor_bench.surrogate import Surrogate
 
 Verdict = Literal["pass", "fall short", "not applicable"]
@@ -56,19 +56,28 @@ def judged(good: bool, happened: str, **measured: Any) -> Outcome:
 
 
 class Scenes:
-    """The datasets that methods are tried on, each read when it is first used."""
+    """The datasets that methods are tried on.
+
+    Parameters
+    ----------
+    cache : Path, optional
+        Cache folder of datasets.
+
+    Attributes
+    ----------
+    spec : DatasetSpec
+        That of beam-tiny.
+    tiny : Dataset
+        beam-tiny with its test sets.
+    """
 
     def __init__(self, cache: Path | None) -> None:
         self._cache = cache
         self.spec = load_generated_spec("beam-tiny")
-
-    @cached_property
-    def tiny(self) -> Dataset:
-        """beam-tiny with the test sets that it has."""
-        return load_dataset(
+        self.tiny = load_dataset(
             self.spec,
             tests=["in-range", "2x", "4x", "unseen-regions", "several-forces"],
-            cache=self._cache,
+            cache=cache,
         )
 
     @cached_property
@@ -101,6 +110,11 @@ class Subject:
     @property
     def data(self) -> Dataset:
         return self.scenes.tiny
+
+    def check_parameters(self) -> None:
+        """Raise `SpecError` if the method file's parameters are not valid."""
+        parameters = self._spec.parameters_of(self._profile)
+        check_parameters(self._spec.load_class(), parameters, f"method {self.name}")
 
     def fresh(self, brief: bool = False, **knobs: Any) -> Surrogate:
         """An unfitted one with the method file's parameters, a short training and some other knobs."""

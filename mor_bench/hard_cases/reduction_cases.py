@@ -57,7 +57,7 @@ def poor_snapshots(subject: Subject) -> Outcome:
                 wrong.append(f"{kind}: crashed with {type(error).__name__}: {error}")
                 continue
         said = any("rank" in str(warning.message) for warning in caught)
-        wrong += [f"{kind}: {what}" for what in _faults(method, snapshots, said)]
+        wrong += [f"{kind}: {what}" for what in basis_faults(method, snapshots, said)]
         modes = getattr(method, "modes_", None)
         kept = (
             f", {modes.shape[1]} modes kept of rank {_rank(snapshots)}"
@@ -72,7 +72,7 @@ def _rank(snapshots: Snapshots) -> int:
     return int(np.linalg.matrix_rank(snapshots.free_displacements))
 
 
-def _faults(method: Surrogate, snapshots: Snapshots, said: bool) -> list[str]:
+def basis_faults(method: Surrogate, snapshots: Snapshots, said: bool) -> list[str]:
     """What is wrong with a method that was fitted to poor snapshots; ``said`` is whether it warned of their rank."""
     faults = []
     rank = _rank(snapshots)

@@ -1,91 +1,55 @@
-"""The hard cases: what the full-order model and every method do where simulations usually go wrong."""
+"""Try the hard cases on methods, and collect the results."""
 
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
-from math import isfinite
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from mor_bench.errors import (
-    InvalidInputError,
-    MissingDependencyError,
-    MorBenchError,
-    OutOfTimeError,
-    UnsupportedSceneError,
+from mor_bench.errors import InvalidInputError, MissingDependencyError, MorBenchError
+from mor_bench.hard_cases.case import LONGEST, Scenes, Subject, Verdict
+from mor_bench.hard_cases.case_session import CaseSession
+from mor_bench.hard_cases.catalogue import CASE_NAMES, CASES, CaseResult, attempt, cases_for
+from mor_bench.machine import describe_machine
+from mor_bench.sandbox.process import (
+    Restrictions,
+    SandboxedProcess,
+    default_memory_limit_bytes,
 )
-from mor_bench.hard_cases import mechanics_cases, method_cases, reduction_cases
-from mor_bench.hard_cases.case import LONGEST, Case, Outcome, Scenes, Subject, Verdict, every
-from mor_bench.machine import describe_machine, pinned_threads
-from mor_bench.sandbox.process import Worker, default_memory_limit_bytes
 from mor_bench.snapshots.store import write_atomically
-from mor_bench.specs import MethodSpec, check_parameters, list_suite, load_method_spec
+from mor_bench.specs import MethodSpec, list_suite, load_method_spec
 from mor_bench.version import __version__
 
-CASES: tuple[Case, ...] = (*mechanics_cases.CASES, *reduction_cases.CASES, *method_cases.CASES)
-"""All of them, in the order in which they are tried."""
-
-CASE_NAMES = tuple(dict.fromkeys(case.name for case in CASES))
-
-
 CASE_S = 300.0
-"""Seconds that a third party's method may take for a case."""
+"""Time limit for a case of a third party's method, s."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """A case tried on a method.
+class StressResults:
+    """The results of the stress suite.
 
     Attributes
     ----------
-    case, part : str
-        The case, and which part of it, if it has several.
-    method : str
-    expected, happened : str
-        The correct behaviour, and what was seen.
-    verdict : {"pass", "fall short", "not applicable"}
-    measured : dict
-        The numbers behind it; one that is not finite is None.
-    seconds : float
-    """
-
-    case: str
-    part: str
-    method: str
-    expected: str
-    happened: str
-    verdict: Verdict
-    measured: dict[str, Any]
-    seconds: float
-
-
-@dataclass(frozen=True)
-class Stress:
-    """What came of the hard cases.
-
-    Attributes
-    ----------
-    rows : list of Row
+    rows : list of CaseResult
     profile : str
     machine : dict
     """
 
-    rows: list[Row]
+    rows: list[CaseResult]
     profile: str
     machine: dict[str, Any]
 
     def count(self, verdict: Verdict) -> int:
-        """How many rows ended so."""
+        """Count the rows with a verdict."""
         return sum(row.verdict == verdict for row in self.rows)
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it, as JSON can hold it."""
+        """Return all of it, as JSON can hold it."""
         return {
             "format": "mor-bench stress",
             "schema_version": 1,
@@ -98,12 +62,8 @@ class Stress:
     def write(self, path: Path) -> None:
         """Write `as_dict` as JSON."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(
-            path,
-            (
-                json.dumps(self.as_dict(), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-            ).encode(),
-        )
+        text = json.dumps(self.as_dict(), indent=1, allow_nan=False, ensure_ascii=False)
+        write_atomically(path, (text + "\n").encode())
 
 
 def stress(
@@ -114,38 +74,71 @@ def stress(
     cache: Path | None = None,
     suite: Path | None = None,
     starting: Callable[[str, str, int, int], None] = lambda *_: None,
-    finished: Callable[[Row], None] = lambda *_: None,
-) -> Stress:
-    """Try the hard cases on methods; each outcome is computed and judged, and a crash costs only its own row.
+) -> StressResults:
+    """Try the hard cases on methods. Each verdict is computed, and a crash costs only its own row.
 
-    A third party's method is tried in a process of its own, so that one that hangs or ends it costs its own rows only.
-
-    Methods are tried on beam-tiny with the parameters of their files, none swept.
+    Methods are tried on beam-tiny with the parameters of their files, none swept. A third party's
+    method runs in a process of its own, so that one that hangs or ends Python costs its own rows
+    only.
 
     Parameters
     ----------
     methods : sequence of names or paths of TOML files, optional
-        All of the suite by default.
+        By default all of the suite.
     cases : sequence of str, optional
-        Of `CASE_NAMES`; all by default.
+        Of `CASE_NAMES`; by default all.
     profile : {"quick", "full"}
-        Which parameters of the method files to use. `quick` also cuts trainings to `LONGEST` iterations.
+        Which parameters of the method files to use; ``quick`` also cuts trainings to `LONGEST`
+        iterations.
     cache, suite : Path, optional
         Cache folder of datasets; folder with ``methods/``.
     starting : callable
-        Told (case, method, number of the row, how many there are) before each row.
-    finished : callable
-        Told each row.
+        Called before each row with (case, method, number of the row, number of rows).
 
     Raises
     ------
     SpecError
         If a method or a parameter is not valid.
     InvalidInputError
-        If an argument is not one of those allowed.
+        If an argument is not one of those allowed, or no case concerns any of the methods.
     StoreError, WorkerError
         If beam-tiny cannot be generated or read.
     """
+    _check_arguments(methods, cases, profile)
+    scenes = Scenes(cache)
+    names = [case.name for case in CASES if not cases or case.name in cases]
+    specs = [
+        load_method_spec(method, suite)
+        for method in (list_suite("methods", suite) if methods is None else methods)
+    ]
+    with ExitStack() as stack:
+        trials = [
+            _Trial(Subject(spec, profile, scenes), names)
+            if spec.folder is None
+            else _SandboxedTrial(spec, profile, names, cache)
+            for spec in specs
+        ]
+        for trial in trials:
+            stack.callback(trial.end)
+        total = sum(len(trial.cases) for trial in trials)
+        if total == 0:
+            raise InvalidInputError(
+                f"none of the cases {', '.join(cases or ())} concerns "
+                f"{', '.join(spec.name for spec in specs)}."
+            )
+        rows: list[CaseResult] = []
+        for trial in trials:
+            for number, (name, part) in enumerate(trial.cases):
+                label = f"{name}: {part}" if part else name
+                starting(label, trial.name, len(rows) + 1, total)
+                rows.append(trial.result(number))
+            trial.end()
+    return StressResults(rows, profile, describe_machine())
+
+
+def _check_arguments(
+    methods: Sequence[str | Path] | None, cases: Sequence[str] | None, profile: str
+) -> None:
     if profile not in LONGEST:
         raise InvalidInputError(f"`profile` must be {' or '.join(LONGEST)}; got {profile!r}.")
     for name in cases or ():
@@ -159,157 +152,73 @@ def stress(
         raise InvalidInputError(
             f"`methods` must be a list of names or paths, not empty; got {methods!r}."
         )
-    scenes = Scenes(cache)
-    _ = scenes.tiny  # what keeps it from being read is no method's fault
-    wanted = [case.name for case in CASES if not cases or case.name in cases]
-    specs = [
-        load_method_spec(method, suite)
-        for method in (list_suite("methods", suite) if methods is None else methods)
-    ]
-    with ExitStack() as stack:
-        tried = [
-            _Here(spec, profile, wanted, scenes)
-            if spec.folder is None
-            else _Apart(spec, profile, wanted, cache)
-            for spec in specs
-        ]
-        for trial in tried:
-            stack.callback(trial.end)
-        total = sum(len(trial.cases) for trial in tried)
-        if total == 0:
-            raise InvalidInputError(
-                f"none of the cases {', '.join(cases or ())} concerns {', '.join(spec.name for spec in specs)}."
-            )
-        rows: list[Row] = []
-        for trial in tried:
-            for number, (name, part) in enumerate(trial.cases):
-                starting(_label(name, part), trial.name, len(rows) + 1, total)
-                rows.append(trial.row(number))
-                finished(rows[-1])
-            trial.end()
-    return Stress(rows, profile, describe_machine())
 
 
-def concerning(subject: Subject, names: Sequence[str]) -> list[tuple[Case, str | None]]:
-    """The cases that concern a method, and what is missing to try it."""
-    wanted = [case for case in CASES if case.name in names]
-    try:
-        method = subject.fresh()
-    except MissingDependencyError as error:
-        return [(case, str(error)) for case in wanted if case.concerns is every]
-    return [(case, None) for case in wanted if case.concerns(method)]
-
-
-class _Here:
+class _Trial:
     """A method of the suite, tried in this process."""
 
-    def __init__(
-        self, spec: MethodSpec, profile: str, names: Sequence[str], scenes: Scenes
-    ) -> None:
-        self.name = spec.name
-        self._subject = Subject(spec, profile, scenes)
+    def __init__(self, subject: Subject, names: Sequence[str]) -> None:
+        self.name = subject.name
+        self._subject = subject
         with suppress(MissingDependencyError):
-            check_parameters(spec.load_class(), spec.parameters_of(profile), f"method {spec.name}")
-        self._concerning = concerning(self._subject, names)
-        self.cases = [(case.name, case.part) for case, _ in self._concerning]
+            subject.check_parameters()
+        self._cases = cases_for(subject, names)
+        self.cases = [(case.name, case.part) for case, _ in self._cases]
 
-    def row(self, number: int) -> Row:
-        case, missing = self._concerning[number]
-        return attempt(case, self._subject, missing)
+    def result(self, number: int) -> CaseResult:
+        case, obstacle = self._cases[number]
+        return attempt(case, self._subject, obstacle)
 
     def end(self) -> None:
         """Nothing is held."""
 
 
-class _Apart:
+class _SandboxedTrial:
     """A third party's method, tried in a process of its own, which is started again after a case that ended it."""
 
     def __init__(
         self, spec: MethodSpec, profile: str, names: Sequence[str], cache: Path | None
     ) -> None:
         self.name = spec.name
-        self._spec, self._profile, self._names, self._cache = spec, profile, list(names), cache
-        self._worker: Worker | None = None
+        self._spec, self._profile = spec, profile
+        self._choice = {"method": spec, "profile": profile, "cases": list(names), "cache": cache}
+        self._process: SandboxedProcess | None = None
         self.cases = self._start()
 
     def _start(self) -> list[tuple[str, str]]:
-        self._worker = Worker(None, [], self._spec.folder, default_memory_limit_bytes())
-        asked = {
-            "method": self._spec,
-            "profile": self._profile,
-            "cases": self._names,
-            "cache": self._cache,
-        }
-        where = f"method {self._spec.name}"
-        self._worker.ask(
+        """Start a process and return the names and parts of the cases that it will try."""
+        restrictions = Restrictions(
+            import_from=self._spec.folder, memory_bytes=default_memory_limit_bytes()
+        )
+        self._process = SandboxedProcess(CaseSession, restrictions)
+        self._process.ask(
             "check",
             CASE_S,
             surrogate=self._spec.surrogate,
             configurations=[self._spec.parameters_of(self._profile)],
-            where=where,
+            where=f"method {self.name}",
         )
-        return [(name, part) for name, part in self._worker.ask("stress", CASE_S, **asked)["cases"]]
+        chosen = self._process.ask("choose_cases", CASE_S, **self._choice)["cases"]
+        return [(name, part) for name, part in chosen]
 
-    def row(self, number: int) -> Row:
+    def result(self, number: int) -> CaseResult:
         begun = perf_counter()
-        name, part = self.cases[number]
-        case = next(case for case in CASES if (case.name, case.part) == (name, part))
         try:
-            if self._worker is None:
+            if self._process is None:
                 self._start()
-            assert self._worker is not None
-            return Row(**self._worker.ask("stress_case", CASE_S, number=number)["row"])
+            assert self._process is not None
+            return CaseResult(**self._process.ask("attempt", CASE_S, number=number)["result"])
         except MorBenchError as error:
             self.end()
-            return Row(
-                name,
-                part,
-                self.name,
-                case.expected,
-                str(error),
-                "fall short",
-                {},
-                perf_counter() - begun,
+            name, part = self.cases[number]
+            case = next(case for case in CASES if (case.name, case.part) == (name, part))
+            seconds = perf_counter() - begun
+            return CaseResult(
+                name, part, self.name, case.expected, str(error), "fall short", {}, seconds
             )
 
     def end(self) -> None:
         """End the process."""
-        if self._worker:
-            self._worker.end()
-            self._worker = None
-
-
-def _label(name: str, part: str) -> str:
-    return f"{name}: {part}" if part else name
-
-
-def attempt(case: Case, subject: Subject, missing: str | None) -> Row:
-    """Try a case on a method, which ``missing`` may say that cannot be had."""
-    begun = perf_counter()
-    # One thread: on scenes as small as these the fastest, and answers do not depend on the number of cores.
-    with warnings.catch_warnings(), pinned_threads(1):
-        warnings.simplefilter("ignore")
-        try:
-            reason = missing or subject.fresh().supports(subject.data.scene)
-            outcome = Outcome("not applicable", reason) if reason else case.examine(subject)
-        except (MissingDependencyError, UnsupportedSceneError, OutOfTimeError) as error:
-            outcome = Outcome("not applicable", str(error))
-        except (Exception, SystemExit) as error:  # third parties' code runs here
-            outcome = Outcome("fall short", f"crashed with {type(error).__name__}: {error}")
-    measured = {name: _for_json(value) for name, value in outcome.measured.items()}
-    return Row(
-        case.name,
-        case.part,
-        subject.name,
-        case.expected,
-        outcome.happened,
-        outcome.verdict,
-        measured,
-        perf_counter() - begun,
-    )
-
-
-def _for_json(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_for_json(item) for item in value]
-    return None if isinstance(value, float) and not isfinite(value) else value
+        if self._process:
+            self._process.end()
+            self._process = None

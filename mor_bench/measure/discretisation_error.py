@@ -1,7 +1,8 @@
 """The discretisation error of a scene's own mesh, from a few of its loads solved on uniformly refined meshes.
 
-Every mesh is given the same forces at the same points of the surface, so that resultant and moment are the same on all.
-The limit of vanishing cell size is Richardson's from the last three meshes where the order that they show is sane.
+Every mesh is given the same forces at the same points of the surface, so that resultant and moment
+are the same on all. The limit of vanishing cell size is Richardson's from the last three meshes
+where the order that they show is sane.
 """
 
 from __future__ import annotations
@@ -66,7 +67,8 @@ def limit_of(
     Returns
     -------
     limit : (n_nodes, 3) float64
-        Richardson's, or the last of the list if there are less than three or their order is not in `SANE_ORDERS`.
+        Richardson's, or the last of the list if there are less than three or their order is not in
+        `SANE_ORDERS`.
     order : float or None
         That the last three show.
     kind : {"extrapolated", "finest"}
@@ -161,10 +163,11 @@ def refine(
     Returns
     -------
     dict
-        `error_m` and `relative_l2`: mean over the loads of e (mean absolute error per dof at the scene's nodes, m) and of
-        relative l2, against the limit; `relative_l2_median`; `loads`: each with `sample`, `patch`, `vector_n`, `error_m`,
-        `relative_l2`, `order` and `limit` (`extrapolated`, `finest`, or `none` with a `reason` if a mesh has no
-        equilibrium; such a load counts in no mean); `meshes` and `left_out`: cells and dofs; `digest`, `version`,
+        `error_m` and `relative_l2`: mean over the loads of e (mean absolute error per dof at the
+        scene's nodes, m) and of relative l2, against the limit; `relative_l2_median`; `loads`: each
+        with `sample`, `patch`, `vector_n`, `error_m`, `relative_l2`, `order` and `limit`
+        (`extrapolated`, `finest`, or `none` with a `reason` if a mesh has no equilibrium; such a
+        load counts in no mean); `meshes` and `left_out`: cells and dofs; `digest`, `version`,
         `command`.
 
     Raises
@@ -274,7 +277,8 @@ def measured(
 ) -> dict[str, Any] | None:
     """The record of `refine` for a dataset: the one in the cache, else one shipped as ``datasets/*.refine.json``, else None.
 
-    Records are told apart by the digest of the dataset's physics: of a dataset that was changed there is none.
+    Records are told apart by the digest of the dataset's physics: of a dataset that was changed
+    there is none.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Errors of predictions against the reference, per sample, and their summary.
 
-A sample without a prediction (the method failed on it) has an infinite error: it counts as not reaching any target and
-is never dropped.
+A sample without a prediction (the method failed on it) has an infinite error: it counts as not
+reaching any target and is never dropped.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def sample_errors(
 ) -> SampleErrors:
     """Errors of predictions (n, n_nodes, 3) against references of the same shape, both in m.
 
-    NaN in a prediction means that there is none, and gives infinite errors. Where only some nodes are wanted, the others
-    do not count.
+    NaN in a prediction means that there is none, and gives infinite errors. Where only some nodes
+    are wanted, the others do not count.
     """
     if nodes is not None and len(nodes) < reference.shape[1]:
         predicted, reference = predicted[:, nodes], reference[:, nodes]
@@ -63,8 +63,9 @@ def sample_errors(
 def summary(errors: SampleErrors) -> dict[str, float]:
     """The figures of a results row.
 
-    `mean_dof_m` is the paper's ē, `std_dof_m` its σ(e) with M - 1, and `slope` that of the least-squares line through
-    the origin of e against the sample's largest displacement, as in the paper's figures.
+    `mean_dof_m` is the paper's ē, `std_dof_m` its σ(e) with M - 1, and `slope` that of the
+    least-squares line through the origin of e against the sample's largest displacement, as in the
+    paper's figures.
     """
     e, relative = errors.mean_dof_m, errors.relative_l2
     with np.errstate(invalid="ignore"):

@@ -1,8 +1,8 @@
 """Latency of fitted methods: fresh processes, interleaved rounds, every raw sample kept, unstable timings told.
 
-All configurations of a dataset are alive at once, each in a process of its own, and answer in turn: whatever slows the
-machine for a while slows all of them. That is done again in other fresh processes, since where a process's memory
-happens to lie makes its every query faster or slower.
+All configurations of a dataset are alive at once, each in a process of its own, and answer in turn:
+whatever slows the machine for a while slows all of them. That is done again in other fresh
+processes, since where a process's memory happens to lie makes its every query faster or slower.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 from mor_bench.errors import MorBenchError
 from mor_bench.machine import pinned_threads
 from mor_bench.measure.error_metrics import sample_errors
-from mor_bench.sandbox.fork_server import CAN_FORK, Nursery
-from mor_bench.sandbox.process import MethodFailedError, Worker
+from mor_bench.measure.method_session import MethodSession
+from mor_bench.sandbox.fork_server import CAN_FORK, ForkServer
+from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
 
 BATCHES = (8, 64, 512)
 
@@ -178,12 +179,12 @@ class Opener:
     Attributes
     ----------
     open : callable
-        Starts the process, forked from a nursery if there is one, and loads the model.
+        Starts the process, forked from a fork_server if there is one, and loads the model.
     memory_bytes : float
         What the process is expected to take.
     """
 
-    open: Callable[[Nursery | None], Worker]
+    open: Callable[[ForkServer | None], SandboxedProcess]
     memory_bytes: float
 
 
@@ -245,10 +246,12 @@ def measure(
     for process in range(protocol.processes if openers else 0):
         for group in groups:
             with ExitStack() as stack:
-                nursery = stack.enter_context(closing(Nursery())) if CAN_FORK else None
+                fork_server = (
+                    stack.enter_context(closing(ForkServer(MethodSession))) if CAN_FORK else None
+                )
                 workers = _open_all(
                     stack,
-                    nursery,
+                    fork_server,
                     {label: openers[label] for label in group},
                     queries,
                     threads,
@@ -299,19 +302,19 @@ def _groups(openers: Mapping[str, Opener]) -> list[list[str]]:
 
 def _open_all(
     stack: ExitStack,
-    nursery: Nursery | None,
+    fork_server: ForkServer | None,
     openers: Mapping[str, Opener],
     queries: Queries,
     threads: int,
     seed: int,
     timings: Mapping[str, Timing],
-) -> dict[str, Worker]:
+) -> dict[str, SandboxedProcess]:
     """Processes with a loaded and warm method each; what fails on the way says so in its timing."""
 
-    def start(label: str) -> Worker | None:
+    def start(label: str) -> SandboxedProcess | None:
         worker = None
         try:
-            worker = openers[label].open(nursery)
+            worker = openers[label].open(fork_server)
             found = worker.ask(
                 "warm", ANSWER_LIMIT_S, forces=queries.forces, threads=threads, seed=seed
             )
@@ -331,7 +334,7 @@ def _open_all(
 
 
 def _attempt(
-    timing: Timing, measurement: Callable[..., None], worker: Worker, *arguments: Any
+    timing: Timing, measurement: Callable[..., None], worker: SandboxedProcess, *arguments: Any
 ) -> None:
     if timing.failed:
         return
@@ -341,7 +344,9 @@ def _attempt(
         timing.failed = f"while timed: {error}"
 
 
-def _ask(timing: Timing, worker: Worker, queries: Queries, n: int, threads: int) -> dict[str, Any]:
+def _ask(
+    timing: Timing, worker: SandboxedProcess, queries: Queries, n: int, threads: int
+) -> dict[str, Any]:
     """A turn of single queries; errors of the answers that were kept are noted."""
     with TemporaryDirectory(dir=queries.scratch) as folder:
         out = Path(folder) / "answers.npy"
@@ -362,7 +367,7 @@ def _ask(timing: Timing, worker: Worker, queries: Queries, n: int, threads: int)
 
 def _turn(
     timing: Timing,
-    worker: Worker,
+    worker: SandboxedProcess,
     queries: Queries,
     n: int,
     threads: int,
@@ -381,7 +386,9 @@ def _turn(
     timing.used.append((wall, found["cpu_s"] / found["wall_s"] * wall, others))
 
 
-def _on_all_cores(timing: Timing, worker: Worker, queries: Queries, n: int, batches: bool) -> None:
+def _on_all_cores(
+    timing: Timing, worker: SandboxedProcess, queries: Queries, n: int, batches: bool
+) -> None:
     cores = cpu_count() or 1
     timing.all_threads_ms += _ask(timing, worker, queries, n, cores)["latency_ms"]
     if batches:

@@ -25,7 +25,8 @@ class Flags:
     in_range : str
         The test set that it was measured on.
     usual_rel_l2 : float
-        95th percentile of the relative l2 there; infinite if more than one in twenty has no prediction.
+        95th percentile of the relative l2 there; infinite if more than one in twenty has no
+        prediction.
     n, n_flagged : int
         Loads there, and those that are flagged all the same: false alarms.
     """

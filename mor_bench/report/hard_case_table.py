@@ -9,18 +9,19 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from mor_bench.hard_cases.suite import CASES, Row, Stress
+from mor_bench.hard_cases.catalogue import CASES, CaseResult
+from mor_bench.hard_cases.suite import StressResults
 
 STYLES = {"pass": "green", "fall short": "bold red", "not applicable": "dim"}
 
 
-def ordered(found: Stress) -> list[Row]:
+def ordered(found: StressResults) -> list[CaseResult]:
     """The rows by case, and within one in the order in which methods were tried."""
     places = {(case.name, case.part): number for number, case in enumerate(CASES)}
     return sorted(found.rows, key=lambda row: places[row.case, row.part])
 
 
-def print_stress(found: Stress, console: Console) -> None:
+def print_stress(found: StressResults, console: Console) -> None:
     """Print all rows, then those that fell short once more by name, and the counts."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     longest = max((len(row.method) for row in found.rows), default=0)

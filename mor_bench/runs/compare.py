@@ -16,10 +16,11 @@ import psutil
 from mor_bench.analysis.analyse import analyse
 from mor_bench.errors import InvalidInputError, MissingDependencyError
 from mor_bench.machine import describe_machine, gpu_name
+from mor_bench.measure.method_session import MethodSession
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.configurations import BUDGETS, checked_specs, jobs_of
 from mor_bench.runs.dataset_run import SEEDS, DatasetRun, Listener, Settings, StopRunError
-from mor_bench.sandbox.fork_server import CAN_FORK, Nursery
+from mor_bench.sandbox.fork_server import CAN_FORK, ForkServer
 from mor_bench.sandbox.process import default_memory_limit_bytes
 from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import default_cache
@@ -162,12 +163,24 @@ def run(
     jobs_of_all = jobs_of(method_specs, profile, training)
     with ExitStack() as stack:
         stack.enter_context(_alone(comparison.out))
-        nursery = stack.enter_context(closing(Nursery(yielding=True))) if CAN_FORK else None
+        fork_server = (
+            stack.enter_context(closing(ForkServer(MethodSession, passive_wait=True)))
+            if CAN_FORK
+            else None
+        )
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mor-bench-")))
         stack.enter_context(suppress(StopRunError))
         for number, spec in enumerate(specs):
             DatasetRun(
-                spec, jobs_of_all, comparison, settings, scratch, nursery, suite, number, len(specs)
+                spec,
+                jobs_of_all,
+                comparison,
+                settings,
+                scratch,
+                fork_server,
+                suite,
+                number,
+                len(specs),
             ).go()
     comparison.finish(analyse(comparison))
     return comparison

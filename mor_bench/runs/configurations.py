@@ -10,13 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from mor_bench.errors import InvalidInputError, MissingDependencyError
+from mor_bench.measure.method_session import MethodSession
 from mor_bench.mechanics.model import check_supports
 from mor_bench.results.row import label_of
 from mor_bench.runs.fit_cache import Job
 from mor_bench.sandbox.process import (
     START_LIMIT_S,
     MethodFailedError,
-    Worker,
+    Restrictions,
+    SandboxedProcess,
     default_memory_limit_bytes,
 )
 from mor_bench.scene.scene import load_scene
@@ -155,10 +157,14 @@ def _check_method(spec: MethodSpec, cache: Path, memory_limit_bytes: float | Non
         with suppress(MissingDependencyError):  # that becomes a row with its reason
             check_method(spec)
         return
-    limit = memory_limit_bytes or default_memory_limit_bytes()
+    restrictions = Restrictions(
+        sealed=tuple(sealed_folders(cache)),
+        import_from=spec.folder,
+        memory_bytes=memory_limit_bytes or default_memory_limit_bytes(),
+    )
     with (
         suppress(MethodFailedError, MissingDependencyError),
-        Worker(None, sealed_folders(cache), spec.folder, limit) as worker,
+        SandboxedProcess(MethodSession, restrictions) as worker,
     ):
         for profile in ("quick", "full"):
             where = f"method {spec.name} ({profile})"

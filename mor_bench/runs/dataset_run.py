@@ -38,6 +38,7 @@ from mor_bench.measure.latency import (
     probe_s,
     summary_of_timing,
 )
+from mor_bench.measure.method_session import CURVES
 from mor_bench.measure.range_flags import flags_of
 from mor_bench.reduction.basis import pod
 from mor_bench.results.comparison import Comparison
@@ -56,10 +57,9 @@ from mor_bench.runs.fit_cache import (
     fit_elsewhere,
     score,
 )
-from mor_bench.sandbox.fork_server import Nursery
+from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.handover import arrays_of
 from mor_bench.sandbox.process import MethodFailedError
-from mor_bench.sandbox.worker import CURVES
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.executors import Pool, cluster_pool
 from mor_bench.snapshots.fresh import fresh_test_set
@@ -154,7 +154,7 @@ class DatasetRun:
         comparison: Comparison,
         settings: Settings,
         scratch: Path,
-        nursery: Nursery | None,
+        fork_server: ForkServer | None,
         suite: Path | None,
         number: int,
         n: int,
@@ -163,7 +163,7 @@ class DatasetRun:
         self.first, self.total = number * len(jobs), n * len(jobs)
         self.folder = scratch / f"{number}"
         self.discretisation = _discretisation(spec, settings.cache, suite)
-        self.nursery = nursery
+        self.fork_server = fork_server
         self.spent: dict[str, float] = {}
         self.lock = Lock()
 
@@ -218,7 +218,7 @@ class DatasetRun:
             settings.jobs,
             settings.threads,
             settings.memory_limit_bytes,
-            self.nursery,
+            self.fork_server,
         )
 
     def _fit_all(self) -> dict[str, Entry]:
@@ -585,7 +585,7 @@ def place_of(
     jobs: int,
     threads: int,
     memory_limit_bytes: float,
-    nursery: Nursery | None = None,
+    fork_server: ForkServer | None = None,
 ) -> Place:
     """Where methods run, and what they must not open."""
     machine = describe_machine()
@@ -597,7 +597,7 @@ def place_of(
         max(1, cores // jobs),
         threads,
         memory_limit_bytes,
-        nursery,
+        fork_server,
     )
 
 

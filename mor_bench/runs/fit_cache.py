@@ -32,12 +32,13 @@ from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, S
 from mor_bench.machine import gpu_name
 from mor_bench.measure.error_metrics import SampleErrors, sample_errors
 from mor_bench.measure.indicator_quality import Indicated
+from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.mechanics.indicator import ErrorIndicator
 from mor_bench.results.arrays import read_arrays, write_arrays
 from mor_bench.runs.code_digest import code_digest
-from mor_bench.sandbox.fork_server import Nursery
+from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.handover import arrays_of, write_snapshots
-from mor_bench.sandbox.process import MethodFailedError, Worker
+from mor_bench.sandbox.process import MethodFailedError, Restrictions, SandboxedProcess
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.store import remove_leftovers, write_atomically
@@ -101,7 +102,7 @@ class Place:
     fit_threads, threads : int
         Of a fit, and of a prediction.
     memory_limit_bytes : float
-    nursery : Nursery or None
+    fork_server : ForkServer or None
         What processes for fits are forked from.
     """
 
@@ -111,7 +112,7 @@ class Place:
     fit_threads: int
     threads: int
     memory_limit_bytes: float
-    nursery: Nursery | None
+    fork_server: ForkServer | None
 
 
 @dataclass(frozen=True)
@@ -252,7 +253,7 @@ class Entry:
 
     def __init__(self, job: Job, material: Material, place: Place) -> None:
         self.job, self.material, self.place = job, material, place
-        self._held: Worker | None = None
+        self._held: SandboxedProcess | None = None
         self.taken_s = 0.0
         parts = {
             "data": material.train_digest,
@@ -361,20 +362,21 @@ class Entry:
             self.folder / f"{name}.h5", {**arrays, "digest": np.array(digest_of(arrays).encode())}
         )
 
-    def process(self, nursery: Nursery | None = None, open_one: Path | None = None) -> Worker:
+    def process(
+        self, fork_server: ForkServer | None = None, exempt: Path | None = None
+    ) -> SandboxedProcess:
         """A fresh process for this method, without a model."""
-        sealed, own = list(self.place.sealed), self.job.method.folder
-        return Worker(
-            self.material.scene,
-            sealed,
-            own,
-            self.place.memory_limit_bytes,
-            nursery or self.place.nursery,
-            open_one,
+        return SandboxedProcess(
+            MethodSession,
+            Restrictions(
+                self.place.sealed, exempt, self.job.method.folder, self.place.memory_limit_bytes
+            ),
+            fork_server or self.place.fork_server,
+            scene=self.material.scene,
         )
 
     def ask_fit(
-        self, worker: Worker, limit_s: float, checkpoint: Path | None = None
+        self, worker: SandboxedProcess, limit_s: float, checkpoint: Path | None = None
     ) -> tuple[dict[str, Any], Path]:
         """Let a process fit, anew or going on from a checkpoint; its answer, and where the model is."""
         model = Path(tempfile.mkdtemp(dir=self.material.scratch)) / "model.safetensors"
@@ -382,24 +384,28 @@ class Entry:
         answer = worker.ask(
             "fit",
             limit_s,
-            surrogate=job.method.surrogate,
-            parameters=job.parameters,
-            train=self.material.train_folder,
-            model=model,
-            threads=self.place.fit_threads,
-            limit_s=limit_s,
-            training=None if job.training is None else replace(job.training, checkpoint=checkpoint),
+            request=FitRequest(
+                surrogate=job.method.surrogate,
+                parameters=job.parameters,
+                train=self.material.train_folder,
+                model=model,
+                threads=self.place.fit_threads,
+                limit_s=limit_s,
+                training=job.training and replace(job.training, checkpoint=checkpoint),
+            ),
         )
         if answer["needs_snapshots"]:
             self.material.check_unchanged()
         return answer, model
 
-    def opened(self, limit_s: float = LOAD_LIMIT_S, nursery: Nursery | None = None) -> Worker:
+    def opened(
+        self, limit_s: float = LOAD_LIMIT_S, fork_server: ForkServer | None = None
+    ) -> SandboxedProcess:
         """A process with the fitted method: a fresh one with the model, or one that fits again where it cannot be saved."""
-        if self._held and nursery is None:
+        if self._held and fork_server is None:
             worker, self._held = self._held, None
             return worker
-        worker = self.process(nursery)
+        worker = self.process(fork_server)
         try:
             if self.fit and self.fit["model_sha256"] is not None:
                 worker.ask(
@@ -412,7 +418,7 @@ class Entry:
             raise
         return worker
 
-    def hold(self, worker: Worker) -> None:
+    def hold(self, worker: SandboxedProcess) -> None:
         """Keep the process of a method that cannot be saved until it has been scored."""
         self._held = worker
 
@@ -489,12 +495,12 @@ def fit(entry: Entry, limit_s: float, remote: RemoteFit | None = None) -> dict[s
     return record
 
 
-def _fitting_process(entry: Entry) -> Worker:
+def _fitting_process(entry: Entry) -> SandboxedProcess:
     """A process for a fit; one that may train can open the folder of its checkpoint."""
     if entry.job.training is None:
         return entry.process()
     entry.begin_training()
-    return entry.process(open_one=entry.checkpoint.parent)
+    return entry.process(exempt=entry.checkpoint.parent)
 
 
 def _left(limit_s: float, taken_s: float) -> float:
@@ -524,9 +530,9 @@ def score(entry: Entry, limit_s: float, *, count: bool = True) -> Outcome:
     assert entry.fit is not None
     with ExitStack() as stack:
         stack.callback(entry.release)
-        worker: Worker | None = None
+        worker: SandboxedProcess | None = None
 
-        def opened() -> Worker:
+        def opened() -> SandboxedProcess:
             nonlocal worker
             if worker is None:
                 worker = entry.opened(limit_s)
@@ -568,7 +574,9 @@ def _keep_remote(entry: Entry, answer: dict[str, Any], content: bytes | None) ->
         return entry.keep_fit(_record(entry, answer), model)
 
 
-def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[str, NDArray[Any]]:
+def _score(
+    entry: Entry, worker: SandboxedProcess, test: TestSet, limit_s: float
+) -> dict[str, NDArray[Any]]:
     """Errors of each sample of a test set, and the worst sample."""
     parts: list[SampleErrors] = []
     flagged: list[bool] | None = []
@@ -616,7 +624,12 @@ def _score(entry: Entry, worker: Worker, test: TestSet, limit_s: float) -> dict[
 
 
 def ask_answers(
-    worker: Worker, do: str, limit_s: float, out: Path, forces: NDArray[np.float64], threads: int
+    worker: SandboxedProcess,
+    do: str,
+    limit_s: float,
+    out: Path,
+    forces: NDArray[np.float64],
+    threads: int,
 ) -> NDArray[np.float64]:
     """Predictions that a process writes to a file, checked: a third party's code ran there."""
     worker.ask(do, limit_s, forces=forces, out=out, threads=threads)
@@ -632,7 +645,7 @@ def ask_answers(
     return np.asarray(predicted)
 
 
-def _cost(entry: Entry, opened: Callable[[], Worker]) -> dict[str, float] | None:
+def _cost(entry: Entry, opened: Callable[[], SandboxedProcess]) -> dict[str, float] | None:
     """Cost of a query, counted once and kept with the fit."""
     test = entry.material.sets["test"]
     path = entry.folder / f"cost-{test.digest[:20]}.json"
@@ -678,17 +691,17 @@ def fit_elsewhere(
         (folder / "train").mkdir()
         for key, array in arrays.items():
             np.save(folder / "train" / f"{key}.npy", array, allow_pickle=False)
-        with Worker(scene, [], memory_limit_bytes=limits[1]) as worker:
-            model = folder / "model.safetensors"
-            answer = worker.ask(
-                "fit",
-                limits[0],
-                surrogate=surrogate,
-                parameters=parameters,
-                train=folder / "train",
-                model=model,
-                threads=os.cpu_count() or 1,
-                limit_s=limits[0],
-                training=training,
-            )
+        model = folder / "model.safetensors"
+        request = FitRequest(
+            surrogate,
+            parameters,
+            folder / "train",
+            model,
+            os.cpu_count() or 1,
+            limits[0],
+            training,
+        )
+        restrictions = Restrictions(memory_bytes=limits[1])
+        with SandboxedProcess(MethodSession, restrictions, scene=scene) as process:
+            answer = process.ask("fit", limits[0], request=request)
         return answer, model.read_bytes() if model.exists() else None

@@ -17,12 +17,12 @@ import numpy as np
 from mor_bench.errors import InvalidInputError
 from mor_bench.machine import pinned_threads
 from mor_bench.measure.error_metrics import sample_errors, summary
+from mor_bench.measure.predictions import predict_all
 from mor_bench.method_loading import make_surrogate
 from mor_bench.model_file import weights_to_start_from
 from mor_bench.runs.compare import training_options
 from mor_bench.runs.dataset_run import Listener
 from mor_bench.runs.fit_cache import SCORE_CHUNK
-from mor_bench.sandbox.handover import predict_all
 from mor_bench.snapshots.dataset import Snapshots, load_dataset
 from mor_bench.snapshots.store import remove_leftovers
 from mor_bench.specs import SplitBy, check_parameters, load_dataset_spec, load_method_spec

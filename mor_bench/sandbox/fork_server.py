@@ -1,7 +1,8 @@
-"""Fresh processes in milliseconds: a server imports what all methods need, once, and forks a worker whenever it is asked.
+"""Fresh processes in milliseconds: a server imports what a session needs once, then forks a process per request.
 
-Importing takes a second, which a comparison of thirty configurations would pay a hundred times. Two servers share
-nothing: for each replicate of a timing there is a new one. Linux only; elsewhere every worker is a new interpreter.
+Importing takes a second, which a comparison of thirty configurations would pay a hundred times.
+Each replicate of a timing gets a server of its own, so that replicates share nothing. Linux only;
+elsewhere each process is a new interpreter.
 """
 
 from __future__ import annotations
@@ -15,70 +16,85 @@ import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from importlib import import_module
 from pathlib import Path
 from threading import Condition, Lock, Thread
 from time import monotonic, sleep
 from typing import Any, BinaryIO
 
 from mor_bench import errors
+from mor_bench.sandbox.session import Session
 
 CAN_FORK = sys.platform == "linux"
 
 START_S = 120.0
+"""Time limit for the server to start, s."""
+
+CHILD_MODULE = "mor_bench.sandbox.child"
 
 
 def environment() -> dict[str, str]:
-    """The parent's, with its own package first: ``-m`` must find the same one."""
+    """Return the parent's environment with its own package first, so that ``-m`` finds the same one."""
     package = str(Path(errors.__file__).parents[1])
     paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}
 
 
-class Nursery:
-    """The parent's side of a server. Started at once; ready when it is first needed.
+class ForkServer:
+    """The parent's side of a fork server. Its process starts at once and is ready when first needed.
 
     Parameters
     ----------
-    yielding : bool
-        Let OpenMP's threads sleep while they wait for each other. On a machine that does other things too a training is
-        two to three times faster so; single queries on several threads are slower.
+    session : type of Session
+        Its `preload` runs in the server before the first fork.
+    passive_wait : bool
+        Let OpenMP's threads sleep while they wait for each other. Trainings are then two to three
+        times faster on a machine with other load; single queries on several threads are slower.
     """
 
-    def __init__(self, yielding: bool = False) -> None:
+    def __init__(self, session: type[Session], passive_wait: bool = False) -> None:
+        self._session = session
         self._folder = tempfile.TemporaryDirectory(prefix="mor-bench-")
         self._path = os.path.join(self._folder.name, "s")
-        self._ended: dict[int, int] = {}
-        self._news = Condition()
-        self._lock = Lock()
-        self._environment = {
-            **({"OMP_WAIT_POLICY": "passive"} if yielding else {}),
-            **environment(),
-        }
+        self._exit_codes: dict[int, int] = {}
+        self._child_ended = Condition()
+        self._restarting = Lock()
+        wait = {"OMP_WAIT_POLICY": "passive"} if passive_wait else {}
+        self._environment = {**wait, **environment()}
         self._start()
 
     def _start(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "mor_bench.sandbox.worker", self._path],
+            [sys.executable, "-m", CHILD_MODULE, self._path, self._session.path()],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=self._environment,
             start_new_session=True,
         )
-        Thread(target=self._listen, args=(self._process.stdout,), daemon=True).start()
+        Thread(target=self._record_exits, args=(self._process.stdout,), daemon=True).start()
 
-    def _listen(self, news: BinaryIO) -> None:
-        """Take down how workers ended."""
-        for line in news:
+    def _record_exits(self, reports: BinaryIO) -> None:
+        for line in reports:
             pid, status = map(int, line.split())
-            with self._news:
-                self._ended[pid] = os.waitstatus_to_exitcode(status)
-                self._news.notify_all()
+            with self._child_ended:
+                self._exit_codes[pid] = os.waitstatus_to_exitcode(status)
+                self._child_ended.notify_all()
 
-    def new_worker(self, said: str) -> tuple[socket.socket, int]:
-        """A connection to a new worker, and its process id; its standard error goes to a file."""
-        with self._lock:
-            if self._process.poll() is not None:  # a method has ended it
+    def fork(self, stderr_path: str) -> tuple[socket.socket, int]:
+        """Fork a process whose standard error goes to a file.
+
+        Returns
+        -------
+        connection : socket
+            For requests and answers.
+        pid : int
+
+        Raises
+        ------
+        MorBenchError
+            If the server does not start, or dies.
+        """
+        with self._restarting:
+            if self._process.poll() is not None:  # foreign code has ended it
                 Path(self._path).unlink(missing_ok=True)
                 self._start()
         until = monotonic() + START_S
@@ -93,17 +109,22 @@ class Nursery:
                         "the server that methods' processes are forked from does not start."
                     ) from None
                 sleep(0.02)
-        connection.sendall(said.encode() + b"\n")
-        return connection, int.from_bytes(_exactly(connection, 8), "little")
+        connection.sendall(stderr_path.encode() + b"\n")
+        pid = connection.recv(8, socket.MSG_WAITALL)
+        if len(pid) < 8:
+            raise errors.MorBenchError(
+                "the server that methods' processes are forked from has died."
+            )
+        return connection, int.from_bytes(pid, "little")
 
     def exit_code(self, pid: int, within_s: float = 5.0) -> int:
-        """How a worker ended, as `subprocess` has it."""
-        with self._news:
-            self._news.wait_for(lambda: pid in self._ended, within_s)
-            return self._ended.get(pid, 1)
+        """Return the exit code of a forked process as `subprocess` reports it: negative for a signal."""
+        with self._child_ended:
+            self._child_ended.wait_for(lambda: pid in self._exit_codes, within_s)
+            return self._exit_codes.get(pid, 1)
 
     def close(self) -> None:
-        """End the server; its workers end with their connections."""
+        """End the server; forked processes end with their connections."""
         assert self._process.stdin
         with suppress(OSError):
             self._process.stdin.close()
@@ -111,55 +132,18 @@ class Nursery:
         self._folder.cleanup()
 
 
-def _exactly(connection: socket.socket, n: int) -> bytes:
-    received = b""
-    while len(received) < n:
-        part = connection.recv(n - len(received))
-        if not part:
-            raise errors.MorBenchError(
-                "the server that methods' processes are forked from has died."
-            )
-        received += part
-    return received
+def serve(
+    path: str,
+    preload: Callable[[], None],
+    answer_requests: Callable[[BinaryIO, BinaryIO], Any],
+) -> None:
+    """Preload, then fork a process for every connection to a socket, until standard input closes.
 
-
-PRELOADED = (
-    "sklearn.linear_model",
-    "mor_bench.measure.query_cost",
-    "mor_bench.sandbox.handover",
-    "mor_bench.machine",
-    "mor_bench.surrogates.fem",
-    "mor_bench.surrogates.deim",
-    "mor_bench.surrogates.ecm",
-    "mor_bench.surrogates.hpod",
-    "mor_bench.surrogates.pca_regression",
-    "mor_bench.surrogates.pod",
-)
-"""What methods import: no fit's time holds an import. PyTorch is not among it, since few need it and it takes two seconds."""
-
-
-def _preload() -> None:
-    """Import what methods import, and load the compiled kernels by solving once."""
-    import numpy as np
-
-    for module in PRELOADED:
-        import_module(module)
-    from mor_bench.machine import pinned_threads
-    from mor_bench.scene.scene import load_scene
-    from mor_bench.surrogates.fem import FullFEM
-
-    with pinned_threads(1):
-        scene = load_scene("beam-tiny")
-        force = np.zeros((scene.mesh.n_nodes, 3))
-        force[-1] = 0.1
-        FullFEM().fit(scene).predict(force)
-
-
-def serve(path: str, work: Callable[[BinaryIO, BinaryIO], Any]) -> None:
-    """Fork a worker for every connection, tell on standard output how each ended, and end with standard input."""
+    Standard output carries a line ``pid status`` for each forked process that has ended.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _preload()
-    news = os.dup(1)
+    preload()
+    reports = os.dup(1)
     woken, wake = os.pipe()
     os.set_blocking(wake, False)
     signal.signal(signal.SIGCHLD, lambda *_: None)
@@ -171,28 +155,27 @@ def serve(path: str, work: Callable[[BinaryIO, BinaryIO], Any]) -> None:
         ready = select.select([listener.fileno(), 0, woken], [], [])[0]
         if woken in ready:
             os.read(woken, 4096)
-            _tell_ended(news)
+            _report_ended(reports)
         if 0 in ready and not os.read(0, 1):
             os._exit(0)
         if listener.fileno() in ready:
             connection, _ = listener.accept()
-            said = b""
-            while not said.endswith(b"\n") and (part := connection.recv(4096)):
-                said += part
-            if said.endswith(b"\n") and os.fork() == 0:
-                os.setsid()  # what a method does to its process group is done to its own
+            stderr_path = b""
+            while not stderr_path.endswith(b"\n") and (part := connection.recv(4096)):
+                stderr_path += part
+            if stderr_path.endswith(b"\n") and os.fork() == 0:
+                os.setsid()  # a signal to the child's process group must not reach the server
                 signal.set_wakeup_fd(-1)
                 signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-                for descriptor in (listener.fileno(), news, woken, wake):
+                for descriptor in (listener.fileno(), reports, woken, wake):
                     os.close(descriptor)
-                errors_to = os.open(said.strip(), os.O_WRONLY)
-                os.dup2(errors_to, 2)
+                os.dup2(os.open(stderr_path.strip(), os.O_WRONLY), 2)
                 connection.sendall(os.getpid().to_bytes(8, "little"))
-                work(connection.makefile("rb"), connection.makefile("wb"))
+                answer_requests(connection.makefile("rb"), connection.makefile("wb"))
             connection.close()
 
 
-def _tell_ended(news: int) -> None:
+def _report_ended(reports: int) -> None:
     while True:
         try:
             pid, status = os.waitpid(-1, os.WNOHANG)
@@ -200,4 +183,4 @@ def _tell_ended(news: int) -> None:
             return
         if pid == 0:
             return
-        os.write(news, f"{pid} {status}\n".encode())
+        os.write(reports, f"{pid} {status}\n".encode())

@@ -1,4 +1,4 @@
-"""A method's process seen from outside: asked, watched, and ended when it takes too long or too much memory."""
+"""A sandboxed process seen from its parent: asked, watched, and ended at its limits of time and memory."""
 
 from __future__ import annotations
 
@@ -11,87 +11,116 @@ import subprocess
 import sys
 import tempfile
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Thread
 from time import monotonic
-from types import TracebackType
 from typing import Any, Self
 
 import psutil
 
 from mor_bench import errors
 from mor_bench.errors import MorBenchError
-from mor_bench.sandbox.fork_server import Nursery, environment
-from mor_bench.scene.scene import Scene
+from mor_bench.sandbox.fork_server import CHILD_MODULE, ForkServer, environment
+from mor_bench.sandbox.session import Session
 
-LOOK_EVERY_S = 0.2
-"""Between looks at a process's memory."""
+MEMORY_CHECK_S = 0.2
+"""Interval between checks of a process's memory, s."""
 
 START_LIMIT_S = 120.0
+"""Time limit for a process to start, s."""
 
 MEMORY_SHARE = 0.75
-"""Of the machine's memory, that a method may take unless another limit is given."""
+"""Default memory limit of a method, as a share of the machine's memory."""
 
 
 def default_memory_limit_bytes() -> float:
-    """What a method's process may take unless another limit is given."""
+    """Return the memory that a method may use where no limit is given."""
     return MEMORY_SHARE * float(psutil.virtual_memory().total)
 
 
 class MethodFailedError(MorBenchError):
-    """A method crashed, its process died, or it took more time or memory than it may."""
+    """A method crashed, its process died, or it exceeded its limit of time or memory."""
 
 
-class Worker:
-    """A fresh process of `mor_bench.sandbox.worker`.
+@dataclass(frozen=True)
+class Restrictions:
+    """What a sandboxed process may see and use.
+
+    Attributes
+    ----------
+    sealed : tuple of Path
+        Folders that it must not access.
+    exempt : Path, optional
+        A folder within the sealed ones that stays accessible.
+    import_from : Path, optional
+        A folder that imports search first: where a third party's module lies.
+    memory_bytes : float
+        Resident memory, of the process and its children, at which it is ended.
+    """
+
+    sealed: tuple[Path, ...] = ()
+    exempt: Path | None = None
+    import_from: Path | None = None
+    memory_bytes: float = float("inf")
+
+
+class SandboxedProcess:
+    """A fresh process that runs a session.
 
     Parameters
     ----------
-    scene : Scene or None
-    sealed : list of Path
-        Folders that the process must not look into.
-    folder : Path, optional
-        Where a third party's module lies.
-    memory_limit_bytes : float
-        Resident memory, of the process and its children, at which it is ended.
-    nursery : Nursery, optional
-        What the process is forked from; otherwise it is a new interpreter.
-    open_one : Path, optional
-        A folder within the sealed ones that stays open.
+    session : type of Session
+        What the process does.
+    restrictions : Restrictions
+    fork_server : ForkServer, optional
+        Fork the process from it; by default the process is a new interpreter.
+    **arguments
+        Keyword arguments of the session.
+
+    Raises
+    ------
+    MethodFailedError
+        If the process does not start.
     """
 
     def __init__(
         self,
-        scene: Scene | None,
-        sealed: list[Path],
-        folder: Path | None = None,
-        memory_limit_bytes: float = float("inf"),
-        nursery: Nursery | None = None,
-        open_one: Path | None = None,
+        session: type[Session],
+        restrictions: Restrictions = Restrictions(),
+        fork_server: ForkServer | None = None,
+        **arguments: Any,
     ) -> None:
-        self._memory_limit = memory_limit_bytes
-        self._said = tempfile.NamedTemporaryFile()  # noqa: SIM115 - closed by `end`
-        self._process = _Forked(nursery, self._said.name) if nursery else _Started(self._said)
+        self._session, self._memory_limit = session, restrictions.memory_bytes
+        self._stderr = tempfile.NamedTemporaryFile()  # noqa: SIM115 - closed by `end`
+        self._process = (
+            _Forked(fork_server, self._stderr.name) if fork_server else _Spawned(self._stderr)
+        )
         self._watched = psutil.Process(self._process.pid)
         self._answers: SimpleQueue[bytes] = SimpleQueue()
-        Thread(target=self._listen, daemon=True).start()
-        path = [str(folder), *sys.path] if folder else list(sys.path)
+        Thread(target=self._read_answers, daemon=True).start()
+        folder = restrictions.import_from
         try:
-            within = None if open_one is None else str(open_one)
             self.ask(
-                "begin",
+                "start",
                 START_LIMIT_S,
-                path=path,
-                scene=scene,
-                sealed=[str(item) for item in sealed],
-                open_one=within,
+                session=session.path(),
+                arguments=arguments,
+                import_path=[*([str(folder)] if folder else []), *sys.path],
+                sealed=list(restrictions.sealed),
+                exempt=restrictions.exempt,
             )
         except BaseException:
             self.end()
             raise
 
-    def _listen(self) -> None:
+    @property
+    def pid(self) -> int:
+        """The process id."""
+        return self._process.pid
+
+    def _read_answers(self) -> None:
         with suppress(ValueError, OSError):
             for line in self._process.answers:
                 self._answers.put(line)
@@ -103,48 +132,30 @@ class Worker:
         Parameters
         ----------
         do : str
-            A function of `mor_bench.sandbox.worker.Session`.
+            A public method of the session.
         within_s : float
-            Seconds until the process is ended.
+            Time limit, s; the process is ended when it is exceeded.
         **request
-            The function's arguments.
+            The method's arguments.
 
         Raises
         ------
         MethodFailedError
-            If the method crashes, or its process dies or is ended.
+            If the session crashes, or its process dies or is ended.
         MorBenchError
-            Of the kind that the method raised.
+            Of the same type and text as one that the session raised.
         """
-        with suppress(OSError):  # it has died: said below
+        with suppress(OSError):  # a dead process is noticed while waiting
             pickle.dump({"do": do, **request}, self._process.requests)
             self._process.requests.flush()
-        until = monotonic() + within_s
-        while True:
-            try:
-                line = self._answers.get(timeout=max(0.0, min(LOOK_EVERY_S, until - monotonic())))
-                break
-            except Empty:
-                if monotonic() >= until:
-                    self.end()
-                    raise MethodFailedError(
-                        f"{_DOING.get(do, do)} took longer than the limit of {within_s:g} s"
-                    ) from None
-                if self._is_dead() and self._answers.empty():  # a child of it may hold the pipe
-                    line = b""
-                    break
-                if (used := self._memory()) > self._memory_limit:
-                    self.end()
-                    raise MethodFailedError(
-                        f"{_DOING.get(do, do)} took more memory than the limit: {used / 1e9:.3g} GB of {self._memory_limit / 1e9:.3g} GB"
-                    ) from None
+        line = self._wait_for_answer(do, within_s)
         if not line:
-            raise MethodFailedError(self._how_it_died())
+            raise MethodFailedError(self._cause_of_death())
         try:
             answer: dict[str, Any] = json.loads(line)
         except ValueError:
             self.end()
-            raise MethodFailedError("it wrote into the pipe of its answers") from None
+            raise MethodFailedError("the method wrote to its result pipe") from None
         if "error" not in answer:
             return answer
         kind = getattr(errors, answer["error"] or "", None)
@@ -152,23 +163,46 @@ class Worker:
             raise kind(answer["message"])
         raise MethodFailedError(answer["message"])
 
+    def _wait_for_answer(self, do: str, within_s: float) -> bytes:
+        """Return the next line of the answers, empty if the process died, and enforce the limits meanwhile."""
+        until = monotonic() + within_s
+        activity = "starting its process" if do == "start" else self._session.activities.get(do, do)
+        while True:
+            try:
+                return self._answers.get(timeout=max(0.0, min(MEMORY_CHECK_S, until - monotonic())))
+            except Empty:
+                if monotonic() >= until:
+                    self.end()
+                    raise MethodFailedError(
+                        f"{activity} took longer than the limit of {within_s:g} s"
+                    ) from None
+                # Checked here too, since a child of the process may keep the pipe open.
+                if self._is_dead() and self._answers.empty():
+                    return b""
+                if (used := self._memory_bytes()) > self._memory_limit:
+                    self.end()
+                    raise MethodFailedError(
+                        f"{activity} took more memory than the limit: "
+                        f"{used / 1e9:.3g} GB of {self._memory_limit / 1e9:.3g} GB"
+                    ) from None
+
     def _is_dead(self) -> bool:
         try:
             return bool(self._watched.status() == psutil.STATUS_ZOMBIE)
         except psutil.Error:
             return True
 
-    def _memory(self) -> int:
+    def _memory_bytes(self) -> int:
         total = 0
         with suppress(psutil.Error):
             for process in [self._watched, *self._watched.children(recursive=True)]:
                 total += process.memory_info().rss
         return total
 
-    def _how_it_died(self) -> str:
+    def _cause_of_death(self) -> str:
         code = self._process.exit_code()
-        self._said.seek(0)
-        lines = self._said.read().decode(errors="replace").strip().splitlines()
+        self._stderr.seek(0)
+        lines = self._stderr.read().decode(errors="replace").strip().splitlines()
         last = f": {lines[-1]}" if lines else ""
         if code < 0:
             return f"its process died of {signal.Signals(-code).name}{last}"
@@ -181,50 +215,29 @@ class Worker:
                 with suppress(psutil.Error):
                     process.kill()
         if hasattr(os, "killpg"):
-            with suppress(OSError):  # what it started without a session of its own
-                os.killpg(self._process.pid, signal.SIGKILL)
+            with suppress(OSError):  # orphans that stayed in its process group
+                os.killpg(self.pid, signal.SIGKILL)
         with suppress(psutil.Error):
             self._watched.kill()
         self._process.close()
-        self._said.close()
+        self._stderr.close()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.end()
 
 
-_DOING = {
-    "begin": "starting its process",
-    "check": "importing it",
-    "fit": "fitting",
-    "load": "loading the model",
-    "predict": "predicting",
-    "warm": "warming up",
-    "time": "timing",
-    "throughput": "timing batches",
-    "cost": "counting the cost",
-    "flag": "telling its range",
-    "stress": "importing it",
-    "stress_case": "the case",
-}
-
-
-class _Started:
+class _Spawned:
     """A new interpreter."""
 
-    def __init__(self, said: Any) -> None:
+    def __init__(self, stderr: Any) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "mor_bench.sandbox.worker"],
+            [sys.executable, "-m", CHILD_MODULE],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=said,
+            stderr=stderr,
             env=environment(),
             start_new_session=True,
         )
@@ -244,18 +257,16 @@ class _Started:
 
 
 class _Forked:
-    """A child of a nursery's server."""
+    """A process forked from a server."""
 
-    def __init__(self, nursery: Nursery, said: str) -> None:
-        self._nursery = nursery
-        self._connection, self.pid = nursery.new_worker(said)
-        self.requests, self.answers = (
-            self._connection.makefile("wb"),
-            self._connection.makefile("rb"),
-        )
+    def __init__(self, fork_server: ForkServer, stderr_path: str) -> None:
+        self._fork_server = fork_server
+        self._connection, self.pid = fork_server.fork(stderr_path)
+        self.requests = self._connection.makefile("wb")
+        self.answers = self._connection.makefile("rb")
 
     def exit_code(self) -> int:
-        return self._nursery.exit_code(self.pid)
+        return self._fork_server.exit_code(self.pid)
 
     def close(self) -> None:
         with suppress(OSError):

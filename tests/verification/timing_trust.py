@@ -20,9 +20,10 @@ import numpy as np
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.intervals import compare_latency, intervals_of
 from mor_bench.measure.latency import PROTOCOLS, Opener, Queries, Timing, measure, why_unstable
+from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.results.comparison import Comparison
-from mor_bench.sandbox.fork_server import Nursery
-from mor_bench.sandbox.process import Worker
+from mor_bench.sandbox.fork_server import ForkServer
+from mor_bench.sandbox.process import SandboxedProcess
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.sampling import draw_loads
 
@@ -49,18 +50,13 @@ class _Method:
     surrogate: str
     parameters: dict[str, Any]
 
-    def __call__(self, nursery: Nursery | None) -> Worker:
-        worker = Worker(self.scene, [], nursery=nursery)
+    def __call__(self, fork_server: ForkServer | None) -> SandboxedProcess:
+        worker = SandboxedProcess(MethodSession, fork_server=fork_server, scene=self.scene)
         model = self.folder / "model.safetensors"
         worker.ask(
             "fit",
             60.0,
-            surrogate=self.surrogate,
-            parameters=self.parameters,
-            train=self.folder,
-            model=model,
-            threads=1,
-            limit_s=60.0,
+            request=FitRequest(self.surrogate, self.parameters, self.folder, model, 1, 60.0),
         )
         return worker
 

@@ -1,0 +1,346 @@
+"""The session that a method runs in while it is compared: it fits or loads, predicts, and is timed.
+
+The session is given the scene, the training snapshots, and the loads to predict. The reference
+displacements stay in the parent process, which scores.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.errors import InvalidInputError, SolverError, UnknownRangeError
+from mor_bench.machine import peak_memory_bytes, pinned_threads
+from mor_bench.measure.predictions import predict_all
+from mor_bench.measure.query_cost import cost_of
+from mor_bench.method_loading import load_fitted, make_surrogate
+from mor_bench.sandbox.handover import read_snapshots
+from mor_bench.sandbox.session import Session
+from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.specs import check_parameters, load_class
+from mor_bench.surrogate import Surrogate
+from mor_bench.training_options import TrainingOptions
+
+CURVES = ("loss_curve", "validation_curve")
+"""Attributes, with an underscore behind, in which a trained method keeps its losses."""
+
+SETTLE_QUERIES = 3
+"""Untimed queries before each round, which fill the processor's caches with the method's own data."""
+
+CHECKED_ANSWERS, CHECKED_SHARE = 4, 0.2
+"""Most answers that a round keeps for a check, and the probability that a query is one of them."""
+
+UNANSWERED = object()
+"""Stands for the answer to a query for which the method finds no equilibrium."""
+
+WARM_UP_QUERIES, WARM_UP_S = 20, 2.0
+"""Most queries and, about, seconds of the warm-up."""
+
+PRELOADED = (
+    "sklearn.linear_model",
+    "mor_bench.surrogates.deim",
+    "mor_bench.surrogates.ecm",
+    "mor_bench.surrogates.hpod",
+    "mor_bench.surrogates.pca_regression",
+    "mor_bench.surrogates.pod",
+)
+"""Modules that many methods import. PyTorch is left out: it takes two seconds, and few methods need it."""
+
+
+@dataclass(frozen=True)
+class FitRequest:
+    """What a session needs to fit a method.
+
+    Attributes
+    ----------
+    surrogate : str
+        The class, ``package.module:Class``.
+    parameters : dict
+    train : Path
+        Folder of the training snapshots; see `mor_bench.sandbox.handover`.
+    model : Path
+        Where the fitted model is saved.
+    threads : int
+    limit_s : float
+        Seconds that the method may plan with.
+    training : TrainingOptions, optional
+        Of a method that may train.
+    """
+
+    surrogate: str
+    parameters: dict[str, Any]
+    train: Path
+    model: Path
+    threads: int
+    limit_s: float
+    training: TrainingOptions | None = None
+
+
+class MethodSession(Session):
+    """One configuration of a method.
+
+    Parameters
+    ----------
+    scene : Scene, optional
+        Not needed to check parameters.
+    """
+
+    activities: ClassVar[Mapping[str, str]] = {
+        "check": "importing it",
+        "fit": "fitting",
+        "load": "loading the model",
+        "predict": "predicting",
+        "warm": "warming up",
+        "time": "timing",
+        "throughput": "timing batches",
+        "cost": "counting the cost",
+        "flag": "flagging loads out of range",
+    }
+
+    def __init__(self, scene: Scene | None = None) -> None:
+        if scene is not None:
+            self.scene = scene
+        self.method: Surrogate
+        self.queries: NDArray[np.float64]
+        self.generator: np.random.Generator
+
+    @classmethod
+    def preload(cls) -> None:
+        """Import what many methods import, and compile or load the kernels with one solve."""
+        from mor_bench.surrogates.fem import FullFEM
+
+        for module in PRELOADED:
+            import_module(module)
+        with pinned_threads(1):
+            scene = load_scene("beam-tiny")
+            force = np.zeros((scene.mesh.n_nodes, 3))
+            force[-1] = 0.1
+            FullFEM().fit(scene).predict(force)
+
+    def check(
+        self, surrogate: str, configurations: list[dict[str, Any]], where: str
+    ) -> dict[str, Any]:
+        """Import a class and check parameters against it."""
+        loaded = load_class(surrogate)
+        for configuration in configurations:
+            check_parameters(loaded, configuration, where)
+        return {}
+
+    def fit(self, request: FitRequest) -> dict[str, Any]:
+        """Fit and save the model."""
+        method = make_surrogate(load_class(request.surrogate), request.parameters)
+        method.time_limit_s = request.limit_s
+        if request.training is not None:
+            method.training = request.training
+        with pinned_threads(request.threads):
+            snapshots = (
+                read_snapshots(request.train, self.scene) if method.needs_snapshots else None
+            )
+            start = perf_counter()
+            method.fit(self.scene, snapshots)
+            seconds = perf_counter() - start
+        self.method = method
+        saved = True
+        try:
+            method.save(request.model)
+        except Exception:  # a method that cannot be saved is fitted again where it is timed
+            saved = False
+        return {
+            "fit_s": seconds,
+            "fit_memory_bytes": peak_memory_bytes(),
+            "model_bytes": request.model.stat().st_size if saved else None,
+            "needs_snapshots": method.needs_snapshots,
+            "parameters": method.parameters,
+            "sizes": getattr(method, "sizes_", {}),
+            "training": _training_record(method),
+        }
+
+    def load(self, surrogate: str, model: Path) -> dict[str, Any]:
+        """Load a fitted model."""
+        self.method = load_fitted(model, load_class(surrogate), self.scene)
+        return {}
+
+    def predict(self, forces: NDArray[np.float64], out: Path, threads: int) -> dict[str, Any]:
+        """Predict loads, (n, n_nodes, 3), N, and write the displacements to a file."""
+        with pinned_threads(threads):
+            np.save(out, predict_all(self.method, forces), allow_pickle=False)
+        return {}
+
+    def flag(self, forces: NDArray[np.float64]) -> dict[str, Any]:
+        """Flag the loads that the method reports as out of its training range; None if it does not know its range."""
+        try:
+            flagged = self.method.out_of_range(forces)
+        except UnknownRangeError:
+            return {"flagged": None}
+        if flagged.shape != (len(forces),):
+            raise InvalidInputError(
+                f"`out_of_range` must return {len(forces)} flags for as many loads; "
+                f"it returned shape {flagged.shape}."
+            )
+        return {"flagged": [bool(flag) for flag in flagged]}
+
+    def cost(self, forces: NDArray[np.float64]) -> dict[str, Any]:
+        """Count the work of a query, averaged over some loads."""
+        return {"cost": cost_of(self.method, forces)}
+
+    def warm(self, forces: NDArray[np.float64], threads: int, seed: int) -> dict[str, Any]:
+        """Take the queries, (n, n_nodes, 3), N, and answer some of them."""
+        self.queries = forces
+        self.generator = np.random.default_rng(seed)
+        with pinned_threads(threads):
+            start = perf_counter()
+            for i in range(WARM_UP_QUERIES):
+                with suppress(SolverError):
+                    self.method.predict(self.queries[-1 - i % len(self.queries)].copy())
+                if perf_counter() - start > WARM_UP_S:
+                    break
+        return {"memory_bytes": peak_memory_bytes()}
+
+    def time(
+        self, out: Path, n: int, floor_s: float, most_s: float, threads: int
+    ) -> dict[str, Any]:
+        """Time single queries: at least ``n`` and at least for ``floor_s``, but for no longer than ``most_s``.
+
+        Each load is one of the queries, drawn at random and scaled by a random factor, so that no
+        load comes twice. A few are not scaled; the answers to those are written to a file, to be
+        compared with the scored ones. The garbage collector runs as it would for a user, and its
+        time is recorded apart. A query that the method cannot answer counts with the time until the
+        method reports so.
+
+        Returns
+        -------
+        dict
+            `latency_ms` and `gc_ms` of each query; `cpu_s` and `wall_s`, the sums over the queries;
+            `cpu_all_s` of the whole request; `checked`, the numbers of the queries whose answers
+            were kept.
+        """
+        begun, shape = process_time(), self.queries.shape[1:]
+        with pinned_threads(threads):
+            for _ in range(SETTLE_QUERIES):
+                self._predict_if_possible(
+                    self.queries[self.generator.integers(len(self.queries))]
+                    * self.generator.uniform(0.5, 1.0)
+                )
+            turn = self._timed_queries(n, floor_s, most_s)
+        if {answer.shape for answer in turn.kept.values()} - {shape}:
+            raise InvalidInputError(
+                f"a single load of shape {shape} is not answered in that shape."
+            )
+        np.save(out, np.array(list(turn.kept.values())).reshape(-1, *shape), allow_pickle=False)
+        return {
+            "latency_ms": turn.latency_ms,
+            "gc_ms": turn.gc_ms,
+            "cpu_s": turn.cpu_s,
+            "wall_s": turn.wall_s,
+            "cpu_all_s": process_time() - begun,
+            "checked": list(turn.kept),
+        }
+
+    def _predict_if_possible(self, query: NDArray[np.float64]) -> Any:
+        try:
+            return self.method.predict(query)
+        except SolverError:
+            return UNANSWERED
+
+    def _timed_queries(self, n: int, floor_s: float, most_s: float) -> _Turn:
+        turn, queries, draw = _Turn(), self.queries, self.generator
+        with _collector_clock() as clock:
+            while True:
+                number, check = (
+                    int(draw.integers(len(queries))),
+                    len(turn.kept) < CHECKED_ANSWERS and draw.random() < CHECKED_SHARE,
+                )
+                query = queries[number] * (1.0 if check else draw.uniform(0.5, 1.0))
+                clock.seconds, busy = 0.0, process_time()
+                before = perf_counter()
+                answer = self._predict_if_possible(query)
+                after = perf_counter()
+                turn.cpu_s += process_time() - busy
+                turn.wall_s += after - before
+                turn.latency_ms.append(1e3 * (after - before))
+                turn.gc_ms.append(1e3 * clock.seconds)
+                if check and answer is not UNANSWERED:
+                    turn.kept[number] = np.array(answer, dtype=float)
+                if turn.wall_s > most_s or (len(turn.latency_ms) >= n and turn.wall_s > floor_s):
+                    return turn
+
+    def throughput(
+        self, sizes: list[int], floor_s: float, most_s: float, threads: int
+    ) -> dict[str, Any]:
+        """Measure queries per second in batches; None where a batch would take longer than ``most_s`` or has no answer."""
+        rates: dict[str, float | None] = {}
+        expected = 0.0
+        with pinned_threads(threads):
+            for size in sizes:
+                batch = self.queries[np.arange(size) % len(self.queries)]
+                if expected * size > most_s:
+                    rates[str(size)] = None
+                    continue
+                start, n = perf_counter(), 0
+                try:
+                    while n == 0 or perf_counter() - start < floor_s:
+                        self.method.predict(batch)
+                        n += size
+                except SolverError:
+                    rates[str(size)] = None
+                    continue
+                expected = (perf_counter() - start) / n
+                rates[str(size)] = 1 / expected
+        return {"throughput": rates}
+
+
+def _training_record(method: Surrogate) -> dict[str, Any] | None:
+    """Return the iterations and loss curves of a method that has trained; None of others, or if they are no numbers."""
+    try:
+        record: dict[str, Any] = {
+            name: [float(loss) for loss in getattr(method, f"{name}_", ())] for name in CURVES
+        }
+        iterations = getattr(method, "iterations_", None)
+        record["iterations"] = None if iterations is None else int(iterations)
+    except (TypeError, ValueError):
+        return None
+    return record if record["loss_curve"] or iterations is not None else None
+
+
+@dataclass
+class _Turn:
+    """What a turn of timed queries yields; ``kept`` are checked answers by the number of their query."""
+
+    latency_ms: list[float] = field(default_factory=list)
+    gc_ms: list[float] = field(default_factory=list)
+    cpu_s: float = 0.0
+    wall_s: float = 0.0
+    kept: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+
+
+class _CollectorClock:
+    """Sums the time of garbage collections, as one of `gc.callbacks`."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._start = 0.0
+
+    def __call__(self, phase: str, info: dict[str, int]) -> None:
+        if phase == "start":
+            self._start = perf_counter()
+        else:
+            self.seconds += perf_counter() - self._start
+
+
+@contextmanager
+def _collector_clock() -> Iterator[_CollectorClock]:
+    clock = _CollectorClock()
+    gc.callbacks.append(clock)
+    try:
+        yield clock
+    finally:
+        gc.callbacks.remove(clock)

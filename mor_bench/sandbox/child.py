@@ -1,0 +1,104 @@
+"""The main loop of a sandboxed process: read requests, let the session answer, send the answers.
+
+Requests come pickled from the parent, which is trusted. Answers go back as JSON, since foreign code
+may have touched them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import signal
+import sys
+import warnings
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, BinaryIO
+
+from mor_bench.errors import MorBenchError
+from mor_bench.sandbox.seal import seal
+from mor_bench.sandbox.session import Session, session_class
+
+
+class _Child:
+    """The process's session, and how requests reach it."""
+
+    session: Session
+
+    def start(
+        self,
+        session: str,
+        arguments: dict[str, Any],
+        import_path: list[str],
+        sealed: list[Path],
+        exempt: Path | None,
+    ) -> dict[str, Any]:
+        """Import the session class, seal the process, and make the session."""
+        made_by = session_class(session)
+        seal(sealed, exempt)
+        sys.path[:] = import_path
+        self.session = made_by(**arguments)
+        return {}
+
+    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Return what a request yields, or the error that ended it, with the warnings on the way."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            try:
+                name = request.pop("do")
+                answer = (self.start if name == "start" else getattr(self.session, name))(**request)
+            except MorBenchError as error:
+                answer = {"error": type(error).__name__, "message": _printable(error)}
+            except (Exception, SystemExit) as error:  # foreign code runs here
+                message = f"crashed with {type(error).__name__}: {_printable(error)}"
+                answer = {"error": None, "message": message}
+        notes = [_printable(w.message) for w in caught if issubclass(w.category, UserWarning)]
+        return {**answer, "warnings": list(dict.fromkeys(notes))}
+
+
+def _printable(error: object) -> str:
+    """Return the text of an error with every character that UTF-8 cannot hold replaced."""
+    return str(error).encode("utf-8", "replace").decode()
+
+
+def _read(requests: BinaryIO, queue: SimpleQueue[dict[str, Any]]) -> None:
+    """Pass requests on. End the process at once when the parent is gone, whatever runs in it."""
+    while True:
+        try:
+            queue.put(pickle.load(requests))
+        except (EOFError, OSError):
+            os._exit(1)
+
+
+def answer_requests(requests: BinaryIO, answers: BinaryIO) -> None:
+    """Answer requests until the parent closes the pipe. Standard output is sent to standard error."""
+    # A terminal interrupts all processes; the parent ends this one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.dup2(2, 1)
+    with open(os.devnull, "rb") as nothing:
+        os.dup2(nothing.fileno(), 0)
+    queue: SimpleQueue[dict[str, Any]] = SimpleQueue()
+    Thread(target=_read, args=(requests, queue), daemon=True).start()
+    child, process = _Child(), os.getpid()
+    while True:
+        answer = child.answer(queue.get())
+        if os.getpid() != process:  # foreign code has forked, and this is the copy
+            os._exit(0)
+        answers.write(json.dumps(answer).encode() + b"\n")
+        answers.flush()
+
+
+def main() -> None:
+    """Answer requests on standard input; given a socket's path and a session class, be their fork server."""
+    if len(sys.argv) == 3:
+        from mor_bench.sandbox.fork_server import serve
+
+        serve(sys.argv[1], session_class(sys.argv[2]).preload, answer_requests)
+    else:
+        answer_requests(os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb"))
+
+
+if __name__ == "__main__":
+    main()
