@@ -32,11 +32,43 @@ class UnsupportedSceneError(MorBenchError):
 
 
 class SolverError(MorBenchError, RuntimeError):
-    """The nonlinear solve did not end in a valid equilibrium."""
+    """The nonlinear solve did not end in a valid equilibrium.
+
+    Attributes
+    ----------
+    cuts : int or None
+        How often the load increment was halved, where the solve steps the load.
+    """
+
+    def __init__(self, message: str, *, cuts: int | None = None) -> None:
+        super().__init__(message)
+        self.cuts = cuts
 
 
 class NoEquilibriumError(SolverError):
     """No convergence, even after the load increments were cut back."""
+
+
+class LimitPointError(NoEquilibriumError):
+    """The path of stable equilibria from rest ends before the whole load is reached.
+
+    Attributes
+    ----------
+    load_factor : float or None
+        Share of the load at which the path ends.
+    lowest_eigenvalue : float or None
+        Lowest eigenvalue of the tangent there, relative to that at rest.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        load_factor: float | None = None,
+        lowest_eigenvalue: float | None = None,
+    ) -> None:
+        super().__init__(message)
+        self.load_factor, self.lowest_eigenvalue = load_factor, lowest_eigenvalue
 
 
 class InvertedElementError(SolverError):
@@ -44,7 +76,17 @@ class InvertedElementError(SolverError):
 
 
 class UnconstrainedBodyError(MorBenchError, ValueError):
-    """The supports leave rigid motions free."""
+    """The supports leave rigid motions free.
+
+    Attributes
+    ----------
+    free_motions : tuple of str
+        Names of these motions.
+    """
+
+    def __init__(self, message: str, *, free_motions: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.free_motions = free_motions
 
 
 class OutOfTimeError(MorBenchError):
@@ -69,6 +111,10 @@ class MissingDependencyError(MorBenchError, ImportError):
 
 class UnavailableBackendError(MorBenchError, RuntimeError):
     """A network cannot be computed in some way, on this machine or at all; the message says why."""
+
+
+class RankDeficientWarning(UserWarning):
+    """The snapshots have fewer independent directions than the modes that were asked for."""
 
 
 class IllConditionedWarning(UserWarning):

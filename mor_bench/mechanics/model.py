@@ -118,7 +118,8 @@ def check_supports(scene: Scene) -> None:
     free = free_rigid_modes(scene)
     if free:
         raise UnconstrainedBodyError(
-            f"the supports of {scene.name} leave rigid motions free: {', '.join(free)}; fix at least three nodes not in line."
+            f"the supports of {scene.name} leave rigid motions free: {', '.join(free)}; fix at least three nodes not in line.",
+            free_motions=tuple(free),
         )
 
 

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from mor_bench.errors import NoEquilibriumError, SolverError
+from mor_bench.errors import LimitPointError, SolverError
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.linear import NotPositiveDefiniteError
 from mor_bench.mechanics.newton import NewtonOptions, Problem, solve_equilibrium
@@ -157,13 +157,15 @@ def solve_on_path(problem: AssembledProblem, load: Array) -> Array:
 
     Raises
     ------
-    NoEquilibriumError
+    LimitPointError
         If the path ends before; the message gives the limit's factor and the lowest eigenvalue there.
     """
     limit = limit_load(problem, load)
     if limit is not None:
-        raise NoEquilibriumError(
+        raise LimitPointError(
             f"no stable equilibrium on the path from rest: it ends at {limit.factor:.6g} of the load, "
-            f"where the lowest tangent eigenvalue is {limit.lowest_eigenvalue:.3g} of that at rest."
+            f"where the lowest tangent eigenvalue is {limit.lowest_eigenvalue:.3g} of that at rest.",
+            load_factor=limit.factor,
+            lowest_eigenvalue=limit.lowest_eigenvalue,
         )
     return solve_equilibrium(problem, load).displacement

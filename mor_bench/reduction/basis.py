@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky, lapack, qr, solve_triangular, svd
 
-from mor_bench.errors import InvalidInputError
+from mor_bench.errors import InvalidInputError, RankDeficientWarning
 
 RANDOMISED_FROM = 2000
 """Smaller side of a snapshot matrix from which `pod` is randomised, if it is also this many times the modes asked for:"""
@@ -287,6 +287,7 @@ class _Decomposition:
         if wanted is not None and wanted > self.rank:
             warnings.warn(
                 f"{wanted} modes were asked for, but the {self.n_samples} snapshots have rank {self.rank}: {self.rank} are used.",
+                RankDeficientWarning,
                 stacklevel=3,
             )
         kept = self.rank if wanted is None else min(wanted, self.rank)

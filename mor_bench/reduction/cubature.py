@@ -28,7 +28,17 @@ MAX_ENTRIES = 2**26
 
 
 class CubatureError(MorBenchError):
-    """The weights did not reach the tolerance, or the optimality conditions, within the iterations."""
+    """The weights did not reach the tolerance, or the optimality conditions, within the iterations.
+
+    Attributes
+    ----------
+    relative_residual : float or None
+        The residual that was reached, where it missed the tolerance.
+    """
+
+    def __init__(self, message: str, *, relative_residual: float | None = None) -> None:
+        super().__init__(message)
+        self.relative_residual = relative_residual
 
 
 @dataclass(frozen=True)
@@ -266,7 +276,8 @@ def sparse_nnls(
     found = SparseWeights.of(matrix, target, columns.weights(x), iterations)
     if found.relative_residual > tolerance * (1 + 1e-9) > 0:
         raise CubatureError(
-            f"cubature reached a relative residual of {found.relative_residual:.3g} in {iterations} iterations; `tolerance` asks for {tolerance:.3g}."
+            f"cubature reached a relative residual of {found.relative_residual:.3g} in {iterations} iterations; `tolerance` asks for {tolerance:.3g}.",
+            relative_residual=found.relative_residual,
         )
     if found.passive_gradient > OPTIMAL or (tolerance == 0 and found.dual_gradient > OPTIMAL):
         raise CubatureError(

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from mor_bench.counting import count
-from mor_bench.errors import InvalidInputError
+from mor_bench.errors import InvalidInputError, RankDeficientWarning
 from mor_bench.mechanics.compliance import Compliance
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.reduction.basis import pod
@@ -77,7 +77,11 @@ class LocalPOD(Surrogate):
             snapshots = self._checked_snapshots(snapshots)
             if self.n_modes > len(snapshots):
                 said = f"{self.n_modes} modes were asked for, but the {len(snapshots)} snapshots have at most rank {len(snapshots)}"
-                warnings.warn(f"{said}: their linear responses fill the basis.", stacklevel=2)
+                warnings.warn(
+                    f"{said}: their linear responses fill the basis.",
+                    RankDeficientWarning,
+                    stacklevel=2,
+                )
             model = FullOrderModel(scene)
             linear = model.rest_factor.solve(snapshots.free_forces.T).T
             axes = pod(linear).modes[:, :N_COORDINATES]
