@@ -19,7 +19,7 @@ from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction import basis
 from mor_bench.reduction.basis import Basis, pod, pod_streamed, remembering
 from mor_bench.reduction.galerkin import GalerkinProblem
-from mor_bench.snapshots.dataset import Dataset, stream
+from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.pod import PODGalerkin, stiffness_at_rest
 
 Array = NDArray[np.float64]
@@ -129,18 +129,6 @@ def test_the_streamed_decomposition_is_the_same_in_every_run_and_however_it_is_c
     np.testing.assert_array_equal(in_blocks(snapshots, 20).modes, first)
     whole = pod_streamed(lambda: [snapshots], 20).modes
     assert np.linalg.norm(whole - first @ (first.T @ whole)) <= 1e-10
-
-
-def test_a_dataset_is_decomposed_as_it_is_read(cache: Path) -> None:
-    data = mor_bench.load_dataset("beam-tiny", cache=cache, workers=1)
-    whole = np.vstack([part.free_displacements for part in stream("beam-tiny", cache=cache)])
-    assert len(whole) == len(data.train) + len(data.test) + data.n_unused
-    found = pod_streamed(
-        lambda: (part.free_displacements for part in stream("beam-tiny", cache=cache)), 5
-    )
-    assert left_over(whole, found.modes) == pytest.approx(
-        left_over(whole, pod(whole, 5).modes), rel=1e-4
-    )
 
 
 def test_streaming_never_holds_the_matrix() -> None:

@@ -356,27 +356,6 @@ def test_the_direction_split_reaches_load_dataset(cache: Path) -> None:
     assert len(data.train) + len(data.test) + data.n_refused == 210
 
 
-def test_a_stream_gives_the_same_samples(cache: Path) -> None:
-    from mor_bench.snapshots.dataset import stream
-
-    data = mor_bench.load_dataset("beam-tiny", cache=cache)
-    parts = list(stream("beam-tiny", 150, cache=cache))
-    assert [len(part) for part in parts] == [100, 50]
-    known = {
-        tuple(row): u
-        for row, u in zip(
-            data.train.loads.vectors[:, 0], data.train.free_displacements, strict=True
-        )
-    }
-    n_found = 0
-    for part in parts:
-        for row, u in zip(part.loads.vectors[:, 0], part.free_displacements, strict=True):
-            if tuple(row) in known:
-                np.testing.assert_array_equal(known[tuple(row)], u)
-                n_found += 1
-    assert n_found > 100
-
-
 def test_patch_loads_of_several_forces_add_up() -> None:
     scene = several()
     loads = draw_loads(scene, 0, 4)

@@ -136,7 +136,7 @@ def test_a_file_truncated_anywhere_says_so(content: bytes) -> None:
             StoreError, match="truncated" if length >= HEADER_BYTES else "header|not a shard"
         ):
             parse_shard(content[:length], "it")
-    with pytest.raises(StoreError, match="not as long"):
+    with pytest.raises(StoreError, match="length is not that"):
         parse_shard(content + b"\0", "it")
 
 
@@ -159,7 +159,7 @@ def foreign_hdf5(userblock: int = 0) -> bytes:
 def with_other_fields() -> bytes:
     """A foreign HDF5 file under a header as we write it."""
     body = foreign_hdf5(HEADER_BYTES)[HEADER_BYTES:]
-    return store._header(store.SCHEMA_VERSION, len(body), hashlib.sha256(body).hexdigest()) + body
+    return store.header_line(store.SCHEMA_VERSION, len(body), hashlib.sha256(body).hexdigest()) + body
 
 
 def of_schema(content: bytes, version: int) -> bytes:
@@ -511,7 +511,7 @@ def test_a_failed_write_leaves_what_was_there(
 def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(tmp_path: Path) -> None:
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    host, living = store._host(), os.getppid()
+    host, living = store.host_name(), os.getppid()
     names = {
         f".a.h5.{host}.{dead.pid}.00.tmp": False,
         f".b.h5.{host}.{living}.00.tmp": True,
@@ -763,7 +763,7 @@ def test_newer_files_are_kept_and_damaged_ones_named(tmp_path: Path, content: by
     manifest.write_bytes(before)
     for spoilt in (b"a note of mine", sound[:-1], shard_path(folder, 0).read_bytes()):
         path.write_bytes(spoilt)
-        with pytest.warns(DamagedFileWarning, match=r"shard-00001\.h5: .* made again"):
+        with pytest.warns(DamagedFileWarning, match=r"shard-00001\.h5: .* generated again"):
             generate(spec, workers=1, cache=tmp_path)
         assert path.read_bytes() == sound
 

@@ -142,8 +142,7 @@ def pod_streamed(
     ----------
     blocks : callable
         Gives an iterable of the snapshots' rows, (any number, n) float64 each, from the beginning and in the same order
-        every time, e.g. ``lambda: (part.free_displacements for part in stream("beam-fine"))`` with
-        `mor_bench.snapshots.dataset.stream`, which gives test samples too: no basis for a comparison.
+        every time.
     n_modes, energy_tolerance, inner_product
         As of `pod`; by neither of the first two, the rank is found.
 

@@ -1,4 +1,4 @@
-"""Where shards are solved: in this process, in a pool of processes, or on a Dask cluster, behind one interface."""
+"""Where shards are solved: in this process, in a process pool, or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -32,53 +32,57 @@ _T = TypeVar("_T")
 _R = TypeVar("_R")
 
 IN_FLIGHT = 2
-"""Tasks per worker that are submitted at once: one is solved, one is there when that is done."""
+"""Tasks per worker that are submitted at once: one is solved while another waits."""
 
 CONNECT_S = 10
-"""How long to wait for a cluster's scheduler, and for the first of its workers."""
+"""Timeout for a cluster's scheduler, and for its first worker, s."""
 
-KEPT = "Finished shards are kept, and the same command goes on from them."
+KEPT = "Finished shards are kept; run the same command again to continue."
+
+_ADDRESS = r"tcp://([^\s:/]+|\[[0-9a-fA-F:.]+\]):\d{1,5}"
 
 
 @dataclass(frozen=True)
 class Pool:
-    """An executor, and how many tasks it should be given at once, which may change while it is used."""
+    """An executor with a limit of submitted tasks, which may change over time."""
 
     executor: Executor
     window: Callable[[], int]
 
     def in_any_order(self, function: Callable[[_T], _R], tasks: Iterable[_T]) -> Iterator[_R]:
-        """Results as they come; no more tasks are drawn, and no more results held, than the window allows."""
+        """Yield results as they finish. Draw no more tasks than the window allows."""
         waiting: set[Future[_R]] = set()
         for task in tasks:
             waiting.add(self.executor.submit(function, task))
             while len(waiting) >= self.window():
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                while done:
-                    yield done.pop().result()
+                yield from self._finished(waiting)
         while waiting:
-            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            while done:
-                yield done.pop().result()
+            yield from self._finished(waiting)
+
+    @staticmethod
+    def _finished(waiting: set[Future[_R]]) -> Iterator[_R]:
+        """Wait for some tasks, remove them from the set, and yield their results."""
+        done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+        waiting -= done
+        while done:
+            yield done.pop().result()
 
 
 def check_pool(workers: int | None, cluster: str | None) -> None:
-    """Check where to solve, before anything is done.
+    """Check the options for parallel generation.
 
     Raises
     ------
     InvalidInputError
-        If ``workers`` is less than 1, both are given, or the address does not read ``tcp://host:port``.
+        If ``workers`` is less than 1, both are given, or the address is not ``tcp://host:port``.
     """
     if workers is not None and workers < 1:
         raise InvalidInputError(f"`workers` must be an integer >= 1; got {workers}.")
     if cluster is not None and workers is not None:
         raise InvalidInputError(
-            "`workers` and `cluster` exclude each other: a cluster has as many workers as were started."
+            "`workers` and `cluster` exclude each other: a cluster uses all workers it has."
         )
-    if cluster is not None and not re.fullmatch(
-        r"tcp://([^\s:/]+|\[[0-9a-fA-F:.]+\]):\d{1,5}", cluster
-    ):
+    if cluster is not None and not re.fullmatch(_ADDRESS, cluster):
         raise InvalidInputError(
             f"`cluster` must be the address of a Dask scheduler, tcp://host:port; got {cluster!r}."
         )
@@ -86,7 +90,10 @@ def check_pool(workers: int | None, cluster: str | None) -> None:
 
 @contextmanager
 def open_pool(workers: int | None, cluster: str | None) -> Iterator[Pool]:
-    """A pool of processes, as many as there are cores by default; or the cluster at an address; or, for one worker, this process."""
+    """Open the cluster at an address, this process for one worker, or a pool of processes.
+
+    The default number of workers is the number of cores.
+    """
     if cluster is not None:
         with cluster_pool(cluster) as pool:
             yield pool
@@ -98,7 +105,7 @@ def open_pool(workers: int | None, cluster: str | None) -> Iterator[Pool]:
 
 
 class _InThisProcess(Executor):
-    """Runs a task where it is submitted."""
+    """Runs each task when it is submitted."""
 
     def submit(self, fn: Callable[..., _R], /, *args: Any, **kwargs: Any) -> Future[_R]:
         future: Future[_R] = Future()
@@ -107,7 +114,7 @@ class _InThisProcess(Executor):
 
 
 def _end_with(parent: int) -> None:
-    """Let this worker end when its parent has died by a signal that no one can catch; otherwise it would wait for ever."""
+    """Let this worker exit after its parent was killed. Otherwise it would wait for ever."""
 
     def watch() -> None:
         _wait_for_end_of_parent(parent)
@@ -117,13 +124,12 @@ def _end_with(parent: int) -> None:
 
 
 def _wait_for_end_of_parent(parent: int) -> None:
-    if sys.platform == "win32":  # where a process keeps the number of a parent that is no more
+    if sys.platform == "win32":  # getppid() keeps returning a dead parent there
         import ctypes
 
         synchronize, infinite = 0x00100000, 0xFFFFFFFF
-        ctypes.windll.kernel32.WaitForSingleObject(
-            ctypes.windll.kernel32.OpenProcess(synchronize, False, parent), infinite
-        )
+        kernel = ctypes.windll.kernel32
+        kernel.WaitForSingleObject(kernel.OpenProcess(synchronize, False, parent), infinite)
     else:
         while os.getppid() == parent:
             sleep(1.0)
@@ -131,12 +137,14 @@ def _wait_for_end_of_parent(parent: int) -> None:
 
 @contextmanager
 def worker_pool(workers: int) -> Iterator[Pool]:
-    """Worker processes that need no `if __name__ == "__main__"` in the caller's script, and end with their parent.
+    """Open a pool of worker processes that end with their parent.
+
+    The caller's script needs no `if __name__ == "__main__"`.
 
     Raises
     ------
     WorkerError
-        If one of them is killed.
+        If a worker is killed.
     """
     from loky import ProcessPoolExecutor
 
@@ -148,7 +156,8 @@ def worker_pool(workers: int) -> Iterator[Pool]:
     except BrokenExecutor as error:
         executor.shutdown(kill_workers=True)
         raise WorkerError(
-            f"a worker process was killed; if there was too little memory, take fewer workers than {workers}. {KEPT}"
+            "a worker process was killed; if memory was short, use fewer workers than "
+            f"{workers}. {KEPT}"
         ) from error
     except BaseException:
         executor.shutdown(kill_workers=True)
@@ -158,15 +167,15 @@ def worker_pool(workers: int) -> Iterator[Pool]:
 
 @contextmanager
 def cluster_pool(address: str) -> Iterator[Pool]:
-    """The workers of a Dask cluster; they may come and go, and what a lost one had is solved by another.
+    """Connect to a Dask cluster. Its workers may come and go; lost tasks are solved again.
 
     Raises
     ------
     MissingDependencyError
-        Without the extra `cluster`.
+        If the extra `cluster` is not installed.
     WorkerError
-        If the scheduler cannot be reached, is lost, or has no workers; if workers die again and again on the same shard; or
-        if the cluster's mor-bench is another one.
+        If the scheduler cannot be reached, is lost, has no workers or lacks this version of
+        mor-bench, or if workers repeatedly die on the same shard.
     """
     try:
         from distributed import Client, KilledWorker
@@ -177,12 +186,7 @@ def cluster_pool(address: str) -> Iterator[Pool]:
 
     client = _connected(address, partial(Client, address, timeout=CONNECT_S, set_as_default=False))
     try:
-        try:
-            client.wait_for_workers(1, timeout=CONNECT_S)
-        except TimeoutError:
-            raise WorkerError(
-                f"the Dask scheduler at {address} has no workers; start some with: dask worker {address}"
-            ) from None
+        _wait_for_worker(client, address)
         _check_installed(client, address)
         yield Pool(
             client.get_executor(pure=False),
@@ -190,7 +194,8 @@ def cluster_pool(address: str) -> Iterator[Pool]:
         )
     except KilledWorker as error:
         raise WorkerError(
-            f"workers of {address} died one after the other on the same shard; do they have enough memory? {KEPT}"
+            f"workers of {address} died one after the other on the same shard; "
+            f"do they have enough memory? {KEPT}"
         ) from error
     except (CancelledError, OSError) as error:
         raise WorkerError(
@@ -201,7 +206,7 @@ def cluster_pool(address: str) -> Iterator[Pool]:
 
 
 def _connected(address: str, connect: Callable[[], Client]) -> Client:
-    """A client, or a `WorkerError` when its time is up: its own limit does not hold for a peer that accepts and stays silent."""
+    """Return a client; its own timeout does not work if the peer accepts and stays silent."""
     made: Future[Client] = Future()
 
     def attempt() -> None:
@@ -220,7 +225,7 @@ def _connected(address: str, connect: Callable[[], Client]) -> Client:
 
 
 def _close(client: Client) -> None:
-    """Close a client, without the page of traceback that it logs where the scheduler is gone."""
+    """Close a client without the traceback that it logs if the scheduler is gone."""
     log = logging.getLogger("distributed.client")
     before, log.disabled = log.disabled, True
     try:
@@ -229,17 +234,26 @@ def _close(client: Client) -> None:
         log.disabled = before
 
 
+def _wait_for_worker(client: Client, address: str) -> None:
+    try:
+        client.wait_for_workers(1, timeout=CONNECT_S)
+    except TimeoutError:
+        raise WorkerError(
+            f"the Dask scheduler at {address} has no workers; "
+            f"start some with: dask worker {address}"
+        ) from None
+
+
 def _check_installed(client: Client, address: str) -> None:
-    """A worker that cannot import what it is sent would be silent for ever."""
+    """Check that all workers can import the tasks. A worker that cannot would never answer."""
     module = "mor_bench.snapshots.solve"
     try:
-        found = [
-            client.run_on_scheduler(find_spec, module),
-            *client.run(find_spec, module).values(),
-        ]
+        scheduler = client.run_on_scheduler(find_spec, module)
+        found = [scheduler, *client.run(find_spec, module).values()]
     except ModuleNotFoundError:
         found = [None]
     if None in found:
         raise WorkerError(
-            f"the scheduler and the workers at {address} must have this version of mor-bench installed; some have not."
+            f"the scheduler and the workers at {address} must have this version of mor-bench "
+            "installed; some do not."
         )

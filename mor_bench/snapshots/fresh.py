@@ -1,4 +1,4 @@
-"""A test set that does not exist before it is asked for."""
+"""A test set that is generated only when it is needed, so that no method can know it."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from mor_bench.snapshots.split import split_samples
 from mor_bench.specs import DatasetSpec, Split, SplitBy
 
 MAX_FRESH = 400
-"""Samples of a fresh test set; it is solved in one process, while the run waits."""
+"""Largest number of samples. They are solved in one process while the run waits."""
 
 
 def fresh_test_set(spec: DatasetSpec, scene: Scene, by: SplitBy, seed: int, n: int) -> Snapshots:
-    """A test set of the same distribution that no one has seen: other draws in the load regions, or directions, held out.
+    """Return a new test set of the same distribution, with other draws in the held-out part.
 
     It is solved here and kept in memory only.
 
@@ -26,18 +26,18 @@ def fresh_test_set(spec: DatasetSpec, scene: Scene, by: SplitBy, seed: int, n: i
     ----------
     spec : DatasetSpec
     scene : Scene
-        Of the dataset.
+        The dataset's scene.
     by : {"region", "sample", "direction"}
-        How training and test are parted.
+        How training and test samples are split.
     seed : int
-        Of the draws, in the place of the dataset's.
+        Seed of the draws, instead of the dataset's.
     n : int
-        Most samples wanted, no more than `MAX_FRESH`; fewer where the draws do not hold as many.
+        Largest number of samples, at most `MAX_FRESH`. There are fewer if the plan has fewer.
 
     Raises
     ------
     SolverError
-        If not one of the loads has a valid equilibrium.
+        If none of the loads has a valid equilibrium.
     """
     other = spec.model_copy(update={"loads": spec.loads.model_copy(update={"seed": seed})})
     drawn = draw_loads(load_scene(other), 0, n_samples_of(scene))
@@ -50,9 +50,5 @@ def fresh_test_set(spec: DatasetSpec, scene: Scene, by: SplitBy, seed: int, n: i
     if not solved:
         raise SolverError(f"{spec.name}: no fresh test load has a valid equilibrium.")
     displacements = np.array([answer.displacement for _, answer in solved])
-    return Snapshots(
-        scene,
-        held[np.array([i for i, _ in solved])],
-        displacements,
-        np.array([answer.min_det_f for _, answer in solved]),
-    )
+    min_det_f = np.array([answer.min_det_f for _, answer in solved])
+    return Snapshots(scene, held[np.array([i for i, _ in solved])], displacements, min_det_f)

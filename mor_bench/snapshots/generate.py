@@ -1,4 +1,4 @@
-"""Generation of a dataset by the full-order model, in parallel, stopped and resumed at any moment."""
+"""Generation of a dataset by the full-order model: parallel, interruptible, resumable."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TypedDict
 
 import numpy as np
 import platformdirs
@@ -33,24 +34,33 @@ SHARD_SIZE = 100
 """Samples per shard."""
 
 ROUND_OFF = 1e-9
-"""Relative difference of loads that is another processor's round-off, and not another sample."""
+"""Relative difference of loads that counts as another processor's round-off."""
 
 Progress = Callable[[int, int], None]
-"""Called with the samples done and the samples wanted."""
+"""Called with the number of finished samples and of wanted samples."""
+
+
+class GenerationOptions(TypedDict, total=False):
+    """How missing samples are generated; see `generate`."""
+
+    workers: int | None
+    cache: Path | None
+    progress: Progress | None
+    cluster: str | None
 
 
 def default_cache() -> Path:
-    """The user's cache folder for datasets."""
+    """Return the user's cache folder for datasets."""
     return Path(platformdirs.user_cache_dir("mor-bench"))
 
 
 def dataset_key(spec: DatasetSpec) -> str:
-    """What tells a dataset's samples from all others: a digest of all that decides them, and the versions."""
+    """Return a digest of everything that decides a dataset's samples, with the versions."""
     return f"{spec.digest()}-v{SCHEMA_VERSION}.{GENERATOR_VERSION}"
 
 
 def dataset_folder(spec: DatasetSpec, cache: Path | None) -> Path:
-    """Where a dataset lies: its name and its key; or that of another name, if there is one with the same samples."""
+    """Return the folder of a dataset, or of another one with the same samples if it exists."""
     parent = Path(cache or default_cache()) / "datasets"
     own = parent / f"{spec.name}-{dataset_key(spec)}"
     return own if own.exists() else min(parent.glob(f"*-{dataset_key(spec)}"), default=own)
@@ -61,20 +71,19 @@ def shard_path(folder: Path, number: int) -> Path:
 
 
 def n_samples_to_generate(spec: DatasetSpec, limit: int | None = None) -> int:
-    """How many samples a dataset has, or the limit if that is less."""
-    whole = n_samples_of(load_scene(spec))
-    return whole if limit is None else min(limit, whole)
+    """Return the number of samples of a dataset, or the limit if that is less."""
+    return n_samples_of(load_scene(spec), limit)
 
 
 def read_shards(folder: Path, n_samples: int) -> Iterator[Shard]:
-    """The first samples of a dataset, a shard at a time; raises `StoreError`."""
+    """Yield the first samples of a dataset, one shard at a time; errors as in `read_shard`."""
     for start in range(0, n_samples, SHARD_SIZE):
         yield read_shard(shard_path(folder, start // SHARD_SIZE)).first(n_samples - start)
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """Which shards a folder should hold, each known by its number."""
+    """The shards that a folder should hold, by number."""
 
     folder: Path
     scene: Scene
@@ -85,12 +94,12 @@ class _Plan:
         return range(-(-self.n_wanted // SHARD_SIZE))
 
     def n_wanted_of(self, number: int) -> int:
-        """How many of a shard's samples are wanted; it has more if a limit ends in it."""
+        """Return how many of a shard's samples are wanted. It has more if a limit ends in it."""
         return min(SHARD_SIZE, self.n_wanted - number * SHARD_SIZE)
 
     def loads(self, number: int) -> PatchLoads:
         start = number * SHARD_SIZE
-        return draw_loads(self.scene, start, min(start + SHARD_SIZE, n_samples_of(self.scene)))
+        return draw_loads(self.scene, start, n_samples_of(self.scene, start + SHARD_SIZE))
 
     @cached_property
     def key(self) -> str:
@@ -104,14 +113,14 @@ class _Plan:
         return Task(self.key, self._problem, number * SHARD_SIZE, self.loads(number))
 
     def has(self, number: int) -> bool:
-        """Whether a shard is there, is sound, and is the one that it should be; warns if it is there and is not."""
+        """Whether a shard exists, is sound, and is the right one; warn if it exists but is not."""
         path = shard_path(self.folder, number)
         try:
             shard = read_shard(path)
         except NewerSchemaError:
             raise
         except StoreError as error:
-            warnings.warn(f"{error} It is made again.", DamagedFileWarning, stacklevel=3)
+            warnings.warn(f"{error} It is generated again.", DamagedFileWarning, stacklevel=3)
             return False
         except FileNotFoundError:
             return False
@@ -119,42 +128,35 @@ class _Plan:
         if named and self._is_filled(shard) and self._is_loaded(shard, self.loads(number)):
             return True
         warnings.warn(
-            f"{path}: not the samples that belong there. They are made again.",
+            f"{path}: holds other samples than it should. It is generated again.",
             DamagedFileWarning,
             stacklevel=3,
         )
         return False
 
     def _is_filled(self, shard: Shard) -> bool:
-        n = len(shard.status)
-        shapes = shard.displacements.shape == (
-            n,
-            len(self.scene.free_dofs),
-        ) and shard.min_det_f.shape == (n,)
-        valid = shard.status == 0
+        n, n_free = len(shard.status), len(self.scene.free_dofs)
         return bool(
-            shapes
+            shard.displacements.shape == (n, n_free)
+            and shard.min_det_f.shape == (n,)
             and (shard.status < len(STATUSES)).all()
-            and np.isfinite(shard.displacements[valid]).all()
+            and np.isfinite(shard.displacements[shard.status == 0]).all()
         )
 
     def _is_loaded(self, shard: Shard, loads: PatchLoads) -> bool:
-        if (
-            shard.patches.shape != loads.patches.shape
-            or shard.vectors.shape != loads.vectors.shape
-            or len(shard.status) != len(loads)
-        ):
-            return False
-        difference = np.abs(shard.vectors - loads.vectors).max()
+        largest = self.scene.generated.loads.magnitude_n[1]
         return bool(
-            (shard.patches == loads.patches).all()
-            and difference <= ROUND_OFF * self.scene.generated.loads.magnitude_n[1]
+            shard.patches.shape == loads.patches.shape
+            and shard.vectors.shape == loads.vectors.shape
+            and len(shard.status) == len(loads)
+            and (shard.patches == loads.patches).all()
+            and np.abs(shard.vectors - loads.vectors).max() <= ROUND_OFF * largest
         )
 
 
 @contextmanager
 def _writing(folder: Path) -> Iterator[None]:
-    """Turn the system's errors into one that names the folder."""
+    """Turn errors of the operating system into one that names the folder."""
     try:
         yield
     except OSError as error:
@@ -171,61 +173,45 @@ def generate(
     progress: Progress | None = None,
     cluster: str | None = None,
 ) -> Path:
-    """Make sure that the shards of a dataset exist; what is there and sound is kept, what is damaged is made again.
+    """Generate the shards of a dataset that are missing or damaged; return its folder.
 
-    Several processes may generate the same dataset into the same folder at once. No more than a few shards per worker are
-    in memory, however many there are. Neither what is stopped nor where it is solved changes a bit; processors of another
-    kind, with other instructions, agree to the solver's tolerance.
+    Several processes may generate the same dataset into the same folder. Only a few shards per
+    worker are in memory. Interruptions, workers and clusters do not change a bit of the result;
+    processors with other instructions agree to the solver's tolerance.
 
     Parameters
     ----------
     spec : DatasetSpec
     limit : int, optional
-        Only the first samples.
+        Generate the first samples only.
     workers : int, optional
-        Processes, all cores by default; 1 solves in this one.
+        Number of processes. Default: all cores. 1 solves in this process.
     cache : Path, optional
-        Cache folder; the user's by default.
+        Cache folder. Default: the user's.
     progress : callable, optional
-        Called with (samples done, samples wanted) before the first and after each shard.
+        Called with (finished samples, wanted samples) before the first and after each shard.
     cluster : str, optional
-        Solve on the workers of the Dask scheduler at this address, ``tcp://host:port``. They need this version of
-        mor-bench, no disk in common, and one thread each for the best rate.
-
-    Returns
-    -------
-    Path
-        The dataset's folder.
+        Address of a Dask scheduler whose workers solve instead, ``tcp://host:port``. They need this
+        version of mor-bench and no shared disk; one thread each gives the best rate.
 
     Raises
     ------
     InvalidInputError
         If ``workers`` is less than 1, ``cluster`` is no address, or both are given.
     StoreError
-        If the folder cannot be written, as on a full disk, or holds files of a newer schema. Finished shards stay.
+        If the folder cannot be written, as on a full disk, or holds files of a newer schema.
     WorkerError
-        If workers were killed, or the cluster cannot be reached. Finished shards stay.
+        If workers were killed, or the cluster cannot be reached. Finished shards are kept.
     MissingDependencyError
         If ``cluster`` is given without the extra of that name.
     """
     check_pool(workers, cluster)
     scene, folder = load_scene(spec), dataset_folder(spec, cache)
-    whole = n_samples_of(scene)
-    plan = _Plan(folder, scene, whole if limit is None else min(limit, whole))
-    with _writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(folder)
-    missing = [number for number in plan.numbers if not plan.has(number)]
-    with _writing(folder):
-        keep_sources(folder, spec)
-        update_manifest(
-            folder,
-            Manifest(_owner(folder, spec), GENERATOR_VERSION, whole, SHARD_SIZE),
-            solves=bool(missing),
-        )
+    plan = _Plan(folder, scene, n_samples_of(scene, limit))
+    missing = _prepare_folder(plan, spec)
     count = _Count(plan, missing, progress)
     if missing and cluster is None:
-        # Compiles the kernels, or reads them from numba's cache, here rather than in every worker at once.
+        # Compile the kernels, or read them from numba's cache, once here and not in every worker.
         _fill(plan, missing[:1], count, workers=1)
         missing = missing[1:]
     if missing:
@@ -233,8 +219,26 @@ def generate(
     return folder
 
 
+def _prepare_folder(plan: _Plan, spec: DatasetSpec) -> list[int]:
+    """Create the folder with its manifest, and return the numbers of missing shards."""
+    folder = plan.folder
+    with _writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(folder)
+    missing = [number for number in plan.numbers if not plan.has(number)]
+    whole = n_samples_of(plan.scene)
+    manifest = Manifest(_owner(folder, spec), GENERATOR_VERSION, whole, SHARD_SIZE)
+    with _writing(folder):
+        keep_sources(folder, spec)
+        update_manifest(folder, manifest, solves=bool(missing))
+    return missing
+
+
 def _owner(folder: Path, spec: DatasetSpec) -> DatasetSpec:
-    """The specification that a folder's manifest is kept for: that of another dataset with the same samples, if it lies under its name."""
+    """Return the specification for a folder's manifest.
+
+    It is that of another dataset with the same samples if the folder has that dataset's name.
+    """
     if folder.name != f"{spec.name}-{dataset_key(spec)}":
         with suppress(StoreError, FileNotFoundError):
             kept = read_manifest(folder).spec
@@ -244,18 +248,18 @@ def _owner(folder: Path, spec: DatasetSpec) -> DatasetSpec:
 
 
 class _Count:
-    """How many of the samples that are wanted are there."""
+    """Counts the wanted samples that exist, and reports them."""
 
     def __init__(self, plan: _Plan, missing: list[int], progress: Progress | None) -> None:
         self._plan, self._progress = plan, progress
         self._done = plan.n_wanted - sum(map(plan.n_wanted_of, missing))
-        self._tell()
+        self._report()
 
     def add(self, number: int) -> None:
         self._done += self._plan.n_wanted_of(number)
-        self._tell()
+        self._report()
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         if self._progress:
             self._progress(self._done, self._plan.n_wanted)
 
@@ -263,11 +267,11 @@ class _Count:
 def _fill(
     plan: _Plan, missing: list[int], count: _Count, workers: int | None, cluster: str | None = None
 ) -> None:
-    """Solve the shards that are missing, and commit each when it is there."""
+    """Solve the missing shards, and write each as soon as it is finished."""
 
     def tasks() -> Iterator[Task]:
         for number in missing:
-            if plan.has(number):  # meanwhile another process has made it
+            if plan.has(number):  # another process has generated it in the meantime
                 count.add(number)
             else:
                 yield plan.task(number)
@@ -286,16 +290,14 @@ def _commit(folder: Path, number: int, solved: Solved) -> None:
 
 
 def generation_seconds(spec: DatasetSpec, cache: Path | None, n_samples: int) -> float | None:
-    """Core-seconds that the full-order model took for a number of samples, from the shards solved; None if unknown.
+    """Return the core-seconds for a number of samples, from the timings of shards; None if unknown.
 
-    Kept beside the shards and not in them: a dataset generated twice is bit-identical, its timings are not.
+    Timings are stored beside the shards, because repeated generations give bit-identical shards.
     """
     times = []
     for path in sorted(dataset_folder(spec, cache).glob("seconds-*.txt")):
-        with suppress(ValueError, OSError):  # a timing that was lost costs nothing but itself
+        with suppress(ValueError, OSError):  # a lost timing does no harm
             times.append(float(path.read_text()))
-    return (
-        sum(times) * n_samples / n_samples_to_generate(spec, len(times) * SHARD_SIZE)
-        if times
-        else None
-    )
+    if not times:
+        return None
+    return sum(times) * n_samples / n_samples_to_generate(spec, len(times) * SHARD_SIZE)

@@ -1,4 +1,4 @@
-"""A dataset whose snapshots come from another program."""
+"""Loads and samples of a dataset whose snapshots come from another program."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class NodalLoads:
     forces : (n_samples, n_nodes, 3) float64
         N.
     patches : (n_samples, k) int64
-        Load-region ids; zeros where the file has none.
+        Load-region ids; zeros if the file has none.
     """
 
     forces: NDArray[np.float64]
@@ -39,7 +39,7 @@ class NodalLoads:
 
 
 def read_samples(spec: ImportedDatasetSpec, limit: int | None = None) -> ImportedArrays:
-    """The first samples of an imported dataset, or all; raises `SpecError`."""
+    """Read the first samples of an imported dataset, or all; errors as in `read_arrays`."""
     arrays = read_arrays(spec.snapshots.file)
     first = slice(limit)
     return replace(
@@ -52,10 +52,8 @@ def read_samples(spec: ImportedDatasetSpec, limit: int | None = None) -> Importe
 
 
 def nodal_loads(arrays: ImportedArrays) -> NodalLoads:
-    """The loads of imported samples."""
-    regions = (
-        np.zeros((len(arrays.forces), 1), dtype=np.int64)
-        if arrays.regions is None
-        else arrays.regions
-    )
+    """Return the loads of imported samples."""
+    regions = arrays.regions
+    if regions is None:
+        regions = np.zeros((len(arrays.forces), 1), dtype=np.int64)
     return NodalLoads(arrays.forces, regions)

@@ -1,4 +1,4 @@
-"""The manifest of a dataset's folder: all that is needed to generate the dataset again, and what it was generated with."""
+"""The manifest of a dataset's folder: what is needed to generate it again, and its environments."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ NAME = "manifest.json"
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a folder of shards is.
+    """The content of a folder of shards.
 
     Attributes
     ----------
     spec : DatasetSpec
-        A mesh or surface file is known by its path and its SHA-256; `keep_sources` puts a copy into the folder.
+        Names mesh and surface files by path and SHA-256; `keep_sources` copies them to the folder.
     generator_version : int
     n_samples : int
-        Of the whole dataset.
+        Size of the whole dataset.
     shard_size : int
-        Samples per shard; the last one may have fewer.
+        Samples per shard. The last one may have fewer.
     environments : tuple of dict of str to str
-        Versions and platform of every environment that shards were generated in, in the order of their first use.
+        Versions and platform of each environment that generated shards, in order of first use.
     """
 
     spec: DatasetSpec
@@ -46,7 +46,7 @@ class Manifest:
     environments: tuple[dict[str, str], ...] = ()
 
     def to_json(self) -> bytes:
-        """The content of the file, with a checksum."""
+        """Return the content of the file, with a checksum."""
         content = {
             "format": FORMAT,
             "schema_version": SCHEMA_VERSION,
@@ -56,9 +56,8 @@ class Manifest:
             "spec": self.spec.model_dump(mode="json"),
             "environments": list(self.environments),
         }
-        return (
-            json.dumps({**content, "sha256": _digest(content)}, indent=1, sort_keys=True) + "\n"
-        ).encode()
+        checked = {**content, "sha256": _digest(content)}
+        return (json.dumps(checked, indent=1, sort_keys=True) + "\n").encode()
 
 
 def _digest(content: dict[str, Any]) -> str:
@@ -66,7 +65,7 @@ def _digest(content: dict[str, Any]) -> str:
 
 
 def this_environment() -> dict[str, str]:
-    """Versions of this package, Python and the libraries that decide a sample's last bits, and the platform."""
+    """Return the platform and the versions that decide a sample's last bits."""
     libraries = {name: version(name) for name in ("numpy", "scipy", "numba", "h5py")}
     system = {"platform": platform.platform(), "machine": platform.machine()}
     return {"mor-bench": __version__, "python": platform.python_version(), **libraries, **system}
@@ -80,7 +79,7 @@ def read_manifest(folder: Path) -> Manifest:
     StoreError
         If the file is foreign, of another schema, or damaged.
     FileNotFoundError
-        If there is none.
+        If it does not exist.
     """
     path = folder / NAME
     try:
@@ -104,7 +103,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def keep_sources(folder: Path, spec: DatasetSpec) -> None:
-    """Copy the files that a dataset is made from into its folder, so that it can be made again from there alone."""
+    """Copy a dataset's mesh and surface files into its folder, so that the folder is enough."""
     for file in _sources(spec.model_dump(mode="json")):
         kept = _kept(folder, file)
         if not kept.is_file():
@@ -116,7 +115,7 @@ def _kept(folder: Path, file: dict[str, str]) -> Path:
 
 
 def _sources(value: Any) -> Iterator[dict[str, str]]:
-    """Every file, as its path and SHA-256, that a specification names."""
+    """Yield every file that a specification names, with its path and SHA-256."""
     if isinstance(value, dict):
         if value.keys() == {"path", "sha256"}:
             yield value
@@ -127,7 +126,7 @@ def _sources(value: Any) -> Iterator[dict[str, str]]:
 
 
 def _with_kept(spec: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The specification with the folder's copies in the place of files that are gone."""
+    """Replace missing files in a specification by the folder's copies, in place; return it."""
     for file in _sources(spec):
         if not Path(file["path"]).is_file():
             file["path"] = str(_kept(folder, file).resolve())
@@ -135,15 +134,15 @@ def _with_kept(spec: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def update_manifest(folder: Path, manifest: Manifest, *, solves: bool) -> None:
-    """Write a folder's manifest if it is missing, damaged or another one; environments that are named there are kept.
+    """Write a folder's manifest if it is missing, damaged or different. Its environments are kept.
 
     Parameters
     ----------
     folder : Path
     manifest : Manifest
-        As it should be, without environments.
+        The wanted content, without environments.
     solves : bool
-        Whether shards are about to be generated, so that this environment belongs into it.
+        Whether shards will be generated now. Then this environment is added.
     """
     try:
         environments = read_manifest(folder).environments

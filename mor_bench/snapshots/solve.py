@@ -1,4 +1,4 @@
-"""The part of generation that runs in a worker, maybe on another machine: it reads no file and is given all that it needs."""
+"""The part of generation that runs in a worker process or on another machine. It reads no file."""
 
 from __future__ import annotations
 
@@ -22,24 +22,27 @@ from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.snapshots.store import STATUSES, Shard
 
 GENERATOR_VERSION = 3
-"""Raised when a change of the full-order model or of the sampling changes samples; part of a dataset's folder name."""
+"""Increase it when a change of the full-order model or of the sampling changes samples.
+
+It is part of a dataset's folder name.
+"""
 
 
 @dataclass(frozen=True)
 class Task:
-    """The samples of one shard to be solved.
+    """The samples of one shard that are to be solved.
 
     Attributes
     ----------
     dataset : str
         See `Shard`.
     problem : bytes
-        From `pack`; 0.5 MB for the 12,096 dofs of beam-fine, whose shards are 9 MB.
+        From `pack`.
     start : int
         Number of the first sample.
     loads : PatchLoads
     generator_version : int
-        Of the sender.
+        The sender's version.
     """
 
     dataset: str
@@ -51,14 +54,14 @@ class Task:
 
 @dataclass(frozen=True)
 class Solved:
-    """A shard, and the seconds that its solves took."""
+    """A shard, and the time of its solves, s."""
 
     shard: Shard
     seconds: float
 
 
 def pack(scene: Scene) -> bytes:
-    """What a worker needs of a scene: mesh, material, supports and the patches' weights, without what it can work out."""
+    """Serialise what a worker needs: mesh, material, supports and patch weights."""
     mesh = replace(scene.mesh)  # a copy without cached properties
     return pickle.dumps(
         (replace(scene, mesh=mesh, embedded_surface=None, point_sets={}), scene.patch_weights)
@@ -66,7 +69,7 @@ def pack(scene: Scene) -> bytes:
 
 
 class _Kept(threading.local):
-    """The model that a thread built last; threads share none, since a model works in its own buffers."""
+    """The last model of each thread. Models have buffers, so threads do not share them."""
 
     problem: bytes = b""
     model: FullOrderModel
@@ -83,7 +86,7 @@ _kept = _Kept()
 
 
 class _SingleThreaded:
-    """BLAS and OpenMP on one thread, for as long as any thread of the process solves."""
+    """Keeps BLAS and OpenMP on one thread while any thread of the process solves."""
 
     def __init__(self) -> None:
         self._lock, self._n = threading.Lock(), 0
@@ -116,7 +119,8 @@ def solve_task(task: Task) -> Solved:
     """
     if task.generator_version != GENERATOR_VERSION:
         raise WorkerError(
-            f"a worker generates samples of version {GENERATOR_VERSION}, wanted is {task.generator_version}; update its mor-bench."
+            f"a worker generates samples of version {GENERATOR_VERSION}, "
+            f"but version {task.generator_version} is wanted; update its mor-bench."
         )
     model, weights = _kept.of(task.problem)
     loads = task.loads
@@ -130,13 +134,8 @@ def solve_task(task: Task) -> Solved:
             if isinstance(found, Solution):
                 displacements[row], min_det_f[row] = found.displacement, found.min_det_f
             else:
-                status[row] = STATUSES.index(
-                    "inverted" if isinstance(found, InvertedElementError) else "no-equilibrium"
-                )
+                inverted = isinstance(found, InvertedElementError)
+                status[row] = STATUSES.index("inverted" if inverted else "no-equilibrium")
         seconds = perf_counter() - begun
-    return Solved(
-        Shard(
-            task.dataset, task.start, loads.patches, loads.vectors, displacements, min_det_f, status
-        ),
-        seconds,
-    )
+    columns = loads.patches, loads.vectors, displacements, min_det_f, status
+    return Solved(Shard(task.dataset, task.start, *columns), seconds)

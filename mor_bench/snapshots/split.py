@@ -14,22 +14,23 @@ from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.specs import ImportedDatasetSpec, Split, SplitBy
 
 IMPORTED_SEED = 0
-"""Of the split of imported samples."""
+"""Seed of the split of imported samples."""
 
 
 def split_samples(
     loads: PatchLoads | NodalLoads, n_regions: int, split: Split, seed: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row numbers of the training and of the test samples, each sorted.
+    """Return the sorted row numbers of the training and of the test samples.
 
-    By sample, any go to the test. By region, whole load regions do, chosen independently of how many samples there are;
-    by direction, forces in a cone around a random axis. A sample of several forces is for the test if all of them are and
-    for training if none is; the part of the regions, or of the sphere, is such that the test has its fraction of those.
+    By sample, any samples are held out. By region, whole load regions are, whatever the number of
+    samples. By direction, forces in a cone around a random axis are. A sample of several forces is
+    for the test if all of them are held out, and for training if none is. The fraction of regions,
+    or of the sphere, is such that the test gets its fraction of these samples.
 
     Raises
     ------
     InvalidInputError
-        If a part would be empty.
+        If the training or the test part would be empty.
     """
     generator = np.random.default_rng([seed, 0x5917])
     n, k = loads.patches.shape
@@ -37,7 +38,8 @@ def split_samples(
         held = np.zeros((n, 1), dtype=bool)
         held[generator.permutation(n)[: round(split.test_fraction * n)]] = True
     else:
-        # With p of the regions held out, p^k of the samples have all in them and (1 - p)^k none.
+        # If a fraction p of the regions is held out, p^k of the samples have all forces in them and
+        # (1 - p)^k have none.
         odds = (split.test_fraction / (1 - split.test_fraction)) ** (1 / k)
         part = odds / (1 + odds)
         if split.by == "region":
@@ -45,19 +47,13 @@ def split_samples(
             held = np.isin(loads.patches, generator.permutation(n_regions)[:n_test])
         else:
             axis = generator.normal(size=3)
-            along = (
-                loads.vectors
-                @ axis
-                / (
-                    np.linalg.norm(axis)
-                    * np.maximum(np.linalg.norm(loads.vectors, axis=2), np.finfo(float).tiny)
-                )
-            )
-            held = along > 1 - 2 * part
+            size = np.maximum(np.linalg.norm(loads.vectors, axis=2), np.finfo(float).tiny)
+            held = loads.vectors @ axis / (np.linalg.norm(axis) * size) > 1 - 2 * part
     test, train = held.all(axis=1), ~held.any(axis=1)
     if not train.any() or not test.any():
         raise InvalidInputError(
-            f"{n} samples cannot be split by {split.by}: the training or the test part would be empty."
+            f"{n} samples cannot be split by {split.by}: "
+            "the training or the test part would be empty."
         )
     return np.flatnonzero(train), np.flatnonzero(test)
 
@@ -65,23 +61,23 @@ def split_samples(
 def split_imported(
     spec: ImportedDatasetSpec, arrays: ImportedArrays, by: SplitBy | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row numbers of the training and of the test samples, each sorted.
+    """Return the sorted row numbers of imported training and test samples, see `split_samples`.
 
-    As `split_samples`; the direction of a sample is that of the sum of its forces.
+    The direction of a sample is that of the sum of its forces.
 
     Raises
     ------
     InvalidInputError
-        If the file has not what the split needs, or a part would be empty.
+        If the file lacks the array that the split needs, or a part would be empty.
     """
-    by_or_file = by or spec.split.by
-    needed = {"file": arrays.test, "region": arrays.regions}
-    if by_or_file in needed and needed[by_or_file] is None:
-        name = {"file": "test", "region": "regions"}[by_or_file]
+    chosen = by or spec.split.by
+    needed = {"file": ("test", arrays.test), "region": ("regions", arrays.regions)}
+    if chosen in needed and needed[chosen][1] is None:
         raise InvalidInputError(
-            f"{spec.name}: a split by {by_or_file} needs the array `{name}` in {spec.snapshots.file.path}; or split by sample."
+            f"{spec.name}: a split by {chosen} needs the array `{needed[chosen][0]}` "
+            f"in {spec.snapshots.file.path}; or split by sample."
         )
-    if by_or_file == "file":
+    if chosen == "file":
         assert arrays.test is not None
         if arrays.test.all() or not arrays.test.any():
             raise InvalidInputError(
@@ -89,9 +85,8 @@ def split_imported(
             )
         return np.flatnonzero(~arrays.test), np.flatnonzero(arrays.test)
     loads = nodal_loads(arrays)
-    # Ids may have gaps of any size: what is drawn is their rank.
+    # Ids may have large gaps, so their ranks are drawn.
     ids, ranks = np.unique(loads.patches, return_inverse=True)
-    split = Split(test_fraction=spec.split.test_fraction, by=by_or_file)
-    return split_samples(
-        replace(loads, patches=ranks.reshape(loads.patches.shape)), len(ids), split, IMPORTED_SEED
-    )
+    ranked = replace(loads, patches=ranks.reshape(loads.patches.shape))
+    split = Split(test_fraction=spec.split.test_fraction, by=chosen)
+    return split_samples(ranked, len(ids), split, IMPORTED_SEED)

@@ -1,7 +1,8 @@
-"""Shards of snapshots on disk: HDF5 files, each written atomically and carrying a checksum of all that it holds.
+"""Shards of snapshots on disk: HDF5 files, written atomically, with a checksum of their content.
 
-A shard begins with a 512-byte user block (which HDF5 skips) that holds one line of JSON: format, schema version, and the
-length and the SHA-256 of the rest of the file. One rename commits data and checksum together.
+A shard begins with a user block of 512 bytes, which HDF5 skips. It holds one line of JSON: format,
+schema version, and the length and SHA-256 of the rest of the file. One rename commits data and
+checksum together.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ HEADER_BYTES = 512
 STATUSES = ("ok", "inverted", "no-equilibrium")
 
 STALE_AFTER_S = 3600.0
-"""Age from which a temporary file is a leftover whoever wrote it; no write takes as long."""
+"""Age at which a temporary file counts as a leftover of any process, s. No write takes as long."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Shard:
     Attributes
     ----------
     dataset : str
-        What the samples belong to, see `mor_bench.snapshots.generate.dataset_key`.
+        Key of the dataset, see `mor_bench.snapshots.generate.dataset_key`.
     start : int
         Number of the first sample.
     patches : (n, k) int64
@@ -63,7 +64,7 @@ class Shard:
     status: NDArray[np.uint8]
 
     def first(self, n: int) -> Shard:
-        """The first n samples, or all if there are no more."""
+        """Return the first n samples, or all if there are fewer."""
         return replace(self, **{name: getattr(self, name)[:n] for name in _FIELDS})
 
 
@@ -76,14 +77,16 @@ _FIELDS = {
 }
 
 
-def _host() -> str:
+def host_name() -> str:
+    """Return the name of this machine as it stands in names of temporary files."""
     return re.sub(r"[^0-9A-Za-z-]", "-", platform.node())
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that it is there whole or not at all, whatever happens in between."""
-    # The name tells who writes, and is another's on no machine that shares the folder.
-    temporary = path.with_name(f".{path.name}.{_host()}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    """Write a file so that it exists complete or not at all, even if the process is killed."""
+    # The name identifies the writer, also among machines that share the folder.
+    writer = f"{host_name()}.{os.getpid()}.{secrets.token_hex(4)}"
+    temporary = path.with_name(f".{path.name}.{writer}.tmp")
     try:
         with open(temporary, "wb") as file:
             file.write(content)
@@ -95,19 +98,21 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def remove_leftovers(folder: Path, of: str = "*") -> None:
-    """Remove temporary files, of all or of one name, whose writers were killed; those of processes that live are left to them."""
+    """Remove temporary files of killed writers, for one target name or all.
+
+    Files of live processes are kept.
+    """
     for path in folder.glob(f".{of}.*.tmp"):
-        with suppress(FileNotFoundError):  # another process is tidying up too
+        with suppress(FileNotFoundError):  # another process may remove it first
             if _writer_is_dead(path) or time.time() - path.stat().st_mtime > STALE_AFTER_S:
                 path.unlink()
 
 
 def _writer_is_dead(temporary: Path) -> bool:
-    """Whether a file was written by a process of this machine that is no more; False if that cannot be known."""
+    """Whether the writer is a dead process of this machine; False if that cannot be known."""
     named = re.fullmatch(r"\..*\.(?P<host>[^.]*)\.(?P<pid>\d+)\.[0-9a-f]+\.tmp", temporary.name)
-    if (
-        named is None or named["host"] != _host() or sys.platform == "win32"
-    ):  # there, signal 0 is not one that does nothing
+    # On Windows signal 0 would end the process.
+    if named is None or named["host"] != host_name() or sys.platform == "win32":
         return False
     try:
         os.kill(int(named["pid"]), 0)
@@ -119,17 +124,18 @@ def _writer_is_dead(temporary: Path) -> bool:
 
 
 def shard_bytes(shard: Shard) -> bytes:
-    """A shard as the content of a file; the same shard always gives the same bytes."""
+    """Return a shard as the content of a file. The same shard always gives the same bytes."""
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", userblock_size=HEADER_BYTES) as file:
         file.attrs["dataset"], file.attrs["start"] = shard.dataset, shard.start
         for name, dtype in _FIELDS.items():
             file.create_dataset(name, data=getattr(shard, name).astype(dtype), track_times=False)
     body = buffer.getvalue()[HEADER_BYTES:]
-    return _header(SCHEMA_VERSION, len(body), hashlib.sha256(body).hexdigest()) + body
+    return header_line(SCHEMA_VERSION, len(body), hashlib.sha256(body).hexdigest()) + body
 
 
-def _header(version: int, length: int, digest: str) -> bytes:
+def header_line(version: int, length: int, digest: str) -> bytes:
+    """Return the user block of a shard."""
     header = {"format": FORMAT, "schema_version": version, "bytes": length, "sha256": digest}
     return json.dumps(header).encode().ljust(HEADER_BYTES, b" ")
 
@@ -145,9 +151,9 @@ def read_shard(path: Path) -> Shard:
     Raises
     ------
     StoreError
-        If the file cannot be read, is foreign, of another schema, truncated, or a bit of it has changed.
+        If the file is unreadable, foreign, of another schema, truncated, or any bit has changed.
     FileNotFoundError
-        If there is none.
+        If it does not exist.
     """
     try:
         content = path.read_bytes()
@@ -159,7 +165,7 @@ def read_shard(path: Path) -> Shard:
 
 
 def parse_shard(content: bytes, where: str) -> Shard:
-    """The shard that a file's content is; raises `StoreError`, whose message begins with ``where``."""
+    """Return the shard in a file's content; messages of `StoreError` begin with ``where``."""
     head, body = content[:HEADER_BYTES], memoryview(content)[HEADER_BYTES:]
     try:
         header = json.loads(head)
@@ -170,13 +176,14 @@ def parse_shard(content: bytes, where: str) -> Shard:
         raise StoreError(f"{where}: not a shard of mor-bench (format {format_!r}).")
     check_version(version, where)
     length, digest = header.get("bytes"), header.get("sha256")
-    if _header(version, length, digest) != head:
-        raise StoreError(f"{where}: damaged: the header is not as it was written.")
+    if header_line(version, length, digest) != head:
+        raise StoreError(f"{where}: damaged: the header has changed.")
     if not isinstance(length, int) or len(body) > length:
-        raise StoreError(f"{where}: damaged: it is not as long as its header says.")
+        raise StoreError(f"{where}: damaged: its length is not that in its header.")
     if len(body) < length:
         raise StoreError(
-            f"{where}: truncated: {HEADER_BYTES + len(body):,} of {HEADER_BYTES + length:,} bytes are there."
+            f"{where}: truncated: only {HEADER_BYTES + len(body):,} of "
+            f"{HEADER_BYTES + length:,} bytes exist."
         )
     if hashlib.sha256(body).hexdigest() != digest:
         raise StoreError(f"{where}: damaged: the checksum does not match.")
@@ -188,19 +195,17 @@ def parse_shard(content: bytes, where: str) -> Shard:
                 **{name: file[name][()] for name in _FIELDS},
             )
     except (OSError, KeyError) as error:
-        raise StoreError(f"{where}: its content is not that of a shard: {error}") from None
+        raise StoreError(f"{where}: the content is not that of a shard: {error}") from None
 
 
 def check_version(version: object, where: str) -> None:
-    """Raise `StoreError`, saying what to do, if a file is of another schema than this version of mor-bench reads."""
+    """Raise `StoreError` with advice if a file has a schema that this version does not read."""
     if version == SCHEMA_VERSION:
         return
     newer = isinstance(version, int) and version > SCHEMA_VERSION
-    kind, remedy = (
-        (NewerSchemaError, "update mor-bench to read it, or remove it")
-        if newer
-        else (StoreError, "generate the dataset again")
-    )
+    kind: type[StoreError] = NewerSchemaError if newer else StoreError
+    remedy = "update mor-bench to read it, or remove it" if newer else "generate the dataset again"
     raise kind(
-        f"{where}: schema version {version}; this version of mor-bench reads version {SCHEMA_VERSION}: {remedy}."
+        f"{where}: schema version {version}; "
+        f"this version of mor-bench reads version {SCHEMA_VERSION}: {remedy}."
     )
