@@ -1,27 +1,30 @@
 """Time at error and error at time, from the swept configurations of each method.
 
-Between two adjacent non-dominated configurations the frontier is a straight line in log-log; beyond them it does not
-exist: nothing is extrapolated. Beside each interpolated figure stands the best real configuration that meets the target.
+Between two adjacent non-dominated configurations the frontier is a straight line in log-log.
+Nothing is extrapolated beyond them. Each interpolated figure comes with the best real configuration
+that meets the target.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, inf, isfinite, log
+from math import exp, inf, isfinite, isnan, log
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.results.row import Row
+
 TARGET_ERRORS = (0.10, 0.03, 0.01, 0.003, 0.001)
-"""Relative l2, median over the test set."""
+"""Median relative L2 errors over the test set, as fractions."""
 
 TARGET_TIMES_MS = (0.1, 1.0, 3.0, 10.0, 33.0, 100.0)
-"""Latency of one query, median, ms."""
+"""Median latencies of one query, ms."""
 
 EXACT = 1e-16
-"""An error of zero has no logarithm; it stands at the round-off of double precision."""
+"""Stands for an error of zero, which has no logarithm: the round-off of double precision."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Point:
 
 
 def non_dominated(points: Sequence[Point]) -> list[Point]:
-    """The points that no other beats in one of latency and error without losing in the other, fastest first."""
+    """Return the Pareto front of latency and error, fastest first."""
     front: list[Point] = []
     for point in sorted(points, key=lambda p: (p.latency_ms, p.error)):
         if isfinite(point.error) and (not front or point.error < front[-1].error):
@@ -51,9 +54,9 @@ def _interpolate(x: float, x0: float, y0: float, x1: float, y1: float) -> float:
 
 
 def time_at_error(points: Sequence[Point], target: float) -> dict[str, Any]:
-    """Latency at an error: interpolated, and that of the fastest real configuration that meets it.
+    """Return the interpolated latency at an error, and the fastest real configuration there.
 
-    When even the fastest configuration meets the target, its own latency stands for both; None means not reached.
+    If the fastest configuration of all meets the target, its latency is both. None: not reached.
     """
     front = non_dominated(points)
     real = next((p for p in front if p.error <= target), None)
@@ -73,7 +76,7 @@ def time_at_error(points: Sequence[Point], target: float) -> dict[str, Any]:
 
 
 def error_at_time(points: Sequence[Point], target_ms: float) -> dict[str, Any]:
-    """Error at a latency: interpolated, and that of the most accurate real configuration that is fast enough."""
+    """Return the interpolated error at a latency, and the most accurate configuration within it."""
     front = non_dominated(points)
     within = [p for p in front if p.latency_ms <= target_ms]
     if not within:
@@ -97,12 +100,12 @@ def frontier_draws(
     errors: Sequence[float],
     times_ms: Sequence[float],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """`time_at_error` and `error_at_time` of many resamples at once.
+    """Compute `time_at_error` and `error_at_time` for many resamples at once.
 
     Parameters
     ----------
     log_latencies, log_errors : (n_configurations, n) float64
-        Natural logarithms, of ms and of relative l2; the errors no smaller than that of `EXACT`.
+        Natural logarithms of ms and of relative L2 errors; no error is below `EXACT`.
     errors, times_ms : sequence of float
         Targets.
 
@@ -122,9 +125,8 @@ def frontier_draws(
     numbers, columns = np.arange(n_configurations)[:, None], np.arange(n)
     least = np.minimum.accumulate(error, axis=0)
     on_front = np.vstack([np.isfinite(error[:1]), (error[1:] < least[:-1])])
-    last = np.maximum.accumulate(
-        np.where(on_front, numbers, -1), axis=0
-    )  # of the front's points so far
+    # The last point of the front up to each configuration.
+    last = np.maximum.accumulate(np.where(on_front, numbers, -1), axis=0)
     at_error, at_time = np.full((len(errors), n), np.inf), np.full((len(times_ms), n), np.inf)
     for out, target in zip(at_error, np.log(np.maximum(errors, EXACT)), strict=True):
         meets = error <= target
@@ -148,31 +150,43 @@ def frontier_draws(
 
 
 def _share(x: float, start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far x is from start to end; all of it where they are one, or not finite."""
+    """Relative position of x between start and end; 1 where they coincide or are not finite."""
     with np.errstate(invalid="ignore", divide="ignore"):
         share = (x - start) / (end - start)
     return np.where(np.isfinite(share), share, 1.0)
 
 
-def is_point(row: dict[str, Any]) -> bool:
-    """Whether a results row has a place on the plane: it ran, was timed and was scored."""
-    if row["status"] != "ok":
-        return False
-    latency, error = (
-        (row["latency_ms"] or {}).get("median"),
-        (row["error"] or {}).get("rel_l2_median"),
-    )
-    return latency is not None and error is not None and 0 < latency < inf
+def number_or_inf(value: float | None) -> float:
+    """A figure of a row; infinite if there is none, or if it is not a number."""
+    return inf if value is None or isnan(value) else float(value)
 
 
-def compare(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Both tables over all datasets and methods of results rows; a method without a usable row reaches nothing."""
+def median_error(row: Row) -> float:
+    """Median relative L2 error of a row; infinite if there is none."""
+    return number_or_inf(row.error.rel_l2_median if row.error else None)
+
+
+def median_latency_ms(row: Row) -> float:
+    """Median latency of a row, ms; infinite if there is none."""
+    return number_or_inf(row.latency_ms.median if row.latency_ms else None)
+
+
+def is_point(row: Row) -> bool:
+    """Whether a row has a place on the plane: it ran, was timed and was scored."""
+    return row.status == "ok" and row.error is not None and 0 < median_latency_ms(row) < inf
+
+
+def compare(rows: Sequence[Row]) -> dict[str, Any]:
+    """Time at error and error at time of all methods on all datasets.
+
+    A method without a usable row reaches nothing.
+    """
     at_error, at_time = [], []
-    for dataset, method in dict.fromkeys((row["dataset"], row["method"]) for row in rows):
+    for dataset, method in dict.fromkeys((row.dataset, row.method) for row in rows):
         points = [
-            Point(row["latency_ms"]["median"], row["error"]["rel_l2_median"], row["label"])
+            Point(median_latency_ms(row), median_error(row), row.label)
             for row in rows
-            if (row["dataset"], row["method"]) == (dataset, method) and is_point(row)
+            if (row.dataset, row.method) == (dataset, method) and is_point(row)
         ]
         key = {"dataset": dataset, "method": method}
         at_error += [

@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mor_bench.report.console_tables import print_tables
-    from mor_bench.report.page import render, write_report
+    from mor_bench.report.page import render
 
-__all__ = ["print_tables", "render", "write_report"]
+__all__ = ["print_tables", "render"]
 
 _HOMES = {
     "print_tables": "mor_bench.report.console_tables",
     "render": "mor_bench.report.page",
-    "write_report": "mor_bench.report.page",
 }
 
 

@@ -1,4 +1,4 @@
-"""What all figures share: size, colours and markers of methods, writing, and labels that do not overlap."""
+"""What all figures share: size, colours, markers, ticks, saving, and labels that do not overlap."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
@@ -25,10 +27,13 @@ from mor_bench.snapshots.store import write_atomically
 
 DPI = 150
 WIDTH_IN = 9.4
-"""Inches; 1,410 pixels, what a README shows without scaling up."""
+"""Width in inches; its 1,410 pixels are what a README shows without scaling up."""
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
-"""Okabe and Ito's palette, distinct for the common kinds of colour blindness (its yellow, illegible on white, replaced by a brown)."""
+"""Okabe and Ito's palette, which colour-blind readers can tell apart.
+
+Its yellow is illegible on white and is replaced by a brown.
+"""
 
 MARKERS = ("o", "s", "^", "D", "P", "X", "v", "*", "<", ">", "h")
 
@@ -36,18 +41,27 @@ INK, GREY, LIGHT = "#222222", "#8a8a8a", "#d9d9d9"
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """A figure on disk.
+class Picture:
+    """A figure that is drawn but not saved.
 
     Attributes
     ----------
-    dataset : str
-    path : Path
-        PNG file.
-    title : str
-    caption : str
-        How to read it.
+    kind : str
+        Part of its file name, such as ``learning-curves``.
+    title, caption : str
+        What it shows, and how to read it.
+    figure : Figure
     """
+
+    kind: str
+    title: str
+    caption: str
+    figure: Figure
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure on disk: its dataset, PNG file, title, and a caption that says how to read it."""
 
     dataset: str
     path: Path
@@ -57,30 +71,31 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Style:
-    """How a method looks in every figure."""
+    """Colour and marker of a method in every figure."""
 
     colour: str
     marker: str
 
 
 def styles_of(comparison: Comparison) -> dict[str, Style]:
-    """A colour and a marker for each method, in the order in which they ran."""
-    methods = dict.fromkeys(row["method"] for row in comparison.rows)
+    """Choose a colour and a marker for each method, in the order in which they ran."""
+    methods = dict.fromkeys(row.method for row in comparison.rows)
     return {
         method: Style(COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)])
         for i, method in enumerate(methods)
     }
 
 
-def new_figure(height_in: float) -> Figure:
-    """An empty figure of the common width that belongs to no global state."""
+def new_figure(height_in: float, title: str) -> Figure:
+    """Make an empty figure of the common width that belongs to no global state."""
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
+    figure.suptitle(plain(title), x=0.01, ha="left", fontsize=13, color=INK)
     return figure
 
 
 def dress(axes: Axes) -> None:
-    """The common look of plots: light grid, no box."""
+    """Give plots their common look: light grid, no box."""
     axes.grid(True, which="major", color="#e6e6e6", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=9, colors=INK, which="both")
@@ -89,25 +104,33 @@ def dress(axes: Axes) -> None:
         spine.set_color(GREY)
 
 
-def save(figure: Figure, comparison: Comparison, dataset: str, kind: str) -> Path:
+def log_ticks(axis: Axis, values: Sequence[float] = (1.0,), unit: str = "") -> None:
+    """Label a logarithmic axis with plain numbers, fewer where the values span a wide range."""
+    subs = (1.0, 2.0, 5.0) if max(values) / min(values) < 300 else (1.0,)
+    axis.set_major_locator(LogLocator(subs=subs, numticks=20))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}{unit}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def save(picture: Picture, comparison: Comparison, dataset: str) -> Drawn:
     """Write a figure to OUT/figures/ atomically."""
     folder = comparison.out / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     name = re.sub(r"[^\w.=-]+", "-", dataset).strip("-")
-    path = folder / f"{name}--{kind}.png"
+    path = folder / f"{name}--{picture.kind}.png"
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    picture.figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
     write_atomically(path, buffer.getvalue())
-    return path
+    return Drawn(dataset, path, picture.title, picture.caption)
 
 
 def plain(text: str) -> str:
-    """Text in which matplotlib sees no formula."""
+    """Escape a text so that matplotlib sees no formula."""
     return text.replace("$", r"\$")
 
 
 def shortened(text: str, length: int) -> str:
-    """At most so many characters, with an ellipsis where some were lost."""
+    """Cut a text to a number of characters, with an ellipsis if some are lost."""
     return text if len(text) <= length else text[: length - 1] + "…"
 
 
@@ -123,7 +146,7 @@ _OFFSETS = (
     (0, 14),
     (0, -14),
 )
-"""Places around a point, in points, the best first."""
+"""Positions around a point, in typographic points, the best first."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +166,7 @@ def annotate(
     keep_free: Sequence[Artist] = (),
     radius: float = 5.0,
 ) -> None:
-    """Write notes where nothing else stands; one for which there is no room is left out.
+    """Write notes where nothing else is; a note without room is left out.
 
     Parameters
     ----------
@@ -152,49 +175,34 @@ def annotate(
     notes : sequence of Note
         The most important first.
     lines : sequence of (n, 2) arrays
-        Polylines in data coordinates that texts should rather not cross.
+        Polylines in data coordinates that notes should preferably not cross.
     keep_free : sequence of Artist
         Texts that must not be covered.
     radius : float
-        Of the markers, in typographic points.
+        Radius of the markers, in typographic points.
     """
-    canvas: Any = FigureCanvasAgg(
-        axes.get_figure(root=True)
-    )  # matplotlib's annotations lack this class's methods
+    # matplotlib types the figure's canvas without the methods of this class
+    canvas: Any = FigureCanvasAgg(axes.get_figure(root=True))
     canvas.draw()
     renderer = canvas.get_renderer()
-    half, further = radius * DPI / 72.0, radius - 5.0
+    half = radius * DPI / 72.0
     points = axes.transData.transform(np.array([(note.x, note.y) for note in notes]).reshape(-1, 2))
-    markers = [Bbox.from_bounds(x - half, y - half, 2 * half, 2 * half) for x, y in points]
-    taken = [artist.get_window_extent(renderer) for artist in keep_free]
+    taken = [Bbox.from_bounds(x - half, y - half, 2 * half, 2 * half) for x, y in points]
+    taken += [artist.get_window_extent(renderer) for artist in keep_free]
     on_lines = np.concatenate(
         [np.zeros((0, 2)), *(_dense(axes.transData.transform(line)) for line in lines)]
     )
     frame = axes.get_window_extent(renderer)
     for note in notes:
         best: tuple[float, Annotation, Bbox] | None = None
-        for rank, (dx, dy) in enumerate(_OFFSETS):
-            away = (dx + further * np.sign(dx), dy + further * np.sign(dy))
-            text = axes.annotate(
-                plain(note.text),
-                (note.x, note.y),
-                xytext=away,
-                textcoords="offset points",
-                **_look(note, dx, dy),
-            )
-            text.set_in_layout(False)
-            text.set_path_effects([withStroke(linewidth=2, foreground="white")])
+        for rank, offset in enumerate(_OFFSETS):
+            text = _write(axes, note, offset, radius - 5.0)
             box = text.get_window_extent(renderer).padded(1.5)
-            inside = (
-                frame.x0 <= box.x0
-                and box.x1 <= frame.x1
-                and frame.y0 <= box.y0
-                and box.y1 <= frame.y1
-            )
-            free = inside and not any(box.overlaps(other) for other in [*taken, *markers])
-            cost = 2.0 * rank + float(
-                ((on_lines >= box.min) & (on_lines <= box.max)).all(axis=1).sum()
-            )
+            inside = frame.x0 <= box.x0 and box.x1 <= frame.x1
+            inside = inside and frame.y0 <= box.y0 and box.y1 <= frame.y1
+            free = inside and not any(box.overlaps(other) for other in taken)
+            crossed = ((on_lines >= box.min) & (on_lines <= box.max)).all(axis=1).sum()
+            cost = 2.0 * rank + float(crossed)
             if free and (best is None or cost < best[0]):
                 if best is not None:
                     best[1].remove()
@@ -205,13 +213,26 @@ def annotate(
             taken.append(best[2])
 
 
-def _look(note: Note, dx: int, dy: int) -> dict[str, Any]:
-    horizontal = "left" if dx > 0 else "right" if dx < 0 else "center"
-    vertical = "center" if abs(dy) <= 5 else "bottom" if dy > 0 else "top"
-    return {"fontsize": 7.5, "color": note.colour, "zorder": 6, "ha": horizontal, "va": vertical}
+def _write(axes: Axes, note: Note, offset: tuple[int, int], further: float) -> Annotation:
+    """Write a note at an offset from its point."""
+    dx, dy = offset
+    text = axes.annotate(
+        plain(note.text),
+        (note.x, note.y),
+        xytext=(dx + further * np.sign(dx), dy + further * np.sign(dy)),
+        textcoords="offset points",
+        fontsize=7.5,
+        color=note.colour,
+        zorder=6,
+        ha="left" if dx > 0 else "right" if dx < 0 else "center",
+        va="center" if abs(dy) <= 5 else "bottom" if dy > 0 else "top",
+    )
+    text.set_in_layout(False)
+    text.set_path_effects([withStroke(linewidth=2, foreground="white")])
+    return text
 
 
 def _dense(line: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points every three pixels or so along a polyline."""
+    """Points along a polyline, about every three pixels."""
     pieces = [np.linspace(a, b, max(2, int(np.hypot(*(b - a)) / 3))) for a, b in pairwise(line)]
     return np.concatenate(pieces) if pieces else line

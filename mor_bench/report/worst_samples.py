@@ -1,4 +1,4 @@
-"""The worst test sample of each method: the predicted mesh over the reference, seen in parallel projection."""
+"""The figure of worst test samples: predicted mesh over reference, in parallel projection."""
 
 from __future__ import annotations
 
@@ -17,33 +17,36 @@ from mor_bench.report.canvas import (
     GREY,
     INK,
     WIDTH_IN,
-    Drawn,
+    Picture,
     Style,
     new_figure,
     plain,
-    save,
     shortened,
 )
-from mor_bench.report.summary import (
-    Entry,
-    best_per_method,
-    entries_of,
-    metres,
-    percent,
-    short_swept,
-)
+from mor_bench.report.entries import Entry, best_per_method, entries_of
+from mor_bench.report.number_format import metres, percent, short_swept
 from mor_bench.results.comparison import Comparison
 from mor_bench.scene.mesh import Mesh
 
-REFERENCE, PREDICTION, FORCE = "#7fb2d6", "#D55E00", "#222222"
+REFERENCE, REFERENCE_EDGE = "#7fb2d6", "#33607f"
+REST, PREDICTION, FORCE = "#c4c4c4", "#D55E00", "#222222"
 
 AZIMUTH, ELEVATION = np.deg2rad(-68.0), np.deg2rad(20.0)
-"""Direction from which the mesh is seen: x runs to the right, z up, and the faces y-min and z-max show."""
+"""Direction of view: x runs to the right, z up, and the faces y-min and z-max are visible."""
+
+CAPTION = (
+    "The test sample with the largest e of each method's configuration with the smallest ē: "
+    "a mean hides it. "
+    "Samples without a prediction cannot be drawn; the title gives their number. "
+    "Filled: the reference. Lines: the prediction. Grey: the body at rest. "
+    "Deformations are not magnified, and all panels have the same scale. "
+    "The arrow shows the direction and place of the force, not its size."
+)
 
 
 @dataclass(frozen=True)
 class WorstSample:
-    """The predicted test sample with the largest e of a configuration; arrays are (n_nodes, 3).
+    """The predicted test sample of a configuration with the largest e; arrays are (n_nodes, 3).
 
     Attributes
     ----------
@@ -64,18 +67,15 @@ class WorstSample:
     relative_l2: float
 
 
-def worst_samples(comparison: Comparison, dataset: str, styles: dict[str, Style]) -> Drawn | None:
-    """Predicted mesh over reference for the worst sample of each method's best configuration; None if there are none."""
+def worst_samples(comparison: Comparison, dataset: str, styles: dict[str, Style]) -> Picture | None:
+    """Draw the worst sample of each method's best configuration; None if there are none."""
     try:
         arrays = comparison.dataset_arrays(dataset)
         mesh = Mesh(np.asarray(arrays["points"]), np.asarray(arrays["cells"]))
     except (OSError, KeyError):
         return None
-    samples = [
-        sample
-        for entry in best_per_method(entries_of(comparison, dataset))
-        if (sample := _read(comparison, entry)) is not None
-    ]
+    best = best_per_method(entries_of(comparison, dataset))
+    samples = [sample for entry in best if (sample := _read(comparison, entry)) is not None]
     if not samples:
         return None
     columns = min(3 if len(samples) > 4 else 2, len(samples))
@@ -83,61 +83,45 @@ def worst_samples(comparison: Comparison, dataset: str, styles: dict[str, Style]
     arrows = [_arrow(mesh, sample) for sample in samples]
     limits = _limits(mesh, samples, arrows)
     tall = float(np.divide(*np.diff(limits, axis=0)[0, ::-1]))
-    figure = new_figure(0.9 + rows * (0.45 + WIDTH_IN / columns * min(tall, 1.0)))
+    title = "Worst test sample of each method"
+    height = 0.9 + rows * (0.45 + WIDTH_IN / columns * min(tall, 1.0))
+    figure = new_figure(height, f"{title} – {dataset}")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.ravel():
         axes.set_axis_off()
     for axes, sample, arrow in zip(grid.ravel(), samples, arrows, strict=False):
-        _panel(axes, mesh, sample, arrow, limits)
+        axes.set_aspect("equal")
+        axes.set_xlim(limits[0, 0], limits[1, 0])
+        axes.set_ylim(limits[0, 1], limits[1, 1])
+        _draw_sample(axes, mesh, sample, arrow)
     handles = [
         Line2D([], [], color=GREY, linewidth=0.8, label="at rest"),
-        Patch(facecolor=REFERENCE, edgecolor="#33607f", label="reference (full-order)"),
+        Patch(facecolor=REFERENCE, edgecolor=REFERENCE_EDGE, label="reference (full-order)"),
         Line2D([], [], color=PREDICTION, linewidth=1.5, label="prediction"),
         Line2D([], [], color=FORCE, linewidth=1.5, marker=">", label="total force"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    figure.suptitle(
-        plain(f"Worst test sample of each method – {dataset}"),
-        x=0.01,
-        ha="left",
-        fontsize=13,
-        color=INK,
-    )
-    path = save(figure, comparison, dataset, "worst-samples")
-    caption = (
-        "The test sample with the largest e of each method, in the configuration with the smallest ē: the average hides it. "
-        "Samples without a prediction cannot be drawn; the title gives their number. "
-        "Filled: the reference; lines: the prediction; grey: the body at rest. Deformations are not magnified, all panels have the same scale. "
-        "The arrow shows direction and place of the force, not its size."
-    )
-    return Drawn(dataset, path, "Worst test sample of each method", caption)
+    return Picture("worst-samples", title, CAPTION, figure)
 
 
 def _read(comparison: Comparison, entry: Entry) -> WorstSample | None:
     try:
         arrays = comparison.samples(entry.row)
         e = np.asarray(arrays["mean_dof_m"])
-        worst = int(
-            np.argmax(np.where(np.isfinite(e), e, -1.0))
-        )  # a sample without a prediction has nothing to draw
+        # A sample without a prediction cannot be drawn.
+        worst = int(np.argmax(np.where(np.isfinite(e), e, -1.0)))
         prediction, reference, forces = (
             np.asarray(arrays[f"worst_{name}"], dtype=float)
             for name in ("prediction", "reference", "forces")
         )
-        return WorstSample(
-            entry,
-            prediction,
-            reference,
-            forces,
-            float(e[worst]),
-            float(arrays["relative_l2"][worst]),
-        )
+        figures = float(e[worst]), float(arrays["relative_l2"][worst])
     except (OSError, KeyError, ValueError):
         return None
+    return WorstSample(entry, prediction, reference, forces, *figures)
 
 
 def _project(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Screen coordinates (n, 2) in m and nearness (n,): a rotation, so all three axes have the same scale."""
+    """Rotate points into screen coordinates (n, 2), m, and nearness to the viewer (n,), m."""
     ca, sa, ce, se = np.cos(AZIMUTH), np.sin(AZIMUTH), np.cos(ELEVATION), np.sin(ELEVATION)
     towards = np.array([ce * ca, ce * sa, se])
     right = np.array([-sa, ca, 0.0])
@@ -147,7 +131,10 @@ def _project(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 def _limits(
     mesh: Mesh, samples: list[WorstSample], arrows: list[NDArray[np.float64] | None]
 ) -> NDArray[np.float64]:
-    """(2, 2) screen box that holds all shapes and arrows; of wild predictions only what lies within half a diagonal of the body."""
+    """Screen box (2, 2) of all shapes and arrows.
+
+    Displacements of wild predictions are cut at half a diagonal of the body.
+    """
     span = _diagonal(mesh)
     shapes = [mesh.points, *(arrow for arrow in arrows if arrow is not None)]
     for sample in samples:
@@ -166,7 +153,7 @@ def _diagonal(mesh: Mesh) -> float:
 
 
 def _arrow(mesh: Mesh, sample: WorstSample) -> NDArray[np.float64] | None:
-    """(2, 3) start and end of the total force: it ends on the surface where it pushes and starts there where it pulls."""
+    """Start and end (2, 3) of the total force: it ends on the surface if it pushes, else starts."""
     size, total = np.linalg.norm(sample.forces, axis=1), sample.forces.sum(axis=0)
     if not size.sum() > 0 or not np.linalg.norm(total) > 0:
         return None
@@ -180,36 +167,23 @@ def _arrow(mesh: Mesh, sample: WorstSample) -> NDArray[np.float64] | None:
     return np.stack([place - arrow, place] if pushes else [place, place + arrow])
 
 
-def _panel(
-    axes: Axes,
-    mesh: Mesh,
-    sample: WorstSample,
-    arrow: NDArray[np.float64] | None,
-    limits: NDArray[np.float64],
+def _draw_sample(
+    axes: Axes, mesh: Mesh, sample: WorstSample, arrow: NDArray[np.float64] | None
 ) -> None:
-    axes.set_aspect("equal")
-    axes.set_xlim(limits[0, 0], limits[1, 0])
-    axes.set_ylim(limits[0, 1], limits[1, 1])
+    """Draw the body at rest, the reference, the prediction and the force."""
     facets = mesh.boundary_facets
-    rest, _ = _project(mesh.points)
-    axes.add_collection(
-        LineCollection(list(rest[_edges(facets)]), colors="#c4c4c4", linewidths=0.5, zorder=1)
-    )
-    reference = mesh.points + sample.reference
-    _draw_surface(axes, reference, facets)
+    _draw_edges(axes, mesh.points, facets, {"colors": REST, "linewidths": 0.5, "zorder": 1})
+    _draw_surface(axes, mesh.points + sample.reference, facets)
     predicted = np.asarray(np.isfinite(sample.prediction).all(axis=1))
+    figures = "no prediction: the method failed on it"
     if predicted.any():
-        screen, _ = _project(mesh.points + sample.prediction)
+        points = mesh.points + sample.prediction
         whole = facets[predicted[facets].all(axis=1)]
-        front = whole[_facing(mesh.points + sample.prediction, whole)]
-        axes.add_collection(
-            LineCollection(list(screen[_edges(front)]), colors=PREDICTION, linewidths=0.9, zorder=4)
-        )
+        look = {"colors": PREDICTION, "linewidths": 0.9, "zorder": 4}
+        _draw_edges(axes, points, whole[_facing(points, whole)], look)
         figures = f"e = {metres(sample.error_m)} m, relative L2 = {percent(sample.relative_l2)} %"
         if sample.entry.n_failed:
             figures += f"; {sample.entry.n_failed} failed"
-    else:
-        figures = "no prediction: the method failed on it"
     if arrow is not None:
         start, end = _project(arrow)[0]
         _draw_force(axes, start, end, float(np.linalg.norm(sample.forces.sum(axis=0))))
@@ -217,25 +191,28 @@ def _panel(
     axes.set_title(plain(f"{name}\n{figures}"), fontsize=9.5, loc="left", color=INK)
 
 
-def _edges(facets: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n_edges, 2) edges of facets, each once."""
+def _draw_edges(
+    axes: Axes, points: NDArray[np.float64], facets: NDArray[np.int64], look: dict[str, Any]
+) -> None:
+    """Draw the edges of facets, each once."""
     pairs = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
-    return np.unique(np.sort(pairs, axis=1), axis=0)
+    edges = np.unique(np.sort(pairs, axis=1), axis=0)
+    axes.add_collection(LineCollection(list(_project(points)[0][edges]), **look))
 
 
 def _normals(points: NDArray[np.float64], facets: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(n_facets, 3) outward normals, as long as twice the facet's area."""
+    """Outward normals (n_facets, 3), twice as long as the facet's area."""
     corners = points[facets]
     return np.asarray(np.cross(corners[:, 2] - corners[:, 0], corners[:, -1] - corners[:, 1]))
 
 
 def _facing(points: NDArray[np.float64], facets: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """The facets whose outer side is seen."""
+    """Mark the facets whose outer side is visible."""
     return np.asarray(_project(_normals(points, facets))[1] > 0)
 
 
 def _draw_surface(axes: Axes, points: NDArray[np.float64], facets: NDArray[np.int64]) -> None:
-    """Visible facets from far to near, the brighter the more they face upwards."""
+    """Draw visible facets from far to near; facets that face upwards are brighter."""
     seen = facets[_facing(points, facets)]
     screen, nearness = _project(points)
     order = np.argsort(nearness[seen].mean(axis=1))
@@ -248,7 +225,7 @@ def _draw_surface(axes: Axes, points: NDArray[np.float64], facets: NDArray[np.in
         PolyCollection(
             list(screen[seen[order]]),
             facecolors=colours[order],
-            edgecolors="#33607f",
+            edgecolors=REFERENCE_EDGE,
             linewidths=0.4,
             zorder=3,
         )
@@ -258,6 +235,7 @@ def _draw_surface(axes: Axes, points: NDArray[np.float64], facets: NDArray[np.in
 def _draw_force(
     axes: Axes, start: NDArray[np.float64], end: NDArray[np.float64], newton: float
 ) -> None:
+    """Draw the arrow of the force with its size in N beside the upper end."""
     shape = {"arrowstyle": "-|>", "color": FORCE, "linewidth": 1.6, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops=shape, zorder=6)
     frame = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}

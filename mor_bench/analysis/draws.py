@@ -1,0 +1,207 @@
+"""Resamples of the latencies and errors of a dataset's configurations, and their intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import inf, isfinite
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.analysis.bootstrap import (
+    central_interval,
+    cluster_numbers,
+    resample_weights,
+    weighted_means,
+    weighted_medians,
+    widen,
+    widening,
+)
+from mor_bench.analysis.frontier import (
+    EXACT,
+    is_point,
+    median_error,
+    median_latency_ms,
+    number_or_inf,
+)
+from mor_bench.analysis.latency_intervals import (
+    latency_draws,
+    latency_intervals,
+    n_processes_of,
+    spreads_of,
+)
+from mor_bench.results.comparison import Comparison
+from mor_bench.results.row import Row
+
+Interval = tuple[float, float]
+Samples = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Resamples of the latencies and errors of the usable rows of a dataset.
+
+    Attributes
+    ----------
+    rows : list of Row
+        The rows that have a latency and an error.
+    log_latencies, log_errors : (n_rows, n) float64
+        Natural logarithms. Resample i of all rows has the same load regions and processes.
+    intervals : dict
+        By label: the intervals of `rel_l2_median`, `mean_dof_m` and `latency_ms`, where there are
+        raw samples.
+    clusters, timing : dict
+        What was resampled, and the spread between processes; empty without raw samples.
+    """
+
+    rows: list[Row]
+    log_latencies: NDArray[np.float64]
+    log_errors: NDArray[np.float64]
+    intervals: dict[str, dict[str, Interval]] = field(default_factory=dict)
+    clusters: dict[str, Any] = field(default_factory=dict)
+    timing: dict[str, Any] = field(default_factory=dict)
+
+
+def draws_of(comparison: Comparison, dataset: str, n: int, generator: np.random.Generator) -> Draws:
+    """Resample a dataset n times: its load regions for the errors, its processes for latencies."""
+    ran = [row for row in comparison.rows if row.dataset == dataset and row.status == "ok"]
+    raw = {row.label: _raw_samples(comparison, row) for row in ran}
+    resampler = _Resampler(_test_regions(comparison, dataset), n, generator)
+    intervals: dict[str, dict[str, Interval]] = {row.label: {} for row in ran}
+    errors: dict[str, NDArray[np.float64]] = {}
+    for label, samples in raw.items():
+        if len(samples.get("relative_l2", ())) < 2:
+            continue
+        errors[label] = resampler.median_errors(samples)
+        intervals[label]["rel_l2_median"] = central_interval(errors[label])
+        if "mean_dof_m" in samples:
+            intervals[label]["mean_dof_m"] = resampler.mean_interval(samples["mean_dof_m"])
+    for label, interval in latency_intervals(raw).items():
+        intervals[label]["latency_ms"] = interval
+    usable = [row for row in ran if is_point(row)]
+    medians = np.array([median_latency_ms(row) for row in usable], dtype=float)
+    latencies = latency_draws([raw[row.label] for row in usable], medians, n, generator)
+    drawn = [errors.get(row.label, np.full(n, median_error(row))) for row in usable]
+    return Draws(
+        usable,
+        latencies,
+        np.log(np.maximum(np.array(drawn).reshape(len(usable), n), EXACT)),
+        intervals,
+        resampler.resampled,
+        _timing_facts(raw),
+    )
+
+
+def _raw_samples(comparison: Comparison, row: Row) -> Samples:
+    try:
+        return comparison.samples(row)
+    except (OSError, KeyError):
+        return {}
+
+
+def _test_regions(comparison: Comparison, dataset: str) -> NDArray[Any] | None:
+    try:
+        return comparison.dataset_arrays(dataset).get("test_regions")
+    except OSError:
+        return None
+
+
+def _timing_facts(raw: Mapping[str, Samples]) -> dict[str, Any]:
+    """Number of processes, and the relative standard deviations between them (None if unknown)."""
+    timed = [samples for samples in raw.values() if len(samples.get("latency_ms", ()))]
+    if not timed:
+        return {}
+    spreads = spreads_of(timed)
+    specific, common = (
+        spread.sd if spread.df > 0 else None for spread in (spreads.specific, spreads.common)
+    )
+    n_processes = max(map(n_processes_of, timed))
+    return {"n_processes": n_processes, "specific": specific, "common": common}
+
+
+class _Resampler:
+    """Bootstrap of errors: all configurations with as many test samples share their resamples."""
+
+    def __init__(
+        self, regions: NDArray[Any] | None, n: int, generator: np.random.Generator
+    ) -> None:
+        self.regions, self.n, self.generator = regions, n, generator
+        self.resampled: dict[str, Any] = {}
+        self._weights: dict[int, tuple[NDArray[np.int32], float]] = {}
+
+    def _resamples(self, n_samples: int) -> tuple[NDArray[np.int32], float]:
+        """Weights (n_samples, n) of the resamples, and the factor that widens their spread."""
+        if n_samples not in self._weights:
+            clusters = cluster_numbers(self.regions, n_samples)
+            count = int(clusters.max()) + 1
+            weights = resample_weights(clusters, self.n, self.generator)
+            self._weights[n_samples] = weights, widening(count)
+            of_samples = clusters.shape[1] == 1 and count == n_samples
+            found = {"of": "test samples" if of_samples else "load regions", "n": count}
+            self.resampled = self.resampled or found
+        return self._weights[n_samples]
+
+    def median_errors(self, samples: Samples) -> NDArray[np.float64]:
+        """Draw median relative L2 errors over load regions and, where there are several, seeds.
+
+        Another training seed changes the error by the ratio of its median to the geometric mean
+        of all seeds' medians.
+        """
+        values = np.asarray(samples["relative_l2"], dtype=float)
+        weights, factor = self._resamples(len(values))
+        bounds = float(values.min()), float(values.max())
+        draws = widen(weighted_medians(values, weights), float(np.median(values)), factor, bounds)
+        no_seeds = np.zeros((0, len(values)))
+        others = np.asarray(samples.get("seeds_relative_l2", no_seeds), dtype=float)
+        if not len(others):
+            return draws
+        medians = np.median(np.concatenate([values[None], others]), axis=1)
+        if not (np.isfinite(medians) & (medians > 0)).all():
+            return draws
+        few = np.sqrt(len(medians) / (len(medians) - 1))
+        ratios = np.exp(np.log(medians) - np.log(medians).mean()) ** few
+        return np.asarray(draws * self.generator.choice(ratios, draws.size))
+
+    def mean_interval(self, mean_dof_m: NDArray[Any]) -> Interval:
+        """Interval of the mean over the test set of each sample's error, m."""
+        e = np.asarray(mean_dof_m, dtype=float)
+        weights, factor = self._resamples(len(e))
+        bounds = float(e.min()), float(e.max())
+        return central_interval(widen(weighted_means(e, weights), float(e.mean()), factor, bounds))
+
+
+def finite_or_none(value: float) -> float | None:
+    """Replace an infinite figure by None, which is what JSON can hold."""
+    return float(value) if isfinite(value) else None
+
+
+def headlines(row: Row, draws: Draws) -> dict[str, Any]:
+    """Value, low and high of the median error, the mean error and the median latency of a row.
+
+    An interval of the latency that was stored with the row takes precedence.
+    """
+    error, latency = row.error, row.latency_ms
+    intervals = draws.intervals[row.label]
+    values = {
+        "rel_l2_median": median_error(row),
+        "mean_dof_m": number_or_inf(error.mean_dof_m if error else None),
+        "latency_ms": median_latency_ms(row),
+    }
+    found: dict[str, Any] = {"dataset": row.dataset, "label": row.label}
+    for name, value in values.items():
+        low, high = intervals.get(name, (inf, inf))
+        if (
+            name == "latency_ms"
+            and latency
+            and latency.low is not None
+            and latency.high is not None
+        ):
+            low, high = latency.low, latency.high
+        found[name] = {
+            "value": finite_or_none(value),
+            "low": finite_or_none(min(low, value) if isfinite(low) else low),
+            "high": finite_or_none(max(high, value)),
+        }
+    return found

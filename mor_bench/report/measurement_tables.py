@@ -1,0 +1,136 @@
+"""Tables of what was measured beside error and latency: timing, memory, work, trainings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mor_bench.report.entries import Entry
+from mor_bench.report.number_format import DASH, bytes_text, metres, number, percent, whole
+from mor_bench.report.text_table import Cell, TextTable, figure_cell, table_of
+
+
+def timing(entries: Sequence[Entry]) -> TextTable | None:
+    """Build the table of what each timing rests on, on more threads and in batches."""
+    columns: dict[str, Cell] = {
+        "processes": figure_cell("latency_ms", "n_processes", whole),
+        "queries": figure_cell("latency_ms", "n_queries", whole),
+        "collector (ms)": figure_cell("latency_ms", "gc"),
+        "all threads (ms)": figure_cell("all_threads_ms", "median"),
+    }
+    for size in ("8", "64", "512"):
+        columns[f"queries/s by {size}"] = figure_cell("throughput", size, whole)
+    columns["stable"] = _stable
+    note = (
+        "Latencies were measured in fresh processes, the configurations in turn. "
+        "Collector: mean time of garbage collection per query, which the latencies contain. "
+        "Queries/s: throughput in batches of 8, 64 and 512."
+    )
+    return table_of("Timing", note, entries, columns)
+
+
+def _stable(entry: Entry) -> str:
+    if entry.unstable:
+        return f"no: {'; '.join(entry.unstable)}"
+    return "yes" if entry.row.latency_ms and entry.row.latency_ms.stable else DASH
+
+
+def resources(entries: Sequence[Entry]) -> TextTable | None:
+    """Build the table of memory, model size and the countable work of a query."""
+    if not any(entry.row.memory_bytes or entry.row.cost for entry in entries):
+        return None
+    columns: dict[str, Cell] = {
+        "memory to fit": figure_cell("memory_bytes", "fit", bytes_text),
+        "memory to predict": figure_cell("memory_bytes", "predict", bytes_text),
+        "factorisations of a mesh": _on_mesh("factorisations"),
+        "back-solves of a mesh": _on_mesh("back_solves"),
+        "reduced factorisations": figure_cell("cost", "reduced_factorisations"),
+        "reduced back-solves": figure_cell("cost", "reduced_back_solves"),
+        "element evaluations": figure_cell("cost", "element_evaluations", whole),
+        "multiply-adds": figure_cell("cost", "multiply_adds"),
+        "model": lambda e: bytes_text(e.row.model_bytes),
+    }
+    note = (
+        "Memory: peak resident memory. Counts: means per query, which do not depend on the machine."
+    )
+    return table_of("Memory and cost", note, entries, columns)
+
+
+def _on_mesh(key: str) -> Cell:
+    """Count of a mesh's sparse matrices, without the cheap dense reduced ones."""
+
+    def cell(entry: Entry) -> str:
+        total, reduced = entry.figure("cost", key), entry.figure("cost", f"reduced_{key}")
+        return number(total if total is None or reduced is None else total - reduced)
+
+    return cell
+
+
+def indicated(entries: Sequence[Entry]) -> TextTable | None:
+    """Build the table of error indicators: estimated against measured errors."""
+    columns: dict[str, Cell] = {
+        "indicated / measured, median": figure_cell("indicator", "ratio_median"),
+        "5 %": figure_cell("indicator", "ratio_p5"),
+        "95 %": figure_cell("indicator", "ratio_p95"),
+        "rank correlation": figure_cell("indicator", "rank_correlation"),
+        "that of the residual": figure_cell("indicator", "residual_rank_correlation"),
+    }
+    note = (
+        "Indicated: the first correction that the full-order solve would make to a prediction, "
+        "relative to the prediction, as an estimate of its relative L2 error "
+        "(`Surrogate.indicate_error`). It costs about one iteration of that solve. "
+        "The residual relative to the load is shown for comparison. "
+        "Measured over some samples of the test set, without exact answers."
+    )
+    return table_of("Indicated errors", note, entries, columns)
+
+
+def training(entries: Sequence[Entry]) -> TextTable | None:
+    """Build the table of trainings: device, length and losses."""
+    rows = []
+    for entry in entries:
+        if found := entry.row.training:
+            rows.append(
+                [
+                    entry.label,
+                    found.device,
+                    whole(found.iterations),
+                    number(found.fit_seconds),
+                    number(entry.figure("offline_s", "fit")),
+                    number(found.loss),
+                    number(found.validation_loss),
+                ]
+            )
+    headings = ["configuration", "device", "iterations", "asked (s)", "fit (s)"]
+    headings += ["last loss", "of validation"]
+    note = (
+        "Asked: the seconds for which the number of iterations was chosen. "
+        "The parameter `iterations` with this number repeats the training."
+    )
+    return TextTable("Training", note, headings, rows) if rows else None
+
+
+def seeds(entries: Sequence[Entry]) -> TextTable | None:
+    """Build the table of how errors scatter over the seeds of the training."""
+    rows = []
+    for entry in entries:
+        found = entry.row.seeds
+        if not found or not found.trainings:
+            continue
+        figures = []
+        for spread, shown in ((found.rel_l2_median, percent), (found.mean_dof_m, metres)):
+            if spread is None:
+                figures += [DASH] * 3
+                continue
+            ends = f"{shown(spread.min)}–{shown(spread.max)}"
+            figures += [shown(spread.median), ends, shown(spread.std)]
+        failed = "\n".join(found.failed) or DASH
+        rows.append([entry.label, f"{found.n} of {found.asked}", *figures, failed])
+    statistics = ("median", "min–max", "st. dev.")
+    named = [f"{name}: {what}" for name in ("rel. L2 (%)", "ē (m)") for what in statistics]
+    note = (
+        "The same configuration trained with other seeds; all other tables show the first seed. "
+        "The figures are of the trainings' median relative L2 errors and of their ē. "
+        "A failed training has an infinite error."
+    )
+    headings = ["configuration", "trained", *named, "failed"]
+    return TextTable("Training seeds", note, headings, rows) if rows else None

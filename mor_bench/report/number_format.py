@@ -1,0 +1,83 @@
+"""Numbers as short texts for tables, captions and sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from math import isfinite
+from typing import Any
+
+DASH = "–"
+"""Stands for a figure that was not measured."""
+
+SHORT_NAMES = {
+    "n_modes": "r",
+    "tolerance": "tol",
+    "cubature_tolerance": "ctol",
+    "n_input_modes": "k",
+    "n_output_modes": "r",
+}
+"""Names of swept parameters where space is short; others use the initials of their words."""
+
+
+def number(value: float | None) -> str:
+    """Format a number in at most seven characters; a dash if there is none."""
+    if value is None:
+        return DASH
+    if not isfinite(value):
+        return str(value)
+    size = abs(value)
+    if size == 0 or 1e-3 <= size < 99.95:
+        return f"{value:.3g}"
+    return f"{value:.0f}" if 1 <= size < 1e5 else f"{value:.1e}"
+
+
+def whole(value: float | None) -> str:
+    """Format a count with separators of thousands; a dash if there is none."""
+    return DASH if value is None else f"{value:,.0f}"
+
+
+def metres(value: float | None) -> str:
+    """Format a length such as 6.4e-04; a dash if there is none."""
+    if value is None:
+        return DASH
+    return f"{value:.1e}" if isfinite(value) else str(value)
+
+
+def percent(value: float | None) -> str:
+    """Format a fraction in percent, without the sign."""
+    return number(None if value is None else 100 * value)
+
+
+def bytes_text(n_bytes: float | None) -> str:
+    """Format a size in B, kB, MB or GB; a dash if there is none."""
+    if n_bytes is None:
+        return DASH
+    for unit in ("B", "kB", "MB"):
+        if n_bytes < 999.5:
+            return f"{n_bytes:.3g} {unit}"
+        n_bytes /= 1000
+    return f"{n_bytes:.3g} GB"
+
+
+def span(
+    interval: tuple[float, float] | None, shown: Callable[[float | None], str] = number
+) -> str:
+    """Format an interval such as ``0.51–0.56``; a dash if there is none."""
+    return DASH if interval is None else "–".join(map(shown, interval))
+
+
+def short_name(key: str) -> str:
+    """Short name of a swept parameter."""
+    initials = "".join(word[0] for word in key.split("_") if word)
+    return SHORT_NAMES.get(key, initials if "_" in key else key)
+
+
+def short_swept(swept: Mapping[str, Any]) -> str:
+    """Format swept values such as ``r=20, ctol=0.001``."""
+    return ", ".join(f"{short_name(key)}={value}" for key, value in swept.items())
+
+
+def explain_short_names(all_swept: Iterable[Mapping[str, Any]]) -> str:
+    """Say in one line what the short names stand for; empty if there are none."""
+    keys = dict.fromkeys(key for swept in all_swept for key in swept)
+    return ", ".join(f"{short_name(key)} = {key}" for key in keys if short_name(key) != key)

@@ -1,0 +1,220 @@
+"""Tables that compare methods: time at error, error at time, pairs, whole cost, profile."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+from mor_bench.analysis.frontier import TARGET_ERRORS
+from mor_bench.analysis.performance_profile import share_within
+from mor_bench.report.entries import Analysis, Entry, needs_of
+from mor_bench.report.number_format import (
+    bytes_text,
+    number,
+    percent,
+    short_swept,
+)
+from mor_bench.report.text_table import TextTable
+from mor_bench.results.comparison import Comparison
+
+NOT_REACHED = "not reached"
+
+PAIRWISE_LEGEND = (
+    "+2: the row's method is 2 times faster than the column's. -2: 2 times slower. "
+    "?1.1: 1.1 times faster, but the 95 % interval of the ratio contains 1."
+)
+
+FACTORS = (1.0, 1.5, 2.0, 5.0, 10.0, 100.0)
+"""Columns of the performance profile's table."""
+
+
+def target_table(comparison: Comparison, dataset: str, kind: str, analysis: Analysis) -> TextTable:
+    """Build the table of time at error or error at time, a row per method.
+
+    A cell has the interpolated value, the best real configuration and the 95 % interval.
+
+    Parameters
+    ----------
+    kind : {"time_at_error", "error_at_time"}
+    """
+    swept = {row.label: short_swept(row.swept) for row in comparison.rows if row.dataset == dataset}
+    of_time = kind == "time_at_error"
+    key, shown, unit = ("latency_ms", number, "ms") if of_time else ("error", percent, "%")
+    headings: dict[str, None] = {"method": None}
+    rows: dict[str, list[str]] = {}
+    for record in analysis[kind]:
+        if record["dataset"] != dataset:
+            continue
+        best, cell = record["best"], NOT_REACHED
+        if best is not None:
+            value = f"{shown(record[key])} {unit} ({shown(best[key])})"
+            lines = (value, swept[best["label"]], _target_interval(record, shown))
+            cell = "\n".join(filter(None, lines))
+        headings[_target_heading(record)] = None
+        rows.setdefault(record["method"], []).append(cell)
+    title = (
+        "Time at error: median latency at a median relative L2 error"
+        if of_time
+        else "Error at time: median relative L2 error within a median latency"
+    )
+    note = "In brackets: the best real configuration."
+    return TextTable(title, note, list(headings), [[name, *row] for name, row in rows.items()])
+
+
+def _target_heading(record: Mapping[str, Any]) -> str:
+    if "target_latency_ms" in record:
+        return f"{number(record['target_latency_ms'])} ms"
+    return f"{percent(record['target_rel_l2_median'])} %"
+
+
+def _target_interval(record: Mapping[str, Any], shown: Callable[[float | None], str]) -> str:
+    """Interval of a target; it says so where enough resamples do not reach the target."""
+    low, high = record["low"], record["high"]
+    if low == high == 0:
+        return ""
+    if low is None:
+        missed = record["not_reached"]
+        return f"{NOT_REACHED} in {percent(missed)} %" if missed else ""
+    return f"{shown(low)}–{NOT_REACHED if high is None else shown(high)}"
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Who is faster than whom at an error.
+
+    Attributes
+    ----------
+    methods, absent : list of str
+        Methods that reach the error, and those that do not.
+    cells : list of list of str
+        For each of `methods` a row: ``+2.3`` where it is 2.3 times faster than the column's method,
+        ``-2.3`` where it is slower, ``?1.1`` where it is undecided.
+    intervals : list of list of str
+        95 % intervals of these factors.
+    """
+
+    methods: list[str]
+    absent: list[str]
+    cells: list[list[str]]
+    intervals: list[list[str]]
+
+
+def pairs_at(comparison: Comparison, dataset: str, target: float, analysis: Analysis) -> Pairs:
+    """Collect the pairs of methods at an error."""
+    records = {
+        (r["a"], r["b"]): r
+        for r in analysis["pairwise"]
+        if r["dataset"] == dataset and r["target_rel_l2_median"] == target
+    }
+    ran = dict.fromkeys(row.method for row in comparison.rows if row.dataset == dataset)
+    missing = {name for record in records.values() for name in record["by"]}
+    methods = [method for method in ran if records and method not in missing]
+    lines = [[_factor(records[a, b]) if a != b else ("·", "") for b in methods] for a in methods]
+    return Pairs(
+        methods,
+        [method for method in ran if method in missing],
+        [[cell for cell, _ in line] for line in lines],
+        [[interval for _, interval in line] for line in lines],
+    )
+
+
+def _factor(record: Mapping[str, Any]) -> tuple[str, str]:
+    """Factor of a pair with its sign, and its interval."""
+    ratio, low, high = (record[name] for name in ("ratio", "low", "high"))
+    sign = {"faster": "+", "slower": "-", "undecided": "?"}[record["verdict"]]
+    if sign != "-":  # the ratio is one of times; a speed-up is its inverse
+        ratio, low, high = (None if x is None else 1 / x for x in (ratio, high, low))
+    interval = f"{'0' if low is None else number(low)}–{'∞' if high is None else number(high)}"
+    return f"{sign}{number(ratio)}", interval
+
+
+def pairwise(comparison: Comparison, dataset: str, analysis: Analysis) -> list[TextTable]:
+    """Build a matrix of pairs for each error that at least two methods reach."""
+    tables = []
+    records = (r for r in analysis["pairwise"] if r["dataset"] == dataset)
+    needed = needs_of(comparison, dataset).error
+    for target in sorted({r["target_rel_l2_median"] for r in records}, reverse=True):
+        pairs = pairs_at(comparison, dataset, target, analysis)
+        if len(pairs.methods) < 2:
+            continue
+        rows = [
+            [
+                method,
+                *(f"{cell}\n{interval}".strip() for cell, interval in zip(*lines, strict=True)),
+            ]
+            for method, *lines in zip(pairs.methods, pairs.cells, pairs.intervals, strict=True)
+        ]
+        of_need = ", the error that is needed" if target == needed else ""
+        note = f"{PAIRWISE_LEGEND} Below: the 95 % interval of that factor."
+        note += f" Not reached by {', '.join(pairs.absent)}." if pairs.absent else ""
+        title = f"Who is faster at {percent(target)} %{of_need}"
+        tables.append(TextTable(title, note, ["", *pairs.methods], rows))
+    return tables
+
+
+def break_even_table(
+    dataset: str, analysis: Analysis, entries: Sequence[Entry]
+) -> TextTable | None:
+    """Build the table of break-even queries and of what they follow from."""
+    by_label = {entry.label: entry for entry in entries}
+    rows = []
+    for record in analysis["break_even"]:
+        if record["dataset"] != dataset or record["verdict"] == NOT_REACHED:
+            continue
+        entry = by_label[record["label"]]
+        queries = record["verdict"] if record["queries"] is None else f"{record['queries']:,}"
+        why = f"\n{record['reason']}" if record["verdict"] == "unknown" else ""
+        rows.append(
+            [
+                record["method"],
+                f"{percent(record['target_rel_l2_median'])} %",
+                record["label"],
+                queries + why,
+                number(record["latency_ms"]),
+                number(record["fem_latency_ms"]),
+                number(record["offline_s"]["data"]),
+                number(record["offline_s"]["fit"]),
+                bytes_text(entry.figure("memory_bytes", "fit")),
+                bytes_text(entry.row.model_bytes),
+            ]
+        )
+    headings = ["method", "error", "configuration", "break-even queries", "latency (ms)"]
+    headings += ["full-order (ms)", "data (s)", "fit (s)", "memory", "model"]
+    note = (
+        "Each row is the fastest configuration of a method with at most this error. "
+        "Break-even queries: offline time (data and fit) divided by the time that a query saves. "
+        "The saving is against the fastest full-order configuration that is at least as accurate. "
+        "Never: the full-order model is as fast. Errors that a method does not reach are left out."
+    )
+    return TextTable("Whole cost", note, headings, rows) if rows else None
+
+
+def profile_table(analysis: Analysis) -> TextTable | None:
+    """Build the performance profile: shares of problems solved within factors of the fastest."""
+    found = analysis["profile"]
+    if not found["problems"] or len(found["factors"]) < 2:
+        return None
+    rows = [
+        [method, *(f"{100 * share_within(factors, tau):.0f}" for tau in (*FACTORS, inf))]
+        for method, factors in found["factors"].items()
+    ]
+    headings = ["method", *(f"≤ {tau:g}× (%)" for tau in FACTORS), "solved (%)"]
+    return TextTable("Performance profile", profile_note(found), headings, rows)
+
+
+def profile_note(found: Mapping[str, Any]) -> str:
+    """Explain the problems of a performance profile, and what can be read from it."""
+    n_datasets = found["n_datasets"]
+    over = f"{n_datasets} datasets" if n_datasets > 1 else "one dataset"
+    targets = ", ".join(f"{percent(target)} %" for target in TARGET_ERRORS)
+    return (
+        f"A problem is a dataset at an error: {over} at {targets}. "
+        f"At least one method solves {len(found['problems'])} of them. "
+        f"The {found['n_unsolved']} that no method solves are left out. "
+        "Shown is the share that a method solves within a factor of the fastest method's time. "
+        "Only who is first and who solves most can be read from it. "
+        "The order of the others depends on which methods take part."
+        + (" With one dataset this says nothing about other scenes." if n_datasets == 1 else "")
+    )

@@ -1,0 +1,61 @@
+"""A table of texts that console and page draw in their own way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from mor_bench.report.entries import Entry
+from mor_bench.report.number_format import DASH, number
+
+Cell = Callable[[Entry], str]
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table of texts.
+
+    Attributes
+    ----------
+    title, note : str
+        What it shows, and how to read it.
+    headings : sequence of str
+    rows : sequence of sequence of str
+        The first cell names the row. A cell may have several lines; the first is the main one.
+    """
+
+    title: str
+    note: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+def table_of(
+    title: str, note: str, entries: Sequence[Entry], columns: Mapping[str, Cell]
+) -> TextTable | None:
+    """Build a row per configuration that ran; columns and rows without a figure are left out.
+
+    Parameters
+    ----------
+    columns : dict
+        By heading, a function from an entry to its cell.
+
+    Returns
+    -------
+    TextTable or None
+        None if no figure is left.
+    """
+    ran = [entry for entry in entries if entry.ran]
+    cells = {heading: [cell(entry) for entry in ran] for heading, cell in columns.items()}
+    shown = {heading: texts for heading, texts in cells.items() if set(texts) - {DASH}}
+    rows = [
+        [entry.label, *texts]
+        for entry, *texts in zip(ran, *shown.values(), strict=True)
+        if set(texts) - {DASH}
+    ]
+    return TextTable(title, note, ["configuration", *shown], rows) if rows else None
+
+
+def figure_cell(part: str, name: str, shown: Callable[[float | None], str] = number) -> Cell:
+    """Make the cell of one figure, such as ``figure_cell("latency_ms", "median")``."""
+    return lambda entry: shown(entry.figure(part, name))
