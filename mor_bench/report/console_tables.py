@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import hypot
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group, RenderableType
@@ -34,7 +34,9 @@ from mor_bench.report.summary import (
 )
 from mor_bench.report.text_table import TextTable
 from mor_bench.results.comparison import Comparison
-from mor_bench.runs.plan import Plan
+
+if TYPE_CHECKING:
+    from mor_bench.runs.plan import Plan
 
 
 def _empty_table() -> Table:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.analysis.intervals import intervals_of
+from mor_bench.analysis.latency_intervals import latency_intervals
 from mor_bench.errors import (
     MissingDependencyError,
     MorBenchError,
@@ -479,7 +479,7 @@ class DatasetRun:
                 timing.probe_s = speed
                 entries[label].keep_arrays(name, timing.arrays)
         timings |= fresh
-        intervals = intervals_of(
+        intervals = latency_intervals(
             {label: timing.samples for label, timing in timings.items() if not timing.failed}
         )
         for label in entries:

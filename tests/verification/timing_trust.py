@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mor_bench.analysis.analyse import analyse
-from mor_bench.analysis.intervals import compare_latency, intervals_of
+from mor_bench.analysis.latency_intervals import compare_latency, latency_intervals
 from mor_bench.measure.latency import PROTOCOLS, Opener, Queries, Timing, measure, why_unstable
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.results.comparison import Comparison
@@ -154,7 +154,7 @@ def reruns(scene: Scene, folder: Path, protocol: str) -> float:
     ]
     inside = []
     for before, after in pairwise(runs):
-        stated = intervals_of(before)
+        stated = latency_intervals(before)
         inside += [
             stated[name][0] <= np.median(after[name]["latency_ms"]) <= stated[name][1]
             for name in after
