@@ -1,4 +1,4 @@
-"""The hard cases on the console: a table, and how many fell short."""
+"""The hard cases on the console: a table of verdicts, and their counts."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ STYLES = {"pass": "green", "fall short": "bold red", "not applicable": "dim"}
 
 
 def ordered(found: StressResults) -> list[CaseResult]:
-    """The rows by case, and within one in the order in which methods were tried."""
+    """Sort the rows by case; within a case they keep the order in which methods were tried."""
     places = {(case.name, case.part): number for number, case in enumerate(CASES)}
     return sorted(found.rows, key=lambda row: places[row.case, row.part])
 
 
 def print_stress(found: StressResults, console: Console) -> None:
-    """Print all rows, then those that fell short once more by name, and the counts."""
+    """Print all rows and the counts, then the names of those that fell short."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     longest = max((len(row.method) for row in found.rows), default=0)
     for heading, width in (
@@ -43,12 +43,13 @@ def print_stress(found: StressResults, console: Console) -> None:
             )
         table.add_section()
     console.print(table)
-    short = [
-        f"{row.case}{f' ({row.part})' if row.part else ''} of {row.method}"
-        for row in ordered(found)
-        if row.verdict == "fall short"
-    ]
-    counts = f"{len(found.rows)} tried: {found.count('pass')} pass, {len(short)} fall short, {found.count('not applicable')} not applicable."
+    short = [row for row in ordered(found) if row.verdict == "fall short"]
+    counts = (
+        f"{len(found.rows)} tried: {found.count('pass')} pass, {len(short)} fall short, "
+        f"{found.count('not applicable')} not applicable."
+    )
     console.print(counts, highlight=False)
     if short:
-        console.print(f"Fall short: {', '.join(short)}.", highlight=False, markup=False)
+        names = (f"{row.case} ({row.part})" if row.part else row.case for row in short)
+        cases = (f"{name} of {row.method}" for name, row in zip(names, short, strict=True))
+        console.print(f"Fall short: {', '.join(cases)}.", highlight=False, markup=False)

@@ -1,9 +1,9 @@
 """The tables of the U-Mesh paper filled from our own rows, beside the paper's figures.
 
-Source of the published figures: Mendizabal, Márquez-Neila, Cotin: Simulation of hyperelastic materials
-in real-time using deep learning, Medical Image Analysis 2020; its tables of error measures (one
-per scene) and its two comparisons with POD. Its networks ran on a GeForce 1080 Ti. Its errors are
-over a random split, and its slopes and maxima are from the captions.
+Source of the published figures: Mendizabal, Márquez-Neila, Cotin: Simulation of hyperelastic
+materials in real-time using deep learning, Medical Image Analysis 2020. They are from its tables of
+error measures (one per scene) and its two comparisons with POD. Its networks ran on a GeForce 1080
+Ti. Its errors are over a random split, and its slopes and maxima are from the captions.
 """
 
 from __future__ import annotations

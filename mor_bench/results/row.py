@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from math import nan
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, WithJsonSchema
+from pydantic import BaseModel, BeforeValidator, ConfigDict, WithJsonSchema, model_validator
 
 Real = Annotated[
     float,
@@ -330,6 +330,20 @@ class Row(Part):
     discretisation_rel_l2: Real | None = None
     warnings: list[str] = []
     tuning_s: Real | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_swept(cls, data: Any) -> Any:
+        """Take the swept parameters of an older file from those that the label names."""
+        if not isinstance(data, dict) or "swept" in data:
+            return data
+        inside = f", {str(data.get('label')).partition('[')[2].removesuffix(']')}, "
+        places = {
+            key: inside.find(f", {key}={value}, ")
+            for key, value in (data.get("parameters") or {}).items()
+        }
+        named = sorted((key for key in places if places[key] >= 0), key=places.__getitem__)
+        return {**data, "swept": {key: data["parameters"][key] for key in named}}
 
     @property
     def ok(self) -> bool:

@@ -26,6 +26,7 @@ from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.process import SandboxedProcess
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.sampling import draw_loads
+from tests.synthetic import a_row
 
 DATASET = "beam-tiny"
 AT_ONCE = 20
@@ -94,18 +95,12 @@ def _matrix(timings: dict[str, Timing], folder: Path) -> dict[tuple[str, str], s
     )
     errors = 1e-3 * np.random.default_rng(0).uniform(0.5, 2.0, len(regions))
     for name, timing in timings.items():
-        row = {
-            "dataset": DATASET,
-            "method": name,
-            "label": name,
-            "parameters": {},
-            "status": "ok",
-            "split": "region",
-            "n_failed": 0,
-            "error": {"rel_l2_median": float(np.median(errors)), "mean_dof_m": 1e-4},
-            "latency_ms": {"median": float(np.median(timing.latency_ms))},
-            "offline_s": {"data": 0.0, "fit": 0.0},
-        }
+        row = a_row(
+            name,
+            dataset=DATASET,
+            error={"rel_l2_median": float(np.median(errors)), "mean_dof_m": 1e-4},
+            latency_ms={"median": float(np.median(timing.latency_ms))},
+        )
         comparison.put(row, {**timing.samples, "relative_l2": errors, "mean_dof_m": 0.1 * errors})
     return {
         (r["a"], r["b"]): r["verdict"]

@@ -1,4 +1,4 @@
-"""Intervals that hold what they promise: simulated measurements, of which the truth is known."""
+"""Intervals hold what they promise, in simulated measurements whose truth is known."""
 
 from __future__ import annotations
 
@@ -9,33 +9,36 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mor_bench.analysis.intervals import (
-    TYPICAL_SPREAD,
-    Spread,
-    clusters_of,
-    compare_latency,
-    intervals_of,
-    latency_draws,
-    latency_interval,
-    quantiles,
+from mor_bench.analysis.bootstrap import (
+    central_interval,
+    cluster_numbers,
     resample_weights,
-    spreads_of,
     student_t,
     weighted_means,
     weighted_medians,
-    widened,
+    widen,
     widening,
+)
+from mor_bench.analysis.latency_intervals import (
+    TYPICAL_SPREAD,
+    Spread,
+    compare_latency,
+    latency_draws,
+    latency_interval,
+    latency_intervals,
+    spreads_of,
 )
 from mor_bench.errors import InvalidInputError
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What disturbs a timing; relative standard deviations.
+    """Disturbances of a timing, as relative standard deviations.
 
-    `process` between fresh processes (of Student's t with 3 degrees of freedom if `heavy`), `slow_processes` the share of
-    processes that are slower by 5 to 10 %, `query` between queries of which the share `tails` has Pareto's tail, `drift`
-    the slow change of the machine over all rounds.
+    `process`: between fresh processes (Student's t with 3 degrees of freedom if `heavy`).
+    `slow_processes`: share of processes that are slower by 5 to 10 %.
+    `query`: between queries, of which the share `tails` has Pareto's tail.
+    `drift`: slow change of the machine over all rounds.
     """
 
     process: float = 0.015
@@ -57,7 +60,7 @@ NOISES = (
 def machine(
     generator: np.random.Generator, noise: Noise, n_processes: int = 5, n_rounds: int = 5
 ) -> NDArray[np.float64]:
-    """(n_processes, n_rounds) log speed of the machine at the time of each round: a wave of random length and phase."""
+    """Log speed of the machine in each round: a wave of random length and phase."""
     time = np.linspace(0, 1, n_processes * n_rounds)
     wave = np.sin(2 * np.pi * (time / generator.uniform(0.3, 3) + generator.random()))
     return np.asarray(noise.drift * generator.random() * wave).reshape(n_processes, n_rounds)
@@ -68,26 +71,19 @@ def measure(
     noise: Noise,
     speed: NDArray[np.float64],
     latency_ms: float = 1.0,
-    n_queries: int = 40,
 ) -> dict[str, NDArray[np.float64]]:
-    """Simulated raw samples of a configuration on a machine."""
+    """Raw samples of a configuration on a machine, 40 queries per round."""
     n, rounds = speed.shape
     shape = np.asarray(
         generator.standard_t(3, n) / 3**0.5 if noise.heavy else generator.normal(size=n)
     )
-    process = noise.process * shape + np.where(
-        generator.random(n) < noise.slow_processes, np.log1p(generator.uniform(0.05, 0.1, n)), 0
-    )
-    query = noise.query * generator.normal(size=(n, rounds, n_queries))
-    query += np.where(
-        generator.random(query.shape) < noise.tails, np.log1p(generator.pareto(1.5, query.shape)), 0
-    )
-    logs = (
-        process[:, None, None]
-        + speed[..., None]
-        + 0.003 * generator.normal(size=(n, rounds, 1))
-        + query
-    )
+    slow = generator.random(n) < noise.slow_processes
+    process = noise.process * shape + slow * np.log1p(generator.uniform(0.05, 0.1, n))
+    query = noise.query * generator.normal(size=(n, rounds, 40))
+    tail = generator.random(query.shape) < noise.tails
+    query += tail * np.log1p(generator.pareto(1.5, query.shape))
+    turn = 0.003 * generator.normal(size=(n, rounds, 1))
+    logs = process[:, None, None] + speed[..., None] + turn + query
     numbers = np.indices(logs.shape)
     return {
         "latency_ms": latency_ms * np.exp(logs).ravel(),
@@ -97,7 +93,7 @@ def measure(
 
 
 def verdicts(noise: Noise, slow_down: float, n: int, seed: int) -> list[str]:
-    """Of n comparisons of a configuration with the same one, slowed down by a factor, on the same machine."""
+    """Compare a configuration n times with the same one, slowed down by a factor."""
     generator = np.random.default_rng(seed)
     found = []
     for _ in range(n):
@@ -108,7 +104,9 @@ def verdicts(noise: Noise, slow_down: float, n: int, seed: int) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "noise", NOISES, ids=lambda noise: f"{noise.process}-{'heavy' if noise.heavy else 'normal'}"
+    "noise",
+    [NOISES[0], *(pytest.param(noise, marks=pytest.mark.slow) for noise in NOISES[1:])],
+    ids=lambda noise: f"{noise.process}-{'heavy' if noise.heavy else 'normal'}",
 )
 def test_identical_code_is_seldom_called_different_and_ten_percent_are_found(noise: Noise) -> None:
     same, slower = verdicts(noise, 1.0, 100, 0), verdicts(noise, 1.1, 100, 1)
@@ -117,21 +115,18 @@ def test_identical_code_is_seldom_called_different_and_ten_percent_are_found(noi
     assert "faster" not in slower
 
 
-def test_what_slows_both_cancels_and_a_ratio_is_found() -> None:
+def test_drift_that_slows_both_cancels_and_the_ratio_is_found() -> None:
     generator = np.random.default_rng(2)
     speed = machine(generator, Noise(drift=2.0))
     a, b = (measure(generator, Noise(slow_processes=0), speed, latency) for latency in (3.0, 1.5))
-    found = compare_latency(a, b)
-    assert found["low"] < 2.0 < found["high"]
-    assert found["high"] / found["low"] < 1.2
-    assert found["verdict"] == "slower"
-    back = compare_latency(b, a)
-    assert back["verdict"] == "faster"
+    found, back = compare_latency(a, b), compare_latency(b, a)
+    assert found["low"] < 2.0 < found["high"] < 1.2 * found["low"]
+    assert (found["verdict"], back["verdict"]) == ("slower", "faster")
     assert back["ratio"] == pytest.approx(1 / found["ratio"])
     assert found["n_processes"] == 5
 
 
-def test_few_processes_are_told_from_many() -> None:
+def test_more_processes_narrow_the_interval_of_a_ratio() -> None:
     generator = np.random.default_rng(3)
     quiet = Noise(process=0.0, slow_processes=0, query=0.01, tails=0)
     widths = []
@@ -140,51 +135,53 @@ def test_few_processes_are_told_from_many() -> None:
         widths.append(log(found["high"] / found["low"]))
     assert widths == sorted(widths, reverse=True)
     assert widths[0] == pytest.approx(2 * student_t(0.98, 2) * TYPICAL_SPREAD * 2**0.5)
-    plain = {
-        "latency_ms": np.ones(20)
-    }  # without the numbers of its process and round it is one process
+    plain = {"latency_ms": np.ones(20)}  # without numbers of its process and round
     assert compare_latency(plain, plain)["n_processes"] == 1
     with pytest.raises(InvalidInputError, match="in common"):
         compare_latency(plain, {**plain, "process": np.full(20, 7)})
 
 
-@pytest.mark.parametrize("n_processes", [2, 3, 5])
-def test_a_repeated_measurement_falls_into_the_interval(n_processes: int) -> None:
+@pytest.mark.parametrize(("n_processes", "widest"), [(2, 1.5), (3, 1.3), (5, 1.25)])
+def test_the_median_of_a_repeated_measurement_falls_into_the_interval(
+    n_processes: int, widest: float
+) -> None:
     generator = np.random.default_rng(4)
-    latencies = np.geomspace(0.1, 10, 8)
     inside, widths = [], []
     for noise in NOISES[:3]:
         for _ in range(25):
             first, again = (
-                {
-                    str(i): measure(generator, noise, speed, latency)
-                    for i, latency in enumerate(latencies)
-                }
-                for speed in (
-                    machine(generator, noise, n_processes),
-                    machine(generator, noise, n_processes),
-                )
+                [measure(generator, noise, speed, latency) for latency in np.geomspace(0.1, 10, 8)]
+                for speed in (machine(generator, noise, n_processes) for _ in range(2))
             )
-            for label, (low, high) in intervals_of(first).items():
-                inside.append(low <= np.median(again[label]["latency_ms"]) <= high)
+            intervals = latency_intervals({str(i): samples for i, samples in enumerate(first)})
+            for (low, high), repeated in zip(intervals.values(), again, strict=True):
+                inside.append(low <= np.median(repeated["latency_ms"]) <= high)
                 widths.append(high / low)
     assert np.mean(inside) >= 0.93
-    assert np.median(widths) < {2: 1.5, 3: 1.3, 5: 1.25}[n_processes]
+    assert np.median(widths) < widest
 
 
-def test_pooling_narrows_what_two_processes_know_and_an_unsteady_one_keeps_its_own() -> None:
+def test_the_interval_of_a_latency_has_the_noise_of_two_measurements() -> None:
+    """One process on a machine without raw spread: only the typical spread and drift remain."""
+    low, high = latency_interval({"latency_ms": np.ones(9)})
+    noise = (0.014**2 + 0.02**2) ** 0.5
+    df = noise**4 / ((0.014**4 + 0.02**4) / 2)
+    assert log(high / low) / 2 == pytest.approx(student_t(0.95, df) * noise * 2**0.5)
+
+
+def test_pooling_narrows_intervals_and_an_unsteady_configuration_keeps_its_own() -> None:
     generator = np.random.default_rng(5)
     noise, speed = Noise(process=0.01, slow_processes=0, drift=0), np.zeros((3, 4))
     samples = {str(i): measure(generator, noise, speed) for i in range(20)}
     samples["unsteady"] = measure(generator, Noise(process=0.2, slow_processes=0), speed)
-    found = intervals_of(samples)
+    found = latency_intervals(samples)
     alone = latency_interval(samples["0"])
     assert found["0"][1] / found["0"][0] < alone[1] / alone[0]
     assert log(found["unsteady"][1] / found["unsteady"][0]) > 2 * log(found["0"][1] / found["0"][0])
-    assert intervals_of({}) == intervals_of({"a": {}}) == {}
+    assert latency_intervals({}) == latency_intervals({"a": {}}) == {}
 
 
-def test_the_analysis_of_variance_finds_its_parts() -> None:
+def test_the_analysis_of_variance_separates_common_from_specific_noise() -> None:
     generator = np.random.default_rng(6)
     common, private = generator.normal(0, 0.04, (30, 1)), generator.normal(0, 0.01, (30, 50))
     samples = [
@@ -198,43 +195,36 @@ def test_the_analysis_of_variance_finds_its_parts() -> None:
     found = spreads_of(samples)
     assert found.specific.sd == pytest.approx(0.01, rel=0.1)
     assert found.common.sd == pytest.approx(np.std(common, ddof=1), rel=0.02)
-    assert found.specific.df == pytest.approx(29 * 49)
-    assert found.common.df == 29
+    assert (found.specific.df, found.common.df) == (pytest.approx(29 * 49), 29)
     two = spreads_of(samples[:2])
     ratios = np.log(samples[0]["latency_ms"] / samples[1]["latency_ms"])
     assert two.specific.sd == pytest.approx(ratios.std(ddof=1) / 2**0.5)
-    assert two.specific.df == pytest.approx(29)
     one = spreads_of(samples[:1])
-    assert (
-        one.specific.sd == one.own[0] == pytest.approx(np.std(common[:, 0] + private[:, 0], ddof=1))
-    )
+    total = np.std(common[:, 0] + private[:, 0], ddof=1)
+    assert one.specific.sd == one.own[0] == pytest.approx(total)
     assert one.common == spreads_of([{"latency_ms": np.ones(5)}]).specific == Spread(0.0, 0.0)
     assert Spread(0.0, 0.0).moderated(0.014) == Spread(0.014, 2.0)
 
 
-def test_draws_of_latencies_share_what_is_common() -> None:
+def test_draws_of_latencies_share_the_common_part() -> None:
     generator = np.random.default_rng(7)
     speed = 0.1 * generator.normal(size=(5, 1)) + np.zeros((5, 4))
     samples = [measure(generator, Noise(process=0.005, slow_processes=0), speed) for _ in range(8)]
     draws = latency_draws([*samples, None], np.arange(1.0, 10.0), 4000, generator)
     assert draws.shape == (9, 4000)
     assert np.exp(np.median(draws, axis=1)) == pytest.approx(np.arange(1.0, 10.0), rel=0.02)
-    alone, ratio = np.subtract(*quantiles(draws[0])), np.subtract(*quantiles(draws[0] - draws[1]))
-    assert abs(ratio) < 0.3 * abs(alone)
+    alone, ratio = (np.ptp(central_interval(x)) for x in (draws[0], draws[0] - draws[1]))
+    assert ratio < 0.3 * alone
 
 
 def test_resampled_medians_and_means_are_those_of_the_repeated_samples() -> None:
     generator = np.random.default_rng(8)
     values = generator.choice([*generator.random(30), np.inf], 41)
-    clusters = clusters_of(generator.integers(0, 6, (41, 1)) * 10, 41)
+    clusters = cluster_numbers(generator.integers(0, 6, (41, 1)) * 10, 41)
     weights = resample_weights(clusters, 50, generator)
     repeated = [np.repeat(values, column) for column in weights.T]
-    assert weighted_medians(values, weights).tolist() == [
-        float(np.median(sample)) for sample in repeated
-    ]
-    assert weighted_means(values, weights) == pytest.approx(
-        [float(np.mean(sample)) for sample in repeated]
-    )
+    assert weighted_medians(values, weights).tolist() == [float(np.median(x)) for x in repeated]
+    assert weighted_means(values, weights) == pytest.approx([float(np.mean(x)) for x in repeated])
     for cluster in range(6):
         assert (np.ptp(weights[clusters[:, 0] == cluster], axis=0) == 0).all()
     assert weights.sum(axis=0).min() > 0
@@ -242,38 +232,40 @@ def test_resampled_medians_and_means_are_those_of_the_repeated_samples() -> None
 
 def test_without_two_regions_each_sample_is_its_own_cluster() -> None:
     for regions in (None, np.zeros((5, 1), dtype=int), np.zeros((4, 1), dtype=int)):
-        assert clusters_of(regions, 5).tolist() == [[0], [1], [2], [3], [4]]
+        assert cluster_numbers(regions, 5).tolist() == [[0], [1], [2], [3], [4]]
 
 
 def coverage(effect: float, k: int, by_region: bool, n_regions: int = 13) -> float:
-    """Share of simulated test sets whose 95 % interval holds the median over all regions; errors vary by region and by sample."""
+    """Share of simulated test sets whose interval contains the median over all regions.
+
+    Errors vary by region and by sample; each sample has k regions.
+    """
     generator = np.random.default_rng(9)
     inside = []
     for _ in range(150):
         regions = np.array([generator.choice(n_regions, k, replace=False) for _ in range(300)])
         means = effect * generator.normal(size=n_regions)
         errors = np.exp(means[regions].sum(axis=1) + 0.3 * generator.normal(size=300))
-        clusters = clusters_of(regions, 300) if by_region else np.arange(300)[:, None]
+        clusters = cluster_numbers(regions if by_region else None, 300)
         median, count = float(np.median(errors)), int(clusters.max()) + 1
         draws = weighted_medians(errors, resample_weights(clusters, 200, generator))
-        low, high = quantiles(widened(draws, median, widening(count), (errors.min(), errors.max())))
+        stretched = widen(draws, median, widening(count), (errors.min(), errors.max()))
+        low, high = central_interval(stretched)
         inside.append(low <= 1.0 <= high)
     return float(np.mean(inside))
 
 
-@pytest.mark.parametrize("k", [1, 3])
-def test_regions_not_samples_are_resampled(k: int) -> None:
+@pytest.mark.parametrize("k", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_resampling_regions_covers_the_truth_and_resampling_samples_does_not(k: int) -> None:
     assert coverage(0.3, k, by_region=True) >= 0.9
-    assert (
-        coverage(0.3, k, by_region=False) < 0.7
-    )  # what a bootstrap of the samples would have promised
+    assert coverage(0.3, k, by_region=False) < 0.7
 
 
 def test_widening_is_that_of_student_and_stays_within_bounds() -> None:
     assert widening(13) == pytest.approx((13 / 12) ** 0.5 * 2.1788 / 1.95996, rel=1e-4)
     assert widening(10_000) == pytest.approx(1, abs=1e-3)
     draws = np.array([0.5, 1.0, 2.0, 0.0, np.inf])
-    assert widened(draws, 1.0, 2.0, (0.3, 3.0)).tolist() == [0.3, 1.0, 3.0, 0.0, np.inf]
-    assert widened(draws, np.inf, 2.0, (0.3, 3.0)) is draws
-    assert quantiles(np.arange(1.0, 1001.0)) == (26, 975)
-    assert quantiles(np.append(np.arange(1.0, 971.0), np.full(30, np.inf))) == (26, np.inf)
+    assert widen(draws, 1.0, 2.0, (0.3, 3.0)).tolist() == [0.3, 1.0, 3.0, 0.0, np.inf]
+    assert widen(draws, np.inf, 2.0, (0.3, 3.0)) is draws
+    assert central_interval(np.arange(1.0, 1001.0)) == (26, 975)
+    assert central_interval(np.append(np.arange(1.0, 971.0), np.full(30, np.inf))) == (26, np.inf)

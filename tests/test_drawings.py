@@ -1,0 +1,125 @@
+"""Figures, tables and headlines show the rows: their artists and cells are compared with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.patches import Rectangle
+
+from mor_bench.report.canvas import Picture, styles_of
+from mor_bench.report.entries import Entry, entries_of
+from mor_bench.report.error_against_time import error_against_time
+from mor_bench.report.paper_tables import error_measures
+from mor_bench.report.singular_values import SIGMA, TAIL, singular_values
+from mor_bench.report.speed_tables import pairs_at
+from mor_bench.report.summary import headline
+from mor_bench.results.comparison import Comparison
+from tests.synthetic import a_row
+
+LOW, HIGH = 0.8, 1.5
+"""Ends of all intervals, relative to the value."""
+
+SIGMAS = np.array([9.0, 3.0, 2.0, 1.0])
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Comparison:
+    """Two methods on a dataset that needs 2 % within 3 ms."""
+    made = Comparison(tmp_path, {})
+    needs = {"needs": {"error": 0.02, "latency_ms": 3.0}}
+    made.add_dataset("beam", needs, {"singular_values": SIGMAS})
+    for rank, error, latency in ((2, 0.01, 1.0), (3, 0.005, 2.0)):
+        errors = {"rel_l2_median": error, "rel_l2_p95": 4 * error, "rel_l2_max": 7 * error}
+        row = a_row("pod", {"n_modes": rank}, dataset="beam", error=errors)
+        made.put(row.model_validate({**row.as_dict(), "latency_ms": {"median": latency}}))
+    return made
+
+
+def intervals(made: Comparison) -> dict[str, object]:
+    """An analysis that only has intervals."""
+    rows = []
+    for entry in entries_of(made, "beam"):
+        values = {"rel_l2_median": entry.error, "latency_ms": entry.latency_ms, "mean_dof_m": 1e-3}
+        ends = {k: {"value": v, "low": LOW * v, "high": HIGH * v} for k, v in values.items()}
+        rows.append({"dataset": "beam", "label": entry.label, **ends})
+    return {"rows": rows}
+
+
+def axes_of(picture: Picture | None) -> Axes:
+    assert picture is not None
+    (axes,) = picture.figure.axes
+    return axes
+
+
+def test_points_bars_and_the_needs_box_are_in_percent_and_ms(made: Comparison) -> None:
+    axes = axes_of(error_against_time(made, "beam", styles_of(made), intervals(made)))
+    rows = [(e.latency_ms, 100 * e.error) for e in entries_of(made, "beam")]
+    points = {tuple(xy) for line in axes.lines for xy in np.column_stack(line.get_data())}
+    assert points >= set(rows)
+    bars = [c.get_segments() for c in axes.collections if isinstance(c, LineCollection)]
+    horizontal, vertical = (np.array(segments) for segments in bars)
+    for (x, y), flat, upright in zip(rows, horizontal, vertical, strict=True):
+        assert flat == pytest.approx(np.array([[LOW * x, y], [HIGH * x, y]]))
+        assert upright == pytest.approx(np.array([[x, LOW * y], [x, HIGH * y]]))
+    (box,) = (patch for patch in axes.patches if isinstance(patch, Rectangle))
+    assert box.get_corners()[2] == pytest.approx((3.0, 2.0))
+    assert "≤ 3 ms, ≤ 2 %" in " ".join(text.get_text() for text in axes.texts)
+    assert "(ms)" in axes.get_xlabel()
+    assert "(%)" in axes.get_ylabel()
+
+
+def test_each_label_of_the_legend_belongs_to_its_curve(made: Comparison) -> None:
+    axes = axes_of(singular_values(made, "beam", styles_of(made)))
+    legend = axes.get_legend()
+    assert legend is not None
+    colours = {
+        text.get_text(): handle.get_color()  # type: ignore[union-attr]
+        for text, handle in zip(legend.get_texts(), legend.legend_handles, strict=True)
+    }
+    curves = {line.get_color(): line.get_ydata() for line in axes.lines[:2]}
+    assert curves[colours[SIGMA]] == pytest.approx(SIGMAS / 9.0)
+    left_out = np.sqrt([(9 + 4 + 1) / 95, (4 + 1) / 95, 1 / 95])
+    assert curves[colours[TAIL]] == pytest.approx(left_out)
+    (ranks,) = (line for line in axes.lines if line.get_label() == "pod")
+    assert np.column_stack(ranks.get_data()) == pytest.approx(
+        np.column_stack([[2, 3], left_out[1:]])
+    )
+
+
+def test_the_worst_sample_of_a_headline_is_the_maximum(made: Comparison) -> None:
+    assert "1 ms (p95 – ms) at 1 % (worst sample 7 %)" in headline(made, "beam")
+
+
+def test_the_training_time_of_the_paper_s_table_is_in_minutes() -> None:
+    network = Entry(
+        a_row("umesh", parameters={"channels": 128, "steps": 3}, offline_s={"data": 0, "fit": 1200})
+    )
+    for dataset in ("beam-coarse", "another"):
+        table = error_measures(dataset, [network])
+        assert table is not None
+        assert table.rows[0][table.headings.index("train (min)")] == "20"
+
+
+@pytest.mark.parametrize(
+    ("verdict", "ratio", "low", "high", "cell", "interval"),
+    [
+        ("undecided", 0.8, 0.5, 1.25, "?1.25", "0.8–2"),
+        ("undecided", 0.8, 0.5, None, "?1.25", "0–2"),
+        ("faster", 0.5, 0.4, 0.8, "+2", "1.25–2.5"),
+        ("faster", 0.5, None, 0.8, "+2", "1.25–∞"),
+        ("slower", 2.0, 1.6, 2.5, "-2", "1.6–2.5"),
+    ],
+)
+def test_the_factor_of_a_pair_and_its_interval_are_inverted_together(
+    verdict: str, ratio: float, low: float | None, high: float | None, cell: str, interval: str
+) -> None:
+    made = Comparison(Path(), {}, rows=[a_row("a"), a_row("b")])
+    record = {"dataset": "beam-tiny", "target_rel_l2_median": 0.01, "by": [], "verdict": verdict}
+    record |= {"ratio": ratio, "low": low, "high": high}
+    both = [{**record, "a": "a", "b": "b"}, {**record, "a": "b", "b": "a"}]
+    pairs = pairs_at(made, "beam-tiny", 0.01, {"pairwise": both})
+    assert (pairs.cells[0][1], pairs.intervals[0][1]) == (cell, interval)
