@@ -87,7 +87,22 @@ class Options(BaseModel):
         return f"`{name}` must be {allowed_values(field)}; got {values[name]!r}."
 
 
-class DataOptions(Options):
+class FolderOptions(Options):
+    """Folders that every command with data uses."""
+
+    cache: Annotated[
+        Path | None,
+        Field(description="Folder for generated datasets and finished fits."),
+        CommandLine(metavar="DIR", default="the user's cache folder"),
+    ] = None
+    suite: Annotated[
+        Path | None,
+        Field(description="Folder with datasets/ and methods/ to search first."),
+        CommandLine(metavar="DIR"),
+    ] = None
+
+
+class DataOptions(FolderOptions):
     """Options of everything that reads a dataset."""
 
     limit: Annotated[
@@ -99,16 +114,6 @@ class DataOptions(Options):
         int | None,
         Field(ge=1, description="Number of processes for data generation."),
         CommandLine(metavar="N", default="all cores"),
-    ] = None
-    cache: Annotated[
-        Path | None,
-        Field(description="Folder for generated datasets and finished fits."),
-        CommandLine(metavar="DIR", default="the user's cache folder"),
-    ] = None
-    suite: Annotated[
-        Path | None,
-        Field(description="Folder with datasets/ and methods/ to search first."),
-        CommandLine(metavar="DIR"),
     ] = None
 
 

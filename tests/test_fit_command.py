@@ -18,7 +18,7 @@ import pytest
 from safetensors import safe_open
 
 import mor_bench
-from mor_bench.cli.app import _knobs
+from mor_bench.cli.fit_command import parse_hyperparameters
 from mor_bench.errors import InvalidInputError, MorBenchError, SpecError
 from mor_bench.runs.dataset_run import Listener
 from mor_bench.scene.scene import Scene
@@ -423,7 +423,7 @@ def test_where_displacements_are_observed_the_error_is_that_of_answers_to_them(
 
 def test_knobs_of_the_command_line() -> None:
     given = ["n=3", "rate=1e-3", "schedule=one-cycle", 'name="3"', "on=true", "sizes=[1, 2]"]
-    assert _knobs(given) == {
+    assert parse_hyperparameters(given) == {
         "n": 3,
         "rate": 1e-3,
         "schedule": "one-cycle",
@@ -431,5 +431,5 @@ def test_knobs_of_the_command_line() -> None:
         "on": True,
         "sizes": [1, 2],
     }
-    with pytest.raises(InvalidInputError, match="`--set` takes KNOB=VALUE; got 'n'"):
-        _knobs(["n"])
+    with pytest.raises(InvalidInputError, match="`--set` takes PARAMETER=VALUE; got 'n'"):
+        parse_hyperparameters(["n"])

@@ -1,0 +1,90 @@
+"""`mor-bench generate` and `mor-bench refine`: the data that methods learn from and its quality."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from typing import Annotated
+
+import typer
+from pydantic import Field
+from threadpoolctl import threadpool_limits
+
+from mor_bench.cli.console import make_console
+from mor_bench.cli.option_groups import DatasetName, Json, with_options
+from mor_bench.cli.progress_bars import show_progress
+from mor_bench.measure.discretisation_error import refine as refine_dataset
+from mor_bench.options import Cluster, CommandLine, DataOptions, FolderOptions
+from mor_bench.report.console_tables import print_discretisation
+from mor_bench.snapshots.generate import generate as generate_shards
+from mor_bench.snapshots.test_sets import with_test_sets
+from mor_bench.specs import load_generated_spec
+
+app = typer.Typer(rich_markup_mode=None)
+
+
+class GenerateOptions(DataOptions):
+    """Options of `mor-bench generate`."""
+
+    cluster: Cluster = None
+
+
+class RefineOptions(FolderOptions):
+    """Options of `mor-bench refine`."""
+
+    n_loads: Annotated[
+        int,
+        Field(description="Number of samples to solve, spread over the load patches."),
+        CommandLine("--loads"),
+    ] = 5
+    levels: Annotated[
+        int, Field(description="Number of refinements; each doubles the cells per axis.")
+    ] = 2
+    max_dofs: Annotated[
+        int, Field(description="Skip meshes with more degrees of freedom than this.")
+    ] = 150_000
+
+
+@app.command()
+@with_options
+def generate(
+    dataset: DatasetName,
+    tests: Annotated[
+        bool, typer.Option("--tests", help="Also generate the named test sets of the dataset.")
+    ] = False,
+    *,
+    options: GenerateOptions,
+) -> None:
+    """Generate the snapshots of a dataset and print its folder.
+
+    Generation can be stopped at any moment; the same command resumes it.
+    """
+    spec = load_generated_spec(dataset, options.suite)
+    items = with_test_sets(spec) if tests else [spec]
+    with show_progress(make_console(stderr=True)) as listener:
+        for item in items:
+            progress = partial(listener.generating, item.name)
+            folder = generate_shards(
+                item, options.limit, options.workers, options.cache, progress, options.cluster
+            )
+            print(folder)
+
+
+@app.command()
+@with_options
+def refine(dataset: DatasetName, *, options: RefineOptions, as_json: Json = False) -> None:
+    """Measure the discretisation error of a dataset's mesh on refined meshes.
+
+    Later runs show it beside the errors of the methods.
+    """
+    spec = load_generated_spec(dataset, options.suite)
+    with show_progress(make_console(stderr=True)) as listener, threadpool_limits(1):
+        record = refine_dataset(
+            spec,
+            progress=partial(listener.generating, f"{spec.name} on refined meshes"),
+            **options.model_dump(),
+        )
+    if as_json:
+        print(json.dumps(record, indent=1, allow_nan=False))
+    else:
+        print_discretisation(record, make_console())

@@ -1,0 +1,135 @@
+"""`mor-bench export`: samples and results for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import mor_bench
+from mor_bench.cli.console import make_console
+from mor_bench.cli.option_groups import DatasetName, with_options
+from mor_bench.cli.progress_bars import show_progress
+from mor_bench.errors import InvalidInputError
+from mor_bench.export.asv_results import export_asv
+from mor_bench.export.data import PARTS, export_numpy, export_onnx, export_vtu
+from mor_bench.options import DataOptions
+from mor_bench.snapshots.dataset import Dataset, load_dataset
+from mor_bench.snapshots.test_sets import SET_NAMES, SetName
+from mor_bench.specs import load_dataset_spec
+
+app = typer.Typer(rich_markup_mode=None)
+export = typer.Typer(
+    help="Write samples and results for other programs.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+app.add_typer(export, name="export")
+
+
+@export.command()
+@with_options
+def vtu(
+    dataset: DatasetName,
+    sample: Annotated[int, typer.Option(min=0, help="Number of the sample in its part.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write to.")],
+    part: Annotated[str, typer.Option(help="train, test, or the name of a test set.")] = "test",
+    model: Annotated[
+        list[Path] | None,
+        typer.Option("--model", metavar="FILE", help="Fitted model; repeat for more."),
+    ] = None,
+    *,
+    options: DataOptions,
+) -> None:
+    """Write a sample and its predictions as VTU for ParaView."""
+    known = {name: name for name in PARTS}
+    if part not in known:
+        raise InvalidInputError(f"`--part` must be {', '.join(known)}; got {part!r}.")
+    data = _load(dataset, options, [name for name in SET_NAMES if name == part])
+    for path in export_vtu(data, sample, out, part=known[part], models=model or []):
+        print(path)
+
+
+@export.command()
+@with_options
+def numpy(
+    dataset: DatasetName,
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE",
+            help="NPZ file to write. A TOML that reads it again is written beside it.",
+        ),
+    ],
+    *,
+    options: DataOptions,
+) -> None:
+    """Write the samples of a dataset as NumPy arrays."""
+    for path in export_numpy(_load(dataset, options), out):
+        print(path)
+
+
+@export.command()
+def onnx(
+    model: Annotated[Path, typer.Argument(help="File of a fitted model that has a network.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="ONNX file to write.")],
+) -> None:
+    """Write a fitted network as ONNX.
+
+    It maps nodal forces (N) to nodal displacements (m).
+    """
+    path, difference = export_onnx(model, out)
+    print(path)
+    compared = (
+        "not compared: onnxruntime is not installed"
+        if difference is None
+        else f"ONNX Runtime's answers agree to {difference:.1e}"
+    )
+    typer.echo(compared, err=True)
+
+
+@export.command()
+def asv(
+    folder: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="Folder of a run.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR", help="Folder of asv's results; .asv/results with our asv.conf.json."
+        ),
+    ],
+    commit: Annotated[
+        str | None,
+        typer.Option(
+            help="Commit of mor-bench that made the run. "
+            "[default: HEAD of the checkout in the working folder]"
+        ),
+    ] = None,
+    machine: Annotated[
+        str | None,
+        typer.Option(help="Name of the machine that made the run. [default: this one, if it is]"),
+    ] = None,
+) -> None:
+    """Write the figures of a comparison for asv.
+
+    The dashboard of asv then shows them over commits.
+    """
+    comparison = mor_bench.Comparison.read(folder)
+    for path in export_asv(comparison, out, commit=commit, machine=machine):
+        print(path)
+
+
+def _load(dataset: str, options: DataOptions, tests: Sequence[SetName] = ()) -> Dataset:
+    """Load a dataset, with a progress bar if it must be generated first."""
+    spec = load_dataset_spec(dataset, options.suite)
+    with show_progress(make_console(stderr=True)) as listener:
+        return load_dataset(
+            spec,
+            options.limit,
+            tests=tests,
+            cache=options.cache,
+            workers=options.workers,
+            progress=partial(listener.generating, spec.name),
+        )

@@ -1,0 +1,84 @@
+"""`mor-bench fit`: fit one configuration, save the model, and print its test error."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+import mor_bench
+from mor_bench.cli.console import make_console
+from mor_bench.cli.option_groups import DatasetName, with_options
+from mor_bench.cli.progress_bars import show_progress
+from mor_bench.errors import InvalidInputError
+from mor_bench.options import FitOptions
+
+app = typer.Typer(rich_markup_mode=None)
+
+
+@app.command()
+@with_options
+def fit(
+    dataset: DatasetName,
+    method: Annotated[str, typer.Option("--method", "-m", help="Name or TOML file of a method.")],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="Safetensors file to write or to overwrite.")
+    ],
+    parameters: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="PARAMETER=VALUE",
+            help="Hyperparameter to change; repeat for more. [default: as the method file says]",
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(help="Seed of the method's random draws; the same as --set seed=N."),
+    ] = None,
+    *,
+    options: FitOptions,
+) -> None:
+    """Fit one configuration on the training part of a dataset, and save the model.
+
+    Repeat the same command to resume a training that was stopped.
+    """
+    given = parse_hyperparameters(parameters or [])
+    if seed is not None:
+        given["seed"] = seed
+    with show_progress(make_console(stderr=True)) as listener:
+        fitted = mor_bench.fit(
+            dataset, method, given, out=out, listener=listener, **options.model_dump()
+        )
+    error = fitted.error
+    iterations = "" if fitted.iterations is None else f", {fitted.iterations:,} iterations"
+    print(f"fit: {fitted.seconds:.3g} s{iterations}, {fitted.n_train:,} training samples")
+    relative = ", ".join(
+        f"{name} {error[f'rel_l2_{name}']:.3%}" for name in ("median", "p95", "max")
+    )
+    print(
+        f"test error: ē {error['mean_dof_m']:.2e} m, relative l2 {relative} "
+        f"({fitted.n_test:,} samples)"
+    )
+    print(fitted.out)
+
+
+def parse_hyperparameters(given: Sequence[str]) -> dict[str, Any]:
+    """Read ``name=value`` pairs. A value is written as in TOML; anything else is text.
+
+    >>> parse_hyperparameters(["n_modes=20", "schedule=constant"])
+    {'n_modes': 20, 'schedule': 'constant'}
+    """
+    parsed: dict[str, Any] = {}
+    for item in given:
+        name, equals, value = item.partition("=")
+        if not equals or not name.strip():
+            raise InvalidInputError(f"`--set` takes PARAMETER=VALUE; got {item!r}.")
+        try:
+            parsed[name.strip()] = tomllib.loads(f"value = {value}")["value"]
+        except tomllib.TOMLDecodeError:
+            parsed[name.strip()] = value.strip()
+    return parsed

@@ -1,0 +1,118 @@
+"""Progress bars of generation, configurations, timing and training."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from mor_bench.results.row import Row
+from mor_bench.runs.dataset_run import Listener
+
+PRINT_EVERY_S = 10.0
+"""Seconds between lines about progress where there is no terminal to show a bar."""
+
+
+@contextmanager
+def show_progress(console: Console) -> Iterator[Listener]:
+    """Show the progress of a run, fit or generation; print one line per fitted configuration."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as progress:
+        bars = _Bars(progress)
+        yield Listener(
+            bars.generating, bars.starting, bars.fitted, bars.timing, training=bars.training
+        )
+
+
+@dataclass
+class _Bars:
+    progress: Progress
+    tasks: dict[str, TaskID] = field(default_factory=dict)
+    begun: dict[str, tuple[int, float]] = field(default_factory=dict)
+    """Number done and time at the first call: earlier work is no part of the rate."""
+
+    printed_at: dict[str, float] = field(default_factory=dict)
+
+    def generating(self, dataset: str, done: int, total: int) -> None:
+        now = perf_counter()
+        self._begin(dataset, f"samples of {escape(dataset)}", done, total)
+        before, since = self.begun[dataset]
+        rate = (done - before) / (now - since) if done > before else 0.0
+        self._update(dataset, done, rate=f"{rate:.1f}/s" if rate else "")
+        if rate and self._is_due(dataset, now, done == total):
+            left = (total - done) / rate
+            self._print(
+                f"{dataset}: {done:,} of {total:,} samples, {rate:.1f}/s, {left:.0f} s left"
+            )
+
+    def starting(self, dataset: str, label: str, number: int, total: int) -> None:
+        self._begin("run", "", 0, total)
+        self._update("run", number - 1, description=escape(f"{dataset}: {label}"))
+
+    def fitted(self, row: Row) -> None:
+        text = f"{row.status}: {row.reason}"
+        if row.ok and row.error and row.offline_s:
+            text = (
+                f"ē {row.error.mean_dof_m:.2e} m   rel. l2 {row.error.rel_l2_median:.3%}   "
+                f"fit {row.offline_s.fit:.3g} s"
+            )
+        label = f"[bold]{escape(row.label):<46}[/bold]"
+        self.progress.console.print(f"{label} {escape(text)}", highlight=False)
+
+    def timing(self, dataset: str, done: int, total: int) -> None:
+        name = f"timing {dataset}"
+        if name not in self.tasks and not self.progress.console.is_terminal:
+            self._print(f"{dataset}: all configurations are fitted; timing them in turns")
+        self._begin(name, escape(name), 0, total)
+        self._update(name, done)
+
+    def training(self, done: int, total: int, loss: float) -> None:
+        self._begin("training", "training", done, total)
+        self._update("training", done, rate=f"loss {loss:.3g}")
+        if self._is_due("training", perf_counter()):
+            self._print(f"training: {done:,} of {total:,} iterations, loss {loss:.3g}")
+
+    def _begin(self, name: str, description: str, done: int, total: int) -> None:
+        if name not in self.tasks:
+            self.tasks[name] = self.progress.add_task(
+                description, total=total, completed=done, rate=""
+            )
+            now = perf_counter()
+            self.begun[name] = done, now
+            self.printed_at[name] = now
+
+    def _update(self, name: str, done: int, **fields: Any) -> None:
+        self.progress.update(self.tasks[name], completed=done, **fields)
+
+    def _is_due(self, name: str, now: float, last: bool = False) -> bool:
+        """Tell whether to print a line now, and note the time if so."""
+        if self.progress.console.is_terminal:
+            return False
+        due = last or now - self.printed_at[name] >= PRINT_EVERY_S
+        if due:
+            self.printed_at[name] = now
+        return due
+
+    def _print(self, text: str) -> None:
+        self.progress.console.print(text, highlight=False, markup=False)

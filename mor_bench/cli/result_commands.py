@@ -1,0 +1,87 @@
+"""`mor-bench report` and `mor-bench pick`: what a finished run says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from pydantic import Field
+
+import mor_bench
+from mor_bench.analysis.analyse import analyse
+from mor_bench.cli.console import make_console
+from mor_bench.cli.option_groups import DatasetName, with_options
+from mor_bench.cli.progress_bars import show_progress
+from mor_bench.options import CommandLine, FolderOptions
+from mor_bench.report import print_tables, render
+
+app = typer.Typer(rich_markup_mode=None)
+
+
+class PickOptions(FolderOptions):
+    """Options of `mor-bench pick`."""
+
+    error: Annotated[
+        float | None,
+        Field(description="Largest relative l2 error, median over the test set; 0.01 is 1 %."),
+        CommandLine(default="the dataset's need"),
+    ] = None
+    latency_ms: Annotated[
+        float | None,
+        Field(description="Largest median latency of one query, in ms."),
+        CommandLine("--latency", metavar="MS", default="the dataset's need"),
+    ] = None
+    memory_bytes: Annotated[
+        float | None,
+        Field(description="Largest resident memory of the predicting process, in MB."),
+        CommandLine("--memory", metavar="MB", default="any", scale=1e6),
+    ] = None
+    offline_s: Annotated[
+        float | None,
+        Field(description="Largest time for data (core-seconds) and fit together, in seconds."),
+        CommandLine("--offline", metavar="SECONDS", default="any"),
+    ] = None
+    comparison: Annotated[
+        Path | None,
+        Field(description="Folder of the run to take the evidence from."),
+        CommandLine("--run", metavar="DIR", default="the newest finished run, or a new one"),
+    ] = None
+
+
+@app.command()
+def report(
+    out: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="Folder of a run.")],
+) -> None:
+    """Print the tables of a finished run, and draw its figures and report again."""
+    comparison = mor_bench.Comparison.read(out)
+    analysis = analyse(comparison)
+    comparison.finish(analysis)
+    print_tables(comparison, make_console(), analysis)
+    for path in render(comparison, analysis):
+        print(path)
+
+
+@app.command()
+@with_options
+def pick(
+    dataset: DatasetName,
+    *,
+    options: PickOptions,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the choice to standard output as JSON.")
+    ] = False,
+) -> None:
+    """Name the cheapest configuration that meets a dataset's needs, with the evidence.
+
+    If there is none, the exit code is 1 and the output says which need to relax.
+    """
+    with show_progress(make_console(stderr=True)) as listener:
+        chosen = mor_bench.pick(dataset, listener=listener, **options.model_dump())
+    if as_json:
+        print(json.dumps(chosen.as_json(), indent=1, ensure_ascii=False, allow_nan=False))
+    else:
+        print(chosen.text())
+    if chosen.choice is None:
+        raise typer.Exit(1)

@@ -1,0 +1,73 @@
+"""`mor-bench stress`: the hard cases."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from pydantic import Field
+from rich.status import Status
+
+from mor_bench.cli.console import make_console
+from mor_bench.cli.option_groups import Json, with_options
+from mor_bench.errors import InvalidInputError
+from mor_bench.hard_cases.suite import stress as run_cases
+from mor_bench.options import FolderOptions, Profile
+from mor_bench.report.hard_case_table import print_stress
+
+app = typer.Typer(rich_markup_mode=None)
+
+
+class StressOptions(FolderOptions):
+    """Options of `mor-bench stress`."""
+
+    profile: Annotated[
+        Profile,
+        Field(description="Parameters of the method files; quick also shortens trainings."),
+    ] = "quick"
+
+
+@app.command()
+@with_options
+def stress(
+    method: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method",
+            "-m",
+            help="Name or TOML file of a method; repeat for more. [default: all of the suite]",
+        ),
+    ] = None,
+    case: Annotated[
+        list[str] | None,
+        typer.Option("--case", help="Name of a hard case; repeat for more. [default: all]"),
+    ] = None,
+    *,
+    options: StressOptions,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="JSON file to write.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Try the hard cases on the full-order model and on methods.
+
+    The table shows the expected and the actual behaviour. Falling short is no error.
+    """
+    if out is not None and not out.resolve().parent.is_dir():
+        raise InvalidInputError(f"`--out`: there is no folder {out.resolve().parent}.")
+    console = make_console(stderr=as_json)
+    with Status("", console=console) as status:
+        found = run_cases(
+            method or None,
+            case or None,
+            starting=lambda name, tried, number, total: status.update(
+                f"{number} of {total}: {name}, {tried}"
+            ),
+            **options.model_dump(),
+        )
+    print_stress(found, console)
+    if out is not None:
+        found.write(out)
+        console.print(str(out), highlight=False, soft_wrap=True)
+    if as_json:
+        print(json.dumps(found.as_dict(), indent=1, allow_nan=False, ensure_ascii=False))
