@@ -11,22 +11,25 @@ import pytest
 
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.measure.latency import (
-    BATCHES,
-    CHUNK_S,
     LEAST_QUERIES,
-    MOST_S,
+    LEAST_TURN_S,
+    MOST_TURN_S,
     PROTOCOLS,
-    Opener,
+    Protocol,
     Queries,
-    Timing,
-    _groups,
-    check_answers,
-    measure,
+    TimedMethod,
+    groups_that_fit,
+    measure_latencies,
     probe_s,
-    summary_of_timing,
-    why_unstable,
 )
 from mor_bench.measure.method_session import FitRequest, MethodSession
+from mor_bench.measure.timing import (
+    BATCHES,
+    Timing,
+    check_answers,
+    timing_summary,
+    why_unstable,
+)
 from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
 from mor_bench.snapshots.dataset import Dataset
@@ -64,7 +67,7 @@ def test_a_quiet_timing_is_stable_and_a_disturbed_one_is_not() -> None:
 
 
 def test_a_summary_says_all_of_it() -> None:
-    latency = summary_of_timing(timing([1.0, 1.01]), (0.9, 1.1), 1)["latency_ms"]
+    latency = timing_summary(timing([1.0, 1.01]), (0.9, 1.1), 1)["latency_ms"]
     assert latency["low"] < latency["median"] < latency["high"]
     assert (latency["n_queries"], latency["n_processes"], latency["stable"], latency["gc"]) == (
         200,
@@ -79,7 +82,7 @@ def test_a_timing_comes_back_from_its_arrays() -> None:
     kept.throughput["512"] = None
     kept.checked = [(3, 0.1)]
     kept.probe_s = 0.5
-    again = Timing.of_arrays(kept.arrays)
+    again = Timing.from_arrays(kept.arrays)
     assert replace(again, checked=kept.checked) == kept
     assert again.holds(0.51)
     assert not again.holds(0.6)
@@ -94,10 +97,10 @@ def test_groups_fit_into_memory() -> None:
 
     half = 0.5 * virtual_memory().available
     openers = {
-        name: Opener(lambda fork_server: pytest.fail("not opened"), size * half)
+        name: TimedMethod(lambda fork_server: pytest.fail("not opened"), size * half)
         for name, size in (("a", 0.3), ("b", 0.3), ("c", 0.9), ("d", 5.0))
     }
-    assert _groups(openers) == [["a", "b"], ["c"], ["d"]]
+    assert groups_that_fit(openers) == [["a", "b"], ["c"], ["d"]]
 
 
 def opened(
@@ -122,28 +125,30 @@ def test_configurations_are_timed_in_turn_and_fail_alone(tiny: Dataset, tmp_path
 
     queries = Queries(tiny.test.forces, tiny.test.displacements, tiny.scene.output_nodes, tmp_path)
     openers = {
-        "plain": Opener(partial(opened, tiny, "tests.third_party:Slowed", {}, tmp_path), 1e8),
-        "slow": Opener(
+        "plain": TimedMethod(partial(opened, tiny, "tests.third_party:Slowed", {}, tmp_path), 1e8),
+        "slow": TimedMethod(
             partial(opened, tiny, "tests.third_party:Slowed", {"part": 4.0}, tmp_path), 1e8
         ),
-        "broken": Opener(
+        "broken": TimedMethod(
             partial(opened, tiny, "tests.third_party:Broken", {"how": "crash"}, tmp_path), 1e8
         ),
-        "dead": Opener(dead, 1e8),
+        "dead": TimedMethod(dead, 1e8),
     }
     turns: list[int] = []
-    timings = measure(
+    timings = measure_latencies(
         openers, queries, PROTOCOLS["quick"], 1, lambda done, total: turns.append(done)
     )
     assert timings["dead"].failed == "it does not open"
     assert "crashed with ZeroDivisionError" in str(timings["broken"].failed)
     for name in ("plain", "slow"):
         samples = timings[name].samples
-        assert len(samples["latency_ms"]) >= LEAST_QUERIES or samples["used"][:, 0].max() > MOST_S
+        assert (
+            len(samples["latency_ms"]) >= LEAST_QUERIES or samples["used"][:, 0].max() > MOST_TURN_S
+        )
         assert {tuple(pair) for pair in zip(samples["process"], samples["round"], strict=True)} == {
             (p, r) for p in range(2) for r in range(5)
         }
-        assert samples["used"][:, 0].min() >= CHUNK_S
+        assert samples["used"][:, 0].min() >= LEAST_TURN_S
         assert len(samples["all_threads_ms"]) >= 2
         assert set(timings[name].throughput) == {"8", "64", "512"}
         assert timings[name].memory_bytes > 5e7
@@ -155,10 +160,10 @@ def test_answers_that_are_worse_while_timed_than_when_scored_are_found(
     tiny: Dataset, tmp_path: Path
 ) -> None:
     queries = Queries(tiny.test.forces, tiny.test.displacements, tiny.scene.output_nodes, tmp_path)
-    honest = Opener(partial(opened, tiny, "tests.third_party:Slowed", {}, tmp_path), 1e8)
-    zero = Opener(partial(opened, tiny, "tests.third_party:Zero", {}, tmp_path), 1e8)
-    timings = measure(
-        {"honest": honest, "zero": zero}, queries, PROTOCOLS["quick"], 1, single_only=True
+    honest = TimedMethod(partial(opened, tiny, "tests.third_party:Slowed", {}, tmp_path), 1e8)
+    zero = TimedMethod(partial(opened, tiny, "tests.third_party:Zero", {}, tmp_path), 1e8)
+    timings = measure_latencies(
+        {"honest": honest, "zero": zero}, queries, Protocol(1, 2, all_cores=False), 1
     )
     scored = sample_errors(
         Slowed().fit(tiny.scene, None).predict(queries.forces), queries.references

@@ -18,7 +18,13 @@ from mor_bench.errors import (
     StoreError,
     UnsupportedSceneError,
 )
-from mor_bench.measure.discretisation_error import chosen_samples, limit_of, measured, refine
+from mor_bench.measure.discretisation_error import (
+    RefinementPlan,
+    chosen_samples,
+    limit_of,
+    measured,
+    refine,
+)
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.report.page import render
 from mor_bench.scene.interpolation import interpolation_matrix
@@ -271,7 +277,9 @@ def changed() -> DatasetSpec:
     "discretisation", [{}, {"element": "tetrahedron"}, {"integration": "selective"}]
 )
 def test_refinement_of_every_element(discretisation: dict[str, str], tmp_path: Path) -> None:
-    record = refine(box(discretisation=discretisation).generated, 2, 1, cache=tmp_path)
+    record = refine(
+        box(discretisation=discretisation).generated, RefinementPlan(2, 1), cache=tmp_path
+    )
     n = 144 if "element" in discretisation else 24
     assert [mesh["n_cells"] for mesh in record["meshes"]] == [n, 8 * n]
     assert {load["limit"] for load in record["loads"]} == {"finest"}
@@ -282,7 +290,7 @@ def test_a_record_holds_what_it_is_made_of_and_serves_only_its_physics(
     changed: DatasetSpec, tmp_path: Path
 ) -> None:
     assert measured(changed, tmp_path) is None
-    record = refine(changed, 3, 3, max_dofs=7000, cache=tmp_path)
+    record = refine(changed, RefinementPlan(3, 3, 7000), cache=tmp_path)
     assert [mesh["n_dofs"] for mesh in record["meshes"]] == [189, 975, 6075]
     assert [mesh["n_dofs"] for mesh in record["left_out"]] == [42483]
     assert record["error_m"] == pytest.approx(
@@ -337,7 +345,7 @@ def test_a_changed_dataset_shows_none_until_it_is_measured(
         "out": tmp_path / "out",
     }
     assert mor_bench.run([content], **arguments).rows[0]["discretisation_error_m"] is None
-    record = refine(content, 2, 1, cache=tmp_path / "cache")
+    record = refine(content, RefinementPlan(2, 1), cache=tmp_path / "cache")
     assert [
         row["discretisation_error_m"] for row in mor_bench.run([content], **arguments).rows
     ] == [record["error_m"]]
@@ -355,7 +363,7 @@ def test_a_changed_dataset_shows_none_until_it_is_measured(
     ],
 )
 def test_a_damaged_record_is_named(changed: DatasetSpec, tmp_path: Path, damage: str) -> None:
-    refine(changed, 1, 1, cache=tmp_path)
+    refine(changed, RefinementPlan(1, 1), cache=tmp_path)
     path = next(tmp_path.rglob("discretisation.json"))
     path.write_text(damage)
     with pytest.raises(StoreError, match=r"discretisation\.json: damaged"):
@@ -376,7 +384,7 @@ def test_bad_arguments_are_one_clear_line(tmp_path: Path) -> None:
         ),
     ):
         with pytest.raises(InvalidInputError, match=message):
-            refine("beam-tiny", cache=tmp_path, **arguments)  # type: ignore[arg-type]
+            refine("beam-tiny", RefinementPlan(**arguments), cache=tmp_path)
     with pytest.raises(SpecError, match="unknown dataset 'beam-tini'; did you mean 'beam-tiny'"):
         refine("beam-tini", cache=tmp_path)
     assert not list(tmp_path.iterdir())

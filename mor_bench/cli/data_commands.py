@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from mor_bench.cli.console import make_console
 from mor_bench.cli.option_groups import DatasetName, Json, with_options
 from mor_bench.cli.progress_bars import show_progress
+from mor_bench.measure.discretisation_error import RefinementPlan
 from mor_bench.measure.discretisation_error import refine as refine_dataset
 from mor_bench.options import Cluster, CommandLine, DataOptions, FolderOptions
 from mor_bench.report.console_tables import print_discretisation
@@ -81,8 +82,10 @@ def refine(dataset: DatasetName, *, options: RefineOptions, as_json: Json = Fals
     with show_progress(make_console(stderr=True)) as listener, threadpool_limits(1):
         record = refine_dataset(
             spec,
+            RefinementPlan(options.n_loads, options.levels, options.max_dofs),
+            cache=options.cache,
+            suite=options.suite,
             progress=partial(listener.generating, f"{spec.name} on refined meshes"),
-            **options.model_dump(),
         )
     if as_json:
         print(json.dumps(record, indent=1, allow_nan=False))

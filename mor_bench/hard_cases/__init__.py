@@ -1,4 +1,4 @@
-"""The stress suite: situations in which simulations and surrogates usually go wrong, each with the correct behaviour.
+"""The stress suite: where simulations and surrogates usually go wrong, and what they should do.
 
 Here live the cases, bodies with a known answer, and the code that tries every case on every method
 that it concerns. A case judges what it computed; it never looks at a method's name. Measuring for a

@@ -1,15 +1,16 @@
-"""The discretisation error of a scene's own mesh, from a few of its loads solved on uniformly refined meshes.
+"""Measure the discretisation error of a scene's mesh on uniformly refined meshes.
 
-Every mesh is given the same forces at the same points of the surface, so that resultant and moment
-are the same on all. The limit of vanishing cell size is Richardson's from the last three meshes
-where the order that they show is sane.
+Every mesh gets the same forces at the same points of the surface, so resultant and moment agree.
+The limit of vanishing cell size is Richardson's extrapolation from the last three meshes, if their
+order of convergence is plausible.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from math import inf, log2
 from pathlib import Path
 from typing import Any
@@ -31,17 +32,40 @@ from mor_bench.version import __version__
 
 FORMAT = "mor-bench discretisation error"
 SCHEMA_VERSION = 1
-SANE_ORDERS = (0.5, 3.0)
-"""Orders of convergence with which a limit is extrapolated; linear elements have 2 at most, less at a clamped edge."""
+PLAUSIBLE_ORDERS = (0.5, 3.0)
+"""Orders of convergence with which a limit is extrapolated.
+
+Linear elements have at most 2, and less at a clamped edge.
+"""
 
 Progress = Callable[[int, int], None]
-"""Called with the solves done and the solves wanted."""
+"""Called with the finished solves and all solves."""
+
+
+@dataclass(frozen=True)
+class RefinementPlan:
+    """What `refine` solves.
+
+    Attributes
+    ----------
+    n_loads : int
+        Samples of the dataset, spread over its load patches. At least 1, at most one per patch.
+    levels : int
+        Refinements, in [1, 10]; each divides every cell into eight.
+    max_dofs : int
+        Meshes with more degrees of freedom are left out.
+    """
+
+    n_loads: int = 5
+    levels: int = 2
+    max_dofs: int = 150_000
 
 
 def chosen_samples(scene: Scene, n_loads: int) -> NDArray[np.int64]:
-    """Numbers of samples of a dataset, one from each of equal stretches of its load patches, seeded by the dataset.
+    """Choose samples of a dataset, one from each of equal ranges of its load patches.
 
-    Where patches come in random order, the first samples.
+    The choice is seeded by the dataset. Where patches come in random order, these are the first
+    samples.
     """
     loads, n_patches = scene.generated.loads, len(scene.patch_nodes)
     if loads.samples_per_patch is None:
@@ -57,7 +81,7 @@ def chosen_samples(scene: Scene, n_loads: int) -> NDArray[np.int64]:
 def limit_of(
     displacements: list[NDArray[np.float64]],
 ) -> tuple[NDArray[np.float64], float | None, str]:
-    """The displacement that those of meshes refined by two again and again tend to.
+    """Estimate the limit of displacements on meshes that are refined by two again and again.
 
     Parameters
     ----------
@@ -67,10 +91,10 @@ def limit_of(
     Returns
     -------
     limit : (n_nodes, 3) float64
-        Richardson's, or the last of the list if there are less than three or their order is not in
-        `SANE_ORDERS`.
+        Richardson's extrapolation; or the last of the list, if there are fewer than three or their
+        order is not in `PLAUSIBLE_ORDERS`.
     order : float or None
-        That the last three show.
+        Order of convergence of the last three.
     kind : {"extrapolated", "finest"}
     """
     finest = displacements[-1]
@@ -81,20 +105,21 @@ def limit_of(
         for a, b in zip(displacements[-3:-1], displacements[-2:], strict=True)
     )
     order = log2(before / last) if before > 0 and last > 0 else inf
-    if not SANE_ORDERS[0] <= order <= SANE_ORDERS[1]:
+    if not PLAUSIBLE_ORDERS[0] <= order <= PLAUSIBLE_ORDERS[1]:
         return finest, order if np.isfinite(order) else None, "finest"
     return finest + (finest - displacements[-2]) / (2**order - 1), order, "extrapolated"
 
 
-def _meshes(scene: Scene, levels: int, max_dofs: int) -> tuple[list[Scene], list[dict[str, Any]]]:
-    """The scene on its own and on the refined meshes that are within the limit, and a record of those that are not."""
+def _meshes(scene: Scene, plan: RefinementPlan) -> tuple[list[Scene], list[dict[str, int]]]:
+    """Return the scene on its own and refined meshes, and the sizes of meshes that are left out."""
     meshes = [scene]
-    for _ in range(levels):
+    for _ in range(plan.levels):
         finer = refined(meshes[-1])
-        if finer.mesh.n_dofs > max_dofs:
+        if finer.mesh.n_dofs > plan.max_dofs:
             if len(meshes) == 1:
                 raise InvalidInputError(
-                    f"`max_dofs` must be at least {finer.mesh.n_dofs}, the unknowns of the first refinement of {scene.name}; got {max_dofs}."
+                    f"`max_dofs` must be at least {finer.mesh.n_dofs}, the unknowns of the first "
+                    f"refinement of {scene.name}; got {plan.max_dofs}."
                 )
             return meshes, [_size(finer)]
         meshes.append(finer)
@@ -106,7 +131,7 @@ def _size(scene: Scene) -> dict[str, int]:
 
 
 class _OnMesh:
-    """Some loads of a scene on another mesh of its body, and answers at the scene's own nodes."""
+    """Some loads of a scene on another mesh of its body, and displacements at the scene's nodes."""
 
     def __init__(self, scene: Scene, mesh: Scene, loads: Sequence[PatchLoads]) -> None:
         points, shares = scene.patch_points(np.concatenate([load.patches[0] for load in loads]))
@@ -124,7 +149,7 @@ class _OnMesh:
         self.model = FullOrderModel(mesh)
 
     def solve(self, row: int, start: NDArray[np.float64] | None) -> NDArray[np.float64]:
-        """(n_nodes of this mesh, 3) displacements, m, from a start of that shape."""
+        """Solve for displacements (n_nodes of this mesh, 3), m, from a start of that shape."""
         free = self.scene.free_dofs
         out = np.zeros(self.scene.mesh.n_dofs)
         out[free] = self.model.solve(
@@ -133,42 +158,103 @@ class _OnMesh:
         return out.reshape(-1, 3)
 
 
+@dataclass
+class _Load:
+    """A load followed from mesh to mesh.
+
+    Attributes
+    ----------
+    sample : int
+    load : PatchLoads
+    found : (n_nodes, 3) float64 or None
+        Displacements on the last mesh, m, where the next solve starts.
+    answers : list of (n_nodes, 3) float64
+        Displacements at the scene's nodes, of every mesh.
+    reason : str or None
+        Why a mesh has no equilibrium.
+    """
+
+    sample: int
+    load: PatchLoads
+    found: NDArray[np.float64] | None
+    answers: list[NDArray[np.float64]]
+    reason: str | None = None
+
+    def record(self) -> dict[str, Any]:
+        """Return the load's part of the record."""
+        record: dict[str, Any] = {
+            "sample": self.sample,
+            "patches": self.load.patches[0].tolist(),
+            "vectors_n": self.load.vectors[0].tolist(),
+            "error_m": None,
+            "relative_l2": None,
+            "order": None,
+            "limit": "none",
+        }
+        if self.reason is not None:
+            return {**record, "reason": self.reason}
+        limit, order, kind = limit_of(self.answers)
+        errors = sample_errors(self.answers[0][None], limit[None])
+        return {
+            **record,
+            "error_m": float(errors.mean_dof_m[0]),
+            "relative_l2": float(errors.relative_l2[0]),
+            "order": order,
+            "limit": kind,
+        }
+
+
+def _solve_all(scene: Scene, meshes: list[Scene], loads: list[_Load]) -> Iterator[None]:
+    """Solve every load on every mesh, coarsest first; yields after each solve."""
+    previous: Scene | None = None
+    for mesh in meshes:
+        on_mesh = _OnMesh(scene, mesh, [load.load for load in loads])
+        carried = (
+            None if previous is None else interpolation_matrix(previous.mesh, mesh.mesh.points)
+        )
+        for row, load in enumerate(loads):
+            if load.reason is None:
+                known = load.found
+                start = None if carried is None or known is None else carried @ known
+                try:
+                    load.found = on_mesh.solve(row, start)
+                except SolverError as error:
+                    load.reason = f"{mesh.mesh.n_cells} cells: {error}"
+                else:
+                    load.answers.append(on_mesh.at_nodes @ load.found)
+            yield
+        previous = mesh
+
+
 def refine(
     dataset: str | Path | Mapping[str, Any] | DatasetSpec,
-    n_loads: int = 5,
-    levels: int = 2,
+    plan: RefinementPlan = RefinementPlan(),
     *,
-    max_dofs: int = 150_000,
     cache: Path | None = None,
     suite: Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure the discretisation error of a dataset's mesh, and keep the record beside the dataset's samples.
+    """Measure the discretisation error of a dataset's mesh, and keep it in the dataset's cache.
 
     Parameters
     ----------
     dataset : str, Path, dict or DatasetSpec
         As for `load_dataset`.
-    n_loads : int
-        Samples of the dataset that are solved, spread over its load patches.
-    levels : int
-        Refinements, each of eight cells in the place of one.
-    max_dofs : int
-        Meshes with more unknowns are left out.
+    plan : RefinementPlan
     cache, suite : Path, optional
         Cache folder of datasets; folder with ``datasets/``.
     progress : callable, optional
-        Called with (solves done, solves wanted).
+        Called with (finished solves, all solves).
 
     Returns
     -------
     dict
-        `error_m` and `relative_l2`: mean over the loads of e (mean absolute error per dof at the
-        scene's nodes, m) and of relative l2, against the limit; `relative_l2_median`; `loads`: each
-        with `sample`, `patch`, `vector_n`, `error_m`, `relative_l2`, `order` and `limit`
-        (`extrapolated`, `finest`, or `none` with a `reason` if a mesh has no equilibrium; such a
-        load counts in no mean); `meshes` and `left_out`: cells and dofs; `digest`, `version`,
-        `command`.
+        `error_m` and `relative_l2`: means over the loads of the mean absolute error per degree of
+        freedom, m, and of the relative l2 error, both against the limit; `relative_l2_median`;
+        `meshes` and `left_out`: cells and degrees of freedom; `digest`, `version`, `command`;
+        `loads`: each with `sample`, `patches`, `vectors_n`, `error_m`, `relative_l2`, `order` and
+        `limit`, which is ``extrapolated``, ``finest``, or ``none`` with a `reason` if a mesh has no
+        equilibrium. Such a load counts in no mean.
 
     Raises
     ------
@@ -182,89 +268,56 @@ def refine(
     spec = dataset if isinstance(dataset, DatasetSpec) else load_generated_spec(dataset, suite)
     scene = load_scene(spec)
     n_patches = len(scene.patch_nodes)
-    if not 1 <= n_loads <= n_patches:
+    if not 1 <= plan.n_loads <= n_patches:
         raise InvalidInputError(
-            f"`loads` must be an integer in [1, {n_patches}], the load patches of {spec.name}; got {n_loads}."
+            f"`loads` must be an integer in [1, {n_patches}], the load patches of {spec.name}; "
+            f"got {plan.n_loads}."
         )
-    if not 1 <= levels <= 10:
-        raise InvalidInputError(f"`levels` must be an integer in [1, 10]; got {levels}.")
-    scenes, left_out = _meshes(scene, levels, max_dofs)
-    samples = chosen_samples(scene, n_loads)
-    loads = [draw_loads(scene, int(i), int(i) + 1) for i in samples]
-    answers: list[list[NDArray[np.float64]]] = [[] for _ in samples]
-    starts: list[NDArray[np.float64] | None] = [None] * n_loads
-    reasons: list[str | None] = [None] * n_loads
-    previous: Scene | None = None
-    for number, mesh in enumerate(scenes):
-        on_mesh = _OnMesh(scene, mesh, loads)
-        carried = (
-            None if previous is None else interpolation_matrix(previous.mesh, mesh.mesh.points)
-        )
-        for row in range(n_loads):
-            if reasons[row] is None:
-                known = starts[row]
-                start = None if carried is None or known is None else carried @ known
-                try:
-                    found = on_mesh.solve(row, start)
-                except SolverError as error:
-                    reasons[row] = f"{mesh.mesh.n_cells} cells: {error}"
-                else:
-                    starts[row] = found
-                    answers[row].append(on_mesh.at_nodes @ found)
-            if progress:
-                progress(number * n_loads + row + 1, len(scenes) * n_loads)
-        previous = mesh
-    records = [
-        {
-            "sample": int(i),
-            "patches": load.patches[0].tolist(),
-            "vectors_n": load.vectors[0].tolist(),
-            **_errors(answer, reason),
-        }
-        for i, load, answer, reason in zip(samples, loads, answers, reasons, strict=True)
+    if not 1 <= plan.levels <= 10:
+        raise InvalidInputError(f"`levels` must be an integer in [1, 10]; got {plan.levels}.")
+    meshes, left_out = _meshes(scene, plan)
+    loads = [
+        _Load(int(i), draw_loads(scene, int(i), int(i) + 1), None, [])
+        for i in chosen_samples(scene, plan.n_loads)
     ]
-    solved = [record for record in records if record["error_m"] is not None]
-    if not solved:
-        raise SolverError(
-            f"{spec.name}: no load has an equilibrium on every mesh; the first: {reasons[0]}"
-        )
-    result = {
-        "format": FORMAT,
-        "schema_version": SCHEMA_VERSION,
-        "dataset": spec.name,
-        "digest": spec.digest(),
-        "version": __version__,
-        "command": f"mor-bench refine {spec.name} --loads {n_loads} --levels {levels} --max-dofs {max_dofs}",
-        "error_m": float(np.mean([record["error_m"] for record in solved])),
-        "relative_l2": float(np.mean([record["relative_l2"] for record in solved])),
-        "relative_l2_median": float(np.median([record["relative_l2"] for record in solved])),
-        "meshes": [_size(mesh) for mesh in scenes],
-        "left_out": left_out,
-        "loads": records,
-    }
+    for number, _ in enumerate(_solve_all(scene, meshes, loads)):
+        if progress:
+            progress(number + 1, len(meshes) * len(loads))
+    result = _record(spec, plan, loads, [_size(mesh) for mesh in meshes], left_out)
     path = _cached_path(spec, cache)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
     return result
 
 
-def _errors(answers: list[NDArray[np.float64]], reason: str | None) -> dict[str, Any]:
-    """The part of a load's record that its displacements on all meshes yield."""
-    if reason is not None:
-        return {
-            "error_m": None,
-            "relative_l2": None,
-            "order": None,
-            "limit": "none",
-            "reason": reason,
-        }
-    limit, order, kind = limit_of(answers)
-    errors = sample_errors(answers[0][None], limit[None])
+def _record(
+    spec: DatasetSpec,
+    plan: RefinementPlan,
+    loads: list[_Load],
+    meshes: list[dict[str, int]],
+    left_out: list[dict[str, int]],
+) -> dict[str, Any]:
+    """Return the record of `refine`, given the sizes of the meshes."""
+    records = [load.record() for load in loads]
+    solved = [record for record in records if record["error_m"] is not None]
+    if not solved:
+        raise SolverError(
+            f"{spec.name}: no load has an equilibrium on every mesh; the first: {loads[0].reason}"
+        )
+    options = f"--loads {plan.n_loads} --levels {plan.levels} --max-dofs {plan.max_dofs}"
     return {
-        "error_m": float(errors.mean_dof_m[0]),
-        "relative_l2": float(errors.relative_l2[0]),
-        "order": order,
-        "limit": kind,
+        "format": FORMAT,
+        "schema_version": SCHEMA_VERSION,
+        "dataset": spec.name,
+        "digest": spec.digest(),
+        "version": __version__,
+        "command": f"mor-bench refine {spec.name} {options}",
+        "error_m": float(np.mean([record["error_m"] for record in solved])),
+        "relative_l2": float(np.mean([record["relative_l2"] for record in solved])),
+        "relative_l2_median": float(np.median([record["relative_l2"] for record in solved])),
+        "meshes": meshes,
+        "left_out": left_out,
+        "loads": records,
     }
 
 
@@ -275,10 +328,9 @@ def _cached_path(spec: DatasetSpec, cache: Path | None) -> Path:
 def measured(
     spec: DatasetSpec, cache: Path | None = None, suite: Path | None = None
 ) -> dict[str, Any] | None:
-    """The record of `refine` for a dataset: the one in the cache, else one shipped as ``datasets/*.refine.json``, else None.
+    """Read the record of `refine` for a dataset, from the cache or shipped as ``*.refine.json``.
 
-    Records are told apart by the digest of the dataset's physics: of a dataset that was changed
-    there is none.
+    A record belongs to a dataset if the digests of the physics agree. None if there is none.
 
     Raises
     ------
@@ -299,10 +351,8 @@ def measured(
 def _read(path: Path) -> dict[str, Any]:
     try:
         record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        sound = (record["format"], record["schema_version"]) == (
-            FORMAT,
-            SCHEMA_VERSION,
-        ) and isinstance(record["digest"], str)
+        sound = (record["format"], record["schema_version"]) == (FORMAT, SCHEMA_VERSION)
+        sound = sound and isinstance(record["digest"], str)
         sound = sound and all(
             0 <= float(record[key]) < inf for key in ("error_m", "relative_l2_median")
         )
@@ -310,6 +360,7 @@ def _read(path: Path) -> dict[str, Any]:
         sound = False
     if not sound:
         raise StoreError(
-            f"{path}: damaged, or not a discretisation error of schema version {SCHEMA_VERSION}; remove it and run `mor-bench refine`."
+            f"{path}: damaged, or not a discretisation error of schema version {SCHEMA_VERSION}; "
+            "remove it and run `mor-bench refine`."
         )
     return record

@@ -1,7 +1,7 @@
 """Errors of predictions against the reference, per sample, and their summary.
 
-A sample without a prediction (the method failed on it) has an infinite error: it counts as not
-reaching any target and is never dropped.
+A sample on which the method failed has an infinite error. It misses every target and is never
+dropped.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class SampleErrors:
-    """Errors of each test sample, (n_test,) float64.
+    """Errors of each test sample.
 
     Attributes
     ----------
-    mean_dof_m
-        The paper's e: mean over all degrees of freedom of the absolute error, m.
-    relative_l2
+    mean_dof_m : (n_test,) float64
+        Mean absolute error over all degrees of freedom, m; the paper's e.
+    relative_l2 : (n_test,) float64
         Norm of the error over norm of the reference, over the degrees of freedom of the sample.
-    max_nodal_m
-        Largest Euclidean nodal error, m.
-    amplitude_m
-        Largest nodal displacement of the reference, m.
+    max_nodal_m : (n_test,) float64
+        Largest Euclidean error of a node, m.
+    amplitude_m : (n_test,) float64
+        Largest displacement of a node in the reference, m.
     """
 
     mean_dof_m: NDArray[np.float64]
@@ -39,10 +39,14 @@ def sample_errors(
     reference: NDArray[np.float64],
     nodes: NDArray[np.int64] | None = None,
 ) -> SampleErrors:
-    """Errors of predictions (n, n_nodes, 3) against references of the same shape, both in m.
+    """Compute the errors of predictions.
 
-    NaN in a prediction means that there is none, and gives infinite errors. Where only some nodes
-    are wanted, the others do not count.
+    Parameters
+    ----------
+    predicted, reference : (n, n_nodes, 3) float64
+        Displacements, m; a prediction with NaN has infinite errors.
+    nodes : (n_output_nodes,) int64, optional
+        The nodes that count; by default all.
     """
     if nodes is not None and len(nodes) < reference.shape[1]:
         predicted, reference = predicted[:, nodes], reference[:, nodes]
@@ -61,11 +65,10 @@ def sample_errors(
 
 
 def summary(errors: SampleErrors) -> dict[str, float]:
-    """The figures of a results row.
+    """Return the error figures of a results row.
 
-    `mean_dof_m` is the paper's ē, `std_dof_m` its σ(e) with M - 1, and `slope` that of the
-    least-squares line through the origin of e against the sample's largest displacement, as in the
-    paper's figures.
+    `mean_dof_m` is the paper's ē, and `std_dof_m` its σ(e) with M - 1. `slope` is that of the
+    least-squares line through the origin of e over the sample's largest displacement.
     """
     e, relative = errors.mean_dof_m, errors.relative_l2
     with np.errstate(invalid="ignore"):

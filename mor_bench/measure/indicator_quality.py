@@ -1,4 +1,4 @@
-"""Whether errors can be told without the right answer: indicated beside measured errors of some test samples."""
+"""How well errors that are estimated without the reference agree with measured errors."""
 
 from __future__ import annotations
 
@@ -12,22 +12,24 @@ from scipy.stats import spearmanr
 from mor_bench.mechanics.indicator import ErrorIndicator
 
 N_INDICATED = 64
-"""Test loads, spread evenly."""
+"""Test samples whose errors are estimated, spread evenly over the test set."""
 
 LEAST_INDICATED = 10
+"""Fewest usable samples for a summary."""
+
 EXACT = 1e-6
-"""Errors of full-order answers are round-off and tolerance, of which the reference has as much: nothing to indicate."""
+"""Relative error below which no summary is made: the reference itself has such errors."""
 
 
 class Indicated:
-    """Collects the indications of the predictions of a test set, which come in chunks.
+    """Collects the error estimates of a test set, whose predictions come in chunks.
 
     Parameters
     ----------
     indicator : ErrorIndicator or None
-        Without it nothing is collected.
+        None collects nothing.
     n_samples : int
-        In the test set.
+        Size of the test set.
     """
 
     def __init__(self, indicator: ErrorIndicator | None, n_samples: int) -> None:
@@ -36,7 +38,15 @@ class Indicated:
         self._rows: list[NDArray[np.float64]] = []
 
     def add(self, first: int, forces: NDArray[np.float64], predicted: NDArray[np.float64]) -> None:
-        """Indicate the chosen ones among the samples from number ``first`` on: loads, N, and predictions, m, (n, n_nodes, 3)."""
+        """Estimate the errors of a chunk's chosen samples.
+
+        Parameters
+        ----------
+        first : int
+            Number of the chunk's first sample.
+        forces, predicted : (n, n_nodes, 3) float64
+            Loads, N, and predictions, m.
+        """
         if self._indicator is None:
             return
         chosen = self._chosen[(self._chosen >= first) & (self._chosen < first + len(forces))]
@@ -47,12 +57,12 @@ class Indicated:
 
     @property
     def arrays(self) -> dict[str, NDArray[np.float64]]:
-        """`indicated` (n, 3): number of the sample, relative correction and residual."""
+        """Return `indicated`, (n, 3): number of the sample, relative correction and residual."""
         return {"indicated": np.concatenate(self._rows)} if self._rows else {}
 
 
 def indicator_summary(score: Mapping[str, Any]) -> dict[str, float] | None:
-    """How far the indicated errors of some samples tell the measured ones; None where there are too few."""
+    """Compare estimated with measured errors; None if too few samples are usable."""
     rows, correction, residual = score.get("indicated", np.zeros((0, 3))).T
     measured = score["relative_l2"][rows.astype(int)]
     usable = (

@@ -1,4 +1,4 @@
-"""The session that a method runs in while it is compared: it fits or loads, predicts, and is timed.
+"""The session that a method runs in: it fits or loads, predicts, and is timed.
 
 The session is given the scene, the training snapshots, and the loads to predict. The reference
 displacements stay in the parent process, which scores.
@@ -34,7 +34,7 @@ CURVES = ("loss_curve", "validation_curve")
 """Attributes, with an underscore behind, in which a trained method keeps its losses."""
 
 SETTLE_QUERIES = 3
-"""Untimed queries before each round, which fill the processor's caches with the method's own data."""
+"""Untimed queries before each round; they fill the processor's caches with the method's data."""
 
 CHECKED_ANSWERS, CHECKED_SHARE = 4, 0.2
 """Most answers that a round keeps for a check, and the probability that a query is one of them."""
@@ -53,7 +53,7 @@ PRELOADED = (
     "mor_bench.surrogates.pca_regression",
     "mor_bench.surrogates.pod",
 )
-"""Modules that many methods import. PyTorch is left out: it takes two seconds, and few methods need it."""
+"""Modules that many methods import, without PyTorch: it takes two seconds, and few need it."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ class MethodSession(Session):
         return {}
 
     def flag(self, forces: NDArray[np.float64]) -> dict[str, Any]:
-        """Flag the loads that the method reports as out of its training range; None if it does not know its range."""
+        """Return which loads are out of the training range; None if the method does not know."""
         try:
             flagged = self.method.out_of_range(forces)
         except UnknownRangeError:
@@ -208,7 +208,7 @@ class MethodSession(Session):
     def time(
         self, out: Path, n: int, floor_s: float, most_s: float, threads: int
     ) -> dict[str, Any]:
-        """Time single queries: at least ``n`` and at least for ``floor_s``, but for no longer than ``most_s``.
+        """Time at least ``n`` single queries, for at least ``floor_s`` and at most ``most_s``.
 
         Each load is one of the queries, drawn at random and scaled by a random factor, so that no
         load comes twice. A few are not scaled; the answers to those are written to a file, to be
@@ -276,7 +276,10 @@ class MethodSession(Session):
     def throughput(
         self, sizes: list[int], floor_s: float, most_s: float, threads: int
     ) -> dict[str, Any]:
-        """Measure queries per second in batches; None where a batch would take longer than ``most_s`` or has no answer."""
+        """Measure queries per second in batches.
+
+        None stands for a batch that would take longer than ``most_s`` or has no answer.
+        """
         rates: dict[str, float | None] = {}
         expected = 0.0
         with pinned_threads(threads):
@@ -299,7 +302,10 @@ class MethodSession(Session):
 
 
 def _training_record(method: Surrogate) -> dict[str, Any] | None:
-    """Return the iterations and loss curves of a method that has trained; None of others, or if they are no numbers."""
+    """Return the iterations and loss curves of a training.
+
+    None if the method did not train, or keeps something else than numbers there.
+    """
     try:
         record: dict[str, Any] = {
             name: [float(loss) for loss in getattr(method, f"{name}_", ())] for name in CURVES
@@ -313,7 +319,7 @@ def _training_record(method: Surrogate) -> dict[str, Any] | None:
 
 @dataclass
 class _Turn:
-    """What a turn of timed queries yields; ``kept`` are checked answers by the number of their query."""
+    """What a turn of timed queries yields; ``kept`` maps a query's number to its checked answer."""
 
     latency_ms: list[float] = field(default_factory=list)
     gc_ms: list[float] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""What a query costs in work that no machine changes."""
+"""The cost of a query as counted work, which does not depend on the machine."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from mor_bench.surrogate import Surrogate
 
 
 def cost_of(method: Surrogate, forces: NDArray[np.float64]) -> dict[str, float] | None:
-    """Mean work per query over some loads, each predicted on its own.
+    """Return the mean work per query over some loads, each predicted on its own.
 
     Parameters
     ----------
     method : Surrogate
         Fitted.
     forces : (n, n_nodes, 3) float64
-        Loads, N. One that the method cannot answer counts with the work that it took.
+        Loads, N. One that the method cannot answer counts with the work until its error.
 
     Returns
     -------

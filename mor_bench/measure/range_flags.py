@@ -1,4 +1,4 @@
-"""Whether a method says so where its errors are large: the flags of `Surrogate.out_of_range` beside measured errors."""
+"""How well the flags of `Surrogate.out_of_range` find large errors."""
 
 from __future__ import annotations
 
@@ -10,25 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 IN_RANGE = ("in-range", "test")
-"""Test sets of loads like those of training; the first that was scored tells what errors are usual."""
+"""Test sets of loads like those of training; the first that was scored defines the usual error."""
 
 USUAL = 95
-"""Percentile of the errors in range above which an error is unusual."""
+"""Percentile of the errors in range; a larger error is unusual."""
 
 
 @dataclass(frozen=True)
 class Flags:
-    """What is usual in the training range.
+    """The usual error in the training range, and the false alarms there.
 
     Attributes
     ----------
     in_range : str
-        The test set that it was measured on.
+        The test set with which both were measured.
     usual_rel_l2 : float
-        95th percentile of the relative l2 there; infinite if more than one in twenty has no
-        prediction.
+        95th percentile of the relative l2 error; infinite if more than 5 % have no prediction.
     n, n_flagged : int
-        Loads there, and those that are flagged all the same: false alarms.
+        Samples there, and false alarms among them.
     """
 
     in_range: str
@@ -37,13 +36,13 @@ class Flags:
     n_flagged: int
 
     def of(self, score: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-        """Of a test set: `n_unusual` errors beyond the usual, how many of these are flagged, and their share, the `recall`; None without any."""
+        """Count a test set's unusual errors and those flagged; `recall` is their share."""
         unusual = score["relative_l2"] > self.usual_rel_l2
         n, found = int(unusual.sum()), int((unusual & score["flagged"]).sum())
         return {"n_unusual": n, "n_unusual_flagged": found, "recall": found / n if n else None}
 
     def as_dict(self, main: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-        """For a row, with the figures of the main test set."""
+        """Return the figures of a results row, given the scores of the main test set."""
         test = {"n": len(main["flagged"]), "n_flagged": int(main["flagged"].sum()), **self.of(main)}
         usual = {
             "in_range": self.in_range,
@@ -55,7 +54,7 @@ class Flags:
 
 
 def flags_of(scores: Mapping[str, Mapping[str, NDArray[Any]]]) -> Flags | None:
-    """What is usual in range, by the scores of the test sets; None if the method does not know its range."""
+    """Find the usual error from the scores of all test sets; None if the method has no flags."""
     if any("flagged" not in score for score in scores.values()):
         return None
     name = next(name for name in IN_RANGE if name in scores)

@@ -30,16 +30,14 @@ from mor_bench.measure.error_metrics import SampleErrors, summary
 from mor_bench.measure.indicator_quality import indicator_summary
 from mor_bench.measure.latency import (
     PROTOCOLS,
-    Opener,
     Queries,
-    Timing,
-    check_answers,
-    measure,
+    TimedMethod,
+    measure_latencies,
     probe_s,
-    summary_of_timing,
 )
 from mor_bench.measure.method_session import CURVES
 from mor_bench.measure.range_flags import flags_of
+from mor_bench.measure.timing import Timing, check_answers, timing_summary
 from mor_bench.reduction.basis import pod
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import LearningPoint, Memory, Row, SeedSpread, SetErrors
@@ -446,10 +444,10 @@ class DatasetRun:
         timings: dict[str, Timing] = {}
         for label, entry in entries.items():
             kept = None if settings.retime else entry.arrays(name)
-            if kept is not None and (timing := Timing.of_arrays(kept)).holds(speed):
+            if kept is not None and (timing := Timing.from_arrays(kept)).holds(speed):
                 timings[label] = timing
         openers = {
-            label: Opener(
+            label: TimedMethod(
                 partial(entry.opened, settings.budget.seconds),
                 (entry.fit or {})["fit_memory_bytes"],
             )
@@ -461,7 +459,7 @@ class DatasetRun:
             int
         )
         queries = Queries(test.forces[chosen], test.references[chosen], test.nodes, self.folder)
-        fresh = measure(
+        fresh = measure_latencies(
             openers,
             queries,
             protocol,
@@ -487,7 +485,7 @@ class DatasetRun:
             if timing.failed:
                 row = row.with_parts(status="failed", reason=timing.failed)
             else:
-                figures = summary_of_timing(timing, intervals[label], settings.threads)
+                figures = timing_summary(timing, intervals[label], settings.threads)
                 assert row.memory_bytes is not None
                 memory = Memory(fit=row.memory_bytes.fit, predict=timing.memory_bytes)
                 row = Row(**{**row.as_dict(), **figures, "memory_bytes": memory})

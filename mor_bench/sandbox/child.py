@@ -1,4 +1,4 @@
-"""The main loop of a sandboxed process: read requests, let the session answer, send the answers.
+"""The main loop of a sandboxed process, in which a session answers the parent's requests.
 
 Requests come pickled from the parent, which is trusted. Answers go back as JSON, since foreign code
 may have touched them.
@@ -43,7 +43,7 @@ class _Child:
         return {}
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Return what a request yields, or the error that ended it, with the warnings on the way."""
+        """Return what a request yields, or the error that ended it, and its warnings."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             try:
@@ -73,7 +73,7 @@ def _read(requests: BinaryIO, queue: SimpleQueue[dict[str, Any]]) -> None:
 
 
 def answer_requests(requests: BinaryIO, answers: BinaryIO) -> None:
-    """Answer requests until the parent closes the pipe. Standard output is sent to standard error."""
+    """Answer requests until the parent closes the pipe. Prints go to standard error."""
     # A terminal interrupts all processes; the parent ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.dup2(2, 1)
@@ -91,7 +91,10 @@ def answer_requests(requests: BinaryIO, answers: BinaryIO) -> None:
 
 
 def main() -> None:
-    """Answer requests on standard input; given a socket's path and a session class, be their fork server."""
+    """Answer requests on standard input.
+
+    With a socket's path and a session class as arguments, serve forks instead.
+    """
     if len(sys.argv) == 3:
         from mor_bench.sandbox.fork_server import serve
 

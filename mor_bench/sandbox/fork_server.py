@@ -1,4 +1,4 @@
-"""Fresh processes in milliseconds: a server imports what a session needs once, then forks a process per request.
+"""Start processes in milliseconds: a server imports what they need once, then forks.
 
 Importing takes a second, which a comparison of thirty configurations would pay a hundred times.
 Each replicate of a timing gets a server of its own, so that replicates share nothing. Linux only;
@@ -33,14 +33,14 @@ CHILD_MODULE = "mor_bench.sandbox.child"
 
 
 def environment() -> dict[str, str]:
-    """Return the parent's environment with its own package first, so that ``-m`` finds the same one."""
+    """Return this process's environment, in which ``-m`` finds this very package."""
     package = str(Path(errors.__file__).parents[1])
     paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}
 
 
 class ForkServer:
-    """The parent's side of a fork server. Its process starts at once and is ready when first needed.
+    """The parent's side of a fork server, whose process starts at once.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ class ForkServer:
         return connection, int.from_bytes(pid, "little")
 
     def exit_code(self, pid: int, within_s: float = 5.0) -> int:
-        """Return the exit code of a forked process as `subprocess` reports it: negative for a signal."""
+        """Return the exit code of a forked process; a signal is negative, as in `subprocess`."""
         with self._child_ended:
             self._child_ended.wait_for(lambda: pid in self._exit_codes, within_s)
             return self._exit_codes.get(pid, 1)

@@ -1,4 +1,4 @@
-"""A sandboxed process seen from its parent: asked, watched, and ended at its limits of time and memory."""
+"""The parent's side of a sandboxed process: requests, and limits of time and memory."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ class SandboxedProcess:
         raise MethodFailedError(answer["message"])
 
     def _wait_for_answer(self, do: str, within_s: float) -> bytes:
-        """Return the next line of the answers, empty if the process died, and enforce the limits meanwhile."""
+        """Return the next answer, empty if the process died; enforce the limits meanwhile."""
         until = monotonic() + within_s
         activity = "starting its process" if do == "start" else self._session.activities.get(do, do)
         while True:

@@ -10,7 +10,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,9 @@ import numpy as np
 
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.latency_intervals import compare_latency, latency_intervals
-from mor_bench.measure.latency import PROTOCOLS, Opener, Queries, Timing, measure, why_unstable
+from mor_bench.measure.latency import PROTOCOLS, Queries, TimedMethod, measure_latencies
 from mor_bench.measure.method_session import FitRequest, MethodSession
+from mor_bench.measure.timing import Timing, why_unstable
 from mor_bench.results.comparison import Comparison
 from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.process import SandboxedProcess
@@ -74,12 +75,11 @@ def _measured(
     seed: int,
     processes: str = "full",
 ) -> dict[str, Timing]:
-    openers = {
-        name: Opener(_Method(scene, folder, *method), 1e8) for name, method in methods.items()
+    protocol = replace(PROTOCOLS[processes], all_cores=False)
+    methods_here = {
+        name: TimedMethod(_Method(scene, folder, *method), 1e8) for name, method in methods.items()
     }
-    timings = measure(
-        openers, _queries(scene, folder), PROTOCOLS[processes], 1, seed=seed, single_only=True
-    )
+    timings = measure_latencies(methods_here, _queries(scene, folder), protocol, 1, seed=seed)
     failed = {name: timing.failed for name, timing in timings.items() if timing.failed}
     if failed:
         raise SystemExit(f"failed: {failed}")
