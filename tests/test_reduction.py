@@ -15,7 +15,7 @@ from mor_bench.reduction.cubature import ecsw_system
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.hpod import HyperReducedPOD
-from mor_bench.surrogates.pca_regression import Monomials, monomial_indices
+from mor_bench.surrogates.monomials import Monomials, monomial_indices
 from mor_bench.surrogates.pod import PODGalerkin
 
 

@@ -1,35 +1,30 @@
-"""DeepONet: coefficients from a branch network, times functions of the position from a trunk network or from POD."""
+"""DeepONet: coefficients from a branch network, times functions of the position."""
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, final
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
-from mor_bench.errors import InvalidInputError
+from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.coordinates import change_of_basis, input_axes
 from mor_bench.scene.mesh import Mesh
 from mor_bench.surrogates.field_network import (
-    Arrays,
     FieldNetwork,
-    FieldSurrogate,
-    Input,
+    OperatorSurrogate,
+    add_constants,
     n_products,
     perceptron,
 )
+from mor_bench.surrogates.field_surrogate import Array, Arrays, Input
 
 EVENNESS = 0.0
-"""Coordinates of the input keep their sizes, see `input_axes`.
-
-Half way to equal sizes, 200 coordinates of the linear response were learned by heart: on the coarse beam, split by region (1,280
-samples, POD trunk, 1,000 iterations), the error was 5.8e-4 m, more than that of the linear response alone, against 8.2e-5 m. With 20
-coordinates either scaling does.
-"""
+"""Coordinates of the input keep their sizes, see `input_axes`. More even sizes overfit."""
 
 
 class DeepONetNetwork(FieldNetwork):
@@ -40,11 +35,11 @@ class DeepONetNetwork(FieldNetwork):
     axes : (n_dofs, n_inputs) float32
         A, principal directions of the input.
     positions : (n_nodes, 3) float32
-        Of the nodes, scaled to the unit of the body's size.
+        Node positions relative to the size of the body.
     modes : (n_dofs, n_functions) float32 or None
-        tₖ at the nodes; None for a trunk network.
+        Values of tₖ at the nodes; None for a trunk network.
     n_functions, width, depth : int
-        Functions, and units and number of the hidden layers of branch and trunk.
+        Number of functions, and units and number of the hidden layers of branch and trunk.
     """
 
     axes: Tensor
@@ -61,17 +56,14 @@ class DeepONetNetwork(FieldNetwork):
         depth: int,
     ) -> None:
         super().__init__()
-        self.register_buffer("axes", axes, persistent=False)
-        self.register_buffer("positions", positions, persistent=False)
-        self.register_buffer(
-            "functions", None if modes is None else modes.T.contiguous(), persistent=False
-        )
+        functions = None if modes is None else modes.T.contiguous()
+        add_constants(self, axes=axes, positions=positions, functions=functions)
         self.branch = perceptron(axes.shape[1], *[width] * depth, n_functions)
         self.trunk = perceptron(3, *[width] * depth, 3 * n_functions) if modes is None else None
         self.n_functions = n_functions
 
     def basis(self) -> Tensor:
-        """(n_functions, n_dofs) values of the functions at the nodes."""
+        """Return the values of the functions at the nodes, (n_functions, n_dofs)."""
         if self.functions is not None:
             functions: Tensor = self.functions
             return functions
@@ -87,7 +79,7 @@ class DeepONetNetwork(FieldNetwork):
         answer: Tensor = self.branch(features) @ self.basis()
         return answer.view(len(features), -1, 3)
 
-    def prepare(self) -> None:
+    def precompute(self) -> None:
         self.functions = self.basis().contiguous()
 
     @property
@@ -96,114 +88,82 @@ class DeepONetNetwork(FieldNetwork):
 
 
 @final
-class DeepONet(FieldSurrogate):
-    """A branch network for the load, and functions of the position from a trunk network or from POD.
+@dataclass(eq=False)
+class DeepONet(OperatorSurrogate):
+    """A branch network for the load, and functions of the position from a trunk network or POD.
 
-    Lu, Jin, Pang, Zhang, Karniadakis, "Learning nonlinear operators via DeepONet", and for the POD trunk Lu et al., "A
-    comprehensive and fair comparison of two neural operators". Here the branch is given principal coordinates of the input
-    in the place of its values at sensors, and the trunk's functions are vector-valued, so that the three components share
-    the branch. The POD trunk is without the mean, which G(0) would take off. Once trained, the trunk is a matrix: what is
-    left for a query is that of a regression between principal coordinates by a network.
+    Lu, Jin, Pang, Zhang, Karniadakis, "Learning nonlinear operators via DeepONet"; for the POD
+    trunk Lu et al., "A comprehensive and fair comparison of two neural operators". Here the branch
+    sees principal coordinates of the input instead of its values at sensors. The trunk's functions
+    are vector-valued, so that the three components share the branch. The POD trunk has no mean.
+    After the training the trunk is a matrix.
 
     Parameters
     ----------
     input : {"force", "linear-response"}
-        What the network is given; see `FieldSurrogate`.
+        Input of the network; see `FieldSurrogate`. The linear response gives the smaller errors.
     trunk : {"network", "pod"}
-        Where the functions tₖ come from. POD modes are those of the displacement, or of its nonlinear rest.
+        Source of the functions tₖ. POD modes are those of the displacement, or of its nonlinear
+        rest.
     n_input_modes : int
-        Principal coordinates of the input, at most its rank. Those of forces are all of about one size: none can be left out.
+        Principal coordinates of the input; capped at its rank. Keep many for forces, whose
+        coordinates are all of about one size.
     n_functions : int
-        At most the rank with POD.
+        Number of functions; capped at the rank with POD.
     width, depth : int
-        Units and number of hidden layers in branch and trunk.
+        Units and number of the hidden layers in branch and trunk.
     iterations : int
-        Adam steps; a number, not a time, so that the result does not depend on the load of the machine.
-    batch_size, learning_rate, seed
-        Samples per step, peak of the one-cycle schedule, and seed of the initial weights and of the order of the samples.
+        Adam steps. A number, not a time, so that the result does not depend on the machine's load.
+    batch_size : int
+        Samples per step.
+    learning_rate : float
+        Peak of the one-cycle schedule.
+    seed : int
+        Seed of the initial weights and the order of the samples.
     """
 
-    architecture: ClassVar[tuple[str, ...]] = (
-        "input",
-        "trunk",
-        "n_input_modes",
-        "n_functions",
-        "width",
-        "depth",
-    )
+    input: Input = "force"
+    trunk: Literal["network", "pod"] = "network"
+    n_input_modes: Annotated[int, Field(ge=1)] = 200
+    n_functions: Annotated[int, Field(ge=1)] = 64
+    width: Annotated[int, Field(ge=1)] = 128
+    depth: Annotated[int, Field(ge=1)] = 3
+    iterations: Annotated[int, Field(ge=1)] = 20_000
+    batch_size: Annotated[int, Field(ge=1)] = 64
+    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 2e-3
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
-    def __init__(
-        self,
-        input: Input = "force",
-        trunk: Literal["network", "pod"] = "network",
-        n_input_modes: Annotated[int, Field(ge=1)] = 200,
-        n_functions: Annotated[int, Field(ge=1)] = 64,
-        width: Annotated[int, Field(ge=1)] = 128,
-        depth: Annotated[int, Field(ge=1)] = 3,
-        iterations: Annotated[int, Field(ge=1)] = 20_000,
-        batch_size: Annotated[int, Field(ge=1)] = 64,
-        learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 2e-3,
-        seed: Annotated[int, Field(ge=0, lt=2**32)] = 0,
-    ) -> None:
-        self.input = input
-        self.trunk = trunk
-        self.n_input_modes = n_input_modes
-        self.n_functions = n_functions
-        self.width = width
-        self.depth = depth
-        self.iterations = iterations
-        self.batch_size = batch_size
-        self.learning_rate = learning_rate
-        self.seed = seed
+    architecture: ClassVar = ("input", "trunk", "n_input_modes", "n_functions", "width", "depth")
 
-    def _constants(
-        self, inputs: NDArray[np.float64], targets: NDArray[np.float64]
-    ) -> dict[str, NDArray[np.float64]]:
-        constants = {
-            "axes": input_axes(inputs.reshape(len(inputs), -1), self.n_input_modes, EVENNESS)
-        }
+    def constants(self, inputs: Array, targets: Array) -> dict[str, Array]:
+        flat_inputs, flat = inputs.reshape(len(inputs), -1), targets.reshape(len(targets), -1)
+        constants = {"axes": input_axes(flat_inputs, self.n_input_modes, EVENNESS)}
         if self.trunk == "pod":
-            flat = targets.reshape(len(targets), -1)
             modes = pod(flat).modes[:, : self.n_functions]
-            constants["modes"] = modes * np.sqrt(
-                ((flat @ modes) ** 2).mean(axis=0)
-            )  # coefficients of unit size
+            sizes = np.sqrt(((flat @ modes) ** 2).mean(axis=0))
+            constants["modes"] = modes * sizes  # so that coefficients are of unit size
         return constants
 
-    def _network(self, constants: Arrays) -> DeepONetNetwork:
-        n_dofs = self.scene_.mesh.n_dofs
-        names = (
-            {"axes": self.n_input_modes, "modes": self.n_functions}
-            if self.trunk == "pod"
-            else {"axes": self.n_input_modes}
-        )
-        for name, most in names.items():
-            if constants[name].shape[:1] != (n_dofs,) or not 1 <= constants[name].shape[1] <= most:
-                raise InvalidInputError(
-                    f"`{name}` must have shape ({n_dofs}, at most {most}); got {constants[name].shape}."
-                )
-        single = {name: torch.from_numpy(constants[name].astype(np.float32)) for name in names}
-        n_functions = constants["modes"].shape[1] if "modes" in names else self.n_functions
-        return DeepONetNetwork(
-            single["axes"],
-            scaled_positions(self.scene_.mesh),
-            single.get("modes"),
-            n_functions,
-            self.width,
-            self.depth,
-        )
+    def build_network(self, constants: Arrays) -> DeepONetNetwork:
+        shape = (self.scene_.mesh.n_dofs, None)
+        axes = _single(take_array(constants, "axes", shape))
+        modes, n_functions = None, self.n_functions
+        if self.trunk == "pod":
+            modes = _single(take_array(constants, "modes", shape))
+            n_functions = modes.shape[1]
+        positions = scaled_positions(self.scene_.mesh)
+        return DeepONetNetwork(axes, positions, modes, n_functions, self.width, self.depth)
 
-    def _turned(
-        self, weights: dict[str, Tensor], constants: Arrays, scales: NDArray[np.float64]
-    ) -> dict[str, Tensor]:
-        """The branch from coordinates of a load, and to coefficients of a displacement, in their own units."""
+    def turned(self, weights: dict[str, Tensor], source: Arrays, target: Arrays) -> Any:
+        """Convert the branch's first layer to the new axes, and its last one to the new modes."""
         inward = change_of_basis(
-            constants["axes"] / scales[0], self.constants_["axes"] / self.input_scale_
+            source["constant.axes"] / source["scales"][0],
+            target["constant.axes"] / target["scales"][0],
         )
         outward = np.eye(self.n_functions)
         if self.trunk == "pod":
-            outward = change_of_basis(constants["modes"], self.constants_["modes"])
-        outward *= scales[1] / self.output_scale_
+            outward = change_of_basis(source["constant.modes"], target["constant.modes"])
+        outward *= source["scales"][1] / target["scales"][1]
         first, last = "branch.0.weight", f"branch.{2 * self.depth}"
         turned = {first: weights[first].double() @ torch.from_numpy(inward.T)}
         turned |= {
@@ -214,8 +174,10 @@ class DeepONet(FieldSurrogate):
 
 
 def scaled_positions(mesh: Mesh) -> Tensor:
-    """(n_nodes, 3) positions from the middle of the bounding box, in halves of its longest edge."""
+    """Return node positions from the middle of the bounding box, in halves of its longest edge."""
     low, high = mesh.bounds
-    return torch.from_numpy(
-        (2.0 * (mesh.points - (low + high) / 2) / (high - low).max()).astype(np.float32)
-    )
+    return _single(2.0 * (mesh.points - (low + high) / 2) / (high - low).max())
+
+
+def _single(array: Array) -> Tensor:
+    return torch.from_numpy(array.astype(np.float32))

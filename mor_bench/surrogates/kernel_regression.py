@@ -1,10 +1,11 @@
-"""Kernel ridge regression and Gaussian-process regression between principal coordinates, with the Gaussian kernel."""
+"""Kernel ridge and Gaussian-process regression between principal coordinates, Gaussian kernel."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,69 +14,72 @@ from scipy.optimize import minimize
 
 from mor_bench.counting import count
 from mor_bench.errors import InvalidInputError
-from mor_bench.surrogates.coordinate_regression import CoordinateRegression, CoordinateSamples
-
-Array = NDArray[np.float64]
+from mor_bench.surrogates.coordinate_regression import (
+    Array,
+    Arrays,
+    CoordinateRegression,
+    CoordinateSamples,
+    Input,
+)
 
 LENGTH_SCALES = {"linear-response": 8.0, "force": 100.0}
-"""Of kernel ridge regression, by input."""
+"""Default length scale of kernel ridge regression, by input."""
+
 LENGTHS = (1e-2, 1e3)
 """Bounds on length scales; inputs are of the order of one."""
+
 N_LEADING, MAX_ITERATIONS = 5, 30
-"""Outputs that they are chosen by, the first and largest ones, and steps of L-BFGS-B; each takes a second with all 40 outputs."""
+"""Leading outputs that choose length scales, and steps of L-BFGS-B; a step with 40 takes 1 s."""
+
 SHORTEST = 1e-6
-"""Length that a file may hold; loads over it can be squared."""
+"""Shortest length in a model; loads divided by it can be squared."""
+
 LARGEST = 1e50
-"""Of the points over the length scales: their squares, and their products with any load's, stay finite."""
+"""Largest ratio of points to length scales; its square, and products with any load, are finite."""
+
 LEAST_NOISE = 1e-10
-"""Of the variance of the targets; what is added at the origin, where the value is known."""
+"""Share of the variance of the targets, added at the origin, where the value is known."""
 
 
 def gaussian_kernel(a: Array, b: Array) -> Array:
-    """k(a, b) = exp(-|a - b|² / 2) of points (n, d) and (m, d), as (n, m)."""
+    """Return k(a, b) = exp(-|a - b|² / 2) of points (n, d) and (m, d), as (n, m)."""
     squares = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T
     return np.asarray(np.exp(-0.5 * np.maximum(squares, 0.0)))
 
 
-class _GaussianSums(CoordinateRegression):
-    """g(z) = Σ_i w_i k(z, z_i) with the Gaussian kernel; one of the z_i is the origin, by whose weight g(0) = 0."""
+class GaussianSums(CoordinateRegression):
+    """g(z) = Σ_i w_i k(z, z_i) with the Gaussian kernel.
 
-    def _shapes(
-        self, state: dict[str, NDArray[Any]], n_inputs: int, n_outputs: int
-    ) -> Mapping[str, tuple[int, ...]]:
-        n_points = len(state["points"])
+    One of the z_i is the origin, whose weight makes g(0) = 0.
+    """
+
+    n_points: int
+
+    def shapes(
+        self, model: Arrays, n_inputs: int, n_outputs: int
+    ) -> Mapping[str, tuple[int | None, ...]]:
+        n_points = len(model["points"])
         return {
             "points": (n_points, n_inputs),
             "weights": (n_points, n_outputs),
             "lengths": (n_inputs,),
         }
 
-    def _take(self, state: dict[str, NDArray[Any]]) -> None:
-        self.points_, self.weights_, self.lengths_ = (
-            state["points"],
-            state["weights"],
-            state["lengths"],
-        )
+    def take(self, model: dict[str, NDArray[Any]]) -> None:
+        self.points_, self.weights_ = model["points"], model["weights"]
+        self.lengths_ = model["lengths"]
         if not (self.lengths_ >= SHORTEST).all():
             raise InvalidInputError(f"`lengths` must be at least {SHORTEST:g}.")
         scaled = self.points_ / self.lengths_
         if not (np.abs(scaled) < LARGEST).all():
-            raise InvalidInputError("`points` must be of moderate size against `lengths`.")
-        # [z, 1, -|z|²/2] times these are the exponents, never much above zero.
-        self._exponents = np.vstack(
-            [
-                scaled.T / self.lengths_[:, None],
-                -0.5 * (scaled**2).sum(axis=1),
-                np.ones(len(scaled)),
-            ]
-        )
+            raise InvalidInputError("`points` must be of moderate size relative to `lengths`.")
+        # [z, 1, -|z|²/2] times this matrix gives the exponents, never much above zero.
+        squares = -0.5 * (scaled**2).sum(axis=1)
+        rows = [scaled.T / self.lengths_[:, None], squares, np.ones(len(scaled))]
+        self._exponents = np.vstack(rows)
 
-    def _learned(self) -> dict[str, NDArray[Any]]:
-        return {"points": self.points_, "weights": self.weights_, "lengths": self.lengths_}
-
-    def _coefficients(self, z: Array) -> Array:
-        # An exponential as one.
-        per_load = self._exponents.size + self.weights_.size + 2 * z.shape[1]
+    def coefficients(self, z: Array) -> Array:
+        per_load = self._exponents.size + self.weights_.size + 2 * z.shape[1]  # exp counts one
         count(multiply_adds=len(z) * per_load)
         left = np.empty((len(z), len(self._exponents)))
         left[:, :-2], left[:, -2] = z, 1.0
@@ -86,48 +90,44 @@ class _GaussianSums(CoordinateRegression):
         return np.asarray(out)
 
 
-class PCAKernelRidge(_GaussianSums):
-    """Kernel ridge regression between principal coordinates; see `CoordinateRegression` for what it shares with others.
+@dataclass(eq=False)
+class PCAKernelRidge(GaussianSums):
+    """Kernel ridge regression between principal coordinates; see `CoordinateRegression`.
 
-    g is sought among the functions with g(0) = 0, whose kernel is k(z, z') - k(z, 0) k(0, z'), with k the Gaussian kernel.
+    g is sought among the functions with g(0) = 0. Their kernel is k(z, z') - k(z, 0) k(0, z'), with
+    k the Gaussian kernel.
 
     Parameters
     ----------
     input : {"linear-response", "force"}
         What the coordinates z are taken of.
     n_input_modes : int, optional
-        Length of z, by default 20 of the linear response and at most 200 of the force; capped at the rank of the input with a warning.
+        Length of z; 20 of the linear response and at most 200 of the force by default. Capped at
+        the rank of the input with a warning.
     n_output_modes : int
-        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a warning.
+        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a
+        warning.
     n_points : int
-        Training samples at most that are learned from, the first ones, which cover the load regions evenly (imported ones are
-        shuffled): each is kept and compared with in every query, and the fit solves with a dense matrix of that size.
+        Largest number of training samples used, the first ones, which cover the load regions
+        evenly; imported ones are shuffled. Each is compared with in every query, and the fit solves
+        with a dense matrix of this size.
     length_scale : float, optional
-        Of the kernel, where the coordinates have root mean squares from a few to less than one; by default 8 for the linear
-        response and 100 for the force, whose effect is all but linear over such lengths.
+        Of the kernel, where coordinates have root mean squares of the order of one; 8 for the
+        linear response and 100 for the force by default.
     ridge : float
         Tikhonov weight, relative to the kernel's largest value.
     """
 
-    usual_inputs = {"linear-response": 20, "force": 200}  # noqa: RUF012
+    input: Input = "linear-response"
+    n_input_modes: Annotated[int, Field(ge=1)] | None = None
+    n_output_modes: Annotated[int, Field(ge=1)] = 40
+    n_points: Annotated[int, Field(ge=1, le=20_000)] = 2000
+    length_scale: Annotated[float, Field(ge=LENGTHS[0], le=LENGTHS[1])] | None = None
+    ridge: Annotated[float, Field(ge=1e-14, allow_inf_nan=False)] = 1e-8
 
-    def __init__(
-        self,
-        input: Literal["linear-response", "force"] = "linear-response",
-        n_input_modes: Annotated[int, Field(ge=1)] | None = None,
-        n_output_modes: Annotated[int, Field(ge=1)] = 40,
-        n_points: Annotated[int, Field(ge=1, le=20_000)] = 2000,
-        length_scale: Annotated[float, Field(ge=LENGTHS[0], le=LENGTHS[1])] | None = None,
-        ridge: Annotated[float, Field(ge=1e-14, allow_inf_nan=False)] = 1e-8,
-    ) -> None:
-        self.input = input
-        self.n_input_modes = n_input_modes
-        self.n_output_modes = n_output_modes
-        self.n_points = n_points
-        self.length_scale = length_scale
-        self.ridge = ridge
+    usual_inputs: ClassVar = {"linear-response": 20, "force": 200}
 
-    def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
+    def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         from sklearn.kernel_ridge import KernelRidge
 
         z, targets = samples.z[: self.n_points], samples.values[: self.n_points]
@@ -136,9 +136,8 @@ class PCAKernelRidge(_GaussianSums):
         scaled = z / length
         to_origin = gaussian_kernel(scaled, origin)
         kernel = gaussian_kernel(scaled, scaled) - to_origin @ to_origin.T
-        weights = (
-            KernelRidge(alpha=self.ridge, kernel="precomputed").fit(kernel, targets).dual_coef_
-        )
+        regression = KernelRidge(alpha=self.ridge, kernel="precomputed").fit(kernel, targets)
+        weights = regression.dual_coef_
         return {
             "points": np.vstack([z, origin]),
             "weights": np.vstack([weights, -to_origin.T @ weights]),
@@ -146,57 +145,40 @@ class PCAKernelRidge(_GaussianSums):
         }
 
 
-def _optimised(objective: Any, start: Any, bounds: Any) -> tuple[Array, float]:
-    """Where the negative likelihood is least, and its value there."""
-    found = minimize(
-        objective,
-        start,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=bounds,
-        options={"maxiter": MAX_ITERATIONS},
-    )
-    return np.asarray(found.x), float(found.fun)
+@dataclass(eq=False)
+class PCAGaussianProcess(GaussianSums):
+    """Gaussian-process regression between principal coordinates; see `CoordinateRegression`.
 
-
-class PCAGaussianProcess(_GaussianSums):
-    """Gaussian-process regression between principal coordinates; see `CoordinateRegression` for what it shares with others.
-
-    The prior covariance is a Gaussian kernel with a length scale for each input, the same for all outputs, and g(0) = 0 is an
-    observation without noise. Length scales, variance and noise maximise the likelihood of the first `n_optimised` samples
-    and the first `N_LEADING` outputs (at most `MAX_ITERATIONS` steps of L-BFGS-B from one start); with them the mean is conditioned
-    on the first `n_points`, and alone is kept.
+    The prior covariance is a Gaussian kernel with a length scale for each input, the same for all
+    outputs; g(0) = 0 is an observation without noise. Length scales, variance and noise maximise
+    the likelihood of the first `n_optimised` samples and the first `N_LEADING` outputs, in at most
+    `MAX_ITERATIONS` steps of L-BFGS-B from one start. Then the mean is conditioned on the first
+    `n_points` samples; only the mean is kept.
 
     Parameters
     ----------
     input : {"linear-response", "force"}
         What the coordinates z are taken of.
     n_input_modes : int, optional
-        Length of z, by default 20 of the linear response and 60 of the force; capped at the rank of the input with a warning.
+        Length of z; 20 of the linear response and 60 of the force by default. Capped at the rank of
+        the input with a warning.
     n_output_modes : int
-        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a warning.
+        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a
+        warning.
     n_points : int
-        Training samples at most that the mean is conditioned on, the first ones, which cover the load regions evenly (imported
-        ones are shuffled).
+        Largest number of training samples that the mean is conditioned on: the first ones, which
+        cover the load regions evenly; imported ones are shuffled.
     n_optimised : int
-        Of these, samples at most that the length scales, the variance and the noise are chosen by.
+        Largest number of these that choose length scales, variance and noise.
     """
 
-    def __init__(
-        self,
-        input: Literal["linear-response", "force"] = "linear-response",
-        n_input_modes: Annotated[int, Field(ge=1)] | None = None,
-        n_output_modes: Annotated[int, Field(ge=1)] = 40,
-        n_points: Annotated[int, Field(ge=1, le=20_000)] = 2000,
-        n_optimised: Annotated[int, Field(ge=1, le=5000)] = 300,
-    ) -> None:
-        self.input = input
-        self.n_input_modes = n_input_modes
-        self.n_output_modes = n_output_modes
-        self.n_points = n_points
-        self.n_optimised = n_optimised
+    input: Input = "linear-response"
+    n_input_modes: Annotated[int, Field(ge=1)] | None = None
+    n_output_modes: Annotated[int, Field(ge=1)] = 40
+    n_points: Annotated[int, Field(ge=1, le=20_000)] = 2000
+    n_optimised: Annotated[int, Field(ge=1, le=5000)] = 300
 
-    def _learn(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
+    def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.gaussian_process import GaussianProcessRegressor
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -209,22 +191,29 @@ class PCAGaussianProcess(_GaussianSums):
         )
         chosen = GaussianProcessRegressor(kernel, alpha=0.0, optimizer=_optimised)
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", ConvergenceWarning
-            )  # of an input that says nothing the length is at its upper bound
+            # The length of an input without effect ends at its upper bound.
+            warnings.simplefilter("ignore", ConvergenceWarning)
             chosen.fit(z[: self.n_optimised], targets[: self.n_optimised, :N_LEADING] / scale)
-        variance, lengths = (
-            chosen.kernel_.k1.k1.constant_value,
-            np.atleast_1d(chosen.kernel_.k1.k2.length_scale),
-        )
+        variance = chosen.kernel_.k1.k1.constant_value
+        lengths = np.atleast_1d(chosen.kernel_.k1.k2.length_scale)
         noise = np.append(np.full(len(z), chosen.kernel_.k2.noise_level), LEAST_NOISE) / variance
         points = np.vstack([z, np.zeros((1, z.shape[1]))])
         process = GaussianProcessRegressor(
             RBF(lengths), alpha=np.maximum(noise, LEAST_NOISE), optimizer=None
         )
         process.fit(points, np.vstack([targets, np.zeros((1, targets.shape[1]))]))
-        return {
-            "points": points,
-            "weights": process.alpha_.reshape(len(points), -1),
-            "lengths": lengths,
-        }
+        weights = process.alpha_.reshape(len(points), -1)
+        return {"points": points, "weights": weights, "lengths": lengths}
+
+
+def _optimised(objective: Any, start: Any, bounds: Any) -> tuple[Array, float]:
+    """Return where the negative likelihood is least, and its value there."""
+    found = minimize(
+        objective,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": MAX_ITERATIONS},
+    )
+    return np.asarray(found.x), float(found.fun)

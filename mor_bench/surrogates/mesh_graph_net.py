@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, final
 
 import numpy as np
@@ -13,33 +14,20 @@ from torch.nn import functional
 
 from mor_bench.scene.mesh import Mesh
 from mor_bench.surrogates.field_network import (
-    Arrays,
     FieldNetwork,
-    FieldSurrogate,
-    Input,
+    OperatorSurrogate,
+    add_constants,
     linear,
     n_products,
     perceptron,
 )
+from mor_bench.surrogates.field_surrogate import Arrays, Input
 
+HEXAHEDRON = "01 12 23 30 45 56 67 74 04 15 26 37"
+TETRAHEDRON = "01 02 03 12 13 23"
 EDGES = {
-    8: np.array(
-        [
-            [0, 1],
-            [1, 2],
-            [2, 3],
-            [3, 0],
-            [4, 5],
-            [5, 6],
-            [6, 7],
-            [7, 4],
-            [0, 4],
-            [1, 5],
-            [2, 6],
-            [3, 7],
-        ]
-    ),
-    4: np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]),
+    n: np.array([[int(node) for node in edge] for edge in edges.split()])
+    for n, edges in ((8, HEXAHEDRON), (4, TETRAHEDRON))
 }
 """Node pairs along the edges of a hexahedron and of a tetrahedron, in VTK order."""
 
@@ -64,15 +52,15 @@ class Graph(nn.Module):
         pairs = np.unique(pairs, axis=0)
         both = np.concatenate([pairs, pairs[:, ::-1]])
         receivers, senders = both[np.lexsort((both[:, 1], both[:, 0]))].T
-        for name, array in (
-            ("senders", senders),
-            ("receivers", receivers),
-            ("outgoing", _table(senders, mesh.n_nodes)),
-            ("incoming", _table(receivers, mesh.n_nodes)),
-        ):
-            self.register_buffer(
-                name, torch.from_numpy(np.ascontiguousarray(array)), persistent=False
-            )
+        arrays = {
+            "senders": senders,
+            "receivers": receivers,
+            "outgoing": _table(senders, mesh.n_nodes),
+            "incoming": _table(receivers, mesh.n_nodes),
+        }
+        add_constants(
+            self, **{k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
+        )
 
     @property
     def n_edges(self) -> int:
@@ -80,19 +68,21 @@ class Graph(nn.Module):
 
     def from_senders(self, nodal: Tensor) -> Tensor:
         """(n_nodes, n, c) → (n_edges, n, c): the value of each edge's sender."""
-        return _Gather.apply(nodal, self.senders, self.outgoing)  # type: ignore[no-any-return,no-untyped-call]
+        return _gather(nodal, self.senders, self.outgoing)
 
     def from_receivers(self, nodal: Tensor) -> Tensor:
         """(n_nodes, n, c) → (n_edges, n, c): the value of each edge's receiver."""
-        return _Gather.apply(nodal, self.receivers, self.incoming)  # type: ignore[no-any-return,no-untyped-call]
+        return _gather(nodal, self.receivers, self.incoming)
 
     def to_receivers(self, messages: Tensor) -> Tensor:
         """(n_edges, n, c) → (n_nodes, n, c): the sum over the edges that each node receives."""
-        return _SegmentSum.apply(messages, self.receivers, self.incoming)  # type: ignore[no-any-return,no-untyped-call]
+        summed: Any = _SegmentSum
+        total: Tensor = summed.apply(messages, self.receivers, self.incoming)
+        return total
 
 
 def _table(ends: NDArray[np.int64], n_nodes: int) -> NDArray[np.int64]:
-    """(n_nodes, largest number of edges) the edges at each node, in ascending order, then n_edges in the place of none."""
+    """Return the edges at each node in ascending order, (n_nodes, most), padded with n_edges."""
     order = np.argsort(ends, kind="stable")
     counts = np.bincount(ends, minlength=n_nodes)
     table = np.full((n_nodes, counts.max()), len(ends))
@@ -101,7 +91,7 @@ def _table(ends: NDArray[np.int64], n_nodes: int) -> NDArray[np.int64]:
 
 
 def _segment_sum(messages: Tensor, table: Tensor) -> Tensor:
-    """The sum of the rows of messages (n_edges, ...) that a table names for each node; always added in the same order."""
+    """Sum the rows of messages (n_edges, ...) at each node, always in the same order."""
     with_none = torch.cat([messages, torch.zeros_like(messages[:1])])
     total = with_none.index_select(0, table[:, 0])
     for column in table.T[1:]:
@@ -110,7 +100,7 @@ def _segment_sum(messages: Tensor, table: Tensor) -> Tensor:
 
 
 class _Gather(torch.autograd.Function):
-    """Rows by index. The backward pass of torch's own indexing adds atomically on some devices, this one never."""
+    """Rows by index; unlike torch's own, the backward pass never adds atomically."""
 
     @staticmethod
     def forward(ctx: Any, nodal: Tensor, ends: Tensor, table: Tensor) -> Tensor:
@@ -120,6 +110,12 @@ class _Gather(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         return _segment_sum(gradient, ctx.table), None, None
+
+
+def _gather(nodal: Tensor, ends: Tensor, table: Tensor) -> Tensor:
+    function: Any = _Gather
+    gathered: Tensor = function.apply(nodal, ends, table)
+    return gathered
 
 
 class _SegmentSum(torch.autograd.Function):
@@ -136,10 +132,10 @@ class _SegmentSum(torch.autograd.Function):
 
 
 class MessagePassing(nn.Module):
-    """One step: e ← e + f(e, v_sender, v_receiver), v ← v + g(v, Σ e), with two-layer perceptrons f and g.
+    """One step: e ← e + f(e, v_sender, v_receiver), v ← v + g(v, Σ e), with perceptrons f and g.
 
-    The first layer of f is three products, of which those with node values are taken at the nodes: there are about a fifth
-    as many of them as of edges.
+    The first layer of f is three products. Those with node values are taken at the nodes, since
+    there are about five times as many edges.
     """
 
     def __init__(self, width: int) -> None:
@@ -163,17 +159,18 @@ class MessagePassing(nn.Module):
         return edges, nodes
 
     def multiply_adds(self, n_edges: int, n_nodes: int) -> int:
-        """For one sample."""
-        return n_edges * n_products(
-            nn.ModuleList([self.edge, self.message])
-        ) + n_nodes * n_products(nn.ModuleList([self.sender, self.receiver, self.node]))
+        """Return the work for one sample."""
+        at_edges = n_products(nn.ModuleList([self.edge, self.message]))
+        at_nodes = n_products(nn.ModuleList([self.sender, self.receiver, self.node]))
+        return n_edges * at_edges + n_nodes * at_nodes
 
 
 class GraphNetwork(FieldNetwork):
-    """Encode, process, decode: Pfaff et al., "Learning mesh-based simulation with graph networks", section 3.
+    """Pfaff et al., "Learning mesh-based simulation with graph networks", section 3.
 
-    Node features are the input and whether the node is fixed, edge features the relative position and the length. After each
-    step a node knows of nodes one edge further away, and of no others.
+    Encode, process, decode. Node features are the input and whether the node is fixed; edge
+    features are the relative position and the length. Each step carries information one edge
+    further.
     """
 
     fixed: Tensor
@@ -184,13 +181,11 @@ class GraphNetwork(FieldNetwork):
         self.graph = Graph(mesh)
         fixed = torch.zeros(mesh.n_nodes, 1)
         fixed[torch.from_numpy(fixed_nodes)] = 1.0
-        self.register_buffer("fixed", fixed, persistent=False)
         points = torch.from_numpy(mesh.points.astype(np.float32))
         relative = points[self.graph.senders] - points[self.graph.receivers]
         length = relative.norm(dim=1, keepdim=True)
-        self.register_buffer(
-            "shapes", torch.cat([relative, length], dim=1) / length.mean(), persistent=False
-        )
+        shapes = torch.cat([relative, length], dim=1) / length.mean()
+        add_constants(self, fixed=fixed, shapes=shapes)
         self.node_encoder = perceptron(4, width, width)
         self.edge_encoder = perceptron(4, width, width)
         self.steps = nn.ModuleList(MessagePassing(width) for _ in range(steps))
@@ -200,19 +195,16 @@ class GraphNetwork(FieldNetwork):
     def encode(self, fields: Tensor) -> Tensor:
         return fields
 
-    def prepare(self) -> None:
+    def precompute(self) -> None:
         self.encoded = self.edge_encoder(self.shapes).unsqueeze(1)
 
     def forward(self, features: Tensor) -> Tensor:
-        features = features.transpose(
-            0, 1
-        )  # the nodes first: a node's row of all samples is moved in one piece
-        edges = (
-            self.edge_encoder(self.shapes).unsqueeze(1) if self.encoded is None else self.encoded
-        )
-        nodes = self.node_encoder(
-            torch.cat([features, self.fixed.unsqueeze(1).expand(-1, features.shape[1], -1)], dim=-1)
-        )
+        features = features.transpose(0, 1)  # nodes first: a node's row moves in one piece
+        edges = self.encoded
+        if edges is None:
+            edges = self.edge_encoder(self.shapes).unsqueeze(1)
+        fixed = self.fixed.unsqueeze(1).expand(-1, features.shape[1], -1)
+        nodes = self.node_encoder(torch.cat([features, fixed], dim=-1))
         for step in self.steps:
             edges, nodes = step(edges, nodes, self.graph)
         answer: Tensor = self.decoder(nodes)
@@ -230,52 +222,44 @@ class GraphNetwork(FieldNetwork):
 
 
 @final
-class MeshGraphNet(FieldSurrogate):
+@dataclass(eq=False)
+class MeshGraphNet(OperatorSurrogate):
     """Message passing along the edges of the mesh; see `GraphNetwork`.
 
-    Without time: the paper's network adds one step's velocity, this one answers with the displacement under a load. A node
-    sees as many edges far as there are steps. From the force alone it can therefore not know of loads, or of supports, that
-    lie further away, and a cantilever's tip hangs on both; the linear response carries that over the whole body. Nodes know
-    no position, only those of their neighbours relative to them.
+    The paper's network adds the velocity of one time step; this one answers with the displacement
+    under a load. A node sees as many edges far as there are steps. From the force alone it
+    therefore knows nothing of loads or supports further away. The linear response carries their
+    effect over the whole body. Nodes know no positions but those of their neighbours relative to
+    them.
 
     Parameters
     ----------
     input : {"force", "linear-response"}
-        What the network is given; see `FieldSurrogate`.
+        Input of the network; see `FieldSurrogate`. Take the linear response on bodies with more
+        edges than steps.
     width : int
-        Of the features of nodes and edges, and of the one hidden layer of each perceptron.
+        Features of nodes and edges, and units of the hidden layer of each perceptron.
     steps : int
-        Message-passing steps, each with weights of its own.
+        Message-passing steps, each with its own weights.
     iterations : int
-        Adam steps; a number, not a time, so that the result does not depend on the load of the machine.
-    batch_size, learning_rate, seed
-        Samples per step, peak of the one-cycle schedule, and seed of the initial weights and of the order of the samples.
+        Adam steps. A number, not a time, so that the result does not depend on the machine's load.
+    batch_size : int
+        Samples per step.
+    learning_rate : float
+        Peak of the one-cycle schedule.
+    seed : int
+        Seed of the initial weights and the order of the samples.
     """
 
-    architecture: ClassVar[tuple[str, ...]] = ("input", "width", "steps")
+    input: Input = "force"
+    width: Annotated[int, Field(ge=1, le=1024)] = 32
+    steps: Annotated[int, Field(ge=1, le=64)] = 6
+    iterations: Annotated[int, Field(ge=1)] = 1000
+    batch_size: Annotated[int, Field(ge=1)] = 8
+    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
-    def __init__(
-        self,
-        input: Input = "force",
-        width: Annotated[int, Field(ge=1, le=1024)] = 32,
-        steps: Annotated[int, Field(ge=1, le=64)] = 6,
-        iterations: Annotated[int, Field(ge=1)] = 1000,
-        batch_size: Annotated[int, Field(ge=1)] = 8,
-        learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-3,
-        seed: Annotated[int, Field(ge=0, lt=2**32)] = 0,
-    ) -> None:
-        self.input = input
-        self.width = width
-        self.steps = steps
-        self.iterations = iterations
-        self.batch_size = batch_size
-        self.learning_rate = learning_rate
-        self.seed = seed
+    architecture: ClassVar = ("input", "width", "steps")
 
-    def _constants(
-        self, inputs: NDArray[np.float64], targets: NDArray[np.float64]
-    ) -> dict[str, NDArray[np.float64]]:
-        return {}
-
-    def _network(self, constants: Arrays) -> GraphNetwork:
+    def build_network(self, constants: Arrays) -> GraphNetwork:
         return GraphNetwork(self.scene_.mesh, self.scene_.fixed_nodes, self.width, self.steps)

@@ -19,7 +19,7 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.specs import ImportedDatasetSpec
 from mor_bench.surrogate import Surrogate
-from mor_bench.surrogates.pca_regression import monomial_indices
+from mor_bench.surrogates.monomials import monomial_indices
 
 Array = NDArray[np.float64]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,103 +21,129 @@ if TYPE_CHECKING:
 
 
 MAX_RESPONSE_DOFS = 4096
-"""Of a scene whose linear response is written, as a dense matrix: 64 MiB."""
+"""Most unknowns of a linear response that is written, as a dense matrix of 64 MiB."""
 
 
-def umesh_graph(
-    scene: Scene,
-    grid: PaddedGrid,
-    network: UNet,
-    input_scale: float,
-    output_scale: float,
-    at_rest: NDArray[np.float32] | None,
-    response: LinearResponse | None,
-) -> onnx.ModelProto:
-    """`UMesh.predict` in float32, scaling included; supports are zero, and so is all where nothing is given if `at_rest` is.
+@dataclass(frozen=True)
+class UMeshParts:
+    """What a U-Mesh predicts with.
 
-    In a scene with observed nodes, what the others hold is not looked at, and may be NaN.
-
-    Parameters
+    Attributes
     ----------
-    at_rest : (n_nodes, 3), optional
-        What is taken off every answer of the network, scaled.
-    response : LinearResponse, optional
-        The network is given this linear response and answers with the rest of the displacement.
+    scene : Scene
+    grid : PaddedGrid
+    network : UNet
+    scales : tuple of float
+        What the input, and the network's answer, are scaled by.
+    at_rest : (n_nodes, 3) or None
+        What is subtracted from every answer of the network, scaled.
+    response : LinearResponse or None
+        The input is this linear response, and the network answers with the nonlinear rest.
+    """
+
+    scene: Scene
+    grid: PaddedGrid
+    network: UNet
+    scales: tuple[float, float]
+    at_rest: NDArray[np.float32] | None
+    response: LinearResponse | None
+
+
+def umesh_graph(parts: UMeshParts) -> onnx.ModelProto:
+    """Return `UMesh.predict` in float32 as a graph, scaling included.
+
+    Supports do not move. With `at_rest`, no load gives no displacement. In a scene with observed
+    nodes, values at other nodes are ignored and may be NaN.
 
     Raises
     ------
     UnavailableBackendError
-        If the linear response is wanted of more than `MAX_RESPONSE_DOFS` unknowns.
+        If the linear response has more than `MAX_RESPONSE_DOFS` unknowns.
     """
-    n_nodes, n_dofs, weights = scene.mesh.n_nodes, scene.mesh.n_dofs, grid.grid.weights
+    scene, weights, response = parts.scene, parts.grid.grid.weights, parts.response
+    n_nodes, output_scale = scene.mesh.n_nodes, parts.scales[1]
     graph = GraphBuilder()
-    given, to_grid = "forces", sp.csr_array(weights.T)
-    if scene.observed_nodes is not None:
-        seen = np.zeros((n_nodes, 1), dtype=np.bool_)
-        seen[scene.observed_nodes] = True
-        given = graph.add(
-            "Where", graph.constant(seen), given, graph.constant(np.zeros(1, dtype=np.float32))
-        )
-    loads = given
+    loads = _given(graph, scene)
+    given, to_grid = loads, sp.csr_array(weights.T)
     if response is not None:
-        if n_dofs > MAX_RESPONSE_DOFS:
-            raise UnavailableBackendError(
-                f"the linear response of {scene.name} has {n_dofs:,} unknowns; ONNX has no sparse solve, and a dense matrix is written for at "
-                f"most {MAX_RESPONSE_DOFS:,}."
-            )
-        compliance = response.respond(np.eye(n_dofs)).astype(np.float32)
-        flat = graph.add("Reshape", loads, graph.constant(np.array([-1, n_dofs])))
-        solved = graph.add("MatMul", flat, graph.constant(compliance))
-        given = graph.add("Reshape", solved, graph.constant(np.array([-1, n_nodes, 3])))
+        given = _linear_response(graph, scene, response, loads)
     if response is not None or scene.observed_nodes is not None:
-        to_grid = sp.csr_array(sp.diags_array(1.0 / grid.shares.numpy().ravel()) @ weights.T)
-    x = graph.add("Mul", given, graph.constant(np.array([1.0 / input_scale], dtype=np.float32)))
+        shares = parts.grid.shares.numpy().ravel()
+        to_grid = sp.csr_array(sp.diags_array(1.0 / shares) @ weights.T)
+    x = graph.add("Mul", given, _scalar(graph, 1.0 / parts.scales[0]))
     x = _sparse_product(graph, to_grid, x)  # (n, x y z, 3)
-    x = graph.add("Reshape", x, graph.constant(np.array([-1, *grid.shape, 3])))
-    x = graph.network(network, graph.add("Transpose", x, perm=[0, 4, 1, 2, 3]))
+    x = graph.add("Reshape", x, graph.constant(np.array([-1, *parts.grid.shape, 3])))
+    x = graph.network(parts.network, graph.add("Transpose", x, perm=[0, 4, 1, 2, 3]))
     x = graph.add("Transpose", x, perm=[0, 2, 3, 4, 1])
-    x = _sparse_product(
-        graph, weights, graph.add("Reshape", x, graph.constant(np.array([-1, weights.shape[1], 3])))
-    )
-    if at_rest is not None:
-        x = graph.add("Sub", x, graph.constant(at_rest))
+    x = graph.add("Reshape", x, graph.constant(np.array([-1, weights.shape[1], 3])))
+    x = _sparse_product(graph, weights, x)
+    if parts.at_rest is not None:
+        x = graph.add("Sub", x, graph.constant(parts.at_rest))
     if response is not None:
-        scaled = graph.add("Mul", x, graph.constant(np.array([output_scale], dtype=np.float32)))
-        x = graph.add("Add", scaled, given)
+        x = graph.add("Add", graph.add("Mul", x, _scalar(graph, output_scale)), given)
+    if parts.at_rest is not None:  # another runtime rounds the network at rest differently
+        largest = graph.add("ReduceMax", graph.add("Abs", loads), axes=[1, 2], keepdims=1)
+        x = graph.add("Mul", x, graph.add("Sign", largest))
     free_nodes = np.full((n_nodes, 1), output_scale if response is None else 1.0, dtype=np.float32)
     free_nodes[scene.fixed_nodes] = 0.0
-    if at_rest is not None:  # another runtime rounds the network at rest otherwise
-        loaded = graph.add(
-            "Sign", graph.add("ReduceMax", graph.add("Abs", loads), axes=[1, 2], keepdims=1)
-        )
-        x = graph.add("Mul", x, loaded)
     graph.add("Mul", x, graph.constant(free_nodes), name="displacements")
-    given_in = (
-        "forces in N"
-        if scene.observed_nodes is None
-        else "`forces` are displacements of the observed nodes in m"
-    )
-    described = {
-        "scene": scene.name,
-        "scene_spec": scene.spec.model_dump_json(),
-        "units": f"{given_in}, displacements in m, one row per node of the scene's mesh",
-    }
     shape = ["n", n_nodes, 3]
     return graph.model(
-        f"U-Mesh of {scene.name}", ("forces", shape), ("displacements", shape), described
+        f"U-Mesh of {scene.name}", ("forces", shape), ("displacements", shape), _described(scene)
     )
+
+
+def _described(scene: Scene) -> dict[str, str]:
+    given = "forces in N"
+    if scene.observed_nodes is not None:
+        given = "`forces` are displacements of the observed nodes in m"
+    return {
+        "scene": scene.name,
+        "scene_spec": scene.spec.model_dump_json(),
+        "units": f"{given}, displacements in m, one row per node of the scene's mesh",
+    }
+
+
+def _scalar(graph: GraphBuilder, value: float) -> str:
+    return graph.constant(np.array([value], dtype=np.float32))
+
+
+def _given(graph: GraphBuilder, scene: Scene) -> str:
+    """Return the input, with zeros at nodes that are not observed."""
+    if scene.observed_nodes is None:
+        return "forces"
+    seen = np.zeros((scene.mesh.n_nodes, 1), dtype=np.bool_)
+    seen[scene.observed_nodes] = True
+    return graph.add("Where", graph.constant(seen), "forces", _scalar(graph, 0.0))
+
+
+def _linear_response(
+    graph: GraphBuilder, scene: Scene, response: LinearResponse, loads: str
+) -> str:
+    """Add the product with a dense compliance; ONNX has no sparse solve."""
+    n_nodes, n_dofs = scene.mesh.n_nodes, scene.mesh.n_dofs
+    if n_dofs > MAX_RESPONSE_DOFS:
+        raise UnavailableBackendError(
+            f"the linear response of {scene.name} has {n_dofs:,} unknowns; ONNX has no sparse "
+            f"solve, and a dense matrix is written for at most {MAX_RESPONSE_DOFS:,}."
+        )
+    compliance = response.respond(np.eye(n_dofs)).astype(np.float32)
+    flat = graph.add("Reshape", loads, graph.constant(np.array([-1, n_dofs])))
+    solved = graph.add("MatMul", flat, graph.constant(compliance))
+    return graph.add("Reshape", solved, graph.constant(np.array([-1, n_nodes, 3])))
 
 
 def _sparse_product(graph: GraphBuilder, matrix: sp.csr_array[np.float32], values: str) -> str:
-    """A v along the second of three axes: rows of v gathered, as many for each row of A as its longest has, and their weighted sum.
+    """Add A v along the second of three axes.
 
-    ONNX has no sparse product. Where every row of A has one entry at most, and that is 1, rows are only moved.
+    ONNX has no sparse product: for each row of A, as many rows of v are gathered as its longest row
+    has entries, and their weighted sum is taken. Where every row of A has at most one entry, and
+    that is 1, rows are only moved.
     """
     lengths = np.diff(matrix.indptr)
     longest, n_columns = max(int(lengths.max()), 1), matrix.shape[1]
-    places: NDArray[np.int64] = np.full(
-        (matrix.shape[0], longest), n_columns
-    )  # a row of zeros that is put behind the last
+    # The last row is padding: zeros.
+    places: NDArray[np.int64] = np.full((matrix.shape[0], longest), n_columns)
     weights: NDArray[np.float32] = np.zeros((matrix.shape[0], longest, 1), dtype=np.float32)
     entry = np.arange(matrix.nnz) - np.repeat(matrix.indptr[:-1], lengths)
     row = np.repeat(np.arange(matrix.shape[0]), lengths)

@@ -14,22 +14,23 @@ from torch import Tensor
 from mor_bench.scene.grid import GridMap
 
 SMALLEST_SHARE = 1e-3
-"""Grid points whose shape functions sum to less than this over all nodes lie beside the body: their means fade out."""
+"""Least sum of the weights at a grid point for a full mean: beside the body means fade out."""
 
 
 @dataclass(frozen=True)
 class PaddedGrid:
-    """A regular grid whose sides are multiples of 2^k, between the nodal forces and the nodal displacements of a mesh.
+    """A regular grid whose sides are multiples of 2^k, and its map from and to mesh nodes.
 
-    Values lie channels-last in memory, as `Snapshots` has them: on a box without padding the grid is the nodal array itself.
+    Values lie channels-last in memory, as `Snapshots` has them: on a box without padding the grid
+    is the nodal array itself.
 
     Attributes
     ----------
     grid : GridMap
         With the padding; weights in float32.
     places : (n_nodes,) int64 tensor or None
-        The grid point on which each node lies, if each lies on one of its own. Values are then moved, which takes a fourth
-        of the time of a sparse product.
+        The grid point on which each node lies, if each lies on one of its own. Values are then
+        moved, which takes a fourth of the time of a sparse product.
     """
 
     grid: GridMap
@@ -42,11 +43,11 @@ class PaddedGrid:
 
     @property
     def multiply_adds(self) -> int:
-        """Of `to_grid` and `to_nodes` for one sample; none where values are only moved."""
+        """Work of `to_grid` and `to_nodes` for one sample; none where values are only moved."""
         return 0 if self.places is not None else 6 * int(self.grid.weights.nnz)
 
     def to_grid(self, forces: Tensor) -> Tensor:
-        """Nᵀ f: (n, n_nodes, 3) → (n, 3, x, y, z) with zeros at padding, channels-last in memory."""
+        """Nᵀ f: (n, n_nodes, 3) → (n, 3, x, y, z), zeros at padding, channels-last in memory."""
         if self.places is None:
             flat = torch.from_numpy(self.grid.forces_to_grid(forces.cpu().numpy())).to(
                 forces.device
@@ -58,9 +59,10 @@ class PaddedGrid:
         return flat.view(-1, *self.shape, 3).permute(0, 4, 1, 2, 3)
 
     def displacements_to_grid(self, displacements: Tensor) -> Tensor:
-        """(n, n_nodes, 3) → (n, 3, x, y, z): at each grid point the mean of the nodes around it, weighted by N; zeros at padding.
+        """(n, n_nodes, 3) → (n, 3, x, y, z): means of the nodes around each grid point.
 
-        Where each node lies on a grid point of its own, these are its values.
+        The means are weighted by N; padding holds zeros. Where each node lies on a grid point of
+        its own, the values are moved.
         """
         if self.places is not None:
             return self.to_grid(displacements)
@@ -68,7 +70,7 @@ class PaddedGrid:
 
     @cached_property
     def shares(self) -> Tensor:
-        """(1, 1, x, y, z) sums of N over the nodes."""
+        """Sums of N over the nodes, (1, 1, x, y, z)."""
         sums = np.maximum(self.grid.weights.sum(axis=0), SMALLEST_SHARE).astype(np.float32)
         return torch.from_numpy(sums).view(1, 1, *self.shape)
 
@@ -81,7 +83,8 @@ class PaddedGrid:
 class _ToNodes(torch.autograd.Function):
     """N u, with the gradient Nᵀ g.
 
-    Both add in a fixed order on any number of threads; the backward pass of torch's indexing adds atomically.
+    Both add in a fixed order on any number of threads; the backward pass of torch's indexing adds
+    atomically.
     """
 
     @staticmethod
@@ -104,7 +107,7 @@ class _ToNodes(torch.autograd.Function):
 
 
 def padded_grid(grid: GridMap, steps: int) -> PaddedGrid:
-    """A grid, padded at the high end of each axis to a multiple of 2^steps."""
+    """Pad a grid at the high end of each axis to a multiple of 2^steps."""
     multiple = 2**steps
     nx, ny, nz = (-(-n // multiple) * multiple for n in grid.shape)
     entries = grid.weights.astype(np.float32).tocoo()
