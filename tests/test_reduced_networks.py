@@ -232,9 +232,9 @@ def test_a_training_starts_from_a_saved_model_in_other_bases(tiny: Dataset, tmp_
 @pytest.mark.parametrize("name", ["axes", "network.first", "network.last", "loss_curve"])
 def test_a_damaged_model_is_refused(name: str, tiny: Dataset) -> None:
     method = mor_bench.load_method("pod-nn", n_hidden=4, iterations=2).fit(tiny.scene, tiny.train)
-    for spoilt in (np.full_like(method._state()[name], np.nan), method._state()[name][None, :1]):
+    for spoilt in (np.full_like(method.arrays_[name], np.nan), method.arrays_[name][None, :1]):
         with pytest.raises(InvalidInputError, match=name):
-            method._restore({**method._state(), name: spoilt})
+            method.restore(tiny.scene, {**method.arrays_, name: spoilt})
 
 
 def test_axes_and_weights_scale_as_they_say() -> None:

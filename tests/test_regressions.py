@@ -175,11 +175,11 @@ def coordinates(
     """Inputs and outputs of the training samples, and the inputs of the test samples, rounded as in `fit`: trees see each bit of them."""
     rest = data.train.free_displacements
     z, queries = (
-        project(method._from_forces, part.forces.reshape(len(part), -1))
+        project(method.from_forces_, part.forces.reshape(len(part), -1))
         for part in (data.train, data.test)
     )
     if method.input == "linear-response":
-        responses = method.compliance_.respond(data.train.forces.reshape(len(data.train), -1))[
+        responses = method.response_.respond(data.train.forces.reshape(len(data.train), -1))[
             :, data.scene.free_dofs
         ]
         np.testing.assert_allclose(
@@ -280,7 +280,7 @@ def test_a_gaussian_process_fits_its_points(tiny: Dataset) -> None:
         "pca-gaussian-process", n_input_modes=6, n_output_modes=5
     ).fit(tiny.scene, tiny.train)
     z, outputs, _ = coordinates(method, tiny)
-    np.testing.assert_allclose(method._coefficients(z), outputs, atol=0.03 * np.abs(outputs).max())
+    np.testing.assert_allclose(method.coefficients(z), outputs, atol=0.03 * np.abs(outputs).max())
     assert np.ptp(method.lengths_) > 0.1
 
 
@@ -304,39 +304,39 @@ FORGERIES = [
         "pca-extra-trees",
         "children",
         "a child that is its own parent",
-        lambda m: at(m.children_, (0, 1), 0),
+        lambda m: at(m.arrays_["children"], (0, 1), 0),
     ),
     (
         "pca-extra-trees",
         "children",
         "a child behind all nodes",
-        lambda m: at(m.children_, (0, 0), len(m.features_)),
+        lambda m: at(m.arrays_["children"], (0, 0), len(m.arrays_["features"])),
     ),
     (
         "pca-random-forest",
         "children",
         "a leaf without values",
-        lambda m: at(m.children_, (len(m.features_) - 1, 0), len(m.values_)),
+        lambda m: at(m.arrays_["children"], (len(m.arrays_["features"]) - 1, 0), len(m.arrays_["values"])),
     ),
     (
         "pca-random-forest",
         "children",
         "a leaf before all values",
-        lambda m: at(m.children_, (len(m.features_) - 1, 0), -1),
+        lambda m: at(m.arrays_["children"], (len(m.arrays_["features"]) - 1, 0), -1),
     ),
     (
         "pca-random-forest",
         "features",
         "an input that is none",
-        lambda m: at(m.features_, 0, m.axes_.shape[1]),
+        lambda m: at(m.arrays_["features"], 0, m.axes_.shape[1]),
     ),
-    ("pca-random-forest", "features", "less than a leaf", lambda m: at(m.features_, 0, -2)),
-    ("pca-random-forest", "features", "floats", lambda m: m.features_.astype(np.float64)),
-    ("pca-random-forest", "features", "64 bits", lambda m: m.features_.astype(np.int64)),
-    ("pca-random-forest", "roots", "behind all nodes", lambda m: at(m.roots_, 1, len(m.features_))),
-    ("pca-random-forest", "roots", "before all nodes", lambda m: at(m.roots_, 1, -1)),
-    ("pca-random-forest", "thresholds", "NaN", lambda m: at(m.thresholds_, 0, np.nan)),
-    ("pca-random-forest", "values", "no outputs", lambda m: m.values_[:, :0]),
+    ("pca-random-forest", "features", "less than a leaf", lambda m: at(m.arrays_["features"], 0, -2)),
+    ("pca-random-forest", "features", "floats", lambda m: m.arrays_["features"].astype(np.float64)),
+    ("pca-random-forest", "features", "64 bits", lambda m: m.arrays_["features"].astype(np.int64)),
+    ("pca-random-forest", "roots", "behind all nodes", lambda m: at(m.arrays_["roots"], 1, len(m.arrays_["features"]))),
+    ("pca-random-forest", "roots", "before all nodes", lambda m: at(m.arrays_["roots"], 1, -1)),
+    ("pca-random-forest", "thresholds", "NaN", lambda m: at(m.arrays_["thresholds"], 0, np.nan)),
+    ("pca-random-forest", "values", "no outputs", lambda m: m.arrays_["values"][:, :0]),
     ("pca-kernel-ridge", "lengths", "zero", lambda m: 0 * m.lengths_),
     ("pca-kernel-ridge", "points", "too large to square", lambda m: 1e200 * (1 + m.points_)),
     ("pca-kernel-ridge", "weights", "too few", lambda m: m.weights_[:-1]),
@@ -364,12 +364,12 @@ def test_arrays_that_would_mislead_a_kernel_are_refused(
 
 def test_more_arrays_than_a_model_has_are_refused(tiny: Dataset, tmp_path: Path) -> None:
     method = mor_bench.load_method("pca-ridge").fit(tiny.scene, tiny.train[:40])
-    state = method._state()
+    state = method.arrays_
     with pytest.raises(
         mor_bench.errors.InvalidInputError,
         match="axes, modes, weights; got axes, modes, other, weights",
     ):
-        method._restore({**state, "other": np.zeros(3)})
+        method.restore(tiny.scene, {**state, "other": np.zeros(3)})
 
 
 def test_inputs_too_large_for_single_precision_find_a_leaf(tiny: Dataset) -> None:
@@ -399,7 +399,7 @@ def test_the_samples_that_kernels_see_are_of_all_load_regions(
     )
     assert len(method.points_) == 101
     assert not method.points_[-1].any()
-    z = project(method._from_forces, train.forces.reshape(len(train), -1))
+    z = project(method.from_forces_, train.forces.reshape(len(train), -1))
     seen = [int(np.abs(z - point).max(axis=1).argmin()) for point in method.points_[:-1]]
     assert len(set(seen)) == 100
     np.testing.assert_array_equal(np.unique(train.regions[seen]), np.unique(train.regions))
@@ -448,11 +448,11 @@ def test_length_scales_too_short_to_divide_by_are_refused(tiny: Dataset) -> None
     method: Any = mor_bench.load_method("pca-kernel-ridge", **FAMILIES["pca-kernel-ridge"]).fit(
         tiny.scene, tiny.train
     )
-    state = method._state()
+    state = method.arrays_
     with pytest.raises(
         mor_bench.errors.InvalidInputError, match="`lengths` must be at least 1e-06"
     ):
-        method._restore(
+        method.restore(tiny.scene, 
             {
                 **state,
                 "points": 1e-300 + 0 * state["points"],

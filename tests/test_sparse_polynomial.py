@@ -13,16 +13,16 @@ import mor_bench
 from mor_bench.errors import InvalidInputError
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.surrogates.coordinate_regression import CoordinateSamples
-from mor_bench.surrogates.pca_regression import Monomials
-from mor_bench.surrogates.sparse_polynomial import (
+from mor_bench.surrogates.monomials import (
     MAX_DEGREE,
-    SparsePolynomial,
-    _as_array,
-    _checked_terms,
+    Monomials,
     cheapest_terms,
     monomial_derivatives,
     sparse_levels,
+    terms_from_array,
+    terms_to_array,
 )
+from mor_bench.surrogates.sparse_polynomial import SparsePolynomial
 
 
 def median_error(method: mor_bench.Surrogate, samples: Snapshots) -> float:
@@ -68,7 +68,7 @@ def test_a_high_degree_in_one_coordinate_is_found_from_few_samples() -> None:
     z = generator.normal(size=(60, 6))
     values = (z[:, 0] ** 5 + z[:, 0] * z[:, 1] - z[:, 2])[:, None]
     method = SparsePolynomial(ridge=1e-12)
-    terms = method._chosen(CoordinateSamples(z, values, np.ones((60, 1))), smallness)
+    terms = method.choose_terms(CoordinateSamples(z, values, np.ones((60, 1))), smallness)
     assert {(0,) * 5, (0, 1), (2,)} <= set(terms)
     assert len(terms) < 60
 
@@ -116,9 +116,9 @@ def test_no_load_gives_no_displacement_and_the_force_alone_will_do(tiny: Dataset
 )
 def test_damaged_terms_are_refused(spoil: Any) -> None:
     with pytest.raises(InvalidInputError, match="`terms` must hold monomials of 3 variables"):
-        _checked_terms(np.array(spoil, dtype=np.int32), 3)
+        terms_from_array(np.array(spoil, dtype=np.int32), 3)
 
 
 def test_terms_come_back_as_they_were() -> None:
     terms = cheapest_terms(np.array([0.4, 0.9, 1.3]), 25)
-    assert _checked_terms(_as_array(terms), 3) == terms
+    assert terms_from_array(terms_to_array(terms), 3) == terms

@@ -232,7 +232,7 @@ def test_a_second_fit_is_bit_identical_and_leaves_global_random_state_alone(
         threads,
         deterministic,
     )
-    first, second = fitted._state(), again._state()
+    first, second = fitted.arrays_, again.arrays_
     assert first.keys() == second.keys()
     for name, array in first.items():
         np.testing.assert_array_equal(array, second[name], err_msg=name)
@@ -266,7 +266,7 @@ def test_a_file_with_other_weights_is_refused(fitted: Surrogate, tmp_path: Path)
     other = copy.copy(fitted)
     other.channels = 4  # type: ignore[attr-defined]
     other.save(path)
-    with pytest.raises(StoreError, match="weights do not fit"):
+    with pytest.raises(StoreError, match="`network.* must be|do not fit the network"):
         mor_bench.load_surrogate(path)
 
 
@@ -357,8 +357,8 @@ def test_a_second_fit_without_a_grid_is_bit_identical(
         )
     finally:
         torch.set_num_threads(before)
-    for name, array in first._state().items():
-        np.testing.assert_array_equal(array, second._state()[name], err_msg=name)
+    for name, array in first.arrays_.items():
+        np.testing.assert_array_equal(array, second.arrays_[name], err_msg=name)
 
 
 def test_saved_and_loaded_without_a_grid_is_the_same_model(
@@ -477,8 +477,8 @@ def test_a_training_that_was_stopped_resumes_to_the_same_bits(
     with pytest.raises(InvalidInputError, match="another training"):
         other.fit(data.scene, data.train)
     method.fit(data.scene, data.train)
-    for name, array in improved._state().items():
-        np.testing.assert_array_equal(array, method._state()[name], err_msg=name)
+    for name, array in improved.arrays_.items():
+        np.testing.assert_array_equal(array, method.arrays_[name], err_msg=name)
 
 
 def test_transfer_starts_from_a_network_of_another_scene(
