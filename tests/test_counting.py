@@ -25,8 +25,10 @@ from mor_bench.counting import (
 from mor_bench.errors import SolverError
 from mor_bench.measure.query_cost import cost_of
 from mor_bench.mechanics import kernels, laws
-from mor_bench.mechanics.linear import BandedCholesky, MultigridFactor, Pardiso, SparseLU
+from mor_bench.mechanics.banded import BandedCholesky
+from mor_bench.mechanics.linear import Pardiso, SparseLU
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.multigrid import MultigridFactor
 from mor_bench.mechanics.rotated import BlockJacobi, conjugate_gradients
 from mor_bench.reduction import point_kernels
 from mor_bench.reduction.points import SVK_MULTIPLY_ADDS, tangent_multiply_adds

@@ -16,7 +16,12 @@ import mor_bench
 from mor_bench.counting import Cost, counted
 from mor_bench.errors import InvalidInputError, SolverError
 from mor_bench.hard_cases.setups import LAW
-from mor_bench.mechanics.assembly import Assembler, quadrature_of
+from mor_bench.mechanics.assembly import (
+    Assembler,
+    Discretisation,
+    discretisation_of,
+    quadrature_of,
+)
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.reduction.basis import pod
@@ -58,20 +63,11 @@ def cubature_of(
 
 def whole_mesh(scene: Scene, weights: Array, modes: Array) -> GalerkinProblem:
     """The same, assembled over the nodes; cells of weight zero add nothing."""
-    assert scene.material is not None
     number = np.full(scene.mesh.n_dofs, len(scene.free_dofs))
     number[scene.free_dofs] = np.arange(len(scene.free_dofs))
-    mesh, dofs = scene.mesh, number.reshape(-1, 3)
+    dofs = number.reshape(-1, 3)
     return GalerkinProblem(
-        Assembler(
-            mesh.points,
-            mesh.cells,
-            dofs,
-            len(scene.free_dofs),
-            scene.material,
-            weights,
-            scene.selective,
-        ),
+        Assembler(discretisation_of(scene), dofs, len(scene.free_dofs), weights),
         modes,
     )
 
@@ -95,10 +91,7 @@ def test_points_sum_to_what_is_assembled(law: str, kind: tuple[str, bool]) -> No
     )
     np.testing.assert_allclose(tangent, stiffness, rtol=0, atol=1e-12 * np.abs(stiffness).max())
     assert state.energy_j == pytest.approx(expected.energy_j, rel=1e-12)
-    assert scene.material is not None
-    shapes = quadrature_of(
-        scene.mesh.points, scene.mesh.cells[cells], scene.material, scene.selective
-    ).gradients
+    shapes = quadrature_of(discretisation_of(scene, cells)).gradients
     u = (nodal(scene, modes) @ q)[scene.mesh.cells[cells]]
     assert state.min_det_f == pytest.approx(
         np.linalg.det(np.eye(3) + np.einsum("cai,cqaj->cqij", u, shapes)).min(), rel=1e-12
@@ -568,7 +561,7 @@ def test_compiled_steps_never_end_in_an_unstable_or_inverted_state() -> None:
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
     mode = np.zeros((mesh.n_nodes, 3, 1))
     mode[mesh.points[:, 2] == 1.0, 2] = 1.0
-    points = ReducedPoints(mesh.points, mesh.cells, LAW, False, np.ones(1), mode)
+    points = ReducedPoints(Discretisation(mesh.points, mesh.cells, LAW), np.ones(1), mode)
     roots = np.sort(np.roots([1.0, 0.0, -1.0, 0.9 * 2 / (3 * np.sqrt(3))]).real)
     mirrored, unstable, stable = roots
     load = points.force(np.array([stable - 1])).force

@@ -15,10 +15,10 @@ from safetensors.numpy import save as serialise
 import mor_bench
 from mor_bench.counting import Cost, counted, triangular_multiply_adds
 from mor_bench.errors import StoreError
+from mor_bench.mechanics import banded
 from mor_bench.mechanics import compliance as compliance_module
-from mor_bench.mechanics import linear
+from mor_bench.mechanics.banded import BandedCholesky, BandedFactor
 from mor_bench.mechanics.compliance import Compliance, project
-from mor_bench.mechanics.linear import BandedCholesky, BandedFactor
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.model_file import model_digest as file_digest
 from mor_bench.scene.dofs import dofs_of_nodes
@@ -155,7 +155,7 @@ def test_many_right_hand_sides_are_solved_for_as_few(
     many = factor.solve(rhs)
     monkeypatch.setattr(linear, "MANY", 100)
     few = factor.solve(rhs)
-    assert n % linear.BLOCK
+    assert n % banded.BLOCK
     assert not np.array_equal(many, few)  # else both took one way
     np.testing.assert_allclose(many, few, rtol=0, atol=1e-11 * np.abs(few).max())
 

@@ -25,7 +25,7 @@ from mor_bench.hard_cases import setups
 from mor_bench.hard_cases.catalogue import CASES, CaseResult
 from mor_bench.hard_cases.suite import StressResults, stress
 from mor_bench.mechanics import model as model_module
-from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.assembly import Assembler, Discretisation
 from mor_bench.mechanics.newton import Solution
 from mor_bench.mechanics.stability import limit_load
 from mor_bench.reduction.basis import Basis, pod
@@ -392,7 +392,9 @@ def silently(snapshots: NDArray[np.float64], n_modes: int | None = None, **_: An
 def lopsided(mesh: Any, law: Any = setups.LAW, selective: bool = False) -> Assembler:
     dofs = np.arange(mesh.n_dofs).reshape(-1, 3)
     weights = 1 + 0.1 * np.arange(mesh.n_cells)
-    return Assembler(mesh.points, mesh.cells, dofs, mesh.n_dofs, law, weights, selective)
+    return Assembler(
+        Discretisation(mesh.points, mesh.cells, law, selective), dofs, mesh.n_dofs, weights
+    )
 
 
 def optimistic(

@@ -9,8 +9,9 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mor_bench.mechanics.assembly import Assembler
-from mor_bench.mechanics.linear import BandedCholesky, Factor
+from mor_bench.mechanics.assembly import Assembler, Discretisation
+from mor_bench.mechanics.banded import BandedCholesky
+from mor_bench.mechanics.linear import Factor
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.scene.materials import Material, SaintVenantKirchhoff
@@ -28,23 +29,13 @@ LIMIT_PA = -206.19652
 
 def dense(assembler: Assembler, values: Array) -> Array:
     """The whole tangent as a dense matrix."""
-    pattern = assembler.pattern
-    upper = sp.csr_array(
-        (values, pattern.indices, pattern.indptr), shape=(pattern.n, pattern.n)
-    ).toarray()
-    return np.asarray(upper + np.triu(upper, 1).T)
+    return np.asarray(assembler.pattern.symmetric(values).toarray())
 
 
 def free_assembler(mesh: Mesh, law: Material = LAW, selective: bool = False) -> Assembler:
     """All dofs free, numbered as in the mesh."""
-    return Assembler(
-        mesh.points,
-        mesh.cells,
-        np.arange(mesh.n_dofs).reshape(-1, 3),
-        mesh.n_dofs,
-        law,
-        selective=selective,
-    )
+    body = Discretisation(mesh.points, mesh.cells, law, selective)
+    return Assembler(body, np.arange(mesh.n_dofs).reshape(-1, 3), mesh.n_dofs)
 
 
 def distorted_box(cells: tuple[int, int, int], tetrahedra: bool = False, seed: int = 0) -> Mesh:
@@ -82,9 +73,8 @@ def confined_column(
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1), tetrahedra)
     dofs = np.full((8, 3), 4)
     dofs[mesh.points[:, 0] == 1.0, 0] = np.arange(4)
-    return GalerkinProblem(
-        Assembler(mesh.points, mesh.cells, dofs, 4, law, selective=selective), np.ones((4, 1))
-    )
+    body = Discretisation(mesh.points, mesh.cells, law, selective)
+    return GalerkinProblem(Assembler(body, dofs, 4), np.ones((4, 1)))
 
 
 @dataclass(frozen=True)
@@ -138,7 +128,8 @@ def make_arch() -> Arch:
     fixed = ((x == 0) | (x == 4.0)) & np.isclose(z, 0.1)
     lifted = Mesh(mesh.points + np.outer(0.4 * (1 - np.abs(x / 2 - 1)), [0, 0, 1]), mesh.cells)
     dofs, n = _numbered(mesh, ~fixed)
-    problem = GalerkinProblem(Assembler(lifted.points, lifted.cells, dofs, n, LAW), np.eye(n))
+    body = Discretisation(lifted.points, lifted.cells, LAW)
+    problem = GalerkinProblem(Assembler(body, dofs, n), np.eye(n))
     crown = dofs[(x == 2.0) & (z == 0.2), 2]
     load = np.zeros(n)
     load[crown] = -1.0
@@ -177,15 +168,8 @@ def make_bars(tetrahedra: bool = False, selective: bool = False, contrast: float
     free = mesh.points[:, 0] > 0
     dofs, n = _numbered(mesh, free)
     stiff = mesh.points[mesh.cells].mean(axis=1)[:, 0] < 1
-    assembler = Assembler(
-        mesh.points,
-        mesh.cells,
-        dofs,
-        n,
-        SaintVenantKirchhoff(1.0, 0.0),
-        np.where(stiff, contrast, 1.0),
-        selective,
-    )
+    body = Discretisation(mesh.points, mesh.cells, SaintVenantKirchhoff(1.0, 0.0), selective)
+    assembler = Assembler(body, dofs, n, np.where(stiff, contrast, 1.0))
     load = np.zeros((mesh.n_nodes, 3))
     for facet in mesh.boundary_facets[
         (mesh.points[mesh.boundary_facets][:, :, 0] == 2.0).all(axis=1)

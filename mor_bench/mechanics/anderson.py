@@ -1,7 +1,5 @@
 """Anderson acceleration of the iteration q ← q + P⁻¹ (f - f_int(q)), which needs no tangent.
 
-With the turned rest-state factor as P, seven iterations give a relative residual of 1e-8 on the fine beam, each a
-residual and a back-solve; Newton's method with the same preconditioner pays for four tangents and twenty back-solves.
 Walker & Ni, "Anderson acceleration for fixed-point iterations", SIAM J. Numer. Anal. 49 (2011).
 """
 
@@ -16,12 +14,15 @@ from mor_bench.counting import count
 Array = NDArray[np.float64]
 
 WINDOW = 5
-"""Differences that are kept; 2, 5 and 20 took equally many iterations within the range of the scenes, 5 fewest beyond it."""
+"""Number of differences that are kept."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
 def _combine(correction, steps, changes, held, basis, out):
-    """out = g - (ΔQ + ΔG) c with c the least-squares solution of ΔG c = g, by modified Gram-Schmidt."""
+    """Write g - (ΔQ + ΔG) c to ``out``, with c the least-squares solution of ΔG c = g.
+
+    Modified Gram-Schmidt finds c.
+    """
     n = len(correction)
     triangle, c = np.zeros((held, held)), np.zeros(held)
     for j in range(held):
@@ -59,14 +60,10 @@ def _combine(correction, steps, changes, held, basis, out):
 
 
 class Anderson:
-    """The acceleration's memory: the last differences of iterates, of corrections and of residuals."""
+    """Memory of the acceleration: the last differences of iterates, corrections and residuals."""
 
     def __init__(self, n: int) -> None:
-        self._steps, self._changes, self._basis = (
-            np.empty((WINDOW, n)),
-            np.empty((WINDOW, n)),
-            np.empty((WINDOW, n)),
-        )
+        self._steps, self._changes, self._basis = np.empty((3, WINDOW, n))
         self._held = 0
         self._count = 0
         self._last: tuple[Array, Array, Array] | None = None
@@ -74,11 +71,11 @@ class Anderson:
 
     @property
     def convex(self) -> bool:
-        """Whether the force rose along every step that is held: no direction of negative curvature was seen."""
+        """Whether the force rose along every kept step, so that no negative curvature was seen."""
         return bool((self._curvatures > 0).all())
 
     def advance(self, q: Array, correction: Array, residual: Array) -> Array:
-        """The step from q, given the correction P⁻¹ r and the residual r there."""
+        """Return the step from q, given the correction P⁻¹r and the residual r there."""
         if self._last is not None:
             slot = self._count % WINDOW
             q_before, correction_before, residual_before = self._last

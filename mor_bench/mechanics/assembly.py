@@ -1,4 +1,4 @@
-"""Assembly of internal force and tangent into a sparsity pattern that is computed once."""
+"""Assembly of the internal force and the tangent stiffness of a set of cells."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.counting import count
+from mor_bench.errors import UnsupportedSceneError
 from mor_bench.mechanics.elements import H8, element_of, shape_gradients
 from mor_bench.mechanics.kernels import (
     ADVANCE_MULTIPLY_ADDS,
@@ -23,41 +23,17 @@ from mor_bench.mechanics.kernels import (
     relax,
 )
 from mor_bench.mechanics.laws import general_force, general_multiply_adds
+from mor_bench.mechanics.pattern import build_pattern
 from mor_bench.scene.materials import Material, SaintVenantKirchhoff
+from mor_bench.scene.scene import Scene
+from mor_bench.specs import NO_EQUATIONS
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Pattern:
-    """Upper triangle (diagonal included) of a symmetric sparse matrix in CSR form, without values."""
-
-    n: int
-    indptr: NDArray[np.int64]
-    indices: NDArray[np.int32]
-
-    @property
-    def rows(self) -> NDArray[np.int64]:
-        """(n_nonzeros,) row of each entry."""
-        return np.repeat(np.arange(self.n), np.diff(self.indptr))
-
-    @property
-    def node_graph(self) -> sp.csr_matrix:
-        """(n / 3, n / 3) whether two nodes share a cell; the three dofs of a node are neighbours in the pattern."""
-        starts, stops = self.indptr[:-1:3], self.indptr[1::3]
-        counts = (stops - starts) // 3
-        rows = np.repeat(np.arange(self.n // 3), counts)
-        first = np.repeat(starts - 3 * np.append(0, np.cumsum(counts)[:-1]), counts)
-        columns = self.indices[first + 3 * np.arange(counts.sum())] // 3
-        upper = sp.csr_matrix(
-            (np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(self.n // 3, self.n // 3)
-        )
-        return sp.csr_matrix(upper + upper.T)
-
-
-@dataclass(frozen=True)
 class State:
-    """Internal force and what comes with it."""
+    """Internal force, N, stored energy, J, and the smallest det F over all quadrature points."""
 
     force: NDArray[np.float64]
     energy_j: float
@@ -65,13 +41,51 @@ class State:
 
 
 def _batched(values: NDArray[Any], fill: float) -> NDArray[Any]:
-    """(n_cells, ...) → (n_batches, ..., LANES), padded with ``fill``."""
+    """Rearrange (n_cells, ...) to (n_batches, ..., LANES), padded with ``fill``."""
     n_batches = -(-len(values) // LANES)
     padded = np.full((n_batches * LANES, *values.shape[1:]), fill, dtype=values.dtype)
     padded[: len(values)] = values
     return np.ascontiguousarray(
         np.moveaxis(padded.reshape(n_batches, LANES, *values.shape[1:]), 1, -1)
     )
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """Cells of a mesh, their material and how they are integrated.
+
+    Attributes
+    ----------
+    points : (n_nodes, 3) float64
+        Reference positions, m.
+    cells : (n_cells, 8) or (n_cells, 4) int
+        Nodes of the H8 or T4 cells to sum over.
+    material : Material
+    selective : bool
+        Whether the volumetric energy is integrated with mean gradients, which cures volumetric
+        locking of H8.
+    """
+
+    points: Array
+    cells: NDArray[np.int64]
+    material: Material
+    selective: bool = False
+
+
+def discretisation_of(
+    scene: Scene, chosen: NDArray[np.int64] | slice = slice(None)
+) -> Discretisation:
+    """Return the discretisation of all cells of a scene, or of the chosen ones.
+
+    Raises
+    ------
+    UnsupportedSceneError
+        If the scene's snapshots were imported, so that its equations are unknown.
+    """
+    if scene.material is None:
+        raise UnsupportedSceneError(f"{scene.name}: {NO_EQUATIONS}.")
+    mesh = scene.mesh
+    return Discretisation(mesh.points, mesh.cells[chosen], scene.material, scene.selective)
 
 
 @dataclass(frozen=True)
@@ -90,22 +104,22 @@ class Quadrature:
     parameters: Array
 
 
-def quadrature_of(
-    points: Array, cells: NDArray[np.int64], material: Material, selective: bool
-) -> Quadrature:
-    """Full integration, or selective: the volumetric part from each cell's mean gradient only, the rest at every point.
+def quadrature_of(body: Discretisation) -> Quadrature:
+    """Return the quadrature of all cells, with full or selective integration.
 
-    Selective integration with mean gradients (Hughes, IJNME 15, 1980: B-bar) of an energy that is a sum of both parts
-    keeps a potential and hence a symmetric tangent. The pressure is constant in a cell and may oscillate between cells.
+    Selective integration takes the volumetric part from each cell's mean gradient, the rest at
+    every point (B-bar: Hughes, IJNME 15, 1980). The energy is a sum of both parts, so the tangent
+    stays symmetric. The pressure is constant in a cell and may oscillate between cells.
     """
-    element = element_of(cells)
-    gradients, det_j = shape_gradients(points, cells, element.derivatives)
+    material = body.material
+    element = element_of(body.cells)
+    gradients, det_j = shape_gradients(body.points, body.cells, element.derivatives)
     weights = det_j * element.weights
-    if not selective:
+    if not body.selective:
         return Quadrature(
             gradients, weights, np.array([material.parameters] * len(element.weights))
         )
-    # The cell's mean gradient, not that at its centre, which fails the patch test on warped cells.
+    # The gradient at the centre instead of the mean fails the patch test on warped cells.
     volume = weights.sum(axis=1)
     mean = np.einsum("cq,cqaj->caj", weights, gradients) / volume[:, None, None]
     parameters = [material.shape_parameters] * len(element.weights) + [material.volume_parameters]
@@ -116,78 +130,18 @@ def quadrature_of(
     )
 
 
-def _pattern(
-    dof_of_node: NDArray[np.int64], cells: NDArray[np.int64], n_dofs: int
-) -> tuple[Pattern, NDArray[np.int32]]:
-    """The pattern, and where each upper entry of each element matrix lies in it, (n_cells, n_upper).
-
-    Pairs of nodes are sorted, not pairs of dofs: a ninth of the memory. Nodes with no free dof take no part; those with
-    one or two are treated as free first.
-    """
-    active = np.flatnonzero((dof_of_node < n_dofs).any(axis=1))
-    active = active[np.argsort(dof_of_node[active].min(axis=1))]
-    n_nodes = len(active)
-    number = np.full(len(dof_of_node), n_nodes)
-    number[active] = np.arange(n_nodes)
-    nodes = number[cells]
-    a, b = np.triu_indices(cells.shape[1])
-    low, high = np.minimum(nodes[:, a], nodes[:, b]), np.maximum(nodes[:, a], nodes[:, b])
-    pairs, pair_of = np.unique(
-        np.where(high < n_nodes, low * n_nodes + high, n_nodes * n_nodes), return_inverse=True
-    )
-    pairs, pair_of = pairs[pairs < n_nodes * n_nodes], pair_of.reshape(low.shape)
-    rows, columns = pairs // n_nodes, pairs % n_nodes
-    # Row 3A holds 3 entries per pair (A, B); rows 3A + 1 and 3A + 2 lack the 1 and 2 entries left of the diagonal.
-    counts = 3 * np.bincount(rows, minlength=n_nodes)
-    indptr = np.append(0, np.cumsum(np.stack([counts, counts - 1, counts - 2], axis=1)))
-    rank = np.arange(len(pairs)) - np.searchsorted(rows, rows)
-    indices, starts = np.empty(indptr[-1], dtype=np.int32), np.full((len(pairs) + 1, 3), indptr[-1])
-    for i in range(3):
-        starts[:-1, i] = indptr[3 * rows + i] + 3 * rank - i
-        for j in range(3):
-            right = (rank > 0) | (j >= i)
-            indices[(starts[:-1, i] + j)[right]] = (3 * columns + j)[right]
-    slots = np.empty((len(cells), 9 * len(a) - 3 * cells.shape[1]), dtype=np.int32)
-    p = 0
-    for pair, (m, n) in enumerate(zip(a, b, strict=True)):
-        swapped, start = nodes[:, m] > nodes[:, n], starts[pair_of[:, pair]]
-        for i in range(3):
-            for j in range(i if m == n else 0, 3):
-                slots[:, p] = np.where(
-                    start[:, 0] == indptr[-1],
-                    indptr[-1],
-                    np.where(swapped, start[:, j] + i, start[:, i] + j),
-                )
-                p += 1
-    dofs = dof_of_node[active].ravel()
-    if len(dofs) == n_dofs:
-        return Pattern(n_dofs, indptr, indices), slots
-    kept = (dofs < n_dofs)[indices] & np.repeat(dofs < n_dofs, np.diff(indptr))
-    place = np.append(np.where(kept, np.cumsum(kept) - 1, kept.sum()), kept.sum()).astype(np.int32)
-    ends = np.append(0, np.cumsum(kept))[indptr]
-    return Pattern(
-        n_dofs, np.append(0, ends[1:][dofs < n_dofs]), dofs[indices[kept]].astype(np.int32)
-    ), place[slots]
-
-
 class Assembler:
-    """Internal force and tangent of a set of cells over the dofs that matter.
+    """Internal force and tangent of a set of cells over chosen dofs.
 
     Parameters
     ----------
-    points : (n_nodes, 3) float64
-        Reference positions, m.
-    cells : (n_cells, 8) or (n_cells, 4) int
-        The cells to sum over: H8 or T4.
+    body : Discretisation
     dof_of_node : (n_nodes, 3) int
-        Row of each nodal displacement component in the vectors; ``n_dofs`` for one that is zero (a support).
+        Row of each nodal displacement component in the vectors; ``n_dofs`` at supports.
     n_dofs : int
         Length of the vectors.
-    material : Material
     cell_weights : (n_cells,) float64, optional
         Cubature weights that multiply each cell's energy; 1 by default.
-    selective : bool
-        Take the volumetric part of the energy from the cells' mean gradients, which cures volumetric locking of H8.
 
     Raises
     ------
@@ -197,26 +151,21 @@ class Assembler:
 
     def __init__(
         self,
-        points: Array,
-        cells: NDArray[np.int64],
+        body: Discretisation,
         dof_of_node: NDArray[np.int64],
         n_dofs: int,
-        material: Material,
         cell_weights: Array | None = None,
-        selective: bool = False,
     ) -> None:
-        quadrature = quadrature_of(points, cells, material, selective)
-        weights = (
-            quadrature.weights
-            if cell_weights is None
-            else quadrature.weights * cell_weights[:, None]
-        )
+        quadrature, material = quadrature_of(body), body.material
+        weights = quadrature.weights
+        if cell_weights is not None:
+            weights = weights * cell_weights[:, None]
         n_cells, n_points, n_nodes, _ = quadrature.gradients.shape
-        dofs = dof_of_node[cells].reshape(n_cells, 3 * n_nodes)
-        self.pattern, slots = _pattern(dof_of_node, cells, n_dofs)
+        dofs = dof_of_node[body.cells].reshape(n_cells, 3 * n_nodes)
+        self.pattern, slots = build_pattern(dof_of_node, body.cells, n_dofs)
         self.n_dofs = n_dofs
         self.n_cells = n_cells
-        self.extent_m = float(np.ptp(points, axis=0).max())
+        self.extent_m = float(np.ptp(body.points, axis=0).max())
         self.material = material
         self._n_values = len(self.pattern.indices) + 1
         self._vectorised = isinstance(material, SaintVenantKirchhoff) and n_nodes == H8.n_nodes
@@ -230,11 +179,8 @@ class Assembler:
             self._slots = _batched(slots, len(self.pattern.indices))
             per_point = FORCE_MULTIPLY_ADDS, FORCE_MULTIPLY_ADDS + TANGENT_MULTIPLY_ADDS
         else:
-            self._gradients, self._weights, self._parameters = (
-                quadrature.gradients,
-                weights,
-                quadrature.parameters,
-            )
+            self._gradients, self._weights = quadrature.gradients, weights
+            self._parameters = quadrature.parameters
             self._dofs, self._slots = dofs.astype(np.int32), slots
             per_point = general_multiply_adds(material.law, quadrature.parameters.shape[1], n_nodes)
         self._multiply_adds = n_cells * n_points * per_point[0], n_cells * n_points * per_point[1]
@@ -242,33 +188,33 @@ class Assembler:
     def _sum(
         self, u: Array, dofs: NDArray[np.int32], force: Array, values: Array
     ) -> tuple[float, float]:
-        """Add the cells' forces and, where ``values`` is not empty, tangents; returns energy and min det F."""
+        """Add forces and, where ``values`` is not empty, tangents; return energy and min det F."""
         count(element_evaluations=self.n_cells, multiply_adds=self._multiply_adds[len(values) > 0])
+        out: tuple[float, float]
         if not self._vectorised:
-            law, parameters = self.material.law, self._parameters
-            return general_force(
-                u, dofs, self._gradients, self._weights, law, parameters, self._slots, force, values
-            )  # type: ignore[no-any-return]
-        if len(values) == 0:
-            return internal_force(u, dofs, self._gradients, self._w_lam, self._w_mu, force)  # type: ignore[no-any-return]
-        return internal_force_and_tangent(
-            u, dofs, self._gradients, self._w_lam, self._w_mu, self._slots, force, values
-        )  # type: ignore[no-any-return]
+            law = self.material.law, self._parameters
+            cells = dofs, self._gradients, self._weights
+            out = general_force(u, *cells, *law, self._slots, force, values)
+        elif len(values) == 0:
+            out = internal_force(u, dofs, self._gradients, self._w_lam, self._w_mu, force)
+        else:
+            cells = dofs, self._gradients, self._w_lam
+            out = internal_force_and_tangent(u, *cells, self._w_mu, self._slots, force, values)
+        return out
 
     def force(self, u: Array) -> State:
-        """Internal force, N, stored energy, J, and min det F at displacements ``u`` (n_dofs,), m."""
+        """Return the state at displacements ``u`` (n_dofs,), m."""
         force = np.zeros(self.n_dofs + 1)
         return State(force[:-1], *self._sum(np.append(u, 0.0), self._dofs, force, np.zeros(0)))
 
     def force_and_tangent(self, u: Array) -> tuple[State, Array]:
-        """`force`, and the values of the tangent stiffness, N/m, in ``pattern``."""
+        """Return the state and the values of the tangent stiffness, N/m, in ``pattern``."""
         force, values = np.zeros(self.n_dofs + 1), np.zeros(self._n_values)
-        return State(force[:-1], *self._sum(np.append(u, 0.0), self._dofs, force, values)), values[
-            :-1
-        ]
+        state = State(force[:-1], *self._sum(np.append(u, 0.0), self._dofs, force, values))
+        return state, values[:-1]
 
     def cell_forces(self, u: Array) -> Array:
-        """Internal force of each cell on its own, (n_cells, 3 n_nodes), N: what cubature is trained on."""
+        """Return each cell's own internal force, (n_cells, 3 n_nodes), N; it trains cubatures."""
         local = np.arange(self._dofs.size, dtype=np.int32).reshape(self._dofs.shape)
         force = np.zeros(local.size + 1)
         self._sum(np.append(np.append(u, 0.0)[self._dofs].ravel(), 0.0), local, force, np.zeros(0))
@@ -278,9 +224,9 @@ class Assembler:
     def relax(
         self, u: Array, load: Array, mass: Array, control: Array, n_steps: int
     ) -> tuple[int, int, float]:
-        """Steps of dynamic relaxation from u (n_dofs,), m, which they change, with no velocity; see `kernels.advance`.
+        """Take steps of dynamic relaxation from u (n_dofs,), m, at rest; see `kernels.advance`.
 
-        Returns their number, how the last ended, and min det F there.
+        Overwrites ``u``. Returns the number of steps, how the last one ended, and min det F there.
         """
         padded, v, before = np.append(u, 0.0), np.zeros(self.n_dofs), np.zeros(self.n_dofs)
         done, status, min_det = 0, RUNNING, np.inf

@@ -1,9 +1,7 @@
-"""The linear response to loads on few nodes, as a sum of columns of the compliance K₀⁻¹ that are computed once.
+"""Linear response to loads on few nodes, as a sum of precomputed columns of the compliance K₀⁻¹.
 
-The loads of a scene act on the nodes of its load patches, and each on some ten of them: a sum of thirty columns takes the place of a
-back-solve through both triangles of a factor. On beam-coarse, l-shape, liver-hex and beam-fine a response takes 0.005, 0.007, 0.06
-and 0.2 ms in place of 0.04, 0.26, 0.8 and 10; the columns take 0.03, 0.06, 1 and 3 s to make and 1, 2, 45 and 98 MB to keep
-(one thread of a busy machine).
+A load of a scene acts on some ten nodes of its load patches. A sum of thirty columns is then faster
+than a back-solve with both triangles of a factor.
 """
 
 from __future__ import annotations
@@ -13,21 +11,25 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mor_bench.counting import count, counted, is_counting, uncounted
-from mor_bench.mechanics.linear import BandedFactor, SparseFactor
+from mor_bench.mechanics.banded import BandedFactor
+from mor_bench.mechanics.linear import SparseFactor
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.dofs import dofs_of_nodes
 
 Array = NDArray[np.float64]
 
 MAX_BYTES = 256 * 2**20
-"""Of the columns; where they need more, every response is a back-solve."""
+"""Largest memory of the columns; if they need more, every response is a back-solve."""
 
 _FIXED, _ELSEWHERE = -1, -2
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _respond(columns, place, most, loads, out, used):
-    """Sum columns (n_kept, n_dofs) for each of the loads (n, n_dofs); used (n,) is their number, or -1 where that cannot be done."""
+    """Sum columns (n_kept, n_dofs) for each of the loads (n, n_dofs).
+
+    ``used`` (n,) receives the number of columns, or -1 if the load needs a back-solve.
+    """
     rows, forces = np.empty(most, np.int64), np.empty(most)
     for i in range(len(loads)):
         load, u, n = loads[i], out[i], 0
@@ -41,15 +43,9 @@ def _respond(columns, place, most, loads, out, used):
         used[i] = n
         u[:] = 0.0
         whole = n - n % 4 if n > 0 else 0
-        for k in range(
-            0, whole, 4
-        ):  # four at once, so that u is loaded and stored once for four multiply-adds
-            a, b, c, d = (
-                columns[rows[k]],
-                columns[rows[k + 1]],
-                columns[rows[k + 2]],
-                columns[rows[k + 3]],
-            )
+        for k in range(0, whole, 4):  # four at once load and store u once for four multiply-adds
+            a, b = columns[rows[k]], columns[rows[k + 1]]
+            c, d = columns[rows[k + 2]], columns[rows[k + 3]]
             fa, fb, fc, fd = forces[k], forces[k + 1], forces[k + 2], forces[k + 3]
             for dof in range(len(u)):
                 u[dof] += fa * a[dof] + fb * b[dof] + fc * c[dof] + fd * d[dof]
@@ -61,7 +57,7 @@ def _respond(columns, place, most, loads, out, used):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _project(matrix, loads, out):
-    """out (n, r) = loads (n, n_dofs) @ matrix (n_dofs, r) over the components that are not zero; returns their number."""
+    """Write loads (n, n_dofs) @ matrix (n_dofs, r) to out (n, r); return the non-zeros of loads."""
     n = 0
     for i in range(len(loads)):
         load, z = loads[i], out[i]
@@ -75,12 +71,12 @@ def _project(matrix, loads, out):
 
 
 def project(matrix: Array, loads: Array) -> Array:
-    """The product of loads, most of whose components are zero, with a matrix.
+    """Return the product of sparse loads, stored densely, with a matrix.
 
     Parameters
     ----------
     matrix : (n_dofs, r) float64, in C order
-        With rows of zeros at the supports, e.g. from `Compliance.to_coordinates`.
+        Zero at the supports, e.g. from `Compliance.to_coordinates`.
     loads : (n, n_dofs) float64
         Nodal forces, N.
 
@@ -96,11 +92,11 @@ def project(matrix: Array, loads: Array) -> Array:
 
 
 class Compliance:
-    """K₀⁻¹ of a scene, with K₀ the stiffness at rest: columns at the dofs of the nodes that its load patches touch, and a factor.
+    """K₀⁻¹ of a scene, with K₀ the stiffness at rest.
 
-    A load anywhere else, or on so many nodes that a back-solve takes fewer multiplications, is answered by a back-solve; so is
-    every load where the columns would need more than `MAX_BYTES`, or where only an iterative solver is at hand. Both agree to
-    round-off.
+    It keeps the columns of K₀⁻¹ at the nodes of the load patches. A back-solve answers loads
+    elsewhere, and loads on so many nodes that it takes fewer multiplications. It answers all loads
+    if the columns exceed `MAX_BYTES`, or if the solver is iterative. Both agree to round-off.
 
     Parameters
     ----------
@@ -109,7 +105,7 @@ class Compliance:
     Attributes
     ----------
     columns : (n_kept, n_dofs) float64
-        One column in each row, m/N, zero at the supports; without rows where none are kept.
+        One kept column of K₀⁻¹ in each row, m/N, zero at the supports; may be empty.
     """
 
     def __init__(self, model: FullOrderModel) -> None:
@@ -136,19 +132,19 @@ class Compliance:
         self._most = min(len(kept), one.multiply_adds // n_free)
 
     def respond(self, loads: Array) -> Array:
-        """K₀⁻¹ f.
+        """Return the linear responses K₀⁻¹f.
 
         Parameters
         ----------
         loads : (n, n_dofs) float64
-            Nodal forces, N; those on supports are not looked at.
+            Nodal forces, N; forces on supports are ignored.
 
         Returns
         -------
         (n, n_dofs) float64
-            m, exactly zero at the supports.
+            Displacements, m, exactly zero at the supports.
         """
-        loads = np.ascontiguousarray(loads)  # of one memory order the kernel is compiled once
+        loads = np.ascontiguousarray(loads)  # the kernel is compiled once per memory order
         out, used = np.empty(loads.shape), np.empty(len(loads), dtype=np.int64)
         _respond(self.columns, self._place, self._most, loads, out, used)
         others = used < 0
@@ -162,13 +158,15 @@ class Compliance:
         return out
 
     def solve(self, rhs: Array) -> Array:
-        """As `respond`, on the free dofs and as a factor does it: (n_free,) or (n_free, m) in, N, the same shape out, m."""
+        """Solve like a `Factor`: forces (n_free,) or (n_free, m), N, to displacements, m."""
         loads = np.zeros((rhs.size // len(self._free), len(self._place)))
         loads[:, self._free] = rhs.T
         return np.ascontiguousarray(self.respond(loads)[:, self._free].T).reshape(rhs.shape)
 
     def to_coordinates(self, axes: Array) -> Array:
-        """K₀⁻¹ A on all dofs, zero at the supports: `project` by it is Aᵀ K₀⁻¹ f, without the response itself.
+        """Return K₀⁻¹A on all dofs, zero at the supports.
+
+        `project` with it gives Aᵀ K₀⁻¹f without the response itself.
 
         Parameters
         ----------

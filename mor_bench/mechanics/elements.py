@@ -1,4 +1,4 @@
-"""Reference elements: H8 with 2x2x2 Gauss points and T4 with one; gradients of their shape functions."""
+"""Reference elements, H8 with 2x2x2 Gauss points and T4 with one, and their shape functions."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Element:
-    """Derivatives of the shape functions at quadrature points of the reference cell.
+    """A reference element with its quadrature.
 
     Attributes
     ----------
     name : str
     derivatives : (n_points, n_nodes, 3) float64
+        Derivatives of the shape functions at the quadrature points.
     weights : (n_points,) float64
-        They sum to the reference cell's volume.
+        Quadrature weights; their sum is the reference cell's volume.
     centre : (n_nodes, 3) float64
-        Derivatives at the centroid.
+        Derivatives of the shape functions at the centroid.
     """
 
     name: str
@@ -47,12 +48,12 @@ T4 = Element("T4", _LINEAR[None], np.array([1.0 / 6.0]), _LINEAR)
 
 
 def element_of(cells: NDArray[np.int64]) -> Element:
-    """The element whose number of nodes the cells have.
+    """Return the element with as many nodes as the cells.
 
     Raises
     ------
     InvalidInputError
-        If no element has.
+        If there is none.
     """
     for element in (H8, T4):
         if cells.ndim == 2 and cells.shape[1] == element.n_nodes:
@@ -65,7 +66,7 @@ def element_of(cells: NDArray[np.int64]) -> Element:
 def shape_gradients(
     points: Array, cells: NDArray[np.int64], derivatives: Array
 ) -> tuple[Array, Array]:
-    """Gradients of the shape functions in the reference configuration, and det J.
+    """Return the gradients of the shape functions in the reference configuration, and det J.
 
     Parameters
     ----------
@@ -87,11 +88,12 @@ def shape_gradients(
     """
     jacobian = np.einsum("qai,cak->cqki", derivatives, points[cells])
     det_j = np.linalg.det(jacobian)
-    # A flat cell has a det J of round-off size rather than zero.
+    # The det J of a flat cell is of round-off size rather than zero.
     least = 1e-12 * np.linalg.norm(jacobian, axis=(2, 3)) ** 3
     if not np.all(det_j > least):
         cell, point = np.argwhere(~(det_j > least))[0]
         raise InvalidInputError(
-            f"cell {cell} is inverted or degenerate: det J must be > 0 m³; got {det_j[cell, point]:.3g} at quadrature point {point}."
+            f"cell {cell} is inverted or degenerate: det J must be > 0 m³; "
+            f"got {det_j[cell, point]:.3g} at quadrature point {point}."
         )
     return np.einsum("qai,cqik->cqak", derivatives, np.linalg.inv(jacobian)), det_j

@@ -1,4 +1,4 @@
-"""How wrong a displacement is, told without the right one: the residual that it leaves, and the correction that this asks for."""
+"""Estimate of a prediction's error from its equilibrium residual, without the reference."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from mor_bench.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Indication:
-    """Per prediction, (n,) float64; both are zero at an exact equilibrium.
+    """Estimated errors of n predictions; both are zero at an exact equilibrium.
 
     Attributes
     ----------
-    relative_residual
+    relative_residual : (n,) float64
         ‖f - f_int(u)‖ / ‖f‖ over the free dofs. Short waves of small displacement dominate it.
-    relative_correction
-        ‖R K₀⁻¹ Rᵀ (f - f_int(u))‖ / ‖u‖: the first correction that the full-order solve would make from u, an estimate of
-        the relative l2 error. It is within some 10 % of it where loads are in the usual range and Poisson's ratio is moderate,
-        and too large, threefold and more, near incompressibility (0.499) and under loads far beyond. Displacements of supports
-        count as errors.
+    relative_correction : (n,) float64
+        ‖R K₀⁻¹ Rᵀ (f - f_int(u))‖ / ‖u‖: the full-order solve's first correction from u. It
+        estimates the relative l2 error to some 10 % at moderate Poisson's ratios and usual loads.
+        It is at least three times too large near incompressibility (0.499) and at much larger
+        loads. Displacements of supports count as errors.
     """
 
     relative_residual: NDArray[np.float64]
@@ -32,7 +32,9 @@ class Indication:
 
 
 class ErrorIndicator:
-    """Indicates the errors of any method's predictions of a scene; costs about one iteration of the full-order solve each.
+    """Estimates the errors of any method's predictions of a scene.
+
+    One estimate costs about one iteration of the full-order solve.
 
     Parameters
     ----------
@@ -41,7 +43,7 @@ class ErrorIndicator:
     Raises
     ------
     UnsupportedSceneError
-        If the scene's equations are not known.
+        If the scene's equations are unknown.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -52,12 +54,14 @@ class ErrorIndicator:
     def __call__(
         self, forces: NDArray[np.float64], displacements: NDArray[np.float64]
     ) -> Indication:
-        """Indicate.
+        """Estimate the errors of predictions.
 
         Parameters
         ----------
-        forces, displacements : (n, n_nodes, 3) float64
-            Nodal forces, N, and predicted displacements at all nodes, m. A prediction that is not finite has an infinite error.
+        forces : (n, n_nodes, 3) float64
+            Nodal forces, N.
+        displacements : (n, n_nodes, 3) float64
+            Predicted displacements, m. A prediction that is not finite has an infinite error.
 
         Raises
         ------
@@ -67,14 +71,14 @@ class ErrorIndicator:
         shape = (len(forces), self._scene.mesh.n_nodes, 3)
         if forces.shape != shape or displacements.shape != shape:
             raise InvalidInputError(
-                f"forces and displacements must have shape (n, {shape[1]}, 3); got {forces.shape} and {displacements.shape}."
+                f"forces and displacements must have shape (n, {shape[1]}, 3); "
+                f"got {forces.shape} and {displacements.shape}."
             )
         n_dofs, free = self._scene.mesh.n_dofs, self._scene.free_dofs
         loads, fields = forces.reshape(-1, n_dofs)[:, free], displacements.reshape(-1, n_dofs)
         moved = np.linalg.norm(np.delete(fields, free, axis=1), axis=1)
-        pairs = np.array(
-            [self._indicated(*triple) for triple in zip(loads, fields[:, free], moved, strict=True)]
-        ).reshape(-1, 2)
+        triples = zip(loads, fields[:, free], moved, strict=True)
+        pairs = np.array([self._indicated(*triple) for triple in triples]).reshape(-1, 2)
         return Indication(pairs[:, 0], pairs[:, 1])
 
     def _indicated(

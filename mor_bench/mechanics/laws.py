@@ -1,13 +1,15 @@
-"""Hyperelastic laws at a quadrature point, and the kernel that sums any of them over cells of any element.
+"""Hyperelastic laws at a quadrature point, and kernels that sum them over cells of any element.
 
-A law is one function ``law(C, parameters, S, D) -> W``: from the right Cauchy-Green tensor C (3, 3) and the law's
-parameters it writes S = 2 dW/dC (3, 3) and D = dS/dE (6, 6), both zero on entry, Voigt order 00 11 22 01 02 12 with
-engineering shear strains, and returns the energy density W. To add one, write the function, give it a number in
-`evaluate`, and a parameter class in `mor_bench.scene.materials`.
+A law is one function ``law(C, parameters, S, D) -> W``. From the right Cauchy-Green tensor C (3, 3)
+and the law's parameters it writes S = 2 dW/dC (3, 3) and D = dS/dE (6, 6), and returns the energy
+density W. S and D are zero on entry. D has the Voigt order 00 11 22 01 02 12 with engineering shear
+strains. To add a law, write the function, give it a number in `evaluate`, and write a parameter
+class in `mor_bench.scene.materials`.
 
-The kernel takes one cell after the other: K_ab = w [ B_aᵀ D B_b + (g_a · S g_b) I ], with B_a the strain-displacement
-matrix at F (Bonet & Wood, section 9.4). It stands in this file since numba compiles anew only what a change in the
-function's own file touches. Saint Venant-Kirchhoff on H8 has its own, vectorised kernel.
+`general_force` takes one cell after the other: K_ab = w [ B_aᵀ D B_b + (g_a · S g_b) I ], with B_a
+the strain-displacement matrix at F (Bonet & Wood, section 9.4). It is in this file because numba
+recompiles a function only after a change in its own file. Saint Venant-Kirchhoff on H8 has its own,
+vectorised kernel.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ _LAW_MULTIPLY_ADDS = {
     MOONEY_RIVLIN: 1563,
     OGDEN: 3313 + 122,
 }
-"""Of a law's stress and tangent at one point; the eigenvectors that Ogden's needs count as 9/2 n³ = 122."""
+"""Per point, for stress and tangent; Ogden's eigenvectors count as 9/2 n³ = 122."""
 
 _OGDEN_TERM_MULTIPLY_ADDS = 44
 
@@ -36,7 +38,7 @@ _VOIGT = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _inverse(C, out):
-    """Inverse of a symmetric (3, 3) matrix; returns the determinant."""
+    """Write the inverse of a symmetric (3, 3) matrix to ``out``; return the determinant."""
     out[0, 0] = C[1, 1] * C[2, 2] - C[1, 2] * C[1, 2]
     out[0, 1] = out[1, 0] = C[0, 2] * C[1, 2] - C[0, 1] * C[2, 2]
     out[0, 2] = out[2, 0] = C[0, 1] * C[1, 2] - C[0, 2] * C[1, 1]
@@ -50,19 +52,19 @@ def _inverse(C, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_dyad(D, factor, A, B):
-    """D += factor (A ⊗ B + B ⊗ A) / 2 for symmetric A, B."""
+    """Add factor (A ⊗ B + B ⊗ A) / 2 to D, for symmetric A and B."""
     for m in range(6):
         for n in range(6):
-            D[m, n] += (
-                0.5
-                * factor
-                * (A[_I[m], _J[m]] * B[_I[n], _J[n]] + B[_I[m], _J[m]] * A[_I[n], _J[n]])
-            )
+            both = A[_I[m], _J[m]] * B[_I[n], _J[n]] + B[_I[m], _J[m]] * A[_I[n], _J[n]]
+            D[m, n] += 0.5 * factor * both
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_product(D, factor, A):
-    """D += factor A ⊙ A, (A ⊙ A)_ijkl = (A_ik A_jl + A_il A_jk) / 2: minus the derivative of C⁻¹ by C for A = C⁻¹."""
+    """Add factor A ⊙ A to D, with (A ⊙ A)_ijkl = (A_ik A_jl + A_il A_jk) / 2.
+
+    For A = C⁻¹ the product is minus the derivative of C⁻¹ by C.
+    """
     for m in range(6):
         i, j = _I[m], _J[m]
         for n in range(6):
@@ -72,7 +74,7 @@ def _add_product(D, factor, A):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _saint_venant_kirchhoff(C, p, S, D):
-    """W = λ/2 tr(E)² + μ tr(E²); p = (λ, μ)."""
+    """Saint Venant-Kirchhoff, W = λ/2 tr(E)² + μ tr(E²); p = (λ, μ)."""
     lam, mu = p[0], p[1]
     trace = 0.5 * (C[0, 0] + C[1, 1] + C[2, 2] - 3.0)
     W = 0.5 * lam * trace * trace
@@ -91,7 +93,10 @@ def _saint_venant_kirchhoff(C, p, S, D):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _neo_hookean(C, p, S, D):
-    """W = μ/2 (tr C - 3) - μ ln J + λ/2 (ln J)²; p = (λ, μ). Bonet & Wood, section 6.4.3."""
+    """Neo-Hooke, W = μ/2 (tr C - 3) - μ ln J + λ/2 (ln J)²; p = (λ, μ).
+
+    Bonet & Wood, section 6.4.3.
+    """
     lam, mu = p[0], p[1]
     inverse = np.empty((3, 3))
     log_j = 0.5 * log(_inverse(C, inverse))
@@ -106,7 +111,7 @@ def _neo_hookean(C, p, S, D):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_volumetric(J, inverse, bulk, S, D):
-    """U = κ/2 (J - 1)²: adds its stress and tangent, returns its energy."""
+    """Add stress and tangent of U = κ/2 (J - 1)²; return its energy."""
     d_u = bulk * (J - 1.0)
     S += (J * d_u) * inverse
     _add_dyad(D, J * (d_u + J * bulk), inverse, inverse)
@@ -116,7 +121,10 @@ def _add_volumetric(J, inverse, bulk, S, D):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mooney_rivlin(C, p, S, D):
-    """W = c10 (J^(-2/3) I₁ - 3) + c01 (J^(-4/3) I₂ - 3) + κ/2 (J - 1)²; p = (c10, c01, κ). Holzapfel, section 6.5."""
+    """Mooney-Rivlin, W = c10 (J^(-2/3) I₁ - 3) + c01 (J^(-4/3) I₂ - 3) + κ/2 (J - 1)².
+
+    p = (c10, c01, κ). Holzapfel, section 6.5.
+    """
     c10, c01, bulk = p[0], p[1], p[2]
     inverse, identity = np.empty((3, 3)), np.eye(3)
     J = sqrt(_inverse(C, inverse))
@@ -140,10 +148,21 @@ def _mooney_rivlin(C, p, S, D):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _ogden(C, p, S, D):
-    """W = Σ μ_p/α_p (λ̄₁^α_p + λ̄₂^α_p + λ̄₃^α_p - 3) + κ/2 (J - 1)²; p = (κ, μ₁, α₁, μ₂, α₂, …).
+def _add_shear(D, factor, a, b):
+    """Add factor/2 (a ⊗ b + b ⊗ a) ⊗ (a ⊗ b + b ⊗ a) to D, for vectors a and b."""
+    for m in range(6):
+        i, j = _I[m], _J[m]
+        for n in range(6):
+            k, q = _I[n], _J[n]
+            D[m, n] += factor * 0.5 * (a[i] * b[j] + a[j] * b[i]) * (a[k] * b[q] + a[q] * b[k])
 
-    λ̄ = J^(-1/3) λ. Principal form with the limit of equal stretches: Holzapfel, sections 6.5 and 6.6.
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ogden(C, p, S, D):
+    """Ogden, W = Σ μ_p/α_p (λ̄₁^α_p + λ̄₂^α_p + λ̄₃^α_p - 3) + κ/2 (J - 1)².
+
+    λ̄ = J^(-1/3) λ; p = (κ, μ₁, α₁, μ₂, α₂, …). Principal form with the limit of equal stretches:
+    Holzapfel, sections 6.5 and 6.6.
     """
     values, vectors = np.linalg.eigh(C)
     inverse = np.empty((3, 3))
@@ -159,12 +178,8 @@ def _ogden(C, p, S, D):
         for a in range(3):
             beta[a] += mu * (powers[a] - mean)
             for b in range(3):
-                gamma[a, b] += (
-                    mu
-                    * alpha
-                    / 3.0
-                    * ((powers[a] * 3.0 if a == b else 0.0) - powers[a] - powers[b] + mean)
-                )
+                own = powers[a] * 3.0 if a == b else 0.0
+                gamma[a, b] += mu * alpha / 3.0 * (own - powers[a] - powers[b] + mean)
     # S_a = β_a / λ_a²; dS_a/dlnλ_b gives the normal block, differences of S the shear block.
     principal = beta / values
     for a in range(3):
@@ -180,22 +195,13 @@ def _ogden(C, p, S, D):
                 else:
                     middle = 0.5 * (values[a] + values[b])
                     shear = 0.5 * (gamma[a, a] - gamma[a, b] - 2.0 * beta[a]) / (middle * middle)
-                for m in range(6):
-                    i, j = _I[m], _J[m]
-                    for n in range(6):
-                        k, q = _I[n], _J[n]
-                        D[m, n] += (
-                            shear
-                            * 0.5
-                            * (vectors[i, a] * vectors[j, b] + vectors[j, a] * vectors[i, b])
-                            * (vectors[k, a] * vectors[q, b] + vectors[q, a] * vectors[k, b])
-                        )
+                _add_shear(D, shear, vectors[:, a], vectors[:, b])
     return energy + _add_volumetric(J, inverse, p[0], S, D)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def evaluate(law, C, parameters, S, D):
-    """Dispatch by the law's number; S and D are overwritten."""
+    """Evaluate the law with a number; S and D are overwritten."""
     S[:] = 0.0
     D[:] = 0.0
     if law == SAINT_VENANT_KIRCHHOFF:
@@ -208,8 +214,62 @@ def evaluate(law, C, parameters, S, D):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _kinematics(H, F, C):
+    """Write F = I + H and C = FᵀF, formed from H, for H = du/dX (3, 3); return det F."""
+    for i in range(3):
+        for j in range(3):
+            unit = 1.0 if i == j else 0.0
+            F[i, j] = H[i, j] + unit
+            C[i, j] = H[i, j] + H[j, i] + unit
+            for k in range(3):
+                C[i, j] += H[k, i] * H[k, j]
+    return (
+        F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
+        - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
+        + F[0, 2] * (F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0])
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_forces(g, w, F, S, Sg, f_e, B):
+    """Add nodal forces to f_e; write w S g to Sg and the strain-displacement matrices to B."""
+    for a in range(len(g)):
+        for i in range(3):
+            Sg[a, i] = w * (S[i, 0] * g[a, 0] + S[i, 1] * g[a, 1] + S[i, 2] * g[a, 2])
+        for i in range(3):
+            f_e[a, i] += F[i, 0] * Sg[a, 0] + F[i, 1] * Sg[a, 1] + F[i, 2] * Sg[a, 2]
+            B[a, 0, i] = F[i, 0] * g[a, 0]
+            B[a, 1, i] = F[i, 1] * g[a, 1]
+            B[a, 2, i] = F[i, 2] * g[a, 2]
+            B[a, 3, i] = F[i, 0] * g[a, 1] + F[i, 1] * g[a, 0]
+            B[a, 4, i] = F[i, 0] * g[a, 2] + F[i, 2] * g[a, 0]
+            B[a, 5, i] = F[i, 1] * g[a, 2] + F[i, 2] * g[a, 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_stiffness(g, w, D, Sg, B, k_e):
+    """Add one point to the upper entries k_e of a cell's stiffness."""
+    n, p, DB = len(g), 0, np.empty((6, 3))
+    for a in range(n):
+        for m in range(6):
+            for i in range(3):
+                DB[m, i] = 0.0
+                for k in range(6):
+                    DB[m, i] += w * D[m, k] * B[a, k, i]
+        for b in range(a, n):
+            geometric = g[b, 0] * Sg[a, 0] + g[b, 1] * Sg[a, 1] + g[b, 2] * Sg[a, 2]
+            for i in range(3):
+                for j in range(i if a == b else 0, 3):
+                    k_ab = geometric if i == j else 0.0
+                    for m in range(6):
+                        k_ab += DB[m, i] * B[b, m, j]
+                    k_e[p] += k_ab
+                    p += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def general_force(u, dofs, gradients, weights, law, parameters, slots, force, values):
-    """Internal force and, where ``values`` is not empty, the upper triangle of the tangent, added into both.
+    """Add the internal force to ``force`` and, if not empty, the tangent to ``values``.
 
     Parameters
     ----------
@@ -222,7 +282,7 @@ def general_force(u, dofs, gradients, weights, law, parameters, slots, force, va
         Quadrature weight times det J, m³.
     law : int
     parameters : (n_points, n_parameters) float64
-        Of each quadrature point: a point may carry only the volumetric part, or only the rest.
+        Of each quadrature point, which may carry only the volumetric part, or only the rest.
     slots : (n_cells, n_upper) int32
     force : (n_dofs + 1,) float64
     values : (n_upper_nonzeros + 1,) or (0,) float64
@@ -230,24 +290,16 @@ def general_force(u, dofs, gradients, weights, law, parameters, slots, force, va
     Returns
     -------
     (float, float)
-        Stored energy, J, and the smallest det F over all quadrature points. Where det F <= 0 the energy is infinite,
-        since these laws have no meaning there.
+        Stored energy, J, and the smallest det F over all quadrature points. The energy is infinite
+        where det F <= 0, because the laws have no meaning there.
     """
     n = gradients.shape[2]
-    H, F, C, S, D = (
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((6, 6)),
-    )
-    B, DB, Sg = np.empty((n, 6, 3)), np.empty((6, 3)), np.empty((n, 3))
-    u_e, f_e, k_e = np.empty((n, 3)), np.empty((n, 3)), np.empty(slots.shape[1])
+    H, F, C = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    S, D = np.empty((3, 3)), np.empty((6, 6))
+    B, Sg = np.empty((n, 6, 3)), np.empty((n, 3))
+    f_e, k_e = np.empty((n, 3)), np.empty(slots.shape[1])
     energy, min_det = 0.0, np.inf
     for e in range(dofs.shape[0]):
-        for a in range(n):
-            for i in range(3):
-                u_e[a, i] = u[dofs[e, 3 * a + i]]
         f_e[:] = 0.0
         k_e[:] = 0.0
         for q in range(gradients.shape[1]):
@@ -256,52 +308,16 @@ def general_force(u, dofs, gradients, weights, law, parameters, slots, force, va
                 for j in range(3):
                     H[i, j] = 0.0
                     for a in range(n):
-                        H[i, j] += u_e[a, i] * g[a, j]
-                    F[i, j] = H[i, j] + (1.0 if i == j else 0.0)
-            det = (
-                F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
-                - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
-                + F[0, 2] * (F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0])
-            )
+                        H[i, j] += u[dofs[e, 3 * a + i]] * g[a, j]
+            det = _kinematics(H, F, C)
             min_det = min(min_det, det)
             if not det > 0.0:
                 energy = np.inf
                 continue
-            for i in range(3):
-                for j in range(3):
-                    C[i, j] = H[i, j] + H[j, i] + (1.0 if i == j else 0.0)
-                    for k in range(3):
-                        C[i, j] += H[k, i] * H[k, j]
             energy += w * evaluate(law, C, parameters[q], S, D)
-            for a in range(n):
-                for i in range(3):
-                    Sg[a, i] = w * (S[i, 0] * g[a, 0] + S[i, 1] * g[a, 1] + S[i, 2] * g[a, 2])
-                for i in range(3):
-                    f_e[a, i] += F[i, 0] * Sg[a, 0] + F[i, 1] * Sg[a, 1] + F[i, 2] * Sg[a, 2]
-                    B[a, 0, i] = F[i, 0] * g[a, 0]
-                    B[a, 1, i] = F[i, 1] * g[a, 1]
-                    B[a, 2, i] = F[i, 2] * g[a, 2]
-                    B[a, 3, i] = F[i, 0] * g[a, 1] + F[i, 1] * g[a, 0]
-                    B[a, 4, i] = F[i, 0] * g[a, 2] + F[i, 2] * g[a, 0]
-                    B[a, 5, i] = F[i, 1] * g[a, 2] + F[i, 2] * g[a, 1]
-            if len(values) == 0:
-                continue
-            p = 0
-            for a in range(n):
-                for m in range(6):
-                    for i in range(3):
-                        DB[m, i] = 0.0
-                        for k in range(6):
-                            DB[m, i] += w * D[m, k] * B[a, k, i]
-                for b in range(a, n):
-                    geometric = g[b, 0] * Sg[a, 0] + g[b, 1] * Sg[a, 1] + g[b, 2] * Sg[a, 2]
-                    for i in range(3):
-                        for j in range(i if a == b else 0, 3):
-                            k_ab = geometric if i == j else 0.0
-                            for m in range(6):
-                                k_ab += DB[m, i] * B[b, m, j]
-                            k_e[p] += k_ab
-                            p += 1
+            _add_forces(g, w, F, S, Sg, f_e, B)
+            if len(values) > 0:
+                _add_stiffness(g, w, D, Sg, B, k_e)
         for a in range(n):
             for i in range(3):
                 force[dofs[e, 3 * a + i]] += f_e[a, i]
@@ -312,8 +328,31 @@ def general_force(u, dofs, gradients, weights, law, parameters, slots, force, va
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _write_derivative(F, S, D, w, out, l, n_lanes):
+    """Write the weighted A = dP/dF of a point to lane l of a batch; out (81 * n_lanes,)."""
+    DL = np.empty((6, 9))
+    # dE = sym(Fᵀ dH): dH_iJ changes the strains with index J, each by a component of row i of F.
+    for m in range(6):
+        for i in range(3):
+            for j in range(3):
+                DL[m, 3 * i + j] = w * (
+                    D[m, _VOIGT[0, j]] * F[i, 0]
+                    + D[m, _VOIGT[1, j]] * F[i, 1]
+                    + D[m, _VOIGT[2, j]] * F[i, 2]
+                )
+    for i in range(3):
+        for j in range(3):
+            x, y, z = DL[_VOIGT[0, j]], DL[_VOIGT[1, j]], DL[_VOIGT[2, j]]
+            for d in range(9):
+                a = F[i, 0] * x[d] + F[i, 1] * y[d] + F[i, 2] * z[d]
+                if d // 3 == i:
+                    a += w * S[j, d % 3]
+                out[(9 * (3 * i + j) + d) * n_lanes + l] = a
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def point_stresses(H, weights, law, parameters, P, A):
-    """Weighted first Piola-Kirchhoff stress P and, where ``A`` is not empty, its derivative A = dP/dF, point by point.
+    """Write the weighted first Piola-Kirchhoff stress P and, if not empty, A = dP/dF.
 
     Parameters
     ----------
@@ -333,81 +372,42 @@ def point_stresses(H, weights, law, parameters, P, A):
         Stored energy and the smallest det F; the energy is infinite where det F <= 0.
     """
     n_lanes = weights.shape[1]
-    F, C, S, D, DL = (
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((6, 6)),
-        np.empty((6, 9)),
-    )
+    h, F, C = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    S, D = np.empty((3, 3)), np.empty((6, 6))
     energy, min_det = 0.0, np.inf
     P[:] = 0.0
     A[:] = 0.0
     for point in range(len(parameters)):
         b, l = point // n_lanes, point % n_lanes
-        h, w = H[b], weights[b, l]
+        w = weights[b, l]
         for i in range(3):
             for j in range(3):
-                F[i, j] = h[(3 * i + j) * n_lanes + l] + (1.0 if i == j else 0.0)
-        det = (
-            F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
-            - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
-            + F[0, 2] * (F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0])
-        )
+                h[i, j] = H[b, (3 * i + j) * n_lanes + l]
+        det = _kinematics(h, F, C)
         min_det = min(min_det, det)
         if not det > 0.0:
             energy = np.inf
             continue
-        for i in range(3):
-            for j in range(3):
-                C[i, j] = (
-                    h[(3 * i + j) * n_lanes + l]
-                    + h[(3 * j + i) * n_lanes + l]
-                    + (1.0 if i == j else 0.0)
-                )
-                for k in range(3):
-                    C[i, j] += h[(3 * k + i) * n_lanes + l] * h[(3 * k + j) * n_lanes + l]
         energy += w * evaluate(law, C, parameters[point], S, D)
         for i in range(3):
             for j in range(3):
                 P[b, (3 * i + j) * n_lanes + l] = w * (
                     F[i, 0] * S[0, j] + F[i, 1] * S[1, j] + F[i, 2] * S[2, j]
                 )
-        if len(A) == 0:
-            continue
-        # dE = sym(Fᵀ dH): dH_iJ changes the strains that hold the index J, each by a component of row i of F.
-        for m in range(6):
-            for i in range(3):
-                for j in range(3):
-                    DL[m, 3 * i + j] = w * (
-                        D[m, _VOIGT[0, j]] * F[i, 0]
-                        + D[m, _VOIGT[1, j]] * F[i, 1]
-                        + D[m, _VOIGT[2, j]] * F[i, 2]
-                    )
-        for i in range(3):
-            for j in range(3):
-                for d in range(9):
-                    a = (
-                        F[i, 0] * DL[_VOIGT[0, j], d]
-                        + F[i, 1] * DL[_VOIGT[1, j], d]
-                        + F[i, 2] * DL[_VOIGT[2, j], d]
-                    )
-                    if d // 3 == i:
-                        a += w * S[j, d % 3]
-                    A[b, (9 * (3 * i + j) + d) * n_lanes + l] = a
+        if len(A) > 0:
+            _write_derivative(F, S, D, w, A[b], l, n_lanes)
     return energy, min_det
 
 
 def point_multiply_adds(law: int, n_parameters: int) -> tuple[int, int]:
-    """Of `point_stresses` at one point: of P, energy and det F, and what A adds."""
+    """Return the work of `point_stresses` at one point, without A, and what A adds."""
     terms = n_parameters // 2 if law == OGDEN else 0
-    return 27 + 9 + 37 + _LAW_MULTIPLY_ADDS[
-        law
-    ] + terms * _OGDEN_TERM_MULTIPLY_ADDS, 9 * 6 * 4 + 81 * 3 + 27
+    stress = 27 + 9 + 37 + _LAW_MULTIPLY_ADDS[law] + terms * _OGDEN_TERM_MULTIPLY_ADDS
+    return stress, 9 * 6 * 4 + 81 * 3 + 27
 
 
 def general_multiply_adds(law: int, n_parameters: int, n_nodes: int) -> tuple[int, int]:
-    """Of `general_force` at one quadrature point of a cell, by force alone and by force and tangent."""
+    """Return the work of `general_force` at one point, for the force, and with the tangent."""
     terms = n_parameters // 2 if law == OGDEN else 0
     force = 57 * n_nodes + 37 + _LAW_MULTIPLY_ADDS[law] + terms * _OGDEN_TERM_MULTIPLY_ADDS
     tangent = n_nodes * (216 + 39) + n_nodes * (n_nodes - 1) // 2 * 57

@@ -1,4 +1,4 @@
-"""The warning that a discretisation is too stiff for a nearly incompressible material."""
+"""Warning about a discretisation that is too stiff for a nearly incompressible material."""
 
 from __future__ import annotations
 
@@ -12,26 +12,24 @@ LOCKING_FROM = 0.45
 
 
 def locking_risk(scene: Scene) -> str | None:
-    """Why the scene's answers will be too stiff, and the remedy; None where they will not, or nothing is known of it."""
+    """Return why a scene locks, and the remedy; None if it does not, or its law is unknown."""
     if scene.material is None:
         return None
     poisson = scene.material.poisson_at_rest
     if poisson <= LOCKING_FROM or scene.selective:
         return None
     tetrahedra = scene.mesh.cells.shape[1] == 4
-    remedy = (
-        'element = "hexahedron" and integration = "selective"'
-        if tetrahedra
-        else 'integration = "selective"'
-    )
+    cells, remedy = "fully integrated H8", 'integration = "selective"'
+    if tetrahedra:
+        cells, remedy = "T4", f'element = "hexahedron" and {remedy}'
     return (
-        f"{scene.name}: with Poisson's ratio {poisson:.6g} at rest, above {LOCKING_FROM}, {'T4' if tetrahedra else 'fully integrated H8'} "
+        f"{scene.name}: with Poisson's ratio {poisson:.6g} at rest, above {LOCKING_FROM}, {cells} "
         f"cells lock: displacements are too small; set {remedy} under [discretisation]."
     )
 
 
 def warn_of_locking(scene: Scene) -> None:
-    """Give a `LockingWarning` for a scene that locks; called where a model is built."""
+    """Give a `LockingWarning` if a scene locks; called where a model is built."""
     risk = locking_risk(scene)
     if risk:
         warnings.warn(risk, LockingWarning, stacklevel=3)

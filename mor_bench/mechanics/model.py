@@ -1,4 +1,4 @@
-"""The full-order model of a scene: nodal forces in, nodal displacements at the stable equilibrium out."""
+"""The full-order model of a scene, from nodal forces to displacements at a stable equilibrium."""
 
 from __future__ import annotations
 
@@ -16,23 +16,19 @@ from mor_bench.errors import (
     SolverError,
     SpecError,
     UnconstrainedBodyError,
-    UnsupportedSceneError,
 )
-from mor_bench.mechanics.assembly import Assembler, State
+from mor_bench.mechanics.assembly import Assembler, State, discretisation_of
+from mor_bench.mechanics.banded import BandedCholesky, BandedFactor
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.linear import (
-    BandedCholesky,
-    BandedFactor,
     Factor,
     LinearSolver,
-    Multigrid,
-    MultigridFactor,
     NotPositiveDefiniteError,
     Pardiso,
     SparseLU,
-    choose_solver,
 )
 from mor_bench.mechanics.locking import warn_of_locking
+from mor_bench.mechanics.multigrid import Multigrid, MultigridFactor
 from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibria, solve_equilibrium
 from mor_bench.mechanics.rotated import (
     BlockJacobi,
@@ -48,24 +44,31 @@ SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 """How equilibria are solved.
 
 auto
-    Anderson-accelerated iteration with the stiffness at rest, factorised once in single precision and turned with the
-    nodes; where that fails, Newton's method as by `cholesky` on small meshes and `rotated-pcg` on others.
+    Anderson-accelerated iteration with the stiffness at rest, factorised once in single precision
+    and turned with the nodes. Where that fails, Newton's method as by `cholesky` on small meshes
+    and `rotated-pcg` on others.
 rotated-pcg
-    Newton's method, each step by conjugate gradients preconditioned by the turned rest-state factor.
+    Newton's method. Conjugate gradients, preconditioned by the turned rest-state factor, find each
+    step.
 jacobi-pcg
-    Newton's method, each step by conjugate gradients preconditioned by the tangent's own 3x3 diagonal blocks.
+    Newton's method. Conjugate gradients, preconditioned by the tangent's own 3x3 diagonal blocks,
+    find each step.
 cholesky, superlu, pardiso
-    Newton's method, each step by a fresh direct factor: banded Cholesky, SuperLU, or MKL's (extra `mkl`).
+    Newton's method with a fresh direct factor for each step: banded Cholesky, SuperLU, or MKL's
+    (extra `mkl`).
 
-Meshes whose band has more than `MAX_BAND_ENTRIES` entries use multigrid in place of a rest-state factor.
+Meshes whose band exceeds `MAX_BAND_ENTRIES` use multigrid instead of a rest-state factor.
 """
+
+MAX_BAND_ENTRIES = 1e8
+"""Largest number of entries of a banded rest-state factor (0.8 GB); multigrid serves the rest."""
 
 PCG_FROM = 3000
 """Unknowns from which conjugate gradients beat a fresh banded factor for each Newton step."""
 JACOBI_ITERATIONS = 20_000
 CERTIFY_TOLERANCE = 1e-2
 ILL_CONDITIONED = 1e10
-"""Condition number of the stiffness at rest from which answers cannot be trusted to the default tolerance."""
+"""Condition number from which answers do not reach the default tolerance."""
 
 RIGID_MODES = (
     "translation x",
@@ -78,20 +81,20 @@ RIGID_MODES = (
 
 
 def missing_library(solver: SolverName) -> str | None:
-    """What to install before a solver can be used; None if nothing."""
+    """Return what must be installed before a solver can be used; None if nothing."""
     if solver == "pardiso" and find_spec("pypardiso") is None:
         return "the solver `pardiso` needs pypardiso: pip install 'mor-bench[mkl]'"
     return None
 
 
 def unknown_equations(scene: Scene, *, observed: bool = False) -> str | None:
-    """The reason why a scene has no equilibrium to be solved for; None if it has one.
+    """Return why a scene's equilibria cannot be solved for; None if they can.
 
     Parameters
     ----------
     scene : Scene
     observed : bool
-        Whether displacements of a part of the surface will do in the place of the forces, as to an `ObservedModel`.
+        Whether observed displacements may replace the forces, as for an `ObservedModel`.
     """
     if scene.material is None:
         return NO_EQUATIONS
@@ -99,7 +102,7 @@ def unknown_equations(scene: Scene, *, observed: bool = False) -> str | None:
 
 
 def free_rigid_modes(scene: Scene) -> list[str]:
-    """The rigid motions that the supports do not stop, each named by its largest component."""
+    """Return the rigid motions that the supports leave free, named by their largest component."""
     x = scene.mesh.points[scene.fixed_nodes] - scene.mesh.points.mean(axis=0)
     x = x / np.abs(scene.mesh.points - scene.mesh.points.mean(axis=0)).max()
     modes = np.zeros((len(x), 3, 6))
@@ -118,7 +121,8 @@ def check_supports(scene: Scene) -> None:
     free = free_rigid_modes(scene)
     if free:
         raise UnconstrainedBodyError(
-            f"the supports of {scene.name} leave rigid motions free: {', '.join(free)}; fix at least three nodes not in line.",
+            f"the supports of {scene.name} leave rigid motions free: {', '.join(free)}; "
+            "fix at least three nodes not in line.",
             free_motions=tuple(free),
         )
 
@@ -130,12 +134,12 @@ class FullOrderModel:
     ----------
     scene : Scene
     solver : str, optional
-        One of `SOLVERS`; by default as the scene says.
+        One of `SOLVERS`; the scene's own solver by default.
 
     Raises
     ------
     UnsupportedSceneError
-        If the scene's snapshots were imported, so that its equations are not known.
+        If the scene's snapshots were imported, so that its equations are unknown.
     UnconstrainedBodyError
         If the supports leave rigid motions free; the message names them.
     MissingDependencyError
@@ -143,8 +147,7 @@ class FullOrderModel:
     """
 
     def __init__(self, scene: Scene, solver: SolverName | None = None) -> None:
-        if scene.material is None:
-            raise UnsupportedSceneError(f"{scene.name}: {NO_EQUATIONS}.")
+        body = discretisation_of(scene)
         check_supports(scene)
         warn_of_locking(scene)
         self.solver = solver or scene.generated.solver
@@ -160,14 +163,7 @@ class FullOrderModel:
         number[scene.free_dofs] = np.arange(self.n_unknowns)
         dof_of_node = number.reshape(-1, 3)
         self.cell_dofs = dof_of_node[mesh.cells].reshape(mesh.n_cells, -1)
-        self.assembler = Assembler(
-            mesh.points,
-            mesh.cells,
-            dof_of_node,
-            self.n_unknowns,
-            scene.material,
-            selective=scene.selective,
-        )
+        self.assembler = Assembler(body, dof_of_node, self.n_unknowns)
         self.extent = self.assembler.extent_m
         self._direct = self._direct_solver()
 
@@ -179,41 +175,54 @@ class FullOrderModel:
             return SparseLU(pattern)
         if self.solver == "pardiso":
             return Pardiso(pattern)
-        return choose_solver(pattern, self.scene.mesh.points[self.scene.free_dofs[::3] // 3])
+        banded = BandedCholesky(pattern)
+        if banded.entries <= MAX_BAND_ENTRIES:
+            return banded
+        return Multigrid(pattern, self.scene.mesh.points[self.scene.free_dofs[::3] // 3])
 
     @cached_property
     def rest_tangent(self) -> NDArray[np.float64]:
-        """Values of the stiffness at rest, N/m, in the assembler's pattern."""
+        """Values of the stiffness at rest in the assembler's pattern, N/m."""
         return self.assembler.force_and_tangent(np.zeros(self.n_unknowns))[1]
 
     @cached_property
     def rest_factor(self) -> Factor:
-        """The stiffness at rest, factorised: the linear response is one back-solve."""
-        # With Pardiso a solver of its own, since it holds one factor at a time.
+        """Factor of the stiffness at rest; a linear response is one back-solve."""
         if self.solver == "jacobi-pcg":
             return JacobiFactor(self.assembler.pattern, self.rest_tangent)
+        # A Pardiso solver holds one factor at a time.
+        solver = self._direct_solver() if self.solver == "pardiso" else self._direct
         try:
-            factor = (self._direct_solver() if self.solver == "pardiso" else self._direct).factor(
-                self.rest_tangent
-            )
+            factor = solver.factor(self.rest_tangent)
         except NotPositiveDefiniteError:
             raise SolverError(
-                f"{self.scene.name}: the stiffness at rest is not positive definite in double precision; is the material too nearly "
-                "incompressible, or the body too slender?"
+                f"{self.scene.name}: the stiffness at rest is not positive definite in double "
+                "precision; the material may be too nearly incompressible, or the body too slender."
             ) from None
-        condition = (
-            condition_number(self.assembler.pattern, self.rest_tangent, factor)
-            if isinstance(factor, BandedFactor)
-            else 1.0
-        )
-        if condition > ILL_CONDITIONED:
-            warnings.warn(
-                f"{self.scene.name}: the condition number of the stiffness at rest is about {condition:.0e}, above {ILL_CONDITIONED:.0e}: "
-                f"displacements have some {max(0, int(15.9 - np.log10(condition)))} correct digits.",
-                IllConditionedWarning,
-                stacklevel=2,
-            )
+        if isinstance(factor, BandedFactor):
+            self._warn_if_ill_conditioned(factor)
         return factor
+
+    def _warn_if_ill_conditioned(self, factor: BandedFactor) -> None:
+        condition = condition_number(self.assembler.pattern, self.rest_tangent, factor)
+        if condition > ILL_CONDITIONED:
+            digits = max(0, int(15.9 - np.log10(condition)))
+            warnings.warn(
+                f"{self.scene.name}: the condition number of the stiffness at rest is about "
+                f"{condition:.0e}, above {ILL_CONDITIONED:.0e}: displacements have some {digits} "
+                "correct digits.",
+                IllConditionedWarning,
+                stacklevel=3,
+            )
+
+    def prepare(self) -> None:
+        """Compute the factors that all solves share, so that no query has to."""
+        _ = self.turned_rest if self._turns else self.rest_factor
+
+    @property
+    def _turns(self) -> bool:
+        """Whether solves use the turned rest-state factor."""
+        return self.solver in ("auto", "rotated-pcg")
 
     def force(self, q: NDArray[np.float64]) -> State:
         return self.assembler.force(q)
@@ -222,19 +231,19 @@ class FullOrderModel:
         return self.assembler.force_and_tangent(q)
 
     def factor(self, tangent: NDArray[np.float64]) -> Factor:
-        """Factorise a tangent; raises `NotPositiveDefiniteError`."""
+        """Factorise a tangent, or raise `NotPositiveDefiniteError`."""
         return self._direct.factor(tangent)
 
     @cached_property
     def turned_rest(self) -> RotatedRest:
-        """An approximate inverse of all tangents, R K₀⁻¹ Rᵀ, where there is a factor of the stiffness at rest."""
+        """An approximate inverse of all tangents, R K₀⁻¹ Rᵀ; needs a banded or multigrid factor."""
         factor = self.rest_factor
         assert isinstance(factor, BandedFactor | MultigridFactor)
         return RotatedRest(factor.single_precision(), *self.turning_cells)
 
     @property
     def turning_cells(self) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """What nodal rotations are found from: the cells' free nodes, and gradients and volumes at their centres; see `RotatedRest`."""
+        """The cells' free nodes, and gradients and volumes at the centres; see `RotatedRest`."""
         mesh = self.scene.mesh
         element = element_of(mesh.cells)
         gradients, det_j = shape_gradients(mesh.points, mesh.cells, element.centre[None])
@@ -251,7 +260,7 @@ class FullOrderModel:
         return self.solver in ("rotated-pcg", "jacobi-pcg") or (self.solver == "auto" and by_size)
 
     def certify(self, q: NDArray[np.float64]) -> None:
-        """With an iterative solver, look for negative curvature by conjugate gradients under a random force."""
+        """Look for negative curvature by conjugate gradients, if the solver is iterative."""
         if self._iterative:
             force = np.random.default_rng(0).normal(size=self.n_unknowns)
             self.step(q, self.linearise(q)[1], force, CERTIFY_TOLERANCE)
@@ -285,12 +294,12 @@ class FullOrderModel:
         start: NDArray[np.float64] | None = None,
         options: NewtonOptions = NewtonOptions(),
     ) -> Solution:
-        """Equilibrium under forces on the free dofs, (n_free,) N; see `solve_equilibrium`."""
+        """Solve for forces on the free dofs, (n_free,) N; see `solve_equilibrium`."""
         return solve_equilibrium(self, load, start, options)
 
     def solve_many(
         self, loads: NDArray[np.float64], options: NewtonOptions = NewtonOptions()
     ) -> list[Solution | SolverError]:
-        """Equilibria under loads (m, n_free), N, or the errors that `solve` would raise; faster than one after the other."""
+        """Solve for loads (m, n_free), N; returns solutions, or the errors `solve` would raise."""
         found = dict(solve_equilibria(self, list(loads), options=options))
         return [found[i] for i in range(len(loads))]

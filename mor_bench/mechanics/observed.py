@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from mor_bench.counting import count, uncounted
 from mor_bench.errors import LockingWarning, NoEquilibriumError, SolverError, UnsupportedSceneError
 from mor_bench.mechanics.assembly import State
+from mor_bench.mechanics.banded import BandedFactor
 from mor_bench.mechanics.compliance import Compliance
-from mor_bench.mechanics.linear import BandedFactor, MultigridFactor
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.multigrid import MultigridFactor
 from mor_bench.mechanics.newton import NewtonOptions, Solution
 from mor_bench.mechanics.rotated import RotatedRest, SingleFactor, nodal_rotations
 from mor_bench.scene.scene import Scene
@@ -158,9 +159,7 @@ class ObservedModel:
             self._model = _HiddenModel(whole, held, solver)
         self._model.prepare()
         self._seen = np.setdiff1d(np.arange(whole.n_unknowns), self._model.hidden)
-        pattern, n = whole.assembler.pattern, whole.n_unknowns
-        upper = sp.csr_array((whole.rest_tangent, pattern.indices, pattern.indptr), shape=(n, n))
-        stiffness = sp.csr_array(upper + sp.triu(upper, 1).T)
+        stiffness = whole.assembler.pattern.symmetric(whole.rest_tangent)
         self._coupling = sp.csr_array(stiffness[self._model.hidden][:, self._seen])
 
     def linear_response(self, observed: Array) -> Array:

@@ -1,9 +1,11 @@
 """The rest-state stiffness, turned with the body, as an approximate inverse of any tangent.
 
-A tangent far from rest is, to first order, the rest-state stiffness seen by an observer who turns with each node:
-K ≈ R K₀ Rᵀ with R the block-diagonal matrix of nodal rotations, the polar factors of the nodal mean deformation
-gradient. One single-precision factor of K₀ hence serves every iteration of every load (corotational warping: Müller et
-al., "Stable real-time deformations", SCA 2002; here it only directs the iteration, so that the answer stays exact).
+To first order, a tangent is the rest-state stiffness turned with each node: K ≈ R K₀ Rᵀ, with R the
+block-diagonal matrix of nodal rotations. These are the polar factors of the nodal mean deformation
+gradients. One single-precision factor of K₀ hence serves every iteration of every load.
+
+Corotational warping: Müller et al., "Stable real-time deformations", SCA 2002. Here it only directs
+the iteration, so the answer stays exact.
 """
 
 from __future__ import annotations
@@ -18,22 +20,25 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mor_bench.counting import count, uncounted
-from mor_bench.mechanics.assembly import Pattern
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
+from mor_bench.mechanics.pattern import Pattern
 
 Array = NDArray[np.float64]
 
 MAX_ITERATIONS = 400
-"""Of conjugate gradients with the turned factor; 11-15 are usual, so that a tangent which needs more is nearly singular."""
+"""Limit for conjugate gradients with the turned factor.
+
+11-15 iterations are usual. A tangent that needs more than the limit is nearly singular.
+"""
 
 
 class SingleFactor(Protocol):
-    """A factor in single precision, or what comes near one, with its unknowns in an order of its own.
+    """An exact or approximate factor in single precision, with an order of its own.
 
     Attributes
     ----------
     place : (n,) int64
-        Place of each unknown.
+        Place of each unknown in that order.
     """
 
     place: NDArray[np.int64]
@@ -43,9 +48,56 @@ class SingleFactor(Protocol):
         ...
 
 
+@njit(inline="always")
+def _to_rotation(Q):
+    """Overwrite a (3, 3) matrix by its polar factor; return the number of iterations."""
+    size = 0.0
+    for row in range(3):
+        for column in range(3):
+            size += Q[row, column] * Q[row, column]
+    scale = np.sqrt(3.0 / size)
+    a, b, c = scale * Q[0, 0], scale * Q[0, 1], scale * Q[0, 2]
+    d, e, f = scale * Q[1, 0], scale * Q[1, 1], scale * Q[1, 2]
+    g, h, i = scale * Q[2, 0], scale * Q[2, 1], scale * Q[2, 2]
+    # Higham's Newton iteration for the polar factor converges quadratically within the basin.
+    for iteration in range(1, 9):  # noqa: B007 - returned
+        ca, cb, cc = e * i - f * h, f * g - d * i, d * h - e * g
+        det = a * ca + b * cb + c * cc
+        if not det > 1e-6:  # a collapsed or mirrored neighbourhood has no rotation
+            a, b, c, d, e, f, g, h, i = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
+            break
+        r = 0.5 / det
+        cd, ce, cf = c * h - b * i, a * i - c * g, b * g - a * h
+        cg, ch, ci = b * f - c * e, c * d - a * f, a * e - b * d
+        change = (
+            abs(r * ca - 0.5 * a)
+            + abs(r * ce - 0.5 * e)
+            + abs(r * ci - 0.5 * i)
+            + abs(r * cb - 0.5 * b)
+            + abs(r * cf - 0.5 * f)
+        )
+        change += (
+            abs(r * cc - 0.5 * c)
+            + abs(r * cd - 0.5 * d)
+            + abs(r * cg - 0.5 * g)
+            + abs(r * ch - 0.5 * h)
+        )
+        a, b, c = 0.5 * a + r * ca, 0.5 * b + r * cb, 0.5 * c + r * cc
+        d, e, f = 0.5 * d + r * cd, 0.5 * e + r * ce, 0.5 * f + r * cf
+        g, h, i = 0.5 * g + r * cg, 0.5 * h + r * ch, 0.5 * i + r * ci
+        if change < 1e-4:  # the next change would be its square
+            break
+    Q[0, 0], Q[0, 1], Q[0, 2] = a, b, c
+    Q[1, 0], Q[1, 1], Q[1, 2] = d, e, f
+    Q[2, 0], Q[2, 1], Q[2, 2] = g, h, i
+    return iteration
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def nodal_rotations(u, cell_nodes, centre_gradients, volumes, rotations):
-    """Rotation of the volume-weighted mean deformation gradient of the cells around each free node.
+    """Find each free node's rotation: that of the mean deformation gradient of its cells.
+
+    The mean is weighted by volume.
 
     Parameters
     ----------
@@ -80,62 +132,13 @@ def nodal_rotations(u, cell_nodes, centre_gradients, volumes, rotations):
             Q[1, 0], Q[1, 1], Q[1, 2] = Q[1, 0] + h10, Q[1, 1] + h11, Q[1, 2] + h12
             Q[2, 0], Q[2, 1], Q[2, 2] = Q[2, 0] + h20, Q[2, 1] + h21, Q[2, 2] + h22
     for node in range(len(rotations) - 1):
-        Q = rotations[node]
-        size = 0.0
-        for row in range(3):
-            for column in range(3):
-                size += Q[row, column] * Q[row, column]
-        scale = np.sqrt(3.0 / size)
-        a, b, c = scale * Q[0, 0], scale * Q[0, 1], scale * Q[0, 2]
-        d, e, f = scale * Q[1, 0], scale * Q[1, 1], scale * Q[1, 2]
-        g, h, i = scale * Q[2, 0], scale * Q[2, 1], scale * Q[2, 2]
-        for _ in range(
-            8
-        ):  # Newton's iteration for the polar factor (Higham): quadratic, from within the basin
-            iterations += 1
-            ca, cb, cc = e * i - f * h, f * g - d * i, d * h - e * g
-            det = a * ca + b * cb + c * cc
-            if not det > 1e-6:  # a collapsed or mirrored neighbourhood: no rotation to speak of
-                a, b, c, d, e, f, g, h, i = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
-                break
-            r = 0.5 / det
-            cd, ce, cf = c * h - b * i, a * i - c * g, b * g - a * h
-            cg, ch, ci = b * f - c * e, c * d - a * f, a * e - b * d
-            change = (
-                abs(r * ca - 0.5 * a)
-                + abs(r * ce - 0.5 * e)
-                + abs(r * ci - 0.5 * i)
-                + abs(r * cb - 0.5 * b)
-                + abs(r * cf - 0.5 * f)
-            )
-            change += (
-                abs(r * cc - 0.5 * c)
-                + abs(r * cd - 0.5 * d)
-                + abs(r * cg - 0.5 * g)
-                + abs(r * ch - 0.5 * h)
-            )
-            a, b, c = 0.5 * a + r * ca, 0.5 * b + r * cb, 0.5 * c + r * cc
-            d, e, f = 0.5 * d + r * cd, 0.5 * e + r * ce, 0.5 * f + r * cf
-            g, h, i = 0.5 * g + r * cg, 0.5 * h + r * ch, 0.5 * i + r * ci
-            if change < 1e-4:  # the next one would change by its square
-                break
-        Q[0, 0], Q[0, 1], Q[0, 2], Q[1, 0], Q[1, 1], Q[1, 2], Q[2, 0], Q[2, 1], Q[2, 2] = (
-            a,
-            b,
-            c,
-            d,
-            e,
-            f,
-            g,
-            h,
-            i,
-        )
+        iterations += _to_rotation(rotations[node])
     return iterations
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def multiply(indptr, indices, values, x, y):
-    """y = K x for the symmetric K whose upper triangle is given; all three dofs of a node are neighbours in the pattern."""
+    """Write K x to y for the symmetric K whose upper triangle has these values in a `Pattern`."""
     y[:] = 0.0
     for a in range(len(x) // 3):
         i = 3 * a
@@ -166,7 +169,7 @@ def multiply(indptr, indices, values, x, y):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _turn_back(place, rotations, scale, r, work):
-    """work = scale Rᵀ r, in the factor's order."""
+    """Write scale Rᵀr to work, in the factor's order."""
     for a in range(len(place)):
         Q, i, p = rotations[a], 3 * a, 3 * place[a]
         r0, r1, r2 = scale * r[i], scale * r[i + 1], scale * r[i + 2]
@@ -177,7 +180,7 @@ def _turn_back(place, rotations, scale, r, work):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _turn(place, rotations, scale, work, z):
-    """z = R work / scale."""
+    """Write R work / scale to z."""
     for a in range(len(place)):
         Q, i, p = rotations[a], 3 * a, 3 * place[a]
         w0, w1, w2 = work[p] / scale, work[p + 1] / scale, work[p + 2] / scale
@@ -187,14 +190,14 @@ def _turn(place, rotations, scale, work, z):
 
 
 class RotatedRest:
-    """z = R K₀⁻¹ Rᵀ r, the solve in single precision.
+    """The approximate inverse R K₀⁻¹ Rᵀ, with the solve in single precision.
 
     Parameters
     ----------
     factor : SingleFactor
-        Of the stiffness at rest, with the three dofs of a node as neighbours.
+        Factor of the stiffness at rest, with the three dofs of a node as neighbours.
     cell_nodes : (n_cells, n_cell_nodes) int32
-        Number of each cell's nodes among the free ones; the number of free nodes for a fixed one.
+        Number of each cell's nodes among the free ones; a fixed node has the number of free nodes.
     centre_gradients : (n_cells, n_cell_nodes, 3) float64
         dN_a/dX at the cells' centres, 1/m.
     volumes : (n_cells,) float64
@@ -214,23 +217,27 @@ class RotatedRest:
         self._identity = np.tile(np.eye(3), (len(self._place) + 1, 1, 1))
 
     def turned(self, q: Array | None) -> Array:
-        """(n_nodes + 1, 3, 3) nodal rotations at displacements q (n,), m; the identity for None."""
+        """Return nodal rotations (n_nodes + 1, 3, 3) at displacements q (n,), m.
+
+        Without q they are the identity.
+        """
         if q is None:
             return self._identity
         rotations = np.empty_like(self._identity)
         iterations = nodal_rotations(
             np.append(q, np.zeros(3)).reshape(-1, 3), *self.cells, rotations
         )
-        # Per component of a cell's nodes, per node, per iteration.
+        # The terms count components of the cells' nodes, nodes, and iterations.
         count(multiply_adds=4 * self.cells[1].size + 20 * len(self._place) + 40 * int(iterations))
         return rotations
 
     def solve_many(self, residuals: Sequence[Array], rotations: Sequence[Array]) -> Array:
-        """Approximate displacements (m, n), m, under forces (n,), N, each with its own rotations.
+        """Return approximate displacements (m, n), m, under forces (n,), N.
 
-        One sweep over the factor serves all; each answer is the same, to the last digit, as alone.
+        Each force has its own rotations. One sweep over the factor serves all forces. An answer
+        does not depend on the other forces, to the last digit.
         """
-        # Scaled to one, so that single precision neither underflows nor overflows.
+        # Forces are scaled to one, so that single precision neither underflows nor overflows.
         scales = [1.0 / (float(np.abs(residual).max()) or 1.0) for residual in residuals]
         work = np.empty((len(residuals), 3 * len(self._place)), dtype=np.float32)
         for row, residual, Q, scale in zip(work, residuals, rotations, scales, strict=True):
@@ -244,22 +251,21 @@ class RotatedRest:
 
     @cached_property
     def _soft(self) -> NDArray[np.float32]:
-        response = (
-            np.random.default_rng(0).normal(size=(1, 3 * len(self._place))).astype(np.float32)
-        )
+        force = np.random.default_rng(0).normal(size=(1, 3 * len(self._place)))
+        response = force.astype(np.float32)
         with uncounted():
             self._factor.solve_in_place(response)
         return np.asarray(response[0] / np.abs(response).max())
 
     def soft(self, rotations: Array) -> Array:
-        """The response at rest to a random force, of size one, turned."""
+        """Return the turned response at rest to a random force, scaled to size one."""
         count(multiply_adds=4 * len(self._soft))
         z = np.empty(len(self._soft))
         _turn(self._place, rotations, 1.0, self._soft, z)
         return z
 
     def at(self, q: Array | None) -> Turned:
-        """The preconditioner of a tangent at displacements q (n,), m."""
+        """Return the preconditioner of a tangent at displacements q (n,), m."""
         return Turned(self, self.turned(q))
 
 
@@ -278,22 +284,10 @@ class BlockJacobi:
     """The plain preconditioner: the inverse of each node's 3x3 block of the tangent itself."""
 
     def __init__(self, pattern: Pattern) -> None:
-        first = pattern.indptr[:-1:3]
-        second, third = pattern.indptr[1::3], pattern.indptr[2::3]
-        self._places = np.stack(
-            [
-                first,
-                first + 1,
-                first + 2,
-                first + 1,
-                second,
-                second + 1,
-                first + 2,
-                second + 1,
-                third,
-            ],
-            axis=1,
-        )
+        first, second, third = pattern.indptr[:-1:3], pattern.indptr[1::3], pattern.indptr[2::3]
+        top, middle = (first, first + 1, first + 2), (first + 1, second, second + 1)
+        bottom = (first + 2, second + 1, third)
+        self._places = np.stack([*top, *middle, *bottom], axis=1)
 
     def take(self, values: Array) -> None:
         """Invert the diagonal blocks of a tangent."""
@@ -315,7 +309,10 @@ class Preconditioner(Protocol):
 
 
 def condition_number(pattern: Pattern, values: Array, factor: Factor, iterations: int = 4) -> float:
-    """The ratio of the extreme eigenvalues of a symmetric positive definite matrix, from below, by power iteration both ways."""
+    """Estimate a symmetric positive definite matrix' condition number, from below.
+
+    Power iterations with the matrix and with its inverse give the extreme eigenvalues.
+    """
     x = np.random.default_rng(0).normal(size=pattern.n)
     y, z = x / np.linalg.norm(x), np.empty(pattern.n)
     largest = smallest = 1.0
@@ -336,12 +333,12 @@ def conjugate_gradients(
     tolerance: float,
     max_iterations: int = MAX_ITERATIONS,
 ) -> tuple[Array, int]:
-    """Solve K x = rhs to a relative tolerance; returns x and the number of iterations.
+    """Solve K x = rhs to a relative tolerance; return x and the number of iterations.
 
     Raises
     ------
     NotPositiveDefiniteError
-        Where a direction of negative curvature is met, or the iterations do not suffice.
+        If a direction of negative curvature is met, or the iterations do not suffice.
     """
     x, r, p, q = np.zeros_like(rhs), rhs.copy(), np.zeros_like(rhs), np.empty_like(rhs)
     target, rz = tolerance * float(np.linalg.norm(rhs)), 1.0
@@ -352,7 +349,7 @@ def conjugate_gradients(
         rz, before = float(r @ z), rz
         p = z + (rz / before) * p
         multiply(pattern.indptr, pattern.indices, values, p, q)
-        # The product with K, of which one triangle is stored, and six with vectors.
+        # One product with K, whose upper triangle is stored, and six with vectors.
         count(multiply_adds=2 * len(values) + 5 * len(p))
         curvature = float(p @ q)
         if not curvature > 0.0:
@@ -363,7 +360,7 @@ def conjugate_gradients(
 
 
 class JacobiFactor:
-    """What stands for a factor where there is none: conjugate gradients with a matrix's diagonal blocks."""
+    """A `Factor` without a factorisation, by conjugate gradients with the diagonal blocks."""
 
     def __init__(self, pattern: Pattern, values: Array) -> None:
         self._pattern, self._values, self._jacobi = pattern, values, BlockJacobi(pattern)

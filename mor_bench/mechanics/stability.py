@@ -1,4 +1,4 @@
-"""Stability of an equilibrium, and the limit load of the path that begins at rest."""
+"""Stability of an equilibrium, and the limit load of the equilibrium path from rest."""
 
 from __future__ import annotations
 
@@ -14,35 +14,39 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from mor_bench.errors import LimitPointError, SolverError
 from mor_bench.mechanics.assembly import Assembler
 from mor_bench.mechanics.linear import NotPositiveDefiniteError
-from mor_bench.mechanics.newton import NewtonOptions, Problem, solve_equilibrium
+from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
+from mor_bench.mechanics.problem import Problem
 
 Array = NDArray[np.float64]
 
 DENSE_UP_TO = 300
-"""Unknowns up to which all eigenvalues are computed."""
+"""Largest number of unknowns for which a dense solver finds the eigenvalue."""
 LEAP = 0.25
-"""How far an increment may lie from the mean of the linear predictions at both its ends, relative to its length."""
+"""Largest distance of an increment from the mean of the linear predictions at its two ends.
+
+Relative to the increment's length; a larger distance is a leap to another path.
+"""
 FIRST_INCREMENT = 1.0 / 16.0
 
 
 class AssembledProblem(Problem, Protocol):
-    """A `Problem` that shows its assembler: `FullOrderModel`, `GalerkinProblem`."""
+    """A `Problem` with an assembler, e.g. `FullOrderModel` or `GalerkinProblem`."""
 
     assembler: Assembler
 
 
 @dataclass(frozen=True)
 class LimitPoint:
-    """The end of the stable path that begins at rest.
+    """End of the stable path from rest.
 
     Attributes
     ----------
     factor : float
         Factor on the load.
     lowest_eigenvalue : float
-        Of the last stable tangent, relative to rest; see `lowest_tangent_eigenvalue`.
+        Lowest eigenvalue of the last stable tangent; see `lowest_tangent_eigenvalue`.
     displacement : (n_unknowns,) float64
-        The last stable state, m.
+        Last stable state, m.
     """
 
     factor: float
@@ -53,44 +57,33 @@ class LimitPoint:
 def _matrix(problem: AssembledProblem, tangent: Array) -> Array | sp.csr_array:
     if tangent.ndim == 2:
         return tangent
-    pattern = problem.assembler.pattern
-    upper = sp.csr_array((tangent, pattern.indices, pattern.indptr), shape=(pattern.n, pattern.n))
-    return sp.csr_array(upper + sp.triu(upper, 1).T)
+    return problem.assembler.pattern.symmetric(tangent)
 
 
 def lowest_tangent_eigenvalue(problem: AssembledProblem, q: Array) -> float:
-    """Lowest μ of K(q) x = μ K(0) x, without unit: 1 at rest, and not positive where the equilibrium is not stable.
+    """Return the lowest μ of K(q) x = μ K(0) x at displacements q (n_unknowns,), m.
 
-    Relative to the stiffness at rest it depends on neither the mesh nor Young's modulus.
-
-    Parameters
-    ----------
-    problem : AssembledProblem
-    q : (n_unknowns,) float64
-        m.
+    It is 1 at rest and not positive where the equilibrium is unstable. It depends on neither the
+    mesh size nor Young's modulus.
     """
-    tangent, rest = (
-        _matrix(problem, problem.linearise(q)[1]),
-        _matrix(problem, problem.rest_tangent),
-    )
-    n = problem.n_unknowns
+    tangent = _matrix(problem, problem.linearise(q)[1])
+    rest, n = _matrix(problem, problem.rest_tangent), problem.n_unknowns
     if n <= DENSE_UP_TO:
         here, there = (m if isinstance(m, np.ndarray) else m.toarray() for m in (tangent, rest))
         return float(scipy.linalg.eigvalsh(here, there, subset_by_index=(0, 0))[0])
     inverse = LinearOperator((n, n), matvec=problem.rest_factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).normal(size=n)
-    return float(
-        eigsh(
-            tangent,
-            1,
-            M=rest,
-            Minv=inverse,
-            which="SA",
-            v0=start,
-            tol=1e-8,
-            return_eigenvectors=False,
-        )[0]
+    lowest = eigsh(
+        tangent,
+        1,
+        M=rest,
+        Minv=inverse,
+        which="SA",
+        v0=start,
+        tol=1e-8,
+        return_eigenvectors=False,
     )
+    return float(lowest[0])
 
 
 def limit_load(
@@ -98,8 +91,8 @@ def limit_load(
 ) -> LimitPoint | None:
     """Follow the stable path from rest until its tangent is no longer positive definite.
 
-    The load factor grows in increments, each solved from the state before and halved where the solver finds no stable
-    equilibrium, or one that is not the neighbour of the state before (a snap-through).
+    The load factor grows in increments, each solved from the previous state. An increment is halved
+    if the solver finds no stable equilibrium, or one on another path (a snap-through).
 
     Parameters
     ----------
@@ -107,36 +100,33 @@ def limit_load(
     load : (n_unknowns,) float64
         N.
     most : float
-        Factor at which to stop.
+        Load factor at which to stop.
     tolerance : float
-        Of the limit's factor, relative.
+        Relative tolerance of the limit's load factor.
 
     Returns
     -------
     LimitPoint or None
-        None where the path is stable up to ``most``.
+        None if the path is stable up to ``most``.
     """
 
     def speed(q: Array) -> Array:
         return problem.step(q, problem.linearise(q)[1], load, 1e-3)
 
     def neighbour(target: float) -> tuple[Array, Array] | None:
-        """State and speed at the target, unless it was not reached or only by a leap to another path."""
+        """Return state and speed at the target; None if it is not reached on this path."""
         try:
-            there = solve_equilibrium(
-                problem, target * load, q, NewtonOptions(max_cuts=0)
-            ).displacement
+            found = solve_equilibrium(problem, target * load, q, NewtonOptions(max_cuts=0))
+            there = found.displacement
             after = speed(there)
         except (SolverError, NotPositiveDefiniteError):
             return None
         predicted = 0.5 * (target - reached) * (before + after)
-        return (
-            (there, after)
-            if np.linalg.norm(there - q - predicted) <= LEAP * np.linalg.norm(there - q)
-            else None
-        )
+        leaps = np.linalg.norm(there - q - predicted) > LEAP * np.linalg.norm(there - q)
+        return None if leaps else (there, after)
 
-    q, reached, increment, successes = np.zeros(problem.n_unknowns), 0.0, FIRST_INCREMENT * most, 0
+    q, reached = np.zeros(problem.n_unknowns), 0.0
+    increment, successes = FIRST_INCREMENT * most, 0
     before = speed(q)
     while reached < most:
         target = min(most, reached + increment)
@@ -153,18 +143,19 @@ def limit_load(
 
 
 def solve_on_path(problem: AssembledProblem, load: Array) -> Array:
-    """The equilibrium that the body reaches when the load grows slowly from zero, (n_unknowns,) m.
+    """Return the equilibrium (n_unknowns,), m, that a slowly growing load reaches from rest.
 
     Raises
     ------
     LimitPointError
-        If the path ends before; the message gives the limit's factor and the lowest eigenvalue there.
+        If the path ends before. The message gives the limit's load factor and lowest eigenvalue.
     """
     limit = limit_load(problem, load)
     if limit is not None:
         raise LimitPointError(
-            f"no stable equilibrium on the path from rest: it ends at {limit.factor:.6g} of the load, "
-            f"where the lowest tangent eigenvalue is {limit.lowest_eigenvalue:.3g} of that at rest.",
+            "no stable equilibrium on the path from rest: it ends at "
+            f"{limit.factor:.6g} of the load, where the lowest tangent eigenvalue is "
+            f"{limit.lowest_eigenvalue:.3g} of that at rest.",
             load_factor=limit.factor,
             lowest_eigenvalue=limit.lowest_eigenvalue,
         )

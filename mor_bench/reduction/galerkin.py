@@ -13,15 +13,16 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 from mor_bench.counting import cholesky_multiply_adds, count, triangular_multiply_adds
 from mor_bench.errors import InvalidInputError, SolverError
-from mor_bench.mechanics.assembly import Assembler, Pattern, State
+from mor_bench.mechanics.assembly import Assembler, State
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
 from mor_bench.mechanics.newton import (
     MAX_LOAD_N,
     NewtonOptions,
     Solution,
-    is_linear,
     solve_equilibrium,
 )
+from mor_bench.mechanics.pattern import Pattern
+from mor_bench.mechanics.problem import is_linear
 from mor_bench.reduction.points import ReducedPoints
 
 

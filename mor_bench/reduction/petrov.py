@@ -15,13 +15,12 @@ from mor_bench.counting import count, triangular_multiply_adds, uncounted
 from mor_bench.errors import InvalidInputError, InvertedElementError, NoEquilibriumError
 from mor_bench.mechanics.newton import (
     HOPELESS,
-    LINEAR,
     MAX_ITERATIONS,
     MAX_LOAD_N,
     PLAIN_ITERATIONS,
-    ROUND_OFF,
     NewtonOptions,
 )
+from mor_bench.mechanics.problem import LINEAR, ROUND_OFF
 from mor_bench.reduction.points import ReducedPoints
 
 Array = NDArray[np.float64]

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.counting import cholesky_multiply_adds, count, triangular_multiply_adds
-from mor_bench.mechanics.assembly import State, quadrature_of
+from mor_bench.mechanics.assembly import Discretisation, State, quadrature_of
 from mor_bench.mechanics.laws import SAINT_VENANT_KIRCHHOFF, point_multiply_adds, point_stresses
-from mor_bench.mechanics.newton import HOPELESS, PLAIN_ITERATIONS, ROUND_OFF, Solution
+from mor_bench.mechanics.newton import HOPELESS, PLAIN_ITERATIONS, Solution
+from mor_bench.mechanics.problem import ROUND_OFF
 from mor_bench.reduction.point_kernels import LANES, full_steps, gradients, integrate, project
-from mor_bench.scene.materials import Material
 
 Array = NDArray[np.float64]
 
@@ -55,13 +55,7 @@ class ReducedPoints:
 
     Parameters
     ----------
-    points : (n_nodes, 3) float64
-        Reference positions, m.
-    cells : (n_cells, 8) or (n_cells, 4) int
-        The cells to sum over.
-    material : Material
-    selective : bool
-        As for `Assembler`.
+    body : Discretisation
     factors : (n_cells,) or (n_cells, n_cell_points) float64
         Cubature weights, which multiply those of the quadrature; points with none are left out.
     modes : (n_nodes, 3, r) float64
@@ -76,15 +70,12 @@ class ReducedPoints:
 
     def __init__(
         self,
-        points: Array,
-        cells: NDArray[np.int64],
-        material: Material,
-        selective: bool,
+        body: Discretisation,
         factors: Array,
         modes: Array,
         test_modes: Array | None = None,
     ) -> None:
-        rule = quadrature_of(points, cells, material, selective)
+        rule, cells = quadrature_of(body), body.cells
         weights = (rule.weights * factors.reshape(len(cells), -1)).ravel()
         kept = np.flatnonzero(weights)
         self.n_cells, self.n_points, self.n_unknowns = len(cells), len(kept), modes.shape[2]
@@ -96,7 +87,10 @@ class ReducedPoints:
             else _mode_gradients(rule.gradients, test_modes[cells], kept)
         )
         self.weights = _batched(weights[kept])
-        self.law, self.parameters = material.law, np.tile(rule.parameters, (len(cells), 1))[kept]
+        self.law, self.parameters = (
+            body.material.law,
+            np.tile(rule.parameters, (len(cells), 1))[kept],
+        )
         self._lame = _batched(self.parameters) if self.law == SAINT_VENANT_KIRCHHOFF else None
         r = self.n_unknowns
         force, tangent = (

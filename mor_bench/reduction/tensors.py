@@ -28,7 +28,7 @@ from mor_bench.counting import (
     triangular_multiply_adds,
 )
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.assembly import State, quadrature_of
+from mor_bench.mechanics.assembly import State, discretisation_of, quadrature_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import HOPELESS, NewtonOptions, solve_equilibrium
 from mor_bench.reduction.galerkin import DenseProblem
@@ -138,9 +138,7 @@ class _Gradients:
     """Gradients of the modes at the quadrature points of a mesh, a few cells at a time."""
 
     def __init__(self, model: FullOrderModel, modes: Array, chunk_bytes_per_point: int) -> None:
-        mesh, scene = model.scene.mesh, model.scene
-        assert scene.material is not None
-        self.quadrature = quadrature_of(mesh.points, mesh.cells, scene.material, scene.selective)
+        self.quadrature = quadrature_of(discretisation_of(model.scene))
         self.n_modes = modes.shape[1]
         self._local = np.vstack([modes, np.zeros(self.n_modes)])
         self._cell_dofs = model.cell_dofs

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from mor_bench.errors import InvalidInputError, UnsupportedSceneError
+from mor_bench.mechanics.assembly import discretisation_of
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.reduction.basis import pod
@@ -77,12 +78,7 @@ def reduced_points(
     test_modes: Array | None = None,
 ) -> ReducedPoints:
     """The scene's law over some of its cells, with nodal modes and test modes (n_nodes, 3, r)."""
-    if scene.material is None:
-        raise UnsupportedSceneError(NO_EQUATIONS)
-    mesh = scene.mesh
-    return ReducedPoints(
-        mesh.points, mesh.cells[cells], scene.material, scene.selective, weights, modes, test_modes
-    )
+    return ReducedPoints(discretisation_of(scene, cells), weights, modes, test_modes)
 
 
 CUBATURE_TOLERANCES = (3e-2, 1e-2, 3e-3, 1e-3)

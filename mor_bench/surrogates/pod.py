@@ -24,11 +24,9 @@ from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
 
 
-def stiffness_at_rest(model: FullOrderModel) -> sp.csr_matrix:
-    """K₀ over the free dofs, (n_free, n_free), N/m."""
-    pattern, n = model.assembler.pattern, model.n_unknowns
-    upper = sp.csr_matrix((model.rest_tangent, pattern.indices, pattern.indptr), shape=(n, n))
-    return sp.csr_matrix(upper + sp.triu(upper, 1).T)
+def stiffness_at_rest(model: FullOrderModel) -> sp.csr_array:
+    """Return the stiffness at rest K₀ over the free dofs, (n_free, n_free), N/m."""
+    return model.assembler.pattern.symmetric(model.rest_tangent)
 
 
 @dataclass(eq=False)

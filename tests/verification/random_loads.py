@@ -19,7 +19,8 @@ from rich.progress import track
 from threadpoolctl import threadpool_limits
 
 import mor_bench
-from mor_bench.mechanics.linear import BandedCholesky, NotPositiveDefiniteError
+from mor_bench.mechanics.banded import BandedCholesky
+from mor_bench.mechanics.linear import NotPositiveDefiniteError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, Solution
 from mor_bench.snapshots.sampling import draw_loads

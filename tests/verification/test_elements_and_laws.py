@@ -21,9 +21,9 @@ from mor_bench.hard_cases.setups import (
     patch_test_error,
     tip,
 )
-from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.assembly import Assembler, Discretisation
+from mor_bench.mechanics.banded import BandedCholesky
 from mor_bench.mechanics.elements import H8, T4, shape_gradients
-from mor_bench.mechanics.linear import BandedCholesky
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.materials import (
     Material,
@@ -377,7 +377,7 @@ def manufactured_error(n: int, element: str, selective: bool, law: Material) -> 
     dofs[~outer] = np.arange(3 * free).reshape(-1, 3)
     load = np.zeros(3 * free + 1)
     np.add.at(load, dofs[mesh.cells], np.einsum("qa,cq,cqi->cai", shape, volume, body_force(x)))
-    model = Assembler(mesh.points, mesh.cells, dofs, 3 * free, law, selective=selective)
+    model = Assembler(Discretisation(mesh.points, mesh.cells, law, selective), dofs, 3 * free)
     solver, u = BandedCholesky(model.pattern), np.zeros(3 * free)
     for _ in range(5):
         state, values = model.force_and_tangent(u)

@@ -28,7 +28,7 @@ from mor_bench.hard_cases.setups import (
     make_bars,
     material_table,
 )
-from mor_bench.mechanics.linear import BandedCholesky
+from mor_bench.mechanics.banded import BandedCholesky
 from mor_bench.mechanics.model import SOLVERS, FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.runs.file_check import check_file

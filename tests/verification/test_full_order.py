@@ -18,14 +18,14 @@ from mor_bench.errors import (
     UnconstrainedBodyError,
 )
 from mor_bench.hard_cases.setups import LAW, dense, distorted_box, free_assembler
-from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.assembly import Assembler, Discretisation
+from mor_bench.mechanics.banded import BandedCholesky
 from mor_bench.mechanics.linear import (
-    BandedCholesky,
-    MultigridFactor,
     NotPositiveDefiniteError,
     SparseLU,
 )
 from mor_bench.mechanics.model import SOLVERS, FullOrderModel
+from mor_bench.mechanics.multigrid import MultigridFactor
 from mor_bench.mechanics.rotated import BlockJacobi, conjugate_gradients
 from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.mesh import Mesh, box_mesh
@@ -169,7 +169,9 @@ def test_banded_solver_reorders_a_badly_numbered_mesh() -> None:
     fixed = points[:, 0] == 0
     dofs = np.full((mesh.n_nodes, 3), 3 * int((~fixed).sum()))
     dofs[~fixed] = np.arange(3 * int((~fixed).sum())).reshape(-1, 3)
-    assembler = Assembler(points, shuffle[mesh.cells], dofs, 3 * int((~fixed).sum()), LAW)
+    assembler = Assembler(
+        Discretisation(points, shuffle[mesh.cells], LAW), dofs, 3 * int((~fixed).sum())
+    )
     values = assembler.force_and_tangent(np.zeros(assembler.n_dofs))[1]
     solver = BandedCholesky(assembler.pattern)
     assert solver.bandwidth < assembler.n_dofs // 3
@@ -304,7 +306,7 @@ def test_conjugate_gradients_notice_an_indefinite_tangent(
 def test_multigrid_solves_as_the_banded_factor_does_and_accelerates(
     large: FullOrderModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mor_bench.mechanics.linear.MAX_BAND_ENTRIES", 0)
+    monkeypatch.setattr("mor_bench.mechanics.model.MAX_BAND_ENTRIES", 0)
     model = FullOrderModel(large.scene)
     rhs = np.random.default_rng(0).normal(size=(large.n_unknowns, 2))
     assert isinstance(model.rest_factor, MultigridFactor)
@@ -339,7 +341,7 @@ def test_multigrid_bears_plates_or_says_why_not(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IllConditionedWarning)
         expected = FullOrderModel(scene).rest_factor.solve(np.ones(len(scene.free_dofs)))
-    monkeypatch.setattr("mor_bench.mechanics.linear.MAX_BAND_ENTRIES", 0)
+    monkeypatch.setattr("mor_bench.mechanics.model.MAX_BAND_ENTRIES", 0)
     try:
         found = FullOrderModel(scene).rest_factor.solve(np.ones(len(scene.free_dofs)))
     except SolverError as error:

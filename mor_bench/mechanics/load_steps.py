@@ -1,0 +1,50 @@
+"""Bookkeeping of a load that is applied in increments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass
+class LoadSteps:
+    """Increments of a load factor from 0 to 1, halved on failure and doubled on success.
+
+    Attributes
+    ----------
+    increment : float
+        Next increment of the load factor.
+    reached : float
+        Largest load factor that was solved for.
+    cuts : int
+        Number of halvings.
+    """
+
+    increment: float
+    reached: float = 0.0
+    cuts: int = 0
+
+    @property
+    def target(self) -> float:
+        """The load factor to solve for next."""
+        return min(1.0, self.reached + self.increment)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the whole load has been solved for."""
+        return self.reached == 1.0
+
+    def accept(self) -> None:
+        """Record that the target was reached, and double the increment."""
+        self.reached, self.increment = self.target, 2.0 * self.increment
+
+    def cut(self) -> None:
+        """Record that the target was not reached, and halve the increment."""
+        self.cuts += 1
+        self.increment *= 0.5
+
+    def story(self, iterations: int) -> str:
+        """Describe for an error message how far the load was followed."""
+        return (
+            f"stopped at {self.reached:.4g} of the load after {iterations} iterations "
+            f"and {self.cuts} cut-backs"
+        )

@@ -1,0 +1,111 @@
+"""What the nonlinear solve needs of a model, and what its passes share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.mechanics.assembly import State
+from mor_bench.mechanics.linear import Factor
+
+Array = NDArray[np.float64]
+
+ROUND_OFF = 1e-13
+"""A correction this small relative to the displacement is round-off.
+
+Slender bodies never meet a force tolerance, so such a correction ends the solve. Once the residual
+falls no further, so does a correction this small relative to the body, because strains lose their
+digits to the 1 in F.
+"""
+LINEAR = 1e-11
+"""Relative size, to the body, of displacements that the stiffness at rest gives to all digits."""
+
+
+class Turning(Protocol):
+    """An approximate inverse of all tangents, which turns with the body."""
+
+    def turned(self, q: Array | None) -> Array:
+        """Return the nodal rotations of the body at q; the identity for None."""
+        ...
+
+    def soft(self, rotations: Array) -> Array:
+        """Return the turned response at rest to a random force; soft modes dominate it."""
+        ...
+
+    def solve_many(self, residuals: Sequence[Array], rotations: Sequence[Array]) -> Array:
+        """Return corrections (m, n_unknowns), each for one residual under its own rotations.
+
+        A correction does not depend on the other residuals.
+        """
+        ...
+
+
+class Problem(Protocol):
+    """A model with unknowns q that the nonlinear solve can handle.
+
+    Attributes
+    ----------
+    n_unknowns : int
+    extent : float
+        Unknowns of this size are displacements of the size of the body.
+    """
+
+    n_unknowns: int
+    extent: float
+
+    @property
+    def accelerator(self) -> Turning | None:
+        """Approximate inverse for the accelerated pass; None if the model has none."""
+        ...
+
+    def force(self, q: Array) -> State: ...
+    def linearise(self, q: Array) -> tuple[State, Array]:
+        """Return the state and the tangent at q."""
+        ...
+
+    def step(self, q: Array, tangent: Array, residual: Array, tolerance: float) -> Array:
+        """Solve tangent · step = residual; iterative solvers stop at the relative tolerance.
+
+        Raises `NotPositiveDefiniteError` where the tangent proves not positive definite.
+        """
+        ...
+
+    def certify(self, q: Array) -> None:
+        """Look for negative curvature at a solution q, unless the steps to it excluded that.
+
+        Raises `NotPositiveDefiniteError` where there is some.
+        """
+        ...
+
+    @property
+    def rest_tangent(self) -> Array: ...
+    @property
+    def rest_factor(self) -> Factor: ...
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """The outcome of one pass of the nonlinear solve."""
+
+    q: Array
+    min_det_f: float
+    iterations: int
+    converged: bool
+
+    @property
+    def valid(self) -> bool:
+        return self.converged and self.min_det_f > 0
+
+
+def is_round_off(step: Array, q: Array, extent: float = 0.0) -> bool:
+    """Return whether a step is round-off relative to q, or to the extent if that is larger."""
+    return float(np.abs(step).max()) <= ROUND_OFF * max(float(np.abs(q).max()), extent)
+
+
+def is_linear(problem: Problem, q: Array) -> bool:
+    """Return whether a linear response is so small that it solves the nonlinear problem."""
+    return float(np.abs(q).max()) <= LINEAR * problem.extent
