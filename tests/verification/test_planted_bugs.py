@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from .planted_bugs import BUGS, Bug, sources
+from .planted_bugs import BUGS, Bug
 
 
 @pytest.mark.parametrize("bug", BUGS, ids=lambda bug: bug.name)
-def test_a_planted_bug_finds_its_text_exactly_once(bug: Bug) -> None:
-    right, wrong = sources(bug)
+def test_a_planted_bug_finds_its_text_exactly_once_and_compiles(bug: Bug) -> None:
+    right, wrong = bug.sources()
     assert right != wrong
     compile(wrong, bug.file, "exec")
+    assert bug.selection
