@@ -1,4 +1,4 @@
-"""Uniform refinement: the same body, eight cells for one, and a finer mesh that fits together."""
+"""Uniform refinement: the same body with eight cells for each, and a finer mesh without gaps."""
 
 from __future__ import annotations
 
@@ -11,68 +11,57 @@ from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.mesh import Mesh, box_mesh
-from mor_bench.scene.scene import load_scene, refined, with_cells
+from mor_bench.scene.scene import Scene, load_scene, refined, with_cells
 from mor_bench.scene.subdivision import subdivide
 
 
 def volumes(mesh: Mesh) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     element = element_of(mesh.cells)
-    return np.asarray(
-        shape_gradients(mesh.points, mesh.cells, element.derivatives)[1] @ element.weights
-    )
+    det_j = shape_gradients(mesh.points, mesh.cells, element.derivatives)[1]
+    return np.asarray(det_j @ element.weights)
 
 
-def bent(tetrahedra: bool) -> Mesh:
-    mesh = box_mesh((2.0, 1.0, 1.0), (4, 2, 3), tetrahedra)
-    x, y, z = mesh.points.T
-    return Mesh(np.stack([x + 0.2 * y * z, y + 0.1 * x * z, z + 0.15 * x * y], axis=1), mesh.cells)
+def off_grid(scene: Scene) -> Scene:
+    return refined(replace(scene, mesh=Mesh(scene.mesh.points, scene.mesh.cells)))
+
+
+def places(points: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> set[tuple[float, ...]]:
+    return {tuple(p) for p in np.round(points, 9)}
 
 
 @pytest.mark.parametrize("tetrahedra", [False, True])
-def test_a_subdivided_mesh_fills_the_same_body_and_fits_together(tetrahedra: bool) -> None:
-    coarse = bent(tetrahedra)
+def test_a_subdivided_mesh_fills_the_same_body_without_gaps(tetrahedra: bool) -> None:
+    box = box_mesh((2.0, 1.0, 1.0), (4, 2, 3), tetrahedra)
+    x, y, z = box.points.T
+    bent = np.stack([x + 0.2 * y * z, y + 0.1 * x * z, z + 0.15 * x * y], axis=1)
+    coarse = Mesh(bent, box.cells)
     fine, parents = subdivide(coarse)
     assert fine.n_cells == 8 * coarse.n_cells
     assert volumes(fine).min() > 0
-    assert volumes(fine).sum() == pytest.approx(
-        volumes(coarse).sum(), rel=1e-12 if tetrahedra else 1e-3
-    )
+    accuracy = 1e-12 if tetrahedra else 1e-3
+    assert volumes(fine).sum() == pytest.approx(volumes(coarse).sum(), rel=accuracy)
     assert len(fine.boundary_facets) == 4 * len(coarse.boundary_facets)
-    assert (
-        len(np.unique(np.round(fine.points, 9), axis=0))
-        == fine.n_nodes
-        == len(np.unique(fine.cells))
-    )
+    assert len(places(fine.points)) == fine.n_nodes == len(np.unique(fine.cells))
     np.testing.assert_allclose(fine.points, coarse.points[parents].mean(axis=1), rtol=0, atol=1e-12)
-    weights = interpolation_matrix(coarse, fine.points)
-    field = coarse.points**2
+    weights, field = interpolation_matrix(coarse, fine.points), coarse.points**2
     np.testing.assert_allclose(weights @ field, field[parents].mean(axis=1), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["beam-tiny", "l-shape"])
-def test_subdivision_of_a_grid_is_the_finer_grid(name: str) -> None:
+def test_subdivision_of_a_grid_gives_the_finer_grid(name: str) -> None:
     scene = load_scene(name)
     nx, ny, nz = (2 * n for n in scene.spec.geometry.cells)  # type: ignore[union-attr]
-    expected = with_cells(scene, (nx, ny, nz))
-    off_grid = refined(replace(scene, mesh=Mesh(scene.mesh.points, scene.mesh.cells)))
-    assert {tuple(p) for p in np.round(off_grid.mesh.points, 9)} == {
-        tuple(p) for p in np.round(expected.mesh.points, 9)
-    }
-    held = [
-        {tuple(p) for p in np.round(s.mesh.points[s.fixed_nodes], 9)} for s in (off_grid, expected)
-    ]
+    expected, found = with_cells(scene, (nx, ny, nz)), off_grid(scene)
+    assert places(found.mesh.points) == places(expected.mesh.points)
+    held = [places(s.mesh.points[s.fixed_nodes]) for s in (found, expected)]
     assert held[0] == held[1]
     assert refined(scene).mesh.grid_shape == expected.mesh.grid_shape
 
 
 def test_answers_on_the_subdivided_mesh_are_those_on_the_finer_grid() -> None:
     scene = load_scene("beam-tiny")
-    on_grid, off_grid = (
-        refined(scene),
-        refined(replace(scene, mesh=Mesh(scene.mesh.points, scene.mesh.cells))),
-    )
     answers = []
-    for finer in (on_grid, off_grid):
+    for finer in (refined(scene), off_grid(scene)):
         tip = finer.mesh.points[:, 0] == 2.0
         load = np.zeros((finer.mesh.n_nodes, 3))
         load[tip, 2] = -2.0 / tip.sum()
