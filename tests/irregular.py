@@ -14,7 +14,7 @@ def irregular_box(
     jitter: float = 0.25,
     seed: int = 0,
 ) -> Mesh:
-    """Return a box with nodes moved by up to ``jitter`` cells, on faces within them, in random order."""
+    """Return a box with nodes in random order, moved by up to ``jitter`` cells; faces stay flat."""
     generator = np.random.default_rng(seed)
     box = box_mesh(size_m, cells, tetrahedra)
     free = (box.points > box.bounds[0]) & (box.points < box.bounds[1])

@@ -31,7 +31,7 @@ def moved(mesh: Mesh, offset: NDArray[np.float64], scale: float) -> Mesh:
 
 @st.composite
 def irregular(draw: st.DrawFn) -> Mesh:
-    """Boxes of any size, place and aspect, of either cell, with nodes on and in the bounding box."""
+    """Draw boxes of any size, place and aspect, of either cell."""
     size = draw(st.tuples(*[st.floats(0.3, 3.0)] * 3))
     cells = draw(st.tuples(*[st.integers(1, 4)] * 3))
     mesh = irregular_box(size, cells, draw(st.booleans()), seed=draw(st.integers(0, 99)))

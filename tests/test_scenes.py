@@ -154,7 +154,7 @@ def on_surface(surface: str, cells: list[int], unit_m: float = 1.0, **loads: Any
 def test_a_users_surface_becomes_a_scene_wherever_its_file_lies(tmp_path: Path) -> None:
     """A cube of 2 cm, in centimetres, with its lowest corner at (1, 0, 0)."""
     cube = box_mesh((2.0, 2.0, 2.0), (1, 1, 1))
-    corners = triangles_of((cube.points + [1.0, 0, 0])[cube.boundary_facets])
+    corners = triangles_of(np.add(cube.points, [1.0, 0, 0])[cube.boundary_facets])
     cubes, loads = [], {"patch_area_m2": 1e-4, "magnitude_n": [0.0, 1e-3], "region": "z-max"}
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
@@ -175,7 +175,7 @@ def test_a_users_surface_becomes_a_scene_wherever_its_file_lies(tmp_path: Path) 
         load_scene(first.spec)
 
 
-@pytest.mark.parametrize("name", sorted(list_suite("datasets")))
+@pytest.mark.parametrize("name", sorted({*list_suite("datasets")} - {"liver-hex-observed"}))
 def test_every_load_patch_lies_on_the_surface_and_pushes_something_that_can_move(name: str) -> None:
     spec = load_generated_spec(name)
     for scene in map(load_scene, [spec, spec_of_set(spec, "unseen-regions")]):
@@ -188,7 +188,7 @@ def test_every_load_patch_lies_on_the_surface_and_pushes_something_that_can_move
 
 
 def rod(n: int = 24) -> NDArray[np.float64]:
-    """Return a rod of 0.2 m with two long triangles for each of n sides, as CAD programs write it."""
+    """Return a rod of 0.2 m with two long triangles for each of n sides, as in CAD files."""
     angle = 2 * np.pi * np.arange(n) / n
     ring = 0.02 * np.stack([np.zeros(n), np.cos(angle), np.sin(angle)], axis=1)
     along, centre = np.array([0.2, 0.0, 0.0]), np.zeros(3)
@@ -203,8 +203,8 @@ def test_patches_on_long_triangles_have_their_area_and_moment(tmp_path: Path) ->
     path, cells = write_stl(tmp_path / "rod.stl", rod()), [20, 5, 5]
     with pytest.raises(SpecError, match="the area of the load region"):
         load_scene(on_surface(path, cells, region="x-max", patch_area_m2=2e-3, kind="normal"))
-    loads = {"region": "surface", "patch_area_m2": 2e-4, "kind": "normal"}
-    scene = load_scene(on_surface(path, cells, **loads))
+    spec = on_surface(path, cells, region="surface", patch_area_m2=2e-4, kind="normal")
+    scene = load_scene(spec)
     patches, surface = scene.patches, scene.surface
     np.testing.assert_allclose(patches.areas.sum(axis=1), 2e-4, rtol=1e-12)
     points, shares = scene.patch_points(np.arange(len(scene.patch_nodes)))

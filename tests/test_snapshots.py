@@ -1,8 +1,9 @@
-"""Sampling, splits, and datasets as they are read."""
+"""Splits and named test sets: what is kept apart, and datasets as they are read."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,91 +11,57 @@ import pytest
 import mor_bench
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.snapshots.dataset import Dataset
-from mor_bench.snapshots.sampling import PatchLoads, draw_loads
+from mor_bench.scene.scene import load_scene
+from mor_bench.snapshots.dataset import Dataset, load_dataset
+from mor_bench.snapshots.generate import dataset_folder, read_shards
+from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of, repeated
 from mor_bench.snapshots.split import split_samples
-from mor_bench.specs import Split
+from mor_bench.snapshots.test_sets import available_sets, check_regions, spec_of_set, why_not
+from mor_bench.specs import DatasetSpec, Split, list_suite, load_generated_spec
 
 
-def test_patch_weights_are_a_partition_of_the_force_and_mesh_independent(tiny_scene: Scene) -> None:
-    weights = tiny_scene.patch_weights.toarray()
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=1e-14)
-    assert (weights >= 0).all()
-    mesh = tiny_scene.mesh
-    assert not weights[:, mesh.points[:, 2] < 1.0].any()
-    finer = mor_bench.load_scene(
-        {
-            **tiny_scene.spec.model_dump(mode="json"),
-            "geometry": {"shape": "box", "size_m": [2.0, 1.0, 1.0], "cells": [12, 4, 4]},
-        }
-    )
-    fine_weights = finer.patch_weights.toarray()
-    for row, node in enumerate(tiny_scene.patch_nodes):
-        same = int(
-            np.linalg.norm(
-                finer.mesh.points[finer.patch_nodes] - mesh.points[node], axis=1
-            ).argmin()
-        )
-        np.testing.assert_allclose(
-            weights[row] @ mesh.points, fine_weights[same] @ finer.mesh.points, atol=5e-3
-        )
+def changed(**loads: Any) -> DatasetSpec:
+    """Return beam-tiny with other loads."""
+    spec = load_generated_spec("beam-tiny").model_dump()
+    return DatasetSpec.model_validate({**spec, "loads": {**spec["loads"], **loads}})
 
 
-def test_the_centroid_of_an_inner_patch_is_its_node(tiny_scene: Scene) -> None:
-    points = tiny_scene.mesh.points
-    for row, node in enumerate(tiny_scene.patch_nodes):
-        if 0.3 < points[node, 0] < 1.7 and points[node, 1] == 0.5:
-            np.testing.assert_allclose(
-                tiny_scene.patch_weights.toarray()[row] @ points, points[node], atol=1e-12
-            )
+@pytest.mark.parametrize("by", ["region", "direction", "sample"])
+@pytest.mark.parametrize("k", [1, 3])
+def test_splits_keep_their_parts_apart(by: Any, k: int) -> None:
+    spec = changed(samples_per_patch=200) if k == 1 else "beam-coarse-3-forces"
+    scene = load_scene(spec)
+    drawn = draw_loads(scene, 0, n_samples_of(scene))
+    train, test = split_samples(drawn, len(scene.patch_nodes), Split(test_fraction=0.2, by=by), 0)
+    assert not set(train) & set(test)
+    assert 0.1 < len(test) / (len(train) + len(test)) < 0.35
+    if k == 1 or by == "sample":
+        assert len(train) + len(test) == len(drawn)
+    if by == "region":
+        assert not set(drawn.patches[train].ravel()) & set(drawn.patches[test].ravel())
+    if by == "direction":
+        directions = drawn.vectors / np.linalg.norm(drawn.vectors, axis=2, keepdims=True)
+        axis = directions[test].reshape(-1, 3).mean(axis=0)
+        axis /= np.linalg.norm(axis)
+        # The axis is estimated from the samples, hence the margin.
+        assert (directions[test] @ axis).min() > (directions[train] @ axis).max() - 0.1
+        held = {tuple(row) for row in directions[test].reshape(-1, 3)}
+        assert not held & {tuple(row) for row in directions[train].reshape(-1, 3)}
 
 
-def test_directions_are_uniform_and_magnitudes_in_range() -> None:
-    drawn = draw_loads(mor_bench.load_scene("beam-coarse"), 0, 6400)
-    vectors = drawn.vectors[:, 0]
-    size = np.linalg.norm(vectors, axis=1)
-    assert size.min() >= 0
-    assert size.max() <= 1
-    assert np.histogram(size, bins=4, range=(0, 1))[0].min() > 1450
-    directions = vectors / size[:, None]
-    assert np.abs(directions.mean(axis=0)).max() < 0.03
-    np.testing.assert_allclose(directions.T @ directions / 6400, np.eye(3) / 3, atol=0.02)
-    np.testing.assert_array_equal(np.bincount(drawn.patches[:, 0]), 100)
-    assert len(np.unique(vectors, axis=0)) == 6400
-
-
-def test_a_sample_depends_on_seed_and_index_only() -> None:
-    scene = mor_bench.load_scene("beam-tiny")
-    whole = draw_loads(scene, 0, 50)
-    part = draw_loads(scene, 17, 23)
-    np.testing.assert_array_equal(whole.vectors[17:23], part.vectors)
-    np.testing.assert_array_equal(whole.patches[17:23], part.patches)
-    loads = scene.generated.loads.model_copy(update={"seed": 1})
-    other = draw_loads(load_scene(scene.generated.model_copy(update={"loads": loads})), 0, 50)
-    assert not np.isclose(other.vectors, whole.vectors).any()
-
-
-def test_dataset_holds_equilibria(tiny: Dataset) -> None:
-    model = FullOrderModel(tiny.scene)
-    for part in (tiny.train, tiny.test):
-        assert part.forces.shape == part.displacements.shape == (len(part), 63, 3)
-        assert part.min_det_f.min() > 0
-        for u, f in zip(part.free_displacements[:20], part.free_forces[:20], strict=True):
-            assert np.linalg.norm(f - model.force(u).force) <= 1e-8 * np.linalg.norm(f)
-    assert len(tiny.train) + len(tiny.test) + tiny.n_refused == 210
-
-
-def test_region_split_shares_no_region(tiny: Dataset) -> None:
-    assert not set(tiny.train.regions) & set(tiny.test.regions)
-    assert len(set(tiny.test.regions)) == 4
-
-
-def test_sample_split_shares_no_sample(cache: Path) -> None:
-    data = mor_bench.load_dataset("beam-tiny", split="sample", cache=cache)
-    assert (len(data.train), len(data.test)) == (168, 42)
-    together = np.concatenate([data.train.loads.vectors, data.test.loads.vectors])
-    assert len(np.unique(together, axis=0)) == 210
+def test_the_sample_split_of_the_paper_has_its_counts() -> None:
+    counts = {
+        "beam-coarse": (5120, 1280),
+        "beam-coarse-3-forces": (9888, 2472),
+        "l-shape": (4800, 1200),
+        "liver-hex": (1600, 400),
+    }
+    for name, expected in counts.items():
+        scene = load_scene(name)
+        n, k = n_samples_of(scene), scene.generated.loads.simultaneous
+        loads = PatchLoads(np.zeros((n, k), dtype=np.int64), np.zeros((n, k, 3)))
+        train, test = split_samples(loads, len(scene.patch_nodes), Split(by="sample"), 0)
+        assert (len(train), len(test)) == expected
 
 
 def test_test_regions_do_not_depend_on_the_limit() -> None:
@@ -104,8 +71,118 @@ def test_test_regions_do_not_depend_on_the_limit() -> None:
     assert test[0] == test[1]
 
 
-def test_too_few_samples_to_split(cache: Path) -> None:
+def test_a_dataset_holds_equilibria(tiny: Dataset) -> None:
+    model = FullOrderModel(tiny.scene)
+    for part in (tiny.train, tiny.test):
+        assert part.forces.shape == part.displacements.shape == (len(part), 63, 3)
+        assert part.min_det_f.min() > 0
+        for u, f in zip(part.free_displacements[:20], part.free_forces[:20], strict=True):
+            assert np.linalg.norm(f - model.force(u).force) <= 1e-8 * np.linalg.norm(f)
+    assert len(tiny.train) + len(tiny.test) + tiny.n_refused == 210
+    assert not set(tiny.train.regions) & set(tiny.test.regions)
+    assert len(set(tiny.test.regions)) == 4
+
+
+@pytest.mark.parametrize("by", ["sample", "region", "direction"])
+def test_refused_samples_are_in_no_part_and_all_others_keep_their_answers(
+    by: Any, cache: Path
+) -> None:
+    spec = changed(samples_per_patch=3, magnitude_n=[0.0, 40.0])
+    data = load_dataset(spec, split=by, cache=cache, workers=1)
+    (shard,) = read_shards(dataset_folder(spec, cache), 63)
+    valid = np.flatnonzero(shard.status == 0)
+    assert data.n_refused == 63 - len(valid) > 0
+    answers = {vector.tobytes(): shard.displacements[i] for i, vector in enumerate(shard.vectors)}
+    expected = {shard.vectors[i].tobytes() for i in valid}
+    found = [v.tobytes() for part in (data.train, data.test) for v in part.loads.vectors]
+    assert len(found) == len(expected)
+    assert set(found) == expected
+    for part in (data.train, data.test):
+        for vector, u in zip(part.loads.vectors, part.free_displacements, strict=True):
+            np.testing.assert_array_equal(u, answers[vector.tobytes()])
+        assert part.min_det_f.min() > 0
+
+
+def test_other_splits_reach_load_dataset(cache: Path) -> None:
+    data = mor_bench.load_dataset("beam-tiny", split="sample", cache=cache)
+    assert (len(data.train), len(data.test)) == (168, 42)
+    data = mor_bench.load_dataset("beam-tiny", split="direction", cache=cache)
+    assert 20 <= len(data.test) <= 70
+    assert len(data.train) + len(data.test) + data.n_refused == 210
+
+
+def test_wrong_options_are_refused(cache: Path) -> None:
     with pytest.raises(InvalidInputError, match="cannot be split"):
-        mor_bench.load_dataset("beam-tiny", limit=1, cache=cache)
+        load_dataset("beam-tiny", limit=1, cache=cache)
     with pytest.raises(InvalidInputError, match=r"`limit` must be an integer >= 1; got 0"):
-        mor_bench.load_dataset("beam-tiny", limit=0, cache=cache)
+        load_dataset("beam-tiny", limit=0, cache=cache)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'wrokers'"):
+        load_dataset("beam-tiny", wrokers=2)  # type: ignore[call-arg]
+
+
+@pytest.fixture(scope="module")
+def with_sets(cache: Path) -> Dataset:
+    tests = available_sets(load_generated_spec("beam-tiny"))
+    return load_dataset("beam-tiny", tests=tests, cache=cache, workers=1)
+
+
+def test_named_sets_of_the_tiny_beam(with_sets: Dataset) -> None:
+    sets = with_sets.tests
+    assert list(sets) == ["in-range", "2x", "4x", "unseen-regions", "several-forces"]
+    one = sets["in-range"].loads
+    for name, times in (("2x", 2), ("4x", 4)):
+        np.testing.assert_allclose(sets[name].loads.vectors, times * one.vectors, rtol=1e-12)
+        np.testing.assert_array_equal(sets[name].loads.patches, one.patches)
+    assert sets["several-forces"].loads.patches.shape[1] == 3
+    assert np.linalg.norm(one.vectors, axis=2).max() <= 4
+    assert sets["4x"].displacements.max() > sets["in-range"].displacements.max()
+    parts = [with_sets.train, with_sets.test, *sets.values()]
+    loads = [(part.scene, part.loads) for part in parts if isinstance(part.loads, PatchLoads)]
+    assert len(loads) == len(parts)
+    assert repeated(loads) == 0
+
+
+def test_unseen_regions_share_no_facet_with_the_main_set(with_sets: Dataset) -> None:
+    main, unseen = with_sets.scene, with_sets.tests["unseen-regions"]
+    check_regions(main.generated)
+    assert not set(main.patch_nodes) & set(unseen.scene.patch_nodes)
+    loaded, other = (np.abs(p.forces).sum(axis=(0, 2)) > 0 for p in (with_sets.train, unseen))
+    assert not (loaded & other).any()
+    tests = main.generated.tests.model_copy(update={"unseen_region": "y-min"})
+    with pytest.raises(InvalidInputError, match=r"they share 0 facets .* and 7 centres"):
+        check_regions(main.generated.model_copy(update={"tests": tests}))
+
+
+def test_missing_sets_give_their_reason() -> None:
+    spec = load_generated_spec("beam-tiny")
+    message = "beam-tiny has no test set 'unseen-directions': its directions are all over"
+    with pytest.raises(InvalidInputError, match=message):
+        spec_of_set(spec, "unseen-directions")
+    three = load_generated_spec("beam-coarse-3-forces")
+    assert "several forces" in str(why_not(three, "several-forces"))
+    assert "known: in-range, 2x" in str(why_not(spec, "5x"))  # type: ignore[arg-type]
+    with pytest.raises(InvalidInputError, match="has no test set '5x'"):
+        load_dataset("beam-tiny", tests=["5x"])  # type: ignore[list-item]
+    for n_patches in (1, 2):
+        few = changed(n_patches=n_patches)
+        assert "several-forces" not in available_sets(few)
+        assert "it has no 3 load patches" in str(why_not(few, "several-forces"))
+
+
+QUICK = {"beam-tiny", "beam-nearly-incompressible", "block-compression"}
+SLOW = {*list_suite("datasets")} - QUICK - {"liver-hex-observed"}  # it has the sets of liver-hex
+
+
+@pytest.mark.parametrize(
+    "name", [*sorted(QUICK), *(pytest.param(n, marks=pytest.mark.slow) for n in sorted(SLOW))]
+)
+def test_every_shipped_dataset_has_sound_test_sets(name: str) -> None:
+    spec = load_generated_spec(name)
+    sets = available_sets(spec)
+    assert {"in-range", "2x", "4x", "unseen-regions"} <= set(sets)
+    check_regions(spec)
+    whole = load_scene(spec)
+    training = (whole, draw_loads(whole, 0, 200))
+    for other in sets:
+        scene = load_scene(spec_of_set(spec, other))
+        assert repeated([(scene, draw_loads(scene, 0, n_samples_of(scene))), training]) == 0
