@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Self
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.model_arrays import take_array, take_indices
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.discrete_interpolation import Selection, interpolation_rows
 from mor_bench.reduction.galerkin import stiffness_times
 from mor_bench.reduction.petrov import InterpolatedProblem
-from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto, size_to_needs
+from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto
 from mor_bench.reduction.subspace import Subspace, extent_of
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates.hyper_reduced import (
-    checked_array,
-    checked_indices,
     nodal,
     reduced_points,
     training_coordinates,
@@ -31,107 +32,72 @@ from mor_bench.surrogates.hyper_reduced import (
 Array = NDArray[np.float64]
 
 FORCE_MODES = (10, 20, 40, 80, 160)
-"""To choose from."""
+"""Values that "auto" chooses from."""
 
 
+@dataclass(eq=False)
 class InterpolatedPOD(Surrogate):
     """POD-Galerkin whose nonlinear force is interpolated from a few of its entries.
 
-    The linear part of the force is projected exactly; the rest n(u) = f(u) - K₀u is taken in the span of the leading modes U of
-    its training snapshots, f_r(q) = ΦᵀK₀Φ q + ΦᵀU (PᵀU)⁻¹ Pᵀ n(Φq), where Pᵀ picks as many dofs as U has columns (Chaturantabut &
-    Sorensen 2010). Only the cells that touch these dofs are integrated. The tangent is not symmetric and there is no potential:
-    nothing keeps the model stable.
+    The linear part of the force is projected exactly. The rest n(u) = f(u) - K₀u is sought in the
+    span of the leading modes U of its training snapshots:
+    f_r(q) = ΦᵀK₀Φ q + ΦᵀU (PᵀU)⁻¹ Pᵀ n(Φq), where Pᵀ picks as many dofs as U has columns
+    (Chaturantabut & Sorensen 2010). Only the cells that touch these dofs are integrated. The
+    tangent is not symmetric and there is no potential: nothing keeps the model stable.
 
     Parameters
     ----------
     n_modes : int or "auto"
-        Size r of the basis Φ; capped at the snapshots' rank with a warning. "auto", here and of the next and the last: as
-        little work as meets the scene's need, see `mor_bench.reduction.sizing`.
+        Size r of the basis Φ; capped at the snapshots' rank with a warning. "auto", here and for
+        `n_force_modes` and `tolerance`: as little work as meets the scene's need, see
+        `mor_bench.reduction.sizing`.
     n_force_modes : int or "auto"
         Columns of U, and dofs sampled; capped at the rank of the nonlinear forces with a warning.
     selection : {"greedy", "pivoted-qr"}
-        How dofs are chosen: as Chaturantabut & Sorensen, or by pivoted QR (Q-DEIM, Drmač & Gugercin 2016).
+        Choice of the dofs: as Chaturantabut & Sorensen, or by pivoted QR (Q-DEIM, Drmač & Gugercin
+        2016).
     n_force_snapshots : int
         Training snapshots whose forces span U, spread evenly over the training set.
     tolerance : float or "auto"
-        Norm of the reduced residual relative to that of the reduced load.
+        Norm of the reduced residual relative to that of the reduced load, in (0, 1].
     """
 
-    def __init__(
-        self,
-        n_modes: Annotated[int, Field(ge=1)] | Auto = 20,
-        n_force_modes: Annotated[int, Field(ge=1)] | Auto = 40,
-        selection: Selection = "pivoted-qr",
-        n_force_snapshots: Annotated[int, Field(ge=1)] = 300,
-        tolerance: Annotated[float, Field(gt=0, le=1)] | Auto = 1e-8,
-    ) -> None:
-        self.n_modes = n_modes
-        self.n_force_modes = n_force_modes
-        self.selection = selection
-        self.n_force_snapshots = n_force_snapshots
-        self.tolerance = tolerance
+    n_modes: Annotated[int, Field(ge=1)] | Auto = 20
+    n_force_modes: Annotated[int, Field(ge=1)] | Auto = 40
+    selection: Selection = "pivoted-qr"
+    n_force_snapshots: Annotated[int, Field(ge=1)] = 300
+    tolerance: Annotated[float, Field(gt=0, le=1)] | Auto = 1e-8
+
+    sized: ClassVar = {"n_modes": MODES, "n_force_modes": FORCE_MODES, "tolerance": TOLERANCES}
 
     def supports(self, scene: Scene) -> str | None:
         return unknown_equations(scene)
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None) -> Self:
-        with self._fitting(scene):
-            known = self._checked_snapshots(snapshots)
-            knobs = size_to_needs(
-                self,
-                scene,
-                known,
-                {"n_modes": MODES, "n_force_modes": FORCE_MODES, "tolerance": TOLERANCES},
-            )
-            displacements = known.free_displacements
-            modes = pod(displacements, knobs["n_modes"]).modes
-            model = FullOrderModel(scene)
-            stiff = stiffness_times(model.assembler.pattern, model.rest_tangent, modes)
-            q = training_coordinates(displacements, modes, self.n_force_snapshots)
-            forces = np.array([model.force(modes @ own).force - stiff @ own for own in q])
-            basis = pod(forces, knobs["n_force_modes"]).modes
-            dofs = interpolation_rows(basis, self.selection)
-            interpolation = np.linalg.solve(basis[dofs].T, basis.T @ modes)
-            self._restore(
-                {
-                    "modes": modes,
-                    "dofs": dofs,
-                    "interpolation": interpolation,
-                    "rest": modes.T @ stiff,
-                }
-            )
-        return self
-
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        batch = self._checked_forces(forces)
-        options = NewtonOptions(self.tolerance_)
-        return self._subspace.answer(
-            batch, lambda load: self.problem_.solve(load, options)
-        ).reshape(np.shape(forces))
-
-    def _state(self) -> dict[str, NDArray[Any]]:
+    def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
+        displacements = samples.free_displacements
+        modes = pod(displacements, self.value("n_modes")).modes
+        model = FullOrderModel(scene)
+        stiff = stiffness_times(model.assembler.pattern, model.rest_tangent, modes)
+        q = training_coordinates(displacements, modes, self.n_force_snapshots)
+        forces = np.array([model.force(modes @ own).force - stiff @ own for own in q])
+        basis = pod(forces, self.value("n_force_modes")).modes
+        dofs = interpolation_rows(basis, self.selection)
         return {
-            "modes": self.modes_,
-            "dofs": self.dofs_,
-            "interpolation": self.interpolation_,
-            "rest": self.rest_,
+            "modes": modes,
+            "dofs": dofs,
+            "interpolation": np.linalg.solve(basis[dofs].T, basis.T @ modes),
+            "rest": modes.T @ stiff,
         }
 
-    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        scene = self.scene_
+    def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
         n_free = len(scene.free_dofs)
-        self.modes_ = checked_array(state["modes"], "modes", (n_free, None))
+        self.modes_ = take_array(model, "modes", (n_free, None))
         r = self.modes_.shape[1]
-        self.dofs_ = checked_indices(state["dofs"], "dofs", n_free)
-        self.interpolation_ = checked_array(
-            state["interpolation"], "interpolation", (len(self.dofs_), r)
-        )
-        self.rest_ = checked_array(state["rest"], "rest", (r, r))
-        self.tolerance_, self._subspace = self._sized("tolerance"), Subspace(scene, self.modes_)
+        dofs = take_indices(model, "dofs", n_free)
         sampled = np.zeros((n_free, r))
-        sampled[self.dofs_] = self.interpolation_
+        sampled[dofs] = take_array(model, "interpolation", (len(dofs), r))
         touched = np.zeros(scene.mesh.n_nodes, dtype=bool)
-        touched[scene.free_dofs[self.dofs_] // 3] = True
+        touched[scene.free_dofs[dofs] // 3] = True
         self.cells_ = np.flatnonzero(touched[scene.mesh.cells].any(axis=1))
         points = reduced_points(
             scene,
@@ -140,7 +106,13 @@ class InterpolatedPOD(Surrogate):
             nodal(scene, self.modes_),
             nodal(scene, sampled),
         )
+        self.subspace_ = Subspace(scene, self.modes_)
+        rest = take_array(model, "rest", (r, r))
         try:
-            self.problem_ = InterpolatedProblem(points, self.rest_, extent_of(scene))
+            self.problem_ = InterpolatedProblem(points, rest, extent_of(scene))
         except np.linalg.LinAlgError:
             raise InvalidInputError("`rest` must be positive definite.") from None
+
+    def answer(self, forces: Array) -> Array:
+        options = NewtonOptions(self.value("tolerance"))
+        return self.subspace_.answer(forces, lambda load: self.problem_.solve(load, options))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,16 +15,17 @@ from mor_bench.surrogates.hyper_reduced import CubatureSurrogate
 Array = NDArray[np.float64]
 
 
+@dataclass(eq=False)
 class EmpiricalCubaturePOD(CubatureSurrogate):
-    """POD-Galerkin over a few weighted cells that integrate a basis of the reduced cell forces exactly, and their number.
+    """POD-Galerkin over a few weighted cells that integrate a basis of the reduced forces exactly.
 
-    ``cubature_tolerance`` is the share of the reduced cell forces, in the Frobenius norm over cells, snapshots and modes, that
-    the basis may lack; 0 keeps every cell with weight 1 (Hernández, Caicedo, Ferrer 2017). The weights sum to the number of cells.
-
-    The other parameters are those of `CubatureSurrogate`.
+    ``cubature_tolerance`` is the share of the reduced cell forces that the basis may lack, in the
+    Frobenius norm over cells, snapshots and modes; 0 keeps every cell with weight 1 (Hernández,
+    Caicedo, Ferrer 2017). The weights sum to the number of cells. The other parameters are those
+    of `CubatureSurrogate`.
     """
 
-    def _train(
+    def choose_cells(
         self, model: FullOrderModel, modes: Array, q: Array, tolerance: float
     ) -> tuple[NDArray[np.int64], Array]:
         weights = empirical_cubature(

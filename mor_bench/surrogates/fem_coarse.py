@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from math import ceil
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field
 
 from mor_bench.counting import count
@@ -15,55 +17,31 @@ from mor_bench.mechanics.model import FullOrderModel, check_supports, unknown_eq
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.scene import Scene, with_cells
-from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
 
 
+@dataclass(eq=False)
 class CoarseFEM(Surrogate):
-    """Full-order FEM with fewer cells, u = P u_c(Pᵀ f), with P the coarse shape functions at the scene's nodes.
+    """Full-order FEM with fewer cells: u = P u_c(Pᵀ f).
 
-    Pᵀ keeps the sum of the forces and their moments. The supports of the coarse mesh come from the same regions.
+    P holds the coarse shape functions at the scene's nodes; Pᵀ keeps the sum of the forces and
+    their moments. The supports of the coarse mesh come from the same regions.
 
     Parameters
     ----------
     coarsening : int
-        The scene's cells per axis are divided by it and rounded up.
+        Divisor of the scene's cells per axis, at least 2; the results are rounded up.
     tolerance : float
-        Norm of the residual relative to that of the load at which the solve stops.
+        Norm of the residual relative to that of the load at which the solve stops, in (0, 1].
     """
 
-    needs_snapshots = False
+    coarsening: Annotated[int, Field(ge=2)] = 2
+    tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-4
 
-    def __init__(
-        self,
-        coarsening: Annotated[int, Field(ge=2)] = 2,
-        tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-4,
-    ) -> None:
-        self.coarsening = coarsening
-        self.tolerance = tolerance
-
-    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
-        """Build the coarse mesh and factorise its rest-state stiffness; snapshots are not used."""
-        with self._fitting(scene):
-            self._restore({})
-        return self
-
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        batch = self._checked_forces(forces)
-        coarse = self.model_.scene
-        out = np.zeros_like(batch)
-        count(multiply_adds=6 * self.interpolation_.nnz * len(batch))
-        for row, load in zip(out, batch, strict=True):
-            displacement = np.zeros(coarse.mesh.n_dofs)
-            displacement[coarse.free_dofs] = self.model_.solve(
-                (self._restriction @ load).ravel()[coarse.free_dofs], options=self._options
-            ).displacement
-            row[:] = self.interpolation_ @ displacement.reshape(-1, 3)
-        out[:, self.scene_.fixed_nodes] = 0
-        return out.reshape(np.shape(forces))
+    needs_snapshots: ClassVar = False
 
     def supports(self, scene: Scene) -> str | None:
-        """The reason why there is no coarser mesh of a scene, or why it would not be held."""
+        """Return the reason why there is no coarser mesh, or why nothing would hold it."""
         if reason := unknown_equations(scene):
             return reason
         try:
@@ -72,22 +50,30 @@ class CoarseFEM(Surrogate):
             return str(error)
         return None
 
+    def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
+        coarse = self._coarse(scene)
+        self.model_ = FullOrderModel(coarse)
+        _ = self.model_.rest_factor
+        self.interpolation_ = interpolation_matrix(coarse.mesh, scene.mesh.points)
+        self.restriction_ = self.interpolation_.T.tocsr()
+
+    def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        coarse, options = self.model_.scene, NewtonOptions(self.tolerance)
+        out = np.zeros_like(forces)
+        count(multiply_adds=6 * self.interpolation_.nnz * len(forces))
+        for row, load in zip(out, forces, strict=True):
+            displacement = np.zeros(coarse.mesh.n_dofs)
+            displacement[coarse.free_dofs] = self.model_.solve(
+                (self.restriction_ @ load).ravel()[coarse.free_dofs], options=options
+            ).displacement
+            row[:] = self.interpolation_ @ displacement.reshape(-1, 3)
+        out[:, self.scene_.fixed_nodes] = 0
+        return out
+
     def _coarse(self, scene: Scene) -> Scene:
-        nx, ny, nz = (
-            ceil(n / self.coarsening) for n in getattr(scene.generated.geometry, "cells", (1, 1, 1))
-        )
+        cells = getattr(scene.generated.geometry, "cells", (1, 1, 1))
+        nx, ny, nz = (ceil(n / self.coarsening) for n in cells)
         coarse = with_cells(scene, (nx, ny, nz))
         if coarse.mesh.n_cells == scene.mesh.n_cells:
             raise UnsupportedSceneError(f"{scene.name}: a mesh of one cell cannot be made coarser.")
         return coarse
-
-    def _state(self) -> dict[str, NDArray[Any]]:
-        return {}
-
-    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        coarse = self._coarse(self.scene_)
-        self.model_ = FullOrderModel(coarse)
-        _ = self.model_.rest_factor
-        self.interpolation_ = interpolation_matrix(coarse.mesh, self.scene_.mesh.points)
-        self._restriction = self.interpolation_.T.tocsr()
-        self._options = NewtonOptions(self.tolerance)

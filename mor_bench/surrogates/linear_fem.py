@@ -1,48 +1,40 @@
-"""Linear elasticity: columns of the inverse of the rest-state stiffness, or a back-solve with it."""
+"""Linear elasticity: columns of the inverse of the rest-state stiffness, or a back-solve."""
 
 from __future__ import annotations
 
-from typing import Any, Self
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.mechanics.observed import linear_response
 from mor_bench.scene.scene import Scene
-from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.surrogate import Surrogate
 
 
+@dataclass(eq=False)
 class LinearFEM(Surrogate):
-    """u = K₀⁻¹ f, with K₀ the stiffness at rest, factorised or inverted once. Wrong by the square of the rotations.
+    """u = K₀⁻¹ f, with the stiffness at rest K₀ factorised or inverted once.
 
-    Given displacements of a part of the surface it answers with their linear extension, u_h = -K_hh⁻¹ K_ho u_o.
+    The error grows as the square of the rotations. From observed displacements u_o it returns the
+    linear extension, u_h = -K_hh⁻¹ K_ho u_o at the hidden nodes.
     """
 
-    needs_snapshots = False
-    takes_observations = True
-
-    def __init__(self) -> None:
-        pass
+    needs_snapshots: ClassVar = False
 
     def supports(self, scene: Scene) -> str | None:
         return unknown_equations(scene, observed=True)
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
-        """Factorise the rest-state stiffness and keep columns of its inverse; snapshots are not used."""
-        with self._fitting(scene):
-            self._restore({})
-        return self
+    def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
+        self.compliance_ = linear_response(scene)
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        batch = self._checked_forces(forces)
-        return self.compliance_.respond(batch.reshape(-1, self.scene_.mesh.n_dofs)).reshape(
-            np.shape(forces)
-        )
+    def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
+        return self.compliance_.respond(loads).reshape(forces.shape)
 
-    def _state(self) -> dict[str, NDArray[Any]]:
-        return {}
-
-    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        self.compliance_ = linear_response(self.scene_)
+    def answer_observed(self, observed: ObservedDisplacements) -> NDArray[np.float64]:
+        return self.answer(observed.values)
