@@ -1,8 +1,8 @@
-"""Equilibria of a body of which displacements of a part of the surface are known in the place of the forces.
+"""Equilibria of a body with known displacements at a part of the surface instead of forces.
 
-The observed nodes are held where they were seen, the supports at rest, and no force acts on all others, the hidden ones:
-f_int(u) = 0 there. That is exact where every loaded node is observed, and a modelling error otherwise: what is not seen is
-taken to be free of load.
+The observed nodes are held at their observed displacements and the supports at rest. All other
+nodes, the hidden ones, carry no force: f_int(u) = 0 there. That is exact if every loaded node is
+observed. Otherwise it is a modelling error, since hidden loads are neglected.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class _HiddenRest(RotatedRest):
     Parameters
     ----------
     factor : SingleFactor
-        Of the hidden nodes' stiffness at rest.
+        Factor of the hidden nodes' stiffness at rest.
     whole : FullOrderModel
     hidden : (n_hidden,) int64
         Places of the hidden dofs among the free ones.
@@ -53,7 +53,7 @@ class _HiddenRest(RotatedRest):
         _ = self._soft  # which copies share
 
     def beside(self, base: Array) -> Self:
-        """For displacements q beside a state of the whole body, (n_free,), m."""
+        """Return a copy for displacements q relative to a state of the whole body, (n_free,), m."""
         found = copy(self)
         found._base = base
         return found
@@ -69,7 +69,10 @@ class _HiddenRest(RotatedRest):
 
 
 class _HiddenModel(FullOrderModel):
-    """The hidden nodes beside a state u₀ of the whole body: u = u₀ + q, with the force f(u₀ + q) - f(u₀) under the load -f(u₀)."""
+    """The hidden nodes relative to a state u₀ of the whole body: u = u₀ + q.
+
+    The internal force is f(u₀ + q) - f(u₀), and the load is -f(u₀).
+    """
 
     _base: Array
     _offset: Array
@@ -85,7 +88,7 @@ class _HiddenModel(FullOrderModel):
         self.beside_force = np.zeros(whole.n_unknowns)
 
     def beside(self, base: Array) -> Self:
-        """The same model beside another state of the whole body, (n_free,), m."""
+        """Return the model relative to another state of the whole body, (n_free,), m."""
         found = copy(self)
         found._base, found.beside_force = base, self._whole.force(base).force
         found._offset = found.beside_force[self.hidden]
@@ -104,11 +107,11 @@ class _HiddenModel(FullOrderModel):
         return _HiddenRest(factor.single_precision(), self._whole, self.hidden)
 
     def prepare(self) -> None:
-        """Factorise, so that no query has to."""
+        """Factorise in advance of the queries."""
         _ = self.turned_rest if self._turns else self.rest_factor
 
     def at(self, q: Array) -> Array:
-        """Displacements of the whole body, (n_free,), m."""
+        """Return displacements of the whole body, (n_free,), m."""
         u = self._base.copy()
         u[self.hidden] += q
         return np.asarray(u)
@@ -129,23 +132,24 @@ class _HiddenModel(FullOrderModel):
 
 
 class ObservedModel:
-    """Finite elements under given displacements of the observed nodes, over the free dofs of a scene.
+    """Finite elements under given displacements of the observed nodes, over the free dofs.
 
-    What `solve_many` is to a `FullOrderModel`, and `respond` and `to_coordinates` are to its `Compliance`.
+    It offers `solve_many` as a `FullOrderModel` does, and `respond` and `to_coordinates` as a
+    `Compliance` does.
 
     Parameters
     ----------
     scene : Scene
-        With observed nodes.
+        A scene with observed nodes.
     solver : str, optional
-        As of `FullOrderModel`.
+        As for `FullOrderModel`.
 
     Raises
     ------
     UnsupportedSceneError
         If the scene has no observed nodes, or its equations are not known.
     UnconstrainedBodyError, MissingDependencyError
-        As by `FullOrderModel`.
+        As `FullOrderModel`.
     """
 
     def __init__(self, scene: Scene, solver: SolverName | None = None) -> None:
@@ -155,7 +159,7 @@ class ObservedModel:
         whole = FullOrderModel(scene, solver)
         held = replace(scene, fixed_nodes=np.union1d(scene.fixed_nodes, scene.observed_nodes))
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", LockingWarning)  # the whole said it
+            warnings.simplefilter("ignore", LockingWarning)  # the whole model warned
             self._model = _HiddenModel(whole, held, solver)
         self._model.prepare()
         self._seen = np.setdiff1d(np.arange(whole.n_unknowns), self._model.hidden)
@@ -163,17 +167,17 @@ class ObservedModel:
         self._coupling = sp.csr_array(stiffness[self._model.hidden][:, self._seen])
 
     def linear_response(self, observed: Array) -> Array:
-        """Linear elasticity: u_h = -K_hh⁻¹ K_ho u_o, with h the hidden and o the observed dofs.
+        """Return the linear extension u_h = -K_hh⁻¹ K_ho u_o; h are hidden, o observed dofs.
 
         Parameters
         ----------
         observed : (n, n_free) float64
-            Displacements, m; those of hidden dofs are not looked at.
+            Displacements, m; those of hidden dofs are ignored.
 
         Returns
         -------
         (n, n_free) float64
-            Of all free dofs, m.
+            Displacements of all free dofs, m.
         """
         out = np.empty(observed.shape)
         out[:, self._seen] = observed[:, self._seen]
@@ -184,19 +188,21 @@ class ObservedModel:
         return out
 
     def respond(self, observed: Array) -> Array:
-        """As `linear_response`, on all dofs, (n, n_dofs), m; zero at the supports."""
+        """As `linear_response`, for all dofs, (n, n_dofs), m; zero at the supports."""
         out = np.zeros(observed.shape)
         out[:, self.scene.free_dofs] = self.linear_response(observed[:, self.scene.free_dofs])
         return out
 
     def to_coordinates(self, axes: Array) -> Array:
-        """Eᵀ A on all dofs, zero where nothing is observed: its product with displacements u_o of the observed dofs is that of A with
-        their linear extension E u_o.
+        """Return Eᵀ A for all dofs, where E u_o is the linear extension of u_o.
+
+        Its product with observed displacements is that of A with their extension. It is zero where
+        nothing is observed.
 
         Parameters
         ----------
         axes : (n_free, r) float64
-            A.
+            Matrix A.
 
         Returns
         -------
@@ -211,20 +217,20 @@ class ObservedModel:
     def solve_many(
         self, observed: Array, options: NewtonOptions = NewtonOptions()
     ) -> list[Solution | SolverError]:
-        """Equilibria of all free dofs under displacements of the observed ones, or the errors that there is none.
+        """Solve for all free dofs under displacements of the observed ones; return errors, too.
 
         Parameters
         ----------
         observed : (n, n_free) float64
-            Displacements, m; those of hidden dofs are not looked at.
+            Displacements, m; those of hidden dofs are ignored.
         options : NewtonOptions
-            The tolerance is that of the forces left on hidden dofs, relative to those that hold the observed ones in the state
-            that the solve starts from, the linear response.
+            The tolerance bounds the residual on hidden dofs relative to the reactions on the
+            observed ones in the starting state, the linear response.
         """
         return [self._solved(self.linear_response(row[None])[0], options) for row in observed]
 
     def _solved(self, response: Array, options: NewtonOptions) -> Solution | SolverError:
-        """From the linear response; where that fails, by and by from rest."""
+        """Solve from the linear response; if that fails, in increments from rest."""
         u, reached, increment, iterations, cuts = np.zeros(len(response)), 0.0, 1.0, 0, 0
         while True:
             target = min(1.0, reached + increment)
@@ -239,11 +245,12 @@ class ObservedModel:
             increment *= 0.5
             if cuts > options.max_cuts:
                 return NoEquilibriumError(
-                    f"no stable equilibrium found: stopped at {reached:.4g} of the observed displacement; {found}"
+                    f"no stable equilibrium found: stopped at {reached:.4g} of the observed "
+                    f"displacement; {found}"
                 )
 
     def _beside(self, base: Array, tolerance: float) -> Solution | SolverError:
-        """The equilibrium next to a state whose observed nodes are where they were seen."""
+        """Solve from a state whose observed nodes have their observed displacements."""
         model = self._model.beside(base)
         force, load = model.beside_force, -model.beside_force[model.hidden]
         if not np.isfinite(force).all():
@@ -260,24 +267,21 @@ class ObservedModel:
 
 
 class LinearResponse(Protocol):
-    """What linear elasticity makes of what the methods of a scene are given: a `Compliance` or an `ObservedModel`."""
+    """Linear elasticity under what methods are given: a `Compliance` or an `ObservedModel`."""
 
     def respond(self, loads: Array, /) -> Array: ...
     def to_coordinates(self, axes: Array) -> Array: ...
 
 
 def linear_response(scene: Scene) -> LinearResponse:
-    """To forces, or to displacements of a part of the surface, where these are given; made once, so that no query has to."""
+    """Prepare the linear response to forces or, if these are given, to observed displacements."""
     return (
         Compliance(FullOrderModel(scene)) if scene.observed_nodes is None else ObservedModel(scene)
     )
 
 
 def forward_model(scene: Scene, solver: SolverName | None = None) -> FullOrderModel | ObservedModel:
-    """What finds a scene's displacements from what its methods are given: forces, or displacements of a part of the surface.
-
-    Its factors are made, so that no query has to.
-    """
+    """Return a factorised model that solves for forces or, if given, for observed displacements."""
     if scene.observed_nodes is not None:
         return ObservedModel(scene, solver)
     model = FullOrderModel(scene, solver)

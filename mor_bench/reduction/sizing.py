@@ -1,14 +1,9 @@
-"""Sizes of reduced models from what the scene needs: knobs set to ``"auto"``, chosen by cross-validation on the training samples.
+"""Choose hyperparameters set to "auto" from the scene's need, by cross-validation.
 
-A method whose knobs may be ``"auto"`` adds two lines to `fit`, and uses what they give in place of the knobs:
-
-    snapshots = self._checked_snapshots(snapshots)
-    knobs = size_to_needs(self, scene, snapshots, {"n_modes": MODES, "tolerance": TOLERANCES})
-    basis = pod(snapshots.free_displacements, knobs["n_modes"])
-
-The annotation of such a knob allows the word, ``Annotated[int, Field(ge=1)] | Auto``. Knobs with another value keep it. What was
-chosen is in ``sizes_`` of the fitted method, and is saved and loaded with it; what `predict` needs of it, `_restore` takes from
-``self._sized("tolerance")``.
+A method lists the values that such a hyperparameter may take in its class attribute ``sized``, and
+allows the word in the annotation: ``Annotated[int, Field(ge=1)] | Auto``. `mor_bench.Surrogate`
+chooses before it learns, keeps the choice in ``sizes_`` and in the model file, and returns it as
+``self.value("n_modes")``.
 """
 
 from __future__ import annotations
@@ -29,28 +24,26 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 
 Auto = Literal["auto"]
-"""Value of a knob that is to be chosen."""
+"""Value of a hyperparameter that is to be chosen."""
 
 N_FOLDS = 5
-"""Parts of the load regions, each held out once: errors differ up to threefold between parts of beam-coarse's."""
+"""Parts of the load regions, each held out once."""
 N_VALIDATION = 200
-"""At most about so many samples of these, spread evenly."""
+"""Held-out samples in all folds together, about; spread evenly."""
 HOPELESS = 4.0
-"""An error this many times the need on the first folds ends a trial."""
+"""A trial ends if its error on the first folds exceeds this multiple of the need."""
 SEED = 0x512E
 STRIDE = 4
-"""Rungs that a climb takes at once before it looks between them."""
+"""Rungs skipped at once while climbing a ladder."""
 
 MODES = tuple(sorted({round(1.12**k) for k in range(42)}))
-"""Numbers of modes to choose from: 1 to 104, some 12 % apart."""
+"""Numbers of modes to choose from: 1 to 104, about 12 % apart."""
 TOLERANCES = (1e-1, 3e-2, 1e-2, 1e-3, 1e-4)
-"""Relative residuals at which a reduced Newton iteration may stop, to choose from."""
+"""Relative residuals of a reduced Newton iteration to choose from."""
 
 
 class Sizeable(Protocol):
     """What the search needs of a `mor_bench.Surrogate`."""
-
-    sizes_: dict[str, Any]
 
     @property
     def parameters(self) -> dict[str, Any]: ...
@@ -60,15 +53,15 @@ class Sizeable(Protocol):
 
 @dataclass(frozen=True)
 class Score:
-    """What a configuration shows on the samples held out.
+    """Error and work of a configuration on held-out samples.
 
     Attributes
     ----------
     error : float
-        Relative l2, median over the samples of all folds, or of the first ones where these show enough; infinity where the
-        method cannot be fitted.
+        Median relative l2 over all folds, or over the first ones if the trial ended early.
+        Infinity if the method cannot be fitted.
     work : float
-        Multiply-adds of one prediction, mean.
+        Mean multiply-adds of one prediction.
     """
 
     error: float
@@ -76,20 +69,20 @@ class Score:
 
 
 def validation_folds(snapshots: Snapshots) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Row numbers to fit candidates on and to score them on, for each fold of the training samples' load regions.
+    """Return the rows to fit on and the rows to score on, for each fold of the load regions.
 
-    A sample of several forces is scored on where all of them are of the fold, and fitted on where none is. With one region
-    only, or where a fold would leave a part empty, the samples are dealt out instead.
+    A sample of several forces is scored if all of them belong to the fold, and fitted if none
+    does. If there is only one region, or a part would be empty, samples form the folds instead.
 
     Raises
     ------
     InvalidInputError
-        If there is but one sample.
+        If there is only one sample.
     """
     n = len(snapshots)
     if n < 2:
         raise InvalidInputError(
-            'a knob set to "auto" needs at least two training samples, of which some are held out.'
+            'a parameter set to "auto" needs at least two training samples, to hold some out.'
         )
     generator = np.random.default_rng(SEED)
     ids, ranks = np.unique(snapshots.loads.patches, return_inverse=True)
@@ -111,20 +104,21 @@ def validation_folds(snapshots: Snapshots) -> list[tuple[NDArray[np.int64], NDAr
 
 
 class Trials:
-    """Configurations of a method, each fitted to all folds of the training samples but one and scored on that one, once."""
+    """Cross-validated configurations of a method; each is tried once."""
 
     def __init__(self, method: Sizeable, scene: Scene, snapshots: Snapshots) -> None:
         self._method, self._scene, self._snapshots = method, scene, snapshots
         self._folds = validation_folds(snapshots)
         self.scores: dict[tuple[tuple[str, Any], ...], Score] = {}
         self.refusal: MorBenchError | None = None
-        """Why a candidate could not be fitted, of the last one."""
+        """Why the last candidate without a fit could not be fitted."""
 
     def whole_score(self, knobs: Mapping[str, Any]) -> Score:
-        """On all folds, however far from the need."""
+        """Score a configuration on all folds, however large its error is."""
         return self._tried(knobs, np.inf)
 
     def score(self, knobs: Mapping[str, Any]) -> Score:
+        """Score a configuration; stop early if it is hopeless."""
         key = tuple(sorted(knobs.items()))
         if key not in self.scores:
             self.scores[key] = self._tried(knobs)
@@ -138,9 +132,7 @@ class Trials:
             for fitted, held in self._folds:
                 try:
                     with uncounted(), warnings.catch_warnings():
-                        warnings.simplefilter(
-                            "ignore"
-                        )  # what concerns the fit to all samples is said there
+                        warnings.simplefilter("ignore")  # the final fit warns
                         candidate.fit(self._scene, self._snapshots[fitted])
                 except MorBenchError as error:
                     self.refusal = error
@@ -152,7 +144,7 @@ class Trials:
 
 
 def _relative_errors(method: Sizeable, samples: Snapshots) -> list[float]:
-    """Relative l2 of each sample; infinity where there is no prediction."""
+    """Return the relative l2 of each sample; infinity where there is no prediction."""
     errors, nodes = [], samples.scene.output_nodes
     for force, reference in zip(samples.forces, samples.displacements[:, nodes], strict=True):
         try:
@@ -170,9 +162,9 @@ def _relative_errors(method: Sizeable, samples: Snapshots) -> list[float]:
 def _first_that_meets(
     trials: Trials, ladder: Sequence[Mapping[str, Any]], need: float, start: int, most_work: float
 ) -> int | None:
-    """Number of the least rung that meets the need; None if none does for less work than ``most_work``.
+    """Return the lowest rung that meets the need; None if none does below ``most_work``.
 
-    Error is taken to fall and work to rise along a ladder, so that few rungs are tried.
+    The search assumes that error falls and work rises along a ladder, so that it tries few rungs.
     """
     low, high = start - 1, start
     while True:
@@ -203,44 +195,39 @@ def size_to_needs(
 def choose_sizes(
     method: Sizeable, scene: Scene, snapshots: Snapshots, rungs: Mapping[str, Sequence[Any]]
 ) -> dict[str, Any]:
-    """The knobs of a method, those set to ``"auto"`` at the least work that meets the scene's need.
+    """Choose the hyperparameters set to "auto": the least work that meets the scene's need.
 
-    Candidates are cross-validated: fitted to the training samples but for a fifth of the load regions, scored on these, and so
-    for each fifth; the final fit, by the method itself, is to all samples. The work of a prediction is counted
-    (`mor_bench.counting`), never timed, so that the choice is the same on every machine. The first knob of `rungs` is climbed
-    from small to large, once for each combination of the others, with the most accurate one first; a looser one begins where
-    that ended, and is given up where it takes more work than the best found.
-
-    What is held out meets the need; a test set does so nearly: on beam-coarse, which needs 0.01, 27 modes of `pod` have an
-    error of 0.0094 on what is held out and of 0.0102 on the test set, on beam-fine (6,720 samples) 19 modes 0.0088 and 0.0114,
-    and on l-shape (1,280 samples) 12 modes 0.0077 and 0.0065. It costs some ten candidates, each of five fits and 200
-    predictions: seconds on beam-coarse, minutes on beam-fine.
+    Candidates are cross-validated: fitted without one fifth of the load regions and scored on it,
+    for each fifth. The work of a prediction is counted (`mor_bench.counting`), not timed, so that
+    the choice is the same on every machine. The first parameter of `rungs` is climbed from small
+    to large for each combination of the others, the most accurate combination first. A looser
+    combination starts where the previous climb ended, and is dropped if it takes more work than
+    the best one found.
 
     Parameters
     ----------
     method : Surrogate
-        Within its `fit`; its ``sizes_`` are set.
     scene : Scene
-        Its need is ``scene.spec.needs.error``: relative l2, median.
+        Its need is ``scene.spec.needs.error``: the median relative l2.
     snapshots : Snapshots
         Training samples.
     rungs : dict of str to sequence
-        Values that each knob may take, from cheap to accurate.
+        Values that each hyperparameter may take, from cheap to accurate.
 
     Returns
     -------
     dict of str to Any
-        All knobs of the method.
+        The chosen values; empty if nothing is set to "auto".
 
     Warns
     -----
     UserWarning
-        If no candidate meets the need; then the most accurate one of those tried is taken.
+        If no candidate meets the need. The most accurate one is chosen then.
 
     Raises
     ------
     InvalidInputError
-        If there are too few samples to hold any out, or no candidate can be fitted at all.
+        If there are too few samples to hold any out, or no candidate can be fitted.
     """
     open_rungs = {
         name: values for name, values in rungs.items() if method.parameters[name] == "auto"
@@ -270,12 +257,12 @@ def choose_sizes(
         best = dict(min(trials.scores.items(), key=lambda item: item[1].error)[0])
         reached = trials.whole_score(best).error
         if not np.isfinite(reached):
-            why = trials.refusal or "no candidate predicts half of the samples held out."
+            why = trials.refusal or "no candidate predicts half of the held-out samples."
             raise InvalidInputError(f"no {', '.join(open_rungs)} could be chosen: {why}")
         said = ", ".join(f"{name} = {value}" for name, value in best.items())
         warnings.warn(
-            f"{scene.name} needs a relative l2 of {need:g} (median); the most accurate candidate, {said}, reaches {reached:.3g} on the "
-            "training samples held out.",
+            f"{scene.name} needs a relative l2 of {need:g} (median); the most accurate candidate, "
+            f"{said}, reaches {reached:.3g} on the training samples held out.",
             stacklevel=3,
         )
     return best

@@ -1,29 +1,9 @@
-"""The range of the training loads in compact form, and which loads lie out of it.
+"""The range of the training loads in compact form, and which loads lie outside it.
 
-A load is out of range if it is larger than any of training, spread over more nodes, or acts where, or in directions in
-which, training loads did not. Measured with the named test sets (`mor_bench.snapshots.test_sets`), share of loads flagged,
-training split by region; beam-coarse with the first 1,280 samples, liver-hex 600, block-compression 500:
-
-================= ========= =========== ========= =================
-set               beam-tiny beam-coarse liver-hex block-compression
-================= ========= =========== ========= =================
-test              0         0           0         0
-in-range          0         0           0         0
-2x                .500      .470        .437      .362
-4x                .783      .725        .692      .632
-unseen-regions    1         1           1         1
-unseen-directions                       .950      1
-several-forces    1         .995        .995      .976
-================= ========= =========== ========= =================
-
-Of `2x` and `4x` exactly the loads larger than training's are flagged; the others are loads of the training distribution.
-The strangeness of loads in range reaches 5.9, 8.7, 7.1 and 1.0, that of unseen regions is 94 to 100 everywhere, and that of
-unseen directions on the liver has the 5th percentile 10 and the median 44; `MOST_STRANGE` lies between. Smaller loads than
-training's, and pushing where training only pulled, are not seen.
-
-Where displacements of a part of the surface are given in the place of forces there is no range. Their strangeness flags loads of
-training itself, and their coordinates in 10 principal directions of training's (on beam-tiny, its loaded face observed), larger than
-any of training, are those of 57 % of `4x`, 10 % of `several-forces` and 2 % of `unseen-regions`: the body hides what moved it.
+A load is out of range if it is larger than any training load, spread over more nodes, or acts at
+places or in directions without training loads. Smaller loads, and pushing where training only
+pulled, are not flagged. If displacements are given instead of forces, there is no range: the body
+hides what moved it.
 """
 
 from __future__ import annotations
@@ -41,24 +21,25 @@ from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.sampling import PatchLoads
 
 LARGER = 1.01
-"""A load may be this many times as large as the largest of training."""
+"""Largest size of a load in range, relative to the largest training load."""
 
 WIDER = 1.25
-"""A load may act on this many times as many nodes as the widest of training; three patches at once act on 2 to 3 times as many as one."""
+"""Largest width of a load in range, relative to the widest training load. Three patches at once
+are 2 to 3 times as wide as one."""
 
 MOST_STRANGE = 10.0
-"""Strangeness from which on a load is out of range; 3 where training pulled in all directions alike."""
+"""Largest strangeness of a load in range. It is 3 if training pulled equally in all directions."""
 
 REGULARISATION = 0.01
-"""ε of the strangeness; a force at a node or in a direction that no training load had scores 1/ε."""
+"""ε of the strangeness: a force at a node or in a direction without training loads scores 1/ε."""
 
 CHUNK = 256
-"""Samples whose nodal forces are in memory at once."""
+"""Samples whose nodal forces are in memory at the same time."""
 
 
 @dataclass(frozen=True)
 class LoadRange:
-    """What the training loads were.
+    """Size, width, places and directions of the training loads.
 
     Attributes
     ----------
@@ -67,9 +48,9 @@ class LoadRange:
     width : float
         Largest (Σ|f_i|)² / Σ|f_i|²: the number of nodes that equal forces act on.
     nodes : (n_loaded,) int64
-        Nodes at which some sample has a force, rising.
+        Nodes at which some sample has a force, in ascending order.
     moments : (n_loaded, 3, 3) float64
-        M_i = Σ f_i f_iᵀ / Σ |f_i|² over the samples: symmetric, not negative, of unit trace.
+        M_i = Σ f_i f_iᵀ / Σ |f_i|² over the samples: symmetric, semi-definite, of unit trace.
     """
 
     size_n: float
@@ -79,7 +60,7 @@ class LoadRange:
 
     @classmethod
     def of(cls, snapshots: Snapshots) -> Self:
-        """The range of training samples, whose nodal forces are gone through in chunks."""
+        """Return the range of training samples; their nodal forces are made in chunks."""
         moments = np.zeros((snapshots.scene.mesh.n_nodes, 3, 3))
         size = width = 0.0
         for nodes, forces in _chunks(snapshots):
@@ -92,7 +73,7 @@ class LoadRange:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]], n_nodes: int) -> Self:
-        """The range that `arrays` made the arrays of, for a mesh of ``n_nodes`` nodes.
+        """Return the range of the arrays of `arrays`, for a mesh of ``n_nodes`` nodes.
 
         Raises
         ------
@@ -101,32 +82,28 @@ class LoadRange:
         """
         if set(arrays) != {"limits", "nodes", "moments"}:
             raise InvalidInputError(
-                f"the range of the training loads must be the arrays limits, nodes and moments; got {', '.join(sorted(arrays))}."
+                "the range of the training loads must be the arrays limits, nodes and moments; "
+                f"got {', '.join(sorted(arrays))}."
             )
         limits, nodes, moments = arrays["limits"], arrays["nodes"], arrays["moments"]
-        if (
-            limits.dtype != np.float64
-            or limits.shape != (2,)
-            or not (np.isfinite(limits) & (limits >= 0)).all()
-        ):
+        positive = np.isfinite(limits) & (limits >= 0)
+        if limits.dtype != np.float64 or limits.shape != (2,) or not positive.all():
             raise InvalidInputError("`limits` of the range must be two finite numbers >= 0.")
         rising = nodes.dtype.kind == "i" and nodes.ndim == 1 and bool((np.diff(nodes) > 0).all())
         if not rising or (len(nodes) > 0 and not 0 <= nodes[0] <= nodes[-1] < n_nodes):
             raise InvalidInputError(
-                f"`nodes` of the range must be rising integers in [0, {n_nodes - 1}]."
+                f"`nodes` of the range must be ascending integers in [0, {n_nodes - 1}]."
             )
-        if (
-            moments.dtype != np.float64
-            or moments.shape != (len(nodes), 3, 3)
-            or not _are_moments(moments)
-        ):
+        shape = len(nodes), 3, 3
+        if moments.dtype != np.float64 or moments.shape != shape or not _are_moments(moments):
             raise InvalidInputError(
-                f"`moments` of the range must be {len(nodes)} symmetric 3x3 matrices of unit trace, none negative."
+                f"`moments` of the range must be {len(nodes)} symmetric 3x3 matrices of unit trace "
+                "without negative eigenvalues."
             )
         return cls(float(limits[0]), float(limits[1]), nodes, moments)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The range as arrays, to be stored."""
+        """Return the range as arrays, for a file."""
         return {
             "limits": np.array([self.size_n, self.width]),
             "nodes": self.nodes,
@@ -134,7 +111,7 @@ class LoadRange:
         }
 
     def excludes(self, forces: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(n,) which of the loads (n, n_nodes, 3), N, are out of range; no force never is."""
+        """Return flags (n,) of the loads (n, n_nodes, 3), N, out of range; zero loads never are."""
         size, width = _sizes_and_widths(forces)
         return np.asarray(
             (size > LARGER * self.size_n)
@@ -143,9 +120,9 @@ class LoadRange:
         )
 
     def strangeness(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Mean over the nodes, weighted by |f_i|, of d_iᵀ (M_i + ε)⁻¹ d_i, with the direction d_i = f_i / |f_i|.
+        """Return the mean over the nodes, weighted by |f_i|, of d_iᵀ (M_i + ε)⁻¹ d_i.
 
-        M_i is zero where no training load had a force.
+        d_i = f_i / |f_i| is the direction of the force. M_i is zero without training loads.
 
         Parameters
         ----------
@@ -155,7 +132,7 @@ class LoadRange:
         Returns
         -------
         (n,) float64
-            About 3 where training pulled in all directions alike, at most 1/ε; 0 for no force.
+            About 3 if training pulled equally in all directions, at most 1/ε; 0 for no force.
         """
         lengths = np.linalg.norm(forces, axis=2)
         known, known_lengths = forces[:, self.nodes], lengths[:, self.nodes]
@@ -174,7 +151,7 @@ class LoadRange:
 
 
 def _chunks(snapshots: Snapshots) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Nodes (n_loaded,), and the forces on them (n, n_loaded, 3), N, of some samples after the other."""
+    """Yield nodes (n_loaded,) and the forces on them (n, n_loaded, 3), N, chunk by chunk."""
     loads = snapshots.loads
     for start in range(0, len(loads), CHUNK):
         some = loads[start : start + CHUNK]
