@@ -1,4 +1,4 @@
-"""What is written for other programs is what was computed, and can be read in again."""
+"""Exported files hold what was computed, and can be read in again."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import InvalidInputError
-from mor_bench.export.data import export_numpy, export_vtu
-from mor_bench.mechanics.elements import element_of, shape_gradients
+from mor_bench.export.npz_file import export_numpy
+from mor_bench.export.vtu_files import export_vtu
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets
 from mor_bench.snapshots.dataset import Dataset
@@ -24,7 +24,7 @@ from tests.test_cli import mor_bench as command
 @pytest.fixture(scope="module")
 def pod(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "pod.safetensors"
-    mor_bench.load_method("pod", n_modes=10).fit(tiny.scene, tiny.train).save(path)
+    mor_bench.load_method("pod", n_modes=3).fit(tiny.scene, tiny.train).save(path)
     return path
 
 
@@ -33,38 +33,22 @@ def test_vtu_holds_reference_and_prediction(
     part: str, tiny: Dataset, pod: Path, tmp_path: Path
 ) -> None:
     samples = {"train": tiny.train, "test": tiny.test}[part]
-    paths = export_vtu(
-        tiny,
-        7,
-        tmp_path / "new" / "folder",
-        part="train" if part == "train" else "test",
-        models=[pod],
-    )
-    assert [path.name for path in paths] == [
-        f"beam-tiny-{part}-00007-reference.vtu",
-        f"beam-tiny-{part}-00007-pod.vtu",
-    ]
+    paths = export_vtu(tiny, 7, tmp_path / "new" / "folder", part=part, models=[pod])  # type: ignore[arg-type]
+    names = [f"beam-tiny-{part}-00007-{name}.vtu" for name in ("reference", "pod")]
+    assert [path.name for path in paths] == names
     assert b'format="binary"' in paths[0].read_bytes()
     reference, predicted = (meshio.read(path) for path in paths)
     for read in (reference, predicted):
         np.testing.assert_array_equal(read.points, tiny.scene.mesh.points)
-        assert [block.type for block in read.cells] == ["hexahedron"]
-        np.testing.assert_array_equal(read.cells[0].data, tiny.scene.mesh.cells)
-        assert (
-            shape_gradients(
-                read.points, read.cells[0].data, element_of(read.cells[0].data).derivatives
-            )[1]
-            > 0
-        ).all()
+        np.testing.assert_array_equal(read.cells_dict["hexahedron"], tiny.scene.mesh.cells)
         np.testing.assert_array_equal(read.point_data["force"], samples.forces[7])
     np.testing.assert_array_equal(reference.point_data["displacement"], samples.displacements[7])
     assert "error" not in reference.point_data
     expected = mor_bench.load_surrogate(pod).predict(samples.forces[7])
+    error = expected - samples.displacements[7]
     np.testing.assert_array_equal(predicted.point_data["displacement"], expected)
-    np.testing.assert_array_equal(
-        predicted.point_data["error"], expected - samples.displacements[7]
-    )
-    assert np.abs(predicted.point_data["error"]).max() > 0
+    np.testing.assert_array_equal(predicted.point_data["error"], error)
+    assert np.abs(error).max() > 0
 
 
 def test_an_embedded_surface_moves_with_the_body(tiny: Dataset, pod: Path, tmp_path: Path) -> None:
@@ -73,64 +57,59 @@ def test_an_embedded_surface_moves_with_the_body(tiny: Dataset, pod: Path, tmp_p
     surface = Facets(low + (high - low) * generator.random((9, 3)), np.arange(9).reshape(3, 3))
     data = replace(tiny, scene=replace(tiny.scene, embedded_surface=surface))
     paths = export_vtu(data, 0, tmp_path, models=[pod])
-    assert [path.stem.split("-", 4)[-1] for path in paths] == [
-        "reference",
-        "reference-surface",
-        "pod",
-        "pod-surface",
-    ]
+    stems = ["reference", "reference-surface", "pod", "pod-surface"]
+    assert [path.stem.split("-", 4)[-1] for path in paths] == stems
+    matrix = interpolation_matrix(tiny.scene.mesh, surface.points)
     for body, skin in (paths[:2], paths[2:]):
         inner, outer = meshio.read(body), meshio.read(skin)
         np.testing.assert_array_equal(outer.points, surface.points)
         np.testing.assert_array_equal(outer.cells_dict["triangle"], surface.facets)
-        matrix = interpolation_matrix(tiny.scene.mesh, surface.points)
-        np.testing.assert_allclose(
-            outer.point_data["displacement"],
-            matrix @ inner.point_data["displacement"],
-            rtol=1e-13,
-            atol=1e-16,
-        )
+        moved = matrix @ inner.point_data["displacement"]
+        found = outer.point_data["displacement"]
+        np.testing.assert_allclose(found, moved, rtol=1e-13, atol=1e-16)
         assert outer.point_data.keys() == inner.point_data.keys() - {"force"}
 
 
-def test_what_cannot_be_exported_is_named_and_nothing_is_written(
+def test_an_impossible_export_is_refused_and_nothing_is_written(
     tiny: Dataset, pod: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with pytest.raises(
-        InvalidInputError,
-        match=r"`sample` must be an integer in \[0, 39\], the samples of part 'test'; got 40",
-    ):
-        export_vtu(tiny, 40, out)
-    with pytest.raises(InvalidInputError, match=r"`part` must be train, test; got '2x'"):
-        export_vtu(tiny, 0, out, part="2x")
-    with pytest.raises(
-        InvalidInputError,
-        match=r"models must differ in name, and none be called 'reference'; got pod, pod",
-    ):
-        export_vtu(tiny, 0, out, models=[pod, pod])
     stiffer = tiny.scene.generated.material.model_copy(update={"young_pa": 501.0})
-    other = replace(
-        tiny,
-        scene=replace(
-            tiny.scene, spec=tiny.scene.generated.model_copy(update={"material": stiffer})
+    spec = tiny.scene.generated.model_copy(update={"material": stiffer})
+    other = replace(tiny, scene=replace(tiny.scene, spec=spec))
+    for message, export in (
+        (
+            r"`sample` must be an integer in \[0, 39\], the samples of part 'test'; got 40",
+            lambda: export_vtu(tiny, 40, out),
         ),
-    )
-    with pytest.raises(
-        InvalidInputError,
-        match=r"pod.safetensors: the model was fitted to 'beam-tiny', not to 'beam-tiny' as it is",
+        (
+            r"`part` must be train, test; got '2x'",
+            lambda: export_vtu(tiny, 0, out, part="2x"),
+        ),
+        (
+            r"models must differ in name, and none be called 'reference'; got pod, pod",
+            lambda: export_vtu(tiny, 0, out, models=[pod, pod]),
+        ),
+        (
+            r"pod.safetensors: the model was fitted to 'beam-tiny', not to 'beam-tiny' as it is",
+            lambda: export_vtu(other, 0, out, models=[pod]),
+        ),
+        (
+            r"`out` must end in .npz; got 'x.npy'",
+            lambda: export_numpy(tiny, "x.npy"),
+        ),
     ):
-        export_vtu(other, 0, out, models=[pod])
-    with pytest.raises(InvalidInputError, match=r"`out` must end in .npz; got 'x.npy'"):
-        export_numpy(tiny, "x.npy")
+        with pytest.raises(InvalidInputError, match=message):
+            export()
     assert not out.exists()
 
 
 @pytest.mark.parametrize("by", ["region", "sample"])
-def test_numpy_is_read_in_again_with_the_same_parts(by: str, cache: Path, tmp_path: Path) -> None:
-    data = mor_bench.load_dataset(
-        "beam-tiny", split="region" if by == "region" else "sample", cache=cache
-    )
+def test_exported_arrays_read_back_with_the_same_parts(
+    by: str, cache: Path, tmp_path: Path
+) -> None:
+    split = "region" if by == "region" else "sample"
+    data = mor_bench.load_dataset("beam-tiny", split=split, cache=cache)  # type: ignore[arg-type]
     npz, toml = export_numpy(data, tmp_path / "new" / "tiny.npz")
     again = mor_bench.load_dataset(toml)
     for before, after in ((data.train, again.train), (data.test, again.test)):
@@ -140,10 +119,9 @@ def test_numpy_is_read_in_again_with_the_same_parts(by: str, cache: Path, tmp_pa
     assert again.scene.mesh.grid_shape == data.scene.mesh.grid_shape == again.scene.spec.grid_nodes
     assert again.scene.spec.needs == data.scene.spec.needs
     assert again.scene.spec.title == data.scene.spec.title
-    for first in (20, 60):  # a beginning of the file holds both parts
-        assert (
-            abs(len(mor_bench.load_dataset(toml, first).test) - len(data.test) / 210 * first) <= 1
-        )
+    for first in (20, 60):  # the first samples of the file hold both parts in proportion
+        n_test = len(mor_bench.load_dataset(toml, first).test)
+        assert abs(n_test - len(data.test) / 210 * first) <= 1
     twice = export_numpy(again, tmp_path / "again.npz")[0]
     with np.load(npz) as one, np.load(twice) as two:
         assert one.files == two.files
@@ -151,19 +129,18 @@ def test_numpy_is_read_in_again_with_the_same_parts(by: str, cache: Path, tmp_pa
             np.testing.assert_array_equal(one[name], two[name])
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no such names of files")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows forbids such file names")
 @pytest.mark.parametrize("name", ["😀", 'a"b\\c', "tab\tdel\x7fesc\x1bé"])
 def test_any_file_name_and_title_is_read_in_again(name: str, tiny: Dataset, tmp_path: Path) -> None:
     spec = tiny.scene.spec.model_copy(update={"title": name, "source": name + "\n\x00"})
-    npz, toml = export_numpy(
-        replace(tiny, scene=replace(tiny.scene, spec=spec)), tmp_path / f"{name}.npz"
-    )
+    data = replace(tiny, scene=replace(tiny.scene, spec=spec))
+    npz, toml = export_numpy(data, tmp_path / f"{name}.npz")
     assert tomllib.loads(toml.read_text(encoding="utf-8"))["snapshots"]["file"] == npz.name
     again = mor_bench.load_scene(toml).spec
     assert (again.title, again.source) == (spec.title, spec.source)
 
 
-def test_snapshots_without_regions_stay_without(tiny: Dataset, tmp_path: Path) -> None:
+def test_snapshots_without_regions_are_exported_without(tiny: Dataset, tmp_path: Path) -> None:
     npz, toml = export_numpy(tiny, tmp_path / "tiny.npz")
     with np.load(npz) as file:
         arrays = {name: file[name] for name in file.files if name != "regions"}
@@ -173,40 +150,26 @@ def test_snapshots_without_regions_stay_without(tiny: Dataset, tmp_path: Path) -
         assert set(file.files) == set(arrays)
 
 
-def test_the_commands(pod: Path, cache: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_the_export_commands_print_the_files_they_write(
+    pod: Path, cache: Path, tmp_path: Path
+) -> None:
     shared = ["beam-tiny", "--cache", str(cache)]
     done = command("export", "numpy", *shared, "--out", "tiny.npz", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, "tiny.npz\ntiny.toml\n"), done.stderr
-    done = command(
-        "export",
-        "vtu",
-        *shared,
-        "--sample",
-        "3",
-        "--part",
-        "train",
-        "--model",
-        str(pod),
-        "--out",
-        "vtu",
-        cwd=tmp_path,
-    )
+    sample = [*shared, "--sample", "3", "--out", "vtu"]
+    done = command("export", "vtu", *sample, "--part", "train", "--model", str(pod), cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert sorted(done.stdout.split()) == sorted(
-        str(path.relative_to(tmp_path)) for path in tmp_path.glob("vtu/*")
-    )
-    assert len(done.stdout.split()) == 2
-    refused = command(
-        "export", "vtu", *shared, "--sample", "3", "--part", "trian", "--out", "vtu", cwd=tmp_path
-    )
+    written = [str(path.relative_to(tmp_path)) for path in tmp_path.glob("vtu/*")]
+    assert sorted(done.stdout.split()) == sorted(written)
+    assert len(written) == 2
+    refused = command("export", "vtu", *sample, "--part", "trian", cwd=tmp_path)
     assert refused.returncode == 2
-    assert refused.stderr.strip() == (
-        "mor-bench: `--part` must be train, test, in-range, 2x, 4x, unseen-regions, unseen-directions, several-forces; got 'trian'."
-    )
+    assert "`--part` must be train, test, in-range, 2x, 4x, unseen-regions" in refused.stderr
 
 
 @pytest.mark.parametrize("there", ["body.toml", "body.npz"])
-def test_no_file_of_the_users_is_overwritten(there: str, tiny: Dataset, tmp_path: Path) -> None:
+def test_no_existing_file_is_overwritten(there: str, tiny: Dataset, tmp_path: Path) -> None:
     (tmp_path / there).write_text("mine")
     with pytest.raises(InvalidInputError, match=f"{there} exists and is not overwritten"):
         export_numpy(tiny, tmp_path / "body.npz")

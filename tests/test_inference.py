@@ -22,7 +22,7 @@ from mor_bench.errors import (
     StoreError,
     UnavailableBackendError,
 )
-from mor_bench.export.data import export_onnx
+from mor_bench.export.onnx_file import export_onnx
 from mor_bench.model_file import model_digest as _digest
 from mor_bench.model_file import read_header_and_arrays as _read_model
 from mor_bench.snapshots.dataset import Dataset

@@ -18,7 +18,9 @@ from mor_bench.errors import (
     UnknownRangeError,
     UnsupportedSceneError,
 )
-from mor_bench.export.data import export_numpy, export_onnx, export_vtu
+from mor_bench.export.npz_file import export_numpy
+from mor_bench.export.onnx_file import export_onnx
+from mor_bench.export.vtu_files import export_vtu
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.observed import ObservedModel

@@ -20,7 +20,7 @@ from mor_bench.errors import (
     StoreError,
     UnsupportedSceneError,
 )
-from mor_bench.export.data import snapshot_arrays
+from mor_bench.export.npz_file import snapshot_arrays
 from mor_bench.measure.discretisation_error import refine
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.runs.configurations import CORE_METHODS, DATA_METHODS, checked_specs

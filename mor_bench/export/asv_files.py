@@ -1,0 +1,176 @@
+"""The three kinds of result files of asv (airspeed velocity), and the commit they belong to."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import platform
+import re
+import subprocess
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mor_bench.errors import InvalidInputError, StoreError
+from mor_bench.machine import describe_machine
+from mor_bench.snapshots.store import write_atomically
+
+VERSION = {"machine": 1, "benchmarks": 2, "results": 2}
+"""asv's version of each kind of file."""
+
+STATISTICS = ("ci_99_a", "ci_99_b", "q_25", "q_75", "number", "repeat")
+COLUMNS = ("result", "params", "version", *(f"stats_{name}" for name in STATISTICS))
+"""asv's columns of a result."""
+
+Key = tuple[str, ...]
+"""Values of a benchmark's parameters, each as Python prints it, which is how asv stores them."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A value with its statistics: NaN means not measured, None means failed."""
+
+    value: float | None
+    statistics: Mapping[str, float] = field(default_factory=dict)
+
+
+Figures = dict[Key, Figure]
+
+
+def to_columns(figures: Figures) -> list[Any]:
+    """Arrange figures in asv's order, that of the product of the parameters' values."""
+    parameters = [list(dict.fromkeys(column)) for column in zip(*figures, strict=True)]
+    listed = [figures.get(key, Figure(math.nan)) for key in itertools.product(*parameters)]
+    columns = [[figure.statistics.get(name) for figure in listed] for name in STATISTICS]
+    return [
+        [figure.value for figure in listed],
+        parameters,
+        "1",
+        *(column if any(x is not None for x in column) else None for column in columns),
+    ]
+
+
+def from_columns(content: list[Any]) -> Figures:
+    """Invert `to_columns`."""
+    values, parameters, _, *columns = content
+    named = {name: column for name, column in zip(STATISTICS, columns, strict=True) if column}
+    return {
+        key: Figure(
+            values[i],
+            {name: column[i] for name, column in named.items() if column[i] is not None},
+        )
+        for i, key in enumerate(itertools.product(*parameters))
+    }
+
+
+def read_file(path: Path, kind: str) -> dict[str, Any] | None:
+    """Read one of asv's files without its version; None if it does not exist.
+
+    Raises
+    ------
+    StoreError
+        If it is not a file of asv, or of another version.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        version = content.pop("version")
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StoreError(f"{path}: not a file of asv: {error!r}") from None
+    if version != VERSION[kind]:
+        raise StoreError(
+            f"{path}: asv's {kind} in version {version}; "
+            f"this version of mor-bench knows version {VERSION[kind]}."
+        )
+    return dict(content)
+
+
+def write_file(path: Path, content: Mapping[str, Any], kind: str) -> None:
+    """Write one of asv's files atomically."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps({**content, "version": VERSION[kind]}, indent=1).encode())
+
+
+def machine_name(ran_on: Mapping[str, Any], name: str | None) -> str:
+    """Check a machine's name on the dashboard, by default this machine's.
+
+    Raises
+    ------
+    InvalidInputError
+        If the name has other characters than a file may have, or the comparison ran on another
+        machine than this one and no name is given.
+    """
+    if name is None:
+        here = describe_machine()
+        if any(here[key] != ran_on.get(key) for key in ("processor", "cores")):
+            raise InvalidInputError(
+                "the comparison ran on another machine "
+                f"({ran_on.get('processor')}, {ran_on.get('cores')} cores); "
+                "give its name as `machine`."
+            )
+        name = platform.node()
+    if not re.fullmatch(r"\w[\w.-]*", name):
+        raise InvalidInputError(
+            "`machine` must consist of letters, digits, '.', '-' and '_', "
+            f"and not begin with a mark; got {name!r}."
+        )
+    return name
+
+
+def describe_for_asv(ran_on: Mapping[str, Any], name: str) -> dict[str, str]:
+    """Describe a machine as asv does, so that both results are under one machine."""
+    here = name == platform.node()
+    return {
+        "arch": platform.machine() if here else "",
+        "cpu": str(ran_on["processor"]),
+        "machine": name,
+        "num_cpu": str(ran_on["cores"]),
+        "os": str(ran_on["system"]),
+        "ram": _memory() if here else "",
+    }
+
+
+def _memory() -> str:
+    try:
+        return str(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):  # unknown on Windows and some others
+        return ""
+
+
+def commit_and_date(commit: str | None) -> tuple[str, int]:
+    """Look up the hash of a commit of the working folder's checkout, and its date, ms since 1970.
+
+    Raises
+    ------
+    InvalidInputError
+        If the working folder is not in a checkout of mor-bench, or there is no such commit.
+    """
+    top = _git("rev-parse", "--show-toplevel")
+    project = Path(top) / "pyproject.toml" if top else None
+    text = project.read_text(encoding="utf-8") if project and project.is_file() else ""
+    if tomllib.loads(text).get("project", {}).get("name") != "mor-bench":
+        raise InvalidInputError(
+            f"{Path().resolve()} is in no git checkout of mor-bench, "
+            "which must hold the commit that ran the comparison."
+        )
+    wanted = f"{commit or 'HEAD'}^{{commit}}"
+    found = _git("rev-parse", "--verify", "--quiet", "--end-of-options", wanted)
+    if not found:
+        raise InvalidInputError(f"`commit` must name a commit of {top}; got {commit or 'HEAD'!r}.")
+    return found, 1000 * int(_git("show", "-s", "--format=%at", found) or 0)
+
+
+def _git(*arguments: str) -> str | None:
+    """Output of git; None if it fails or is not installed."""
+    try:
+        done = subprocess.run(
+            ["git", *arguments], check=True, capture_output=True, text=True, encoding="utf-8"
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()

@@ -1,0 +1,84 @@
+"""A dataset's samples as NumPy arrays, with the TOML file that reads them in again."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.export.output_path import new_file
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.dataset import Dataset
+from mor_bench.snapshots.imported_dataset import NodalLoads
+from mor_bench.snapshots.store import write_atomically
+
+
+def export_numpy(data: Dataset, out: str | Path) -> list[Path]:
+    """Write a dataset's samples to an NPZ file, and beside it a TOML file with the same split.
+
+    Returns
+    -------
+    list of Path
+        The two files.
+
+    Raises
+    ------
+    InvalidInputError
+        If the file's name does not end in .npz, or one of the two files exists.
+    """
+    out = new_file(out, ".npz", ".toml")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    buffer = io.BytesIO()
+    np.savez(buffer, **snapshot_arrays(data))  # type: ignore[arg-type]
+    write_atomically(out, buffer.getvalue())
+    write_atomically(out.with_suffix(".toml"), _toml(data.scene, out.name).encode())
+    return [out, out.with_suffix(".toml")]
+
+
+def snapshot_arrays(data: Dataset) -> dict[str, NDArray[Any]]:
+    """Return training and test samples in the schema of `mor_bench.scene.snapshot_file`.
+
+    The parts alternate, so that the first n samples hold both in about their proportion.
+    """
+    parts = (data.train, data.test)
+    places = np.concatenate([(np.arange(len(part)) + 0.5) / len(part) for part in parts])
+    order = np.argsort(places, kind="stable")
+    arrays: dict[str, NDArray[Any]] = {
+        "points": data.scene.mesh.points,
+        "cells": data.scene.mesh.cells,
+        "fixed_nodes": data.scene.fixed_nodes,
+    }
+    for name in ("forces", "displacements", "regions"):
+        arrays[name] = np.concatenate([getattr(part, name) for part in parts])[order]
+    if isinstance(data.train.loads, NodalLoads) and not arrays["regions"].any():
+        del arrays["regions"]  # the imported file had none
+    arrays["test"] = (np.arange(len(order)) >= len(data.train))[order]
+    return arrays
+
+
+def _quoted(text: str) -> str:
+    """Quote a text as TOML: as JSON does, with the delete character escaped, and no surrogates."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _toml(scene: Scene, file: str) -> str:
+    spec = scene.spec
+    grid = spec.grid_nodes or scene.mesh.grid_shape
+    return f"""title = {_quoted(spec.title)}
+source = {_quoted(spec.source)}
+{f"grid_nodes = {list(grid)}" if grid else ""}
+
+[snapshots]
+file = {_quoted(file)}
+
+[split]
+by = "file"
+
+[needs]
+error = {spec.needs.error!r}
+latency_ms = {spec.needs.latency_ms!r}
+"""

@@ -1,0 +1,132 @@
+"""Single samples as VTU files for ParaView."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import meshio
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.errors import InvalidInputError
+from mor_bench.method_loading import load_surrogate
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.snapshots.test_sets import SET_NAMES, SetName
+from mor_bench.surrogate import Surrogate
+
+Part = Literal["train", "test"] | SetName
+
+PARTS: tuple[Part, ...] = ("train", "test", *SET_NAMES)
+
+
+def export_vtu(
+    data: Dataset,
+    sample: int,
+    out: str | Path,
+    *,
+    part: Part = "test",
+    models: Sequence[str | Path] = (),
+) -> list[Path]:
+    """Write a sample's reference, and the prediction of each model, as VTU.
+
+    Each file holds the mesh at rest with the point data `displacement`, m, and `force`, N. The file
+    of a model also has `error`, its displacement minus the reference's, m. ParaView's filter Warp
+    By Vector shows the deformed body. A scene with an embedded surface adds a second file for each,
+    with the surface.
+
+    Parameters
+    ----------
+    data : Dataset
+    sample : int
+        Number of the sample in its part.
+    out : path
+        Folder; created if it does not exist.
+    part : {"train", "test"} or the name of a test set
+        A test set must have been read with the dataset.
+    models : sequence of paths
+        Fitted models, see `Surrogate.save`. Each file is named after its model's.
+
+    Returns
+    -------
+    list of Path
+        The written files.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no such part or sample, a model is of another dataset, or two have one name.
+    StoreError
+        If a model is damaged.
+    SolverError
+        If a model finds no answer.
+    """
+    samples, out = _samples_of(data, part), Path(out)
+    if not 0 <= sample < len(samples):
+        raise InvalidInputError(
+            f"`sample` must be an integer in [0, {len(samples) - 1}], "
+            f"the samples of part {part!r}; got {sample}."
+        )
+    names = ["reference", *(Path(model).stem for model in models)]
+    if len(set(names)) < len(names):
+        raise InvalidInputError(
+            "files would have one name: models must differ in name, "
+            f"and none be called 'reference'; got {', '.join(names[1:])}."
+        )
+    force, reference = samples.forces[sample], samples.displacements[sample]
+    fields = [{"displacement": reference, "force": force}]
+    for path in models:
+        predicted = _model_of(data.scene, path).predict(samples.given[sample].query)
+        fields.append({"displacement": predicted, "force": force, "error": predicted - reference})
+    out.mkdir(parents=True, exist_ok=True)
+    stems = [f"{data.scene.name}-{part}-{sample:05d}-{name}" for name in names]
+    return [
+        path
+        for stem, found in zip(stems, fields, strict=True)
+        for path in _write(data.scene, found, out, stem)
+    ]
+
+
+def _samples_of(data: Dataset, part: Part) -> Snapshots:
+    parts: dict[str, Snapshots] = {"train": data.train, "test": data.test}
+    parts.update({str(name): samples for name, samples in data.tests.items()})
+    if part not in parts:
+        raise InvalidInputError(f"`part` must be {', '.join(parts)}; got {part!r}.")
+    return parts[part]
+
+
+def _model_of(scene: Scene, path: str | Path) -> Surrogate:
+    """Load a model that was fitted to the same scene, with the same observed nodes."""
+    model = load_surrogate(path)
+    fitted = model.scene_
+    if fitted.spec.physics() != scene.spec.physics() or _observed(fitted) != _observed(scene):
+        raise InvalidInputError(
+            f"{path}: the model was fitted to {fitted.name!r}, not to {scene.name!r} as it is."
+        )
+    return model
+
+
+def _observed(scene: Scene) -> list[int] | None:
+    """Nodes whose displacements methods are given; None if they are given forces."""
+    return None if scene.observed_nodes is None else scene.observed_nodes.tolist()
+
+
+def _write(
+    scene: Scene, fields: Mapping[str, NDArray[np.float64]], out: Path, stem: str
+) -> list[Path]:
+    kind = "tetra" if scene.mesh.cells.shape[1] == 4 else "hexahedron"
+    path, surface = out / f"{stem}.vtu", scene.embedded_surface
+    body = meshio.Mesh(scene.mesh.points, [(kind, scene.mesh.cells)], point_data=dict(fields))
+    body.write(path, binary=True)
+    if surface is None:
+        return [path]
+    # The force stays at the nodes: a sum over nodes cannot be interpolated.
+    carried = {
+        name: scene.to_surface @ values for name, values in fields.items() if name != "force"
+    }
+    skin = meshio.Mesh(surface.points, [("triangle", surface.facets)], point_data=carried)
+    skin_path = out / f"{stem}-surface.vtu"
+    skin.write(skin_path, binary=True)
+    return [path, skin_path]
