@@ -9,15 +9,7 @@ from pathlib import Path
 
 import pytest
 
-
-def mor_bench(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "mor_bench", *arguments],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+from tests.commands import mor_bench_command as mor_bench
 
 
 def test_help_imports_nothing_heavy() -> None:

@@ -27,7 +27,7 @@ from mor_bench.specs import list_suite
 from tests.benchmarks.bench_full_order import FullOrder
 from tests.benchmarks.bench_surrogates import METHODS
 from tests.benchmarks.publish import LOCAL, make_offline, publish
-from tests.test_cli import mor_bench as command
+from tests.commands import mor_bench_command as command
 
 CHROMIUM = next(
     (

@@ -18,7 +18,7 @@ from mor_bench.export.vtu_files import export_vtu
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets
 from mor_bench.snapshots.dataset import Dataset
-from tests.test_cli import mor_bench as command
+from tests.commands import mor_bench_command as command
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ from mor_bench.scene.snapshot_file import MAX_SIZE
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.given import MAX_FORCE_N
 from mor_bench.specs import ImportedDatasetSpec, list_suite, load_generated_spec
-from tests.test_cli import mor_bench as command
+from tests.commands import mor_bench_command as command
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -21,7 +21,8 @@ from rich.console import Console
 import mor_bench
 from mor_bench.errors import InvalidInputError
 from mor_bench.measure.range_flags import flags_of
-from mor_bench.report import print_tables, render
+from mor_bench.report.console_tables import print_tables
+from mor_bench.report.page import render
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.dataset_run import place_of
 from mor_bench.runs.fit_cache import Entry, Job, Material, fit

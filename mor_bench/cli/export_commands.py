@@ -15,7 +15,9 @@ from mor_bench.cli.option_groups import DatasetName, with_options
 from mor_bench.cli.progress_bars import show_progress
 from mor_bench.errors import InvalidInputError
 from mor_bench.export.asv_results import export_asv
-from mor_bench.export.data import PARTS, export_numpy, export_onnx, export_vtu
+from mor_bench.export.npz_file import export_numpy
+from mor_bench.export.onnx_file import export_onnx
+from mor_bench.export.vtu_files import PARTS, export_vtu
 from mor_bench.options import DataOptions
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.test_sets import SET_NAMES, SetName

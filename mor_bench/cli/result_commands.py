@@ -15,7 +15,8 @@ from mor_bench.cli.console import make_console
 from mor_bench.cli.option_groups import DatasetName, with_options
 from mor_bench.cli.progress_bars import show_progress
 from mor_bench.options import CommandLine, FolderOptions
-from mor_bench.report import print_tables, render
+from mor_bench.report.console_tables import print_tables
+from mor_bench.report.page import render
 
 app = typer.Typer(rich_markup_mode=None)
 

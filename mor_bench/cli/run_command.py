@@ -13,8 +13,8 @@ from mor_bench.cli.console import make_console
 from mor_bench.cli.option_groups import Json, with_options
 from mor_bench.cli.progress_bars import show_progress
 from mor_bench.options import RunOptions
-from mor_bench.report import print_tables, render
-from mor_bench.report.console_tables import print_plan
+from mor_bench.report.console_tables import print_plan, print_tables
+from mor_bench.report.page import render
 from mor_bench.runs.plan import plan
 
 app = typer.Typer(rich_markup_mode=None)
