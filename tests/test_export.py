@@ -6,6 +6,7 @@ import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
@@ -77,30 +78,17 @@ def test_an_impossible_export_is_refused_and_nothing_is_written(
     stiffer = tiny.scene.generated.material.model_copy(update={"young_pa": 501.0})
     spec = tiny.scene.generated.model_copy(update={"material": stiffer})
     other = replace(tiny, scene=replace(tiny.scene, spec=spec))
-    for message, export in (
-        (
-            r"`sample` must be an integer in \[0, 39\], the samples of part 'test'; got 40",
-            lambda: export_vtu(tiny, 40, out),
-        ),
-        (
-            r"`part` must be train, test; got '2x'",
-            lambda: export_vtu(tiny, 0, out, part="2x"),
-        ),
-        (
-            r"models must differ in name, and none be called 'reference'; got pod, pod",
-            lambda: export_vtu(tiny, 0, out, models=[pod, pod]),
-        ),
-        (
-            r"pod.safetensors: the model was fitted to 'beam-tiny', not to 'beam-tiny' as it is",
-            lambda: export_vtu(other, 0, out, models=[pod]),
-        ),
-        (
-            r"`out` must end in .npz; got 'x.npy'",
-            lambda: export_numpy(tiny, "x.npy"),
-        ),
-    ):
+    refused: list[tuple[Dataset, dict[str, Any], str]] = [
+        (tiny, {"sample": 40}, r"`sample` must be an integer in \[0, 39\], the samples of part"),
+        (tiny, {"part": "2x"}, "`part` must be train, test; got '2x'"),
+        (tiny, {"models": [pod, pod]}, "none be called 'reference'; got pod, pod"),
+        (other, {"models": [pod]}, "pod.safetensors: the model was fitted to 'beam-tiny', not to"),
+    ]
+    for data, options, message in refused:
         with pytest.raises(InvalidInputError, match=message):
-            export()
+            export_vtu(data, **{"sample": 0, "out": out, **options})
+    with pytest.raises(InvalidInputError, match=r"`out` must end in .npz; got 'x.npy'"):
+        export_numpy(tiny, "x.npy")
     assert not out.exists()
 
 
