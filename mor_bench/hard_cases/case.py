@@ -1,8 +1,9 @@
-"""What a hard case is, what comes of it, and what it is tried on."""
+"""What a hard case is, its outcome, and the methods and datasets that it is tried on."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import SolverError
+from mor_bench.errors import MorBenchError, SolverError
 from mor_bench.measure.discretisation_error import measured
 from mor_bench.method_loading import make_surrogate
 from mor_bench.scene.scene import Scene, load_scene
@@ -23,26 +24,26 @@ from mor_bench.surrogate import Surrogate
 Verdict = Literal["pass", "fall short", "not applicable"]
 
 LONGEST = {"quick": 300, "full": None}
-"""Iterations of a training at most, by profile: what is judged is behaviour, and errors are published, not compared."""
+"""Most iterations of a training, by profile. Errors are published here, not compared."""
 
 LONGEST_S = 1800.0
-"""Seconds of a training at most; a method that sees that they will not do says so."""
+"""Seconds that a training may plan with; a method that predicts to exceed them says so."""
 
 BRIEF = 20
-"""Iterations of a training of which only its manners matter."""
+"""Iterations of a training whose errors do not matter."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a case.
+    """The outcome of a case.
 
     Attributes
     ----------
     verdict : {"pass", "fall short", "not applicable"}
     happened : str
-        In words and numbers.
+        What was observed, in words and numbers.
     measured : dict
-        The numbers.
+        The numbers behind the verdict.
     """
 
     verdict: Verdict
@@ -51,7 +52,7 @@ class Outcome:
 
 
 def judged(good: bool, happened: str, **measured: Any) -> Outcome:
-    """A pass, or falling short."""
+    """Return an outcome that passes or falls short."""
     return Outcome("pass" if good else "fall short", happened, measured)
 
 
@@ -82,7 +83,7 @@ class Scenes:
 
     @cached_property
     def pressed(self) -> Dataset:
-        """beam-tiny under forces along the surface's normal only, so that there are directions that training never saw."""
+        """Return beam-tiny under normal forces only, so that the other directions are unseen."""
         content = self.spec.model_dump()
         spec = DatasetSpec.model_validate(
             {
@@ -95,13 +96,13 @@ class Scenes:
 
     @cached_property
     def discretisation_error(self) -> float:
-        """Median relative l2 of beam-tiny's mesh against the body; 0 where it was not measured."""
+        """Return the median relative l2 error of beam-tiny's mesh; 0 if it was not measured."""
         record = measured(self.spec, self._cache)
         return float(record["relative_l2_median"]) if record else 0.0
 
 
 class Subject:
-    """A method as the cases take it: made anew, or fitted once on beam-tiny."""
+    """A method as cases use it: made anew, or fitted once on beam-tiny."""
 
     def __init__(self, spec: MethodSpec, profile: str, scenes: Scenes) -> None:
         self.name, self.scenes = spec.name, scenes
@@ -117,7 +118,7 @@ class Subject:
         check_parameters(self._spec.load_class(), parameters, f"method {self.name}")
 
     def fresh(self, brief: bool = False, **knobs: Any) -> Surrogate:
-        """An unfitted one with the method file's parameters, a short training and some other knobs."""
+        """Return an unfitted method with a short training and some parameters replaced."""
         parameters = {**self._spec.parameters_of(self._profile), **knobs}
         longest = BRIEF if brief else LONGEST[self._profile]
         if longest is not None and "iterations" in parameters:
@@ -127,6 +128,7 @@ class Subject:
         return method
 
     def fit(self, data: Dataset, brief: bool = False, **knobs: Any) -> Surrogate:
+        """Return a `fresh` method, fitted on a dataset's training samples."""
         method = self.fresh(brief, **knobs)
         return method.fit(data.scene, data.train if method.needs_snapshots else None)
 
@@ -134,18 +136,19 @@ class Subject:
     def _attempt(self) -> Surrogate | Exception:
         try:
             return self.fit(self.data)
-        except Exception as error:  # third parties' code; tried once, whatever it costs
+        except Exception as error:  # foreign code; tried once, since it may be costly
             return error
 
     @property
     def fitted(self) -> Surrogate:
-        """Fitted on beam-tiny's training samples."""
+        """Return the method fitted on beam-tiny's training samples; raise what its fit raised."""
         if isinstance(self._attempt, Exception):
             raise self._attempt
         return self._attempt
 
     @cached_property
     def fitted_on_pressed(self) -> Surrogate:
+        """Return the method fitted on `Scenes.pressed`."""
         return self.fit(self.scenes.pressed)
 
 
@@ -156,13 +159,13 @@ class Case:
     Attributes
     ----------
     name, part : str
-        What it is selected by, and which part of it, if it has several.
+        The name by which it is selected, and its part, if it has several.
     expected : str
         The correct behaviour.
     concerns : callable
-        Whether it is a case for a method.
+        Whether the case applies to a method.
     examine : callable
-        Tries it; may raise what it likes.
+        Tries the case; any exception means falling short.
     """
 
     name: str
@@ -173,39 +176,45 @@ class Case:
 
 
 def every(method: Surrogate) -> bool:
-    """Any method."""
+    """Accept any method."""
     return True
 
 
 def learner(method: Surrogate) -> bool:
-    """One that learns from snapshots."""
+    """Accept a method that learns from snapshots."""
     return method.needs_snapshots
 
 
 def answers(method: Surrogate, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Predictions (n, n_nodes, 3), m, one by one; NaN where the method says that it finds no equilibrium."""
+    """Return predictions (n, n_nodes, 3), m, made one by one; NaN without an equilibrium."""
     out = np.full(forces.shape, np.nan)
     for row, force in zip(out, forces, strict=True):
-        try:
+        with suppress(SolverError):
             row[:] = method.predict(force.copy())
-        except SolverError:
-            continue
     return out
 
 
-def refused(attempt: Callable[[], object], by: type[Exception]) -> str | None:
-    """None where an attempt raises an error of a kind; else what it did instead."""
-    try:
-        attempt()
-    except by:
-        return None
-    except Exception as error:
-        return f"raised {type(error).__name__}"
-    return "was taken"
+def wrongly_handled(
+    attempts: Mapping[str, Callable[[], object]], by: type[Exception] = MorBenchError
+) -> list[str]:
+    """Return what happened instead to attempts that do not raise an error of a kind."""
+    wrong = []
+    for name, attempt in attempts.items():
+        try:
+            attempt()
+            wrong.append(f"{name} was accepted")
+        except by:
+            continue
+        except Exception as error:
+            wrong.append(f"{name} raised {type(error).__name__}")
+    return wrong
 
 
 def with_samples(snapshots: Snapshots, rows: NDArray[np.int64], zeros: int = 0) -> Snapshots:
-    """Some samples, as often as their numbers stand, the last ``zeros`` of them with neither load nor displacement."""
+    """Return some samples; the last ``zeros`` of them get neither load nor displacement.
+
+    A number that is repeated in ``rows`` repeats its sample.
+    """
     chosen = snapshots[rows]
     assert isinstance(chosen.loads, PatchLoads)
     kept = np.arange(len(rows)) < len(rows) - zeros
@@ -216,9 +225,10 @@ def with_samples(snapshots: Snapshots, rows: NDArray[np.int64], zeros: int = 0) 
 
 
 def rms(values: NDArray[np.float64]) -> float:
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
 def scene_of(spec: DatasetSpec, **changes: Any) -> Scene:
-    """The scene of a dataset with some tables of its file replaced."""
+    """Return the scene of a dataset with some tables of its file replaced."""
     return load_scene({**spec.model_dump(mode="json", exclude_none=True), **changes})

@@ -48,7 +48,10 @@ class CaseResult:
 
 
 def cases_for(subject: Subject, names: Sequence[str]) -> list[tuple[Case, str | None]]:
-    """Return the cases of some names that concern a method, each with the reason why it cannot be tried, if any."""
+    """Return the cases that concern a method, of those with some names.
+
+    Each comes with the reason why it cannot be tried, or None.
+    """
     wanted = [case for case in CASES if case.name in names]
     try:
         method = subject.fresh()

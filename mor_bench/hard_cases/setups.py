@@ -1,4 +1,4 @@
-"""Bodies with a known answer that the hard cases, and the tests of the full-order model, load."""
+"""Bodies with a known answer, for the hard cases and for the tests of the full-order model."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ def free_assembler(mesh: Mesh, law: Material = LAW, selective: bool = False) -> 
 
 
 def distorted_box(cells: tuple[int, int, int], tetrahedra: bool = False, seed: int = 0) -> Mesh:
-    """A unit box whose inner nodes are moved by up to 0.3 of a cell's edge (0.15 with tetrahedra, which are thinner)."""
+    """Return a unit box whose inner nodes are moved at random.
+
+    They move by up to 0.3 of a cell's edge, or 0.15 with tetrahedra, which are thinner.
+    """
     mesh = box_mesh((1.0, 1.0, 1.0), cells, tetrahedra)
     inner = np.all((mesh.points > 1e-9) & (mesh.points < 1 - 1e-9), axis=1)
     points = mesh.points.copy()
@@ -52,7 +55,10 @@ def distorted_box(cells: tuple[int, int, int], tetrahedra: bool = False, seed: i
 
 
 def patch_test_error(mesh: Mesh, law: Material = LAW, selective: bool = False) -> float:
-    """Largest error, m, inside a unit box whose surface is given a homogeneous deformation, after Newton's method from near by."""
+    """Return the largest error of the patch test on a unit box, m.
+
+    The surface gets a homogeneous deformation, and Newton's method starts near the solution.
+    """
     gradient = np.eye(3) + np.array([[0.1, 0.05, -0.02], [0.03, -0.08, 0.04], [0.0, 0.06, 0.07]])
     exact = mesh.points @ (gradient - np.eye(3)).T
     outer = np.any((mesh.points < 1e-9) | (mesh.points > 1 - 1e-9), axis=1)
@@ -69,7 +75,10 @@ def patch_test_error(mesh: Mesh, law: Material = LAW, selective: bool = False) -
 def confined_column(
     law: Material = LAW, tetrahedra: bool = False, selective: bool = False
 ) -> GalerkinProblem:
-    """One cube between rigid lateral walls whose top moves along the axis as one: a single unknown."""
+    """Return a cube between rigid lateral walls whose top moves along the axis as one.
+
+    It has a single unknown.
+    """
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1), tetrahedra)
     dofs = np.full((8, 3), 4)
     dofs[mesh.points[:, 0] == 1.0, 0] = np.arange(4)
@@ -79,7 +88,9 @@ def confined_column(
 
 @dataclass(frozen=True)
 class Arch:
-    """Two straight bars between hinges 4 m apart, the crown 0.4 m above them; the load is 2 N downwards on the crown's edge.
+    """Two straight bars between hinges 4 m apart, with the crown 0.4 m above them.
+
+    The load is 2 N downwards on the crown's edge.
 
     Attributes
     ----------
@@ -100,7 +111,10 @@ class Arch:
     crown: NDArray[np.int64]
 
     def reactions(self, depths: Array) -> Array:
-        """The load on each loaded dof, N, that holds the crown at prescribed depths, m, which follow each other closely."""
+        """Return the load on each loaded dof, N, that holds the crown at prescribed depths, m.
+
+        The depths must be close to each other.
+        """
         others = np.setdiff1d(np.arange(len(self.load)), self.crown)
         q, found = np.zeros(len(self.load)), []
         for depth in depths:
@@ -112,7 +126,10 @@ class Arch:
         return np.array(found)
 
     def greatest_reaction(self) -> float:
-        """The top of the path under a prescribed displacement, N: the load at which the arch snaps through."""
+        """Return the load at which the arch snaps through, N.
+
+        It is the top of the path under a prescribed displacement.
+        """
         found = self.reactions(np.linspace(0.0, 0.4, 81))
         most = int(np.argmax(found))
         top = np.polynomial.Polynomial.fit(
@@ -122,7 +139,7 @@ class Arch:
 
 
 def make_arch() -> Arch:
-    """The arch, of 16 H8."""
+    """Return the arch, made of 16 H8."""
     mesh = box_mesh((4.0, 1.0, 0.2), (8, 1, 2))
     x, _, z = mesh.points.T
     fixed = ((x == 0) | (x == 4.0)) & np.isclose(z, 0.1)
@@ -138,7 +155,10 @@ def make_arch() -> Arch:
 
 @dataclass(frozen=True)
 class Bars:
-    """Two bars of 1 m in series, clamped at one end, the second a million times softer: all of the stretch is in it."""
+    """Two bars of 1 m in series, clamped at one end.
+
+    The second is a million times softer, so all of the stretch is in it.
+    """
 
     stretch = 1.2
     assembler: Assembler
@@ -147,12 +167,15 @@ class Bars:
 
     @property
     def rest(self) -> tuple[Array, Factor]:
-        """The stiffness at rest, and its factor."""
+        """Return the stiffness at rest and its factor."""
         values = self.assembler.force_and_tangent(np.zeros(self.assembler.n_dofs))[1]
         return values, BandedCholesky(self.assembler.pattern).factor(values)
 
     def end_displacement(self) -> Array:
-        """Displacement of the loaded end's nodes along the bars by twelve Newton steps, m; exactly the stretch less 1."""
+        """Return the displacement of the loaded end's nodes along the bars, m.
+
+        It is found by twelve Newton steps. The exact value is the stretch minus 1.
+        """
         u = np.zeros(self.assembler.n_dofs)
         for _ in range(12):
             state, values = self.assembler.force_and_tangent(u)
@@ -163,7 +186,7 @@ class Bars:
 
 
 def make_bars(tetrahedra: bool = False, selective: bool = False, contrast: float = 1e6) -> Bars:
-    """The bars, of Saint Venant-Kirchhoff with Y = 1 Pa in the soft one and ν = 0."""
+    """Return the bars, of Saint Venant-Kirchhoff with Y = 1 Pa in the soft one and ν = 0."""
     mesh = box_mesh((2.0, 1.0, 1.0), (2, 1, 1), tetrahedra)
     free = mesh.points[:, 0] > 0
     dofs, n = _numbered(mesh, free)
@@ -179,7 +202,7 @@ def make_bars(tetrahedra: bool = False, selective: bool = False, contrast: float
 
 
 def _numbered(mesh: Mesh, free: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
-    """The numbers (n_nodes, 3) of the dofs of free nodes, and how many there are."""
+    """Number the dofs of free nodes: (n_nodes, 3), and how many there are."""
     n = 3 * int(free.sum())
     dofs = np.full((mesh.n_nodes, 3), n)
     dofs[free] = np.arange(n).reshape(-1, 3)
@@ -187,7 +210,7 @@ def _numbered(mesh: Mesh, free: NDArray[np.bool_]) -> tuple[NDArray[np.int64], i
 
 
 def material_table(law: str, young: float, poisson: float) -> dict[str, Any]:
-    """The material table of a law with Young's modulus, Pa, and Poisson's ratio at rest."""
+    """Return the material table of a law with Young's modulus, Pa, and Poisson's ratio."""
     shear, bulk = young / (2 * (1 + poisson)), young / (3 * (1 - 2 * poisson))
     if law == "mooney-rivlin":
         return {"law": law, "c10_pa": 0.4 * shear, "c01_pa": 0.1 * shear, "bulk_pa": bulk}
@@ -208,7 +231,10 @@ def cantilever_spec(
     integration: str = "full",
     law: str = "saint-venant-kirchhoff",
 ) -> dict[str, Any]:
-    """A beam of Y = 12 kPa along x, clamped at its start, a force on the whole of its end: EI = 1000 N m² if it is 1 m wide and high."""
+    """Return a dataset of a beam along x of Y = 12 kPa, clamped at its start and loaded at its end.
+
+    EI is 1000 N m² if the beam is 1 m wide and high.
+    """
     return {
         "geometry": {"shape": "box", "size_m": size, "cells": cells},
         "discretisation": {"integration": integration},
@@ -233,14 +259,14 @@ def cantilever(
     law: str = "saint-venant-kirchhoff",
     solver: SolverName | None = None,
 ) -> FullOrderModel:
-    """The full-order model of `cantilever_spec`."""
+    """Return the full-order model of `cantilever_spec`."""
     return FullOrderModel(
         load_scene(cantilever_spec(size, cells, poisson, integration, law)), solver
     )
 
 
 def tip_load(model: FullOrderModel, force_z: float) -> Array:
-    """(n_free,) a force, N, spread over the end face of a cantilever."""
+    """Return the nodal forces, (n_free,), of a force spread over a cantilever's end face, N."""
     scene = model.scene
     load = np.zeros((scene.mesh.n_nodes, 3))
     load[:, 2] = scene.patch_weights.toarray()[0] * force_z
@@ -248,7 +274,7 @@ def tip_load(model: FullOrderModel, force_z: float) -> Array:
 
 
 def tip(model: FullOrderModel, force_z: float) -> Array:
-    """(3,) mean displacement of the end face of a cantilever under a force spread over it, m."""
+    """Return the mean displacement, (3,), of a cantilever's end face under `tip_load`, m."""
     scene = model.scene
     u = np.zeros(scene.mesh.n_dofs)
     u[scene.free_dofs] = model.solve(tip_load(model, force_z)).displacement

@@ -174,7 +174,10 @@ class _Trial:
 
 
 class _SandboxedTrial:
-    """A third party's method, tried in a process of its own, which is started again after a case that ended it."""
+    """A third party's method, tried in a process of its own.
+
+    After a case that ended it, the process is started again.
+    """
 
     def __init__(
         self, spec: MethodSpec, profile: str, names: Sequence[str], cache: Path | None
