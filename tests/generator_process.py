@@ -1,9 +1,10 @@
-"""Processes that generate a dataset and can be killed, forked from one that has everything imported: fifty take seconds.
+"""Processes that generate a dataset and can be killed, forked from one with everything imported.
 
     python -m tests.generator_process SPEC SHARD_SIZE
 
-takes lines ``start FOLDER WORKERS``, which prints a process number, and ``wait NUMBER``, which prints the exit status.
-A file is written in pieces with pauses between them, so that a signal at a random time often comes in the middle of one.
+reads lines ``start FOLDER WORKERS``, which prints a process number, and ``wait NUMBER``, which
+prints the exit status. Files are written in pieces with pauses between them, so that a signal at a random
+time often interrupts a write.
 """
 
 from __future__ import annotations
@@ -15,15 +16,24 @@ import tempfile
 import time
 import traceback
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 PIECES = 8
 PAUSE_S = 0.002
 
 
+def files(folder: Path) -> dict[str, bytes]:
+    """Return the committed files without timings. They must not depend on interruptions."""
+    paths = [path for path in sorted(folder.glob("[!.]*")) if "seconds-" not in path.name]
+    return {path.name: path.read_bytes() for path in paths}
+
+
+def shards(folder: Path) -> dict[str, bytes]:
+    return {name: content for name, content in files(folder).items() if name.startswith("shard-")}
+
+
 class SlowFile:
-    """An unbuffered file to which content goes in pieces."""
+    """An unbuffered file that writes content in pieces."""
 
     def __init__(self, path: Path, mode: str) -> None:
         self._file = open(path, mode, buffering=0)  # noqa: SIM115, closed by __exit__
@@ -31,12 +41,7 @@ class SlowFile:
     def __enter__(self) -> SlowFile:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
     def write(self, content: bytes) -> int:
@@ -54,7 +59,7 @@ class SlowFile:
 
 
 class Generators:
-    """The process that forks; its own children are the ones to kill."""
+    """The process that forks. Its children are the ones to kill."""
 
     def __init__(self, spec_json: str, shard_size: int) -> None:
         root = Path(__file__).parents[1]
@@ -67,12 +72,7 @@ class Generators:
     def __enter__(self) -> Generators:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._process.communicate()
 
     def _ask(self, *words: object) -> int:
@@ -82,11 +82,11 @@ class Generators:
         return int(self._process.stdout.readline())
 
     def start(self, cache: Path, workers: int = 1) -> int:
-        """Begin to generate into a cache folder; the process's number."""
+        """Begin to generate into a cache folder; return the process number."""
         return self._ask("start", cache, workers)
 
     def wait(self, process: int) -> int:
-        """Wait for a process; its exit status, or minus the signal that killed it."""
+        """Wait for a process; return its exit status, or minus the signal that killed it."""
         return self._ask("wait", process)
 
 

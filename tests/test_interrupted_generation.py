@@ -1,0 +1,403 @@
+"""Generation on full disks, with killed or competing processes, and on clusters that lose parts."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mor_bench.errors import StoreError, WorkerError
+from mor_bench.snapshots import generate as generate_module
+from mor_bench.snapshots import store
+from mor_bench.snapshots.dataset import Dataset
+from mor_bench.snapshots.executors import cluster_pool
+from mor_bench.snapshots.generate import dataset_folder, generate, shard_path
+from mor_bench.snapshots.store import read_shard, remove_leftovers, write_shard
+from mor_bench.specs import DatasetSpec, load_generated_spec
+from tests.generator_process import Generators, files, shards
+
+ROOT = Path(__file__).parents[1]
+
+SMALL = 10
+"""Samples per shard in tests that need many shards."""
+
+needs_signals = pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKILL and fork")
+
+
+def tiny_spec(samples_per_patch: int) -> DatasetSpec:
+    """Return beam-tiny with 21 times as many samples."""
+    spec = load_generated_spec("beam-tiny").model_dump()
+    loads = {**spec["loads"], "samples_per_patch": samples_per_patch}
+    return DatasetSpec.model_validate({**spec, "loads": loads})
+
+
+LONG = tiny_spec(75)
+
+
+def leftovers(folder: Path) -> list[Path]:
+    return list(folder.glob("*.tmp")) + list(folder.glob(".*.tmp"))
+
+
+# Full disks
+
+
+class FullDisk:
+    """Stands in for `open`: files on a disk that takes a limited number of bytes in all."""
+
+    def __init__(self, capacity: int) -> None:
+        self.free = capacity
+
+    def __call__(self, path: Path, mode: str) -> Any:
+        disk, file = self, open(path, mode, buffering=0)  # noqa: SIM115, closed by `close`
+        write = file.write
+
+        class File(io.BytesIO):
+            def write(self, content: Any) -> int:
+                taken = min(disk.free, len(content))
+                disk.free -= taken
+                write(content[:taken])
+                if taken < len(content):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                return taken
+
+            def fileno(self) -> int:
+                return file.fileno()
+
+            def close(self) -> None:
+                file.close()
+
+        return File()
+
+
+@contextmanager
+def tmpfs(folder: Path) -> Iterator[Path]:
+    """Mount a file system of 16 kB in memory."""
+    folder.mkdir()
+    if not sys.platform.startswith("linux") or shutil.which("mount") is None:
+        pytest.skip("needs Linux and mount")
+    command = ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(folder)]
+    mounted = subprocess.run(command, capture_output=True, text=True, check=False)
+    if mounted.returncode:
+        pytest.skip(f"needs the right to mount a small file system: {mounted.stderr.strip()}")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of 42 small shards."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(generate_module, "SHARD_SIZE", SMALL)
+        cache = tmp_path_factory.mktemp("undisturbed")
+        return files(generate(tiny_spec(20), workers=1, cache=cache))
+
+
+def check_until_done(
+    cache: Path, undisturbed: dict[str, bytes], make_room: Callable[[], None]
+) -> None:
+    """Generate repeatedly, with more room each time, until the disk is no longer full."""
+    spec = tiny_spec(20)
+    folder = dataset_folder(spec, cache)
+    failures = 0
+    while failures < 200:
+        make_room()
+        message = None
+        try:
+            generate(spec, workers=1, cache=cache)
+        except StoreError as error:
+            message = str(error)
+        assert not leftovers(folder)
+        if message is None:
+            break
+        assert message.startswith(f"{folder}: cannot be written: No space left on device. Finished")
+        assert undisturbed.items() >= files(folder).items()
+        failures += 1
+    assert files(folder) == undisturbed
+    assert failures >= 10
+
+
+@pytest.mark.slow
+def test_a_disk_that_is_full_ten_times(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, bytes]
+) -> None:
+    monkeypatch.setattr(generate_module, "SHARD_SIZE", SMALL)
+    rng, size_kb = np.random.default_rng(0), 16
+
+    def make_room() -> None:
+        nonlocal size_kb
+        size_kb += 4 * int(rng.integers(1, 20))
+        options = f"remount,size={size_kb}k"
+        subprocess.run(["mount", "-o", options, str(tmp_path / "disk")], check=True)
+
+    with tmpfs(tmp_path / "disk") as disk:
+        check_until_done(disk, undisturbed, make_room)
+
+
+@pytest.mark.slow
+def test_writes_that_fail_at_any_byte(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, bytes]
+) -> None:
+    monkeypatch.setattr(generate_module, "SHARD_SIZE", SMALL)
+    rng = np.random.default_rng(0)
+
+    def make_room() -> None:
+        monkeypatch.setattr(store, "open", FullDisk(int(rng.integers(0, 80_000))), raising=False)
+
+    check_until_done(tmp_path, undisturbed, make_room)
+
+
+def test_a_failed_write_leaves_the_earlier_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cache: Path, tiny: Dataset
+) -> None:
+    shard = read_shard(shard_path(dataset_folder(load_generated_spec("beam-tiny"), cache), 2))
+    path = tmp_path / "shard.h5"
+    write_shard(path, shard)
+    before = path.read_bytes()
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_shard(path, replace(shard, start=0))
+    assert [path.name for path in tmp_path.iterdir()] == ["shard.h5"]
+    assert path.read_bytes() == before
+
+
+# Killed and competing processes
+
+
+@needs_signals
+def test_leftovers_of_dead_processes_are_removed_and_files_of_live_ones_are_kept(
+    tmp_path: Path,
+) -> None:
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    host, living = store.host_name(), os.getppid()
+    stale = f".d.h5.{host}.{living}.01.tmp"
+    kept = {
+        f".b.h5.{host}.{living}.00.tmp",
+        f".c.h5.elsewhere.{dead.pid}.00.tmp",
+        ".of-someone-else.tmp",
+        "shard-00000.h5",
+    }
+    for name in (*kept, stale, f".a.h5.{host}.{dead.pid}.00.tmp"):
+        (tmp_path / name).touch()
+    an_hour_ago = time.time() - store.STALE_AFTER_S - 1
+    os.utime(tmp_path / stale, (an_hour_ago, an_hour_ago))
+    remove_leftovers(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == kept
+
+
+@pytest.fixture(scope="module")
+def generators() -> Iterator[Generators]:
+    with Generators(LONG.model_dump_json(), SMALL) as processes:
+        yield processes
+
+
+@pytest.fixture(scope="module")
+def long_undisturbed(
+    tmp_path_factory: pytest.TempPathFactory, generators: Generators
+) -> dict[str, bytes]:
+    """The files of 158 small shards."""
+    cache = tmp_path_factory.mktemp("long")
+    assert generators.wait(generators.start(cache)) == 0
+    return files(dataset_folder(LONG, cache))
+
+
+@needs_signals
+@pytest.mark.slow
+def test_killed_fifty_times_and_resumed_is_bit_identical(
+    tmp_path: Path, generators: Generators, long_undisturbed: dict[str, bytes]
+) -> None:
+    """Every tenth time a pool of workers is killed. After its end a dataset is begun anew."""
+    rng = np.random.default_rng(int(time.time()))
+    kills = in_a_write = partial = attempt = 0
+    while kills < 50:
+        cache = tmp_path / str(attempt)
+        folder = dataset_folder(LONG, cache)
+        pool = kills % 10 == 9
+        process = generators.start(cache, workers=2 if pool else 1)
+        time.sleep(rng.uniform(1.0, 2.5) if pool else rng.uniform(0.0, 0.7))
+        os.kill(process, signal.SIGKILL)
+        status, there = generators.wait(process), files(folder)
+        assert long_undisturbed.items() >= there.items()
+        if status == 0:
+            assert there == long_undisturbed
+            attempt += 1
+        else:
+            assert status == -signal.SIGKILL
+            kills += 1
+            in_a_write += bool(leftovers(folder))
+            partial += 0 < len(shards(folder)) < 158
+    assert in_a_write >= 10
+    assert partial >= 25
+    assert generators.wait(generators.start(cache)) == 0
+    assert files(folder) == long_undisturbed
+    assert not leftovers(folder)
+
+
+@needs_signals
+@pytest.mark.slow
+def test_several_processes_may_generate_one_dataset(
+    tmp_path: Path, generators: Generators, long_undisturbed: dict[str, bytes]
+) -> None:
+    folder = dataset_folder(LONG, tmp_path)
+    first, second, killed = (generators.start(tmp_path) for _ in range(3))
+    time.sleep(1.5)
+    os.kill(killed, signal.SIGKILL)
+    late = generators.start(tmp_path)  # removes leftovers while others write
+    assert generators.wait(killed) == -signal.SIGKILL
+    assert [generators.wait(process) for process in (first, second, late)] == [0, 0, 0]
+    assert files(folder) == long_undisturbed
+    assert generators.wait(generators.start(tmp_path)) == 0
+    assert not leftovers(folder)
+
+
+# Clusters
+
+
+class Cluster:
+    """A Dask scheduler and workers over TCP, in processes of their own, without shared folders."""
+
+    def __init__(self, folder: Path, workers: tuple[str, ...]) -> None:
+        pytest.importorskip("distributed", reason="needs pip install 'mor-bench[cluster]'")
+        folder.mkdir()
+        file = folder / "scheduler.json"
+        self._folder = folder
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        address = ["--host", "127.0.0.1", "--port", "0"]
+        self._start("scheduler", "scheduler", *address, "--scheduler-file", str(file))
+        limit = time.time() + 60
+        while not file.exists() or not file.stat().st_size:
+            assert time.time() < limit, "the scheduler does not start"
+            time.sleep(0.05)
+        self.address: str = json.loads(file.read_text())["address"]
+        for name in workers:
+            options = ["--no-nanny", "--nthreads", "1", "--name", name]
+            self._start("worker", name, self.address, *options)
+
+    def _start(self, kind: str, name: str, *options: str) -> None:
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+        command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", *options, "--no-dashboard"]
+        with open(self._folder / f"{name}.log", "wb") as log:
+            self.processes[name] = subprocess.Popen(
+                command, cwd=self._folder, env=environment, stdout=log, stderr=log
+            )
+
+    def __enter__(self) -> Cluster:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self.processes.values():
+            process.kill()
+            process.wait()
+
+
+MANY = tiny_spec(100)
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of 21 shards, solved in this process."""
+    return files(generate(MANY, workers=1, cache=tmp_path_factory.mktemp("many")))
+
+
+@needs_signals
+@pytest.mark.slow
+def test_a_cluster_may_lose_a_worker(tmp_path: Path, many: dict[str, bytes]) -> None:
+    with Cluster(tmp_path / "cluster", ("first", "second")) as cluster:
+        from distributed import Client
+
+        with Client(cluster.address, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
+            workers = client.scheduler_info()["workers"].items()
+            names = {address: worker["name"] for address, worker in workers}
+            killed: list[str] = []
+
+            def kill_one_at_work(done: int, total: int) -> None:
+                # A task in flight may be done when it is looked for: then after the next shard.
+                if done >= total // 2 and not killed:
+                    at_work = client.processing().items()
+                    busy = [names[address] for address, tasks in at_work if tasks]
+                    for name in busy[:1] or ["first"] * (done >= total - 2):
+                        cluster.processes[name].kill()
+                        killed.append(name)
+
+            options: dict[str, Any] = {"cache": tmp_path, "cluster": cluster.address}
+            folder = generate(MANY, progress=kill_one_at_work, **options)
+            assert len(client.nthreads()) == 1
+        assert cluster.processes[killed[0]].wait() == -signal.SIGKILL
+    assert files(folder) == many
+
+
+@needs_signals
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("lost", "message"),
+    [
+        ("scheduler", r"connection to the Dask scheduler .* was lost\. Finished shards are kept"),
+        ("only", r"died one after the other.* memory\?"),
+    ],
+)
+def test_a_cluster_without_scheduler_or_workers_keeps_finished_shards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, many: dict[str, bytes], lost: str, message: str
+) -> None:
+    monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
+    with Cluster(tmp_path / "cluster", ("only",)) as cluster:
+
+        def kill(done: int, total: int) -> None:
+            if done >= total // 2:
+                cluster.processes[lost].kill()
+
+        with pytest.raises(WorkerError, match=message):
+            generate(MANY, cache=tmp_path, progress=kill, cluster=cluster.address)
+    folder = dataset_folder(MANY, tmp_path)
+    assert many.items() >= files(folder).items()
+    assert len(shards(folder)) >= 10
+    generate(MANY, workers=1, cache=tmp_path)
+    assert files(folder) == many
+
+
+@pytest.mark.slow
+def test_a_cluster_without_workers_or_scheduler_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mor_bench.snapshots.executors.CONNECT_S", 2)
+    no_workers = r"has no workers; start some with: dask worker tcp"
+    with Cluster(tmp_path / "cluster", ()) as cluster, pytest.raises(WorkerError, match=no_workers):
+        generate(MANY, cache=tmp_path, cluster=cluster.address)
+    gone = r"no Dask scheduler answers at tcp://127\.0\.0\.1:\d+ within 2 s"
+    with pytest.raises(WorkerError, match=gone):
+        generate(MANY, cache=tmp_path, cluster=cluster.address)
+
+
+@pytest.mark.slow
+def test_a_silent_peer_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("mor_bench.snapshots.executors.CONNECT_S", 1)
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        begun = time.perf_counter()
+        with pytest.raises(WorkerError, match="no Dask scheduler answers"), cluster_pool(address):
+            pass
+        assert time.perf_counter() - begun < 30
