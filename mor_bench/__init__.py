@@ -7,6 +7,14 @@
 >>> method = mor_bench.load_method("linear-fem").fit(scene, None)
 >>> method.predict(scene.mesh.points * 0.0).shape
 (63, 3)
+
+The packages, from the ground up; each imports only from those before it:
+
+`specs` and `options` hold what a user may write. `scene`, `mechanics`, `snapshots` and `reduction`
+compute. `surrogate.py` is the interface of a method, `learning` and `surrogates` the methods.
+`sandbox`, `measure`, `results`, `analysis` and `runs` make a comparison, `hard_cases` the stress
+tests, and `report`, `export` and `cli` show them. Start reading with `surrogate.py`, then
+`surrogates/pod.py`, then `runs/compare.py`.
 """
 
 from __future__ import annotations
@@ -16,32 +24,20 @@ from typing import TYPE_CHECKING, Any
 from mor_bench.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from mor_bench.errors import MorBenchError
-    from mor_bench.method_loading import load_method, load_surrogate
-    from mor_bench.results.comparison import Comparison
-    from mor_bench.runs.compare import run
-    from mor_bench.runs.pick import Pick, pick
-    from mor_bench.runs.single_fit import Fit, fit
-    from mor_bench.scene.scene import Scene, load_scene
-    from mor_bench.snapshots.dataset import Snapshots, load_dataset
-    from mor_bench.surrogate import Surrogate
-
-__all__ = [
-    "Comparison",
-    "Fit",
-    "MorBenchError",
-    "Pick",
-    "Scene",
-    "Snapshots",
-    "Surrogate",
-    "fit",
-    "load_dataset",
-    "load_method",
-    "load_scene",
-    "load_surrogate",
-    "pick",
-    "run",
-]
+    from mor_bench.errors import MorBenchError as MorBenchError
+    from mor_bench.method_loading import load_method as load_method
+    from mor_bench.method_loading import load_surrogate as load_surrogate
+    from mor_bench.results.comparison import Comparison as Comparison
+    from mor_bench.runs.compare import run as run
+    from mor_bench.runs.pick import Pick as Pick
+    from mor_bench.runs.pick import pick as pick
+    from mor_bench.runs.single_fit import Fit as Fit
+    from mor_bench.runs.single_fit import fit as fit
+    from mor_bench.scene.scene import Scene as Scene
+    from mor_bench.scene.scene import load_scene as load_scene
+    from mor_bench.snapshots.dataset import Snapshots as Snapshots
+    from mor_bench.snapshots.dataset import load_dataset as load_dataset
+    from mor_bench.surrogate import Surrogate as Surrogate
 
 _HOMES = {
     "Comparison": "mor_bench.results.comparison",
@@ -61,6 +57,9 @@ _HOMES = {
 }
 
 
+__all__ = sorted(_HOMES)
+
+
 def __getattr__(name: str) -> Any:
     """Import a public name at its first use, so that `import mor_bench` is fast."""
     if name not in _HOMES:
@@ -71,4 +70,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return __all__

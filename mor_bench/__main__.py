@@ -1,4 +1,4 @@
-"""`python -m mor_bench` is `mor-bench`."""
+"""Run the command line: `python -m mor_bench` is the same as `mor-bench`."""
 
 from mor_bench.cli.app import app
 
