@@ -104,7 +104,7 @@ def test_list_names_every_dataset_and_method() -> None:
     plain = mor_bench("list").stdout
     for kind in ("datasets", "methods"):
         names = [entry["name"] for entry in listed[kind]]
-        assert names == [*list_suite(kind)]  # type: ignore[arg-type]
+        assert names == [*list_suite(kind)]
         assert all(f"  {entry['name']}" in plain for entry in listed[kind])
 
 
