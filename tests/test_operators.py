@@ -1,4 +1,4 @@
-"""DeepONet, FNO and message passing: each network is what its equation says, written out slowly, and all are zero at rest."""
+"""DeepONet, FNO and message passing: each network is what its equation says, written out slowly."""
 
 from __future__ import annotations
 
@@ -13,42 +13,30 @@ import numpy as np
 import pytest
 
 import mor_bench
-from mor_bench.errors import InvalidInputError, StoreError
+from mor_bench.errors import StoreError
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import load_scene
-from mor_bench.snapshots.dataset import Dataset, Snapshots
-from mor_bench.snapshots.sampling import draw_loads
+from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import load_dataset_spec
-from mor_bench.surrogate import Surrogate
-from mor_bench.training_options import TrainingOptions
-from tests.irregular import irregular_box
+from tests.irregular import irregular_box, irregular_samples
 
 torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
 
-from mor_bench.surrogates.field_network import initialise  # noqa: E402 - after the check that torch is there
+from mor_bench.surrogates.field_network import initialise  # noqa: E402 - torch is there
 from mor_bench.surrogates.fno import FNO, SpectralConvolution  # noqa: E402
 from mor_bench.surrogates.mesh_graph_net import Graph, GraphNetwork, MessagePassing  # noqa: E402
 from mor_bench.surrogates.umesh.padded_grid import padded_grid  # noqa: E402
 
 SMALL: dict[str, dict[str, Any]] = {
-    "deeponet": {"width": 16, "depth": 2, "n_functions": 8},
-    "pod-deeponet": {"width": 16, "depth": 2, "n_functions": 8},
+    "deeponet": {"width": 16, "depth": 2, "n_functions": 8, "n_input_modes": 20},
+    "pod-deeponet": {"width": 16, "depth": 2, "n_functions": 8, "n_input_modes": 20},
     "fno": {"channels": 4, "modes": 3, "layers": 2, "batch_size": 8},
     "mesh-graph-net": {"width": 8, "steps": 2, "batch_size": 8},
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """Networks as small as these are no faster on two threads, and far slower where another process has a core."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-def make(name: str, **knobs: Any) -> Surrogate:
+def make(name: str, **knobs: Any) -> Any:
     return mor_bench.load_method(name, **{**SMALL[name], "iterations": 4, **knobs})
 
 
@@ -64,7 +52,7 @@ def tetrahedral() -> Mesh:
 def test_the_spectral_convolution_is_a_circular_convolution_with_a_real_kernel(
     shape: tuple[int, int, int], modes: int
 ) -> None:
-    """The kernel from the weights by its defining sum over all wave numbers; the convolution as a sum over shifts."""
+    """The kernel by its sum over all wave numbers, the convolution as a sum over shifts."""
     layer = SpectralConvolution(shape, modes, 2)
     layer.initialise(torch.Generator().manual_seed(0))
     kept = [[k for k in np.fft.fftfreq(n, 1 / n).astype(int) if abs(k) < modes] for n in shape]
@@ -87,34 +75,27 @@ def test_the_spectral_convolution_is_a_circular_convolution_with_a_real_kernel(
 
 
 def test_forces_are_spread_over_the_grid_and_displacements_averaged() -> None:
-    """As the grid does, whose own test says what that is."""
     mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
     grid = padded_grid(grid_map(mesh), 0)
     fields = random(2, mesh.n_nodes, 3)
-    for spread, expected in (
-        (True, grid.to_grid(fields)),
-        (False, grid.displacements_to_grid(fields)),
-    ):
-        torch.testing.assert_close(
-            FNO(grid, spread, 2, 2, 1).encode(fields),
-            expected.permute(0, 2, 3, 4, 1),
-            rtol=0,
-            atol=0,
-        )
-    assert not torch.equal(grid.to_grid(fields), grid.displacements_to_grid(fields))
+    spread, averaged = grid.to_grid(fields), grid.displacements_to_grid(fields)
+    for adds_up, expected in ((True, spread), (False, averaged)):
+        found = FNO(grid, adds_up, 2, 2, 1).encode(fields)
+        assert torch.equal(found, expected.permute(0, 2, 3, 4, 1))
+    assert not torch.equal(spread, averaged)
     spec = load_dataset_spec("beam-tiny").model_dump(mode="json", exclude_none=True)
-    for input, observed, spread in (
-        ("force", None, True),
-        ("force", {"region": "z-max"}, False),
-        ("linear-response", None, False),
+    for input, observed, adds_up in (
+        ("force", {}, True),
+        ("force", {"observed": {"region": "z-max"}}, False),
+        ("linear-response", {}, False),
     ):
-        method: Any = make("fno", input=input)
-        method.scene_ = load_scene({**spec, "observed": observed} if observed else spec)
-        assert method.build_network({}).spread == spread
+        method = make("fno", input=input)
+        method.scene_ = load_scene({**spec, **observed})
+        assert method.build_network({}).spread == adds_up
 
 
 def test_the_padding_keeps_opposite_ends_apart() -> None:
-    """On a circle a force at one end would act on the other as on its neighbour; the padding lies between them."""
+    """On a circle, a force at one end would act on the other as on its neighbour."""
     network = FNO(padded_grid(grid_map(box_mesh((2.0, 1.0, 1.0), (7, 2, 2))), 0), True, 3, 9, 1)
     assert network.spectral[0].shape == (10, 4, 4)
     initialise(network, torch.Generator().manual_seed(0))
@@ -141,9 +122,8 @@ def test_message_passing_is_the_sum_over_edges_written_out(mesh: Mesh) -> None:
         lengths = np.linalg.norm(mesh.points[graph.senders] - mesh.points[graph.receivers], axis=1)
         np.testing.assert_allclose(np.unique(lengths.round(9)), [0.5, round(2 / 3, 9)])
     else:  # each pair of nodes in a tetrahedron is an edge
-        assert pairs == {
-            (int(a), int(b)) for cell in mesh.cells for a in cell for b in cell if a != b
-        }
+        every = {(int(a), int(b)) for cell in mesh.cells for a in cell for b in cell if a != b}
+        assert pairs == every
     step = MessagePassing(5)
     initialise(step, torch.Generator().manual_seed(0))
     edges, nodes = random(graph.n_edges, 2, 5, seed=1), random(mesh.n_nodes, 2, 5, seed=2)
@@ -153,16 +133,14 @@ def test_message_passing_is_the_sum_over_edges_written_out(mesh: Mesh) -> None:
         bias = step.edge.bias + step.sender.bias + step.receiver.bias
         received: list[Any] = [torch.zeros(2, 5) for _ in range(mesh.n_nodes)]
         for number, (s, r) in enumerate(zip(graph.senders, graph.receivers, strict=True)):
-            hidden = torch.nn.functional.silu(
-                torch.cat([edges[number], nodes[s], nodes[r]], dim=1) @ whole.T + bias
-            )
+            joined = torch.cat([edges[number], nodes[s], nodes[r]], dim=1)
+            hidden = torch.nn.functional.silu(joined @ whole.T + bias)
             message = edges[number] + step.norms[0](step.message(hidden))
             torch.testing.assert_close(found_edges[number], message)
             received[int(r)] = received[int(r)] + message
         for node in range(mesh.n_nodes):
-            expected = nodes[node] + step.norms[1](
-                step.node(torch.cat([nodes[node], received[node]], dim=1))
-            )
+            joined = torch.cat([nodes[node], received[node]], dim=1)
+            expected = nodes[node] + step.norms[1](step.node(joined))
             torch.testing.assert_close(found_nodes[node], expected, rtol=1e-4, atol=1e-5)
 
 
@@ -174,14 +152,12 @@ def test_gradients_through_the_graph_are_those_of_dense_matrices() -> None:
         for ends in (graph.senders, graph.receivers)
     )
     nodes, weight = random(mesh.n_nodes, 4).requires_grad_(), random(mesh.n_nodes, 4, seed=1)
-    own = (
-        graph.to_receivers(graph.from_senders(nodes) * graph.from_receivers(nodes).tanh()) * weight
-    ).sum()
+    messages = graph.from_senders(nodes) * graph.from_receivers(nodes).tanh()
+    own = (graph.to_receivers(messages) * weight).sum()
     dense = ((receivers.T @ ((senders @ nodes) * (receivers @ nodes).tanh())) * weight).sum()
     torch.testing.assert_close(own, dense)
-    torch.testing.assert_close(
-        *(torch.autograd.grad(value, nodes)[0] for value in (own, dense)), rtol=1e-4, atol=1e-5
-    )
+    gradients = [torch.autograd.grad(value, nodes)[0] for value in (own, dense)]
+    torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-5)
 
 
 def test_a_graph_network_sees_as_many_edges_far_as_it_has_steps_and_no_numbers_or_places() -> None:
@@ -190,8 +166,7 @@ def test_a_graph_network_sees_as_many_edges_far_as_it_has_steps_and_no_numbers_o
     initialise(network, torch.Generator().manual_seed(0))
     force = random(1, mesh.n_nodes, 3)
     with torch.no_grad():
-        answer = network(force)
-        changed = force.clone()
+        answer, changed = network(force), force.clone()
         changed[0, 4 * 6] += 1.0
         moved = (network(changed) != answer).any(dim=2)[0]
         distance = np.abs(mesh.points - mesh.points[24]).sum(axis=1)
@@ -199,9 +174,8 @@ def test_a_graph_network_sees_as_many_edges_far_as_it_has_steps_and_no_numbers_o
 
         order = np.random.default_rng(0).permutation(mesh.n_nodes)
         place = np.argsort(order)
-        renumbered = replace(
-            mesh, points=mesh.points[order] + [3.0, -1.0, 2.0], cells=place[mesh.cells]
-        )
+        points = mesh.points[order] + [3.0, -1.0, 2.0]
+        renumbered = replace(mesh, points=points, cells=place[mesh.cells])
         other = GraphNetwork(renumbered, place[:4], 8, 2)
         other.load_state_dict(network.state_dict())
         torch.testing.assert_close(other(force[:, order]), answer[:, order], rtol=1e-4, atol=1e-5)
@@ -210,7 +184,7 @@ def test_a_graph_network_sees_as_many_edges_far_as_it_has_steps_and_no_numbers_o
 @pytest.mark.parametrize("name", ["deeponet", "pod-deeponet"])
 def test_deeponet_is_the_branch_times_the_trunk(name: str, tiny: Dataset) -> None:
     """Written out for each node and component, from the force to the displacement."""
-    method: Any = make(name).fit(tiny.scene, tiny.train)
+    method = make(name).fit(tiny.scene, tiny.train)
     force, network = tiny.test.forces[0], method.network_
     n_nodes = tiny.scene.mesh.n_nodes
     axes = method.arrays_["constant.axes"]
@@ -220,19 +194,14 @@ def test_deeponet_is_the_branch_times_the_trunk(name: str, tiny: Dataset) -> Non
         b = (network.branch(inputs[None]) - network.branch(torch.zeros(1, axes.shape[1])))[0]
         for node, component in product(range(n_nodes), range(3)):
             if name == "deeponet":
-                t = (
-                    network.trunk(network.positions[node])[8 * component : 8 * component + 8]
-                    / 8**0.5
-                )
+                t = network.trunk(network.positions[node])[8 * component :][:8] / 8**0.5
             else:
-                t = torch.from_numpy(
-                    method.arrays_["constant.modes"][3 * node + component].astype(np.float32)
-                )
+                modes = method.arrays_["constant.modes"][3 * node + component]
+                t = torch.from_numpy(modes.astype(np.float32))
             expected[node, component] = float(b @ t) * method.output_scale_
     expected[tiny.scene.fixed_nodes] = 0.0
-    np.testing.assert_allclose(
-        method.predict(force), expected, rtol=0, atol=1e-5 * np.abs(expected).max()
-    )
+    found = method.predict(force)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
     assert np.abs(expected).max() > 0.01 * method.output_scale_
     if name == "pod-deeponet":
         rows = tiny.train.displacements.reshape(len(tiny.train), -1)
@@ -246,17 +215,16 @@ def test_deeponet_is_the_branch_times_the_trunk(name: str, tiny: Dataset) -> Non
 def test_the_first_loss_is_that_of_the_network_less_its_answer_at_rest(
     name: str, input: str, tiny: Dataset
 ) -> None:
-    """One step on all samples at a rate that changes nothing: the loss of the predictions is that of the training."""
+    """One step on all samples at a rate that changes nothing."""
     samples = tiny.train[:20]
-    method: Any = make(name, input=input, iterations=1, batch_size=20, learning_rate=1e-30).fit(
-        tiny.scene, samples
-    )
+    knobs = {"input": input, "iterations": 1, "batch_size": 20, "learning_rate": 1e-30}
+    method = make(name, **knobs).fit(tiny.scene, samples)
     error = (method.predict(samples.forces) - samples.displacements) / method.output_scale_
     assert method.loss_curve_[0] == pytest.approx((error**2).mean(), rel=1e-4)
-    linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None).predict(samples.forces)
-    learned = (
-        samples.displacements - linear if input == "linear-response" else samples.displacements
-    )
+    learned = samples.displacements
+    if input == "linear-response":
+        linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
+        learned = learned - linear.predict(samples.forces)
     assert method.output_scale_ == pytest.approx(np.sqrt((learned**2).mean()), rel=1e-9)
 
 
@@ -265,30 +233,31 @@ def test_the_first_loss_is_that_of_the_network_less_its_answer_at_rest(
 def test_no_force_gives_no_displacement_alone_and_among_others(
     name: str, input: str, tiny: Dataset
 ) -> None:
-    method = make(name, input=input).fit(tiny.scene, tiny.train)
+    method = make(name, input=input).fit(tiny.scene, tiny.train[:60])
     forces = tiny.test.forces[:5].copy()
     forces[3] = 0.0
     answers = method.predict(forces)
     assert not answers[3].any()
     assert not method.predict(forces[3]).any()
     assert answers[[0, 1, 2, 4]].any(axis=(1, 2)).all()
-    tiny_force = 1e-7 * forces[0]
-    assert np.abs(method.predict(tiny_force)).max() < 1e-3 * np.abs(answers[0]).max()
+    assert np.abs(method.predict(1e-7 * forces[0])).max() < 1e-3 * np.abs(answers[0]).max()
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.fixture(params=[1, 2])
+def threads(request: pytest.FixtureRequest) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("name", SMALL)
-def test_a_second_fit_is_bit_identical_and_leaves_global_random_state_alone(
-    name: str, threads: int, tiny: Dataset
+def test_a_second_fit_is_bit_identical_and_leaves_the_global_random_state_alone(
+    name: str, tiny: Dataset
 ) -> None:
-    state, before = torch.get_rng_state(), torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        first, second = (
-            make(name, iterations=2).fit(tiny.scene, tiny.train[:20]) for _ in range(2)
-        )
-    finally:
-        torch.set_num_threads(before)
+    state = torch.get_rng_state()
+    first, second = (make(name, iterations=2).fit(tiny.scene, tiny.train[:20]) for _ in range(2))
     assert torch.equal(torch.get_rng_state(), state)
     for key, array in first.arrays_.items():
         np.testing.assert_array_equal(array, second.arrays_[key], err_msg=key)
@@ -296,94 +265,40 @@ def test_a_second_fit_is_bit_identical_and_leaves_global_random_state_alone(
 
 @pytest.mark.parametrize("name", SMALL)
 def test_training_lowers_the_error_of_the_linear_response(name: str, tiny: Dataset) -> None:
-    """Of the training loads, and for DeepONet, which sees the whole body at once, of loads in regions that it never saw."""
-    method: Any = make(name, input="linear-response", iterations=400, learning_rate=3e-3).fit(
-        tiny.scene, tiny.train
+    """DeepONet on load regions that it never saw, the others on a mesh that lies in no grid."""
+    train = test = tiny.train
+    if "deeponet" in name:
+        test = tiny.test
+    else:
+        train = test = irregular_samples(60)
+        assert train.scene.mesh.grid_index is None
+    knobs = {"input": "linear-response", "iterations": 120, "learning_rate": 5e-3}
+    method = make(name, **knobs).fit(train.scene, train)
+    linear = mor_bench.load_method("linear-fem").fit(train.scene, None)
+    own, without = (
+        np.abs(m.predict(test.forces) - test.displacements).mean() for m in (method, linear)
     )
-    assert method.loss_curve_.shape == (8,)
-    linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
-    for part, factor in (
-        ((tiny.train, 0.95), (tiny.test, 0.8)) if "deeponet" in name else ((tiny.train, 0.95),)
-    ):
-        own, without = (
-            np.abs(m.predict(part.forces) - part.displacements).mean() for m in (method, linear)
-        )
-        assert own < factor * without
-
-
-@pytest.mark.parametrize("input", ["force", "linear-response"])
-@pytest.mark.parametrize("name", SMALL)
-def test_saved_and_loaded_is_the_same_model_and_other_knobs_are_refused(
-    name: str, input: str, tiny: Dataset, tmp_path: Path
-) -> None:
-    method: Any = make(name, input=input).fit(tiny.scene, tiny.train)
-    path = tmp_path / "model.safetensors"
-    method.save(path)
-    loaded: Any = mor_bench.load_surrogate(path)
-    np.testing.assert_array_equal(
-        loaded.predict(tiny.test.forces), method.predict(tiny.test.forces)
-    )
-    np.testing.assert_array_equal(loaded.loss_curve_, method.loss_curve_)
-    assert loaded.parameters == method.parameters
-    knob = {"fno": "channels"}.get(name, "width")
-    other = copy.copy(method)
-    setattr(other, knob, SMALL[name][knob] + 1)
-    other.save(path)
-    with pytest.raises(StoreError, match="`network.* must be|do not fit the network"):
-        mor_bench.load_surrogate(path)
-    for key, forged, message in (
-        ("axes", np.zeros((5, 3)), "`axes` must be"),
-        ("axes", np.zeros((3 * tiny.scene.mesh.n_nodes, 0)), "`axes` must be"),
-    ):
-        if f"constant.{key}" in method.arrays_:
-            other = copy.copy(method)
-            other.arrays_ = {**method.arrays_, f"constant.{key}": forged}
-            other.save(path)
-            with pytest.raises(StoreError, match=message):
-                mor_bench.load_surrogate(path)
-
-
-@pytest.mark.parametrize("name", ["fno", "mesh-graph-net"])
-def test_a_mesh_that_lies_in_no_grid_is_learned(name: str) -> None:
-    spec = load_dataset_spec("beam-tiny").model_dump(mode="json", exclude_none=True)
-    scene = load_scene({**spec, "discretisation": {"element": "tetrahedron"}})
-    mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
-    scene = replace(scene, mesh=mesh, fixed_nodes=np.flatnonzero(mesh.points[:, 0] == 0))
-    assert scene.mesh.grid_index is None
-    loads = draw_loads(scene, 0, 60)
-    displacements = (
-        mor_bench.load_method("fem")
-        .fit(scene, None)
-        .predict(loads.nodal_forces(scene.patch_weights))
-    )
-    samples = Snapshots(
-        scene, loads, displacements.reshape(60, -1)[:, scene.free_dofs], np.ones(60)
-    )
-    method = make(name, input="linear-response", iterations=300, learning_rate=3e-3).fit(
-        scene, samples
-    )
-    answer = method.predict(samples.forces)
-    linear = mor_bench.load_method("linear-fem").fit(scene, None).predict(samples.forces)
-    assert not answer[:, scene.fixed_nodes].any()
-    assert np.abs(answer - displacements).mean() < 0.95 * np.abs(linear - displacements).mean()
+    assert own < 0.95 * without
+    assert not method.predict(test.forces)[:, train.scene.fixed_nodes].any()
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_training_starts_from_the_weights_that_fit(
+def test_a_file_whose_arrays_do_not_fit_its_hyperparameters_is_refused(
     name: str, tiny: Dataset, tmp_path: Path
 ) -> None:
-    first: Any = make(name).fit(tiny.scene, tiny.train)
-    first.save(tmp_path / "first.safetensors")
-    second: Any = make(name, iterations=1, learning_rate=1e-30, seed=5)
-    second.training = TrainingOptions(start_from=tmp_path / "first.safetensors")
-    second.fit(tiny.scene, tiny.train)
-    for key, value in first.network_.state_dict().items():
-        torch.testing.assert_close(second.network_.state_dict()[key], value, rtol=0, atol=0)
-    unlike = make(name, seed=5).fit(tiny.scene, tiny.train)
-    assert not np.array_equal(
-        unlike.predict(tiny.test.forces[0]), first.predict(tiny.test.forces[0])
-    )
-    other = make("fno" if name != "fno" else "mesh-graph-net")
-    other.training = second.training
-    with pytest.raises(InvalidInputError, match="must be a model of class"):
-        other.fit(tiny.scene, tiny.train)
+    method, path = make(name).fit(tiny.scene, tiny.train[:20]), tmp_path / "model.safetensors"
+    other = copy.copy(method)
+    knob = "channels" if name == "fno" else "width"
+    setattr(other, knob, SMALL[name][knob] + 1)
+    other.save(path)
+    with pytest.raises(StoreError, match=r"`network.* must be|do not fit the network"):
+        mor_bench.load_surrogate(path)
+    forgeries = {"extra": np.ones(3)}
+    if "deeponet" in name:
+        forgeries = {"constant.axes": np.zeros((5, 3))}
+    for key, forged in forgeries.items():
+        other = copy.copy(method)
+        other.arrays_ = {**method.arrays_, key: forged}
+        other.save(path)
+        with pytest.raises(StoreError, match=key.removeprefix("constant.")):
+            mor_bench.load_surrogate(path)

@@ -45,7 +45,9 @@ def reason_against_packing(dtype: torch.dtype) -> str | None:
     if dtype == torch.bfloat16 and not processor_has_bfloat16():
         return "this processor has no bfloat16 instructions."
     generator = torch.Generator().manual_seed(0)
-    layer = nn.Conv3d(2, 3, 3, padding=1).requires_grad_(False)
+    # `skip_init`: the usual initialisation would draw from torch's global random state.
+    layer = nn.utils.skip_init(nn.Conv3d, 2, 3, 3, padding=1)  # type: ignore[no-untyped-call]
+    layer.requires_grad_(False)
     x = torch.randn(1, 2, 4, 3, 3, generator=generator).to(dtype)
     for parameter in layer.parameters():
         parameter.copy_(torch.randn(parameter.shape, generator=generator))
