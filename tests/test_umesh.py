@@ -27,7 +27,7 @@ from mor_bench.learning import training  # noqa: E402 - after the check that tor
 from mor_bench.surrogates.umesh.network import DoubleConvolution, UNet, new_network  # noqa: E402
 from mor_bench.surrogates.umesh.padded_grid import padded_grid  # noqa: E402
 
-SMALL = {
+SMALL: dict[str, Any] = {
     "channels": 8,
     "steps": 1,
     "iterations": 200,
@@ -36,7 +36,7 @@ SMALL = {
     "schedule": "one-cycle",
     "second_moment_decay": 0.95,
 }
-IMPROVED = {
+IMPROVED: dict[str, Any] = {
     **SMALL,
     "input": "linear-response",
     "activation": "silu",
