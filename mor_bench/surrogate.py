@@ -19,7 +19,6 @@ from mor_bench.errors import (
     UnknownRangeError,
     UnsupportedSceneError,
 )
-from mor_bench.legacy_hooks import LegacyHooks
 from mor_bench.mechanics.indicator import ErrorIndicator, Indication
 from mor_bench.model_arrays import check_finite
 from mor_bench.model_file import StoredModel, class_path, write_model
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-class Surrogate(LegacyHooks):
+class Surrogate:
     """A map from what is given, nodal forces or observed displacements, to nodal displacements.
 
     A subclass is a dataclass of hyperparameters, ``@dataclass(eq=False)``, with three verbs: `learn`
@@ -101,8 +100,6 @@ class Surrogate(LegacyHooks):
         InvalidInputError
             If the arrays are not those of such a model, see `mor_bench.model_arrays`.
         """
-        if hasattr(self, "_restore"):
-            self._restore(dict(model))
 
     def answer(self, forces: Array) -> Array:
         """Return displacements, m, under checked forces (n, n_nodes, 3), N, in the same shape."""
@@ -256,6 +253,8 @@ class Surrogate(LegacyHooks):
             If the range is not known: the class overrides `fit`, the model's file is of an older
             version, or displacements are given instead of forces.
         """
+        if not hasattr(self, "scene_") and type(self).fit is not Surrogate.fit:
+            raise UnknownRangeError(f"{type(self).__name__} overrides `fit` and notes no range.")
         given = self._checked(forces)
         if not self.needs_snapshots:
             flags = np.zeros(len(given), dtype=bool)
@@ -336,11 +335,13 @@ class Surrogate(LegacyHooks):
         """
         if not hasattr(self, "scene_"):
             raise NotFittedError(f"{type(self).__name__} must be fitted before it is saved.")
+        if not hasattr(self, "arrays_"):
+            raise MorBenchError(f"{type(self).__name__} overrides `fit` and cannot be saved.")
         model = StoredModel(
             class_path(type(self)),
             json.dumps(self.parameters),
             self.scene_.spec.model_dump_json(),
-            self.model_arrays(),
+            self.arrays_,
             self.range_.arrays() if hasattr(self, "range_") else {},
             self.sizes_,
             self.timings_ms_,

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.counting import (
@@ -32,8 +32,9 @@ from mor_bench.mechanics.multigrid import MultigridFactor
 from mor_bench.mechanics.rotated import BlockJacobi, conjugate_gradients
 from mor_bench.reduction import point_kernels
 from mor_bench.reduction.points import SVK_MULTIPLY_ADDS, tangent_multiply_adds
-from mor_bench.scene.scene import Scene, with_cells
-from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.scene.scene import with_cells
+from mor_bench.snapshots.dataset import Dataset
+from mor_bench.snapshots.given import Forces
 from mor_bench.specs import SolverName
 from mor_bench.surrogate import Surrogate
 
@@ -280,7 +281,10 @@ def test_linear_fem_is_a_column_per_force_component_or_one_back_solve(
     assert not loads[:, tiny.scene.fixed_nodes].any()
     n_components = np.count_nonzero(loads, axis=(1, 2))
     assert cost(lambda: method.predict(loads[0])) == Cost(multiply_adds=int(n_components[0]) * n)
-    assert cost_of(method, loads) == {**asdict(Cost()), "multiply_adds": n_components.mean() * n}
+    assert cost_of(method, Forces(loads)) == {
+        **asdict(Cost()),
+        "multiply_adds": n_components.mean() * n,
+    }
     elsewhere = np.ones(loads[0].shape)
     assert cost(lambda: method.predict(elsewhere)) == Cost(
         back_solves=1, multiply_adds=2 * (n * (b + 1) - b * (b + 1) // 2)
@@ -639,11 +643,11 @@ def test_a_batch_costs_what_its_samples_cost_and_counting_changes_nothing(
     with counted() as batch:
         answer = method.predict(loads)
     np.testing.assert_array_equal(answer, uncounted_answer)
-    means = cost_of(method, loads)
+    means = cost_of(method, Forces(loads))
     assert means == {field: total / len(loads) for field, total in asdict(batch).items()}
     assert means is not None
     assert means["multiply_adds"] > 1000
-    assert cost_of(method, loads) == means
+    assert cost_of(method, Forces(loads)) == means
 
 
 class Silent(Surrogate):
@@ -651,20 +655,12 @@ class Silent(Surrogate):
 
     needs_snapshots = False
 
-    def __init__(self) -> None:
-        pass
-
-    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Silent:
-        with self._fitting(scene):
-            pass
-        return self
-
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        return np.asarray(0.0 * self._checked_forces(forces).reshape(np.shape(forces)))
+    def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        return 0.0 * forces
 
 
 def test_a_method_that_counts_nothing_has_no_cost(tiny: Dataset, loads: np.ndarray) -> None:
-    assert cost_of(Silent().fit(tiny.scene), loads) is None
+    assert cost_of(Silent().fit(tiny.scene), Forces(loads)) is None
 
 
 def test_work_without_an_answer_counts(tiny: Dataset, loads: np.ndarray) -> None:
@@ -672,7 +668,8 @@ def test_work_without_an_answer_counts(tiny: Dataset, loads: np.ndarray) -> None
     hopeless = loads[:1] * 1e6
     with pytest.raises(SolverError):
         method.predict(hopeless)
-    means, one = cost_of(method, np.concatenate([loads[:1], hopeless])), cost_of(method, loads[:1])
+    means = cost_of(method, Forces(np.concatenate([loads[:1], hopeless])))
+    one = cost_of(method, Forces(loads[:1]))
     assert means is not None
     assert one is not None
     assert means["element_evaluations"] > 10 * one["element_evaluations"]

@@ -417,7 +417,7 @@ def test_where_displacements_are_observed_the_error_is_that_of_answers_to_them(
         dataset, "gappy-pod", out=tmp_path / "a.safetensors", limit=LIMIT, cache=cache
     )
     test = load_dataset(dataset, LIMIT, cache=cache).test
-    off = np.abs(fitted.method.predict(test.inputs) - test.displacements).mean(axis=(1, 2))
+    off = np.abs(fitted.method.predict(test.given.query) - test.displacements).mean(axis=(1, 2))
     assert fitted.error["mean_dof_m"] == pytest.approx(off.mean())
 
 

@@ -417,12 +417,14 @@ def test_points_keep_the_reduced_force_of_training(kind: tuple[str, bool]) -> No
 @pytest.mark.parametrize("forged", [-1, 10**6, "twice", 0.5])
 def test_indices_of_a_file_are_checked(tiny: Dataset, method: Any, forged: Any) -> None:
     """Kernels check no bounds."""
-    state = method.fit(tiny.scene, tiny.train)._state()
+    state = method.fit(tiny.scene, tiny.train).arrays_
     name = "cells" if "cells" in state else "dofs"
     indices = state[name].copy()
     indices[0] = indices[1] if forged == "twice" else forged
     with pytest.raises(InvalidInputError, match=f"`{name}` must be different integers"):
-        method._restore(state | {name: indices.astype(float) if forged == 0.5 else indices})
+        method.restore(
+            tiny.scene, state | {name: indices.astype(float) if forged == 0.5 else indices}
+        )
 
 
 def test_snapshots_of_no_displacement_train_no_cubature(tiny: Dataset) -> None:
@@ -466,8 +468,10 @@ def wanted_at_the_tip(method: HyperReducedPOD) -> tuple[HyperReducedPOD, HyperRe
     ):
         needs = own.spec.needs.model_copy(update={"outputs": "x-max"})
         other = HyperReducedPOD(**method.parameters)
-        other.scene_ = replace(own, spec=own.spec.model_copy(update={"needs": needs}))
-        other._restore({"modes": np.ascontiguousarray(basis), "cells": cells, "weights": weights})
+        own = replace(own, spec=own.spec.model_copy(update={"needs": needs}))
+        other.restore(
+            own, {"modes": np.ascontiguousarray(basis), "cells": cells, "weights": weights}
+        )
         both.append(other)
     return both[0], both[1]
 

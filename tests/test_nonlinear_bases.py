@@ -207,8 +207,8 @@ def test_a_load_is_answered_from_the_basis_of_its_direction(tiny: Dataset) -> No
     method = LocalPOD(n_clusters=4, n_modes=3).fit(tiny.scene, tiny.train)
     assert len(method.problems_) == 4
     loads = tiny.test.forces[:8].reshape(8, -1)[:, tiny.scene.free_dofs]
-    asked = [method._nearest(load) for load in loads]
-    assert asked == [method._nearest(0.01 * load) for load in loads]
+    asked = [method.nearest(load) for load in loads]
+    assert asked == [method.nearest(0.01 * load) for load in loads]
     assert len(set(asked)) > 1
     first, other = (asked.index(number) for number in sorted(set(asked))[:2])
     before = method.predict(tiny.test.forces[[first, other]])
@@ -287,7 +287,7 @@ def test_the_autoencoder_learns_what_linear_elasticity_lacks(cache: Path) -> Non
 @pytest.mark.parametrize("spoil", ["nan", "columns", "integers"])
 def test_modes_of_a_damaged_model_are_refused(spoil: str, tiny: Dataset) -> None:
     method = mor_bench.load_method("modal-derivatives", n_linear=3, n_modes=6).fit(tiny.scene, None)
-    state = method._state()
+    state = dict(method.arrays_)
     modes = state["modes"]
     state["modes"] = {
         "nan": modes * np.nan,
@@ -295,7 +295,7 @@ def test_modes_of_a_damaged_model_are_refused(spoil: str, tiny: Dataset) -> None
         "integers": modes.astype(np.int64),
     }[spoil]
     with pytest.raises(InvalidInputError):
-        method._restore(state)
+        method.restore(method.scene_, state)
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ from mor_bench.runs.fit_cache import Material
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.generate import dataset_folder
+from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.specs import NO_FORCES, list_suite, load_generated_spec
 from mor_bench.surrogate import Surrogate
 from tests.test_contract import CHEAP
@@ -121,10 +122,13 @@ def test_the_samples_are_those_of_the_scene_without_the_option(
     assert nodes is not None
     top = np.flatnonzero((data.scene.mesh.points[:, 2] == 1.0) & (data.scene.mesh.points[:, 0] > 0))
     np.testing.assert_array_equal(nodes, top)
-    np.testing.assert_array_equal(data.test.inputs[:, nodes], data.test.displacements[:, nodes])
-    assert not np.delete(data.test.inputs, nodes, axis=1).any()
+    given = data.test.given
+    assert isinstance(given, ObservedDisplacements)
+    np.testing.assert_array_equal(given.nodes, nodes)
+    np.testing.assert_array_equal(given.values[:, nodes], data.test.displacements[:, nodes])
+    assert not np.delete(given.values, nodes, axis=1).any()
     assert tiny.scene.observed_nodes is None
-    assert tiny.test.inputs is tiny.test.forces
+    assert tiny.test.given.query is tiny.test.forces
 
 
 def test_the_manifest_of_shared_samples_stays_that_of_the_dataset_that_made_them(
@@ -243,51 +247,54 @@ def test_gappy_pod_reproduces_what_its_modes_span(data: Dataset) -> None:
     mixed = np.tensordot([0.5, -1.0, 2.0], few.displacements[[1, 4, 9]], 1)
     seen = np.full(mixed.shape, np.nan)
     seen[data.scene.observed_nodes] = mixed[data.scene.observed_nodes]
-    np.testing.assert_allclose(method.predict(seen), mixed, atol=1e-8 * np.abs(mixed).max())
+    given = data.test.given.with_values(seen)
+    np.testing.assert_allclose(method.predict(given), mixed, atol=1e-8 * np.abs(mixed).max())
 
 
 def test_regularisation_keeps_noise_out_of_gappy_pod(data: Dataset) -> None:
     noise = (
         0.01
         * np.sqrt((data.test.displacements**2).mean())
-        * np.random.default_rng(0).normal(size=data.test.inputs.shape)
+        * np.random.default_rng(0).normal(size=data.test.displacements.shape)
     )
+    noisy = data.test.given.with_values(data.test.given.values + noise)
     errors = {}
     for regularisation in (0.0, 0.01):
         method = mor_bench.load_method("gappy-pod", n_modes=80, regularisation=regularisation).fit(
             data.scene, data.train
         )
         errors[regularisation] = np.median(
-            relative_l2(method.predict(data.test.inputs + noise), data.test.displacements)
+            relative_l2(method.predict(noisy), data.test.displacements)
         )
     assert errors[0.01] < 0.5 * errors[0.0]
 
 
 def test_methods_that_can_complete_what_is_seen(fitted: Surrogate, data: Dataset) -> None:
-    inputs, reference = data.test.inputs, data.test.displacements
-    predicted = fitted.predict(inputs)
+    given, reference = data.test.given, data.test.displacements
+    predicted = fitted.predict(given)
     assert np.median(relative_l2(predicted, reference)) < BOUNDS.get(type(fitted).__name__, 0.1)
-    single = np.stack([fitted.predict(seen) for seen in inputs[:5]])
+    single = np.stack([fitted.predict(given[i]) for i in range(5)])
     np.testing.assert_allclose(single, predicted[:5], rtol=0, atol=2e-6 * np.abs(single).max())
     assert (predicted[:, data.scene.fixed_nodes] == 0).all()
     if type(fitted).__name__ != "UMesh":
-        assert not fitted.predict(np.zeros_like(inputs[0])).any()
-    assert fitted.predict(inputs[:0]).shape == inputs[:0].shape
+        assert not fitted.predict(given.with_values(np.zeros_like(reference[0]))).any()
+    assert fitted.predict(given[:0]).shape == reference[:0].shape
 
 
 def test_what_unobserved_nodes_hold_is_not_looked_at(fitted: Surrogate, data: Dataset) -> None:
     nodes = data.scene.observed_nodes
     assert nodes is not None
-    expected = fitted.predict(data.test.inputs[:2])
+    given = data.test.given[:2]
+    expected = fitted.predict(given)
     for hidden in (np.nan, np.inf, 3.0):
-        seen = np.full_like(data.test.inputs[:2], hidden)
-        seen[:, nodes] = data.test.inputs[:2, nodes]
+        seen = np.full_like(given.values, hidden)
+        seen[:, nodes] = given.values[:, nodes]
         before = seen.copy()
-        np.testing.assert_array_equal(fitted.predict(seen), expected)
+        np.testing.assert_array_equal(fitted.predict(given.with_values(seen)), expected)
         np.testing.assert_array_equal(seen, before)
     seen[1, nodes[3], 2] = np.nan
     with pytest.raises(InvalidInputError, match=r"must be finite .* m at the observed nodes"):
-        fitted.predict(seen)
+        fitted.predict(given.with_values(seen))
 
 
 def test_saved_models_know_what_they_are_given(
@@ -297,7 +304,7 @@ def test_saved_models_know_what_they_are_given(
     loaded = mor_bench.load_surrogate(tmp_path / "model.safetensors")
     np.testing.assert_array_equal(loaded.scene_.observed_nodes, data.scene.observed_nodes)
     np.testing.assert_array_equal(
-        loaded.predict(data.test.inputs[:3]), fitted.predict(data.test.inputs[:3])
+        loaded.predict(data.test.given[:3]), fitted.predict(data.test.given[:3])
     )
 
 
@@ -311,7 +318,7 @@ def test_all_others_say_that_they_need_forces(name: str, data: Dataset) -> None:
     with pytest.raises(UnsupportedSceneError):
         method.fit(data.scene, data.train)
     with pytest.raises(NotFittedError):
-        method.predict(data.test.inputs[0])
+        method.predict(data.test.given[0])
 
 
 class Forgetful(Surrogate):
@@ -320,12 +327,8 @@ class Forgetful(Surrogate):
     def supports(self, scene: Scene) -> str | None:
         return None
 
-    def fit(self, scene: Scene, snapshots: Any) -> Forgetful:
-        with self._fitting(scene):
-            return self
-
-    def predict(self, forces: Any) -> np.ndarray:
-        return self._checked_forces(forces)
+    def answer(self, forces: np.ndarray) -> np.ndarray:
+        return forces
 
 
 def test_a_method_that_does_not_say_that_it_can_is_not_given_displacements(
@@ -336,21 +339,34 @@ def test_a_method_that_does_not_say_that_it_can_is_not_given_displacements(
     Forgetful().fit(tiny.scene, tiny.train)
 
 
+def test_forces_are_not_taken_for_displacements_nor_displacements_for_forces(
+    data: Dataset, tiny: Dataset
+) -> None:
+    linear = mor_bench.load_method("linear-fem")
+    given = data.test.given
+    with pytest.raises(InvalidInputError, match="must be forces"):
+        linear.fit(tiny.scene).predict(given)
+    with pytest.raises(InvalidInputError, match="must be displacements of observed nodes"):
+        linear.fit(data.scene).predict(given.values)
+    with pytest.raises(InvalidInputError, match="are of other nodes"):
+        linear.predict(ObservedDisplacements(given.values, np.arange(5)))
+
+
 def test_gappy_pod_needs_something_to_complete(tiny: Dataset) -> None:
-    with pytest.raises(UnsupportedSceneError, match="it is given forces"):
+    with pytest.raises(UnsupportedSceneError, match="the scene gives forces"):
         mor_bench.load_method("gappy-pod").fit(tiny.scene, tiny.train)
 
 
 def test_no_error_is_indicated_where_forces_are_not_known(data: Dataset) -> None:
     method = mor_bench.load_method("linear-fem").fit(data.scene, None)
     with pytest.raises(UnsupportedSceneError, match="no error can be indicated"):
-        method.indicate_error(data.test.inputs[0], data.test.displacements[0])
+        method.indicate_error(data.test.given[0], data.test.displacements[0])
 
 
 def test_a_range_of_loads_that_are_not_known_is_not_made_up(data: Dataset) -> None:
     method = mor_bench.load_method("gappy-pod").fit(data.scene, data.train)
     with pytest.raises(UnknownRangeError, match=NO_FORCES):
-        method.out_of_range(data.test.inputs)
+        method.out_of_range(data.test.given)
 
 
 def test_a_run_has_rows_of_those_that_can_and_reasons_of_the_others(
@@ -368,7 +384,7 @@ def test_a_run_has_rows_of_those_that_can_and_reasons_of_the_others(
     direct = (
         mor_bench.load_method("pca-regression-force")
         .fit(data.scene, data.train)
-        .predict(data.test.inputs)
+        .predict(data.test.given)
     )
     assert rows["pca-regression-force"]["error"]["rel_l2_median"] == pytest.approx(
         np.median(relative_l2(direct, data.test.displacements))
@@ -389,7 +405,7 @@ def test_the_fit_command_scores_answers_to_what_is_seen(
     fitted = mor_bench.fit(
         written(tmp_path, TOP), "linear-fem", out=tmp_path / "model.safetensors", cache=cache
     )
-    predicted = fitted.method.predict(data.test.inputs)
+    predicted = fitted.method.predict(data.test.given)
     assert fitted.error["rel_l2_median"] == pytest.approx(
         np.median(relative_l2(predicted, data.test.displacements))
     )
@@ -422,7 +438,7 @@ def test_exported_answers_are_those_to_what_is_seen(
     method.save(tmp_path / "gappy.safetensors")
     paths = export_vtu(data, 2, tmp_path / "vtu", models=[tmp_path / "gappy.safetensors"])
     found = meshio.read(paths[1]).point_data
-    np.testing.assert_array_equal(found["displacement"], method.predict(data.test.inputs[2]))
+    np.testing.assert_array_equal(found["displacement"], method.predict(data.test.given[2]))
     np.testing.assert_array_equal(found["force"], data.test.forces[2])
     with pytest.raises(InvalidInputError, match="the model was fitted to"):
         export_vtu(tiny, 2, tmp_path / "vtu", models=[tmp_path / "gappy.safetensors"])
@@ -445,12 +461,12 @@ def test_an_onnx_file_does_not_look_at_what_is_not_seen(
     )
     observed = data.scene.observed_nodes
     assert observed is not None
-    given = data.test.inputs[:3].astype(np.float32)
+    given = data.test.given[:3].values.astype(np.float32)
     given[:, np.setdiff1d(np.arange(given.shape[1]), observed)] = np.nan
     (found,) = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"]).run(
         None, {"forces": given}
     )
-    expected = method.predict(data.test.inputs[:3])
+    expected = method.predict(data.test.given[:3])
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * np.abs(expected).max())
 
 
@@ -462,7 +478,7 @@ def test_imported_snapshots_can_be_completed(data: Dataset, tmp_path: Path) -> N
         mor_bench.load_method("gappy-pod").fit(each.scene, each.train) for each in (mine, data)
     )
     np.testing.assert_allclose(
-        own.predict(data.test.inputs), first.predict(data.test.inputs), atol=1e-9
+        own.predict(data.test.given), first.predict(data.test.given), atol=1e-9
     )
     assert mor_bench.load_method("fem").supports(mine.scene) is not None
     path.write_text(path.read_text().replace('"z-max"', '"x-min"'))

@@ -152,14 +152,15 @@ def test_on_unseen_load_regions_it_is_far_better_than_the_linear_response(tiny: 
 
 def test_outside_the_positions_of_training_it_answers_as_at_their_edge(tiny: Dataset) -> None:
     method = SeparatedLoad("none", n_terms=20, position_degree=2).fit(tiny.scene, tiny.train)
-    assert method.ends_.shape == (2, 2)
+    functions = method.functions_
+    assert functions.ends.shape == (2, 2)
     far, vector = np.array([[50.0, -30.0, 1.0]]), np.ones((1, 3))
-    back = np.linalg.pinv(method.frame_[:3]).T
-    edge = np.clip(far @ method.frame_[:3] + method.frame_[3], *method.ends_)
-    near = (edge - method.frame_[3]) @ back.T
+    back = np.linalg.pinv(functions.frame[:3]).T
+    edge = np.clip(far @ functions.frame[:3] + functions.frame[3], *functions.ends)
+    near = (edge - functions.frame[3]) @ back.T
     (position, _, _), (there, _, _) = (
-        method._functions(far, vector),
-        method._functions(near, vector),
+        functions(far, vector),
+        functions(near, vector),
     )
     np.testing.assert_allclose(position, there, atol=1e-9)
 

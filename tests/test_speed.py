@@ -139,9 +139,11 @@ def test_faster_than_the_baseline(
         int(np.linalg.norm(drawn.vectors, axis=(1, 2)).argsort()[32])
     ]
     if scene.observed_nodes is not None:
-        force = mor_bench.load_dataset(
-            race.scene, limit=N_SAMPLES, cache=cache, workers=1
-        ).test.inputs[0]
+        force = (
+            mor_bench.load_dataset(race.scene, limit=N_SAMPLES, cache=cache, workers=1)
+            .test.given[0]
+            .query
+        )
     with pinned_threads(1):
         try:
             method = fitted(race.scene, name, race.parameters)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 
 import mor_bench
+from mor_bench import surrogate
 from mor_bench.errors import InvalidInputError, MissingDependencyError, SpecError
 from mor_bench.hard_cases import case as case_module
 from mor_bench.hard_cases import mechanics_cases as mechanics
@@ -35,7 +36,6 @@ from mor_bench.scene import soundness
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.specs import MethodSpec, list_suite
-from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates import pod as pod_module
 from mor_bench.surrogates.fem import FullFEM
 from mor_bench.surrogates.pod import PODGalerkin
@@ -241,10 +241,10 @@ class Crashing(PODGalerkin):
     """Divides by zero where there is no force, as in some poor snapshots."""
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        checked = self._checked_forces(forces)
-        if len(checked) and not checked.any():
+        answer = super().predict(forces)
+        if answer.size and not np.any(np.asarray(forces)):
             raise ZeroDivisionError("on purpose")
-        return super().predict(forces)
+        return answer
 
 
 class Rounding(PODGalerkin):
@@ -258,18 +258,10 @@ class Unchecked(PODGalerkin):
     """Learns whatever it is given, and does not know its range."""
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
-        with self._fitting(scene):
-            assert snapshots is not None
-            self._restore(
-                {
-                    "modes": np.nan_to_num(
-                        np.linalg.svd(
-                            np.nan_to_num(snapshots.free_displacements), full_matrices=False
-                        )[2][:5].T
-                    )
-                }
-            )
-        return self
+        assert snapshots is not None
+        known = np.nan_to_num(snapshots.free_displacements)
+        modes = np.linalg.svd(known, full_matrices=False)[2][:5].T
+        return self.restore(scene, {"modes": np.nan_to_num(modes)})
 
 
 class Unfit(PODGalerkin):
@@ -505,9 +497,9 @@ PLANTS: dict[str, tuple[str, str, str, Any, str, Any]] = {
         "pod",
         "bad-snapshots",
         "",
-        Surrogate,
-        "_checked_snapshots",
-        lambda self, snapshots: snapshots,
+        surrogate,
+        "checked_samples",
+        lambda owner, scene, snapshots: snapshots,
     ),
     "a model askew": ("fem", "symmetry", "", FullFEM, "predict", askew),
 }

@@ -10,8 +10,10 @@ import subprocess
 import sys
 import time
 import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import h5py
 import numpy as np
@@ -34,19 +36,8 @@ class Zero(mor_bench.Surrogate):
 
     needs_snapshots = False
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Zero:
-        with self._fitting(scene):
-            pass
-        return self
-
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        return np.zeros_like(self._checked_forces(forces)).reshape(np.shape(forces))
-
-    def _state(self) -> dict[str, NDArray[Any]]:
-        return {}
-
-    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        pass
+    def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.zeros_like(forces)
 
 
 class Slowed(FullFEM):
@@ -66,24 +57,23 @@ class Slowed(FullFEM):
 
 
 class Recorder(mor_bench.Surrogate):
-    """Writes down what it is given, and then spoils it."""
+    """Writes down what it is given, and then spoils it; overrides `fit` and `predict` only."""
 
     def __init__(self, notes: str, spoil: str = "test") -> None:
         self.notes = notes
         self.spoil = spoil
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Recorder:
-        with self._fitting(scene):
-            assert snapshots is not None
-            content = {
-                "regions": snapshots.regions.tolist(),
-                "vectors": snapshots.loads.vectors.tolist(),
-            }
-            Path(self.notes).write_text(json.dumps(content))
-            if self.spoil == "train":
-                snapshots.free_displacements[:] *= 0.5
-            if self.spoil == "exit":
-                raise SystemExit(3)
+        assert snapshots is not None
+        content = {
+            "regions": snapshots.regions.tolist(),
+            "vectors": snapshots.loads.vectors.tolist(),
+        }
+        Path(self.notes).write_text(json.dumps(content))
+        if self.spoil == "train":
+            snapshots.free_displacements[:] *= 0.5
+        if self.spoil == "exit":
+            raise SystemExit(3)
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
@@ -91,6 +81,19 @@ class Recorder(mor_bench.Surrogate):
         out = np.zeros(array.shape)
         array *= 0.0
         return out
+
+
+class Plain:
+    """Predicts no displacement, and knows nothing of mor-bench."""
+
+    def __init__(self, factor: float = 0.0) -> None:
+        self.factor = factor
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None) -> None:
+        assert snapshots is not None
+
+    def predict(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self.factor * forces
 
 
 class Broken(Zero):
@@ -125,7 +128,7 @@ class Broken(Zero):
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        batch = self._checked_forces(forces)
+        batch = np.asarray(forces, dtype=float).reshape(-1, *np.shape(forces)[-2:])
         if self.how == "crash":
             raise ZeroDivisionError("on purpose")
         if self.how == "sometimes" and any(force[:, 0].sum() > 0 for force in batch):
@@ -144,18 +147,15 @@ class Broken(Zero):
         return out.reshape(np.shape(forces))
 
 
-class Poison(mor_bench.Surrogate):
+class Poison(Zero):
     """Writes over the training samples where they lie."""
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Poison:
-        with self._fitting(scene):
-            assert snapshots is not None
-            array: Any = snapshots.free_displacements
-            np.load(array.filename, mmap_mode="r+")[:] = 1.0
-        return self
+    needs_snapshots = True
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        return np.zeros_like(self._checked_forces(forces)).reshape(np.shape(forces))
+    def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
+        array: Any = samples.free_displacements
+        np.load(array.filename, mmap_mode="r+")[:] = 1.0
+        return {}
 
 
 class Leaky(Zero):
@@ -184,9 +184,9 @@ class Peeker(Zero):
         self.dataset = dataset
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Peeker:
-        with self._fitting(scene):
-            found = [*self._in_memory(snapshots), *self._on_disk()]
-            warnings.warn(f"saw {json.dumps(found)}", stacklevel=2)
+        found = [*self._in_memory(snapshots), *self._on_disk()]
+        warnings.warn(f"saw {json.dumps(found)}", stacklevel=2)
+        super().fit(scene, snapshots)
         return self
 
     def _in_memory(self, snapshots: Snapshots | None) -> list[str]:
@@ -250,96 +250,68 @@ def _known(folder: Path) -> list[str]:
     ]
 
 
+@dataclass(eq=False)
 class Descent(mor_bench.Surrogate):
-    """Displacements that are linear in the sum of the nodal forces, by gradient descent: a training that is stopped goes on from its checkpoint.
+    """Displacements linear in the sum of the nodal forces, by gradient descent.
 
-    It says from which iteration it goes on in a warning. ``DESCENT_NAP_S`` in the environment slows its iterations down.
+    A stopped training resumes from its checkpoint and warns of the iteration. The environment
+    variable ``DESCENT_NAP_S`` slows its iterations down.
     """
 
-    EACH = 10
+    iterations: Annotated[int, Field(ge=1)] = 40
+    seed: int = 0
+    channels: int = 1
+    steps: int = 1
+    fails: int = -1
+
+    EACH: ClassVar[int] = 10
     """Iterations per point of the loss curve, and between two checkpoints."""
 
-    def __init__(
-        self,
-        iterations: Annotated[int, Field(ge=1)] = 40,
-        seed: int = 0,
-        channels: int = 1,
-        steps: int = 1,
-        fails: int = -1,
-    ) -> None:
-        self.iterations = iterations
-        self.seed = seed
-        self.channels = channels
-        self.steps = steps
-        self.fails = fails
-
-    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Descent:
-        with self._fitting(scene):
-            samples = self._checked_snapshots(snapshots)
-            if self.seed == self.fails:
-                raise OutOfTimeError("all iterations would take 7 h; the limit is 9 s.")
-            if (
-                self.time_limit_s is not None
-                and self.channels * self.steps * 60 > self.time_limit_s
-            ):
-                raise OutOfTimeError(
-                    f"all iterations would take {self.channels * self.steps / 60:.3g} h; the limit is {self.time_limit_s:.0f} s."
-                )
-            forces, displacements = (
-                samples.forces.sum(axis=1),
-                samples.displacements.reshape(len(samples), -1),
+    def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
+        if self.seed == self.fails:
+            raise OutOfTimeError("all iterations would take 7 h; the limit is 9 s.")
+        size = self.channels * self.steps
+        if self.time_limit_s is not None and size * 60 > self.time_limit_s:
+            raise OutOfTimeError(
+                f"all iterations would take {size / 60:.3g} h; "
+                f"the limit is {self.time_limit_s:.0f} s."
             )
-            generator = np.random.default_rng(self.seed)
-            weights, losses, first = (
-                1e-3 * generator.normal(size=(forces.shape[1], displacements.shape[1])),
-                np.zeros(0),
-                0,
-            )
-            seconds, checkpoint = self.training.fit_seconds, self.training.checkpoint
-            iterations = self.iterations if seconds is None else int(100 * seconds)
-            if checkpoint is not None and checkpoint.exists():
-                try:
-                    kept = load_file(checkpoint)
-                except SafetensorError as error:
-                    raise StoreError(f"{checkpoint}: {error}") from None
-                weights, losses, first, iterations = (
-                    kept["weights"],
-                    kept["losses"],
-                    int(kept["numbers"][0]),
-                    int(kept["numbers"][1]),
-                )
-                warnings.warn(f"goes on from iteration {first} of {iterations}", stacklevel=2)
-            rate = 0.5 / np.linalg.norm(forces, 2) ** 2
-            for iteration in range(first, iterations):
-                off = forces @ weights - displacements
-                weights = weights - rate * forces.T @ off
-                time.sleep(float(os.environ.get("DESCENT_NAP_S", "0")))
-                if (iteration + 1) % self.EACH == 0:
-                    losses = np.append(losses, np.square(off).mean())
-                    if checkpoint is not None:
-                        numbers = np.array([iteration + 1, iterations])
-                        write_atomically(
-                            checkpoint,
-                            serialise({"weights": weights, "losses": losses, "numbers": numbers}),
-                        )
-                    if self.training.progress is not None:
-                        self.training.progress(iteration + 1, iterations, float(losses[-1]))
-            self.weights_, self.loss_curve_, self.validation_curve_, self.iterations_ = (
-                weights,
-                losses,
-                1.5 * losses,
-                iterations,
-            )
-            if checkpoint is not None:
-                checkpoint.unlink(missing_ok=True)
-        return self
+        forces = samples.forces.sum(axis=1)
+        displacements = samples.displacements.reshape(len(samples), -1)
+        generator = np.random.default_rng(self.seed)
+        weights = 1e-3 * generator.normal(size=(forces.shape[1], displacements.shape[1]))
+        losses, first = np.zeros(0), 0
+        seconds, checkpoint = self.training.fit_seconds, self.training.checkpoint
+        iterations = self.iterations if seconds is None else int(100 * seconds)
+        if checkpoint is not None and checkpoint.exists():
+            try:
+                kept = load_file(checkpoint)
+            except SafetensorError as error:
+                raise StoreError(f"{checkpoint}: {error}") from None
+            weights, losses = kept["weights"], kept["losses"]
+            first, iterations = map(int, kept["numbers"])
+            warnings.warn(f"goes on from iteration {first} of {iterations}", stacklevel=2)
+        rate = 0.5 / np.linalg.norm(forces, 2) ** 2
+        for iteration in range(first, iterations):
+            off = forces @ weights - displacements
+            weights = weights - rate * forces.T @ off
+            time.sleep(float(os.environ.get("DESCENT_NAP_S", "0")))
+            if (iteration + 1) % self.EACH == 0:
+                losses = np.append(losses, np.square(off).mean())
+                if checkpoint is not None:
+                    numbers = np.array([iteration + 1, iterations])
+                    kept = {"weights": weights, "losses": losses, "numbers": numbers}
+                    write_atomically(checkpoint, serialise(kept))
+                if self.training.progress is not None:
+                    self.training.progress(iteration + 1, iterations, float(losses[-1]))
+        self.loss_curve_, self.validation_curve_ = losses, 1.5 * losses
+        self.iterations_ = iterations
+        if checkpoint is not None:
+            checkpoint.unlink(missing_ok=True)
+        return {"weights": weights}
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
-        batch = self._checked_forces(forces)
-        return np.asarray(batch.sum(axis=1) @ self.weights_).reshape(np.shape(forces))
+    def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
+        self.weights_ = model["weights"]
 
-    def _state(self) -> dict[str, NDArray[Any]]:
-        return {"weights": self.weights_}
-
-    def _restore(self, state: dict[str, NDArray[Any]]) -> None:
-        self.weights_ = state["weights"]
+    def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(forces.sum(axis=1) @ self.weights_).reshape(forces.shape)

@@ -72,7 +72,7 @@ def _difference(surrogate: Surrogate, written: bytes) -> float | None:
     scene = surrogate.scene_
     if surrogate.parameters.get("inference", "eager") != "eager":
         eager = make_surrogate(type(surrogate), {**surrogate.parameters, "inference": "eager"})
-        surrogate = eager.restore(scene, surrogate.arrays_, surrogate.sizes_)
+        surrogate = eager.restore(scene, surrogate.arrays_)
     forces = np.random.default_rng(0).normal(size=(3, scene.mesh.n_nodes, 3)).astype(np.float32)
     forces[0] = 0.0
     session = onnxruntime.InferenceSession(written, providers=["CPUExecutionProvider"])

@@ -16,7 +16,7 @@ from time import perf_counter, process_time
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mor_bench.errors import InvalidInputError, SolverError, UnknownRangeError
 from mor_bench.machine import peak_memory_bytes, pinned_threads
@@ -26,6 +26,7 @@ from mor_bench.method_loading import load_fitted, make_surrogate
 from mor_bench.sandbox.handover import read_snapshots
 from mor_bench.sandbox.session import Session
 from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.snapshots.given import given_of
 from mor_bench.specs import check_parameters, load_class
 from mor_bench.surrogate import Surrogate
 from mor_bench.training_options import TrainingOptions
@@ -172,13 +173,13 @@ class MethodSession(Session):
     def predict(self, forces: NDArray[np.float64], out: Path, threads: int) -> dict[str, Any]:
         """Predict loads, (n, n_nodes, 3), N, and write the displacements to a file."""
         with pinned_threads(threads):
-            np.save(out, predict_all(self.method, forces), allow_pickle=False)
+            np.save(out, predict_all(self.method, given_of(self.scene, forces)), allow_pickle=False)
         return {}
 
     def flag(self, forces: NDArray[np.float64]) -> dict[str, Any]:
         """Return which loads are out of the training range; None if the method does not know."""
         try:
-            flagged = self.method.out_of_range(forces)
+            flagged = self.method.out_of_range(self._query(forces))
         except UnknownRangeError:
             return {"flagged": None}
         if flagged.shape != (len(forces),):
@@ -190,7 +191,7 @@ class MethodSession(Session):
 
     def cost(self, forces: NDArray[np.float64]) -> dict[str, Any]:
         """Count the work of a query, averaged over some loads."""
-        return {"cost": cost_of(self.method, forces)}
+        return {"cost": cost_of(self.method, given_of(self.scene, forces))}
 
     def warm(self, forces: NDArray[np.float64], threads: int, seed: int) -> dict[str, Any]:
         """Take the queries, (n, n_nodes, 3), N, and answer some of them."""
@@ -200,7 +201,8 @@ class MethodSession(Session):
             start = perf_counter()
             for i in range(WARM_UP_QUERIES):
                 with suppress(SolverError):
-                    self.method.predict(self.queries[-1 - i % len(self.queries)].copy())
+                    load = self.queries[-1 - i % len(self.queries)].copy()
+                    self.method.predict(self._query(load))
                 if perf_counter() - start > WARM_UP_S:
                     break
         return {"memory_bytes": peak_memory_bytes()}
@@ -226,10 +228,8 @@ class MethodSession(Session):
         begun, shape = process_time(), self.queries.shape[1:]
         with pinned_threads(threads):
             for _ in range(SETTLE_QUERIES):
-                self._predict_if_possible(
-                    self.queries[self.generator.integers(len(self.queries))]
-                    * self.generator.uniform(0.5, 1.0)
-                )
+                load = self.queries[self.generator.integers(len(self.queries))]
+                self._predict_if_possible(self._query(load * self.generator.uniform(0.5, 1.0)))
             turn = self._timed_queries(n, floor_s, most_s)
         if {answer.shape for answer in turn.kept.values()} - {shape}:
             raise InvalidInputError(
@@ -245,7 +245,11 @@ class MethodSession(Session):
             "checked": list(turn.kept),
         }
 
-    def _predict_if_possible(self, query: NDArray[np.float64]) -> Any:
+    def _query(self, values: NDArray[np.float64]) -> ArrayLike:
+        """Return what `predict` takes for forces, N, or displacements of observed nodes, m."""
+        return given_of(self.scene, values).query
+
+    def _predict_if_possible(self, query: ArrayLike) -> Any:
         try:
             return self.method.predict(query)
         except SolverError:
@@ -259,7 +263,7 @@ class MethodSession(Session):
                     int(draw.integers(len(queries))),
                     len(turn.kept) < CHECKED_ANSWERS and draw.random() < CHECKED_SHARE,
                 )
-                query = queries[number] * (1.0 if check else draw.uniform(0.5, 1.0))
+                query = self._query(queries[number] * (1.0 if check else draw.uniform(0.5, 1.0)))
                 clock.seconds, busy = 0.0, process_time()
                 before = perf_counter()
                 answer = self._predict_if_possible(query)
@@ -284,7 +288,7 @@ class MethodSession(Session):
         expected = 0.0
         with pinned_threads(threads):
             for size in sizes:
-                batch = self.queries[np.arange(size) % len(self.queries)]
+                batch = self._query(self.queries[np.arange(size) % len(self.queries)])
                 if expected * size > most_s:
                     rates[str(size)] = None
                     continue

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mor_bench.errors import InvalidInputError, SolverError
+from mor_bench.snapshots.given import Given
 from mor_bench.surrogate import Surrogate
 
 
-def predict_all(method: Surrogate, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+def predict_all(method: Surrogate, given: Given) -> NDArray[np.float64]:
     """Return predictions (n, n_nodes, 3), m; NaN where the method found no equilibrium.
 
     Parameters
     ----------
     method : Surrogate
-    forces : (n, n_nodes, 3) float64
-        N.
+    given : Forces or ObservedDisplacements
+        With values (n, n_nodes, 3).
 
     Raises
     ------
@@ -25,17 +26,21 @@ def predict_all(method: Surrogate, forces: NDArray[np.float64]) -> NDArray[np.fl
     """
     try:
         # Copies: what a method does to its input must not reach the scoring.
-        predicted = np.asarray(method.predict(forces.copy()))
+        predicted = np.asarray(method.predict(_copied(given)))
     except SolverError:
-        predicted = np.full(forces.shape, np.nan)
-        for answer, force in zip(predicted, forces, strict=True):
+        predicted = np.full(given.values.shape, np.nan)
+        for i, answer in enumerate(predicted):
             try:
-                answer[:] = method.predict(force.copy())
+                answer[:] = method.predict(_copied(given[i]))
             except SolverError:
                 continue
-    if predicted.shape != forces.shape or predicted.dtype.kind != "f":
+    if predicted.shape != given.values.shape or predicted.dtype.kind != "f":
         raise InvalidInputError(
-            f"`predict` must return floats of shape {forces.shape}; "
+            f"`predict` must return floats of shape {given.values.shape}; "
             f"it returned {predicted.dtype} of shape {predicted.shape}."
         )
     return predicted.astype(np.float64, copy=False)
+
+
+def _copied(given: Given) -> ArrayLike:
+    return given.with_values(given.values.copy()).query

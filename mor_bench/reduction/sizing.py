@@ -146,9 +146,10 @@ class Trials:
 def _relative_errors(method: Sizeable, samples: Snapshots) -> list[float]:
     """Return the relative l2 of each sample; infinity where there is no prediction."""
     errors, nodes = [], samples.scene.output_nodes
-    for force, reference in zip(samples.forces, samples.displacements[:, nodes], strict=True):
+    for i, reference in enumerate(samples.displacements[:, nodes]):
         try:
-            difference = float(np.linalg.norm(method.predict(force)[nodes] - reference))
+            predicted = method.predict(samples.given[i].query)
+            difference = float(np.linalg.norm(predicted[nodes] - reference))
         except SolverError:
             difference = np.inf
         errors.append(
@@ -181,15 +182,6 @@ def _first_that_meets(
         else:
             low = middle
     return high
-
-
-def size_to_needs(
-    method: Sizeable, scene: Scene, snapshots: Snapshots, rungs: Mapping[str, Sequence[Any]]
-) -> dict[str, Any]:
-    """As `choose_sizes`, for methods that are not written as `learn` and `prepare` yet."""
-    if sizes := choose_sizes(method, scene, snapshots, rungs):
-        method.sizes_ = sizes
-    return {**method.parameters, **sizes}
 
 
 def choose_sizes(

@@ -138,9 +138,9 @@ class TestSet:
     def of(cls, snapshots: Snapshots) -> TestSet:
         """A test set from snapshots."""
         nodes = snapshots.scene.output_nodes
-        arrays = {"f": snapshots.inputs, "u": snapshots.displacements}
+        arrays = {"f": snapshots.given.values, "u": snapshots.displacements}
         return cls(
-            snapshots.inputs,
+            snapshots.given.values,
             snapshots.displacements,
             nodes,
             digest_of(

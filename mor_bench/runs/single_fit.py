@@ -220,7 +220,7 @@ def _check_writable(name: str, path: Path) -> None:
 
 def _test_error(method: Surrogate, test: Snapshots) -> dict[str, float]:
     predicted = [
-        predict_all(method, test[start : start + SCORE_CHUNK].inputs)
+        predict_all(method, test[start : start + SCORE_CHUNK].given)
         for start in range(0, len(test), SCORE_CHUNK)
     ]
     return summary(

@@ -73,27 +73,17 @@ class Snapshots:
         return read_only(self.loads.nodal_forces(self.scene.patch_weights))
 
     @cached_property
-    def inputs(self) -> NDArray[np.float64]:
-        """(n_samples, n_nodes, 3) forces, N, or the displacements of observed nodes, m.
+    def given(self) -> Given:
+        """What methods are given: the forces, or displacements of the observed nodes.
 
-        Methods are given these. They are zero at all other nodes.
+        Displacements are zero at all other nodes.
         """
         nodes = self.scene.observed_nodes
         if nodes is None:
-            return self.forces
+            return given_of(self.scene, self.forces)
         seen = np.zeros_like(self.displacements)
         seen[:, nodes] = self.displacements[:, nodes]
-        return read_only(seen)
-
-    @property
-    def given(self) -> Given:
-        """The information that methods are given for these samples."""
-        return given_of(self.scene, self.inputs)
-
-    @property
-    def free_inputs(self) -> NDArray[np.float64]:
-        """(n_samples, n_free) `inputs` at the free dofs."""
-        return self.inputs.reshape(len(self), -1)[:, self.scene.free_dofs]
+        return given_of(self.scene, read_only(seen))
 
     @property
     def free_forces(self) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene
 
 MAX_FORCE_N = 1e30
-"""Largest nodal force component that is accepted, N: its cube must not overflow."""
+"""Largest accepted component of a force, N, or displacement, m: its cube must not overflow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +36,10 @@ class Forces:
 
     def __getitem__(self, index: Any) -> Self:
         return type(self)(self.values[index])
+
+    def with_values(self, values: NDArray[np.float64]) -> Self:
+        """Return other values of the same kind."""
+        return type(self)(values)
 
     @property
     def query(self) -> NDArray[np.float64]:
@@ -66,7 +70,11 @@ class ObservedDisplacements:
         return found.copy() if copy else found
 
     def __getitem__(self, index: Any) -> Self:
-        return type(self)(self.values[index], self.nodes)
+        return self.with_values(self.values[index])
+
+    def with_values(self, values: NDArray[np.float64]) -> Self:
+        """Return other displacements of the same nodes."""
+        return type(self)(values, self.nodes)
 
     @property
     def query(self) -> Self:
@@ -77,7 +85,7 @@ class ObservedDisplacements:
 Given = Forces | ObservedDisplacements
 
 
-def given_of(scene: Scene, values: NDArray[np.float64]) -> Given:
+def given_of(scene: Scene, values: NDArray[Any]) -> Given:
     """Wrap plain values as what the methods of a scene are given."""
     if scene.observed_nodes is None:
         return Forces(values)
@@ -87,32 +95,43 @@ def given_of(scene: Scene, values: NDArray[np.float64]) -> Given:
 def checked_given(scene: Scene, given: ArrayLike) -> Given:
     """Check a query and return it with values of shape (n, n_nodes, 3) in float64.
 
-    The values at nodes that are not observed become zero.
+    Displacements of nodes that are not observed become zero.
+
+    Parameters
+    ----------
+    given : array or Forces, or ObservedDisplacements for a scene with observed nodes
 
     Raises
     ------
     InvalidInputError
-        On a wrong shape or dtype, NaN, infinity or a value beyond `MAX_FORCE_N`.
+        If forces are given instead of displacements or the other way round; on a wrong shape or
+        dtype, NaN, infinity or a value beyond `MAX_FORCE_N`.
     """
+    observed, seen = scene.observed_nodes, isinstance(given, ObservedDisplacements)
+    if seen != (observed is not None):
+        wanted = "forces" if seen else "displacements of observed nodes, `ObservedDisplacements`"
+        raise InvalidInputError(f"{scene.name}: a query must be {wanted}.")
+    name, unit = ("`values`", "m at the observed nodes") if seen else ("`forces`", "N")
     try:
         array = np.asarray(given)
     except (ValueError, TypeError) as error:
-        raise InvalidInputError(f"`forces` must be an array of real numbers: {error}") from None
+        raise InvalidInputError(f"{name} must be an array of real numbers: {error}") from None
     n_nodes = scene.mesh.n_nodes
     if array.dtype.kind not in "fiu":
-        raise InvalidInputError(f"`forces` must hold real numbers; got dtype {array.dtype}.")
+        raise InvalidInputError(f"{name} must hold real numbers; got dtype {array.dtype}.")
     if array.ndim not in (2, 3) or array.shape[-2:] != (n_nodes, 3):
         raise InvalidInputError(
-            f"`forces` must have shape ({n_nodes}, 3) or (n, {n_nodes}, 3); got {array.shape}."
+            f"{name} must have shape ({n_nodes}, 3) or (n, {n_nodes}, 3); got {array.shape}."
         )
-    observed, unit = scene.observed_nodes, "N"
-    if observed is not None:
-        seen, unit = np.zeros(array.shape, dtype=array.dtype), "m at the observed nodes"
-        seen[..., observed, :] = array[..., observed, :]
-        array = seen
+    if isinstance(given, ObservedDisplacements) and observed is not None:
+        if not np.array_equal(given.nodes, observed):
+            raise InvalidInputError(f"{scene.name}: the displacements are of other nodes.")
+        known = np.zeros(array.shape, dtype=array.dtype)
+        known[..., observed, :] = array[..., observed, :]
+        array = known
     if not (np.abs(array) <= MAX_FORCE_N).all():
         raise InvalidInputError(
-            f"`forces` must be finite and at most {MAX_FORCE_N:g} {unit}; "
+            f"{name} must be finite and at most {MAX_FORCE_N:g} {unit}; "
             f"got {np.abs(array).max():g}."
         )
     return given_of(scene, array.astype(np.float64, copy=False).reshape(-1, n_nodes, 3))

@@ -71,7 +71,8 @@ class GappyPOD(Surrogate):
         self.fitting_ = take_array(model, "fitting", shape)
 
     def answer_observed(self, observed: ObservedDisplacements) -> NDArray[np.float64]:
-        batch, free = observed.values.reshape(len(observed), -1), self.scene_.free_dofs
+        batch = observed.values.reshape(-1, self.scene_.mesh.n_dofs)
+        free = self.scene_.free_dofs
         count(multiply_adds=len(batch) * (self.fitting_.size + self.modes_.size))
         out = np.zeros_like(batch)
         out[:, free] = (batch[:, free[self.places_]] @ self.fitting_.T) @ self.modes_.T

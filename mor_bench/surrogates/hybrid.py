@@ -102,7 +102,7 @@ class Hybrid(Surrogate):
         self.start_ = self._unfitted()
         self.start_.time_limit_s = self.time_limit_s
         self.start_.fit(_all_outputs(scene), samples)
-        arrays = {**self.start_.model_arrays(), **size_arrays(self.start_.sizes_)}
+        arrays = {**self.start_.arrays_, **size_arrays(self.start_.sizes_)}
         return {START + name: array for name, array in arrays.items()}
 
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:

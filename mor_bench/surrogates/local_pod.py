@@ -144,9 +144,13 @@ class LocalPOD(Surrogate):
         count(multiply_adds=len(forces) * (self.to_coordinates_.size + self.centroids_.size))
         return answer_each(self.scene_, forces, self._solve)
 
-    def _solve(self, load: Array) -> Array:
+    def nearest(self, load: Array) -> int:
+        """Return the cluster whose directions are nearest to that of a load (n_free,), N."""
         direction = _directions((load @ self.to_coordinates_)[None])
-        nearest = int(((direction - self.centroids_) ** 2).sum(axis=1).argmin())
+        return int(((direction - self.centroids_) ** 2).sum(axis=1).argmin())
+
+    def _solve(self, load: Array) -> Array:
+        nearest = self.nearest(load)
         return predict_corrected(
             self.problems_[nearest],
             self.bases_[nearest],

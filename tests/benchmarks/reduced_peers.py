@@ -263,11 +263,8 @@ def kratos_cubature(hpod: HyperReducedPOD, snapshots: Snapshots) -> HyperReduced
     if not selector.success:
         return None
     order = np.argsort(selector.z)
-    ours = copy(hpod)
-    ours._restore(
-        {"modes": hpod.modes_, "cells": selector.z[order], "weights": selector.w.ravel()[order]}
-    )
-    return ours
+    cubature = {"cells": selector.z[order], "weights": selector.w.ravel()[order]}
+    return copy(hpod).restore(hpod.scene_, {"modes": hpod.modes_, **cubature}, hpod.sizes_)
 
 
 def own_methods(
