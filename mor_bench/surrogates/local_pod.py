@@ -151,14 +151,15 @@ class LocalPOD(Surrogate):
 
     def _solve(self, load: Array) -> Array:
         nearest = self.nearest(load)
-        return predict_corrected(
+        found = predict_corrected(
             self.problems_[nearest],
             self.bases_[nearest],
             self.model_,
             self.compliance_,
             load[None],
             self.tolerance,
-        )[0]
+        )
+        return np.asarray(found[0])
 
 
 def _of_cluster(model: Mapping[str, NDArray[Any]], cluster: int) -> dict[str, NDArray[Any]]:
