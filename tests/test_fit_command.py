@@ -20,7 +20,7 @@ from safetensors import safe_open
 import mor_bench
 from mor_bench.cli.fit_command import parse_hyperparameters
 from mor_bench.errors import InvalidInputError, MorBenchError, SpecError
-from mor_bench.runs.dataset_run import Listener
+from mor_bench.runs.listener import Listener
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots, load_dataset
 from mor_bench.specs import load_generated_spec

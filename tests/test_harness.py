@@ -20,7 +20,7 @@ from mor_bench.measure import latency as clock
 from mor_bench.measure.error_metrics import sample_errors, summary
 from mor_bench.measure.latency import LEAST_QUERIES, MOST_TURN_S
 from mor_bench.results.comparison import Comparison
-from mor_bench.runs.dataset_run import Listener
+from mor_bench.runs.listener import Listener
 from mor_bench.snapshots.generate import generation_seconds
 from mor_bench.specs import list_suite, load_generated_spec
 

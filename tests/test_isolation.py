@@ -15,6 +15,7 @@ import pytest
 import mor_bench
 from mor_bench.errors import InvalidInputError, SpecError
 from mor_bench.measure.method_session import MethodSession
+from mor_bench.options import RunOptions
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.configurations import CORE_METHODS, checked_specs
 from mor_bench.sandbox.fork_server import CAN_FORK, ForkServer
@@ -223,7 +224,7 @@ def test_a_module_beside_its_file_competes(cache: Path, tmp_path: Path) -> None:
     (suite / "my_method.py").write_text((tmp_path / "my_method.py").read_text())
     path.rename(suite / "mine.toml")
     assert [
-        method.name for method in checked_specs(["beam-tiny"], None, "quick", tmp_path / "suite")[1]
+        method.name for method in checked_specs(["beam-tiny"], None, RunOptions(suite=tmp_path / "suite"))[1]
     ] == [*CORE_METHODS, "mine"]
 
 

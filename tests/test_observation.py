@@ -24,8 +24,9 @@ from mor_bench.export.vtu_files import export_vtu
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.observed import ObservedModel
+from mor_bench.options import RunOptions
 from mor_bench.runs.configurations import OBSERVATION_METHODS, checked_specs
-from mor_bench.runs.fit_cache import Material
+from mor_bench.runs.training_data import TrainingData
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.generate import dataset_folder
@@ -416,7 +417,7 @@ def test_a_model_of_other_observed_nodes_is_not_taken_from_the_cache(
 ) -> None:
     corner = scene_of({"region": {"nearest_m": [[2.0, 1.0, 1.0], 20]}})
     digests = {
-        Material(scene, tiny.train, {}, tmp_path).train_digest
+        TrainingData(scene, tiny.train, {}, tmp_path).digest
         for scene in (tiny.scene, data.scene, corner)
     }
     assert len(digests) == 3
@@ -424,7 +425,7 @@ def test_a_model_of_other_observed_nodes_is_not_taken_from_the_cache(
 
 def test_by_default_the_methods_run_that_can(tmp_path: Path) -> None:
     path = written(tmp_path, TOP)
-    chosen = [method.name for method in checked_specs([path], None, "quick", None)[1]]
+    chosen = [method.name for method in checked_specs([path], None, RunOptions())[1]]
     assert chosen == list(OBSERVATION_METHODS)
     assert set(chosen) <= set(CAN)
 

@@ -17,6 +17,7 @@ from mor_bench.errors import InvalidInputError, SpecError, StoreError, Unsupport
 from mor_bench.export.npz_file import snapshot_arrays
 from mor_bench.measure.discretisation_error import refine
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.options import RunOptions
 from mor_bench.runs.configurations import CORE_METHODS, DATA_METHODS, checked_specs
 from mor_bench.runs.file_check import check_file
 from mor_bench.scene.mesh import box_mesh
@@ -200,9 +201,9 @@ def test_by_default_only_methods_run_that_learn_from_samples(
     arrays: Arrays, tmp_path: Path
 ) -> None:
     path = written(tmp_path, arrays)
-    _, alone = checked_specs([path], None, "quick", None)
+    _, alone = checked_specs([path], None, RunOptions())
     assert [spec.name for spec in alone] == list(DATA_METHODS)
-    _, both = checked_specs(["beam-tiny", path], None, "quick", None)
+    _, both = checked_specs(["beam-tiny", path], None, RunOptions())
     assert [spec.name for spec in both] == [*CORE_METHODS, "pca-regression-force"]
 
 

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 import mor_bench
 from mor_bench.cli.app import app
-from mor_bench.runs.code_digest import _closure, code_digest
+from mor_bench.runs.code_digest import code_digest, imported_sources
 from mor_bench.runs.plan import plan
 from mor_bench.specs import MethodSpec
 
@@ -46,7 +46,7 @@ def test_a_digest_follows_what_a_method_imports(name: str) -> None:
         "fem": "mor_bench.surrogates.fem:FullFEM",
         "umesh": "mor_bench.surrogates.umesh.method:UMesh",
     }[name]
-    modules = set(_closure(surrogate.partition(":")[0], None))
+    modules = set(imported_sources(surrogate.partition(":")[0]))
     assert "mor_bench.surrogate" in modules
     assert ("mor_bench.surrogates.umesh.network" in modules) == (name == "umesh")
     assert not any(module.startswith(("mor_bench.run", "mor_bench.report")) for module in modules)
@@ -61,7 +61,7 @@ def test_a_digest_follows_modules_beside_a_third_party_s(tmp_path: Path) -> None
     )
     part = tmp_path / "theirs" / "part.py"
     part.write_text("x = 1")
-    modules = set(_closure("theirs.method", tmp_path))
+    modules = set(imported_sources("theirs.method", tmp_path))
     assert {"theirs.method", "theirs.part", "mor_bench.surrogates.pod"} <= modules
     before = code_digest("theirs.method:Mine", tmp_path)
     part.write_text("x = 22")

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mor_bench.runs.cached_fit import CachedFit
+from mor_bench.runs.training_data import TrainingData
 from safetensors import safe_open
 from safetensors.numpy import save as serialise
 
@@ -20,7 +22,8 @@ from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.model_file import model_digest as file_digest
 from mor_bench.reduction import sizing
 from mor_bench.reduction.sizing import MODES, Score, Trials, choose_sizes, validation_folds
-from mor_bench.runs.fit_cache import Entry, Material
+from mor_bench.runs.cached_fit import CachedFit
+from mor_bench.runs.training_data import TrainingData
 from mor_bench.sandbox.handover import write_snapshots
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
@@ -294,7 +297,8 @@ def test_a_kept_fit_is_that_of_the_need(tmp_path: Path, tiny: Dataset) -> None:
         job: Any = SimpleNamespace(
             method=load_method_spec(tmp_path / "sized.toml"), parameters=knobs, training=None
         )
-        return Entry(job, Material(needing(tiny.scene, need), tiny.train, {}, tmp_path), place).key
+        data = TrainingData(needing(tiny.scene, need), tiny.train, {}, tmp_path)
+        return CachedFit(job, data, place).key
 
     assert key(0.1, n_modes="auto") != key(0.2, n_modes="auto")
     assert key(0.1, n_modes=3) == key(0.2, n_modes=3)

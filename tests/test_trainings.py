@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mor_bench.run import fit_cache as fits
+from mor_bench.runs.fit_cache import Entry, Job, Material, fit
 from rich.console import Console
 
 import mor_bench
@@ -25,7 +26,6 @@ from mor_bench.report.console_tables import print_tables
 from mor_bench.report.page import render
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.dataset_run import place_of
-from mor_bench.runs.fit_cache import Entry, Job, Material, fit
 from mor_bench.runs.plan import plan
 from mor_bench.sandbox.process import MethodFailedError
 from mor_bench.specs import load_method_spec

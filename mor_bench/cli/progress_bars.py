@@ -21,7 +21,7 @@ from rich.progress import (
 )
 
 from mor_bench.results.row import Row
-from mor_bench.runs.dataset_run import Listener
+from mor_bench.runs.listener import Listener
 
 PRINT_EVERY_S = 10.0
 """Seconds between lines about progress where there is no terminal to show a bar."""

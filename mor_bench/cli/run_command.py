@@ -73,21 +73,10 @@ def run(
         raise typer.Exit(1)
 
 
-NOT_PLANNED = {
-    "cluster",
-    "test_seed",
-    "time_limit_s",
-    "memory_limit_bytes",
-    "retime",
-    "fail_fast",
-}
-"""Options that change nothing in a plan."""
-
-
 def _print_plan(
     datasets: list[str], methods: list[str] | None, options: RunOptions, as_json: bool
 ) -> None:
-    planned = plan(datasets, methods, **options.model_dump(exclude=NOT_PLANNED))
+    planned = plan(datasets, methods, **options.model_dump())
     if as_json:
         print(json.dumps(planned.as_dict(), indent=1))
     print_plan(planned, make_console(stderr=as_json))

@@ -112,10 +112,11 @@ class Comparison:
     def samples(self, row: Row) -> dict[str, NDArray[Any]]:
         """Read the raw samples of a row that ran.
 
-        `latency_ms`, `process`, `round` (n_queries,): each query's latency, fresh process and interleaved round.
+        `latency_ms`, `process`, `round` (n_queries,): latency, fresh process and interleaved round.
         `mean_dof_m`, `relative_l2`, `max_nodal_m`, `amplitude_m` (n_test,): errors.
-        `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3): the sample with the largest finite error.
-        `loss_curve`, `validation_curve` (n_intervals,): losses of a training, evenly spread over it.
+        `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3): the sample with the
+        largest finite error.
+        `loss_curve`, `validation_curve` (n_intervals,): losses, evenly spread over the training.
         """
         return read_arrays(self.samples_path(row))
 
@@ -134,7 +135,7 @@ class Comparison:
         return self.out / "samples" / (re.sub(r"[^\w.=-]+", "-", name).strip("-") + ".h5")
 
     def finish(self, analysis: dict[str, Any]) -> None:
-        """Write everything, and the analysis of all rows as comparison.json, which marks the run as finished."""
+        """Write everything; comparison.json with the analysis marks the run as finished."""
         self.write()
         write_json(self.out / "comparison.json", analysis)
         self.analysis = analysis

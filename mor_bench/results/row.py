@@ -1,4 +1,4 @@
-"""The typed rows of results.json: one `Row` per configuration, one `LearningPoint` per point of a learning curve.
+"""The typed rows of results.json: `Row` for a configuration, `LearningPoint` for a learning curve.
 
 None means that a figure was not measured. A float in a part that is present but unknown is NaN.
 """
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from math import nan
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, WithJsonSchema, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, WithJsonSchema
 
 Real = Annotated[
     float,
@@ -53,6 +53,8 @@ class ErrorSummary(Part):
         Largest nodal error, m.
     slope : float
         Slope of the error over the largest displacement, through the origin.
+    rel_l2_median_high : float or None
+        Upper end of the 95 % interval of `rel_l2_median`; only in a pick, never in results.json.
     """
 
     mean_dof_m: Real = nan
@@ -63,6 +65,7 @@ class ErrorSummary(Part):
     rel_l2_max: Real = nan
     max_nodal_m: Real = nan
     slope: Real = nan
+    rel_l2_median_high: Real | None = None
 
 
 class SetErrors(Part):
@@ -156,7 +159,7 @@ class IndicatorQuality(Part):
     n : int
         Compared samples.
     rank_correlation, residual_rank_correlation : float
-        Spearman correlation of the measured error with the estimated correction and with the residual.
+        Spearman correlation of the measured error with the correction and with the residual.
     ratio_p5, ratio_median, ratio_p95 : float
         Percentiles of estimated over measured error.
     """
@@ -291,7 +294,7 @@ class Row(Part):
     training : TrainingRecord or None
     seeds : SeedSpread or None
     discretisation_error_m, discretisation_rel_l2 : float or None
-        Error of the dataset's mesh against the limit of fine meshes: mean in m, and relative median.
+        Error of the dataset's mesh against the limit of fine meshes: mean, m; relative median.
     warnings : list of str
     tuning_s : float or None
         Seconds of the tuning budget that the configuration used.
@@ -330,20 +333,6 @@ class Row(Part):
     discretisation_rel_l2: Real | None = None
     warnings: list[str] = []
     tuning_s: Real | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _fill_swept(cls, data: Any) -> Any:
-        """Take the swept parameters of an older file from those that the label names."""
-        if not isinstance(data, dict) or "swept" in data:
-            return data
-        inside = f", {str(data.get('label')).partition('[')[2].removesuffix(']')}, "
-        places = {
-            key: inside.find(f", {key}={value}, ")
-            for key, value in (data.get("parameters") or {}).items()
-        }
-        named = sorted((key for key in places if places[key] >= 0), key=places.__getitem__)
-        return {**data, "swept": {key: data["parameters"][key] for key in named}}
 
     @property
     def ok(self) -> bool:

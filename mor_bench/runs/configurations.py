@@ -1,10 +1,10 @@
-"""Who competes: the default methods, every configuration of each, all checked before anything runs; and the budget of each."""
+"""Competitors of a run: the default methods, the configurations of each, and the tuning budget."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,8 @@ from typing import Any
 from mor_bench.errors import InvalidInputError, MissingDependencyError
 from mor_bench.measure.method_session import MethodSession
 from mor_bench.mechanics.model import check_supports
+from mor_bench.options import RunOptions
 from mor_bench.results.row import label_of
-from mor_bench.runs.fit_cache import Job
 from mor_bench.sandbox.process import (
     START_LIMIT_S,
     MethodFailedError,
@@ -36,18 +36,21 @@ from mor_bench.specs import (
 from mor_bench.training_options import TrainingOptions
 
 CORE_METHODS = ("fem", "pod", "hpod", "pca-regression", "umesh")
-"""What is compared when nothing else is asked for."""
+"""Default methods."""
 
 DATA_METHODS = ("pca-regression-force", "umesh")
-"""The same on imported snapshots, whose equations are not known."""
+"""Default methods on imported snapshots, whose equations are unknown."""
 
 OBSERVATION_METHODS = ("fem", "linear-fem", "gappy-pod", "pca-regression", "umesh")
-"""The same where displacements of a part of the surface are given in the place of forces."""
+"""Default methods where displacements of a part of the surface are given instead of forces."""
+
+OWN = "mor_bench."
+"""Prefix of the classes of this package; other classes are imported in a sandbox only."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What tuning a method may cost on a dataset: the same for every method."""
+    """Tuning budget per method and dataset: configurations, and seconds of fitting."""
 
     configurations: int
     seconds: float
@@ -56,43 +59,68 @@ class Budget:
 BUDGETS = {"quick": Budget(12, 1200.0), "full": Budget(16, 1800.0)}
 
 
-def jobs_of(
+@dataclass(frozen=True)
+class Configuration:
+    """One configuration of one method.
+
+    Attributes
+    ----------
+    method : MethodSpec
+    parameters : dict
+        All given parameters.
+    swept : dict
+        Those of them that the method's file varies.
+    training : TrainingOptions or None
+        Device and seconds of a training; None for a method that does not train.
+    """
+
+    method: MethodSpec
+    parameters: dict[str, Any]
+    swept: dict[str, Any] = field(default_factory=dict)
+    training: TrainingOptions | None = None
+
+    @property
+    def label(self) -> str:
+        """Name in tables: the method, and the swept parameters in brackets."""
+        return label_of(self.method.name, self.swept)
+
+
+def configurations_of(
     methods: Sequence[MethodSpec], profile: str, training: TrainingOptions = TrainingOptions()
-) -> list[Job]:
-    """Every configuration of every method; those that may train do so with the given device and seconds."""
-    jobs = []
-    for method in methods:
-        swept, options = method.swept_keys(profile), training if may_train(method) else None
-        for parameters in method.configurations(profile):
-            jobs.append(
-                Job(
-                    method,
-                    parameters,
-                    label_of(method.name, {key: parameters[key] for key in swept}),
-                    options,
-                    {key: parameters[key] for key in swept},
-                )
-            )
-    return jobs
+) -> list[Configuration]:
+    """Return every configuration of every method."""
+    return [
+        Configuration(
+            method,
+            parameters,
+            {key: parameters[key] for key in method.swept_keys(profile)},
+            training if may_train(method) else None,
+        )
+        for method in methods
+        for parameters in method.configurations(profile)
+    ]
 
 
 def may_train(method: MethodSpec) -> bool:
-    """Whether a method trains; of a third party's nobody knows before it is fitted."""
-    return _of_class(method, lambda surrogate: bool(surrogate.trains()), of_others=True)
+    """Tell whether a method trains; a third party's class may until it is fitted."""
+    return _ask_class(method, lambda surrogate: bool(surrogate.trains()), of_others=True)
 
 
-def may_draw(job: Job) -> bool:
-    """Whether a fit draws random numbers; a third party's is taken to do so if its file has iterations or a seed."""
-    return _of_class(
-        job.method,
+def draws_randomly(configuration: Configuration) -> bool:
+    """Tell whether a fit draws random numbers.
+
+    A third party's class is assumed to draw if its file has iterations or a seed.
+    """
+    return _ask_class(
+        configuration.method,
         lambda surrogate: "seed" in signature(surrogate).parameters,
-        of_others=bool({"iterations", "seed"} & set(job.parameters)),
+        of_others=bool({"iterations", "seed"} & set(configuration.parameters)),
     )
 
 
-def _of_class(method: MethodSpec, question: Callable[[type[Any]], bool], of_others: bool) -> bool:
-    """The answer for a method's class; `of_others` for a third party's, which is not imported here, and no where a dependency is missing."""
-    if not method.surrogate.startswith("mor_bench."):
+def _ask_class(method: MethodSpec, question: Callable[[type[Any]], bool], of_others: bool) -> bool:
+    """Ask a class of this package; answer `of_others` for others, False without its extra."""
+    if not method.surrogate.startswith(OWN):
         return of_others
     try:
         return question(method.load_class())
@@ -103,81 +131,85 @@ def _of_class(method: MethodSpec, question: Callable[[type[Any]], bool], of_othe
 def checked_specs(
     datasets: Sequence[str | Path | Mapping[str, Any]],
     methods: Sequence[str | Path] | None,
-    profile: str,
-    suite: Path | None,
-    cache: Path | None = None,
-    memory_limit_bytes: float | None = None,
+    options: RunOptions,
 ) -> tuple[list[AnyDatasetSpec], list[MethodSpec]]:
-    """Read all specifications and check them as far as they can be without running, so that no run fails half-way on one."""
-    specs = [load_dataset_spec(dataset, suite) for dataset in datasets]
+    """Read and check all specifications, so that no run fails half-way because of one.
+
+    Raises
+    ------
+    SpecError
+        If a dataset, a method or a parameter is not valid.
+    InvalidInputError
+        If nothing is given, or two datasets or methods have the same name.
+    """
+    if not datasets or (methods is not None and not methods):
+        raise InvalidInputError("`datasets` and `methods` must name at least one each.")
+    specs = [load_dataset_spec(dataset, options.suite) for dataset in datasets]
     if methods is None:
-        methods = _default_methods(specs, profile, suite)
-    method_specs = [load_method_spec(method, suite) for method in methods]
-    for kind, names in (
-        ("dataset", [spec.name for spec in specs]),
-        ("method", [spec.name for spec in method_specs]),
-    ):
-        for name in names:
-            if names.count(name) > 1:
-                raise InvalidInputError(
-                    f"two {kind}s are called {name!r}; rename one of the files."
-                )
+        methods = _default_methods(specs, options)
+    method_specs = [load_method_spec(method, options.suite) for method in methods]
+    _check_names("dataset", [spec.name for spec in specs])
+    _check_names("method", [spec.name for spec in method_specs])
     for spec in specs:
         scene = load_scene(spec)
         if isinstance(spec, DatasetSpec):
             check_supports(scene)
     for method_spec in method_specs:
-        _check_method(method_spec, Path(cache or default_cache()), memory_limit_bytes)
+        _check_method(method_spec, options)
     return specs, method_specs
 
 
-def _default_methods(
-    specs: Sequence[AnyDatasetSpec], profile: str, suite: Path | None
-) -> list[str]:
-    own = list(list_suite("methods", suite)) if suite else []
-    if profile == "full":
+def _check_names(kind: str, names: list[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise InvalidInputError(f"two {kind}s are called {name!r}; rename one of the files.")
+
+
+def _default_methods(specs: Sequence[AnyDatasetSpec], options: RunOptions) -> list[str]:
+    own = list(list_suite("methods", options.suite)) if options.suite else []
+    if options.profile == "full":
         return list(dict.fromkeys([*CORE_METHODS, *list_suite("methods"), *own]))
-    defaults = [_defaults_of(spec) for spec in specs]
-    return list(dict.fromkeys([*(name for names in defaults for name in names), *own]))
+    defaults = [name for spec in specs for name in _defaults_of(spec)]
+    return list(dict.fromkeys([*defaults, *own]))
 
 
 def _defaults_of(spec: AnyDatasetSpec) -> tuple[str, ...]:
+    imported = isinstance(spec, ImportedDatasetSpec)
     if spec.observed is None:
-        return DATA_METHODS if isinstance(spec, ImportedDatasetSpec) else CORE_METHODS
-    return (
-        ("gappy-pod", *DATA_METHODS)
-        if isinstance(spec, ImportedDatasetSpec)
-        else OBSERVATION_METHODS
-    )
+        return DATA_METHODS if imported else CORE_METHODS
+    return ("gappy-pod", *DATA_METHODS) if imported else OBSERVATION_METHODS
 
 
-def _check_method(spec: MethodSpec, cache: Path, memory_limit_bytes: float | None) -> None:
-    """Check knobs; a third party's class in a process of its own, where its import may crash or hang: that becomes a row."""
-    if spec.surrogate.startswith("mor_bench."):
-        with suppress(MissingDependencyError):  # that becomes a row with its reason
+def _check_method(spec: MethodSpec, options: RunOptions) -> None:
+    """Check parameters against the class.
+
+    A third party's class is imported in a worker process, because its import may crash or hang.
+    A class that cannot be imported is no error here: it becomes a row with its reason.
+    """
+    if spec.surrogate.startswith(OWN):
+        with suppress(MissingDependencyError):
             check_method(spec)
         return
     restrictions = Restrictions(
-        sealed=tuple(sealed_folders(cache)),
+        sealed=tuple(sealed_folders(options.cache or default_cache())),
         import_from=spec.folder,
-        memory_bytes=memory_limit_bytes or default_memory_limit_bytes(),
+        memory_bytes=options.memory_limit_bytes or default_memory_limit_bytes(),
     )
     with (
         suppress(MethodFailedError, MissingDependencyError),
         SandboxedProcess(MethodSession, restrictions) as worker,
     ):
         for profile in ("quick", "full"):
-            where = f"method {spec.name} ({profile})"
             worker.ask(
                 "check",
                 START_LIMIT_S,
                 surrogate=spec.surrogate,
                 configurations=spec.configurations(profile),
-                where=where,
+                where=f"method {spec.name} ({profile})",
             )
 
 
 def sealed_folders(cache: Path, out: Path | None = None) -> list[Path]:
-    """What no method may open: datasets, results of others, here and in the default places."""
+    """Return the folders that no method may open: datasets and results, here and by default."""
     caches = [folder / part for folder in (cache, default_cache()) for part in ("datasets", "fits")]
     return [*caches, Path("reports") / "runs", *([out / "samples"] if out else [])]

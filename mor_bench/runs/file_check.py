@@ -1,4 +1,4 @@
-"""Validation of one dataset or method file, without running it."""
+"""Check one dataset or method file without running it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from mor_bench.snapshots.dataset import load_dataset
 from mor_bench.snapshots.sampling import draw_loads, n_samples_of
 from mor_bench.snapshots.test_sets import check_regions
 from mor_bench.specs import (
+    DatasetSpec,
     ImportedDatasetSpec,
     check_method,
     is_method_file,
@@ -21,26 +22,32 @@ from mor_bench.specs import (
 
 
 def check_file(path: Path) -> str:
-    """Validate a file and say what it describes.
+    """Check a file and describe its content in one line.
 
-    A dataset's mesh, regions and patches are built, and its first sample is drawn; every configuration of a method is checked against its class.
+    For a dataset, mesh, regions and patches are built and the first sample is drawn. For a method,
+    every configuration is checked against its class.
 
     Raises
     ------
     SpecError, UnconstrainedBodyError
         The first problem, in one line.
     InvalidInputError
-        If imported samples cannot be split as the file says, or `tests.unseen_region` is not apart from `loads.region`.
+        If imported samples cannot be split, or the unseen region overlaps the load region.
     MissingDependencyError
         If the method's class or the dataset's solver needs an extra that is not installed.
     """
     if is_method_file(path):
         method = load_method_spec(path)
         check_method(method)
-        return f"method, {len(method.configurations('quick'))} quick and {len(method.configurations('full'))} full configurations"
+        quick, full = (len(method.configurations(profile)) for profile in ("quick", "full"))
+        return f"method, {quick} quick and {full} full configurations"
     spec = load_dataset_spec(path)
     if isinstance(spec, ImportedDatasetSpec):
         return _imported(spec)
+    return _generated(spec)
+
+
+def _generated(spec: DatasetSpec) -> str:
     scene = load_scene(spec)
     check_supports(scene)
     missing = missing_library(spec.solver)
@@ -49,17 +56,18 @@ def check_file(path: Path) -> str:
     draw_loads(scene, 0, 1)
     if spec.tests.unseen_region is not None:
         check_regions(spec)
-    n_patches = len(scene.patch_nodes)
-    samples = n_samples_of(scene)
-    said = f"dataset, {scene.mesh.n_cells} cells, {scene.mesh.n_nodes} nodes, {n_patches} load patches, {samples} samples"
+    text = (
+        f"dataset, {scene.mesh.n_cells} cells, {scene.mesh.n_nodes} nodes, "
+        f"{len(scene.patch_nodes)} load patches, {n_samples_of(scene)} samples"
+    )
     risk = locking_risk(scene)
-    return f"{said}; warning: {risk}" if risk else said
+    return f"{text}; warning: {risk}" if risk else text
 
 
 def _imported(spec: ImportedDatasetSpec) -> str:
     data = load_dataset(spec)
-    mesh = data.scene.mesh
+    mesh, n_fixed = data.scene.mesh, len(data.scene.fixed_nodes)
     return (
-        f"dataset of imported snapshots, {mesh.n_cells} cells, {mesh.n_nodes} nodes, {len(data.scene.fixed_nodes)} of them fixed, "
-        f"{len(data.train)} samples to train and {len(data.test)} to test"
+        f"dataset of imported snapshots, {mesh.n_cells} cells, {mesh.n_nodes} nodes, "
+        f"{n_fixed} of them fixed, {len(data.train)} samples to train and {len(data.test)} to test"
     )

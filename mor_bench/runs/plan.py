@@ -1,4 +1,4 @@
-"""What a run would compute, and how long that would take, before anything is computed."""
+"""The dry run: what a run would compute, and how long that would take."""
 
 from __future__ import annotations
 
@@ -15,42 +15,50 @@ from typing import Any
 
 from mor_bench.measure.latency import PROTOCOLS
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.runs.compare import checked_seeds, training_options
-from mor_bench.runs.configurations import BUDGETS, checked_specs, jobs_of, may_draw
-from mor_bench.runs.dataset_run import LEARNING_STEP, place_of
-from mor_bench.runs.fit_cache import Entry, Job, Material
+from mor_bench.options import RunOptions
+from mor_bench.runs.cached_fit import CachedFit, RunEnvironment
+from mor_bench.runs.configurations import (
+    Configuration,
+    checked_specs,
+    configurations_of,
+    draws_randomly,
+)
+from mor_bench.runs.extra_stages import LEARNING_STEP
+from mor_bench.runs.run_context import RunContext
+from mor_bench.runs.training_data import TrainingData
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import load_dataset
 from mor_bench.snapshots.generate import (
     SHARD_SIZE,
     dataset_folder,
-    default_cache,
     n_samples_to_generate,
     shard_path,
 )
 from mor_bench.snapshots.sampling import draw_loads
-from mor_bench.specs import AnyDatasetSpec, DatasetSpec, SplitBy
-from mor_bench.training_options import Device
+from mor_bench.specs import AnyDatasetSpec, DatasetSpec
 
-SEES = 100
-"""Iterations after which a training that would take too long is ended, see `mor_bench.learning.training`."""
+TRIAL_ITERATIONS = 100
+"""Iterations after which a training that would take too long stops itself."""
 
-REFERENCE = ("beam-coarse", 768, 5120)
-"""Where the `fit_s` of the method files were measured: dataset, dofs, training samples; on two cores."""
+REFERENCE_DOFS, REFERENCE_TRAINING = 768, 5120
+"""Problem size of the `fit_s` of the method files: beam-coarse, on two cores."""
 
 PROBED = 8
-"""Samples that are solved to see how long one takes."""
+"""Samples that are solved to measure how long one takes."""
 
 LEARNING_POINTS = 4
-"""Of a learning curve, about, beside that of all samples."""
+"""Typical number of points of a learning curve, beside that of all samples."""
 
 TURN_S = 0.1
+"""Typical time of a turn of timed queries, s."""
+
 START_S = 2.0
+"""Typical time to start the processes of a timing, s."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A dataset to generate or a configuration to fit; seconds are None where nothing is known.
+    """A dataset to generate or a configuration to fit.
 
     Attributes
     ----------
@@ -58,6 +66,7 @@ class Step:
     done : bool
         Whether the cache has it.
     seconds : float or None
+        None if unknown.
     """
 
     dataset: str
@@ -68,30 +77,23 @@ class Step:
 
 @dataclass(frozen=True)
 class Plan:
-    """The steps of a run.
-
-    Attributes
-    ----------
-    steps : list of Step
-    timing_s : float
-        Of timing everything.
-    """
+    """The steps of a run, and the seconds of timing everything."""
 
     steps: list[Step]
     timing_s: float
 
     @property
     def seconds(self) -> float:
-        """Of all steps that are known and not done."""
+        """Seconds of everything that is known and not done."""
         return self.timing_s + sum(step.seconds or 0.0 for step in self.steps if not step.done)
 
     @property
     def n_unknown(self) -> int:
-        """Steps of which nothing is known."""
+        """Number of steps of unknown length."""
         return sum(step.seconds is None and not step.done for step in self.steps)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the content for JSON."""
         return {**asdict(self), "seconds": self.seconds, "n_unknown": self.n_unknown}
 
 
@@ -99,203 +101,185 @@ def plan(
     datasets: Sequence[str | Path | Mapping[str, Any]] = ("beam-coarse",),
     methods: Sequence[str | Path] | None = None,
     profile: str = "quick",
-    *,
-    limit: int | None = None,
-    split: SplitBy | None = None,
-    threads: int = 1,
-    workers: int | None = None,
-    jobs: int = 1,
-    device: Device = "cpu",
-    fit_seconds: float | None = None,
-    seeds: int | None = None,
-    cache: Path | None = None,
-    suite: Path | None = None,
+    **options: Any,
 ) -> Plan:
-    """Say what `mor_bench.run` would do with the same arguments; nothing is generated, fitted or written.
+    """Return what `mor_bench.run` would do with the same arguments, without doing any of it.
 
-    A fit's time follows from earlier fits of the method in the cache, or else from the method's file, both scaled by the
-    number of unknowns and of training samples; that of generating data from a few samples that are solved.
+    The time of a fit follows from earlier fits of the method in the cache, or else from the
+    method's file. Both are scaled by the numbers of unknowns and of training samples. The time of
+    generating data follows from a few samples that are solved here.
 
     Raises
     ------
     SpecError, InvalidInputError
         As `mor_bench.run`.
     """
-    specs, method_specs = checked_specs(datasets, methods, profile, suite)
-    root = Path(cache or default_cache())
-    budget = BUDGETS[profile]
-    allowed = budget.configurations
-    training, n_seeds = (
-        training_options(device, fit_seconds, budget.seconds),
-        checked_seeds(seeds, profile),
-    )
-    all_jobs = [
-        job for method in method_specs for job in jobs_of([method], profile, training)[:allowed]
+    context = RunContext.of(RunOptions(profile=profile, **options))
+    specs, methods_found = checked_specs(datasets, methods, context.options)
+    configurations = [
+        configuration
+        for method in methods_found
+        for configuration in configurations_of([method], profile, context.training)[
+            : context.budget.configurations
+        ]
     ]
-    steps: list[Step] = []
-    for spec in specs:
-        data = _data_step(spec, limit, workers, root)
-        steps.append(data)
-        done = _fitted(spec, all_jobs, limit, split, threads, jobs, root) if data.done else set()
-        n_dofs, n_train = _size(spec, limit)
-        left = {job.method.name: budget.seconds for job in all_jobs}
-        for job in all_jobs:
-            seconds = _within(
-                _fit_s(job, profile, n_dofs, n_train, _earlier(root, job)),
-                left[job.method.name],
-                job.parameters.get("iterations"),
-            )
-            left[job.method.name] -= seconds or 0.0
-            steps.append(
-                Step(
-                    spec.name,
-                    job.label,
-                    job.label in done,
-                    None if seconds is None else seconds / jobs,
-                )
-            )
-        steps += _extras(
-            spec.name, all_jobs, steps[-len(all_jobs) :], n_seeds - 1, profile == "full"
-        )
-    protocol = PROTOCOLS[profile]
-    turns = protocol.processes * (protocol.rounds + 2) * len(all_jobs) * len(specs)
+    steps = [step for spec in specs for step in _steps(spec, configurations, context)]
+    protocol = PROTOCOLS[context.options.profile]
+    turns = protocol.processes * (protocol.rounds + 2) * len(configurations) * len(specs)
     return Plan(steps, turns * TURN_S + protocol.processes * START_S * len(specs))
 
 
-def _within(seconds: float | None, left_s: float, iterations: int | None) -> float | None:
-    """What a fit takes of the seconds that its method has left; a training that sees that they will not do ends after `SEES` iterations."""
+def _steps(
+    spec: AnyDatasetSpec, configurations: Sequence[Configuration], context: RunContext
+) -> list[Step]:
+    """Return the steps on one dataset."""
+    data = _data_step(spec, context)
+    done = _cached_labels(spec, configurations, context) if data.done else set()
+    size = _problem_size(spec, context)
+    left_s = {item.method.name: context.budget.seconds for item in configurations}
+    fits = []
+    for configuration in configurations:
+        method, label = configuration.method.name, configuration.label
+        expected = _fit_seconds(configuration, context, size)
+        seconds = _within_budget(expected, left_s[method], configuration)
+        left_s[method] -= seconds or 0.0
+        shared = None if seconds is None else seconds / context.options.jobs
+        fits.append(Step(spec.name, label, label in done, shared))
+    return [data, *fits, *_extra_steps(spec.name, configurations, fits, context)]
+
+
+def _within_budget(
+    seconds: float | None, left_s: float, configuration: Configuration
+) -> float | None:
+    """Limit a fit to the seconds that its method has left.
+
+    A training that predicts that it will exceed them stops after `TRIAL_ITERATIONS`.
+    """
     if seconds is None or seconds <= left_s:
         return seconds
-    return left_s if iterations is None else min(left_s, seconds * SEES / max(iterations, SEES))
+    iterations = configuration.parameters.get("iterations")
+    if iterations is None:
+        return left_s
+    return float(min(left_s, seconds * TRIAL_ITERATIONS / max(iterations, TRIAL_ITERATIONS)))
 
 
-def _extras(
-    dataset: str, jobs: Sequence[Job], fits: Sequence[Step], other_seeds: int, curves: bool
+def _extra_steps(
+    dataset: str,
+    configurations: Sequence[Configuration],
+    fits: Sequence[Step],
+    context: RunContext,
 ) -> list[Step]:
-    """What is fitted beside: other seeds of what draws random numbers, and in a full comparison learning curves."""
-    extras = []
-    for method in dict.fromkeys(job.method.name for job in jobs):
+    """Return the steps of other seeds and, in a full comparison, of learning curves."""
+    steps = []
+    curves = context.options.profile == "full"
+    for method in dict.fromkeys(item.method.name for item in configurations):
         mine = [
-            (job, step.seconds or 0.0)
-            for job, step in zip(jobs, fits, strict=True)
-            if job.method.name == method
+            (configuration, step.seconds or 0.0)
+            for configuration, step in zip(configurations, fits, strict=True)
+            if configuration.method.name == method
         ]
-        trained, draws = (
-            "iterations" in mine[0][0].parameters,
-            bool(other_seeds) and may_draw(mine[0][0]),
-        )
-        seconds = 0.0
-        if draws:
-            seconds += other_seeds * sum(s for _, s in mine)
+        (first, _), (_, last_s) = mine[0], mine[-1]
+        names, seconds = [], 0.0
+        if context.seeds > 1 and draws_randomly(first):
+            names.append("other seeds")
+            seconds += (context.seeds - 1) * sum(item for _, item in mine)
         if curves:
-            seconds += (
-                LEARNING_POINTS * mine[-1][1] if trained else mine[-1][1] / (LEARNING_STEP - 1)
-            )
-        named = [*(["other seeds"] if draws else []), *(["learning curve"] if curves else [])]
-        if named:
-            extras.append(Step(dataset, f"{method}: {', '.join(named)}", False, seconds))
-    return extras
+            names.append("learning curve")
+            trains = "iterations" in first.parameters
+            seconds += LEARNING_POINTS * last_s if trains else last_s / (LEARNING_STEP - 1)
+        if names:
+            steps.append(Step(dataset, f"{method}: {', '.join(names)}", False, seconds))
+    return steps
 
 
-def _size(spec: AnyDatasetSpec, limit: int | None) -> tuple[int, int]:
-    """Dofs and, about, training samples of a dataset."""
-    n = (
-        n_samples_to_generate(spec, limit)
-        if isinstance(spec, DatasetSpec)
-        else len(load_dataset(spec, limit).train)
-    )
+def _problem_size(spec: AnyDatasetSpec, context: RunContext) -> tuple[int, int]:
+    """Return the degrees of freedom and, roughly, the training samples of a dataset."""
+    limit = context.options.limit
+    if isinstance(spec, DatasetSpec):
+        n = n_samples_to_generate(spec, limit)
+    else:
+        n = len(load_dataset(spec, limit).train)
     return load_scene(spec).mesh.n_dofs, max(1, round((1 - spec.split.test_fraction) * n))
 
 
-def _data_step(spec: AnyDatasetSpec, limit: int | None, workers: int | None, cache: Path) -> Step:
+def _data_step(spec: AnyDatasetSpec, context: RunContext) -> Step:
     if not isinstance(spec, DatasetSpec):
         return Step(spec.name, "imported snapshots", True, 0.0)
-    n = n_samples_to_generate(spec, limit)
-    folder = dataset_folder(spec, cache)
+    n = n_samples_to_generate(spec, context.options.limit)
+    folder = dataset_folder(spec, context.cache)
     missing = sum(
         min(SHARD_SIZE, n - start)
         for start in range(0, n, SHARD_SIZE)
         if not shard_path(folder, start // SHARD_SIZE).exists()
     )
-    label = f"{missing:,} of {n:,} samples" if missing else f"{n:,} samples"
-    return Step(
-        spec.name,
-        label,
-        missing == 0,
-        missing * _sample_s(spec) / (workers or os.cpu_count() or 1) if missing else 0.0,
-    )
+    if not missing:
+        return Step(spec.name, f"{n:,} samples", True, 0.0)
+    workers = context.options.workers or os.cpu_count() or 1
+    seconds = missing * _sample_seconds(spec) / workers
+    return Step(spec.name, f"{missing:,} of {n:,} samples", False, seconds)
 
 
-def _sample_s(spec: DatasetSpec) -> float:
-    """Seconds of a full-order solve among others."""
+def _sample_seconds(spec: DatasetSpec) -> float:
+    """Measure the seconds of one full-order solution among several."""
     scene = load_scene(spec)
     model = FullOrderModel(scene)
-    forces = (
-        draw_loads(scene, 0, PROBED)
-        .nodal_forces(scene.patch_weights)
-        .reshape(PROBED, -1)[:, scene.free_dofs]
-    )
-    model.solve_many(forces[:1])
+    forces = draw_loads(scene, 0, PROBED).nodal_forces(scene.patch_weights)
+    free_forces = forces.reshape(PROBED, -1)[:, scene.free_dofs]
+    model.solve_many(free_forces[:1])
     start = perf_counter()
-    model.solve_many(forces)
+    model.solve_many(free_forces)
     return (perf_counter() - start) / PROBED
 
 
-def _fitted(
-    spec: AnyDatasetSpec,
-    jobs: Sequence[Job],
-    limit: int | None,
-    split: SplitBy | None,
-    threads: int,
-    at_once: int,
-    cache: Path,
+def _cached_labels(
+    spec: AnyDatasetSpec, configurations: Sequence[Configuration], context: RunContext
 ) -> set[str]:
-    """Labels that the cache has."""
-    data = load_dataset(spec, limit, split=split, cache=cache)
+    """Return the labels of the configurations that the cache has."""
+    options = context.options
+    data = load_dataset(spec, options.limit, split=options.split, cache=context.cache)
+    environment = RunEnvironment(context.cache, jobs=options.jobs, threads=options.threads)
     with TemporaryDirectory(prefix="mor-bench-") as scratch:
-        material = Material(data.scene, data.train, {}, Path(scratch))
-        place = place_of(cache, [], at_once, threads, float("inf"))
-        return {job.label for job in jobs if Entry(job, material, place).fit is not None}
+        training_data = TrainingData(data.scene, data.train, {}, Path(scratch))
+        return {
+            item.label
+            for item in configurations
+            if CachedFit(item, training_data, environment).record is not None
+        }
 
 
-def _earlier(cache: Path, job: Job) -> list[dict[str, Any]]:
-    """Records of earlier fits of a method; those of the same knobs, if there are any."""
+def _earlier_fits(cache: Path, configuration: Configuration) -> list[dict[str, Any]]:
+    """Return records of earlier fits of a method, with the same parameters if there are any."""
     records = []
-    for path in (cache / "fits").glob(f"{job.method.name}-*/fit.json"):
+    for path in (cache / "fits").glob(f"{configuration.method.name}-*/fit.json"):
         with suppress(OSError, ValueError):
             records.append(json.loads(path.read_bytes()))
-    same = [
-        record
-        for record in records
-        if record.get("parameters", {}).items() >= job.parameters.items()
-    ]
+    wanted = configuration.parameters.items()
+    same = [record for record in records if record.get("parameters", {}).items() >= wanted]
     return same or records
 
 
-def _fit_s(
-    job: Job, profile: str, n_dofs: int, n_train: int, earlier: Sequence[Mapping[str, Any]]
+def _fit_seconds(
+    configuration: Configuration, context: RunContext, size: tuple[int, int]
 ) -> float | None:
-    """Scaled from earlier fits or the method's file; iterations cost the same however many samples there are, or what they are given."""
-    if job.training and job.training.fit_seconds and "iterations" in job.parameters:
-        return job.training.fit_seconds
+    """Scale the time of a fit from earlier fits or the method's file.
+
+    The time of an iteration is assumed not to depend on the number of training samples.
+    """
+    n_dofs, n_train = size
+    iterates = "iterations" in configuration.parameters
+    training = configuration.training
+    if iterates and training and training.fit_seconds:
+        return training.fit_seconds
     times: list[float] = []
-    for record in earlier:
+    for record in _earlier_fits(context.cache, configuration):
         with suppress(KeyError, TypeError, ZeroDivisionError):
-            grows = record["needs_snapshots"] and "iterations" not in job.parameters
-            times.append(
-                record["fit_s"]
-                * n_dofs
-                / record["n_dofs"]
-                * (n_train / record["n_train"] if grows else 1.0)
-            )
+            grows = record["needs_snapshots"] and not iterates
+            samples = n_train / record["n_train"] if grows else 1.0
+            times.append(record["fit_s"] * n_dofs / record["n_dofs"] * samples)
     if times:
         return median(times)
-    shipped = job.method.fit_seconds(profile)
+    shipped = configuration.method.fit_seconds(context.options.profile)
     if shipped is None:
         return None
-    return (
-        shipped
-        * n_dofs
-        / REFERENCE[1]
-        * (1.0 if "iterations" in job.parameters else n_train / REFERENCE[2])
-    )
+    samples = 1.0 if iterates else n_train / REFERENCE_TRAINING
+    return shipped * n_dofs / REFERENCE_DOFS * samples

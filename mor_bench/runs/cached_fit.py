@@ -1,0 +1,313 @@
+"""A configuration's folder in the cache, under a digest of everything that its fit depends on.
+
+CACHE/fits/METHOD-KEY/
+    fit.json             seconds, memory, parameters, warnings, loss curves, checksum; written last
+    training/checkpoint  a training that was stopped; training.json holds the seconds it has taken
+    model.safetensors    where the method can be saved
+    score-SET.h5         per-sample errors on a test set, under the set's digest
+    cost-SET.json        counted work per query
+    timing-KEY.h5        raw samples of a timing
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from time import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from mor_bench.machine import describe_machine, gpu_name
+from mor_bench.measure.method_session import FitRequest, MethodSession
+from mor_bench.results.arrays import read_arrays, write_arrays
+from mor_bench.runs.code_digest import code_digest
+from mor_bench.runs.configurations import Configuration
+from mor_bench.runs.training_data import TrainingData, digest_of_arrays, digest_of_file
+from mor_bench.sandbox.fork_server import ForkServer
+from mor_bench.sandbox.process import Restrictions, SandboxedProcess
+from mor_bench.snapshots.store import remove_leftovers, write_atomically
+from mor_bench.specs import list_suite, load_method_spec
+from mor_bench.training_options import TrainingOptions
+
+LOAD_LIMIT_S = 300.0
+"""Time limit for loading a model, s."""
+
+
+@dataclass(frozen=True)
+class RunEnvironment:
+    """Where methods run, and their limits.
+
+    Attributes
+    ----------
+    cache : Path
+        Cache folder; its folder ``fits`` keeps fits, scores and timings.
+    sealed : tuple of Path
+        Folders and files that no method may open.
+    jobs : int
+        Fits at once, which share the cores.
+    threads : int
+        Threads of a prediction.
+    memory_limit_bytes : float
+        Memory limit of a method's process.
+    fork_server : ForkServer or None
+        Process that worker processes are forked from.
+    """
+
+    cache: Path
+    sealed: tuple[Path, ...] = ()
+    jobs: int = 1
+    threads: int = 1
+    memory_limit_bytes: float = float("inf")
+    fork_server: ForkServer | None = None
+
+    @cached_property
+    def machine(self) -> str:
+        """Processor and cores, on which seconds of fitting depend."""
+        machine = describe_machine()
+        return f"{machine['processor']} x {machine['cores']}"
+
+    @property
+    def fit_threads(self) -> int:
+        """Threads of a fit."""
+        return max(1, (os.cpu_count() or 1) // self.jobs)
+
+
+class FitRecord(BaseModel):
+    """The content of fit.json: what fitting took and gave.
+
+    Attributes
+    ----------
+    method : str
+    n_train, n_dofs : int
+        Size of the problem.
+    fit_s : float
+        Seconds of fitting.
+    fit_memory_bytes : int
+        Peak resident memory.
+    model_bytes : int or None
+        Size of the saved model; None if the method cannot be saved.
+    needs_snapshots : bool
+        Whether the method used training samples.
+    parameters, sizes : dict
+        All parameters, and the values chosen for those that were "auto".
+    training : dict or None
+        Iterations and loss curves of a training.
+    warnings : list of str
+    model_sha256 : str or None
+        Checksum of the saved model.
+    """
+
+    model_config = ConfigDict(frozen=True, ser_json_inf_nan="constants")
+
+    method: str = ""
+    n_train: int
+    n_dofs: int
+    fit_s: float
+    fit_memory_bytes: int
+    model_bytes: int | None
+    needs_snapshots: bool
+    parameters: dict[str, Any]
+    sizes: dict[str, Any] = {}
+    training: dict[str, Any] | None = None
+    warnings: list[str]
+    model_sha256: str | None = None
+
+    @property
+    def iterations(self) -> int | None:
+        """Iterations of a training that was sized to seconds."""
+        return (self.training or {}).get("iterations")
+
+
+class CachedFit:
+    """A configuration, its folder in the cache and, for one that cannot be saved, its process.
+
+    Attributes
+    ----------
+    taken_s : float
+        Seconds of a training in processes that were stopped.
+    """
+
+    def __init__(
+        self, configuration: Configuration, data: TrainingData, environment: RunEnvironment
+    ) -> None:
+        self.configuration, self.data, self.environment = configuration, data, environment
+        self.taken_s = 0.0
+        self._held: SandboxedProcess | None = None
+        digest = hashlib.sha256(json.dumps(self._key_parts(), sort_keys=True).encode())
+        self.key = digest.hexdigest()[:20]
+        self.folder = environment.cache / "fits" / f"{configuration.method.name}-{self.key}"
+        self.model = self.folder / "model.safetensors"
+        self.checkpoint = self.folder / "training" / "checkpoint"
+
+    def _key_parts(self) -> dict[str, Any]:
+        method, parameters = self.configuration.method, self.configuration.parameters
+        parts: dict[str, Any] = {
+            "data": self.data.digest,
+            "surrogate": method.surrogate,
+            "parameters": parameters,
+            "code": [code_digest(method.surrogate, method.folder), *_code_of_named(parameters)],
+            "machine": self.environment.machine,
+            "threads": self.environment.fit_threads,
+        }
+        if "auto" in parameters.values():  # such a size depends on what the scene needs
+            parts["needs"] = self.data.scene.spec.needs.error
+        training = self.configuration.training
+        if training is not None and training != TrainingOptions():
+            device = gpu_name() if training.device == "cuda" else training.device
+            parts["training"] = {"device": device, "fit_seconds": training.fit_seconds}
+        return parts
+
+    @property
+    def reproducible(self) -> Configuration:
+        """The configuration with the iterations that its seconds came to, once it is fitted."""
+        configuration, record = self.configuration, self.record
+        training = configuration.training
+        if training is None or training.fit_seconds is None or record is None:
+            return configuration
+        if record.iterations is None or "iterations" not in record.parameters:
+            return configuration
+        return replace(
+            configuration,
+            parameters={**configuration.parameters, "iterations": record.iterations},
+            training=replace(training, fit_seconds=None),
+        )
+
+    @cached_property
+    def record(self) -> FitRecord | None:
+        """The record of the fit; None if there is none or it is damaged."""
+        try:
+            record = FitRecord.model_validate_json((self.folder / "fit.json").read_bytes())
+            checksum = record.model_sha256
+            damaged = checksum is not None and checksum != digest_of_file(self.model)
+        except (OSError, ValidationError):
+            return None
+        return None if damaged else record
+
+    @property
+    def fitted(self) -> FitRecord:
+        """The record of a configuration that is known to be fitted."""
+        assert self.record is not None
+        return self.record
+
+    def keep(self, record: FitRecord, model: Path | None) -> FitRecord:
+        """Keep a fit and its model; writing the record commits it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if model is not None:
+            partial = self.folder / f".{os.getpid()}.{self.key}.tmp"
+            shutil.copyfile(model, partial)
+            os.replace(partial, self.model)
+            checksum = {"model_sha256": digest_of_file(self.model)}
+            record = record.model_copy(update=checksum)
+        write_atomically(self.folder / "fit.json", record.model_dump_json(indent=1).encode())
+        self.record = record
+        return record
+
+    def arrays(self, name: str) -> dict[str, NDArray[Any]] | None:
+        """Read arrays that were kept; None if there are none or they are damaged."""
+        with suppress(OSError, KeyError, RuntimeError):
+            arrays = read_arrays(self.folder / f"{name}.h5")
+            if str(arrays.pop("digest").astype(str)) == digest_of_arrays(arrays):
+                return arrays
+        return None
+
+    def keep_arrays(self, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Keep arrays."""
+        digest = np.array(digest_of_arrays(arrays).encode())
+        write_arrays(self.folder / f"{name}.h5", {**arrays, "digest": digest})
+
+    def begin_training(self) -> None:
+        """Make room for a checkpoint; read the seconds that a stopped training took until it."""
+        record, taken = self.folder / "training.json", 0.0
+        self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(self.checkpoint.parent)
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            kept, written = json.loads(record.read_bytes()), self.checkpoint.stat().st_mtime
+            taken = float(kept["taken_s"]) + max(0.0, written - float(kept["began"]))
+        write_atomically(record, json.dumps({"taken_s": taken, "began": time()}).encode())
+        self.taken_s = taken
+
+    def end_training(self) -> None:
+        """Delete a checkpoint. The folder stays, because another run may write to it."""
+        self.checkpoint.unlink(missing_ok=True)
+        (self.folder / "training.json").unlink(missing_ok=True)
+
+    def worker(
+        self, fork_server: ForkServer | None = None, exempt: Path | None = None
+    ) -> SandboxedProcess:
+        """Start a fresh worker process for the method, without a model."""
+        restrictions = Restrictions(
+            self.environment.sealed,
+            exempt,
+            self.configuration.method.folder,
+            self.environment.memory_limit_bytes,
+        )
+        server = fork_server or self.environment.fork_server
+        return SandboxedProcess(MethodSession, restrictions, server, scene=self.data.scene)
+
+    def fit_in(
+        self, worker: SandboxedProcess, limit_s: float, checkpoint: Path | None = None
+    ) -> tuple[dict[str, Any], Path]:
+        """Fit in a worker, from a checkpoint if there is one; return its answer and the model."""
+        model = Path(tempfile.mkdtemp(dir=self.data.scratch)) / "model.safetensors"
+        configuration = self.reproducible
+        training = configuration.training
+        request = FitRequest(
+            surrogate=configuration.method.surrogate,
+            parameters=configuration.parameters,
+            train=self.data.folder,
+            model=model,
+            threads=self.environment.fit_threads,
+            limit_s=limit_s,
+            training=training and replace(training, checkpoint=checkpoint),
+        )
+        answer = worker.ask("fit", limit_s, request=request)
+        if answer["needs_snapshots"]:
+            self.data.check_unchanged()
+        return answer, model
+
+    def open_worker(
+        self, limit_s: float = LOAD_LIMIT_S, fork_server: ForkServer | None = None
+    ) -> SandboxedProcess:
+        """Start a worker with the fitted method; one that cannot be saved is fitted again."""
+        if self._held and fork_server is None:
+            worker, self._held = self._held, None
+            return worker
+        worker = self.worker(fork_server)
+        try:
+            if self.record is not None and self.record.model_sha256 is not None:
+                surrogate = self.configuration.method.surrogate
+                worker.ask("load", LOAD_LIMIT_S, surrogate=surrogate, model=self.model)
+            else:
+                self.fit_in(worker, limit_s)
+        except BaseException:
+            worker.end()
+            raise
+        return worker
+
+    def hold(self, worker: SandboxedProcess) -> None:
+        """Keep the process of a method that cannot be saved until it has been scored."""
+        self._held = worker
+
+    def release(self) -> None:
+        """End the process that is held."""
+        if self._held:
+            self._held.end()
+            self._held = None
+
+
+def _code_of_named(parameters: Mapping[str, Any]) -> list[str]:
+    """Return the code digests of methods of the suite that parameters name."""
+    shipped = list_suite("methods")
+    named = [value for value in parameters.values() if isinstance(value, str) and value in shipped]
+    return [code_digest(load_method_spec(shipped[name]).surrogate) for name in named]

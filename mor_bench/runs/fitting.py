@@ -1,0 +1,166 @@
+"""Fitting a configuration in a worker process, here or on a cluster, unless the cache has it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, StoreError
+from mor_bench.measure.method_session import FitRequest, MethodSession
+from mor_bench.runs.cached_fit import CachedFit, FitRecord
+from mor_bench.runs.configurations import Configuration
+from mor_bench.sandbox.process import MethodFailedError, Restrictions, SandboxedProcess
+from mor_bench.scene.scene import Scene
+
+RemoteFit = Callable[[CachedFit, float], tuple[dict[str, Any], bytes | None]]
+"""Fits elsewhere within a time limit, s; returns the worker's answer and the model's file."""
+
+
+def fit_configuration(
+    cached: CachedFit, limit_s: float, remote: RemoteFit | None = None
+) -> FitRecord:
+    """Fit a configuration, unless the cache has it. The process never gets a test set.
+
+    Parameters
+    ----------
+    cached : CachedFit
+    limit_s : float
+        Time limit of the fit, s.
+    remote : callable, optional
+        Fits elsewhere.
+
+    Raises
+    ------
+    MethodFailedError
+        If the method crashes, hangs, takes too much memory or changes the training samples.
+    MorBenchError
+        Of the kind that the method raised.
+    """
+    if cached.record is not None:
+        return cached.record
+    if remote is not None:
+        return _keep_remote(cached, *remote(cached, limit_s))
+    worker, answer, model = _fit_in_worker(cached, limit_s)
+    try:
+        answer["fit_s"] += cached.taken_s
+        saved = answer["model_bytes"] is not None
+        record = cached.keep(_record(cached, answer), model if saved else None)
+        shutil.rmtree(model.parent, ignore_errors=True)
+        cached.end_training()
+    except BaseException:
+        worker.end()
+        raise
+    if saved:
+        worker.end()
+    else:
+        cached.hold(worker)
+    return record
+
+
+def _fit_in_worker(
+    cached: CachedFit, limit_s: float
+) -> tuple[SandboxedProcess, dict[str, Any], Path]:
+    """Fit from a checkpoint if there is one, and again from the start if it was at fault."""
+    resumed = cached.checkpoint.exists()
+    worker = _worker_for(cached)
+    try:
+        try:
+            left_s = _time_left(limit_s, cached.taken_s)
+            return worker, *cached.fit_in(worker, left_s, cached.checkpoint)
+        except (MethodFailedError, OutOfTimeError):
+            raise  # a later run with more time resumes from the checkpoint
+        except MorBenchError as error:
+            cached.end_training()
+            if not (resumed and isinstance(error, StoreError | InvalidInputError)):
+                raise
+        worker.end()
+        worker = _worker_for(cached)
+        return worker, *cached.fit_in(worker, limit_s, cached.checkpoint)
+    except BaseException:
+        worker.end()
+        raise
+
+
+def _worker_for(cached: CachedFit) -> SandboxedProcess:
+    """Start a worker for a fit; one that may train can open the folder of its checkpoint."""
+    if cached.configuration.training is None:
+        return cached.worker()
+    cached.begin_training()
+    return cached.worker(exempt=cached.checkpoint.parent)
+
+
+def _time_left(limit_s: float, taken_s: float) -> float:
+    if taken_s >= limit_s:
+        raise MethodFailedError(
+            f"fitting took longer than the limit of {limit_s:g} s: "
+            f"{taken_s:.0f} s until it was stopped"
+        )
+    return limit_s - taken_s
+
+
+def _record(cached: CachedFit, answer: dict[str, Any]) -> FitRecord:
+    return FitRecord(
+        method=cached.configuration.method.name,
+        n_train=cached.data.n_train,
+        n_dofs=cached.data.scene.mesh.n_dofs,
+        **answer,
+    )
+
+
+def _keep_remote(cached: CachedFit, answer: dict[str, Any], content: bytes | None) -> FitRecord:
+    if content is None:
+        return cached.keep(_record(cached, answer), None)
+    with tempfile.TemporaryDirectory(dir=cached.data.scratch) as folder:
+        model = Path(folder) / "model.safetensors"
+        model.write_bytes(content)
+        return cached.keep(_record(cached, answer), model)
+
+
+@dataclass(frozen=True)
+class ClusterFit:
+    """A fit to do on another machine: scene, training samples, configuration and limits.
+
+    Attributes
+    ----------
+    scene : Scene
+    arrays : dict
+        The training samples, see `mor_bench.sandbox.handover`.
+    configuration : Configuration
+    limit_s, memory_limit_bytes : float
+    """
+
+    scene: Scene
+    arrays: dict[str, NDArray[Any]]
+    configuration: Configuration
+    limit_s: float
+    memory_limit_bytes: float
+
+
+def fit_on_cluster(task: ClusterFit) -> tuple[dict[str, Any], bytes | None]:
+    """Fit on this machine in a worker process; return its answer and the model's file."""
+    with tempfile.TemporaryDirectory() as name:
+        train, model = Path(name) / "train", Path(name) / "model.safetensors"
+        train.mkdir()
+        for key, array in task.arrays.items():
+            np.save(train / f"{key}.npy", array, allow_pickle=False)
+        request = FitRequest(
+            surrogate=task.configuration.method.surrogate,
+            parameters=task.configuration.parameters,
+            train=train,
+            model=model,
+            threads=os.cpu_count() or 1,
+            limit_s=task.limit_s,
+            training=task.configuration.training,
+        )
+        restrictions = Restrictions(memory_bytes=task.memory_limit_bytes)
+        with SandboxedProcess(MethodSession, restrictions, scene=task.scene) as worker:
+            answer = worker.ask("fit", task.limit_s, request=request)
+        return answer, model.read_bytes() if model.exists() else None

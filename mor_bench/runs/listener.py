@@ -1,0 +1,40 @@
+"""Callbacks that follow a run or a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from mor_bench.results.row import Row
+
+
+def _ignore(*_: object) -> None:
+    """Do nothing."""
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Callbacks for the progress of a run; each does nothing by default.
+
+    Attributes
+    ----------
+    generating : callable
+        Called with (dataset, samples done, samples wanted).
+    starting : callable
+        Called with (dataset, label, number of the configuration, number of configurations).
+    fitted : callable
+        Called with a row that is scored but not yet timed.
+    timing : callable
+        Called with (dataset, turns done, all turns).
+    finished : callable
+        Called with a complete row.
+    training : callable
+        Called with (iterations done, all iterations, loss) during a single fit.
+    """
+
+    generating: Callable[[str, int, int], None] = _ignore
+    starting: Callable[[str, str, int, int], None] = _ignore
+    fitted: Callable[[Row], None] = _ignore
+    timing: Callable[[str, int, int], None] = _ignore
+    finished: Callable[[Row], None] = _ignore
+    training: Callable[[int, int, float], None] = _ignore

@@ -1,0 +1,85 @@
+"""The folder of a run: opened new or resumed, and written by one process at a time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+
+import psutil
+
+from mor_bench.errors import InvalidInputError
+from mor_bench.machine import describe_machine, gpu_name
+from mor_bench.results.comparison import Comparison
+from mor_bench.runs.run_context import RunContext
+from mor_bench.specs import AnyDatasetSpec, MethodSpec
+
+
+def open_run(
+    out: str | Path | None,
+    specs: Sequence[AnyDatasetSpec],
+    methods: Sequence[MethodSpec],
+    context: RunContext,
+) -> Comparison:
+    """Make the comparison in a folder, or resume one with the same settings and datasets.
+
+    Raises
+    ------
+    InvalidInputError
+        If the folder holds another run or cannot be written.
+    """
+    folder = Path(out) if out else _default_folder([spec.name for spec in specs])
+    datasets = {spec.name: spec.model_dump(mode="json") for spec in specs}
+    settings = context.recorded()
+    if (folder / "results.json").exists():
+        comparison = Comparison.read(folder)
+        if comparison.settings != settings or any(
+            datasets.get(name) != spec for name, spec in comparison.datasets.items()
+        ):
+            raise InvalidInputError(
+                f"{folder} holds a run with other settings or datasets; "
+                "choose another folder or remove it."
+            )
+    else:
+        gpu = {"gpu": gpu_name()} if context.training.device == "cuda" else {}
+        comparison = Comparison(folder, {**describe_machine(), **gpu}, settings=settings)
+    comparison.methods |= {
+        method.name: method.model_dump(mode="json", exclude={"folder"}) for method in methods
+    }
+    try:
+        comparison.write()
+    except OSError as error:
+        raise InvalidInputError(f"`out`: {folder} cannot be written: {error.strerror}.") from None
+    return comparison
+
+
+def _default_folder(names: Sequence[str]) -> Path:
+    return Path("reports") / "runs" / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{'-'.join(names)}"
+
+
+@contextmanager
+def only_run_in(folder: Path) -> Iterator[None]:
+    """Refuse to share the folder with another live run; the lock of a killed run is ignored.
+
+    Raises
+    ------
+    InvalidInputError
+        If another run writes there.
+    """
+    lock = folder / ".running"
+    other = None
+    with suppress(OSError, ValueError, psutil.Error):
+        number, created = map(float, lock.read_text().split())
+        other = int(number) if psutil.Process(int(number)).create_time() == created else None
+    if other not in (None, os.getpid()):
+        raise InvalidInputError(
+            f"{folder}: another run, process {other}, writes there; "
+            "wait for it or choose another folder."
+        )
+    lock.write_text(f"{os.getpid()} {psutil.Process().create_time()!r}")
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)

@@ -1,0 +1,183 @@
+"""Scoring a fitted configuration on test sets; scores that the cache has are not computed again."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.measure.error_metrics import SampleErrors, sample_errors
+from mor_bench.measure.indicator_quality import Indicated
+from mor_bench.runs.cached_fit import LOAD_LIMIT_S, CachedFit, FitRecord
+from mor_bench.runs.fitting import fit_configuration
+from mor_bench.runs.training_data import TestSet
+from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
+from mor_bench.snapshots.store import write_atomically
+
+N_COUNTED = 32
+"""Test loads over which the cost of a query is averaged."""
+
+SCORE_CHUNK = 256
+"""Samples that are predicted at once."""
+
+Score = dict[str, NDArray[Any]]
+"""Per-sample errors on a test set, range flags if the method has them, and the worst sample."""
+
+
+@dataclass(frozen=True)
+class ScoredFit:
+    """A fitted configuration and its scores.
+
+    Attributes
+    ----------
+    record : FitRecord
+    scores : dict of str to dict of arrays
+        Scores of each test set.
+    cost : dict or None
+        Counted work per query on the main test set.
+    """
+
+    record: FitRecord
+    scores: dict[str, Score]
+    cost: dict[str, float] | None
+
+
+class _Scorer:
+    """Scores one configuration; its worker starts when it is first needed."""
+
+    def __init__(self, cached: CachedFit, limit_s: float, stack: ExitStack) -> None:
+        self.cached, self.limit_s, self._stack = cached, limit_s, stack
+
+    @cached_property
+    def worker(self) -> SandboxedProcess:
+        worker = self.cached.open_worker(self.limit_s)
+        self._stack.callback(worker.end)
+        return worker
+
+    def score(self, test: TestSet) -> Score:
+        """Return the scores on a test set, from the cache if it has them."""
+        name = f"score-{test.digest[:20]}"
+        found = self.cached.arrays(name)
+        if found is None:
+            found = self._measured(test)
+            self.cached.keep_arrays(name, found)
+        return found
+
+    def _measured(self, test: TestSet) -> Score:
+        errors: list[SampleErrors] = []
+        flags: list[bool] | None = []
+        data, worst = self.cached.data, _Worst(test)
+        is_main = test is data.sets.get("test")
+        indicated = Indicated(data.indicator if is_main else None, len(test.forces))
+        until = monotonic() + self.limit_s
+        with tempfile.TemporaryDirectory(dir=data.scratch) as folder:
+            for start in range(0, len(test.forces), SCORE_CHUNK):
+                chunk = slice(start, start + SCORE_CHUNK)
+                forces = test.forces[chunk]
+                left_s = max(1.0, until - monotonic())
+                predicted = self._predictions(forces, left_s, Path(folder) / "answers.npy")
+                errors.append(sample_errors(predicted, test.references[chunk], test.nodes))
+                worst.look_at(start, errors[-1].mean_dof_m, predicted)
+                indicated.add(start, forces, predicted)
+                found = self.worker.ask("flag", LOAD_LIMIT_S, forces=forces)["flagged"]
+                flags = None if found is None or flags is None else flags + found
+        names = ("mean_dof_m", "relative_l2", "max_nodal_m", "amplitude_m")
+        score: Score = {
+            name: np.concatenate([getattr(part, name) for part in errors]) for name in names
+        }
+        if flags is not None:
+            score["flagged"] = np.asarray(flags, dtype=bool)
+        has_forces = data.scene.observed_nodes is None
+        return {
+            **score,
+            **indicated.arrays,
+            "worst_prediction": worst.prediction,
+            "worst_reference": test.references[worst.number],
+            "worst_forces": test.forces[worst.number] * has_forces,  # nothing to draw otherwise
+        }
+
+    def _predictions(
+        self, forces: NDArray[np.float64], limit_s: float, out: Path
+    ) -> NDArray[np.float64]:
+        """Let the worker predict; check what it wrote, since a third party's code ran there."""
+        threads = self.cached.environment.threads
+        self.worker.ask("predict", limit_s, forces=forces, out=out, threads=threads)
+        try:
+            predicted = np.load(out, allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise MethodFailedError(f"its predictions cannot be read: {error}") from None
+        if predicted.shape != forces.shape or predicted.dtype != np.float64:
+            raise MethodFailedError(
+                f"its predictions have shape {predicted.shape} and are {predicted.dtype}; "
+                f"expected {forces.shape} and float64"
+            )
+        out.unlink()
+        return np.asarray(predicted)
+
+    def cost(self) -> dict[str, float] | None:
+        """Return the counted work per query, from the cache if it has it."""
+        test = self.cached.data.sets["test"]
+        path = self.cached.folder / f"cost-{test.digest[:20]}.json"
+        with suppress(OSError, ValueError):
+            kept: dict[str, float] | None = json.loads(path.read_bytes())
+            return kept
+        chosen = np.linspace(0, len(test.forces) - 1, min(N_COUNTED, len(test.forces))).astype(int)
+        answer = self.worker.ask("cost", LOAD_LIMIT_S, forces=test.forces[chosen])
+        cost: dict[str, float] | None = answer["cost"]
+        write_atomically(path, json.dumps(cost).encode())
+        return cost
+
+
+class _Worst:
+    """The sample with the largest finite error."""
+
+    def __init__(self, test: TestSet) -> None:
+        self.error, self.number = -1.0, 0
+        self.prediction = np.full(test.references.shape[1:], np.nan)
+
+    def look_at(
+        self, start: int, errors: NDArray[np.float64], predicted: NDArray[np.float64]
+    ) -> None:
+        """Look at the samples from number `start` on."""
+        finite = np.where(np.isfinite(errors), errors, -1.0)
+        if finite.max() > self.error:
+            largest = int(finite.argmax())
+            self.error, self.number = float(finite[largest]), start + largest
+            self.prediction = predicted[largest].copy()
+
+
+def score_fit(cached: CachedFit, limit_s: float, *, count: bool = True) -> ScoredFit:
+    """Score a fitted configuration on all test sets, reusing cached scores.
+
+    Parameters
+    ----------
+    cached : CachedFit
+    limit_s : float
+        Time limit of the predictions on a test set, s.
+    count : bool
+        Whether to count the cost of a query.
+
+    Raises
+    ------
+    MethodFailedError, MorBenchError
+        As `mor_bench.runs.fitting.fit_configuration`.
+    """
+    with ExitStack() as stack:
+        stack.callback(cached.release)
+        scorer = _Scorer(cached, limit_s, stack)
+        scores = {name: scorer.score(test) for name, test in cached.data.sets.items()}
+        return ScoredFit(cached.fitted, scores, scorer.cost() if count else None)
+
+
+def fit_and_score(cached: CachedFit, limit_s: float) -> ScoredFit:
+    """Fit and score a configuration, without counting the cost of a query."""
+    fit_configuration(cached, limit_s)
+    return score_fit(cached, limit_s, count=False)

@@ -1,0 +1,115 @@
+"""The timing stage: all configurations of a dataset timed beside each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.analysis.latency_intervals import latency_intervals
+from mor_bench.measure.latency import (
+    PROTOCOLS,
+    Queries,
+    TimedMethod,
+    measure_latencies,
+    probe_s,
+)
+from mor_bench.measure.timing import Timing, check_answers, timing_summary
+from mor_bench.results.row import AllThreadsLatency, Latency, Memory, Row
+from mor_bench.runs.cached_fit import CachedFit
+from mor_bench.runs.extra_stages import Stage
+from mor_bench.sandbox.process import MethodFailedError
+
+MOST_QUERIES = 400
+"""Most loads of the test set that queries are drawn from."""
+
+
+class StopRunError(Exception):
+    """A row failed, and the run shall stop at the first failure."""
+
+
+def time_configurations(stage: Stage, fits: Mapping[str, CachedFit]) -> None:
+    """Time all configurations without a timing from this machine at this speed; complete the rows.
+
+    Raises
+    ------
+    StopRunError
+        If a timing failed and the run shall stop at the first failure.
+    """
+    speed = probe_s()
+    name = _timing_name(stage)
+    kept = {} if stage.context.options.retime else _kept_timings(fits, name, speed)
+    fresh = _measured(stage, {label: fit for label, fit in fits.items() if label not in kept})
+    for label, timing in fresh.items():
+        if not timing.failed:
+            timing.probe_s = speed
+            fits[label].keep_arrays(name, timing.arrays)
+    timings = kept | fresh
+    succeeded = {label: timing for label, timing in timings.items() if not timing.failed}
+    intervals = latency_intervals({label: timing.samples for label, timing in succeeded.items()})
+    for label in fits:
+        row, timing = stage.row(label), timings[label]
+        if timing.failed:
+            stage.comparison.put(row.with_parts(status="failed", reason=timing.failed))
+        else:
+            stage.comparison.put(_timed_row(row, timing, intervals[label]))
+            stage.comparison.add_samples(row, timing.samples)
+    for label in fits:
+        stage.context.listener.finished(stage.row(label))
+    if stage.context.options.fail_fast and len(succeeded) < len(timings):
+        raise StopRunError
+
+
+def _timing_name(stage: Stage) -> str:
+    protocol = PROTOCOLS[stage.context.options.profile]
+    digest = stage.training_data.sets["test"].digest[:12]
+    threads = stage.environment.threads
+    return f"timing-{protocol.processes}x{protocol.rounds}-{threads}-{digest}"
+
+
+def _kept_timings(fits: Mapping[str, CachedFit], name: str, speed: float) -> dict[str, Timing]:
+    kept = {label: fit.arrays(name) for label, fit in fits.items()}
+    timings = {label: Timing.from_arrays(arrays) for label, arrays in kept.items() if arrays}
+    return {label: timing for label, timing in timings.items() if timing.holds(speed)}
+
+
+def _measured(stage: Stage, fits: Mapping[str, CachedFit]) -> dict[str, Timing]:
+    """Time configurations in fresh processes; one that answers worse than when scored fails."""
+    budget_s = stage.context.budget.seconds
+    methods = {
+        label: TimedMethod(partial(fit.open_worker, budget_s), fit.fitted.fit_memory_bytes)
+        for label, fit in fits.items()
+    }
+    test = stage.training_data.sets["test"]
+    n = len(test.forces)
+    chosen: NDArray[np.int64] = np.linspace(0, n - 1, min(MOST_QUERIES, n)).astype(int)
+    queries = Queries(
+        test.forces[chosen], test.references[chosen], test.nodes, stage.training_data.scratch
+    )
+    timings = measure_latencies(
+        methods,
+        queries,
+        PROTOCOLS[stage.context.options.profile],
+        stage.environment.threads,
+        partial(stage.context.listener.timing, stage.spec.name),
+    )
+    for label, timing in timings.items():
+        scored = stage.comparison.samples(stage.row(label))["relative_l2"][chosen]
+        try:
+            check_answers(timing, scored)
+        except MethodFailedError as error:
+            timing.failed = timing.failed or str(error)
+    return timings
+
+
+def _timed_row(row: Row, timing: Timing, interval: tuple[float, float]) -> Row:
+    figures = timing_summary(timing, interval, row.threads)
+    assert row.memory_bytes is not None
+    return row.with_parts(
+        latency_ms=Latency(**figures["latency_ms"]),
+        all_threads_ms=AllThreadsLatency(**figures["all_threads_ms"]),
+        throughput=figures["throughput"],
+        memory_bytes=Memory(fit=row.memory_bytes.fit, predict=timing.memory_bytes),
+    )

@@ -1,0 +1,143 @@
+"""Training samples in files for the methods' processes, and test sets in memory."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tempfile
+import warnings
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.mechanics.indicator import ErrorIndicator
+from mor_bench.sandbox.handover import arrays_of, write_snapshots
+from mor_bench.sandbox.process import MethodFailedError
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.dataset import Snapshots
+
+
+def digest_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Return the SHA-256 of named arrays."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
+        digest.update(np.ascontiguousarray(arrays[name]).data)
+    return digest.hexdigest()
+
+
+def digest_of_file(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@dataclass(frozen=True)
+class TestSet:
+    """Queries and reference displacements; the references stay in the parent process.
+
+    Attributes
+    ----------
+    forces, references : (n, n_nodes, 3) float64
+        N and m. In a scene with observed nodes `forces` holds the observed displacements, m.
+    nodes : (n_output_nodes,) int64
+        Nodes where the error is measured.
+    digest : str
+        SHA-256 of all of it.
+    """
+
+    forces: NDArray[np.float64]
+    references: NDArray[np.float64]
+    nodes: NDArray[np.int64]
+    digest: str
+
+    @classmethod
+    def of(cls, snapshots: Snapshots) -> TestSet:
+        """Make a test set from snapshots."""
+        nodes = snapshots.scene.output_nodes
+        arrays: dict[str, NDArray[Any]] = {"f": snapshots.given.values, "u": snapshots.displacements}
+        if len(nodes) < snapshots.scene.mesh.n_nodes:
+            arrays["nodes"] = nodes
+        return cls(snapshots.given.values, snapshots.displacements, nodes, digest_of_arrays(arrays))
+
+
+class TrainingData:
+    """Training samples as files for the methods' processes, and the test sets to score on.
+
+    Parameters
+    ----------
+    scene : Scene
+    train : Snapshots
+    sets : dict of str to TestSet
+        The main test set is ``test``.
+    scratch : Path
+        An existing folder that every method's process may write to.
+    """
+
+    def __init__(
+        self, scene: Scene, train: Snapshots, sets: Mapping[str, TestSet], scratch: Path
+    ) -> None:
+        self.scene, self.scratch, self.sets = scene, scratch, dict(sets)
+        self.train = train
+        self.folder = Path(tempfile.mkdtemp(dir=scratch)) / "train"
+        write_snapshots(self.folder, train)
+        self._written = self._file_digests()
+
+    @property
+    def n_train(self) -> int:
+        """Number of training samples."""
+        return len(self.train)
+
+    def _file_digests(self) -> dict[str, str]:
+        return {path.name: digest_of_file(path) for path in sorted(self.folder.iterdir())}
+
+    def check_unchanged(self) -> None:
+        """Raise `MethodFailedError` and restore the training samples if a method changed them."""
+        try:
+            unchanged = self._file_digests() == self._written
+        except OSError:
+            unchanged = False
+        if not unchanged:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            write_snapshots(self.folder, self.train)
+            raise MethodFailedError("it wrote over the training samples")
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the training samples and the scene."""
+        spec = self.scene.spec
+        extra: list[dict[str, Any]] = []
+        if spec.needs.outputs != "all":
+            extra.append(spec.needs.model_dump(mode="json", include={"outputs"}))
+        if self.scene.observed_nodes is not None:
+            extra.append({"observed": self.scene.observed_nodes.tolist()})
+        scene = json.dumps([spec.physics(), spec.grid_nodes, *extra], sort_keys=True)
+        return digest_of_arrays(arrays_of(self.train)) + hashlib.sha256(scene.encode()).hexdigest()
+
+    @cached_property
+    def indicator(self) -> ErrorIndicator | None:
+        """Error indicator; None without equations, forces or displacements everywhere."""
+        known = self.scene.material is not None and self.scene.observed_nodes is None
+        if not known or len(self.scene.output_nodes) < self.scene.mesh.n_nodes:
+            return None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # methods repeat the scene's warnings
+            return ErrorIndicator(self.scene)
+
+    def first(self, n: int) -> TrainingData:
+        """Return the same data with only the first training samples and the main test set."""
+        sets = {"test": self.sets["test"]}
+        return TrainingData(self.scene, self.train[:n], sets, self.scratch)
+
+    def with_sets(self, sets: Mapping[str, TestSet]) -> TrainingData:
+        """Return the same training samples with other test sets."""
+        other = copy(self)
+        other.sets = dict(sets)
+        return other
