@@ -10,8 +10,10 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import mor_bench
+from mor_bench.results.comparison import Comparison
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
+from tests.small_runs import Heard, method_file, run_small
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -38,3 +40,24 @@ def tiny(cache: Path) -> Dataset:
 @pytest.fixture(scope="session")
 def tiny_scene() -> Scene:
     return mor_bench.load_scene("beam-tiny")
+
+
+@pytest.fixture(scope="session")
+def heard() -> Heard:
+    """What a listener was told of `small_run`."""
+    return Heard()
+
+
+@pytest.fixture(scope="session")
+def small_run(tmp_path_factory: pytest.TempPathFactory, cache: Path, heard: Heard) -> Comparison:
+    """A comparison of good and broken methods on 60 samples of beam-tiny."""
+    folder = tmp_path_factory.mktemp("small")
+    pod = method_file(
+        folder, "pod-swept", "mor_bench.surrogates.pod:PODGalerkin", sweep={"n_modes": [3, 20]}
+    )
+    broken = [
+        method_file(folder, f"broken-{how}", "tests.third_party:Broken", how=how)
+        for how in ("crash", "shape", "nan", "sometimes")
+    ]
+    out = folder / "reports" / "runs" / "first"
+    return run_small(["linear-fem", pod, *broken], out, cache, listener=heard.listener())

@@ -1,4 +1,4 @@
-"""`mor-bench fit`: a training that is killed goes on to the same last bit, and what cannot be done is refused before it begins."""
+"""`mor-bench fit`: resuming gives the same bytes; what cannot be done is refused first."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,79 +17,52 @@ import pytest
 from safetensors import safe_open
 
 import mor_bench
-from mor_bench.cli.fit_command import parse_hyperparameters
 from mor_bench.errors import InvalidInputError, MorBenchError, SpecError
 from mor_bench.runs.listener import Listener
+from mor_bench.runs.single_fit import Fit
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots, load_dataset
 from mor_bench.specs import load_generated_spec
+from tests.small_runs import COMMAND, LIMIT, descent_file, method_file, wait_for
 from tests.third_party import Descent
 
-LIMIT = 60
+NETWORK = {"channels": 1, "steps": 1, "batch_size": 4, "inference": "packed"}
+"""A tiny U-Mesh; `inference = "auto"` would keep the times that it measures."""
 
 
-def descent_file(folder: Path, more: str = "") -> Path:
-    path = folder / "descent.toml"
-    path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Descent"\n{more}')
-    return path
+def fit_tiny(
+    method: str | Path, parameters: dict[str, Any], out: Path, cache: Path, **options: Any
+) -> Fit:
+    """Fit on a few samples of beam-tiny with one thread."""
+    given = {"out": out, "limit": LIMIT, "cache": cache, "threads": 1, **options}
+    return mor_bench.fit("beam-tiny", method, parameters, **given)
 
 
-def wait_for(done: Any, process: subprocess.Popen[str], within_s: float = 120.0) -> None:
-    until = time.monotonic() + within_s
-    while not done():
-        assert process.poll() is None, process.communicate()[1]
-        assert time.monotonic() < until
-        time.sleep(0.01)
-
-
-def test_a_killed_fit_goes_on_and_ends_with_the_same_bytes(cache: Path, tmp_path: Path) -> None:
-    load_dataset("beam-tiny", LIMIT, cache=cache, workers=1)
+@pytest.mark.slow
+def test_a_killed_fit_resumes_and_ends_with_the_same_bytes(cache: Path, tmp_path: Path) -> None:
+    load_dataset("beam-tiny", LIMIT, cache=cache)
     path, out = descent_file(tmp_path), tmp_path / "model.safetensors"
-    options = [
-        "--set",
-        "iterations=400",
-        "--seed",
-        "3",
-        "--limit",
-        str(LIMIT),
-        "--cache",
-        str(cache),
-        "--threads",
-        "1",
-    ]
-    command = [
-        sys.executable,
-        "-m",
-        "mor_bench",
-        "fit",
-        "beam-tiny",
-        "-m",
-        str(path),
-        "--out",
-        str(out),
-        *options,
-    ]
-    checkpoint = tmp_path / ".model.safetensors.checkpoint"
-    slow = {**os.environ, "DESCENT_NAP_S": "0.02"}
-    seen: float = 0.0
-    for how in (signal.SIGKILL, signal.SIGTERM, signal.SIGINT):
-        heeding = partial(
-            signal.signal, signal.SIGINT, signal.SIG_DFL
-        )  # a job in the background of a shell ignores it, and so would its children
+    options = [f"--limit={LIMIT}", f"--cache={cache}", "--threads=1", f"--out={out}"]
+    options += ["--set=iterations=400", "--seed=3"]
+    command = [*COMMAND, "fit", "beam-tiny", "-m", str(path), *options]
+    checkpoint, seen = tmp_path / ".model.safetensors.checkpoint", 0.0
+    # A background job of a shell ignores the interrupt, and so would its children.
+    listening = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    for how in (signal.SIGKILL, signal.SIGINT):
         with subprocess.Popen(
             command,
-            env=slow,
+            env={**os.environ, "DESCENT_NAP_S": "0.02"},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            preexec_fn=heeding,
+            preexec_fn=listening,
         ) as process:
             wait_for(
                 lambda seen=seen: checkpoint.exists() and checkpoint.stat().st_mtime > seen, process
             )
             process.send_signal(how)
-            said = process.communicate()[1]
-        assert process.returncode == (130 if how == signal.SIGINT else -how), said
+            stderr = process.communicate()[1]
+        assert process.returncode == (130 if how == signal.SIGINT else -how), stderr
         assert not out.exists()
         seen = checkpoint.stat().st_mtime
     last = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -98,55 +70,26 @@ def test_a_killed_fit_goes_on_and_ends_with_the_same_bytes(cache: Path, tmp_path
     assert "goes on from iteration " in last.stderr
     assert "400 iterations, " in last.stdout
     assert not checkpoint.exists()
-    whole = mor_bench.fit(
-        "beam-tiny",
-        path,
-        {"iterations": 400, "seed": 3},
-        out=tmp_path / "whole.safetensors",
-        limit=LIMIT,
-        cache=cache,
-        threads=1,
-    )
+    knobs = {"iterations": 400, "seed": 3}
+    whole = fit_tiny(path, knobs, tmp_path / "whole.safetensors", cache)
     assert out.read_bytes() == whole.out.read_bytes()
     assert f"ē {whole.error['mean_dof_m']:.2e} m" in last.stdout
-    other = mor_bench.fit(
-        "beam-tiny",
-        path,
-        {"iterations": 400, "seed": 4},
-        out=tmp_path / "b.safetensors",
-        limit=LIMIT,
-        cache=cache,
-        threads=1,
-    )
+    other = fit_tiny(path, {**knobs, "seed": 4}, tmp_path / "b.safetensors", cache)
     assert other.out.read_bytes() != whole.out.read_bytes()
 
 
-def test_a_killed_training_of_u_mesh_goes_on_too(cache: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_a_killed_training_of_u_mesh_resumes_too(cache: Path, tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    load_dataset("beam-tiny", LIMIT, cache=cache, workers=1)
-    knobs = {
-        "channels": 1,
-        "steps": 1,
-        "iterations": 300,
-        "batch_size": 4,
-        "inference": "packed",
-    }  # "auto" keeps the times it measured
+    load_dataset("beam-tiny", LIMIT, cache=cache)
+    knobs = {**NETWORK, "iterations": 300}
     out, checkpoint = tmp_path / "model.safetensors", tmp_path / "kept"
-    options = [
-        "--limit",
-        str(LIMIT),
-        "--cache",
-        str(cache),
-        "--threads",
-        "1",
-        "--out",
-        str(out),
-        "--checkpoint",
-        str(checkpoint),
-    ]
-    often = "import mor_bench.learning.training as t; t.CHECKPOINT_EVERY_S = 0.0; from mor_bench.cli.app import app; app()"
-    command = [sys.executable, "-c", often, "fit", "beam-tiny", "-m", "umesh-small", *options]
-    command += [f"--set={name}={value}" for name, value in knobs.items()]
+    code = (
+        "import tests.small_runs as t; t.checkpoint_always(); "
+        "from mor_bench.cli.app import app; app()"
+    )
+    options = [f"--limit={LIMIT}", f"--cache={cache}", "--threads=1", f"--out={out}"]
+    options += [f"--checkpoint={checkpoint}", *(f"--set={k}={v}" for k, v in knobs.items())]
 
     def iteration() -> int:
         if not checkpoint.exists():
@@ -155,54 +98,33 @@ def test_a_killed_training_of_u_mesh_goes_on_too(cache: Path, tmp_path: Path) ->
             return int(json.loads(file.metadata()["numbers"])["iteration"])
 
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", code, "fit", "beam-tiny", "-m", "umesh-small", *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as process:
         wait_for(lambda: iteration() > 60, process)
         process.kill()
         process.communicate()
     assert 60 < iteration() < 300
-    told: list[int] = []
-    listener = Listener(training=lambda done, total, loss: told.append(done))
-    arguments: dict[str, Any] = {"limit": LIMIT, "cache": cache, "threads": 1}
+    seen: list[int] = []
+    listener = Listener(training=lambda done, total, loss: seen.append(done))
+    kept = {"checkpoint": checkpoint, "listener": listener}
     with pytest.raises(InvalidInputError, match="the checkpoint of another training"):
-        mor_bench.fit(
-            "beam-tiny",
-            "umesh-small",
-            {**knobs, "seed": 1},
-            out=out,
-            checkpoint=checkpoint,
-            **arguments,
-        )
-    mor_bench.fit(
-        "beam-tiny",
-        "umesh-small",
-        knobs,
-        out=out,
-        checkpoint=checkpoint,
-        listener=listener,
-        **arguments,
-    )
-    assert told[0] >= 100
-    assert told[-1] == 300
-    whole = mor_bench.fit(
-        "beam-tiny", "umesh-small", knobs, out=tmp_path / "whole.safetensors", **arguments
-    )
+        fit_tiny("umesh-small", {**knobs, "seed": 1}, out, cache, **kept)
+    fit_tiny("umesh-small", knobs, out, cache, **kept)
+    assert seen[0] >= 100
+    assert seen[-1] == 300
+    whole = fit_tiny("umesh-small", knobs, tmp_path / "whole.safetensors", cache)
     assert out.read_bytes() == whole.out.read_bytes()
-    with pytest.raises(
-        InvalidInputError, match="must be a model with `channels` 2; got one with `channels` 1"
-    ):
-        mor_bench.fit(
-            "beam-tiny",
-            "umesh-small",
-            {**knobs, "channels": 2},
-            out=tmp_path / "b.safetensors",
-            start_from=out,
-            **arguments,
-        )
-    assert not (tmp_path / "b.safetensors").exists()
+    other = tmp_path / "b.safetensors"
+    with pytest.raises(InvalidInputError, match="model with `channels` 2; got one with"):
+        fit_tiny("umesh-small", {**knobs, "channels": 2}, other, cache, start_from=out)
+    assert not other.exists()
 
 
-def test_a_fit_that_is_stopped_after_its_training_goes_on_after_it(
+@pytest.mark.slow
+def test_a_fit_that_is_stopped_after_its_training_does_not_train_again(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("torch")
@@ -211,124 +133,85 @@ def test_a_fit_that_is_stopped_after_its_training_goes_on_after_it(
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    told: list[int] = []
-    listener = Listener(training=lambda done, total, loss: told.append(done))
-    arguments: dict[str, Any] = {"limit": LIMIT, "cache": cache, "threads": 1, "listener": listener}
-    knobs = {
-        "channels": 1,
-        "steps": 1,
-        "iterations": 60,
-        "batch_size": 4,
-        "inference": "packed",
-        "validation_fraction": 0.0,
-    }
+    seen: list[int] = []
+    listener = Listener(training=lambda done, total, loss: seen.append(done))
+    knobs = {**NETWORK, "iterations": 60, "validation_fraction": 0.0}
     out, checkpoint = tmp_path / "model.safetensors", tmp_path / ".model.safetensors.checkpoint"
-    for name in ("_choose_inference", "save"):
-        with monkeypatch.context() as patch:
-            patch.setattr(UMesh, name, stop)
-            with pytest.raises(KeyboardInterrupt):
-                mor_bench.fit("beam-tiny", "umesh-small", knobs, out=out, **arguments)
-        assert checkpoint.exists()
-    assert mor_bench.fit("beam-tiny", "umesh-small", knobs, out=out, **arguments).iterations == 60
-    assert told == [50, 60], "it trained once"
-    assert not checkpoint.exists()
-    whole = mor_bench.fit(
-        "beam-tiny", "umesh-small", knobs, out=tmp_path / "whole.safetensors", **arguments
-    )
+    with monkeypatch.context() as patch:
+        patch.setattr(UMesh, "save", stop)
+        with pytest.raises(KeyboardInterrupt):
+            fit_tiny("umesh-small", knobs, out, cache, listener=listener)
+    assert checkpoint.exists()
+    fitted = fit_tiny("umesh-small", knobs, out, cache, listener=listener)
+    assert fitted.iterations == 60
+    assert seen == [50, 60], "it trained once"
+    whole = fit_tiny("umesh-small", knobs, tmp_path / "whole.safetensors", cache)
     assert out.read_bytes() == whole.out.read_bytes()
     assert {item.name for item in tmp_path.iterdir()} == {"model.safetensors", "whole.safetensors"}
 
 
-def test_what_cannot_be_done_is_refused_before_anything_runs(tmp_path: Path) -> None:
-    path, cache = descent_file(tmp_path), tmp_path / "cache"
-    other = tmp_path / "other.safetensors"
-    mor_bench.load_method("linear-fem").fit(mor_bench.load_scene("beam-tiny"), None).save(other)
-    (tmp_path / "text").write_text("no model")
-    refused: list[tuple[str | Path, dict[str, Any], dict[str, Any], type[MorBenchError], str]] = [
-        (path, {"iteration": 3}, {}, SpecError, "unknown key `iteration`"),
-        (path, {"iterations": 0}, {}, SpecError, "iterations"),
-        ("linear-fem", {"seed": 1}, {}, SpecError, "unknown key `seed`"),
-        (
-            "linear-fem",
-            {},
-            {"device": "cuda"},
-            InvalidInputError,
-            "LinearFEM has no training that `device` could act on",
-        ),
-        (
-            "pod",
-            {},
-            {"fit_seconds": 3.0, "start_from": other},
-            InvalidInputError,
-            "no training that `fit_seconds`, `start_from` could act on",
-        ),
-        (path, {}, {"fit_seconds": 0.0}, InvalidInputError, "`fit_seconds` must be above 0; got 0"),
-        (
-            path,
-            {},
-            {"fit_seconds": float("nan")},
-            InvalidInputError,
-            "`fit_seconds` must be above 0",
-        ),
-        (path, {}, {"threads": 0}, InvalidInputError, "`threads` must be an integer in"),
-        (
-            path,
-            {},
-            {"device": "gpu"},
-            InvalidInputError,
-            "`device` must be one of auto, cpu, cuda; got 'gpu'",
-        ),
-        (
-            path,
-            {},
-            {"start_from": other},
-            InvalidInputError,
-            "`start_from` must be a model of class 'tests.third_party:Descent'; got",
-        ),
-        (
-            path,
-            {},
-            {"start_from": tmp_path / "text"},
-            MorBenchError,
-            "not a readable safetensors file",
-        ),
-        (
-            path,
-            {},
-            {"out": tmp_path / "nowhere" / "a.safetensors"},
-            InvalidInputError,
-            "`out`: .* cannot be written: No such file",
-        ),
-        (path, {}, {"out": tmp_path}, InvalidInputError, "is a folder"),
-        (
-            path,
-            {},
-            {"checkpoint": tmp_path / "a.safetensors"},
-            InvalidInputError,
-            "`checkpoint` must be another file than `out`; got",
-        ),
-        (
-            path,
-            {},
-            {"checkpoint": tmp_path / "nowhere" / "c"},
-            InvalidInputError,
-            "`checkpoint`: .* cannot be written",
-        ),
-    ]
-    for method, knobs, options, kind, message in refused:
-        with pytest.raises(kind, match=message):
-            mor_bench.fit(
-                "beam-tiny",
-                method,
-                knobs,
-                **{"out": tmp_path / "a.safetensors", "cache": cache, **options},
-            )
-    assert not cache.exists()
-    assert {item.name for item in tmp_path.iterdir()} == {
-        "descent.toml",
-        "other.safetensors",
-        "text",
-    }
+Refusal = tuple[str, dict[str, Any], dict[str, Any], type[MorBenchError], str]
+INVALID = InvalidInputError
+REFUSED: list[Refusal] = [
+    ("descent", {"iteration": 3}, {}, SpecError, "unknown key `iteration`"),
+    ("descent", {"iterations": 0}, {}, SpecError, "iterations"),
+    ("linear-fem", {"seed": 1}, {}, SpecError, "unknown key `seed`"),
+    ("linear-fem", {}, {"device": "cuda"}, INVALID, "LinearFEM has no training that `device`"),
+    (
+        "pod",
+        {},
+        {"fit_seconds": 3.0, "start_from": "other.safetensors"},
+        INVALID,
+        "no training that `fit_seconds`, `start_from` could act on",
+    ),
+    ("descent", {}, {"fit_seconds": 0.0}, INVALID, "`fit_seconds` must be a number above 0; got 0"),
+    ("descent", {}, {"fit_seconds": float("nan")}, INVALID, "`fit_seconds` must be a number above"),
+    ("descent", {}, {"threads": 0}, INVALID, "`threads` must be an integer in"),
+    ("descent", {}, {"device": "gpu"}, INVALID, "`device` must be 'auto' or 'cpu' or 'cuda'; got"),
+    ("descent", {}, {"seeds": 3}, INVALID, "unknown option `seeds`"),
+    (
+        "descent",
+        {},
+        {"start_from": "other.safetensors"},
+        INVALID,
+        "`start_from` must be a model of class 'tests.third_party:Descent'; got",
+    ),
+    ("descent", {}, {"start_from": "text"}, MorBenchError, "not a readable safetensors file"),
+    ("descent", {}, {"out": "nowhere/a"}, INVALID, "`out`: .* cannot be written: No such file"),
+    ("descent", {}, {"out": "."}, INVALID, "is a folder"),
+    ("descent", {}, {"checkpoint": "a.safetensors"}, INVALID, "must be another file than `out`"),
+    ("descent", {}, {"checkpoint": "nowhere/c"}, INVALID, "`checkpoint`: .* cannot be written"),
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A method file, a model of another method, and a text."""
+    folder = tmp_path_factory.mktemp("refused")
+    descent_file(folder)
+    other = mor_bench.load_method("linear-fem").fit(mor_bench.load_scene("beam-tiny"), None)
+    other.save(folder / "other.safetensors")
+    (folder / "text").write_text("no model")
+    return folder
+
+
+@pytest.mark.parametrize(("method", "knobs", "options", "kind", "message"), REFUSED)
+def test_an_impossible_fit_is_refused_before_anything_runs(
+    method: str,
+    knobs: dict[str, Any],
+    options: dict[str, Any],
+    kind: type[MorBenchError],
+    message: str,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(folder)
+    before = set(folder.iterdir())
+    source = "descent.toml" if method == "descent" else method
+    given = {"out": "a.safetensors", "cache": "cache", **options}
+    with pytest.raises(kind, match=message):
+        mor_bench.fit("beam-tiny", source, knobs, **given)
+    assert set(folder.iterdir()) == before
 
 
 def test_cuda_is_refused_where_there_is_none(
@@ -336,40 +219,24 @@ def test_cuda_is_refused_where_there_is_none(
 ) -> None:
     torch = pytest.importorskip("torch")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(
-        InvalidInputError, match="`device` is 'cuda', but PyTorch finds no CUDA device here"
+    options: dict[str, Any] = {
+        "out": tmp_path / "out",
+        "device": "cuda",
+        "cache": tmp_path / "cache",
+    }
+    for attempt in (
+        partial(mor_bench.fit, "beam-tiny", "umesh-small"),
+        partial(mor_bench.run, ["beam-tiny"], ["linear-fem"]),
     ):
-        mor_bench.fit(
-            "beam-tiny",
-            "umesh-small",
-            out=tmp_path / "a.safetensors",
-            device="cuda",
-            cache=tmp_path / "cache",
-        )
-    with pytest.raises(
-        InvalidInputError, match="`device` is 'cuda', but PyTorch finds no CUDA device here"
-    ):
-        mor_bench.run(
-            ["beam-tiny"],
-            ["linear-fem"],
-            out=tmp_path / "out",
-            device="cuda",
-            cache=tmp_path / "cache",
-        )
+        with pytest.raises(INVALID, match="`device` is 'cuda', but PyTorch finds no CUDA device"):
+            attempt(**options)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_method_that_does_not_train_is_fitted_too_and_a_swept_knob_has_its_first_value(
+def test_a_swept_parameter_has_its_first_value_and_the_error_is_that_of_the_test_part(
     cache: Path, tmp_path: Path
 ) -> None:
-    fitted = mor_bench.fit(
-        "beam-tiny",
-        "pca-regression",
-        {"n_output_modes": 4},
-        out=tmp_path / "a.safetensors",
-        limit=LIMIT,
-        cache=cache,
-    )
+    fitted = fit_tiny("pca-regression", {"n_output_modes": 4}, tmp_path / "a.safetensors", cache)
     again = mor_bench.load_surrogate(fitted.out)
     assert again.parameters["n_input_modes"] == 5
     test = load_dataset("beam-tiny", LIMIT, cache=cache).test
@@ -378,58 +245,30 @@ def test_a_method_that_does_not_train_is_fitted_too_and_a_swept_knob_has_its_fir
     assert (fitted.n_train + fitted.n_test, fitted.iterations) == (LIMIT, None)
 
 
-class Unheeding(Descent):
-    """Trains as many iterations as its knob says, whatever the seconds."""
+class FixedLength(Descent):
+    """Trains for its own number of iterations, whatever the seconds."""
 
-    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Unheeding:
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> FixedLength:
         self.training = replace(self.training, fit_seconds=None)
         super().fit(scene, snapshots)
         del self.iterations_
         return self
 
 
-def test_seconds_that_were_not_heeded_are_told(cache: Path, tmp_path: Path) -> None:
-    path = tmp_path / "unheeding.toml"
-    path.write_text('title = "t"\nsource = "s"\nsurrogate = "tests.test_fit_command:Unheeding"\n')
-    with pytest.warns(
-        UserWarning,
-        match="Unheeding did not size its training to seconds: its knob `iterations` counted",
-    ):
-        fitted = mor_bench.fit(
-            "beam-tiny",
-            path,
-            out=tmp_path / "a.safetensors",
-            fit_seconds=5.0,
-            limit=LIMIT,
-            cache=cache,
-        )
+def test_a_method_that_ignores_the_seconds_is_reported(cache: Path, tmp_path: Path) -> None:
+    path = method_file(tmp_path, "fixed", "tests.test_fit_command:FixedLength")
+    with pytest.warns(UserWarning, match="FixedLength did not size its training to seconds"):
+        fitted = fit_tiny(path, {}, tmp_path / "a.safetensors", cache, fit_seconds=5.0)
     assert fitted.out.exists()
 
 
-def test_where_displacements_are_observed_the_error_is_that_of_answers_to_them(
+def test_a_method_that_is_given_displacements_is_scored_on_its_answers_to_them(
     cache: Path, tmp_path: Path
 ) -> None:
-    dataset = {
-        **load_generated_spec("beam-tiny").model_dump(mode="json"),
-        "observed": {"region": "z-max"},
-    }
-    fitted = mor_bench.fit(
-        dataset, "gappy-pod", out=tmp_path / "a.safetensors", limit=LIMIT, cache=cache
-    )
-    test = load_dataset(dataset, LIMIT, cache=cache).test
-    off = np.abs(fitted.method.predict(test.given.query) - test.displacements).mean(axis=(1, 2))
+    content = load_generated_spec("beam-tiny").model_dump(mode="json")
+    dataset = {**content, "observed": {"region": "z-max"}}
+    options: dict[str, Any] = {"limit": LIMIT, "cache": cache}
+    fitted = mor_bench.fit(dataset, "gappy-pod", out=tmp_path / "a.safetensors", **options)
+    test = load_dataset(dataset, **options).test
+    off = np.abs(fitted.method.predict(test.given) - test.displacements).mean(axis=(1, 2))
     assert fitted.error["mean_dof_m"] == pytest.approx(off.mean())
-
-
-def test_knobs_of_the_command_line() -> None:
-    given = ["n=3", "rate=1e-3", "schedule=one-cycle", 'name="3"', "on=true", "sizes=[1, 2]"]
-    assert parse_hyperparameters(given) == {
-        "n": 3,
-        "rate": 1e-3,
-        "schedule": "one-cycle",
-        "name": "3",
-        "on": True,
-        "sizes": [1, 2],
-    }
-    with pytest.raises(InvalidInputError, match="`--set` takes PARAMETER=VALUE; got 'n'"):
-        parse_hyperparameters(["n"])

@@ -1,443 +1,332 @@
-"""Metrics against hand-made numbers, the frontier's rules, and a whole comparison."""
+"""Comparisons from end to end: rows, errors, resuming, and what one method can do to another."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
 
 import mor_bench
-from mor_bench.analysis.frontier import Point, compare, error_at_time, non_dominated, time_at_error
+from mor_bench.analysis.frontier import compare
 from mor_bench.errors import InvalidInputError, SpecError, StoreError
-from mor_bench.machine import pinned_threads
-from mor_bench.measure import latency as clock
-from mor_bench.measure.error_metrics import sample_errors, summary
-from mor_bench.measure.latency import LEAST_QUERIES, MOST_TURN_S
 from mor_bench.results.comparison import Comparison
+from mor_bench.results.row import ErrorSummary, Latency, Row
 from mor_bench.runs.listener import Listener
 from mor_bench.snapshots.generate import generation_seconds
 from mor_bench.specs import list_suite, load_generated_spec
+from tests.small_runs import LIMIT, Heard, method_file, run_small
+
+GUIDE = Path(__file__).parents[1] / "docs" / "comparison.md"
 
 
-def test_metrics_by_hand() -> None:
-    reference = np.zeros((2, 2, 3))
-    reference[:, 1] = [[3.0, 0.0, 4.0], [0.0, 0.0, 10.0]]
-    predicted = reference.copy()
-    predicted[0, 1] += [0.0, 3.0, 4.0]
-    predicted[1, 0] += [0.0, 0.0, -1.0]
-    errors = sample_errors(predicted, reference)
-    np.testing.assert_allclose(errors.mean_dof_m, [7 / 6, 1 / 6])
-    np.testing.assert_allclose(errors.relative_l2, [1.0, 0.1])
-    np.testing.assert_allclose(errors.max_nodal_m, [5.0, 1.0])
-    np.testing.assert_allclose(errors.amplitude_m, [5.0, 10.0])
-    row = summary(errors)
-    assert row["mean_dof_m"] == pytest.approx(4 / 6)
-    assert row["std_dof_m"] == pytest.approx(math.sqrt(2 * 0.5**2))
-    assert row["max_dof_m"] == pytest.approx(7 / 6)
-    assert row["rel_l2_median"] == pytest.approx(0.55)
-    assert row["rel_l2_p95"] == row["rel_l2_max"] == pytest.approx(1.0)
-    assert row["slope"] == pytest.approx((5 * 7 / 6 + 10 / 6) / 125)
+def row_of(comparison: Comparison, label: str) -> Row:
+    return comparison.row("beam-tiny", label)
 
 
-def test_a_missing_prediction_is_an_infinite_error() -> None:
-    reference = np.ones((30, 4, 3))
-    predicted = reference.copy()
-    predicted[7, 2, 1] = np.nan
-    row = summary(sample_errors(predicted, reference))
-    assert (
-        row["mean_dof_m"] == row["max_dof_m"] == row["rel_l2_max"] == row["std_dof_m"] == math.inf
+def test_every_configuration_has_a_row_and_a_broken_one_its_reason(small_run: Comparison) -> None:
+    assert [row.label for row in small_run.rows] == [
+        "linear-fem",
+        "pod-swept [n_modes=3]",
+        "pod-swept [n_modes=20]",
+        *(f"broken-{how}" for how in ("crash", "shape", "nan", "sometimes")),
+    ]
+    crash, shape, nan, sometimes = small_run.rows[-4:]
+    assert (crash.status, shape.status) == ("failed", "failed")
+    assert crash.reason == "crashed with ZeroDivisionError: on purpose"
+    assert "must return floats of shape" in str(shape.reason)
+    for row in (nan, sometimes):  # a load without an answer costs an infinite error, no more
+        assert row.ok
+        assert 0 < (row.n_failed or 0) < row.n_test
+        assert row.error is not None
+        assert row.error.mean_dof_m == row.error.rel_l2_max == math.inf
+        assert row.latency_ms is not None
+    assert sometimes.throughput is not None
+    assert sometimes.throughput["64"] is None
+
+
+def test_a_row_holds_every_figure(small_run: Comparison, cache: Path) -> None:
+    row = row_of(small_run, "pod-swept [n_modes=3]")
+    assert (row.n_train + row.n_test, row.threads, row.split) == (LIMIT, 1, "region")
+    assert row.swept == {"n_modes": 3}
+    assert row.error is not None
+    assert row.error.model_fields_set == ErrorSummary.model_fields.keys() - {"rel_l2_median_high"}
+    assert row.latency_ms is not None
+    assert row.latency_ms.model_fields_set == Latency.model_fields.keys()
+    assert 0 < (row.latency_ms.low or 0) <= row.latency_ms.median <= (row.latency_ms.high or 0)
+    assert row.all_threads_ms is not None
+    assert row.all_threads_ms.median > 0
+    assert row.throughput is not None
+    assert set(row.throughput) == {"8", "64", "512"}
+    assert row.memory_bytes is not None
+    assert min(row.memory_bytes.fit, row.memory_bytes.predict or 0) > 5e7
+    assert row.cost is not None
+    assert row.cost["element_evaluations"] >= 24
+    assert row.offline_s is not None
+    assert row.offline_s.fit > 0
+    assert (row.model_bytes or 0) > 8 * 3 * 162
+    assert row.offline_s.data == generation_seconds(
+        load_generated_spec("beam-tiny"), cache, row.n_train
     )
-    assert row["rel_l2_median"] == 0.0
+    linear = row_of(small_run, "linear-fem").offline_s
+    assert linear is not None
+    assert linear.data == 0.0  # it does not learn from data
 
 
-POINTS = [
-    Point(1.0, 0.1, "a"),
-    Point(10.0, 0.01, "b"),
-    Point(5.0, 0.2, "dominated"),
-    Point(100.0, 0.001, "c"),
-    Point(0.5, math.inf, "failed"),
+def test_the_raw_samples_give_the_figures_of_the_row(small_run: Comparison) -> None:
+    row = row_of(small_run, "pod-swept [n_modes=3]")
+    assert row.error is not None
+    samples = small_run.samples(row)
+    assert len(samples["latency_ms"]) == len(samples["process"]) == len(samples["round"])
+    assert set(samples["process"]) == {0, 1}
+    assert samples["mean_dof_m"].mean() == pytest.approx(row.error.mean_dof_m)
+    worst = np.abs(samples["worst_prediction"] - samples["worst_reference"]).mean()
+    assert worst == pytest.approx(row.error.max_dof_m)
+
+
+def test_errors_estimated_from_the_residual_agree_with_measured_ones(small_run: Comparison) -> None:
+    errors = []
+    for n_modes in (3, 20):
+        row = row_of(small_run, f"pod-swept [n_modes={n_modes}]")
+        assert row.indicator is not None
+        assert 0.8 < row.indicator.ratio_median < 1.25
+        assert row.indicator.rank_correlation > 0.8
+        assert row.error is not None
+        errors.append(row.error.mean_dof_m)
+    assert errors[0] > errors[1]
+
+
+def test_results_of_a_run_read_back_as_they_were(small_run: Comparison) -> None:
+    again = Comparison.read(small_run.out)
+    assert again.rows == small_run.rows
+    assert compare(again.rows) == compare(small_run.rows)
+    assert len(again.table) == len(again.rows)
+    text = (small_run.out / "results.json").read_text()
+    json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert (small_run.out / "comparison.json").exists()
+
+
+def test_a_listener_is_told_of_every_row(small_run: Comparison, heard: Heard) -> None:
+    label = "pod-swept [n_modes=3]"
+    mine = [event for event in heard.events if label in event]
+    assert mine == [f"start 2/7 {label}", f"fitted {label} None", f"timed {label} True"]
+
+
+BAD: list[tuple[dict[str, Any], str]] = [
+    ({"profile": "fast"}, "`profile` must be 'quick' or 'full'; got 'fast'"),
+    ({"threads": 0}, r"`threads` must be an integer in \[1, "),
+    ({"threads": 10_000}, r"`threads` must be an integer in \[1, "),
+    ({"jobs": 0}, "`jobs` must be an integer"),
+    ({"seeds": 0}, r"`seeds` must be an integer in \[1, 100\]; got 0"),
+    ({"device": "gpu"}, "`device` must be 'auto' or 'cpu' or 'cuda'; got 'gpu'"),
+    ({"fit_seconds": -1.0}, "`fit_seconds` must be a number above 0; got -1.0"),
+    ({"fit_seconds": 60.0, "time_limit_s": 50.0}, "`fit_seconds` must be below the 50 s"),
+    ({"time_limit_s": 0.0}, "`time_limit_s` must be a number above 0"),
+    ({"memory_limit_bytes": 1.0}, "`memory_limit_bytes` must be a number of at least 1e"),
+    ({"test_seed": 0}, "`test_seed` must differ from the seed of beam-tiny"),
+    ({"sed": 3}, "unknown option `sed`; did you mean 'seeds'?"),
+    ({"methods": []}, "must name at least one each"),
+    ({"datasets": []}, "must name at least one each"),
+    ({"datasets": ["beam-tiny"] * 2}, "two datasets are called 'beam-tiny'"),
 ]
 
 
-def test_frontier_interpolates_in_log_log_and_never_extrapolates() -> None:
-    assert [p.label for p in non_dominated(POINTS)] == ["a", "b", "c"]
-    middle = time_at_error(POINTS, math.sqrt(0.1 * 0.01))
-    assert middle["latency_ms"] == pytest.approx(math.sqrt(10.0))
-    assert middle["best"] == {"label": "b", "latency_ms": 10.0, "error": 0.01}
-    assert time_at_error(POINTS, 0.5)["latency_ms"] == 1.0
-    assert time_at_error(POINTS, 0.0005) == {"latency_ms": None, "best": None}
-    assert error_at_time(POINTS, 0.7) == {"error": None, "best": None}
-    assert error_at_time(POINTS, math.sqrt(10.0))["error"] == pytest.approx(math.sqrt(0.1 * 0.01))
-    assert error_at_time(POINTS, math.sqrt(10.0))["best"]["label"] == "a"
-    assert error_at_time(POINTS, 1e6)["error"] == 0.001
-
-
-@example([(1.0, 1.0000000000000002e-06), (2.0, 1e-06)], 1e-06, 1.0)
-@given(
-    st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-6, 1.0)), min_size=1, max_size=12),
-    st.floats(1e-6, 1.0),
-    st.floats(1e-3, 1e3),
-)
-def test_frontier_stays_between_its_points(
-    points: list[tuple[float, float]], error: float, time: float
+@pytest.mark.parametrize(("bad", "message"), BAD)
+def test_a_bad_option_is_refused_before_anything_runs(
+    bad: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
-    cloud = [Point(t, e, str(i)) for i, (t, e) in enumerate(points)]
-    front = non_dominated(cloud)
-    assert all(
-        any(q.latency_ms <= p.latency_ms and q.error <= p.error for q in front) for p in cloud
-    )
-    at_error = time_at_error(cloud, error)
-    if at_error["best"] is None:
-        assert min(p.error for p in cloud) > error
-    else:
-        assert (
-            front[0].latency_ms * (1 - 1e-9)
-            <= at_error["latency_ms"]
-            <= at_error["best"]["latency_ms"] * (1 + 1e-9)
-        )
-    at_time = error_at_time(cloud, time)
-    if at_time["best"] is None:
-        assert min(p.latency_ms for p in cloud) > time
-    else:
-        assert (
-            front[-1].error * (1 - 1e-9)
-            <= at_time["error"]
-            <= at_time["best"]["error"] * (1 + 1e-9)
-        )
+    out = tmp_path / "out"
+    with pytest.raises(InvalidInputError, match=message):
+        mor_bench.run(**{"datasets": ["beam-tiny"], "methods": ["fem"], "out": out, **bad})
+    assert not out.exists()
 
 
-def test_threads_are_pinned_and_given_back() -> None:
-    from threadpoolctl import threadpool_info
-
-    before = [pool["num_threads"] for pool in threadpool_info()]
-    with pinned_threads(1):
-        assert {pool["num_threads"] for pool in threadpool_info()} == {1}
-    assert [pool["num_threads"] for pool in threadpool_info()] == before
-
-
-@pytest.mark.parametrize("spoil", ["test", "train", "exit"])
-def test_a_method_trains_on_the_training_set_and_spoils_only_its_own_row(
-    spoil: str, cache: Path, tmp_path: Path
-) -> None:
-    path, notes = tmp_path / "recorder.toml", tmp_path / "notes.json"
-    knobs = f'spoil = "{spoil}"\nnotes = "{notes.as_posix()}"'
-    path.write_text(
-        f'title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Recorder"\n[parameters]\n{knobs}'
-    )
-    comparison = mor_bench.run(
-        ["beam-tiny"], [path, "linear-fem"], out=tmp_path / "out", cache=cache
-    )
-    alone = mor_bench.run(
-        ["beam-tiny"], ["linear-fem"], out=tmp_path / "alone", cache=tmp_path / "another"
-    )
-    assert comparison.rows[0]["status"] == ("ok" if spoil == "test" else "failed"), comparison.rows[
-        0
-    ]["reason"]
-    assert comparison.rows[1]["error"] == alone.rows[0]["error"]
-    data = mor_bench.load_dataset("beam-tiny", cache=cache)
-    seen = json.loads(notes.read_text())
-    np.testing.assert_array_equal(seen["vectors"], data.train.loads.vectors)
-    assert not set(seen["regions"]) & set(data.test.regions)
-
-
-def test_data_costs_what_its_generation_took_and_only_those_who_learn_from_it(
+def test_method_files_and_the_folder_are_checked_before_anything_runs(
     cache: Path, tmp_path: Path
 ) -> None:
-    comparison = mor_bench.run(
-        ["beam-tiny"], ["linear-fem", "pca-regression"], out=tmp_path / "out", cache=cache
-    )
-    seconds = generation_seconds(load_generated_spec("beam-tiny"), cache, 170)
-    assert seconds is not None
-    assert [row["offline_s"]["data"] for row in comparison.rows] == [0.0, seconds, seconds, seconds]
-
-
-def test_a_stopped_run_goes_on_and_another_run_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        clock, "SAME_SPEED", float("inf")
-    )  # timings of a machine that is busy otherwise hold no longer
-
-    class StopError(Exception):
-        pass
-
-    def stop(row: dict[str, Any]) -> None:
-        if row["label"] == "pod [n_modes=3]":
-            raise StopError
-
-    out, cache = tmp_path / "out", tmp_path / "cache"
-    arguments: dict[str, Any] = {
-        "datasets": ["beam-tiny"],
-        "methods": ["linear-fem", "pod"],
-        "out": out,
-        "cache": cache,
-    }
-    with pytest.raises(StopError):
-        mor_bench.run(**arguments, listener=Listener(fitted=stop))
-    begun = Comparison.read(out).rows
-    assert [row["label"] for row in begun] == ["linear-fem", "pod [n_modes=1]", "pod [n_modes=3]"]
-    fits = {path: path.stat().st_mtime_ns for path in (cache / "fits").glob("*/fit.json")}
-    assert len(fits) == 8  # all of a method are fitted before the first of them is scored
-    whole = mor_bench.run(**arguments)
-    assert len(whole.rows) == 8
-    assert all(path.stat().st_mtime_ns == changed for path, changed in fits.items())
-    assert [row["error"] for row in whole.rows[:3]] == [row["error"] for row in begun]
-    timed = [row["latency_ms"] for row in whole.rows]
-    assert [row["latency_ms"] for row in mor_bench.run(**arguments).rows] == timed
-    with pytest.raises(InvalidInputError, match="holds a run with other settings"):
-        mor_bench.run(**{**arguments, "split": "sample"})
-    assert len(Comparison.read(out).rows) == 8
-
-
-def test_everything_is_checked_before_anything_runs(cache: Path, tmp_path: Path) -> None:
-    mine = tmp_path / "pod.toml"
-    mine.write_text(
-        'title = "t"\nsource = "s"\nsurrogate = "mor_bench.surrogates.pod:PODGalerkin"\n[parameters]\nn_mode = 3'
-    )
+    mine = method_file(tmp_path, "pod", "mor_bench.surrogates.pod:PODGalerkin", n_mode=3)
     out = tmp_path / "out"
     with pytest.raises(SpecError, match="unknown key `n_mode`"):
         mor_bench.run(["beam-tiny"], ["fem", mine], out=out, cache=cache)
     with pytest.raises(InvalidInputError, match="two methods are called 'pod'"):
         mor_bench.run(["beam-tiny"], ["pod", mine], out=out, cache=cache)
-    with pytest.raises(InvalidInputError, match="two datasets are called 'beam-tiny'"):
-        mor_bench.run(["beam-tiny", "beam-tiny"], ["fem"], out=out, cache=cache)
+    with pytest.raises(SpecError, match="unknown method 'pood'"):
+        mor_bench.run(["beam-tiny"], ["fem", "pood"], out=out)
     assert not out.exists()
     out.write_text("a file")
     with pytest.raises(InvalidInputError, match=r"`out`: .* cannot be written"):
         mor_bench.run(["beam-tiny"], ["fem"], out=out, cache=cache)
 
 
-@pytest.fixture(scope="module")
-def comparison(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Comparison:
-    folder = tmp_path_factory.mktemp("methods")
-    methods: list[str | Path] = ["fem", "pod"]
-    for how in ("crash", "shape", "nan"):
-        path = folder / f"broken-{how}.toml"
-        path.write_text(
-            f'title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Broken"\n[parameters]\nhow = "{how}"'
-        )
-        methods.append(path)
-    return mor_bench.run(
-        ["beam-tiny"], methods, out=tmp_path_factory.mktemp("out") / "run", cache=cache, threads=1
-    )
-
-
-def test_every_configuration_has_a_row(comparison: Comparison) -> None:
-    assert [row["label"] for row in comparison.rows] == [
-        *(f"fem [tolerance={t}]" for t in (0.1, 0.01, 0.0001, 1e-08)),
-        *(f"pod [n_modes={r}]" for r in (1, 3, 5, 10, 20, 40, 80)),
-        "broken-crash",
-        "broken-shape",
-        "broken-nan",
-    ]
-    crash, shape, nan = comparison.rows[-3:]
-    assert crash["status"] == shape["status"] == "failed"
-    assert crash["reason"] == "crashed with ZeroDivisionError: on purpose"
-    assert "must return floats of shape" in shape["reason"]
-    assert nan["status"] == "ok"
-    assert 0 < nan["n_failed"] < nan["n_test"]
-    assert nan["error"]["mean_dof_m"] == math.inf
-
-
-def test_rows_hold_what_the_schema_promises(comparison: Comparison) -> None:
-    row = comparison.rows[5]
-    assert row["status"] == "ok"
-    assert (row["dataset"], row["method"], row["parameters"]["n_modes"]) == ("beam-tiny", "pod", 3)
-    assert (row["n_train"], row["n_test"], row["threads"], row["split"]) == (170, 40, 1, "region")
-    assert set(row["error"]) == {
-        "mean_dof_m",
-        "std_dof_m",
-        "max_dof_m",
-        "rel_l2_median",
-        "rel_l2_p95",
-        "rel_l2_max",
-        "max_nodal_m",
-        "slope",
-    }
-    assert set(row["latency_ms"]) == {
-        "median",
-        "p95",
-        "p99",
-        "low",
-        "high",
-        "gc",
-        "n_queries",
-        "n_processes",
-        "stable",
-        "unstable_because",
-    }
-    assert 0 < row["latency_ms"]["low"] <= row["latency_ms"]["median"] <= row["latency_ms"]["high"]
-    assert row["all_threads_ms"]["median"] > 0
-    assert set(row["throughput"]) == {"8", "64", "512"}
-    assert min(row["memory_bytes"].values()) > 5e7
-    assert row["cost"]["element_evaluations"] >= 24
-    assert row["offline_s"]["fit"] > 0
-    assert row["offline_s"]["data"] > 0
-    assert row["model_bytes"] > 8 * 3 * 162
-    samples = comparison.samples(row)
-    assert len(samples["latency_ms"]) == len(samples["process"]) == len(samples["round"])
-    assert len(samples["latency_ms"]) >= LEAST_QUERIES or samples["used"][:, 0].max() > MOST_TURN_S
-    assert set(samples["process"]) == {0, 1}
-    assert samples["mean_dof_m"].mean() == pytest.approx(row["error"]["mean_dof_m"])
-    worst = np.abs(samples["worst_prediction"] - samples["worst_reference"]).mean()
-    assert worst == pytest.approx(row["error"]["max_dof_m"])
-    assert len(comparison.table) == len(comparison.rows)
-
-
-def test_more_modes_are_more_accurate(comparison: Comparison) -> None:
-    pods = [row["error"]["mean_dof_m"] for row in comparison.rows if row["method"] == "pod"]
-    assert pods == sorted(pods, reverse=True)
-
-
-def test_it_reads_back_as_it_was(comparison: Comparison) -> None:
-    again = Comparison.read(comparison.out)
-    assert again.rows == json.loads(json.dumps(comparison.rows))
-    assert compare(again.rows) == compare(comparison.rows)
-    text = (comparison.out / "results.json").read_text()
-    json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
-    reached = {
-        (row["method"], row["target_rel_l2_median"]): row["best"]
-        for row in compare(comparison.rows)["time_at_error"]
-    }
-    assert reached["fem", 0.001] is not None
-    assert reached["broken-crash", 0.1] is None
-
-
-def test_the_same_run_gives_the_same_errors_to_the_last_digit(
-    comparison: Comparison, cache: Path, tmp_path: Path
-) -> None:
-    again = mor_bench.run(
-        ["beam-tiny"], ["fem", "pod"], out=tmp_path / "again", cache=cache, threads=1
-    )
-    assert [row["error"] for row in again.rows] == [row["error"] for row in comparison.rows[:11]]
-
-
-def test_listener_hears_of_every_row(cache: Path, tmp_path: Path) -> None:
-    heard: list[str] = []
-    listener = Listener(
-        starting=lambda dataset, label, number, total: heard.append(f"{number}/{total} {label}"),
-        fitted=lambda row: heard.append(f"{row['status']} {row['latency_ms']}"),
-        finished=lambda row: heard.append("timed" if row["latency_ms"] else "not"),
-    )
-    mor_bench.run(
-        ["beam-tiny"], ["linear-fem"], out=tmp_path / "out", cache=cache, listener=listener
-    )
-    assert heard == ["1/1 linear-fem", "ok None", "timed"]
-
-
-def test_bad_arguments_are_refused_before_anything_runs(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    arguments: list[dict[str, Any]] = [
-        {"profile": "fast"},
-        {"threads": 0},
-        {"threads": 10_000},
-        {"jobs": 0},
-        {"time_limit_s": 0.0},
-        {"memory_limit_bytes": 1.0},
-        {"test_seed": 0},
-        {"methods": []},
-        {"datasets": []},
-    ]
-    for bad in arguments:
-        with pytest.raises(InvalidInputError):
-            mor_bench.run(**{"datasets": ["beam-tiny"], "methods": ["fem"], "out": out, **bad})
-    with pytest.raises(SpecError):
-        mor_bench.run(["beam-tiny"], ["fem", "pood"], out=out)
-    assert not out.exists()
-
-
-def test_reading_a_folder_that_is_no_run(tmp_path: Path) -> None:
+def test_a_folder_that_holds_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="no such file"):
         Comparison.read(tmp_path)
-    (tmp_path / "results.json").write_text("{}")
-    with pytest.raises(StoreError, match="not a results file"):
-        Comparison.read(tmp_path)
-    (tmp_path / "results.json").write_text('{"schema_version": 99}')
-    with pytest.raises(StoreError, match="schema version 99"):
-        Comparison.read(tmp_path)
+    for text, message in (("{}", "not a results file"), ('{"schema_version": 99}', "version 99")):
+        (tmp_path / "results.json").write_text(text)
+        with pytest.raises(StoreError, match=message):
+            Comparison.read(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_method_spoils_only_its_own_row_and_other_errors_keep_every_digit(
+    small_run: Comparison, tmp_path: Path
+) -> None:
+    recorders = [
+        method_file(
+            tmp_path,
+            f"recorder-{spoil}",
+            "tests.third_party:Recorder",
+            spoil=spoil,
+            notes=str(tmp_path / f"{spoil}.json"),
+        )
+        for spoil in ("test", "train", "exit")
+    ]
+    cache = tmp_path / "cache"
+    found = run_small([*recorders, "linear-fem"], tmp_path / "out", cache)
+    assert [row.status for row in found.rows] == ["ok", "failed", "failed", "ok"]
+    assert found.rows[-1].error == row_of(small_run, "linear-fem").error
+    data = mor_bench.load_dataset("beam-tiny", LIMIT, cache=cache)
+    for spoil in ("test", "train", "exit"):
+        seen = json.loads((tmp_path / f"{spoil}.json").read_text())
+        np.testing.assert_array_equal(seen["vectors"], data.train.loads.vectors)
+        assert not set(seen["regions"]) & set(data.test.regions)
+
+
+@pytest.mark.slow
+def test_a_stopped_run_resumes_and_another_run_is_refused(tmp_path: Path) -> None:
+    class StopError(Exception):
+        pass
+
+    def stop(row: Row) -> None:
+        if row.label == "pod [n_modes=3]":
+            raise StopError
+
+    out, cache = tmp_path / "out", tmp_path / "cache"
+    pod = method_file(
+        tmp_path, "pod", "mor_bench.surrogates.pod:PODGalerkin", sweep={"n_modes": [1, 3, 5]}
+    )
+    methods: list[str | Path] = ["linear-fem", pod]
+    with pytest.raises(StopError):
+        run_small(methods, out, cache, listener=Listener(fitted=stop))
+    begun = Comparison.read(out).rows
+    assert [row.label for row in begun] == ["linear-fem", "pod [n_modes=1]", "pod [n_modes=3]"]
+    fits = {path: path.stat().st_mtime_ns for path in (cache / "fits").glob("*/fit.json")}
+    assert len(fits) == 4  # all fits of a method come before its first score
+    whole = run_small(methods, out, cache).rows
+    assert len(whole) == 4
+    assert all(path.stat().st_mtime_ns == changed for path, changed in fits.items())
+    assert [row.error for row in whole[:3]] == [row.error for row in begun]
+    again = run_small(methods, out, cache).rows
+    assert [row.latency_ms for row in again] == [row.latency_ms for row in whole]
+    with pytest.raises(InvalidInputError, match="holds a run with other settings"):
+        run_small(methods, out, cache, split="sample")
+    assert len(Comparison.read(out).rows) == 4
 
 
 @pytest.fixture(scope="module")
 def tip_only(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """beam-tiny, of which only the tip's displacements are wanted."""
     path = tmp_path_factory.mktemp("datasets") / "tip.toml"
-    path.write_text(
-        list_suite("datasets")["beam-tiny"]
-        .read_text()
-        .replace('outputs    = "all"', 'outputs = "x-max"')
-    )
+    text = list_suite("datasets")["beam-tiny"].read_text()
+    path.write_text(text.replace('outputs    = "all"', 'outputs = "x-max"'))
     return path
-
-
-def test_errors_count_the_wanted_nodes_alone(tip_only: Path, cache: Path, tmp_path: Path) -> None:
-    comparison = mor_bench.run(
-        [tip_only],
-        ["fem", "pod-tensor"],
-        out=tmp_path / "run",
-        cache=cache,
-        threads=1,
-        profile="quick",
-    )
-    data = mor_bench.load_dataset(tip_only, cache=cache)
-    tip = data.scene.output_nodes
-    assert (data.scene.mesh.points[tip, 0] == data.scene.mesh.points[:, 0].max()).all()
-    row = next(row for row in comparison.rows if row["label"] == "pod-tensor [n_modes=10]")
-    method = mor_bench.load_method("pod-tensor", n_modes=10).fit(data.scene, data.train)
-    predicted, reference = method.predict(data.test.forces), data.test.displacements
-    assert np.isnan(np.delete(predicted, tip, axis=1)).all()
-    errors = np.abs(predicted[:, tip] - reference[:, tip]).mean(axis=(1, 2))
-    assert row["error"]["mean_dof_m"] == pytest.approx(errors.mean(), rel=1e-6)
-    assert row["indicator"] is None
-    hybrid = (
-        mor_bench.load_method("hybrid", steps=2)
-        .fit(data.scene, data.train)
-        .predict(data.test.forces[:3])
-    )
-    assert np.isfinite(hybrid).all()
-
-
-def test_indicated_errors_stand_in_the_row(cache: Path, tmp_path: Path) -> None:
-    comparison = mor_bench.run(
-        ["beam-tiny"], ["fem", "pod-tensor"], out=tmp_path / "run", cache=cache, threads=1
-    )
-    for row in comparison.rows:
-        if row["method"] == "pod-tensor":
-            assert row["indicator"]["n"] > 30
-            assert 0.8 < row["indicator"]["ratio_median"] < 1.25
-            assert row["indicator"]["rank_correlation"] > 0.8
-    assert comparison.rows[3]["label"] == "fem [tolerance=1e-08]"
-    assert comparison.rows[3]["indicator"] is None
 
 
 def test_a_region_of_outputs_without_nodes_is_an_error_of_the_dataset(
     tip_only: Path, tmp_path: Path
 ) -> None:
-    path = tmp_path / "none.toml"
-    path.write_text(
-        tip_only.read_text().replace(
-            '"x-max"\nerror', "{ sphere_m = [[90.0, 0.0, 0.0], 1.0] }\nerror"
-        )
-    )
+    path, nowhere = tmp_path / "none.toml", "{ sphere_m = [[90.0, 0.0, 0.0], 1.0] }\nerror"
+    path.write_text(tip_only.read_text().replace('"x-max"\nerror', nowhere))
     with pytest.raises(SpecError, match="holds no node"):
         mor_bench.load_scene(path)
 
 
-def test_a_method_without_an_answer_to_some_loads_is_timed_on_all(
-    cache: Path, tmp_path: Path
+@pytest.mark.slow
+def test_errors_count_the_wanted_nodes_alone(tip_only: Path, cache: Path, tmp_path: Path) -> None:
+    tensor = "mor_bench.surrogates.pod_tensor:PODTensor"
+    path = method_file(tmp_path, "tensor", tensor, n_modes=10)
+    comparison = mor_bench.run([tip_only], [path], out=tmp_path / "run", cache=cache, limit=LIMIT)
+    data = mor_bench.load_dataset(tip_only, LIMIT, cache=cache)
+    tip = data.scene.output_nodes
+    assert (data.scene.mesh.points[tip, 0] == data.scene.mesh.points[:, 0].max()).all()
+    method = mor_bench.load_method("pod-tensor", n_modes=10).fit(data.scene, data.train)
+    predicted, reference = method.predict(data.test.forces), data.test.displacements
+    assert np.isnan(np.delete(predicted, tip, axis=1)).all()
+    errors = np.abs(predicted[:, tip] - reference[:, tip]).mean(axis=(1, 2))
+    row = comparison.rows[0]
+    assert row.error is not None
+    assert row.error.mean_dof_m == pytest.approx(errors.mean(), rel=1e-6)
+    assert row.indicator is None
+    hybrid = mor_bench.load_method("hybrid", steps=2).fit(data.scene, data.train)
+    assert np.isfinite(hybrid.predict(data.test.forces[:3])).all()
+
+
+def test_the_method_of_the_comparison_guide_competes(cache: Path, tmp_path: Path) -> None:
+    guide = GUIDE.read_text(encoding="utf-8")
+    (script,) = re.findall(r"```python\n# my_method.py\n(.*?)```", guide, re.DOTALL)
+    (text,) = re.findall(r"```toml\n# mean.toml\n(.*?)```", guide, re.DOTALL)
+    (tmp_path / "my_method.py").write_text(script, encoding="utf-8")
+    (tmp_path / "mean.toml").write_text(text, encoding="utf-8")
+    comparison = run_small([tmp_path / "mean.toml"], tmp_path / "out", cache)
+    labels = [(row.label, row.status) for row in comparison.rows]
+    assert labels == [("mean [power=0.5]", "ok"), ("mean [power=1.0]", "ok")]
+    assert (comparison.rows[0].model_bytes or 0) > 1000
+    assert comparison.rows[0].error is not None
+    assert comparison.rows[0].error.rel_l2_median > 0.3
+
+
+def check_same_errors(rows: list[Row], others: list[Row]) -> None:
+    for row, other in zip(rows, others, strict=True):
+        assert other.label == row.label
+        assert row.error is not None
+        assert other.error is not None
+        expected = pytest.approx(row.error.rel_l2_median, rel=1e-9)
+        assert other.error.rel_l2_median == expected
+        assert other.latency_ms is not None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two cores")
+def test_several_fits_at_once_give_the_same_errors(
+    small_run: Comparison, cache: Path, tmp_path: Path
 ) -> None:
-    path = tmp_path / "sometimes.toml"
-    path.write_text(
-        'title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Broken"\n[parameters]\nhow = "sometimes"'
-    )
-    row = mor_bench.run(["beam-tiny"], [path], out=tmp_path / "run", cache=cache, threads=1).rows[0]
-    assert row["status"] == "ok"
-    assert 0 < row["n_failed"] < row["n_test"]
-    assert row["error"]["rel_l2_max"] == math.inf
-    assert row["latency_ms"]["median"] > 0
-    assert row["throughput"]["64"] is None
+    methods: list[str | Path] = ["linear-fem", "pca-regression-force"]
+    one = run_small(methods, tmp_path / "one", cache).rows
+    two = run_small(methods, tmp_path / "two", tmp_path / "cache", jobs=2).rows
+    check_same_errors(one, two)
+
+
+@pytest.mark.slow
+def test_a_cluster_fits_and_this_machine_times(tmp_path: Path, cache: Path) -> None:
+    pytest.importorskip("distributed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address = f"tcp://127.0.0.1:{port}"
+    scheduler = ["scheduler", "--host", "127.0.0.1", "--port", str(port)]
+    worker = ["worker", address, "--nthreads", "1", "--nworkers", "1", "--no-nanny"]
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.dask_{name}", *options, "--no-dashboard"],
+            stderr=subprocess.DEVNULL,
+        )
+        for name, *options in (scheduler, worker)
+    ]
+    methods: list[str | Path] = ["linear-fem", "pca-regression-force"]
+    try:
+        time.sleep(1)
+        there = run_small(methods, tmp_path / "there", tmp_path / "cache", cluster=address).rows
+    finally:
+        for process in running[::-1]:
+            process.terminate()
+            process.wait()
+    check_same_errors(run_small(methods, tmp_path / "here", cache).rows, there)

@@ -1,4 +1,4 @@
-"""What a run says that it would do, and the digest of what a method's results depend on."""
+"""The dry run, and the digest of the code that a method's results depend on."""
 
 from __future__ import annotations
 
@@ -7,69 +7,87 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-import mor_bench
 from mor_bench.cli.app import app
+from mor_bench.results.comparison import Comparison
 from mor_bench.runs.code_digest import code_digest, imported_sources
 from mor_bench.runs.plan import plan
-from mor_bench.specs import MethodSpec
+from mor_bench.specs import list_suite, load_method_spec
+from tests.small_runs import LIMIT, method_file
 
 
-def test_nothing_is_computed_and_what_is_there_is_said(tmp_path: Path) -> None:
+def test_a_dry_run_computes_nothing_and_names_every_step(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
-    before = plan(["beam-tiny"], ["linear-fem", "pod"], cache=cache, limit=60)
+    planned = plan(["beam-tiny"], ["linear-fem", "pod"], cache=cache, limit=LIMIT)
     assert not cache.exists()
-    assert [step.done for step in before.steps] == [False] * 9
-    assert before.steps[0].label == "60 of 60 samples"
-    assert before.n_unknown == 0
-    assert before.seconds > before.timing_s > 0
-    mor_bench.run(["beam-tiny"], ["linear-fem"], cache=cache, limit=60, out=tmp_path / "out")
-    after = plan(["beam-tiny"], ["linear-fem", "pod"], cache=cache, limit=60)
-    assert [step.done for step in after.steps] == [True, True, *[False] * 7]
-    assert after.seconds < before.seconds
+    assert [step.done for step in planned.steps] == [False] * 9
+    assert planned.steps[0].label == "60 of 60 samples"
+    assert planned.n_unknown == 0
+    assert planned.seconds > planned.timing_s > 0
 
 
-def test_a_method_of_which_nothing_is_known_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text('title = "t"\nsource = "s"\nsurrogate = "tests.third_party:Zero"\n')
-    planned = plan(["beam-tiny"], [path], cache=tmp_path / "cache")
-    assert planned.n_unknown == 1
-    said = CliRunner().invoke(
-        app, ["run", "beam-tiny", "-m", str(path), "--dry-run", "--cache", str(tmp_path / "cache")]
+def test_a_dry_run_knows_what_the_cache_has(small_run: Comparison, cache: Path) -> None:
+    planned = plan(["beam-tiny"], ["linear-fem", "pod"], cache=cache, limit=LIMIT)
+    assert [step.done for step in planned.steps] == [True, True, *[False] * 7]
+
+
+def test_a_method_of_unknown_duration_is_reported(tmp_path: Path) -> None:
+    path = method_file(tmp_path, "mine", "tests.third_party:Zero")
+    cache = tmp_path / "cache"
+    assert plan(["beam-tiny"], [path], cache=cache).n_unknown == 1
+    arguments = ["run", "beam-tiny", "-m", str(path), "--dry-run", "--cache", str(cache)]
+    shown = CliRunner().invoke(app, arguments)
+    assert shown.exit_code == 0, shown.output
+    assert "1 steps of which nothing is known" in shown.output
+
+
+def test_other_seeds_and_trainings_of_given_length_are_planned(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    one, three = (
+        plan(["beam-tiny"], ["umesh"], cache=cache, limit=LIMIT, fit_seconds=50.0, seeds=seeds)
+        for seeds in (1, 3)
     )
-    assert said.exit_code == 0, said.output
-    assert "1 steps of which nothing is known" in said.output
+    assert [step.label for step in one.steps[1:]] == ["umesh [channels=16, steps=2]"]
+    assert one.steps[1].seconds == 50.0
+    assert [step.label for step in three.steps[2:]] == ["umesh: other seeds"]
+    assert three.steps[2].seconds == 100.0
+    drawing = plan(
+        ["beam-tiny"], ["pca-extra-trees", "pca-ridge"], cache=cache, limit=LIMIT, seeds=3
+    )
+    extras = [step.label for step in drawing.steps if "other seeds" in step.label]
+    assert extras == ["pca-extra-trees: other seeds"]  # ridge regression draws no numbers
 
 
-@pytest.mark.parametrize("name", ["fem", "umesh"])
-def test_a_digest_follows_what_a_method_imports(name: str) -> None:
-    surrogate = {
-        "fem": "mor_bench.surrogates.fem:FullFEM",
-        "umesh": "mor_bench.surrogates.umesh.method:UMesh",
-    }[name]
-    modules = set(imported_sources(surrogate.partition(":")[0]))
+@pytest.mark.parametrize(
+    ("surrogate", "has_network"),
+    [
+        ("mor_bench.surrogates.fem:FullFEM", False),
+        ("mor_bench.surrogates.umesh.method:UMesh", True),
+    ],
+)
+def test_a_digest_follows_what_a_method_imports(surrogate: str, has_network: bool) -> None:
+    modules = imported_sources(surrogate.partition(":")[0]).keys()
     assert "mor_bench.surrogate" in modules
-    assert ("mor_bench.surrogates.umesh.network" in modules) == (name == "umesh")
-    assert not any(module.startswith(("mor_bench.run", "mor_bench.report")) for module in modules)
+    assert ("mor_bench.surrogates.umesh.network" in modules) == has_network
+    above = ("mor_bench.runs", "mor_bench.report", "mor_bench.cli")
+    assert not [module for module in modules if module.startswith(above)]
     assert code_digest(surrogate) == code_digest(surrogate)
 
 
-def test_a_digest_follows_modules_beside_a_third_party_s(tmp_path: Path) -> None:
-    (tmp_path / "theirs").mkdir()
-    (tmp_path / "theirs" / "__init__.py").write_text("")
-    (tmp_path / "theirs" / "method.py").write_text(
+def test_a_digest_follows_the_modules_of_a_third_party(tmp_path: Path) -> None:
+    package = tmp_path / "theirs"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "method.py").write_text(
         "from . import part\nfrom mor_bench.surrogates.pod import PODGalerkin as Mine\n"
     )
-    part = tmp_path / "theirs" / "part.py"
-    part.write_text("x = 1")
-    modules = set(imported_sources("theirs.method", tmp_path))
+    (package / "part.py").write_text("x = 1")
+    modules = imported_sources("theirs.method", tmp_path).keys()
     assert {"theirs.method", "theirs.part", "mor_bench.surrogates.pod"} <= modules
     before = code_digest("theirs.method:Mine", tmp_path)
-    part.write_text("x = 22")
+    (package / "part.py").write_text("x = 22")
     assert code_digest("theirs.method:Mine", tmp_path) != before
 
 
 def test_every_shipped_method_says_how_long_a_fit_takes() -> None:
-    from mor_bench.specs import list_suite, load_method_spec
-
-    methods: list[MethodSpec] = [load_method_spec(path) for path in list_suite("methods").values()]
+    methods = [load_method_spec(path) for path in list_suite("methods").values()]
     assert all(method.fit_seconds(profile) for method in methods for profile in ("quick", "full"))

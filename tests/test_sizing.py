@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mor_bench.runs.cached_fit import CachedFit
-from mor_bench.runs.training_data import TrainingData
 from safetensors import safe_open
 from safetensors.numpy import save as serialise
 

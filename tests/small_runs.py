@@ -1,0 +1,103 @@
+"""Small comparisons for tests: method files, short timings, and one run that several tests share."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from subprocess import Popen
+from typing import Any
+
+import pytest
+
+import mor_bench
+from mor_bench.measure import latency, timing
+from mor_bench.results.comparison import Comparison
+from mor_bench.runs.listener import Listener
+
+LIMIT = 60
+"""Samples of beam-tiny in small runs."""
+
+COMMAND = [sys.executable, "-m", "mor_bench"]
+
+
+def method_file(
+    folder: Path,
+    name: str,
+    surrogate: str,
+    sweep: dict[str, list[Any]] | None = None,
+    **parameters: Any,
+) -> Path:
+    """Write a method file."""
+    path = folder / f"{name}.toml"
+    lines = ['title = "t"', 'source = "s"', f'surrogate = "{surrogate}"', "[parameters]"]
+    lines += [f"{key} = {json.dumps(value)}" for key, value in parameters.items()]
+    lines += ["[sweep]"] if sweep else []
+    lines += [f"{key} = {json.dumps(values)}" for key, values in (sweep or {}).items()]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def descent_file(
+    folder: Path, sweep: dict[str, list[Any]] | None = None, **parameters: Any
+) -> Path:
+    """Write the file of a method that trains by gradient descent in milliseconds."""
+    return method_file(folder, "descent", "tests.third_party:Descent", sweep, **parameters)
+
+
+def wait_for(done: Callable[[], Any], process: Popen[str], within_s: float = 120.0) -> None:
+    """Wait until something has happened while a process lives."""
+    until = time.monotonic() + within_s
+    while not done():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+@contextmanager
+def short_timing() -> Iterator[None]:
+    """Time with few queries, and reuse timings even if the machine is busy otherwise."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(latency.PROTOCOLS, "quick", latency.Protocol(2, 2))
+        patch.setattr(latency, "LEAST_QUERIES", 20)
+        patch.setattr(latency, "LEAST_TURN_S", 0.002)
+        patch.setattr(latency, "BATCH_S", 0.01)
+        patch.setattr(timing, "SAME_SPEED", float("inf"))
+        yield
+
+
+def run_small(methods: list[str | Path], out: Path, cache: Path, **options: Any) -> Comparison:
+    """Compare methods on a few samples of beam-tiny with a short timing."""
+    with short_timing():
+        return mor_bench.run(
+            ["beam-tiny"], methods, out=out, cache=cache, **{"limit": LIMIT, **options}
+        )
+
+
+class Heard:
+    """Notes what a listener is told."""
+
+    def __init__(self) -> None:
+        self.events: list[str] = []
+
+    def listener(self) -> Listener:
+        """Return the listener."""
+        return Listener(
+            starting=lambda dataset, label, number, total: self.events.append(
+                f"start {number}/{total} {label}"
+            ),
+            fitted=lambda row: self.events.append(f"fitted {row.label} {row.latency_ms}"),
+            finished=lambda row: self.events.append(
+                f"timed {row.label} {row.latency_ms is not None}"
+            ),
+        )
+
+
+def checkpoint_always() -> None:
+    """Let trainings of networks write a checkpoint as often as they can."""
+    from mor_bench.learning import training
+
+    training.CHECKPOINT_EVERY_S = 0.0

@@ -1,0 +1,129 @@
+"""Error metrics, range flags and frontiers against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from threadpoolctl import threadpool_info
+
+from mor_bench.analysis.frontier import Point, error_at_time, non_dominated, time_at_error
+from mor_bench.machine import pinned_threads
+from mor_bench.measure.error_metrics import sample_errors, summary
+from mor_bench.measure.range_flags import flags_of
+
+
+def test_error_metrics_match_hand_computed_values() -> None:
+    reference = np.zeros((2, 2, 3))
+    reference[:, 1] = [[3.0, 0.0, 4.0], [0.0, 0.0, 10.0]]
+    predicted = reference.copy()
+    predicted[0, 1] += [0.0, 3.0, 4.0]
+    predicted[1, 0] += [0.0, 0.0, -1.0]
+    errors = sample_errors(predicted, reference)
+    np.testing.assert_allclose(errors.mean_dof_m, [7 / 6, 1 / 6])
+    np.testing.assert_allclose(errors.relative_l2, [1.0, 0.1])
+    np.testing.assert_allclose(errors.max_nodal_m, [5.0, 1.0])
+    np.testing.assert_allclose(errors.amplitude_m, [5.0, 10.0])
+    assert summary(errors) == pytest.approx(
+        {
+            "mean_dof_m": 4 / 6,
+            "std_dof_m": math.sqrt(2 * 0.5**2),
+            "max_dof_m": 7 / 6,
+            "rel_l2_median": 0.55,
+            "rel_l2_p95": 1.0,
+            "rel_l2_max": 1.0,
+            "max_nodal_m": 5.0,
+            "slope": (5 * 7 / 6 + 10 / 6) / 125,
+        }
+    )
+
+
+def test_a_missing_prediction_is_an_infinite_error() -> None:
+    reference = np.ones((30, 4, 3))
+    predicted = reference.copy()
+    predicted[7, 2, 1] = np.nan
+    found = summary(sample_errors(predicted, reference))
+    infinite = {name for name, value in found.items() if value == math.inf}
+    assert infinite >= {"mean_dof_m", "max_dof_m", "rel_l2_max", "std_dof_m"}
+    assert found["rel_l2_median"] == 0.0
+
+
+POINTS = [
+    Point(1.0, 0.1, "a"),
+    Point(10.0, 0.01, "b"),
+    Point(5.0, 0.2, "dominated"),
+    Point(100.0, 0.001, "c"),
+    Point(0.5, math.inf, "failed"),
+]
+
+
+def test_a_frontier_interpolates_in_log_log_and_never_extrapolates() -> None:
+    assert [point.label for point in non_dominated(POINTS)] == ["a", "b", "c"]
+    middle = time_at_error(POINTS, math.sqrt(0.1 * 0.01))
+    assert middle["latency_ms"] == pytest.approx(math.sqrt(10.0))
+    assert middle["best"] == {"label": "b", "latency_ms": 10.0, "error": 0.01}
+    assert time_at_error(POINTS, 0.5)["latency_ms"] == 1.0
+    assert time_at_error(POINTS, 0.0005) == {"latency_ms": None, "best": None}
+    assert error_at_time(POINTS, 0.7) == {"error": None, "best": None}
+    between = error_at_time(POINTS, math.sqrt(10.0))
+    assert between["error"] == pytest.approx(math.sqrt(0.1 * 0.01))
+    assert between["best"]["label"] == "a"
+    assert error_at_time(POINTS, 1e6)["error"] == 0.001
+
+
+@example([(1.0, 1.0000000000000002e-06), (2.0, 1e-06)], 1e-06, 1.0)
+@given(
+    st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-6, 1.0)), min_size=1, max_size=12),
+    st.floats(1e-6, 1.0),
+    st.floats(1e-3, 1e3),
+)
+def test_a_frontier_stays_between_its_points(
+    points: list[tuple[float, float]], error: float, latency: float
+) -> None:
+    cloud = [Point(t, e, str(i)) for i, (t, e) in enumerate(points)]
+    front = non_dominated(cloud)
+    for point in cloud:
+        assert any(q.latency_ms <= point.latency_ms and q.error <= point.error for q in front)
+    above, below = 1 + 1e-9, 1 - 1e-9
+    at_error = time_at_error(cloud, error)
+    if at_error["best"] is None:
+        assert min(point.error for point in cloud) > error
+    else:
+        assert front[0].latency_ms * below <= at_error["latency_ms"]
+        assert at_error["latency_ms"] <= at_error["best"]["latency_ms"] * above
+    at_time = error_at_time(cloud, latency)
+    if at_time["best"] is None:
+        assert min(point.latency_ms for point in cloud) > latency
+    else:
+        assert front[-1].error * below <= at_time["error"] <= at_time["best"]["error"] * above
+
+
+def test_threads_are_pinned_and_given_back() -> None:
+    before = [pool["num_threads"] for pool in threadpool_info()]
+    with pinned_threads(1):
+        assert {pool["num_threads"] for pool in threadpool_info()} == {1}
+    assert [pool["num_threads"] for pool in threadpool_info()] == before
+
+
+def test_the_recall_of_range_flags_matches_hand_computed_values() -> None:
+    usual = {"relative_l2": np.linspace(0.01, 0.2, 20), "flagged": np.arange(20) == 3}
+    far = {
+        "relative_l2": np.array([0.3, 0.25, 0.1, math.inf, 0.195]),
+        "flagged": np.array([True, False, True, True, True]),
+    }
+    flags = flags_of({"test": far, "in-range": usual})
+    assert flags is not None
+    assert flags.usual_rel_l2 == pytest.approx(0.2)
+    counts = {"n_unusual": 3, "n_unusual_flagged": 2, "recall": 2 / 3}
+    assert flags.of(far) == counts
+    assert flags.as_dict(far)["false_alarms"] == 1 / 20
+    assert flags.as_dict(far)["test"] == {"n": 5, "n_flagged": 4, **counts}
+    assert flags.of(usual)["recall"] is None
+    assert flags_of({"test": far, "in-range": {"relative_l2": far["relative_l2"]}}) is None
+    main_only = flags_of({"test": far})
+    assert main_only is not None
+    assert (main_only.in_range, main_only.usual_rel_l2) == ("test", math.inf)
+    assert main_only.of(far)["n_unusual"] == 0
