@@ -1,4 +1,4 @@
-"""Small comparisons for tests: method files, short timings, and one run that several tests share."""
+"""Small comparisons for tests: method files, short timings, and a run that tests share."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def wait_for(done: Callable[[], Any], process: Popen[str], within_s: float = 120
 def short_timing() -> Iterator[None]:
     """Time with few queries, and reuse timings even if the machine is busy otherwise."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(latency.PROTOCOLS, "quick", latency.Protocol(2, 2))
+        patch.setitem(latency.PROTOCOLS, "quick", latency.Protocol(1, 3))
         patch.setattr(latency, "LEAST_QUERIES", 20)
         patch.setattr(latency, "LEAST_TURN_S", 0.002)
         patch.setattr(latency, "BATCH_S", 0.01)

@@ -38,6 +38,10 @@ def fit_tiny(
     return mor_bench.fit("beam-tiny", method, parameters, **given)
 
 
+def changed_since(path: Path, time: float) -> bool:
+    return path.exists() and path.stat().st_mtime > time
+
+
 @pytest.mark.slow
 def test_a_killed_fit_resumes_and_ends_with_the_same_bytes(cache: Path, tmp_path: Path) -> None:
     load_dataset("beam-tiny", LIMIT, cache=cache)
@@ -57,9 +61,7 @@ def test_a_killed_fit_resumes_and_ends_with_the_same_bytes(cache: Path, tmp_path
             text=True,
             preexec_fn=listening,
         ) as process:
-            wait_for(
-                lambda seen=seen: checkpoint.exists() and checkpoint.stat().st_mtime > seen, process
-            )
+            wait_for(partial(changed_since, checkpoint, seen), process)
             process.send_signal(how)
             stderr = process.communicate()[1]
         assert process.returncode == (130 if how == signal.SIGINT else -how), stderr

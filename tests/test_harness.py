@@ -38,18 +38,17 @@ def test_every_configuration_has_a_row_and_a_broken_one_its_reason(small_run: Co
         "linear-fem",
         "pod-swept [n_modes=3]",
         "pod-swept [n_modes=20]",
-        *(f"broken-{how}" for how in ("crash", "shape", "nan", "sometimes")),
+        *(f"broken-{how}" for how in ("crash", "shape", "sometimes")),
     ]
-    crash, shape, nan, sometimes = small_run.rows[-4:]
+    crash, shape, sometimes = small_run.rows[-3:]
     assert (crash.status, shape.status) == ("failed", "failed")
     assert crash.reason == "crashed with ZeroDivisionError: on purpose"
     assert "must return floats of shape" in str(shape.reason)
-    for row in (nan, sometimes):  # a load without an answer costs an infinite error, no more
-        assert row.ok
-        assert 0 < (row.n_failed or 0) < row.n_test
-        assert row.error is not None
-        assert row.error.mean_dof_m == row.error.rel_l2_max == math.inf
-        assert row.latency_ms is not None
+    assert sometimes.ok  # a load without an answer costs an infinite error, no more
+    assert 0 < (sometimes.n_failed or 0) < sometimes.n_test
+    assert sometimes.error is not None
+    assert sometimes.error.mean_dof_m == sometimes.error.rel_l2_max == math.inf
+    assert sometimes.latency_ms is not None
     assert sometimes.throughput is not None
     assert sometimes.throughput["64"] is None
 
@@ -87,7 +86,7 @@ def test_the_raw_samples_give_the_figures_of_the_row(small_run: Comparison) -> N
     assert row.error is not None
     samples = small_run.samples(row)
     assert len(samples["latency_ms"]) == len(samples["process"]) == len(samples["round"])
-    assert set(samples["process"]) == {0, 1}
+    assert set(samples["round"]) == {0, 1, 2}
     assert samples["mean_dof_m"].mean() == pytest.approx(row.error.mean_dof_m)
     worst = np.abs(samples["worst_prediction"] - samples["worst_reference"]).mean()
     assert worst == pytest.approx(row.error.max_dof_m)
@@ -118,7 +117,7 @@ def test_results_of_a_run_read_back_as_they_were(small_run: Comparison) -> None:
 def test_a_listener_is_told_of_every_row(small_run: Comparison, heard: Heard) -> None:
     label = "pod-swept [n_modes=3]"
     mine = [event for event in heard.events if label in event]
-    assert mine == [f"start 2/7 {label}", f"fitted {label} None", f"timed {label} True"]
+    assert mine == [f"start 2/6 {label}", f"fitted {label} None", f"timed {label} True"]
 
 
 BAD: list[tuple[dict[str, Any], str]] = [
@@ -270,6 +269,7 @@ def test_errors_count_the_wanted_nodes_alone(tip_only: Path, cache: Path, tmp_pa
     assert np.isfinite(hybrid.predict(data.test.forces[:3])).all()
 
 
+@pytest.mark.slow
 def test_the_method_of_the_comparison_guide_competes(cache: Path, tmp_path: Path) -> None:
     guide = GUIDE.read_text(encoding="utf-8")
     (script,) = re.findall(r"```python\n# my_method.py\n(.*?)```", guide, re.DOTALL)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 from dataclasses import replace
 from math import inf, nan
 from pathlib import Path
@@ -13,15 +12,17 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from typer.testing import CliRunner, Result
 
 import mor_bench
 from mor_bench.analysis.selection import Requirements, choose, figure, offline_rank
+from mor_bench.cli.app import app
 from mor_bench.errors import InvalidInputError
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 from mor_bench.runs.pick import newest_run
 from mor_bench.specs import load_dataset_spec
-from tests.small_runs import COMMAND, short_timing
+from tests.small_runs import short_timing
 
 ASKED = Requirements(0.01, 3.0, 2e8, 100.0)
 
@@ -250,13 +251,12 @@ def test_a_real_comparison_gives_a_choice(small_run: Comparison) -> None:
         return mor_bench.pick("beam-tiny", error=error, latency_ms=latency_ms, comparison=small_run)
 
     rough = pick(10.0, 1e4)
-    assert rough.choice.method == "linear-fem"  # it needs no data
-    assert rough.runner_up.method == "pod-swept"
-    assert rough.n_meeting == 3
+    meeting = small_run.rows[:3]
+    assert rough.n_meeting == len(meeting)
+    assert offline_rank(rough.choice) == min(map(offline_rank, meeting))
+    assert {rough.choice.method, rough.runner_up.method} == {"linear-fem", "pod-swept"}
     assert rough.run == small_run.out
-    exact = pick(figure(small_run.rows[2], "error") * 1.5, 1e4)
-    assert exact.choice.label == "pod-swept [n_modes=20]"
-    assert exact.choice.error.rel_l2_median_high >= exact.choice.error.rel_l2_median
+    assert rough.choice.error.rel_l2_median_high > rough.choice.error.rel_l2_median
     impossible = pick(1e-7, 1e-4)
     assert impossible.choice is None
     assert impossible.relaxations == []
@@ -311,19 +311,16 @@ def test_without_evidence_a_comparison_is_run(
     assert again.requirements == Requirements(0.01, 1e4)
 
 
-def test_the_command_prints_a_choice_and_its_exit_code(
-    small_run: Comparison, tmp_path: Path
-) -> None:
-    def command(*options: str) -> subprocess.CompletedProcess[str]:
-        arguments = [*COMMAND, "pick", "beam-tiny", "--run", str(small_run.out), *options]
-        return subprocess.run(arguments, cwd=tmp_path, capture_output=True, text=True, check=False)
+def test_the_command_prints_a_choice_and_its_exit_code(small_run: Comparison) -> None:
+    def command(*options: str) -> Result:
+        return CliRunner().invoke(app, ["pick", "beam-tiny", f"--run={small_run.out}", *options])
 
     limits = ["--error=10", "--latency=10000", "--offline=1000", "--memory=1e6", "--json"]
     done = command(*limits)
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     asked = {"error": 10.0, "latency_ms": 1e4, "memory_bytes": 1e12, "offline_s": 1e3}
     assert json.loads(done.stdout)["requirements"] == asked
     done = command("--error=10", "--latency=0.00001")
-    assert done.returncode == 1
+    assert done.exit_code == 1
     assert "Enough alone: latency" in done.stdout
-    assert command("--error=0").returncode == 2
+    assert command("--error=0").exit_code == 2

@@ -49,13 +49,13 @@ def test_results_read_back_as_they_were_written(tmp_path: Path) -> None:
     assert (tmp_path / "results.json").read_bytes() == before
 
 
-def test_an_older_row_takes_its_swept_parameters_from_those_its_label_names(tmp_path: Path) -> None:
+def test_a_row_without_swept_parameters_reads_as_one_that_sweeps_nothing(tmp_path: Path) -> None:
     comparison(tmp_path)
     path = tmp_path / "results.json"
     content = json.loads(path.read_text())
     del content["rows"][0]["swept"]
     path.write_text(json.dumps(content))
-    assert Comparison.read(tmp_path).rows[0].swept == {"n_modes": 5}
+    assert Comparison.read(tmp_path).rows[0].swept == {}
 
 
 @pytest.mark.parametrize(

@@ -63,6 +63,7 @@ def training_of(row: Row) -> tuple[int | None, float | None]:
     return row.training.iterations, row.training.fit_seconds
 
 
+@pytest.mark.slow
 def test_seconds_become_iterations_that_can_be_repeated(
     comparison: Comparison, own_cache: Path, tmp_path: Path
 ) -> None:
@@ -167,6 +168,7 @@ def data(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> TrainingData:
     return TrainingData(tiny.scene, tiny.train, {}, tmp_path_factory.mktemp("data"))
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_is_dropped_and_the_time_before_a_stop_counts(
     data: TrainingData, tmp_path: Path
 ) -> None:

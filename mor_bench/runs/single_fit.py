@@ -106,7 +106,7 @@ def fit(
     out = Path(out)
     spec = load_dataset_spec(dataset, chosen.suite)
     unfitted = _unfitted(method, parameters or {}, chosen)
-    checkpoint = chosen.checkpoint or out.with_name(f".{out.name}.checkpoint")
+    checkpoint = chosen.checkpoint or out.parent / f".{out.name}.checkpoint"
     training = _training(unfitted, chosen)
     _check_writable("out", out)
     if unfitted.trains():
