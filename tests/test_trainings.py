@@ -17,7 +17,8 @@ import pytest
 from rich.console import Console
 
 import mor_bench
-from mor_bench.report import print_tables, render
+from mor_bench.report.console_tables import print_tables
+from mor_bench.report.page import render
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 from mor_bench.runs.cached_fit import CachedFit, RunEnvironment
