@@ -62,7 +62,10 @@ class TestSet:
     def of(cls, snapshots: Snapshots) -> TestSet:
         """Make a test set from snapshots."""
         nodes = snapshots.scene.output_nodes
-        arrays: dict[str, NDArray[Any]] = {"f": snapshots.given.values, "u": snapshots.displacements}
+        arrays: dict[str, NDArray[Any]] = {
+            "f": snapshots.given.values,
+            "u": snapshots.displacements,
+        }
         if len(nodes) < snapshots.scene.mesh.n_nodes:
             arrays["nodes"] = nodes
         return cls(snapshots.given.values, snapshots.displacements, nodes, digest_of_arrays(arrays))
