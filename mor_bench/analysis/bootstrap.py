@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LEVEL = 0.95
-"""Level of all intervals except that of `compare_latency`."""
+"""Level of all intervals."""
 
 
 def student_t(level: float, df: float) -> float:

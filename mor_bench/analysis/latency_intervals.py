@@ -14,13 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.analysis.bootstrap import LEVEL, student_t
-from mor_bench.errors import InvalidInputError
-
-COMPARISON_LEVEL = 0.98
-"""Level of the interval of `compare_latency`.
-
-At 95 %, six or more of a hundred comparisons of identical code would often be called different.
-"""
 
 TYPICAL_SPREAD = 0.014
 """Relative standard deviation of a configuration's median between processes, quiet machine."""
@@ -154,26 +147,15 @@ def n_processes_of(samples: Samples) -> int:
     return len(np.unique(samples["process"])) if "process" in samples else 1
 
 
-def latency_interval(samples: Samples, pooled: Spreads | None = None) -> tuple[float, float]:
-    """Return the 95 % prediction interval for the median of a repeated measurement, in ms.
+def _latency_interval(samples: Samples, pooled: Spreads) -> tuple[float, float]:
+    """Prediction interval of one configuration, ms, from the larger of two spreads.
 
-    The repetition follows the same protocol with as many fresh processes, so the interval contains
-    the noise of both measurements. More processes average out the specific noise, not a drift that
-    they share. A drift slower than the whole run cannot be known from the run.
-
-    Parameters
-    ----------
-    samples : mapping
-        Raw samples of a configuration.
-    pooled : Spreads, optional
-        Spread of the configurations that were timed together. The larger of it and the
-        configuration's own is used. Without it, drift and specific noise cannot be separated.
+    These are the spread pooled over all configurations, and the configuration's own.
     """
-    own = spreads_of([samples])
-    pooled = pooled or own
+    own = spreads_of([samples]).own[0]
     common = pooled.common.moderated(TYPICAL_DRIFT)
     specific = pooled.specific.moderated(TYPICAL_SPREAD)
-    alone = own.own[0] if pooled.common.df == 0 else _without(own.own[0], common.sd)
+    alone = own if pooled.common.df == 0 else _without(own, common.sd)
     sd = float(np.nanmax([specific.sd, alone]))
     private, shared = sd**2 * median_variance(n_processes_of(samples)), common.sd**2
     # Degrees of freedom of a sum of variances, after Welch and Satterthwaite.
@@ -189,59 +171,22 @@ def _without(total: float, part: float) -> float:
 
 
 def latency_intervals(samples_by_label: Mapping[str, Samples]) -> dict[str, tuple[float, float]]:
-    """`latency_interval` of configurations that were timed together, with their pooled spread."""
-    timed = {
-        label: samples
-        for label, samples in samples_by_label.items()
-        if len(samples.get("latency_ms", ()))
-    }
+    """Return the 95 % prediction intervals for the medians of a repeated measurement, in ms.
+
+    The repetition follows the same protocol with as many fresh processes, so an interval contains
+    the noise of both measurements. More processes average out the specific noise, not a drift that
+    they share. A drift slower than the whole run cannot be known from the run.
+
+    Parameters
+    ----------
+    samples_by_label : mapping of mapping
+        Raw samples of configurations that were timed together; those without any are left out.
+    """
+    timed = {label: s for label, s in samples_by_label.items() if len(s.get("latency_ms", ()))}
     if not timed:
         return {}
     pooled = spreads_of(list(timed.values()))
-    return {label: latency_interval(samples, pooled) for label, samples in timed.items()}
-
-
-def compare_latency(samples_a: Samples, samples_b: Samples) -> dict[str, Any]:
-    """Decide whether a is faster than b, from processes and rounds in which both were timed.
-
-    Each process gives one number, the median over its rounds of the log ratio of the two medians.
-    What slows both alike cancels. Their mean has a Student-t interval at 98 %, with
-    `TYPICAL_SPREAD` mixed into the variance as if two more processes had shown it.
-
-    Returns
-    -------
-    dict
-        `ratio` of latencies a / b with `low`, `high`; `verdict` on a: ``faster``, ``slower`` or,
-        if the interval contains 1, ``undecided``; `n_processes`.
-
-    Raises
-    ------
-    InvalidInputError
-        If no process timed both.
-    """
-    cube = _cube([samples_a, samples_b])
-    both = np.isfinite(cube).all(axis=0)
-    if not both.any():
-        raise InvalidInputError(
-            "`samples_a` and `samples_b` must have a `process` and `round` in common; "
-            "they have none."
-        )
-    logs = _nan_median(np.where(both, cube[0] - cube[1], nan))
-    logs = logs[np.isfinite(logs)]
-    n = len(logs)
-    # A difference scatters sqrt(2) times as much as one configuration.
-    sd = float(logs.std(ddof=1)) / sqrt(2) if n > 1 else 0.0
-    spread = Spread(sd, n - 1.0).moderated(TYPICAL_SPREAD)
-    centre = float(logs.mean())
-    half = student_t(COMPARISON_LEVEL, spread.df) * spread.sd * sqrt(2 / n)
-    low, high = centre - half, centre + half
-    return {
-        "ratio": exp(centre),
-        "low": exp(low),
-        "high": exp(high),
-        "verdict": verdict_of(low, high),
-        "n_processes": n,
-    }
+    return {label: _latency_interval(samples, pooled) for label, samples in timed.items()}
 
 
 def verdict_of(low: float, high: float) -> str:

@@ -128,36 +128,35 @@ def _as_printed(value: float | None) -> str:
     return DASH if value is None else f"{value:g}"
 
 
-def same_error(dataset: str, entries: Sequence[Entry]) -> TextTable | None:
-    """Build the paper's comparison at the same error: each method's fastest configuration there."""
+def same_error_or_time(dataset: str, entries: Sequence[Entry]) -> list[TextTable]:
+    """Build the paper's two comparisons with its best network: at the same error and time.
+
+    The first shows each method's fastest configuration that is as accurate as the network, the
+    second its most accurate configuration that is as fast. Empty if no network ran.
+    """
     network = _best_network(entries)
     if network is None:
-        return None
-    target = network.mean_error_m
-    chosen = _choose(entries, lambda e: e.mean_error_m <= target, lambda e: e.latency_ms)
-    note = (
-        f"The fastest configuration of each method with ē ≤ {metres(target)} m, "
-        f"that of {network.label}."
-    )
-    return _comparison(
-        "Comparison at the same error", note, chosen, _if_compared(dataset, SAME_ERROR)
-    )
-
-
-def same_time(dataset: str, entries: Sequence[Entry]) -> TextTable | None:
-    """Build the paper's comparison at the same time: each method's most accurate configuration."""
-    network = _best_network(entries)
-    if network is None:
-        return None
-    target = network.latency_ms
-    chosen = _choose(entries, lambda e: e.latency_ms <= target, lambda e: e.mean_error_m)
-    note = (
-        f"The most accurate configuration of each method within {number(target)} ms, "
-        f"the latency of {network.label}."
-    )
-    return _comparison(
-        "Comparison at the same time", note, chosen, _if_compared(dataset, SAME_TIME)
-    )
+        return []
+    accurate = [e for e in entries if e.ran and e.mean_error_m <= network.mean_error_m]
+    fast = [e for e in entries if e.ran and e.latency_ms <= network.latency_ms]
+    error, time = metres(network.mean_error_m), number(network.latency_ms)
+    methods = list(dict.fromkeys(e.method for e in entries))
+    return [
+        _comparison(
+            "Comparison at the same error",
+            f"The fastest configuration of each method with ē ≤ {error} m, "
+            f"that of {network.label}.",
+            _least(methods, accurate, lambda e: e.latency_ms),
+            SAME_ERROR if dataset == COMPARED else {},
+        ),
+        _comparison(
+            "Comparison at the same time",
+            f"The most accurate configuration of each method within {time} ms, "
+            f"the latency of {network.label}.",
+            _least(methods, fast, lambda e: e.mean_error_m),
+            SAME_TIME if dataset == COMPARED else {},
+        ),
+    ]
 
 
 def _best_network(entries: Sequence[Entry]) -> Entry | None:
@@ -169,24 +168,11 @@ def _best_network(entries: Sequence[Entry]) -> Entry | None:
     return best
 
 
-def _choose(
-    entries: Sequence[Entry], allowed: Callable[[Entry], bool], cost: Callable[[Entry], float]
+def _least(
+    methods: Sequence[str], entries: Sequence[Entry], cost: Callable[[Entry], float]
 ) -> dict[str, Entry | None]:
-    """For each method the cheapest allowed configuration; None if it has none."""
-    return {
-        method: min(
-            (e for e in entries if e.ran and e.method == method and allowed(e)),
-            key=cost,
-            default=None,
-        )
-        for method in dict.fromkeys(e.method for e in entries)
-    }
-
-
-def _if_compared(
-    dataset: str, paper: Mapping[str, tuple[float, float]]
-) -> Mapping[str, tuple[float, float]]:
-    return paper if dataset == COMPARED else {}
+    """For each method the entry of least cost; None if it has none."""
+    return {m: min((e for e in entries if e.method == m), key=cost, default=None) for m in methods}
 
 
 def _comparison(
