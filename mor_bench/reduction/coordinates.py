@@ -1,4 +1,4 @@
-"""Coordinates that regressions work in, and what their errors count."""
+"""Coordinates for regressions, and weights of their errors."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from mor_bench.reduction.basis import pod
 Array = NDArray[np.float64]
 
 SMALLEST = 0.2
-"""Errors count relative to the displacement, or to this share of the root mean square displacement where that is larger."""
+"""Least reference size of errors, relative to the root mean square displacement."""
 
 
 def input_axes(inputs: Array, n_modes: int, evenness: float) -> Array:
-    """Axes (n, n_modes) of scaled principal coordinates of inputs (n_samples, n), without a mean.
+    """Return axes (n, n_modes) of scaled principal coordinates of inputs (n_samples, n).
 
-    Their sizes lie between the coordinates' own (evenness 0) and equal ones (1), on a logarithmic scale; their mean square is
-    1 with either. The number of modes is capped at the rank of the inputs with a warning.
+    No mean is removed. Evenness 0 keeps the coordinates' relative sizes, 1 makes them equal, and
+    values between interpolate on a logarithmic scale. The mean square is always 1. The number of
+    modes is capped at the rank of the inputs with a warning.
     """
-    used = np.flatnonzero(inputs.any(axis=0))  # of forces only a few columns
+    used = np.flatnonzero(inputs.any(axis=0))  # forces act on few dofs
     modes = pod(inputs[:, used], n_modes).modes
     squares = ((inputs[:, used] @ modes) ** 2).mean(axis=0)
     axes = np.zeros((inputs.shape[1], modes.shape[1]))
@@ -28,13 +29,19 @@ def input_axes(inputs: Array, n_modes: int, evenness: float) -> Array:
 
 
 def change_of_basis(old: Array, new: Array) -> Array:
-    """B (n_new, n_old) for bases (n, n_old) and (n, n_new): xᵀold = (xᵀnew) B for x in the span of new, and new B a nearest to old."""
+    """Return B (n_new, n_old) for bases old (n, n_old) and new (n, n_new).
+
+    xᵀold = (xᵀnew) B for x in the span of new, and new B is nearest to old.
+    """
     change: Array = np.linalg.pinv(new) @ old
     return change
 
 
 def error_weights(displacements: Array) -> Array:
-    """(n_samples,) what errors are multiplied by so that they count relative to displacements (n_samples, n), see `SMALLEST`."""
+    """Return weights (n_samples,) that make errors relative to displacements (n_samples, n).
+
+    Displacements below `SMALLEST` count as that large.
+    """
     sizes = np.linalg.norm(displacements, axis=1)
     typical = float(np.sqrt((sizes**2).mean()))
     weights: Array = typical / np.maximum(sizes, SMALLEST * typical)

@@ -1,4 +1,4 @@
-"""Empirical cubature: a few cells with non-negative weights that give the same reduced force as all of them."""
+"""Cubature by ECSW: few cells with non-negative weights that give the force of all cells."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from mor_bench.mechanics.assembly import Assembler
 Array = NDArray[np.float64]
 
 DEPENDENT = 1e-12
-"""Share of a column of unit norm that must be new, else it depends on those that are there."""
+"""Least part of a unit column outside the span of the chosen ones; less is linear dependence."""
 OPTIMAL = 1e-10
-"""Largest cosine between residual, relative to the target, and column that passes for none in the optimality conditions."""
+"""Largest gradient, relative to the target, that counts as zero in the optimality conditions."""
 LEAST_GRADIENT = 1e-14
-"""A cosine below which a column promises no progress."""
+"""Gradient, relative to the target, below which a column promises no progress."""
 DRIFT = 1e-12
-"""Passive gradient, relative to the target or the scaled weights, from which the updated factor is made anew."""
+"""Passive gradient, relative to target or scaled weights, that calls for a fresh factor."""
 MAX_ENTRIES = 2**26
-"""Entries of a training matrix that are kept before QR compresses them: 512 MB."""
+"""Entries of a training matrix (512 MB) from which QR compresses it."""
 
 
 class CubatureError(MorBenchError):
-    """The weights did not reach the tolerance, or the optimality conditions, within the iterations.
+    """The weights missed the tolerance or the optimality conditions.
 
     Attributes
     ----------
     relative_residual : float or None
-        The residual that was reached, where it missed the tolerance.
+        The residual, if it missed the tolerance.
     """
 
     def __init__(self, message: str, *, relative_residual: float | None = None) -> None:
@@ -43,7 +43,7 @@ class CubatureError(MorBenchError):
 
 @dataclass(frozen=True)
 class SparseWeights:
-    """The outcome of a cubature, recomputed from matrix, target b and weights: A weights ≈ b.
+    """Weights of a cubature, A weights ≈ b, with residual and gradients recomputed from them.
 
     Attributes
     ----------
@@ -52,11 +52,12 @@ class SparseWeights:
     relative_residual : float
         ‖A weights - b‖ / ‖b‖.
     passive_gradient : float
-        Largest |aⱼᵀ(b - A weights)| / (‖aⱼ‖ ‖b‖) over the columns with a positive weight: zero at the least-squares
-        solution on these columns.
+        Largest |aⱼᵀ(b - A weights)| / (‖aⱼ‖ ‖b‖) over the columns with positive weights. It is zero
+        at the least-squares solution on these columns.
     dual_gradient : float
-        Largest aⱼᵀ(b - A weights) / (‖aⱼ‖ ‖b‖) over the other columns, at least 0. Not positive, together with the above,
-        means that no non-negative weights do better (Karush, Kuhn and Tucker); a run that stops at a tolerance stops before.
+        Largest aⱼᵀ(b - A weights) / (‖aⱼ‖ ‖b‖) over the other columns, at least 0. If both
+        gradients are zero, no non-negative weights are better (Karush, Kuhn and Tucker). A run
+        that stops at a tolerance stops earlier.
     iterations : int
     """
 
@@ -68,7 +69,7 @@ class SparseWeights:
 
     @classmethod
     def of(cls, matrix: Array, target: Array, weights: Array, iterations: int) -> SparseWeights:
-        """Residual and gradients from the weights alone."""
+        """Compute residual and gradients from the weights."""
         size, residual = float(np.linalg.norm(target)), target - matrix @ weights
         if size == 0:
             return cls(weights, 0.0, 0.0, 0.0, iterations)
@@ -85,7 +86,7 @@ class SparseWeights:
 
 
 def _inverse_norms(matrix: Array) -> Array:
-    """1 / ‖aⱼ‖, and 0 for a column of zeros."""
+    """Return 1 / ‖aⱼ‖, and 0 for a column of zeros."""
     norms: Array = np.sqrt(np.einsum("ij,ij->j", matrix, matrix))  # without a copy of the matrix
     inverse: Array = np.zeros_like(norms)
     np.divide(1.0, norms, out=inverse, where=norms > 0)
@@ -94,7 +95,7 @@ def _inverse_norms(matrix: Array) -> Array:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _remove(q: Any, r: Any, c: Any, position: int, n: int) -> None:
-    """Take a column out of the factor QR of n columns: Givens rotations make R, without it, triangular again."""
+    """Remove a column from the factor QR of n columns; Givens rotations keep R triangular."""
     for j in range(position, n - 1):
         r[: j + 2, j] = r[: j + 2, j + 1]
     for j in range(position, n - 1):
@@ -110,10 +111,10 @@ def _remove(q: Any, r: Any, c: Any, position: int, n: int) -> None:
 
 
 class ActiveColumns:
-    """Least squares on a changing choice of a matrix's columns, scaled to unit norm, by a QR factor that is updated.
+    """Least squares on a changing choice of a matrix's columns, with an updated QR factor.
 
-    Appending orthogonalises twice, removing rotates; both cost O(m p) for p columns of length m. The choice of 319 of the fine
-    beam's cells, from 2,000 rows, took 2.8 s instead of 11 s with a fresh least-squares solution each time.
+    Columns are scaled to unit norm. Appending one orthogonalises twice, and removing one rotates;
+    both cost O(m p) for p columns of length m.
 
     Parameters
     ----------
@@ -123,7 +124,7 @@ class ActiveColumns:
     Attributes
     ----------
     chosen : list of int
-        In the order of the factor's columns.
+        Numbers of the columns, in the order of the factor.
     scale : (n,) float64
         1 / ‖aⱼ‖; 0 for columns of zeros.
     """
@@ -134,7 +135,7 @@ class ActiveColumns:
         self._q, self._r, self._c = np.empty((0, len(matrix))), np.empty((0, 0)), np.empty(0)
 
     def _reserve(self, n: int) -> None:
-        """Room for n columns."""
+        """Make room for n columns."""
         if n > len(self._q):
             old, room = len(self._q), max(64, 2 * n)
             q, r, c = np.zeros((room, len(self.matrix))), np.zeros((room, room)), np.zeros(room)
@@ -142,7 +143,7 @@ class ActiveColumns:
             self._q, self._r, self._c = q, r, c
 
     def append(self, column: int) -> bool:
-        """Choose a column; False, and nothing changed, if it depends on those chosen."""
+        """Choose a column; return False, without a change, if it depends on the chosen ones."""
         n = len(self.chosen)
         self._reserve(n + 1)
         new, q = self.matrix[:, column] * self.scale[column], self._q[:n]
@@ -166,37 +167,34 @@ class ActiveColumns:
         del self.chosen[position]
 
     def refactor(self) -> None:
-        """Make the factor of the chosen columns anew."""
+        """Factorise the chosen columns afresh."""
         n = len(self.chosen)
-        q, r = qr(
-            self.matrix[:, self.chosen] * self.scale[self.chosen],
-            mode="economic",
-            check_finite=False,
-        )
+        scaled = self.matrix[:, self.chosen] * self.scale[self.chosen]
+        q, r = qr(scaled, mode="economic", check_finite=False)
         self._q[:n], self._r[:n, :n], self._c[:n] = q.T, r, q.T @ self.target
 
     def coefficients(self) -> Array:
-        """The least-squares solution on the chosen columns, scaled, in their order."""
+        """Return the scaled least-squares solution on the chosen columns, in their order."""
         n = len(self.chosen)
         return np.asarray(solve_triangular(self._r[:n, :n], self._c[:n], check_finite=False))
 
     def residual(self, coefficients: Array) -> Array:
-        """Target minus the chosen columns times their coefficients, from the matrix itself."""
+        """Return the target minus the chosen columns times their coefficients."""
         return self.target - self.matrix[:, self.chosen] @ (coefficients * self.scale[self.chosen])
 
     def gradient(self, residual: Array) -> Array:
-        """(n,) aⱼᵀ residual / ‖aⱼ‖."""
+        """Return aⱼᵀ residual / ‖aⱼ‖, (n,)."""
         return (residual @ self.matrix) * self.scale
 
     def weights(self, coefficients: Array) -> Array:
-        """(n,) weights of the unscaled columns."""
+        """Return weights (n,) of the unscaled columns."""
         weights = np.zeros(self.matrix.shape[1])
         weights[self.chosen] = coefficients * self.scale[self.chosen]
         return weights
 
 
 def check_finite(matrix: Array, target: Array) -> None:
-    """Raise `InvalidInputError` where matrix or target hold NaN or infinity."""
+    """Raise `InvalidInputError` if matrix or target hold NaN or infinity."""
     if not (np.isfinite(matrix).all() and np.isfinite(target).all()):
         raise InvalidInputError("the cubature's training matrix holds NaN or infinity.")
 
@@ -204,15 +202,15 @@ def check_finite(matrix: Array, target: Array) -> None:
 def sparse_nnls(
     matrix: Array, target: Array, tolerance: float, max_iterations: int | None = None
 ) -> SparseWeights:
-    """Few non-negative weights with ‖A x - b‖ <= tolerance ‖b‖: Lawson and Hanson's active set, stopped early.
+    """Find few non-negative weights x with ‖A x - b‖ <= tolerance ‖b‖.
 
-    Farhat, Avery, Chapman, Cortial: Dimensional reduction of nonlinear finite element dynamic models with finite
-    rotations and energy-based mesh sampling and weighting for computational efficiency, IJNME 98 (2014), algorithm 1.
-    Columns are scaled to unit norm, so that the choice does not favour large cells.
+    Lawson and Hanson's active set, stopped early: Farhat, Avery, Chapman, Cortial: Dimensional
+    reduction of nonlinear finite element dynamic models with finite rotations and energy-based mesh
+    sampling and weighting for computational efficiency, IJNME 98 (2014), algorithm 1. Columns are
+    scaled to unit norm, so that the choice does not favour large cells.
 
-    What is returned has x >= 0, a passive gradient of at most `OPTIMAL` and, with a tolerance above 0, the residual asked for;
-    its dual gradient is positive, since it stops early. With tolerance 0 it is the least-squares solution, whatever its
-    residual: the dual gradient is at most `OPTIMAL` too. All are recomputed from the weights. A target of zero has zero weights.
+    The weights have a passive gradient of at most `OPTIMAL`. With tolerance 0 they are the
+    non-negative least-squares solution, and the dual gradient is at most `OPTIMAL` too.
 
     Parameters
     ----------
@@ -221,7 +219,7 @@ def sparse_nnls(
     tolerance : float
         Relative residual at which to stop; 0 runs to the optimum.
     max_iterations : int, optional
-        Columns added or removed; 3 n by default.
+        Most columns added or removed; 3 n by default.
 
     Raises
     ------
@@ -231,18 +229,12 @@ def sparse_nnls(
         If the tolerance, or with tolerance 0 the optimum, is not reached.
     """
     check_finite(matrix, target)
-    columns = ActiveColumns(matrix, target)
-    size, limit = (
-        float(np.linalg.norm(target)),
-        3 * matrix.shape[1] if max_iterations is None else max_iterations,
-    )
+    columns, size = ActiveColumns(matrix, target), float(np.linalg.norm(target))
+    limit = 3 * matrix.shape[1] if max_iterations is None else max_iterations
     x, residual, iterations = np.zeros(0), target, 0
     unusable = columns.scale == 0
-    rejected = unusable.copy()
-    while (
-        float(np.linalg.norm(residual)) > max(tolerance, LEAST_GRADIENT) * size
-        and iterations < limit
-    ):
+    rejected, enough = unusable.copy(), max(tolerance, LEAST_GRADIENT) * size
+    while float(np.linalg.norm(residual)) > enough and iterations < limit:
         gradient = columns.gradient(residual)
         if np.abs(gradient[columns.chosen]).max(initial=0.0) > DRIFT * max(size, float(x.sum())):
             columns.refactor()
@@ -254,7 +246,7 @@ def sparse_nnls(
         if gradient[entering] <= LEAST_GRADIENT * size:
             break
         iterations += 1
-        # Round-off: a (nearly) dependent column, or one that cannot take a positive weight, would enter for ever.
+        # A dependent column, or one that cannot have a positive weight, would enter for ever.
         if not columns.append(entering):
             rejected[entering] = True
             continue
@@ -263,32 +255,49 @@ def sparse_nnls(
             columns.remove(entering)
             rejected[entering] = True
             continue
-        rejected, x = unusable.copy(), np.append(x, 0.0)
-        while not (trial > 0).all():
-            shrinking = trial <= 0
-            x = x + float((x[shrinking] / (x[shrinking] - trial[shrinking])).min()) * (trial - x)
-            leaving = (x <= 1e-14 * x.max()) & shrinking
-            for column in [columns.chosen[i] for i in np.flatnonzero(leaving)]:
-                columns.remove(column)
-            x, trial, iterations = x[~leaving], columns.coefficients(), iterations + 1
-        x = trial
-        residual = columns.residual(x)
+        rejected = unusable.copy()
+        x, removals = _positive(columns, np.append(x, 0.0), trial)
+        residual, iterations = columns.residual(x), iterations + removals
     found = SparseWeights.of(matrix, target, columns.weights(x), iterations)
+    _check(found, tolerance)
+    return found
+
+
+def _positive(columns: ActiveColumns, x: Array, trial: Array) -> tuple[Array, int]:
+    """Remove columns, along the way from x to the trial, until all coefficients are positive.
+
+    Returns the least-squares coefficients on the remaining columns, and the number of removals.
+    """
+    removals = 0
+    while not (trial > 0).all():
+        shrinking = trial <= 0
+        x = x + float((x[shrinking] / (x[shrinking] - trial[shrinking])).min()) * (trial - x)
+        leaving = (x <= 1e-14 * x.max()) & shrinking
+        for column in [columns.chosen[i] for i in np.flatnonzero(leaving)]:
+            columns.remove(column)
+        x, trial, removals = x[~leaving], columns.coefficients(), removals + 1
+    return trial, removals
+
+
+def _check(found: SparseWeights, tolerance: float) -> None:
+    """Raise `CubatureError` if weights miss the tolerance or, on their columns, the optimum."""
+    iterations = found.iterations
     if found.relative_residual > tolerance * (1 + 1e-9) > 0:
         raise CubatureError(
-            f"cubature reached a relative residual of {found.relative_residual:.3g} in {iterations} iterations; `tolerance` asks for {tolerance:.3g}.",
+            f"cubature reached a relative residual of {found.relative_residual:.3g} in "
+            f"{iterations} iterations; `tolerance` asks for {tolerance:.3g}.",
             relative_residual=found.relative_residual,
         )
     if found.passive_gradient > OPTIMAL or (tolerance == 0 and found.dual_gradient > OPTIMAL):
         raise CubatureError(
-            f"cubature found no optimum in {iterations} iterations: the gradient is {found.passive_gradient:.3g} on positive weights and "
-            f"{found.dual_gradient:.3g} on the others; at most {OPTIMAL:.3g} would do."
+            f"cubature found no optimum in {iterations} iterations: the gradient is "
+            f"{found.passive_gradient:.3g} on positive weights and {found.dual_gradient:.3g} on "
+            f"the others; at most {OPTIMAL:.3g} is allowed."
         )
-    return found
 
 
 def _feasible(columns: ActiveColumns, x: Array, residual: Array) -> tuple[Array, Array]:
-    """The solution of a fresh factor, if round-off lets it be positive; else what there was."""
+    """Return the solution of a fresh factor if it is positive; else x."""
     trial = columns.coefficients()
     return (trial, columns.residual(trial)) if (trial > 0).all() else (x, residual)
 
@@ -300,18 +309,18 @@ def ecsw_system(
     q: Array,
     max_entries: int = MAX_ENTRIES,
 ) -> Array:
-    """The ECSW training matrix G, or a shorter one of as much worth to least squares.
+    """Return the ECSW training matrix G, or a shorter one with the same least-squares problem.
 
-    G[(s, i), e] = φ_iᵀ f_e(Φ q_s), (n_snapshots r, n_cells); the target is G·1. Since ‖Gξ - G1‖ = ‖Rξ - R1‖ for G = QR, R will
-    do. QR pays from 4 rows per cell on: below, it takes longer than all that it saves. Blocks of rows are compressed as they
-    come where G has more than ``max_entries``. At 12,000 rows of the fine beam's 3,267 cells G takes 313 MB, and is kept.
+    G[(s, i), e] = φ_iᵀ f_e(Φ q_s), (n_snapshots r, n_cells); the target is G·1. The triangle R of
+    G = QR has the same problem, because ‖Gξ - G1‖ = ‖Rξ - R1‖. QR pays from 4 rows per cell. If G
+    has more than ``max_entries``, blocks of rows are compressed as they come.
 
     Parameters
     ----------
     assembler : Assembler
         Over all cells.
     cell_dofs : (n_cells, n_cell_dofs) int
-        Row of Φ of each cell's dofs; ``n_dofs`` for supports.
+        Row of Φ of each cell's dofs; ``n_dofs`` at supports.
     modes : (n_dofs, r) float64
     q : (n_snapshots, r) float64
         Projected snapshots.
@@ -324,13 +333,12 @@ def ecsw_system(
     for coordinates in q:
         if used + r > most:
             system[:n_cells], used = triangle(system[:used]), n_cells
-        system[used : used + r] = np.matmul(
-            assembler.cell_forces(modes @ coordinates)[:, None], local
-        )[:, 0].T
+        forces = assembler.cell_forces(modes @ coordinates)
+        system[used : used + r] = np.matmul(forces[:, None], local)[:, 0].T
         used += r
     return triangle(system[:used]) if used > 4 * n_cells else system[:used]
 
 
 def triangle(matrix: Array) -> Array:
-    """R of the QR factorisation: of the same worth to least squares."""
+    """Return R of the QR factorisation, which has the same least-squares problem."""
     return np.asarray(qr(matrix, mode="r", check_finite=False)[0][: matrix.shape[1]])

@@ -1,4 +1,4 @@
-"""Bases that need no snapshots: the linear responses to a scene's loads, and how they bend as the body deforms."""
+"""Bases without snapshots: linear responses to a scene's loads, and their modal derivatives."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from mor_bench.reduction.basis import pod
 from mor_bench.scene.scene import Scene
 
 DIFFERENCE = 1e-3
-"""Largest displacement of the differences, relative to the body: truncation is of second order, round-off of minus second."""
+"""Largest displacement of the finite differences, relative to the body.
+
+The truncation error grows with its square, and round-off with its inverse square.
+"""
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,8 @@ class LinearModes:
     modes : (n_free, r) float64
         Orthonormal.
     amplitudes_m : (r,) float64
-        Root mean square coordinate over all patches under forces of the largest magnitude in every direction.
+        Root mean square coordinates under forces of the largest magnitude in all directions on all
+        patches.
     """
 
     modes: NDArray[np.float64]
@@ -32,7 +36,7 @@ class LinearModes:
 
 
 def patch_responses(scene: Scene, model: FullOrderModel) -> NDArray[np.float64]:
-    """Linear responses (3 n_patches, n_free), m/N, to a force of one newton along each axis on each load patch."""
+    """Return linear responses (3 n_patches, n_free), m, to 1 N along each axis on each patch."""
     on_nodes = scene.patch_weights.toarray()
     forces = np.zeros((3, *on_nodes.shape, 3))
     for axis in range(3):
@@ -41,33 +45,35 @@ def patch_responses(scene: Scene, model: FullOrderModel) -> NDArray[np.float64]:
 
 
 def linear_modes(scene: Scene, model: FullOrderModel, n_modes: int | None = None) -> LinearModes:
-    """The n_modes leading modes of the linear responses to a force along each axis on each load patch.
+    """Return leading modes of the linear responses to a force along each axis on each patch.
 
-    At most the rank of the responses, to which it is capped with a warning; all of it by default.
+    The number is capped at the rank of the responses with a warning; it is the rank by default.
     """
     responses = patch_responses(scene, model)
     basis = pod(responses, n_modes)
-    # A direction drawn evenly from the sphere has a mean square of 1/3 along each axis: the sum over axes, over patches.
+    # A random direction has a mean square of 1/3 along each axis.
     size = scene.generated.loads.magnitude_n[1] / np.sqrt(len(responses))
     return LinearModes(basis.modes, size * basis.singular_values[: basis.modes.shape[1]])
 
 
 def pairs(r: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The first and second numbers of all pairs i <= j < r."""
+    """Return the first and second numbers of all pairs i <= j < r."""
     first, second = np.triu_indices(r)
     return first.astype(np.int64), second.astype(np.int64)
 
 
 def modal_derivatives(model: FullOrderModel, modes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Static modal derivatives at rest, ψᵢⱼ = -K₀⁻¹ (∂K/∂qⱼ) φᵢ = -K₀⁻¹ f″[φᵢ, φⱼ], (n_free, r (r + 1) / 2) for `pairs`.
+    """Return static modal derivatives at rest, (n_free, r (r + 1) / 2) for `pairs`.
 
-    Idelsohn, Cardona: A reduction method for nonlinear structural dynamic analysis, CMAME 49 (1985); Barbič, James:
-    Real-time subspace integration for St. Venant-Kirchhoff deformable models, SIGGRAPH 2005, equation 14. They are symmetric
-    in i and j, since f″ is the third derivative of an energy.
+    ψᵢⱼ = -K₀⁻¹ (∂K/∂qⱼ) φᵢ = -K₀⁻¹ f″[φᵢ, φⱼ]. Idelsohn, Cardona: A reduction method for nonlinear
+    structural dynamic analysis, CMAME 49 (1985); Barbič, James: Real-time subspace integration for
+    St. Venant-Kirchhoff deformable models, SIGGRAPH 2005, equation 14. They are symmetric in i and
+    j, because f″ is the third derivative of an energy.
 
-    The second derivative follows from forces alone: the even part e(x) = (f(x) + f(-x)) / 2 is f″[x, x] / 2 and terms of
-    fourth order, so that f″[a, b] = e(a + b) - e(a) - e(b). The force of Saint Venant-Kirchhoff is cubic and has no such
-    terms: there the formula is exact; for other laws its relative error is of the order of the squared strain of the step.
+    The second derivative follows from forces. The even part e(x) = (f(x) + f(-x)) / 2 is
+    f″[x, x] / 2 plus terms of fourth order, so f″[a, b] = e(a + b) - e(a) - e(b). The force of
+    Saint Venant-Kirchhoff is cubic and has no such terms: there the formula is exact. For other
+    laws the relative error is of the order of the squared strain of the step.
     """
     scales = DIFFERENCE * model.extent / np.abs(modes).max(axis=0)
     steps = (modes * scales).T
@@ -87,21 +93,18 @@ def modal_derivatives(model: FullOrderModel, modes: NDArray[np.float64]) -> NDAr
 def derivative_basis(
     scene: Scene, model: FullOrderModel, n_linear: int, n_modes: int
 ) -> NDArray[np.float64]:
-    """An orthonormal basis of linear modes and the modal derivatives of the first n_linear, (n_free, n_modes).
+    """Return an orthonormal basis of linear modes and modal derivatives, (n_free, n_modes).
 
-    All enter one singular value decomposition with the size that they have in the second-order expansion of a response,
+    The derivatives are those of the first n_linear modes. All enter one singular value
+    decomposition with their size in the second-order expansion of a response,
     u = Σ qᵢφᵢ + ½ Σ qᵢqⱼψᵢⱼ, at the coordinates' root mean square.
     """
     linear = linear_modes(scene, model)
     n_linear = min(n_linear, linear.modes.shape[1])
     first, second = pairs(n_linear)
-    sizes = (
-        np.where(first == second, 0.5, 1.0)
-        * linear.amplitudes_m[first]
-        * linear.amplitudes_m[second]
+    amplitudes, halves = linear.amplitudes_m, np.where(first == second, 0.5, 1.0)
+    bent = modal_derivatives(model, linear.modes[:, :n_linear]) * (
+        halves * amplitudes[first] * amplitudes[second]
     )
-    bent = modal_derivatives(model, linear.modes[:, :n_linear]) * sizes
-    return pod(
-        np.vstack([(linear.modes * linear.amplitudes_m).T[: max(n_linear, n_modes)], bent.T]),
-        n_modes,
-    ).modes
+    straight = (linear.modes * amplitudes).T[: max(n_linear, n_modes)]
+    return pod(np.vstack([straight, bent.T]), n_modes).modes

@@ -1,4 +1,4 @@
-"""Discrete empirical interpolation (DEIM): a vector of many entries from a few of them."""
+"""Discrete empirical interpolation (DEIM): recover a vector from a few of its entries."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ Selection = Literal["greedy", "pivoted-qr"]
 
 
 def interpolation_rows(basis: NDArray[np.float64], selection: Selection) -> NDArray[np.int64]:
-    """As many rows of a basis U as it has columns, so that their square part PᵀU is well invertible.
+    """Choose as many rows of a basis U as it has columns, such that PᵀU is well conditioned.
 
     greedy
-        Each next row where the interpolation of the next column errs most: Chaturantabut & Sorensen, Nonlinear model reduction via
-        discrete empirical interpolation, SIAM J. Sci. Comput. 32 (2010), algorithm 1.
+        Take each next row where interpolation of the next column has its largest error.
+        Chaturantabut & Sorensen, Nonlinear model reduction via discrete empirical interpolation,
+        SIAM J. Sci. Comput. 32 (2010), algorithm 1.
     pivoted-qr
-        The pivots of a QR factorisation of Uᵀ: Drmač & Gugercin, A new selection operator for the discrete empirical interpolation
-        method, SIAM J. Sci. Comput. 38 (2016), algorithm 1 (Q-DEIM).
+        Take the pivots of a QR factorisation of Uᵀ. Drmač & Gugercin, A new selection operator for
+        the discrete empirical interpolation method, SIAM J. Sci. Comput. 38 (2016), algorithm 1
+        (Q-DEIM).
 
     Parameters
     ----------
@@ -38,9 +40,8 @@ def interpolation_rows(basis: NDArray[np.float64], selection: Selection) -> NDAr
     if k > n:
         raise InvalidInputError(f"a basis of {n} rows cannot have {k} independent columns.")
     if selection == "pivoted-qr":
-        return np.asarray(
-            qr(basis.T, mode="r", pivoting=True, check_finite=False)[1][:k], dtype=np.int64
-        )
+        pivots = qr(basis.T, mode="r", pivoting=True, check_finite=False)[1]
+        return np.asarray(pivots[:k], dtype=np.int64)
     rows = [int(np.abs(basis[:, 0]).argmax())]
     for column in range(1, k):
         coefficients = np.linalg.solve(basis[rows, :column], basis[rows, column])

@@ -1,4 +1,4 @@
-"""Empirical cubature (ECM): cells that integrate a basis of the reduced cell forces exactly, and their sum of weights."""
+"""Empirical cubature (ECM): cells that integrate a basis of the reduced cell forces exactly."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ from mor_bench.reduction.cubature import ActiveColumns, CubatureError, SparseWei
 Array = NDArray[np.float64]
 
 BLOCK = 64
-"""Directions that the range finder adds at a time."""
+"""Number of directions that the range finder adds at a time."""
 EXACT = 1e-8
-"""Relative residual of the equations for the weights at which they pass for solved."""
+"""Relative residual at which the equations for the weights count as solved."""
 
 
 def cell_basis(matrix: Array, tolerance: float) -> Array:
-    """Leading right singular vectors of a matrix, as many as leave at most ``tolerance`` of its Frobenius norm.
+    """Return leading right singular vectors that leave at most ``tolerance`` of the Frobenius norm.
 
-    The range is found block by block from random combinations of rows, with one step of subspace iteration (Halko, Martinsson,
-    Tropp, SIAM Review 53, 2011, algorithms 4.3 and 4.4), until what is left is small enough; the singular vectors are then
-    those of a small matrix. For 136 vectors of 2,000 rows of the fine beam this took
-    0.4 s, the full decomposition 6 s.
+    Random combinations of rows give the range block by block, with one step of subspace iteration
+    (Halko, Martinsson, Tropp, SIAM Review 53, 2011, algorithms 4.3 and 4.4), until the rest is
+    small enough. The singular vectors are then those of a small matrix.
 
     Parameters
     ----------
@@ -63,7 +62,8 @@ def cell_basis(matrix: Array, tolerance: float) -> Array:
     enough = np.flatnonzero(tails <= max(tolerance, 1e-12) * total)
     if not len(enough):
         raise CubatureError(
-            f"the basis of the cell forces leaves out {rest / total:.3g} of them; `cubature_tolerance` asks for {tolerance:.3g}."
+            f"the basis of the cell forces leaves out {rest / total:.3g} of them; "
+            f"`cubature_tolerance` asks for {tolerance:.3g}."
         )
     kept = int(enough[0]) or 1
     return np.ascontiguousarray((vt[:kept] @ rows).T)
@@ -72,12 +72,13 @@ def cell_basis(matrix: Array, tolerance: float) -> Array:
 def empirical_cubature(
     matrix: Array, tolerance: float, max_iterations: int | None = None
 ) -> SparseWeights:
-    """Cells and non-negative weights that integrate the leading singular vectors of the training matrix, and 1, exactly.
+    """Find weights that integrate the training matrix' leading singular vectors, and 1, exactly.
 
-    Hernández, Caicedo, Ferrer: Dimensional hyper-reduction of nonlinear finite element models via empirical cubature, CMAME 313
-    (2017), section 3, with the constraint on the sum of the weights as Kratos has it: the part of the constant that the basis
-    lacks becomes one more basis function. Cells enter greedily, the one whose basis values point most along the residual first;
-    whichever weights the least squares make negative leave. There are at most as many cells as basis functions.
+    Hernández, Caicedo, Ferrer: Dimensional hyper-reduction of nonlinear finite element models via
+    empirical cubature, CMAME 313 (2017), section 3. The sum of the weights is constrained as in
+    Kratos: the part of the constant outside the basis becomes one more basis function. Cells enter
+    greedily, and cells with negative weights leave. There are at most as many cells as basis
+    functions.
 
     Parameters
     ----------
@@ -86,12 +87,12 @@ def empirical_cubature(
     tolerance : float
         Share of the matrix' Frobenius norm that the basis may lack.
     max_iterations : int, optional
-        Columns added or removed; 3 n by default.
+        Most columns added or removed; 3 n by default.
 
     Returns
     -------
     SparseWeights
-        For the equations of the weights, not for the training matrix; its relative residual is at most `EXACT`.
+        Non-negative; its residual, at most `EXACT`, is that of the equations for the weights.
 
     Raises
     ------
@@ -100,21 +101,10 @@ def empirical_cubature(
     CubatureError
         If the equations are not solved within the iterations, or the matrix is zero.
     """
-    ones = np.ones(matrix.shape[1])
-    check_finite(matrix, ones)
-    if not matrix.any():
-        raise CubatureError("cubature has nothing to integrate: the training matrix is zero.")
-    basis = cell_basis(matrix, tolerance)
-    constant = ones - basis @ (basis.T @ ones)
-    if np.linalg.norm(constant) > 1e-6 * np.linalg.norm(ones):
-        basis = np.column_stack([basis, constant / np.linalg.norm(constant)])
-    equations = np.ascontiguousarray(basis.T)
+    equations = _equations(matrix, tolerance)
     target = equations.sum(axis=1)
-    columns = ActiveColumns(equations, target)
-    size, limit = (
-        float(np.linalg.norm(target)),
-        3 * len(ones) if max_iterations is None else max_iterations,
-    )
+    columns, size = ActiveColumns(equations, target), float(np.linalg.norm(target))
+    limit = 3 * matrix.shape[1] if max_iterations is None else max_iterations
     x, residual, iterations = np.zeros(0), target, 0
     rejected = columns.scale == 0
     while float(np.linalg.norm(residual)) > EXACT * size and iterations < limit:
@@ -137,11 +127,25 @@ def empirical_cubature(
         before, residual = float(np.linalg.norm(residual)), columns.residual(x)
         if float(np.linalg.norm(residual)) < before:
             rejected = columns.scale == 0
-        else:  # the exchange did not help: the cell that came would come and go for ever
+        else:  # a cell that did not help would come and go for ever
             rejected[entering] = True
     found = SparseWeights.of(equations, target, columns.weights(x), iterations)
     if found.relative_residual > EXACT * (1 + 1e-6):
         raise CubatureError(
-            f"cubature reached a relative residual of {found.relative_residual:.3g} in {iterations} iterations; {EXACT:g} is needed."
+            f"cubature reached a relative residual of {found.relative_residual:.3g} in "
+            f"{iterations} iterations; {EXACT:g} is needed."
         )
     return found
+
+
+def _equations(matrix: Array, tolerance: float) -> Array:
+    """Return the orthonormal rows (k, n) that the weights must integrate exactly."""
+    ones = np.ones(matrix.shape[1])
+    check_finite(matrix, ones)
+    if not matrix.any():
+        raise CubatureError("cubature has nothing to integrate: the training matrix is zero.")
+    basis = cell_basis(matrix, tolerance)
+    constant = ones - basis @ (basis.T @ ones)
+    if np.linalg.norm(constant) > 1e-6 * np.linalg.norm(ones):
+        basis = np.column_stack([basis, constant / np.linalg.norm(constant)])
+    return np.ascontiguousarray(basis.T)

@@ -1,4 +1,7 @@
-"""Galerkin projection on a quadratic manifold: u(q) = Φq + ½ Σ qᵢqⱼψᵢⱼ, T(q)ᵀ (f_int(u(q)) - f) = 0 with T = ∂u/∂q."""
+"""Galerkin projection on a quadratic manifold, u(q) = Φq + ½ Σ qᵢqⱼψᵢⱼ.
+
+It solves T(q)ᵀ (f_int(u(q)) - f) = 0 with the tangent space T = ∂u/∂q.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +20,10 @@ from mor_bench.reduction.galerkin import DenseProblem, GalerkinProblem, stiffnes
 
 
 class QuadraticManifold:
-    """Jain, Tiso, Rutzmoser, Rixen: A quadratic manifold for model order reduction of nonlinear structural dynamics,
-    Computers & Structures 188 (2017), equation 11.
+    """The map u(q) and its derivatives.
+
+    Jain, Tiso, Rutzmoser, Rixen: A quadratic manifold for model order reduction of nonlinear
+    structural dynamics, Computers & Structures 188 (2017), equation 11.
 
     Parameters
     ----------
@@ -38,26 +43,25 @@ class QuadraticManifold:
         first, second = pairs(r)
         if derivatives.shape != (n, len(first)) or not np.isfinite(derivatives).all():
             raise InvalidInputError(
-                f"`derivatives` must be a finite array of shape ({n}, {len(first)}); got shape {derivatives.shape}."
+                f"`derivatives` must be a finite array of shape ({n}, {len(first)}); "
+                f"got shape {derivatives.shape}."
             )
-        # One memory order, fitted or loaded: BLAS rounds differently in another.
-        self.modes, self.derivatives = (
-            np.ascontiguousarray(modes),
-            np.ascontiguousarray(derivatives),
-        )
+        # Fitted and loaded arrays need the same memory order, because BLAS rounds differently.
+        self.modes = np.ascontiguousarray(modes)
+        self.derivatives = np.ascontiguousarray(derivatives)
         self._bend = np.empty((n, r, r))
         self._bend[:, first, second] = derivatives
         self._bend[:, second, first] = derivatives
 
     def at(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The displacement u(q), (n,), and the tangent space T(q), (n, r)."""
+        """Return the displacement u(q), (n,), and the tangent space T(q), (n, r)."""
         count(multiply_adds=self._bend.size + self.modes.size)
         bent: NDArray[np.float64] = (self._bend.reshape(-1, len(q)) @ q).reshape(self.modes.shape)
         tangents = self.modes + bent
         return 0.5 * ((self.modes + tangents) @ q), tangents
 
     def curvature(self, force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Σₐ fₐ ∂²uₐ/∂q², (r, r): the part of a tangent that comes of the manifold's own curvature."""
+        """Return Σₐ fₐ ∂²uₐ/∂q², (r, r), the part of a tangent due to the manifold's curvature."""
         count(multiply_adds=self._bend.size)
         r = self.modes.shape[1]
         return (force @ self._bend.reshape(-1, r * r)).reshape(r, r)
@@ -69,17 +73,18 @@ def manifold_system(
     manifold: QuadraticManifold,
     states: list[NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """The ECSW training matrix on a manifold, compressed by QR as in `cubature.ecsw_system`.
+    """Return the ECSW training matrix on a manifold, compressed by QR as in `cubature.ecsw_system`.
 
-    G[(s, i), e] = T(q_s)ᵢᵀ f_e(u(q_s)); the target is G·1. Jain, Tiso: Hyper-reduction over nonlinear manifolds for large
-    nonlinear mechanical systems, J. Comput. Nonlinear Dynam. 14 (2019).
+    G[(s, i), e] = T(q_s)ᵢᵀ f_e(u(q_s)); the target is G·1. Jain, Tiso: Hyper-reduction over
+    nonlinear manifolds for large nonlinear mechanical systems, J. Comput. Nonlinear Dynam. 14
+    (2019).
 
     Parameters
     ----------
     assembler : Assembler
         Over all cells.
     cell_dofs : (n_cells, 24 or 12) int
-        Row of each cell's dofs; ``n_dofs`` for supports.
+        Row of each cell's dofs; ``n_dofs`` at supports.
     manifold : QuadraticManifold
     states : list of (r,) float64
         Coordinates q_s.
@@ -93,18 +98,18 @@ def manifold_system(
 
 
 class ManifoldProblem(DenseProblem):
-    """The potential W(u(q)) - f·u(q) as a problem for the nonlinear solve, under the constant reduced load Φᵀf.
+    """The potential W(u(q)) - f·u(q) as a problem for the nonlinear solve, under the load Φᵀf.
 
-    The rest of the load's work, f·(u(q) - Φq) = ½ q·Bq, counts as stored energy: force and tangent are exact derivatives of
-    one potential, so that all checks and safeguards of the solve hold, and a solution has no direction of negative curvature
-    on the manifold.
+    The rest of the load's work, f·(u(q) - Φq) = ½ q·Bq, counts as stored energy. Force and tangent
+    are then exact derivatives of one potential, so that all checks of the solve hold. A solution
+    has no direction of negative curvature on the manifold.
 
     Parameters
     ----------
     linear : GalerkinProblem
-        On Φ, the manifold's tangent space at rest; over all cells or over weighted ones.
+        On Φ, the manifold's tangent space at rest, over all cells or over weighted ones.
     manifold : QuadraticManifold
-        Of the dofs that the assembler sees.
+        On the assembler's dofs.
     bending_load : (r, r) float64
         B = Σₐ fₐ ∂²uₐ/∂q² over all dofs, N/m.
     """
@@ -120,7 +125,7 @@ class ManifoldProblem(DenseProblem):
 
     @property
     def rest_tangent(self) -> NDArray[np.float64]:
-        # Without the load's part: it only scales shifts towards the rest and the first step from there.
+        # The load's part is left out: the tangent only scales shifts and the first step.
         return self._linear.rest_tangent
 
     @cached_property
@@ -130,9 +135,8 @@ class ManifoldProblem(DenseProblem):
     def _state(self, q: NDArray[np.float64], state: State, tangents: NDArray[np.float64]) -> State:
         count(multiply_adds=tangents.size)
         done = self._bending_load @ q
-        return State(
-            tangents.T @ state.force - done, state.energy_j - 0.5 * float(done @ q), state.min_det_f
-        )
+        energy_j = state.energy_j - 0.5 * float(done @ q)
+        return State(tangents.T @ state.force - done, energy_j, state.min_det_f)
 
     def force(self, q: NDArray[np.float64]) -> State:
         u, tangents = self._manifold.at(q)
@@ -141,7 +145,7 @@ class ManifoldProblem(DenseProblem):
     def linearise(self, q: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]:
         u, tangents = self._manifold.at(q)
         state, values = self._linear.assembler.force_and_tangent(u)
-        # KT with the K of which one triangle is stored, TᵀKT.
+        # The terms are KT with one stored triangle of K, and TᵀKT.
         n, r = tangents.shape
         count(multiply_adds=(2 * len(values) - n) * r + n * r**2)
         product = stiffness_times(self._linear.assembler.pattern, values, tangents)

@@ -1,8 +1,9 @@
-"""The reduced model that interpolates its nonlinear force, and Newton's method for tangents that are not symmetric.
+"""A reduced model with interpolated force, and Newton's method for its unsymmetric tangents.
 
-Such a model has no potential: no energy to descend on, and no Cholesky factor that tells a stable equilibrium. What is checked is
-the residual, det F > 0 at the points that are integrated, and that the tangent's determinant has the sign that it has at rest,
-which it keeps on a path that meets no singular tangent.
+Such a model has no potential. There is no energy to descend on, and no Cholesky factor that
+identifies a stable equilibrium. A solution must have a small residual, det F > 0 at the integrated
+points, and a tangent whose determinant has the sign that it has at rest. A path that meets no
+singular tangent keeps that sign.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 
 from mor_bench.counting import count, triangular_multiply_adds, uncounted
 from mor_bench.errors import InvalidInputError, InvertedElementError, NoEquilibriumError
+from mor_bench.mechanics.load_steps import LoadSteps
 from mor_bench.mechanics.newton import (
     HOPELESS,
     MAX_ITERATIONS,
@@ -20,22 +22,24 @@ from mor_bench.mechanics.newton import (
     PLAIN_ITERATIONS,
     NewtonOptions,
 )
-from mor_bench.mechanics.problem import LINEAR, ROUND_OFF
+from mor_bench.mechanics.problem import LINEAR, is_round_off
 from mor_bench.reduction.points import ReducedPoints
 
 Array = NDArray[np.float64]
 
 MAX_HALVINGS = 8
-"""Of a step that does not lower the residual."""
+"""Halvings of a step that does not lower the residual."""
 
 
 class InterpolatedProblem:
-    """f_r(q) = (K_r - K_s) q + s(q): exact at rest, where s has the tangent K_s and K_r is the reduced stiffness.
+    """The force f_r(q) = (K_r - K_s) q + s(q), which is exact to first order at rest.
+
+    K_r is the reduced stiffness at rest, and K_s the tangent of the sampled force s at rest.
 
     Parameters
     ----------
     points : ReducedPoints
-        s: the sampled force, on test functions that interpolate and project.
+        The sampled force s, on test functions that interpolate and project.
     rest : (r, r) float64
         ΦᵀK₀Φ.
     extent : float
@@ -55,13 +59,13 @@ class InterpolatedProblem:
         self._rest = rest
 
     def linearise(self, q: Array) -> tuple[Array, Array, float]:
-        """Force, tangent, min det F over the sampled cells."""
+        """Return force, tangent, and min det F over the sampled cells."""
         state, tangent = self.points.force_and_tangent(q)
         count(multiply_adds=len(q) ** 2)
         return state.force + self._linear @ q, tangent + self._linear, state.min_det_f
 
     def solve(self, load: Array, options: NewtonOptions) -> Array:
-        """The equilibrium that full steps from rest lead to, else the one that load increments do, (r,).
+        """Return the equilibrium (r,) by full steps from rest, or else by load increments.
 
         Raises
         ------
@@ -84,32 +88,37 @@ class InterpolatedProblem:
         q, _, iterations = self._newton(load, start, options.tolerance, damped=False)
         if q is not None:
             return q
-        reached, increment, cuts, at = 0.0, 0.5, 0, np.zeros_like(load)
+        steps, at = LoadSteps(0.5), np.zeros_like(load)
         while True:
-            target = min(1.0, reached + increment)
-            q, min_det, spent = self._newton(target * load, at, options.tolerance, damped=True)
+            found, min_det, spent = self._newton(
+                steps.target * load, at, options.tolerance, damped=True
+            )
             iterations += spent
-            if q is not None:
-                if target == 1.0:
-                    return q
-                at, reached, increment = q, target, 2.0 * increment
+            if found is not None:
+                at = found
+                steps.accept()
+                if steps.complete:
+                    return at
                 continue
-            cuts += 1
-            increment *= 0.5
-            if cuts > options.max_cuts or iterations > MAX_ITERATIONS:
-                story = f"stopped at {reached:.4g} of the load after {iterations} iterations and {cuts} cut-backs"
+            steps.cut()
+            if steps.cuts > options.max_cuts or iterations > MAX_ITERATIONS:
+                story = steps.story(iterations)
                 if min_det <= 0:
                     raise InvertedElementError(
                         f"sampled elements invert: {story}; det F <= 0 was {min_det:.3g}."
                     )
                 raise NoEquilibriumError(
-                    f"no equilibrium of the interpolated force found: {story}; a symmetric method may find one."
+                    f"no equilibrium of the interpolated force found: {story}; "
+                    "a symmetric method may find one."
                 )
 
     def _newton(
         self, load: Array, start: Array, tolerance: float, damped: bool
     ) -> tuple[Array | None, float, int]:
-        """The solution or None, the last min det F, and the number of iterations; damped, every step lowers the residual."""
+        """Return the solution or None, the last min det F, and the number of iterations.
+
+        If damped, every step lowers the residual.
+        """
         q, size, load_norm = start, np.inf, float(np.linalg.norm(load))
         force, tangent, min_det = self.linearise(q)
         for iteration in range(1, PLAIN_ITERATIONS + 1):
@@ -118,7 +127,7 @@ class InterpolatedProblem:
             if not size <= HOPELESS * load_norm:
                 return None, min_det, iteration
             step, positive = _factored(tangent, residual)
-            small = np.isfinite(step).all() and np.abs(step).max() <= ROUND_OFF * np.abs(q).max()
+            small = np.isfinite(step).all() and is_round_off(step, q)
             if size <= tolerance * load_norm or small:
                 return (q if positive and min_det > 0 else None), min_det, iteration
             for halving in range(MAX_HALVINGS if damped else 1):
@@ -133,7 +142,7 @@ class InterpolatedProblem:
 
 
 def _factored(matrix: Array, rhs: Array) -> tuple[Array, bool]:
-    """Solution by LU with partial pivoting, and whether the determinant is positive."""
+    """Solve by LU with partial pivoting; return also whether the determinant is positive."""
     n = len(rhs)
     work = (n**3 - n) // 3 + triangular_multiply_adds(n, n - 1)
     count(

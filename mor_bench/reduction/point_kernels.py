@@ -1,8 +1,9 @@
-"""Kernels of `mor_bench.reduction.points`: quadrature points in batches of ``LANES``, which end every array.
+"""Kernels of `mor_bench.reduction.points`: quadrature points in batches of ``LANES``.
 
-The innermost loops run over neighbouring points, or over all components of a batch, so that LLVM makes vector instructions of
-them (see `mor_bench.mechanics.kernels`). Component (i, J) of H, P or a mode's gradient at lane l lies at (3i + J) * LANES + l, component
-(i, J, k, L) of A = dP/dF at (9 (3i + J) + 3k + L) * LANES + l.
+Every array ends in the lanes of a batch. The innermost loops run over neighbouring points, or over
+all components of a batch, so that LLVM vectorises them (see `mor_bench.mechanics.kernels`).
+Component (i, J) of H, P or a mode's gradient at lane l is at (3i + J) * LANES + l. Component
+(i, J, k, L) of A = dP/dF is at (9 (3i + J) + 3k + L) * LANES + l.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from numba import njit
 
 LANES = 32
-"""Points per batch; with 40 cells and 10 modes 8, 16 and 32 gave tangents in 0.15, 0.07 and 0.06 ms."""
+"""Points per batch; 32 gave the fastest tangents."""
 
 _COMPONENTS = 9 * LANES
 
@@ -28,7 +29,7 @@ def _dot(a, b):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
 def _dots(a, b, c, d, t, u):
-    """Of four with two, so that each is read once; one by one took twice as long."""
+    """Return the dot products of four vectors with two; each is read once."""
     at, bt, ct, dt, au, bu, cu, du = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for l in range(_COMPONENTS):
         at += a[l] * t[l]
@@ -44,7 +45,7 @@ def _dots(a, b, c, d, t, u):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _rows(A, X, Y, T, U):
-    """A row of A : G for two modes."""
+    """Write a row of A : G for two modes."""
     L = LANES
     for l in range(LANES):
         a0, a1, a2, a3, a4 = A[l], A[L + l], A[2 * L + l], A[3 * L + l], A[4 * L + l]
@@ -63,26 +64,23 @@ def _rows(A, X, Y, T, U):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_force(test, P, force):
-    """f_m += G_m : P for a batch."""
+    """Add G_m : P of a batch to f_m."""
     for m in range(len(force)):
         force[m] += _dot(test[m], P)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_tangent(test, trial, symmetric, A, T, tangent):
-    """K_mk += G_m : A : G_k for a batch; where the tangent is symmetric its upper triangle only. T holds A : G of two modes."""
+    """Add G_m : A : G_k of a batch to K_mk, only to the upper triangle if it is symmetric.
+
+    T receives A : G of two modes.
+    """
     r = len(tangent)
     for k in range(0, r, 2):
-        other = min(k + 1, r - 1)  # the same where a single mode is left
+        other = min(k + 1, r - 1)  # equal to k if a single mode is left
         for c in range(9):
-            lanes = slice(c * LANES, (c + 1) * LANES)
-            _rows(
-                A[c * _COMPONENTS : (c + 1) * _COMPONENTS],
-                trial[k],
-                trial[other],
-                T[0, lanes],
-                T[1, lanes],
-            )
+            lanes, row = slice(c * LANES, (c + 1) * LANES), A[c * _COMPONENTS :]
+            _rows(row, trial[k], trial[other], T[0, lanes], T[1, lanes])
         n = other + 1 if symmetric else r
         for m in range(0, n - n % 4, 4):
             at, bt, ct, dt, au, bu, cu, du = _dots(
@@ -111,15 +109,51 @@ def _add_scaled(factor, x, y):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _gradients(trial, q, H):
-    """H = Σ q_m G_m for a batch."""
+    """Write H = Σ q_m G_m of a batch."""
     H[:] = 0.0
     for m in range(len(q)):
         _add_scaled(q[m], trial[m], H)
 
 
+@njit(inline="always")
+def _derivative(H, w, lam, mu, S, A):
+    """Write A_iJkL = λ F_iJ F_kL + μ F_iL F_kJ + μ b_ik δ_JL + δ_ik S_JL; H holds F here."""
+    L = LANES
+    for i in range(3):
+        for k in range(i, 3):
+            for l in range(L):
+                wl, wm = w[l] * lam[l], w[l] * mu[l]
+                i0, i1, i2 = H[3 * i * L + l], H[(3 * i + 1) * L + l], H[(3 * i + 2) * L + l]
+                k0, k1, k2 = H[3 * k * L + l], H[(3 * k + 1) * L + l], H[(3 * k + 2) * L + l]
+                b = wm * (i0 * k0 + i1 * k1 + i2 * k2)
+                l0, l1, l2 = wl * i0, wl * i1, wl * i2
+                m0, m1, m2 = wm * i0, wm * i1, wm * i2
+                a00, a01, a02 = (l0 + m0) * k0 + b, l0 * k1 + m1 * k0, l0 * k2 + m2 * k0
+                a10, a11, a12 = l1 * k0 + m0 * k1, (l1 + m1) * k1 + b, l1 * k2 + m2 * k1
+                a20, a21, a22 = l2 * k0 + m0 * k2, l2 * k1 + m1 * k2, (l2 + m2) * k2 + b
+                if i == k:
+                    s00, s11, s22 = S[l], S[L + l], S[2 * L + l]
+                    s01, s02, s12 = S[3 * L + l], S[4 * L + l], S[5 * L + l]
+                    a00, a01, a02 = a00 + s00, a01 + s01, a02 + s02
+                    a10, a11, a12 = a10 + s01, a11 + s11, a12 + s12
+                    a20, a21, a22 = a20 + s02, a21 + s12, a22 + s22
+                p = (27 * i + 3 * k) * L + l
+                A[p], A[p + L], A[p + 2 * L] = a00, a01, a02
+                A[p + 9 * L], A[p + 10 * L], A[p + 11 * L] = a10, a11, a12
+                A[p + 18 * L], A[p + 19 * L], A[p + 20 * L] = a20, a21, a22
+                if i != k:
+                    p = (27 * k + 3 * i) * L + l
+                    A[p], A[p + L], A[p + 2 * L] = a00, a10, a20
+                    A[p + 9 * L], A[p + 10 * L], A[p + 11 * L] = a01, a11, a21
+                    A[p + 18 * L], A[p + 19 * L], A[p + 20 * L] = a02, a12, a22
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _saint_venant_kirchhoff(H, w, lam, mu, want_tangent, P, S, A, energy, min_det):
-    """Weighted P and A of a batch; E is formed from H, not from FᵀF - I, which would lose the digits of a small strain."""
+    """Write weighted P and A of a batch; add energy, and update min det F.
+
+    E is formed from H, because FᵀF - I would lose the digits of a small strain.
+    """
     L = LANES
     for l in range(L):
         h00, h01, h02 = H[l], H[L + l], H[2 * L + l]
@@ -143,81 +177,36 @@ def _saint_venant_kirchhoff(H, w, lam, mu, want_tangent, P, S, A, energy, min_de
             + h02 * (h10 * h21 - f11 * h20)
         )
         min_det[l] = min(min_det[l], det)
-        P[l], P[L + l], P[2 * L + l] = (
-            f00 * s00 + h01 * s01 + h02 * s02,
-            f00 * s01 + h01 * s11 + h02 * s12,
-            f00 * s02 + h01 * s12 + h02 * s22,
-        )
-        P[3 * L + l], P[4 * L + l] = (
-            h10 * s00 + f11 * s01 + h12 * s02,
-            h10 * s01 + f11 * s11 + h12 * s12,
-        )
-        P[5 * L + l], P[6 * L + l] = (
-            h10 * s02 + f11 * s12 + h12 * s22,
-            h20 * s00 + h21 * s01 + f22 * s02,
-        )
-        P[7 * L + l], P[8 * L + l] = (
-            h20 * s01 + h21 * s11 + f22 * s12,
-            h20 * s02 + h21 * s12 + f22 * s22,
-        )
+        P[l] = f00 * s00 + h01 * s01 + h02 * s02
+        P[L + l] = f00 * s01 + h01 * s11 + h02 * s12
+        P[2 * L + l] = f00 * s02 + h01 * s12 + h02 * s22
+        P[3 * L + l] = h10 * s00 + f11 * s01 + h12 * s02
+        P[4 * L + l] = h10 * s01 + f11 * s11 + h12 * s12
+        P[5 * L + l] = h10 * s02 + f11 * s12 + h12 * s22
+        P[6 * L + l] = h20 * s00 + h21 * s01 + f22 * s02
+        P[7 * L + l] = h20 * s01 + h21 * s11 + f22 * s12
+        P[8 * L + l] = h20 * s02 + h21 * s12 + f22 * s22
         if want_tangent:
             H[l], H[4 * L + l], H[8 * L + l] = f00, f11, f22  # F from here on
-            S[l], S[L + l], S[2 * L + l], S[3 * L + l], S[4 * L + l], S[5 * L + l] = (
-                s00,
-                s11,
-                s22,
-                s01,
-                s02,
-                s12,
-            )
-    if not want_tangent:
-        return
-    for i in range(3):
-        for k in range(i, 3):
-            for l in range(L):
-                wl, wm = w[l] * lam[l], w[l] * mu[l]
-                i0, i1, i2 = H[3 * i * L + l], H[(3 * i + 1) * L + l], H[(3 * i + 2) * L + l]
-                k0, k1, k2 = H[3 * k * L + l], H[(3 * k + 1) * L + l], H[(3 * k + 2) * L + l]
-                b = wm * (i0 * k0 + i1 * k1 + i2 * k2)
-                l0, l1, l2 = wl * i0, wl * i1, wl * i2
-                m0, m1, m2 = wm * i0, wm * i1, wm * i2
-                # A_iJkL = λ F_iJ F_kL + μ F_iL F_kJ + μ b_ik δ_JL + δ_ik S_JL
-                a00, a01, a02 = (l0 + m0) * k0 + b, l0 * k1 + m1 * k0, l0 * k2 + m2 * k0
-                a10, a11, a12 = l1 * k0 + m0 * k1, (l1 + m1) * k1 + b, l1 * k2 + m2 * k1
-                a20, a21, a22 = l2 * k0 + m0 * k2, l2 * k1 + m1 * k2, (l2 + m2) * k2 + b
-                if i == k:
-                    s00, s11, s22, s01, s02, s12 = (
-                        S[l],
-                        S[L + l],
-                        S[2 * L + l],
-                        S[3 * L + l],
-                        S[4 * L + l],
-                        S[5 * L + l],
-                    )
-                    a00, a01, a02 = a00 + s00, a01 + s01, a02 + s02
-                    a10, a11, a12 = a10 + s01, a11 + s11, a12 + s12
-                    a20, a21, a22 = a20 + s02, a21 + s12, a22 + s22
-                p = (27 * i + 3 * k) * L + l
-                A[p], A[p + L], A[p + 2 * L] = a00, a01, a02
-                A[p + 9 * L], A[p + 10 * L], A[p + 11 * L] = a10, a11, a12
-                A[p + 18 * L], A[p + 19 * L], A[p + 20 * L] = a20, a21, a22
-                if i != k:
-                    p = (27 * k + 3 * i) * L + l
-                    A[p], A[p + L], A[p + 2 * L] = a00, a10, a20
-                    A[p + 9 * L], A[p + 10 * L], A[p + 11 * L] = a01, a11, a21
-                    A[p + 18 * L], A[p + 19 * L], A[p + 20 * L] = a02, a12, a22
+            S[l], S[L + l], S[2 * L + l] = s00, s11, s22
+            S[3 * L + l], S[4 * L + l], S[5 * L + l] = s01, s02, s12
+    if want_tangent:
+        _derivative(H, w, lam, mu, S, A)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def gradients(trial, q, H):
-    """H = Σ q_m G_m at all points, (n_batches, 9 * LANES)."""
+    """Write H = Σ q_m G_m at all points, (n_batches, 9 * LANES)."""
     for b in range(len(H)):
         _gradients(trial[b], q, H[b])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def project(P, A, trial, test, symmetric, force, tangent):
-    """Reduced force and, where ``tangent`` is not empty, tangent of the P and A of all points; A is (n_batches, 81 * LANES)."""
+    """Add the reduced force of P and, if ``tangent`` is not empty, the tangent of A.
+
+    A is (n_batches, 81 * LANES).
+    """
     T = np.empty((2, _COMPONENTS))
     for b in range(len(P)):
         _add_force(test[b], P[b], force)
@@ -236,7 +225,7 @@ def _mirror(tangent):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def integrate(q, trial, test, symmetric, weights, lame, force, tangent):
-    """All of it at once for Saint Venant-Kirchhoff: reduced force and, where ``tangent`` is not empty, tangent.
+    """Write reduced force and, if not empty, tangent for Saint Venant-Kirchhoff.
 
     Parameters
     ----------
@@ -248,7 +237,7 @@ def integrate(q, trial, test, symmetric, weights, lame, force, tangent):
     weights : (n_batches, LANES) float64
         m³; zero for padding.
     lame : (n_batches, 2, LANES) float64
-        λ and μ, Pa: a point may carry only one of them, that is selective integration.
+        λ and μ, Pa. With selective integration a point carries only one of them.
     force : (r,) float64
     tangent : (r, r) or (0, 0) float64
 
@@ -283,7 +272,7 @@ def integrate(q, trial, test, symmetric, weights, lame, force, tangent):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
 def _cholesky(matrix, lower):
-    """Lower factor of a symmetric matrix; False where it is not positive definite."""
+    """Write the lower factor of a symmetric matrix; return whether it is positive definite."""
     for i in range(len(matrix)):
         for j in range(i + 1):
             rest = matrix[i, j]
@@ -316,10 +305,10 @@ def _solve(lower, rhs):
 def full_steps(
     load, q, trial, weights, lame, tolerance, hopeless, round_off, extent, max_iterations
 ):
-    """Newton's full steps from q, as `mor_bench.mechanics.newton` takes them, in one compiled loop.
+    """Take full Newton steps from q, as `mor_bench.mechanics.newton` does, in one compiled loop.
 
-    It ends well only where the load is met in a state whose tangent is positive definite, or was one step before when the
-    load was all but met; everything else is left to the safeguarded solve.
+    It converges only if the tangent is positive definite where the load is met, or one step before.
+    The safeguarded solve handles everything else.
 
     Returns
     -------

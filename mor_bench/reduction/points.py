@@ -1,11 +1,12 @@
-"""Reduced internal force and tangent summed over quadrature points: no mesh, no nodes, no sparse matrix.
+"""Reduced internal force and tangent as sums over quadrature points, without a mesh.
 
-At a quadrature point the gradient of mode m is a fixed 3x3 matrix G_m, so that with H = Σ_m q_m G_m, F = I + H and the weights w
+At a quadrature point, the gradient of mode m is a fixed 3x3 matrix G_m. With H = Σ_m q_m G_m,
+F = I + H and the weights w, for any element,
 
-    f_m = Σ w G_m : P(F),      K_mk = Σ w G_m : A(F) : G_k,      A = dP/dF,
+    f_m = Σ w G_m : P(F),      K_mk = Σ w G_m : A(F) : G_k,      A = dP/dF.
 
-whatever the element. Work and memory depend on the numbers of points and modes only. A basis of test functions other than that of
-the displacement makes the tangent unsymmetric; that is what DEIM needs.
+Work and memory depend only on the numbers of points and modes. Test functions that differ from the
+modes make the tangent unsymmetric; DEIM needs that.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from mor_bench.reduction.point_kernels import LANES, full_steps, gradients, inte
 Array = NDArray[np.float64]
 
 SVK_MULTIPLY_ADDS = 77, 162
-"""Of Saint Venant-Kirchhoff's P, energy and det F from H at one point, and of A."""
+"""Per point, for Saint Venant-Kirchhoff: P, energy and det F from H; and A."""
 
 
 def tangent_multiply_adds(r: int, symmetric: bool) -> int:
-    """Of A : G_k for all modes, taken in pairs, and their products with the test functions, at one point."""
+    """Return the work per point for A : G_k of all modes and their products with test functions."""
     products = 0
     for k in range(0, r, 2):
         pair = 2 if k + 1 < r else 1
@@ -37,14 +38,18 @@ def tangent_multiply_adds(r: int, symmetric: bool) -> int:
 
 
 def _batched(values: Array) -> Array:
-    """(n_points, ...) → (n_batches, ..., LANES), padded with zeros."""
+    """Rearrange (n_points, ...) to (n_batches, ..., LANES), padded with zeros."""
     padded = np.zeros((-(-len(values) // LANES) * LANES, *values.shape[1:]))
     padded[: len(values)] = values
     return np.ascontiguousarray(np.moveaxis(padded.reshape(-1, LANES, *values.shape[1:]), 1, -1))
 
 
 def _mode_gradients(shape_gradients: Array, cell_modes: Array, kept: NDArray[np.int64]) -> Array:
-    """(n_batches, r, 9 * LANES) gradients of modes at points, from (n_cells, n_points, n_nodes, 3) and (n_cells, n_nodes, 3, r)."""
+    """Return gradients of modes (n_batches, r, 9 * LANES) at the kept points.
+
+    They come from gradients of shape functions (n_cells, n_points, n_nodes, 3) and nodal modes
+    (n_cells, n_nodes, 3, r).
+    """
     own = np.einsum("cqaj,caim->cqmij", shape_gradients, cell_modes, optimize=True)
     r = own.shape[2]
     return _batched(own.reshape(-1, r, 9)[kept]).reshape(-1, r, 9 * LANES)
@@ -57,11 +62,12 @@ class ReducedPoints:
     ----------
     body : Discretisation
     factors : (n_cells,) or (n_cells, n_cell_points) float64
-        Cubature weights, which multiply those of the quadrature; points with none are left out.
+        Cubature weights, which multiply those of the quadrature; points with weight 0 are left out.
     modes : (n_nodes, 3, r) float64
-        Displacement of each mode at every node; zero at supports. Only the rows of the cells' nodes are read.
+        Displacement of each mode at every node, zero at supports. Only rows of the cells' nodes are
+        read.
     test_modes : (n_nodes, 3, r) float64, optional
-        What the force is projected on; the modes by default.
+        Test functions that the force is projected on; the modes by default.
 
     Attributes
     ----------
@@ -81,28 +87,21 @@ class ReducedPoints:
         self.n_cells, self.n_points, self.n_unknowns = len(cells), len(kept), modes.shape[2]
         self.trial = _mode_gradients(rule.gradients, modes[cells], kept)
         self.symmetric = test_modes is None
-        self.test = (
-            self.trial
-            if test_modes is None
-            else _mode_gradients(rule.gradients, test_modes[cells], kept)
-        )
+        self.test = self.trial
+        if test_modes is not None:
+            self.test = _mode_gradients(rule.gradients, test_modes[cells], kept)
         self.weights = _batched(weights[kept])
         self.law, self.parameters = (
             body.material.law,
             np.tile(rule.parameters, (len(cells), 1))[kept],
         )
         self._lame = _batched(self.parameters) if self.law == SAINT_VENANT_KIRCHHOFF else None
-        r = self.n_unknowns
-        force, tangent = (
-            SVK_MULTIPLY_ADDS
-            if self.law == SAINT_VENANT_KIRCHHOFF
-            else point_multiply_adds(self.law, rule.parameters.shape[1])
-        )
-        tangent += tangent_multiply_adds(r, self.symmetric)
-        self._multiply_adds = (
-            self.n_points * (force + 18 * r),
-            self.n_points * (force + 18 * r + tangent),
-        )
+        force, tangent = SVK_MULTIPLY_ADDS
+        if self._lame is None:
+            force, tangent = point_multiply_adds(self.law, rule.parameters.shape[1])
+        force += 18 * self.n_unknowns
+        tangent += force + tangent_multiply_adds(self.n_unknowns, self.symmetric)
+        self._multiply_adds = self.n_points * force, self.n_points * tangent
 
     def count(self, forces: int, tangents: int) -> None:
         """Count evaluations of the force alone, and of force and tangent."""
@@ -113,19 +112,8 @@ class ReducedPoints:
         force = np.zeros(self.n_unknowns)
         self.count(len(tangent) == 0, len(tangent) > 0)
         if self._lame is not None:
-            return State(
-                force,
-                *integrate(
-                    q,
-                    self.trial,
-                    self.test,
-                    self.symmetric,
-                    self.weights,
-                    self._lame,
-                    force,
-                    tangent,
-                ),
-            )
+            bases, material = (self.trial, self.test, self.symmetric), (self.weights, self._lame)
+            return State(force, *integrate(q, *bases, *material, force, tangent))
         H, P = np.empty((2, len(self.weights), 9 * LANES))
         A = np.empty((len(self.weights) if len(tangent) else 0, 81 * LANES))
         gradients(self.trial, q, H)
@@ -134,28 +122,30 @@ class ReducedPoints:
         return State(force, energy, min_det)
 
     def force(self, q: Array) -> State:
-        """Reduced internal force, stored energy, J, and min det F at coordinates ``q`` (r,)."""
+        """Return the state at coordinates ``q`` (r,): reduced force, energy and min det F."""
         return self._sum(q, np.empty((0, 0)))
 
     def force_and_tangent(self, q: Array) -> tuple[State, Array]:
-        """`force`, and the reduced tangent (r, r)."""
+        """Return the state and the reduced tangent (r, r)."""
         tangent = np.zeros((self.n_unknowns, self.n_unknowns))
         return self._sum(q, tangent), tangent
 
     def point_forces(self, q: Array) -> Array:
-        """What each point adds to the reduced force, (n_points, r): what their cubature is trained on."""
+        """Return each point's part of the reduced force, (n_points, r); it trains cubatures."""
         H, P = np.empty((2, len(self.weights), 9 * LANES))
         gradients(self.trial, q, H)
         point_stresses(H, self.weights, self.law, self.parameters, P, np.empty((0, 81 * LANES)))
-        own = np.einsum(
-            "bmcl,bcl->blm", self.test.reshape(len(P), -1, 9, LANES), P.reshape(len(P), 9, LANES)
-        )
+        test, stress = self.test.reshape(len(P), -1, 9, LANES), P.reshape(len(P), 9, LANES)
+        own = np.einsum("bmcl,bcl->blm", test, stress)
         return np.asarray(own.reshape(-1, self.n_unknowns)[: self.n_points])
 
     def full_steps(
         self, load: Array, start: Array, tolerance: float, extent: float
     ) -> Solution | None:
-        """Newton's full steps; None for other laws than Saint Venant-Kirchhoff, or without a stable end with det F > 0."""
+        """Take full Newton steps with Saint Venant-Kirchhoff; see `point_kernels.full_steps`.
+
+        Returns None for other laws, or without a stable end with det F > 0.
+        """
         if self._lame is None:
             return None
         q = start.copy()
@@ -173,9 +163,8 @@ class ReducedPoints:
         )
         self.count(forces, tangents)
         r = self.n_unknowns
-        dense = factors * cholesky_multiply_adds(r, r - 1) + solves * triangular_multiply_adds(
-            r, r - 1
-        )
+        dense = factors * cholesky_multiply_adds(r, r - 1)
+        dense += solves * triangular_multiply_adds(r, r - 1)
         count(
             factorisations=factors,
             reduced_factorisations=factors,

@@ -1,10 +1,11 @@
-"""Separated representations from samples: sums of products of functions of one group of coordinates each.
+"""Separated representations from samples: sums of products of functions of few coordinates.
 
     y(s, d, m) ≈ Σ_k X_k S_k(s) D_k(d) M_k(m),   S_k = Σ_j a_kj φ_j(s), and so on.
 
-Terms are sought one after the other by alternating least squares on what the earlier ones leave, and after each all the
-vectors X_k are found anew together: the progressive proper generalised decomposition with update (Nouy, CMAME 199, 2010,
-section 3), fitted to samples as in the sparse, non-intrusive one (Ibáñez et al., Complexity 2018, section 3).
+Alternating least squares find one term after the other, on the residual of the earlier ones. After
+each term, all vectors X_k are fitted again together. This is the progressive proper generalised
+decomposition with update (Nouy, CMAME 199, 2010, section 3), fitted to samples as in the sparse,
+non-intrusive one (Ibáñez et al., Complexity 2018, section 3).
 """
 
 from __future__ import annotations
@@ -20,27 +21,27 @@ Array = NDArray[np.float64]
 Family = Sequence[Array]
 
 ITERATIONS = 8
-"""Alternations for a term at most."""
+"""Most alternations for a term."""
 
 STAGNANT = 1e-2
 """Relative change of a term's sampled function below which its alternation ends."""
 
 RANK = 1e-9
-"""Singular values of a factor's functions below this share of the largest are left out."""
+"""Least singular value of a factor's functions, relative to the largest."""
 
 EXHAUSTED = 1e-12
-"""Share of the targets' norm below which nothing is left to separate."""
+"""Relative residual below which nothing is left to separate."""
 
 
 @dataclass(frozen=True)
 class Term:
-    """A product of one function per factor, of a family.
+    """A product of one function per factor of a family.
 
     Attributes
     ----------
     family : int
     coefficients : tuple of (n_functions,) float64
-        In the functions of each factor.
+        Coefficients of each factor's functions.
     """
 
     family: int
@@ -49,14 +50,14 @@ class Term:
 
 @dataclass(frozen=True)
 class Separation:
-    """Terms, and the vector that each multiplies.
+    """Terms, and the vectors that they multiply.
 
     Attributes
     ----------
     terms : tuple of Term
     vectors : (n_terms, n_outputs) float64
     residuals : (n_terms,) float64
-        Norm of what is left after each term over that of the targets.
+        Norm of the residual after each term, relative to the targets.
     """
 
     terms: tuple[Term, ...]
@@ -65,11 +66,9 @@ class Separation:
 
 
 def _regularised(matrix: Array, ridge: float) -> Array:
-    """With the ridge times its mean diagonal entry added; never singular."""
-    return np.asarray(
-        matrix
-        + (ridge + 1e-14) * max(float(np.trace(matrix)) / len(matrix), 1e-300) * np.eye(len(matrix))
-    )
+    """Return the matrix plus the ridge times its mean diagonal entry; it is never singular."""
+    mean = max(float(np.trace(matrix)) / len(matrix), 1e-300)
+    return np.asarray(matrix + (ridge + 1e-14) * mean * np.eye(len(matrix)))
 
 
 def _solve(matrix: Array, rhs: Array, ridge: float) -> Array:
@@ -77,7 +76,10 @@ def _solve(matrix: Array, rhs: Array, ridge: float) -> Array:
 
 
 def _orthonormal(values: Array) -> tuple[Array, Array]:
-    """Orthonormal combinations of sampled functions, (n, r), and the matrix that takes their coefficients back, (n_functions, r)."""
+    """Return orthonormal combinations (n, r) of sampled functions, and their coefficients.
+
+    The coefficients, (n_functions, r), are those in the functions.
+    """
     scale = np.sqrt((values**2).mean(axis=0))
     scale[scale == 0] = 1.0
     left, s, vt = np.linalg.svd(values / scale, full_matrices=False)
@@ -86,29 +88,25 @@ def _orthonormal(values: Array) -> tuple[Array, Array]:
 
 
 def _product(factors: Family, coefficients: Sequence[Array], without: int = -1) -> Array:
-    return np.asarray(
-        np.prod(
-            [
-                f @ c
-                for j, (f, c) in enumerate(zip(factors, coefficients, strict=True))
-                if j != without
-            ],
-            axis=0,
-        )
-    )
+    """Return the product over all factors, or over all but one, at the samples."""
+    sampled = [
+        f @ c for j, (f, c) in enumerate(zip(factors, coefficients, strict=True)) if j != without
+    ]
+    return np.asarray(np.prod(sampled, axis=0))
 
 
 def _rank_one(residual: Array, factors: Family, ridge: float) -> tuple[list[Array], Array] | None:
-    """Coefficients of one term and its values at the samples, of unit norm; None if the family has nothing to add.
+    """Fit one term; return its coefficients and its values at the samples, of unit norm.
 
-    Begins with the residual's direction of largest variance and the function of the last factors that fits it best.
+    The iteration begins with the residual's direction of largest variance, and the function of the
+    last factors that fits it best. Returns None if the family has nothing to add.
     """
     values, directions = np.linalg.eigh(residual.T @ residual)
     x = directions[:, -1] * np.sqrt(max(values[-1], 0.0))
     coefficients = [np.eye(1, f.shape[1])[0] for f in factors]
     pairs = np.einsum("n,ni,nj->ij", residual @ x, factors[-2], factors[-1])
     u, _, vt = np.linalg.svd(pairs)
-    # The first factor begins as the mean of its functions' span that is nearest to a constant.
+    # The first factor begins as the function of its span that is nearest to a constant.
     constant = factors[0].T @ np.ones(len(residual))
     if constant.any():
         coefficients[0] = constant
@@ -143,12 +141,12 @@ def separate(targets: Array, families: Sequence[Family], n_terms: int, ridge: fl
     ----------
     targets : (n_samples, n_outputs) float64
     families : sequence of sequences of (n_samples, n_functions) float64
-        Of each family of terms the functions of its factors, two or more, at the samples. Each term is of the family that
-        leaves least.
+        For each family of terms, the functions of its factors, two or more, at the samples. Each
+        term comes from the family that leaves the smallest residual.
     n_terms : int
-        At most; fewer where nothing is left.
+        Most terms; fewer if nothing is left.
     ridge : float
-        Tikhonov weight of every least-squares problem, relative to the mean diagonal entry of its matrix.
+        Tikhonov weight of every least-squares problem, relative to its matrix' mean diagonal.
     """
     bases = [[_orthonormal(values) for values in family] for family in families]
     factors = [[basis for basis, _ in family] for family in bases]

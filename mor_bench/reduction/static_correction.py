@@ -1,8 +1,9 @@
-"""Static correction: the part of the linear response that a reduced basis lacks, added to the reduced solution.
+"""Static correction: add the part of the linear response that a reduced basis lacks.
 
-A basis of few modes cannot hold the local dent under every load; at small strains the rest is a back-solve with the
-stiffness at rest that every scene has. Known in linear dynamics as static correction, residual flexibility or the mode
-acceleration method (MacNeal, Computers & Structures 1 (1971) 581-601; Dickens, Nakagawa, Wittbrodt, ibid. 62 (1997) 985-998).
+A basis of few modes cannot represent the local dent under every load. At small strains, a
+back-solve with the stiffness at rest gives the rest. Linear dynamics knows this as static
+correction, residual flexibility or the mode acceleration method (MacNeal, Computers & Structures 1
+(1971) 581-601; Dickens, Nakagawa, Wittbrodt, ibid. 62 (1997) 985-998).
 """
 
 from __future__ import annotations
@@ -25,17 +26,18 @@ def static_correction(
     modes: NDArray[np.float64],
     load: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """What a reduced model lacks of the linear response, (K₀⁻¹ - Φ (ΦᵀK₀Φ)⁻¹ Φᵀ) f.
+    """Return what a reduced model lacks of the linear response, (K₀⁻¹ - Φ (ΦᵀK₀Φ)⁻¹ Φᵀ) f.
 
-    Added to any reduced solution whose tangent space at rest is Φ, it makes the answer to a small load exact to first order,
-    whatever the basis. It is linear in the load and does not turn with the body, so that it may invert cells; `refuse_inverted` looks.
+    Added to a reduced solution with the tangent space Φ at rest, it makes the answer to a small
+    load exact to first order. It does not turn with the body and may invert cells;
+    `refuse_inverted` checks that.
 
     Parameters
     ----------
     rest_factor : Factor
-        Of the full model's stiffness at rest K₀: its factor, or its `Compliance`.
+        Factor or `Compliance` of the full model's stiffness at rest K₀.
     reduced_factor : Factor
-        That of ΦᵀK₀Φ.
+        Factor of ΦᵀK₀Φ.
     modes : (n_free, r) float64
         Φ.
     load : (n_free,) float64
@@ -58,10 +60,11 @@ def predict_corrected(
     loads: NDArray[np.float64],
     tolerance: float,
 ) -> NDArray[np.float64]:
-    """Reduced equilibria under loads (n, n_free), N, with their static corrections, (n, n_free) m.
+    """Return reduced equilibria under loads (n, n_free), N, with static corrections, (n, n_free) m.
 
-    The modes are those of the problem on all free dofs, the factor that of the model's stiffness at rest. Raises `SolverError`
-    if the reduced model has no valid equilibrium, or its correction inverts cells.
+    The modes are those of the problem on all free dofs. The factor is that of the model's stiffness
+    at rest. Raises `SolverError` if the reduced model has no valid equilibrium, or if its
+    correction inverts cells.
     """
     out = np.empty(loads.shape)
     count(multiply_adds=2 * modes.size * len(loads))
@@ -77,7 +80,7 @@ def predict_corrected(
 
 
 def refuse_inverted(model: FullOrderModel, u: NDArray[np.float64]) -> None:
-    """Raise `InvertedElementError` if cells are inverted at displacements u (n_free,), m."""
+    """Raise `InvertedElementError` if displacements u (n_free,), m, invert cells."""
     least = model.force(u).min_det_f
     if not least > 0:
         raise InvertedElementError(
