@@ -15,7 +15,12 @@ from mor_bench.counting import counted
 from mor_bench.errors import InvalidInputError, SolverError, UnsupportedSceneError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.galerkin import GalerkinProblem
-from mor_bench.reduction.tensors import ReducedTensors, TensorProblem, _pairs, reduce_energy
+from mor_bench.reduction.tensors import (
+    ReducedTensors,
+    TensorProblem,
+    reduce_energy,
+    triangular_pairs,
+)
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.pod import PODGalerkin
@@ -66,7 +71,7 @@ def test_energy_force_and_tangent_are_those_of_the_mesh(kind: str) -> None:
 
 def test_derivatives_are_symmetric_in_all_indices() -> None:
     tensors = problems(scene_of("H8"), 4)[1].tensors
-    i, j = _pairs(4)
+    i, j = triangular_pairs(4)
     cubic, quartic = np.empty((4,) * 3), np.empty((4,) * 4)
     for a, b in ((i, j), (j, i)):
         cubic[a, b] = tensors.cubic

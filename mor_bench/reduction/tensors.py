@@ -57,7 +57,7 @@ def n_pairs(r: int) -> int:
     return r * (r + 1) // 2
 
 
-def _pairs(r: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def triangular_pairs(r: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return i and j of each pair, in order."""
     j, i = np.tril_indices(r)
     return i, j
@@ -162,7 +162,7 @@ def _symmetric(gram: Array, r: int) -> ReducedTensors:
     W = ½ q q ee + ½ q qq es + ⅛ qq qq ss. A derivative is the sum over the ways to distribute its
     indices.
     """
-    i, j = _pairs(r)
+    i, j = triangular_pairs(r)
     number = np.empty((r, r), dtype=np.int64)
     number[i, j] = number[j, i] = np.arange(len(i))
     mixed, quartic = gram[:r, r:], gram[r:, r:]
