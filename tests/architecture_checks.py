@@ -51,8 +51,15 @@ MAX_FILE, MAX_FUNCTION, MAX_PARAMETERS, MAX_WIDTH = 400, 60, 6, 100
 MANY_PARAMETERS = {"mor_bench/runs/compare.py:run", "mor_bench/runs/single_fit.py:fit"}
 """Public functions whose options are keywords on purpose."""
 
-PUBLIC_UNDERSCORES = {"_exit", "_replace", "_asdict", "_fields"}
+PUBLIC_UNDERSCORES = {"_exit", "_replace", "_asdict", "_fields", "_getframe"}
 """Documented names of the standard library that begin with an underscore."""
+
+WITHOUT_PUBLIC_NAME = {
+    "_call_pardiso",  # pypardiso: solve with an existing factorisation
+    "_reorder_convolution_weight",  # oneDNN's operators in torch
+    "_convolution_pointwise",
+}
+"""Names of other libraries for what they offer in no other way."""
 
 
 def read_tree() -> Tree:
@@ -149,7 +156,7 @@ def imports_of_tests(tree: Tree) -> list[str]:
 
 def _is_private(name: str) -> bool:
     hidden = name.startswith("_") and not (name.startswith("__") and name.endswith("__"))
-    return hidden and name != "_" and name not in PUBLIC_UNDERSCORES
+    return hidden and name != "_" and name not in PUBLIC_UNDERSCORES | WITHOUT_PUBLIC_NAME
 
 
 def _defined(source: str) -> set[str]:
@@ -240,12 +247,21 @@ def _parameters(function: ast.FunctionDef) -> list[str]:
     return names[1:] if names[:1] in (["self"], ["cls"]) else names
 
 
+def _is_compiled(function: ast.FunctionDef) -> bool:
+    names = {getattr(getattr(d, "func", d), "id", "") for d in function.decorator_list}
+    return "njit" in names
+
+
 def many_parameters(tree: Tree) -> list[str]:
-    """List functions with more than six parameters; ``self`` is not counted."""
+    """List functions with more than six parameters; ``self`` is not counted.
+
+    Compiled kernels are not listed: Numba takes arrays and numbers, but no dataclass.
+    """
     return [
         f"{path}:{function.lineno}: {function.name} has {n} parameters"
         for path, function in _functions(tree)
         if (n := len(_parameters(function))) > MAX_PARAMETERS
+        and not _is_compiled(function)
         and f"{path}:{function.name}" not in MANY_PARAMETERS
     ]
 
