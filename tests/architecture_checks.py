@@ -48,9 +48,6 @@ FLOORS = (
 
 MAX_FILE, MAX_FUNCTION, MAX_PARAMETERS, MAX_WIDTH = 400, 60, 6, 100
 
-MANY_PARAMETERS = {"mor_bench/runs/compare.py:run", "mor_bench/runs/single_fit.py:fit"}
-"""Public functions whose options are keywords on purpose."""
-
 PUBLIC_UNDERSCORES = {"_exit", "_replace", "_asdict", "_fields", "_getframe"}
 """Documented names of the standard library that begin with an underscore."""
 
@@ -260,9 +257,7 @@ def many_parameters(tree: Tree) -> list[str]:
     return [
         f"{path}:{function.lineno}: {function.name} has {n} parameters"
         for path, function in _functions(tree)
-        if (n := len(_parameters(function))) > MAX_PARAMETERS
-        and not _is_compiled(function)
-        and f"{path}:{function.name}" not in MANY_PARAMETERS
+        if (n := len(_parameters(function))) > MAX_PARAMETERS and not _is_compiled(function)
     ]
 
 
