@@ -53,6 +53,8 @@ class Battery(StrictModel):
         Hyperparameters for a cheap fit on scenes with observed nodes. Default: `parameters`.
     observed_error : float
         Upper bound on the median relative l2 error there. Default: 0.1.
+    falls_short : tuple of str
+        Hard cases that the method is known to fall short of.
     benchmark : dict
         Hyperparameters that asv follows over commits.
     races : list of Race
@@ -62,6 +64,7 @@ class Battery(StrictModel):
     error: Annotated[float, Field(gt=0, le=1)] = 0.2
     observed_parameters: dict[str, Any] | None = None
     observed_error: Annotated[float, Field(gt=0, le=1)] = 0.1
+    falls_short: Annotated[tuple[str, ...], Field(strict=False)] = ()
     benchmark: dict[str, Any] = Field(default_factory=dict)
     races: Annotated[tuple[Race, ...], Field(strict=False)] = ()
 
