@@ -11,9 +11,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import Rectangle
 
 from mor_bench.report.canvas import Picture, styles_of
-from mor_bench.report.entries import Entry, entries_of
+from mor_bench.report.entries import entries_of
 from mor_bench.report.error_against_time import error_against_time
-from mor_bench.report.paper_tables import error_measures
 from mor_bench.report.singular_values import SIGMA, TAIL, singular_values
 from mor_bench.report.speed_tables import pairs_at
 from mor_bench.report.summary import headline
@@ -92,16 +91,6 @@ def test_each_label_of_the_legend_belongs_to_its_curve(made: Comparison) -> None
 
 def test_the_worst_sample_of_a_headline_is_the_maximum(made: Comparison) -> None:
     assert "1 ms (p95 – ms) at 1 % (worst sample 7 %)" in headline(made, "beam")
-
-
-def test_the_training_time_of_the_paper_s_table_is_in_minutes() -> None:
-    network = Entry(
-        a_row("umesh", parameters={"channels": 128, "steps": 3}, offline_s={"data": 0, "fit": 1200})
-    )
-    for dataset in ("beam-coarse", "another"):
-        table = error_measures(dataset, [network])
-        assert table is not None
-        assert table.rows[0][table.headings.index("train (min)")] == "20"
 
 
 @pytest.mark.parametrize(

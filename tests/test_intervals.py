@@ -88,7 +88,13 @@ def measure(
     }
 
 
-@pytest.mark.parametrize(("n_processes", "widest"), [(2, 1.5), (3, 1.3), (5, 1.25)])
+@pytest.mark.parametrize(
+    ("n_processes", "widest"),
+    [
+        (3, 1.3),
+        *(pytest.param(n, most, marks=pytest.mark.slow) for n, most in ((2, 1.5), (5, 1.25))),
+    ],
+)
 def test_the_median_of_a_repeated_measurement_falls_into_the_interval(
     n_processes: int, widest: float
 ) -> None:

@@ -6,7 +6,6 @@ import io
 import re
 from collections.abc import Mapping
 from html import unescape
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -16,26 +15,24 @@ from matplotlib.image import imread
 from rich.console import Console
 
 from mor_bench.analysis.analyse import analyse
-from mor_bench.measure.error_metrics import sample_errors, summary
+from mor_bench.measure.error_metrics import SampleErrors, summary
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.details import dataset_details
 from mor_bench.report.entries import Entry, best_per_method, entries_of
 from mor_bench.report.number_format import bytes_text, number, percent, short_swept
 from mor_bench.report.page import render
-from mor_bench.report.paper_tables import PUBLISHED, error_measures, same_error_or_time
 from mor_bench.report.speed_tables import NOT_REACHED, pairs_at, target_table
 from mor_bench.report.summary import discretisation_error, headline, warnings_of
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import ErrorSummary, Row
-from mor_bench.scene.mesh import box_mesh
 from mor_bench.specs import load_dataset_spec
-from tests.synthetic import a_row, synthetic_comparison
+from tests.synthetic import MESH, a_row, put_samples, synthetic_comparison
 
 HOSTILE = "<script>alert(1)</script> & [bold]$x_1$"
 REASON = "OutOfMemoryError: 31 GiB <needed> & 24 GiB there"
 SKIPPED = "needs pip install 'mor-bench[learn]'"
 N_TEST = 40
-MESH = box_mesh((2.0, 1.0, 1.0), (4, 2, 2))
+NEEDS = {"error": 0.01, "latency_ms": 3.0}
 
 Analysis = dict[str, Any]
 
@@ -49,15 +46,10 @@ def add_row(
     **fields: Any,
 ) -> Row:
     """Add a row with raw samples and this median relative L2 error; `n_failed` fails samples."""
-    generator = np.random.default_rng(len(comparison.rows))
-    size = 0.2 * generator.random((N_TEST, 1, 1))
-    reference = size * MESH.points[None, :, [0]] ** 2 * np.array([0.2, 0.1, 1.0])
-    prediction = reference * (1 + error * np.linspace(0.5, 1.5, N_TEST + 1)[1:, None, None])
-    prediction[: fields.get("n_failed", 0)] = np.nan
-    errors = sample_errors(prediction, reference)
-    worst = int(np.argmax(np.where(np.isfinite(errors.mean_dof_m), errors.mean_dof_m, -1)))
-    forces = np.zeros_like(reference[0])
-    forces[-1, 2] = -0.7
+    relative = error * np.linspace(0.5, 1.5, N_TEST)
+    relative[: fields.get("n_failed", 0)] = np.inf
+    amplitude = np.linspace(0.01, 0.2, N_TEST)
+    errors = SampleErrors(relative * amplitude / 4, relative, relative * amplitude, amplitude)
     measured = {
         "n_test": N_TEST,
         "error": summary(errors),
@@ -65,19 +57,9 @@ def add_row(
         "offline_s": {"data": 3.0, "fit": 0.5},
         "model_bytes": 12345,
     }
+    timed = {"latency_ms": latency_ms * np.linspace(0.9, 1.1, 41)}
     row = a_row(method, swept, **{**measured, **fields})
-    samples = {
-        "latency_ms": latency_ms * np.linspace(0.9, 1.1, 41),
-        "mean_dof_m": errors.mean_dof_m,
-        "relative_l2": errors.relative_l2,
-        "max_nodal_m": errors.max_nodal_m,
-        "amplitude_m": errors.amplitude_m,
-        "worst_prediction": prediction[worst],
-        "worst_reference": reference[worst],
-        "worst_forces": forces,
-    }
-    comparison.put(row, samples)
-    return row
+    return put_samples(comparison, row, errors, timed)
 
 
 def tiny(out: Path, *names: str, **machine: Any) -> Comparison:
@@ -142,23 +124,6 @@ def console_text(comparison: Comparison, width: int = 200, analysis: Analysis | 
     return stream.getvalue()
 
 
-class Resources(HTMLParser):
-    """Tags, sources and links of a page."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self.tags: set[str] = set()
-        self.sources: list[str] = []
-        self.links: list[str] = []
-        self.feed(page)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.add(tag)
-        loading = ("src", "srcset", "data", "poster", "background")
-        self.sources += [value or "" for name, value in attrs if name in loading]
-        self.links += [value or "" for name, value in attrs if name == "href"]
-
-
 def test_console_and_page_show_every_row_with_its_reason(comparison: Comparison, page: str) -> None:
     for text in (console_text(comparison), text_of(page)):
         for row in comparison.rows:
@@ -202,15 +167,14 @@ def test_needs_and_front_are_marked_where_they_belong(comparison: Comparison) ->
     }
 
 
-def test_meeting_only_one_need_is_not_enough(tmp_path: Path) -> None:
-    made = tiny(tmp_path)
-    add_row(made, "slow", {}, 0.001, 6.0)
-    add_row(made, "coarse", {}, 0.03, 0.1)
+def test_meeting_only_one_need_is_not_enough() -> None:
+    made = Comparison(Path(), {}, datasets={"beam-tiny": {"needs": NEEDS}})
+    for name, error, latency in (("slow", 0.001, 6.0), ("coarse", 0.03, 0.1)):
+        figures = {"error": {"rel_l2_median": error}, "latency_ms": {"median": latency}}
+        made.rows.append(a_row(name, **figures))
     assert not any(entry.meets_needs for entry in entries_of(made, "beam-tiny"))
-    assert re.search(
-        r"No configuration meets .* Nearest is slow: .* 2 times the allowed latency",
-        headline(made, "beam-tiny"),
-    )
+    found = headline(made, "beam-tiny")
+    assert re.search("No configuration meets .* Nearest is slow: .* 2 times the allowed lat", found)
 
 
 def test_targets_out_of_reach_are_named_so(comparison: Comparison) -> None:
@@ -230,15 +194,15 @@ def test_targets_out_of_reach_are_named_so(comparison: Comparison) -> None:
 
 
 def test_the_page_escapes_and_needs_no_network(page: str, written: list[Path]) -> None:
-    resources = Resources(page)
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
-    assert not {"script", "link", "iframe", "object"} & resources.tags
+    assert not re.search(r"<(script|link|iframe|object)\b|url\(|@import|https?://", page)
     assert "<b>fast</b>" not in page
     assert "31 GiB <needed>" not in page
-    assert len(resources.sources) == len(written) - 1
-    assert all(source.startswith("data:image/png;base64,") for source in resources.sources)
-    assert not any("//" in link or ":" in link for link in resources.links)
-    assert not re.search(r"url\(|@import|https?://", page)
+    loaded = re.findall(r'\b(?:src|srcset|data|poster|background)="([^"]*)"', page)
+    assert len(loaded) == len(written) - 1
+    assert all(source.startswith("data:image/png;base64,") for source in loaded)
+    links = re.findall(r'\bhref="([^"]*)"', page)
+    assert not any("//" in link or ":" in link for link in links)
 
 
 def test_the_page_lists_every_configuration_once_and_nothing_unmeasured(
@@ -247,7 +211,7 @@ def test_the_page_lists_every_configuration_once_and_nothing_unmeasured(
     table = page.split("<h3>Configurations</h3>")[1].split("</table>")[0]
     assert table.count("<tr class=") == len(comparison.rows)
     text = text_of(page)
-    for word in ("results.json", "samples/", "x-min", "2.4", "never extrapolates", "infinite"):
+    for word in ("results.json", "samples/", "x-min", "2.4", "never extrapolates"):
         assert word in text
     for absent in ("Timing", "Memory and cost", "Named test sets", "Hidden test set", "Tuning"):
         assert f"<h3>{absent}" not in page
@@ -272,23 +236,18 @@ def test_figures_are_pictures(comparison: Comparison, written: list[Path]) -> No
     assert not list(comparison.out.rglob("*.tmp"))
 
 
-def test_reading_back_gives_the_same_text(comparison: Comparison, written: list[Path]) -> None:
-    again = Comparison.read(comparison.out)
-    assert again.rows == comparison.rows
-    assert console_text(again) == console_text(comparison)
+def test_the_discretisation_error_is_stated_with_what_is_known() -> None:
+    rows = [a_row("pod"), a_row("pod", discretisation_error_m=0.0123)]
+    rows.append(rows[1].with_parts(discretisation_rel_l2=0.205))
+    unknown, alone, both = (discretisation_error([Entry(row)]) for row in rows)
+    assert unknown == "not measured"
+    assert alone.startswith("1.2e-02 m; an error")
+    assert both.startswith("1.2e-02 m, relative L2 (median) 20.5 %; an error")
 
 
-def test_the_discretisation_error_is_stated_with_what_is_known(tmp_path: Path) -> None:
-    made = tiny(tmp_path)
-    add_row(made, "pod", {"n_modes": 5}, 0.005, 1.0, discretisation_error_m=0.0123)
-    assert discretisation_error(entries_of(made, "beam-tiny")).startswith("1.2e-02 m; an error")
-    made.rows[0] = made.rows[0].with_parts(discretisation_rel_l2=0.205)
-    stated = discretisation_error(entries_of(made, "beam-tiny"))
-    assert stated.startswith("1.2e-02 m, relative L2 (median) 20.5 %; ")
-    assert "1.2e-02 m" in console_text(made)
-
-
-def test_the_report_of_several_datasets_without_a_row_that_ran(tmp_path: Path) -> None:
+def test_a_report_without_a_row_that_ran_says_so(tmp_path: Path) -> None:
+    nothing = render(Comparison(tmp_path / "nothing", {}))[-1].read_text(encoding="utf-8")
+    assert "nothing to report" in nothing
     made = tiny(tmp_path, "beam-tiny", "other")
     made.put(a_row("pod", status="failed", reason="no memory"))
     made.put(a_row("pod", dataset="other", status="skipped", reason="not supported"))
@@ -298,10 +257,6 @@ def test_the_report_of_several_datasets_without_a_row_that_ran(tmp_path: Path) -
         assert "no memory" in text
         assert "not supported" in text
         assert text.count(NOT_REACHED) >= 22
-
-
-def test_the_report_of_no_rows_says_so(tmp_path: Path) -> None:
-    assert "nothing to report" in render(Comparison(tmp_path, {}))[-1].read_text(encoding="utf-8")
 
 
 def test_a_row_without_a_number_is_not_good(tmp_path: Path) -> None:
@@ -315,12 +270,10 @@ def test_a_row_without_a_number_is_not_good(tmp_path: Path) -> None:
     assert "nan" in text
 
 
-def test_the_best_of_a_method_has_a_finite_error(tmp_path: Path) -> None:
-    made = tiny(tmp_path)
-    add_row(made, "pod", {"n_modes": 20}, 0.001, 1.0, n_failed=2)
-    add_row(made, "pod", {"n_modes": 5}, 0.05, 1.0)
-    (best,) = best_per_method(entries_of(made, "beam-tiny"))
-    assert best.label == "pod [n_modes=5]"
+def test_the_best_of_a_method_has_a_finite_error() -> None:
+    errors = {5: 0.01, 20: float("inf")}
+    rows = [a_row("pod", {"r": r}, error={"mean_dof_m": errors[r]}) for r in (20, 5)]
+    assert [entry.row for entry in best_per_method([Entry(row) for row in rows])] == rows[1:]
 
 
 def test_numbers_are_short() -> None:
@@ -341,6 +294,7 @@ def test_a_warning_of_many_configurations_is_shown_once() -> None:
     assert warnings_of(entries) == expected
 
 
+@pytest.mark.slow
 def test_the_page_has_a_section_for_all_that_was_measured(
     rich: Comparison, analysis: Analysis
 ) -> None:
@@ -413,38 +367,3 @@ def test_the_matrix_of_pairs_carries_factors_and_intervals(
     targets = target_table(rich, "beam-coarse", "time_at_error", analysis)
     (cells,) = (cells for method, *cells in targets.rows if method == "pod")
     assert re.fullmatch(r"[\d.]+ ms \([\d.]+\)\nr=\d+\n[\d.]+–[\d.]+", cells[1])
-
-
-def test_the_paper_s_table_of_errors_has_its_networks_beside_ours(rich: Comparison) -> None:
-    entries = entries_of(rich, "beam-coarse")
-    network = next(entry.row for entry in entries if entry.method == "umesh")
-    size = {"channels": 128, "steps": 3}
-    large = Entry(network.with_parts(label="large", parameters=size))
-    measures = error_measures("beam-coarse", [*entries, large])
-    assert measures is not None
-    # Both of ours, and of the paper's eight all but the one that has the size of one of ours.
-    assert len(measures.rows) == 2 + 8 - 1
-    assert measures.rows[0][1:4] == ["16", "2", "64"]
-    assert measures.rows[1][:4] == ["large", "128", "3", "1024"]
-    assert measures.rows[1][5::2] == ["0.0007", "0.0006", "–", "0.00352", "2.5", "35"]
-    assert [row[0] for row in measures.rows[2:]] == ["not run here"] * 7
-    others = [entry for entry in entries if entry.method != "umesh"]
-    assert error_measures("beam-coarse", others) is None
-    assert same_error_or_time("beam-coarse", others) == []
-
-
-def test_the_paper_s_comparisons_stand_beside_ours_on_its_dataset(rich: Comparison) -> None:
-    entries = entries_of(rich, "beam-coarse")
-    error, time = same_error_or_time("beam-fine", entries)
-    by_method = {method: cells for method, *cells in error.rows}
-    assert by_method["pod"][3:] == ["120", "0.006"]
-    assert by_method["linear-fem"][0] == NOT_REACHED
-    assert by_method["fem"][0] == "fem [tolerance=0.1]"
-    assert {method: cells[3:] for method, *cells in time.rows}["hpod"] == ["5", "0.084"]
-
-
-def test_the_published_figures_are_those_of_the_paper() -> None:
-    by_size = {(row.dataset, row.channels, row.steps): row for row in PUBLISHED}
-    assert len(by_size) == len(PUBLISHED) == 13
-    assert by_size["beam-coarse", 64, 5].train_min == 426
-    assert by_size["liver-tet", 128, 3].mean_m == 5.33e-5

@@ -110,11 +110,10 @@ def export_asv(
     commit: str | None = None,
     machine: str | None = None,
 ) -> list[Path]:
-    """Add a comparison's figures for one commit to asv's folder of results.
+    """Add a comparison's figures for one commit to asv's folder; return the written files.
 
-    Existing results of other commits, machines, configurations and settings stay. The same
-    configuration in the same setting is replaced. A skipped configuration is left out; a failed one
-    is a failure in asv too.
+    Existing results stay, except those of the same configuration in the same setting. A skipped
+    configuration is left out; a failed one is a failure in asv too.
 
     Parameters
     ----------
@@ -123,15 +122,9 @@ def export_asv(
     out : path
         `results_dir` of asv.conf.json; created if it does not exist.
     commit : str, optional
-        Name or hash of the commit of mor-bench that ran the comparison. Default: the commit that is
-        checked out in the working folder.
+        Name or hash of the commit that ran the comparison. Default: the one that is checked out.
     machine : str, optional
         Name of the machine on the dashboard. Default: this machine's, if the comparison ran on it.
-
-    Returns
-    -------
-    list of Path
-        The written files.
 
     Raises
     ------
@@ -155,15 +148,6 @@ def export_asv(
     machine_path = out / name / "machine.json"
     read_file(out / "benchmarks.json", "benchmarks")  # refuse a bad one before writing anything
     about = read_file(machine_path, "machine") or describe_for_asv(comparison.machine, name)
-    before = _read_results(path) or {"results": {}, "commit_hash": commit_hash}
-    if before["commit_hash"] != commit_hash:
-        raise StoreError(
-            f"{path}: holds results of commit {before['commit_hash']}, not of {commit_hash}."
-        )
-    results = dict(before["results"])
-    for benchmark, new in figures.items():
-        old = from_columns(results[benchmark]) if benchmark in results else {}
-        results[benchmark] = to_columns({**old, **new})
     content = {
         "commit_hash": commit_hash,
         "env_name": environment,
@@ -173,12 +157,26 @@ def export_asv(
         "requirements": {},
         "env_vars": {},
         "result_columns": COLUMNS,
-        "results": results,
+        "results": _merged(path, commit_hash, figures),
         "durations": {},
     }
     write_file(machine_path, about, "machine")
     write_file(path, content, "results")
     return [machine_path, path, describe(out)]
+
+
+def _merged(path: Path, commit_hash: str, figures: Mapping[str, Figures]) -> dict[str, Any]:
+    """Add figures to the results that a file has, in asv's columns."""
+    before = _read_results(path) or {"results": {}, "commit_hash": commit_hash}
+    if before["commit_hash"] != commit_hash:
+        raise StoreError(
+            f"{path}: holds results of commit {before['commit_hash']}, not of {commit_hash}."
+        )
+    results = dict(before["results"])
+    for benchmark, new in figures.items():
+        old = from_columns(results[benchmark]) if benchmark in results else {}
+        results[benchmark] = to_columns({**old, **new})
+    return results
 
 
 def describe(out: str | Path) -> Path:

@@ -18,12 +18,9 @@ from mor_bench.snapshots.store import write_atomically
 
 
 def export_numpy(data: Dataset, out: str | Path) -> list[Path]:
-    """Write a dataset's samples to an NPZ file, and beside it a TOML file with the same split.
+    """Write a dataset's samples to an NPZ file, with a TOML file beside it; return both files.
 
-    Returns
-    -------
-    list of Path
-        The two files.
+    The TOML file reads the samples in again with the same split.
 
     Raises
     ------

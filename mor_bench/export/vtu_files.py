@@ -30,7 +30,7 @@ def export_vtu(
     part: Part = "test",
     models: Sequence[str | Path] = (),
 ) -> list[Path]:
-    """Write a sample's reference, and the prediction of each model, as VTU.
+    """Write a sample's reference and the models' predictions as VTU; return the files.
 
     Each file holds the mesh at rest with the point data `displacement`, m, and `force`, N. The file
     of a model also has `error`, its displacement minus the reference's, m. ParaView's filter Warp
@@ -48,11 +48,6 @@ def export_vtu(
         A test set must have been read with the dataset.
     models : sequence of paths
         Fitted models, see `Surrogate.save`. Each file is named after its model's.
-
-    Returns
-    -------
-    list of Path
-        The written files.
 
     Raises
     ------
