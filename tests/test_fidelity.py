@@ -323,10 +323,10 @@ def test_the_measured_error_arrives_in_every_row_and_page(cache: Path, tmp_path:
     run = mor_bench.run(
         ["beam-tiny"], ["linear-fem", "fem-coarse"], out=tmp_path / "out", cache=cache
     )
-    assert {row["discretisation_error_m"] for row in run.rows} == {record["error_m"]}
-    assert {row["discretisation_rel_l2"] for row in run.rows} == {record["relative_l2_median"]}
+    assert {row.discretisation_error_m for row in run.rows} == {record["error_m"]}
+    assert {row.discretisation_rel_l2 for row in run.rows} == {record["relative_l2_median"]}
     stored = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
-    assert {row["discretisation_error_m"] for row in stored} == {record["error_m"]}
+    assert {row.discretisation_error_m for row in stored} == {record["error_m"]}
     assert (run.table["discretisation_error_m"] == record["error_m"]).all()
     assert str(record["error_m"]) in (tmp_path / "out" / "results.csv").read_text()
     page = render(run)[-1].read_text(encoding="utf-8")
@@ -344,13 +344,13 @@ def test_a_changed_dataset_shows_none_until_it_is_measured(
         "workers": 1,
         "out": tmp_path / "out",
     }
-    assert mor_bench.run([content], **arguments).rows[0]["discretisation_error_m"] is None
+    assert mor_bench.run([content], **arguments).rows[0].discretisation_error_m is None
     record = refine(content, RefinementPlan(2, 1), cache=tmp_path / "cache")
+    assert [row.discretisation_error_m for row in mor_bench.run([content], **arguments).rows] == [
+        record["error_m"]
+    ]
     assert [
-        row["discretisation_error_m"] for row in mor_bench.run([content], **arguments).rows
-    ] == [record["error_m"]]
-    assert [
-        row["discretisation_error_m"] for row in mor_bench.Comparison.read(tmp_path / "out").rows
+        row.discretisation_error_m for row in mor_bench.Comparison.read(tmp_path / "out").rows
     ] == [record["error_m"]]
 
 

@@ -346,23 +346,26 @@ def test_a_run_has_rows_of_those_that_can_and_reasons_of_the_others(
     comparison = mor_bench.run(
         [path], ["linear-fem", "pca-regression-force", pod], out=tmp_path / "out", cache=cache
     )
-    rows = {row["label"]: row for row in comparison.rows}
+    rows = {row.label: row for row in comparison.rows}
     assert set(rows) == {"linear-fem", "pca-regression-force", "pod"}
     direct = (
         mor_bench.load_method("pca-regression-force")
         .fit(data.scene, data.train)
         .predict(data.test.given)
     )
-    assert rows["pca-regression-force"]["error"]["rel_l2_median"] == pytest.approx(
+    error = rows["pca-regression-force"].error
+    assert error is not None
+    assert error.rel_l2_median == pytest.approx(
         np.median(relative_l2(direct, data.test.displacements))
     )
     for label, row in rows.items():
-        assert row["status"] == ("skipped" if label == "pod" else "ok"), row["reason"]
-        if row["status"] == "skipped":
-            assert NO_FORCES in row["reason"]
+        assert row.status == ("skipped" if label == "pod" else "ok"), row.reason
+        if row.status == "skipped":
+            assert NO_FORCES in (row.reason or "")
         else:
-            assert row["latency_ms"]["median"] > 0
-            assert row["indicator"] is None
+            assert row.latency_ms is not None
+            assert row.latency_ms.median > 0
+            assert row.indicator is None
     assert comparison.datasets["beam-tiny-observed"]["observed"] == {"region": "z-max"}
 
 
