@@ -44,9 +44,9 @@ CASES: dict[str, tuple[str, dict[str, Any], float]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_single_query(case: str, tiny: Dataset, benchmark: BenchmarkFixture) -> None:
     """The test load that displaces most, in a load region that training has not seen."""
-    name, knobs, bound = CASES[case]
+    name, parameters, bound = CASES[case]
     try:
-        method = mor_bench.load_method(name, **knobs)
+        method = mor_bench.load_method(name, **parameters)
     except MissingDependencyError as error:
         pytest.skip(str(error))
     hardest = int(np.abs(tiny.test.displacements).max(axis=(1, 2)).argmax())
@@ -62,8 +62,8 @@ def test_single_query(case: str, tiny: Dataset, benchmark: BenchmarkFixture) -> 
     assert np.linalg.norm(predicted - reference) <= bound * np.linalg.norm(reference)
 
 
-def _named(method: str, knobs: dict[str, Any]) -> str:
-    return " ".join([method, *(f"{key}={value}" for key, value in knobs.items())])
+def _named(method: str, parameters: dict[str, Any]) -> str:
+    return " ".join([method, *(f"{key}={value}" for key, value in parameters.items())])
 
 
 def _race_id(value: str | Race) -> str:
@@ -91,10 +91,10 @@ def fitted(cache: Path) -> Callable[[str, str, dict[str, Any]], Surrogate]:
     """A method on a scene, fitted once for all races."""
     known: dict[tuple[str, str], Surrogate] = {}
 
-    def fit(scene: str, method: str, knobs: dict[str, Any]) -> Surrogate:
-        key = scene, _named(method, knobs)
+    def fit(scene: str, method: str, parameters: dict[str, Any]) -> Surrogate:
+        key = scene, _named(method, parameters)
         if key not in known:
-            surrogate = mor_bench.load_method(method, **knobs)
+            surrogate = mor_bench.load_method(method, **parameters)
             train = (
                 mor_bench.load_dataset(scene, limit=N_SAMPLES, cache=cache, workers=1).train
                 if surrogate.needs_snapshots

@@ -77,15 +77,15 @@ def _annotated_defaults(surrogate: type[Any]) -> dict[str, Any]:
     owner = next(base for base in surrogate.__mro__ if "__init__" in vars(base))
     hints, factories = {}, {}
     if "__dataclass_fields__" in vars(owner):
-        knobs = dataclasses.fields(owner)
-        hints = _field_hints(owner, {knob.name for knob in knobs})
-        factories = {k.name: k.default_factory for k in knobs if callable(k.default_factory)}
+        own = dataclasses.fields(owner)
+        hints = _field_hints(owner, {field.name for field in own})
+        factories = {f.name: f.default_factory for f in own if callable(f.default_factory)}
     else:
         hints = get_type_hints(surrogate.__init__, include_extras=True)
     found: dict[str, Any] = {}
-    for knob in list(inspect.signature(surrogate.__init__).parameters.values())[1:]:
-        default = factories[knob.name]() if knob.name in factories else knob.default
-        found[knob.name] = hints.get(knob.name, Any), ... if default is knob.empty else default
+    for name, parameter in list(inspect.signature(surrogate.__init__).parameters.items())[1:]:
+        default = factories[name]() if name in factories else parameter.default
+        found[name] = hints.get(name, Any), ... if default is parameter.empty else default
     return found
 
 
