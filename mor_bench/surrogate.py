@@ -24,6 +24,7 @@ from mor_bench.model_arrays import check_finite
 from mor_bench.model_file import StoredModel, class_path, write_model
 from mor_bench.reduction.sizing import choose_sizes
 from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.checked_samples import checked_samples
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.given import Given, ObservedDisplacements, checked_given
 from mor_bench.snapshots.load_range import LoadRange
@@ -39,10 +40,10 @@ Array = NDArray[np.float64]
 class Surrogate:
     """A map from what is given, nodal forces or observed displacements, to nodal displacements.
 
-    A subclass is a dataclass of hyperparameters, ``@dataclass(eq=False)``, with three verbs: `learn`
-    returns the arrays that are the model, `prepare` makes what a query needs from them, and `answer`
-    predicts. Pydantic's `Field` in the annotations gives the range of a hyperparameter. This base
-    class checks all input, saves, loads, and forgets an earlier fit.
+    A subclass is a dataclass of hyperparameters, ``@dataclass(eq=False)``, with three verbs.
+    `learn` returns the arrays that are the model, `prepare` makes what a query needs from them, and
+    `answer` predicts. Pydantic's `Field` in the annotations gives the range of a hyperparameter.
+    This base class checks all input, saves, loads, and forgets an earlier fit.
     """
 
     needs_snapshots: ClassVar[bool] = True
@@ -74,7 +75,7 @@ class Surrogate:
     """Values chosen for hyperparameters set to "auto"."""
 
     timings_ms_: dict[str, float]
-    """Times by which the fit chose between equivalent ways to predict, on the machine of the fit."""
+    """Times by which the fit chose between equivalent ways to predict, on its machine."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -155,12 +156,7 @@ class Surrogate:
         model: Mapping[str, NDArray[Any]],
         sizes: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Become fitted from the arrays of a fitted model, ``arrays_``.
-
-        Parameters
-        ----------
-        sizes : dict of str to Any, optional
-            Values chosen for hyperparameters set to "auto".
+        """Become fitted from ``arrays_`` and ``sizes_`` of a fitted model.
 
         Raises
         ------
@@ -231,24 +227,13 @@ class Surrogate:
         return value
 
     def out_of_range(self, forces: ArrayLike) -> NDArray[np.bool_]:
-        """Flag loads outside the range of the training loads.
+        """Flag loads outside the range of the training loads, as a bool array of shape () or (n,).
 
         A flag is no bound on the error, see `mor_bench.snapshots.load_range`. A method that needs
-        no snapshots flags nothing.
-
-        Parameters
-        ----------
-        forces : (n_nodes, 3) or (n, n_nodes, 3)
-            Nodal forces, N.
-
-        Returns
-        -------
-        bool array of shape () or (n,)
+        no snapshots flags nothing. The forces and errors are those of `predict`.
 
         Raises
         ------
-        InvalidInputError, NotFittedError
-            As `predict`.
         UnknownRangeError
             If the range is not known: the class overrides `fit`, the model's file is of an older
             version, or displacements are given instead of forces.
@@ -272,17 +257,9 @@ class Surrogate:
         return flags.reshape(np.shape(forces)[:-2])
 
     def indicate_error(self, forces: ArrayLike, displacements: ArrayLike) -> Indication:
-        """Estimate the error of predictions from the equilibrium residual.
+        """Estimate the error of predictions, m, from the equilibrium residual.
 
-        Parameters
-        ----------
-        forces, displacements : (n_nodes, 3) or (n, n_nodes, 3)
-            Loads, N, and predictions, m, at all nodes.
-
-        Returns
-        -------
-        Indication
-            With arrays of shape (1,) or (n,).
+        Forces and displacements must have the same shape, and displacements hold all nodes.
 
         Raises
         ------
@@ -367,31 +344,3 @@ class Surrogate:
         if not hasattr(self, "scene_"):
             raise NotFittedError(f"{type(self).__name__} must be fitted before it predicts.")
         return checked_given(self.scene_, forces)
-
-
-def checked_samples(owner: str, scene: Scene, snapshots: Snapshots | None) -> Snapshots:
-    """Check training samples.
-
-    Raises
-    ------
-    InvalidInputError
-        If there are none, or they are of a wrong shape or dtype, not finite, or all zero.
-    """
-    if snapshots is None or len(snapshots) == 0:
-        raise InvalidInputError(f"{owner} needs at least one training sample; got none.")
-    displacements, vectors = snapshots.free_displacements, snapshots.loads.vectors
-    shape = (len(snapshots), len(scene.free_dofs))
-    kinds = {displacements.dtype.kind, vectors.dtype.kind}
-    if displacements.shape != shape or not kinds <= set("fiu"):
-        raise InvalidInputError(
-            f"the training samples must be real numbers, displacements of shape {shape}; "
-            f"got {displacements.dtype} of shape {displacements.shape} and forces in "
-            f"{vectors.dtype}."
-        )
-    if not np.isfinite(displacements).all() or not np.isfinite(vectors).all():
-        raise InvalidInputError("the training snapshots hold NaN or infinity.")
-    if not displacements.any() or not vectors.any():
-        raise InvalidInputError(
-            "the training snapshots are all zero: nothing can be learned from them."
-        )
-    return snapshots
