@@ -223,12 +223,9 @@ def dashboard(checkout: Path) -> Iterator[str]:
     """Address of a published dashboard with a comparison of two commits."""
     pytest.importorskip("asv")
     out = checkout / ".asv" / "results"
-    export_asv(
-        comparison(row("fem", 1e-3), row("pod", 2e-3, label="pod [n_modes=10]")),
-        out,
-        commit="HEAD~1",
-    )
-    export_asv(comparison(row("fem", 3e-3), row("pod", 2e-3, label="pod [n_modes=10]")), out)
+    pod = row("pod", 2e-3, label="pod [n_modes=10]")
+    export_asv(comparison(row("fem", 1e-3), pod), out, commit="HEAD~1")
+    export_asv(comparison(row("fem", 3e-3), pod), out)
     html = publish(checkout / "asv.conf.json")
     server = ThreadingHTTPServer(
         ("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=str(html))
@@ -243,22 +240,15 @@ def dashboard(checkout: Path) -> Iterator[str]:
 
 def page(address: str, profile: Path) -> str:
     """The document that a headless browser has made of a page when its scripts are done."""
-    options = (
-        "headless",
-        "no-sandbox",
-        "disable-gpu",
-        "disable-quic",
-        "no-first-run",
-        "disable-background-networking",
-        "disable-component-update",
-        "disable-sync",
+    quiet = "no-first-run disable-background-networking disable-component-update disable-sync"
+    plain = f"headless no-sandbox disable-gpu disable-quic no-proxy-server dump-dom {quiet}"
+    options = [
+        *plain.split(),
         "host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
-        "no-proxy-server",
         f"user-data-dir={profile}",
         "virtual-time-budget=10000",
         "window-size=1400,900",
-        "dump-dom",
-    )
+    ]
     return subprocess.run(
         [str(CHROMIUM), *(f"--{option}" for option in options), address],
         check=True,

@@ -326,12 +326,12 @@ def test_the_measured_error_arrives_in_every_row_and_page(cache: Path, tmp_path:
     assert {row.discretisation_error_m for row in run.rows} == {record["error_m"]}
     assert {row.discretisation_rel_l2 for row in run.rows} == {record["relative_l2_median"]}
     stored = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
-    assert {row.discretisation_error_m for row in stored} == {record["error_m"]}
+    assert {row["discretisation_error_m"] for row in stored} == {record["error_m"]}
     assert (run.table["discretisation_error_m"] == record["error_m"]).all()
     assert str(record["error_m"]) in (tmp_path / "out" / "results.csv").read_text()
     page = render(run)[-1].read_text(encoding="utf-8")
     assert page.count(f"<td>{record['error_m']:.1e}</td>") >= len(run.rows)
-    assert "not against the body" in page
+    assert "says nothing about the real body" in page
 
 
 def test_a_changed_dataset_shows_none_until_it_is_measured(

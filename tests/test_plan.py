@@ -37,7 +37,7 @@ def test_a_method_of_unknown_duration_is_reported(tmp_path: Path) -> None:
     arguments = ["run", "beam-tiny", "-m", str(path), "--dry-run", "--cache", str(cache)]
     shown = CliRunner().invoke(app, arguments)
     assert shown.exit_code == 0, shown.output
-    assert "1 steps of which nothing is known" in shown.output
+    assert "1 steps of unknown duration" in shown.output
 
 
 def test_other_seeds_and_trainings_of_given_length_are_planned(tmp_path: Path) -> None:

@@ -198,6 +198,6 @@ def print_plan(plan: Plan, console: Console) -> None:
         estimate = "unknown" if step.seconds is None else f"{number(step.seconds)} s"
         table.add_row(step.dataset, Text(step.label), "in the cache" if step.done else estimate)
     console.print(table, highlight=False)
-    unknown = f", and {plan.n_unknown} steps of which nothing is known" if plan.n_unknown else ""
+    unknown = f", and {plan.n_unknown} steps of unknown duration" if plan.n_unknown else ""
     total = f"about {plan.seconds / 60:.1f} min, {plan.timing_s / 60:.1f} of them timing"
     console.print(Text(total + unknown, style="bold"))
