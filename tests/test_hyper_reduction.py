@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -24,16 +24,6 @@ from mor_bench.mechanics.assembly import (
 )
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
-from mor_bench.reduction.basis import pod
-from mor_bench.reduction.cubature import (
-    ActiveColumns,
-    CubatureError,
-    SparseWeights,
-    ecsw_system,
-    sparse_nnls,
-)
-from mor_bench.reduction.discrete_interpolation import Selection, interpolation_rows
-from mor_bench.reduction.empirical_cubature import cell_basis, empirical_cubature
 from mor_bench.reduction.galerkin import CubatureProblem, GalerkinProblem
 from mor_bench.reduction.points import ReducedPoints
 from mor_bench.reduction.subspace import extent_of
@@ -47,8 +37,8 @@ from mor_bench.surrogates.ecm import EmpiricalCubaturePOD
 from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.hyper_reduced import nodal, reduced_points
 from mor_bench.surrogates.pod import PODGalerkin
-from tests.verification.test_elements_and_laws import EVERY
-from tests.verification.test_equilibria import scene_of
+from tests.verification.laws_and_elements import EVERY
+from tests.verification.scenes import scene_of
 
 Array = NDArray[np.float64]
 
@@ -161,212 +151,6 @@ def test_the_compiled_steps_end_as_the_shared_solve_does(tiny: Dataset, scale: f
         assert found.iterations == expected.iterations or found.cuts == expected.cuts
         assert found.min_det_f > 0
     assert (failed > 0) == (scale == 100.0)
-
-
-def optimality(matrix: Array, target: Array, x: Array) -> tuple[float, float, float]:
-    """Residual, largest gradient on positive weights and on the others, all relative, from nothing but the weights."""
-    residual, size = target - matrix @ x, np.linalg.norm(target)
-    norms = np.linalg.norm(matrix, axis=0)
-    gradient = matrix.T @ residual / np.where(norms > 0, norms, 1.0) / size
-    passive = x > 0
-    return (
-        float(np.linalg.norm(residual) / size),
-        float(np.abs(gradient[passive]).max(initial=0.0)),
-        float(gradient[~passive].max(initial=0.0)),
-    )
-
-
-def hard_matrix(kind: str) -> Array:
-    rng = np.random.default_rng(1)
-    matrix = rng.normal(size=(60, 200)) + 0.5
-    if kind == "duplicated columns":
-        matrix[:, 100:] = matrix[:, :100]
-    if kind == "badly scaled columns":
-        matrix *= 10.0 ** rng.uniform(-8, 8, 200)
-    if kind == "zero columns":
-        matrix[:, ::3] = 0.0
-    return matrix
-
-
-@pytest.mark.parametrize(
-    "kind", ["plain", "duplicated columns", "badly scaled columns", "zero columns"]
-)
-@pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-8])
-def test_nnls_of_hard_columns_keeps_its_conditions(kind: str, tolerance: float) -> None:
-    """Weights not negative, residual as asked, zero gradient on positive weights; the dual condition is that of the optimum only."""
-    matrix = hard_matrix(kind)
-    target = matrix @ np.random.default_rng(2).uniform(0.5, 1.5, 200)
-    found = sparse_nnls(matrix, target, tolerance)
-    residual, passive, dual = optimality(matrix, target, found.weights)
-    assert (found.weights >= 0).all()
-    assert residual <= tolerance * (1 + 1e-9)
-    assert passive <= 1e-10
-    assert (found.relative_residual, found.passive_gradient, found.dual_gradient) == pytest.approx(
-        (residual, passive, dual), rel=1e-9, abs=1e-16
-    )
-    assert (found.weights[~matrix.any(axis=0)] == 0).all()
-    assert (found.weights > 0).sum() <= 60
-
-
-@pytest.mark.parametrize(
-    "kind", ["plain", "duplicated columns", "badly scaled columns", "zero columns"]
-)
-def test_nnls_run_to_the_end_meets_all_conditions(kind: str) -> None:
-    """On a target out of reach; scipy's solution has the same residual."""
-    from scipy.optimize import nnls
-
-    matrix, rng = hard_matrix(kind)[:, :40], np.random.default_rng(3)
-    matrix[:, 30:] = matrix[:, :10] if kind == "duplicated columns" else matrix[:, 30:]
-    target = rng.normal(size=60)
-    found = sparse_nnls(matrix, target, 0.0)
-    residual, passive, dual = optimality(matrix, target, found.weights)
-    norms = np.linalg.norm(matrix, axis=0)
-    assert residual == pytest.approx(
-        nnls(matrix / np.where(norms > 0, norms, 1.0), target)[1] / np.linalg.norm(target),
-        rel=1e-10,
-    )
-    assert (found.weights >= 0).all()
-    assert max(passive, dual) <= 1e-10
-    assert 0.1 < residual < 1
-
-
-@pytest.mark.parametrize("tolerance", [1e-3, 0.0])
-def test_nnls_with_too_few_iterations_fails_honestly(tolerance: float) -> None:
-    matrix = np.random.default_rng(0).random((30, 50))
-    with pytest.raises(CubatureError, match="in 1 iterations"):
-        sparse_nnls(matrix, matrix.sum(axis=1), tolerance, max_iterations=1)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_nnls_refuses_what_is_not_finite(bad: float) -> None:
-    matrix = np.ones((3, 4))
-    spoilt = matrix.copy()
-    spoilt[1, 2] = bad
-    with pytest.raises(InvalidInputError, match="NaN or infinity"):
-        sparse_nnls(spoilt, np.ones(3), 1e-3)
-    with pytest.raises(InvalidInputError, match="NaN or infinity"):
-        sparse_nnls(matrix, np.array([1.0, bad, 1.0]), 1e-3)
-
-
-def test_nnls_of_a_zero_target_has_zero_weights() -> None:
-    found = sparse_nnls(np.ones((3, 4)), np.zeros(3), 1e-3)
-    assert asdict(found) | {"weights": None} == asdict(
-        SparseWeights(np.zeros(4), 0.0, 0.0, 0.0, 0)
-    ) | {"weights": None}
-    assert not found.weights.any()
-
-
-def test_the_updated_factor_stays_that_of_its_columns() -> None:
-    """600 changes to some of 300 nearly dependent columns."""
-    rng = np.random.default_rng(0)
-    matrix = rng.normal(size=(120, 60)) @ rng.normal(size=(60, 300)) + 1e-4 * rng.normal(
-        size=(120, 300)
-    )
-    target = rng.normal(size=120)
-    columns = ActiveColumns(matrix, target)
-    for _ in range(600):
-        if columns.chosen and (len(columns.chosen) > 100 or rng.random() < 0.4):
-            columns.remove(int(rng.choice(columns.chosen)))
-        else:
-            columns.append(int(rng.choice(np.setdiff1d(np.arange(300), columns.chosen))))
-    assert len(columns.chosen) > 30
-
-    def off() -> float:
-        return float(
-            np.abs(columns.gradient(columns.residual(columns.coefficients()))[columns.chosen]).max()
-        )
-
-    updated = off()
-    columns.refactor()
-    assert updated <= 10 * off() <= 1e-8
-
-
-def test_blocks_of_rows_are_compressed_to_the_same_least_squares(tiny: Dataset) -> None:
-    model = FullOrderModel(tiny.scene)
-    modes = pod(tiny.train.free_displacements, 4).modes
-    q = tiny.train.free_displacements[:90] @ modes
-    arguments = model.assembler, model.cell_dofs, modes, q
-    whole = np.concatenate([ecsw_system(*arguments[:3], q[i : i + 10]) for i in range(0, 90, 10)])
-    assert whole.shape == (360, 24)
-    weights = np.random.default_rng(0).random(24)
-    for compressed in (ecsw_system(*arguments), ecsw_system(*arguments, max_entries=1)):
-        assert len(compressed) <= 2 * 24 + 4
-        for x in (weights, weights - 1, np.ones(24)):
-            assert np.linalg.norm(compressed @ x) == pytest.approx(
-                np.linalg.norm(whole @ x), rel=1e-12
-            )
-
-
-def test_the_cell_basis_leaves_what_it_may_and_is_hardly_larger_than_the_smallest() -> None:
-    rng = np.random.default_rng(0)
-    matrix = (
-        rng.normal(size=(400, 150))
-        * 10.0 ** -np.linspace(0, 8, 150)
-        @ np.linalg.qr(rng.normal(size=(150, 150)))[0]
-    )
-    values = np.linalg.svd(matrix, compute_uv=False)
-    tails = np.sqrt(np.cumsum(values[::-1] ** 2)[::-1])
-    for tolerance in (1e-1, 1e-2, 1e-4):
-        basis = cell_basis(matrix, tolerance)
-        assert np.linalg.norm(basis.T @ basis - np.eye(basis.shape[1])) <= 1e-12
-        assert np.linalg.norm(matrix - matrix @ basis @ basis.T) <= tolerance * np.linalg.norm(
-            matrix
-        ) * (1 + 1e-6)
-        assert basis.shape[1] <= int((tails > tolerance * np.linalg.norm(matrix)).sum()) + 3
-
-
-@pytest.mark.parametrize("tolerance", [0.3, 1e-2, 1e-3])
-def test_empirical_cubature_integrates_its_basis_and_one(tiny: Dataset, tolerance: float) -> None:
-    model = FullOrderModel(tiny.scene)
-    modes = pod(tiny.train.free_displacements, 3).modes
-    system = ecsw_system(
-        model.assembler, model.cell_dofs, modes, tiny.train.free_displacements[:60] @ modes
-    )
-    found = empirical_cubature(system, tolerance)
-    basis = cell_basis(system, tolerance)
-    np.testing.assert_allclose(basis.T @ found.weights, basis.sum(axis=0), atol=1e-7 * np.sqrt(24))
-    assert found.weights.sum() == pytest.approx(24, rel=1e-7)
-    assert (found.weights >= 0).all()
-    assert (found.weights > 0).sum() <= basis.shape[1] + 1
-    missed = system @ (found.weights - 1)
-    assert np.linalg.norm(missed) <= tolerance * np.linalg.norm(system) * np.linalg.norm(
-        found.weights - 1
-    ) * (1 + 1e-6)
-    with pytest.raises(CubatureError, match="in 1 iterations"):
-        empirical_cubature(system, tolerance, max_iterations=1)
-
-
-@pytest.mark.parametrize("selection", ["greedy", "pivoted-qr"])
-def test_interpolation_is_exact_in_the_basis_and_at_its_rows(selection: Selection) -> None:
-    rng = np.random.default_rng(0)
-    x = np.linspace(-1, 1, 200)
-    basis = np.linalg.qr(np.vander(x, 12, increasing=True))[0]
-    rows = interpolation_rows(basis, selection)
-    assert len(set(rows.tolist())) == 12
-    lift = basis @ np.linalg.inv(basis[rows])
-    inside = basis @ rng.normal(size=12)
-    np.testing.assert_allclose(lift @ inside[rows], inside, atol=1e-12)
-    other = np.exp(3 * x)
-    np.testing.assert_allclose((lift @ other[rows])[rows], other[rows], rtol=1e-12)
-    # The error is at most ‖(PᵀU)⁻¹‖ times that of the projection, and the rows are chosen to keep that factor small.
-    factor = np.linalg.norm(np.linalg.inv(basis[rows]), 2)
-    best = np.linalg.norm(other - basis @ basis.T @ other)
-    assert np.linalg.norm(lift @ other[rows] - other) <= factor * best * (1 + 1e-9)
-    scattered = [
-        np.linalg.norm(np.linalg.inv(basis[rng.choice(200, 12, replace=False)]), 2)
-        for _ in range(20)
-    ]
-    assert factor < 0.2 * min(scattered)
-
-
-def test_greedy_rows_of_a_small_basis_by_hand() -> None:
-    basis = np.array([[1.0, 1.0], [2.0, 0.0], [0.0, -3.0]])
-    assert interpolation_rows(basis, "greedy").tolist() == [
-        1,
-        2,
-    ]  # after row 1 the second column is not interpolated at all
-    with pytest.raises(InvalidInputError, match="3 rows cannot have 4"):
-        interpolation_rows(np.ones((3, 4)), "greedy")
 
 
 def test_the_interpolated_force_is_projected_exactly_at_rest_and_has_its_tangent(
@@ -580,13 +364,3 @@ def test_compiled_steps_never_end_in_an_unstable_or_inverted_state() -> None:
 def test_too_few_points_for_the_modes_are_a_typed_error(tiny: Dataset) -> None:
     with pytest.raises(SolverError, match="too few cells or points"):
         HyperReducedPOD(20, 0.9).fit(tiny.scene, tiny.train)
-
-
-@pytest.mark.parametrize("rank", [30, 100])
-def test_the_cell_basis_of_a_matrix_of_low_rank_is_whole_and_orthonormal(rank: int) -> None:
-    rng = np.random.default_rng(0)
-    matrix = rng.normal(size=(900, rank)) @ rng.normal(size=(rank, 300))
-    basis = cell_basis(matrix, 1e-9)
-    assert basis.shape[1] == rank
-    assert np.linalg.norm(basis.T @ basis - np.eye(rank)) <= 1e-12
-    assert np.linalg.norm(matrix - matrix @ basis @ basis.T) <= 1e-9 * np.linalg.norm(matrix)

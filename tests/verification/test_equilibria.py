@@ -1,9 +1,10 @@
-"""Equilibria of every law on every element: convergence, reversibility, symmetry, and loads that have none."""
+"""Equilibria of every law on every element, and loads that have none."""
 
 from __future__ import annotations
 
 import itertools
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,39 +27,20 @@ from mor_bench.hard_cases.setups import (
     confined_column,
     free_assembler,
     make_bars,
-    material_table,
 )
+from mor_bench.mechanics.assembly import State
 from mor_bench.mechanics.banded import BandedCholesky
+from mor_bench.mechanics.indicator import ErrorIndicator
 from mor_bench.mechanics.model import SOLVERS, FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.runs.file_check import check_file
 from mor_bench.scene.mesh import Mesh
-from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.specs import SolverName
 
-from .test_elements_and_laws import ELEMENTS, EVERY, LAWS, piola
+from .laws_and_elements import ELEMENTS, EVERY, LAWS, piola
+from .scenes import patch_load, relative_residual, scene_of
 
 Array = NDArray[np.float64]
-
-
-def scene_of(
-    law: str, kind: tuple[str, bool], poisson: float = 0.4, base: str = "beam-tiny"
-) -> Scene:
-    """A shipped scene with another law, element and Poisson's ratio."""
-    spec = mor_bench.load_scene(base).spec.model_dump(mode="json")
-    discretisation = {"element": kind[0], "integration": "selective" if kind[1] else "full"}
-    return load_scene(
-        {**spec, "discretisation": discretisation, "material": material_table(law, 500.0, poisson)}
-    )
-
-
-def patch_load(scene: Scene, patch: int, force: list[float]) -> Array:
-    """A force, N, on a patch, over the free dofs."""
-    return np.asarray(
-        (scene.patch_weights[[patch]].toarray()[0][:, None] * np.array(force)).ravel()[
-            scene.free_dofs
-        ]
-    )
 
 
 @pytest.mark.parametrize("kind", ELEMENTS)
@@ -67,7 +49,7 @@ def patch_load(scene: Scene, patch: int, force: list[float]) -> Array:
 def test_confined_compression_ends_at_the_limit_point(
     kind: tuple[str, bool], steps: int, factor: float
 ) -> None:
-    """Beyond it plain Newton 'converges' to a mirrored element, with a residual of round-off."""
+    """Beyond it, plain Newton converges to a mirrored element."""
     column, q = confined_column(LAW, kind[0] == "tetrahedron", kind[1]), None
     for step in range(1, steps + 1):
         level = factor * step / steps
@@ -85,11 +67,9 @@ def test_confined_compression_ends_at_the_limit_point(
 
 @pytest.mark.parametrize("kind", ELEMENTS)
 def test_an_unstable_equilibrium_is_never_returned(kind: tuple[str, bool]) -> None:
-    """Under 0.9 of the limit load the residual vanishes at two stretches; started at the unstable one, the other is found."""
-    column, ratio = (
-        confined_column(LAW, kind[0] == "tetrahedron", kind[1]),
-        0.9 * 2 / (3 * np.sqrt(3)),
-    )
+    """Under 0.9 of the limit load the residual vanishes at a stable and an unstable stretch."""
+    column = confined_column(LAW, kind[0] == "tetrahedron", kind[1])
+    ratio = 0.9 * 2 / (3 * np.sqrt(3))
     unstable, stable = sorted(
         root.real for root in np.roots([1.0, 0.0, -1.0, ratio]) if root.real > 0
     )
@@ -121,10 +101,8 @@ def test_newton_converges_quadratically_near_the_solution(law: str, kind: tuple[
     load = np.zeros(model.n_unknowns)
     load[-1] = 2.0
     exact = model.solve(load, options=NewtonOptions(tolerance=1e-12)).displacement
-    u, errors = (
-        exact + 1e-2 * np.random.default_rng(0).normal(size=len(exact)) * np.abs(exact).max(),
-        [],
-    )
+    noise = np.random.default_rng(0).normal(size=len(exact))
+    u, errors = exact + 1e-2 * noise * np.abs(exact).max(), []
     for _ in range(4):
         errors.append(float(np.linalg.norm(u - exact)))
         state, tangent = model.linearise(u)
@@ -143,7 +121,7 @@ def test_work_of_loading_is_the_stored_energy_and_unloading_returns_to_rest(
 ) -> None:
     model = FullOrderModel(scene_of(law, kind))
     load = patch_load(model.scene, -1, [0.2, -1.0, 2.0])
-    levels = np.linspace(0, 1, 41)
+    levels = np.linspace(0, 1, 21)
     states = [np.zeros(model.n_unknowns)]
     for level in levels[1:]:
         states.append(model.solve(level * load, start=states[-1]).displacement)
@@ -153,7 +131,7 @@ def test_work_of_loading_is_the_stored_energy_and_unloading_returns_to_rest(
             itertools.pairwise(levels), itertools.pairwise(states), strict=True
         )
     )
-    assert work == pytest.approx(model.force(states[-1]).energy_j, rel=1e-3)
+    assert work == pytest.approx(model.force(states[-1]).energy_j, rel=4e-3)
     u = model.solve(levels[1] * load, start=states[-1]).displacement
     np.testing.assert_allclose(u, states[1], atol=1e-6 * np.abs(states[1]).max())
     for _ in range(6):
@@ -174,38 +152,31 @@ def test_mirrored_load_gives_the_mirrored_answer(law: str, selective: bool) -> N
         ]
     )
     forces = scene.patch_weights[[30]].toarray()[0][:, None] * np.array([0.3, 0.5, -0.4])
-    answers = []
-    for load in (forces, forces[mirror] * [1, -1, 1]):
-        u = np.zeros(scene.mesh.n_dofs)
-        u[scene.free_dofs] = model.solve(
-            load.ravel()[scene.free_dofs], options=NewtonOptions(tolerance=1e-13)
-        ).displacement
-        answers.append(u.reshape(-1, 3))
-    assert np.linalg.norm(answers[1] - answers[0][mirror] * [1, -1, 1]) <= 1e-12 * np.linalg.norm(
-        answers[0]
-    )
-    assert np.abs(answers[1] - answers[0]).max() > 0.1 * np.abs(answers[0]).max()
+    answers = np.zeros((2, scene.mesh.n_dofs))
+    for answer, load in zip(answers, (forces, forces[mirror] * [1, -1, 1]), strict=True):
+        found = model.solve(load.ravel()[scene.free_dofs], options=NewtonOptions(tolerance=1e-13))
+        answer[scene.free_dofs] = found.displacement
+    first, second = answers.reshape(2, -1, 3)
+    apart = np.linalg.norm(second - first[mirror] * [1, -1, 1])
+    assert apart <= 1e-12 * np.linalg.norm(first)
+    assert np.abs(second - first).max() > 0.1 * np.abs(first).max()
 
 
 @pytest.mark.parametrize(("law", "kind"), EVERY)
 def test_two_runs_are_identical(law: str, kind: tuple[str, bool]) -> None:
     first, second = (FullOrderModel(scene_of(law, kind)) for _ in range(2))
     loads = [patch_load(first.scene, patch, [0.3, -1.0, 1.5]) for patch in (-1, 3)]
-    once, again = (
-        [first.solve(load) for load in loads],
-        [second.solve(load) for load in reversed(loads)],
-    )
+    once = [first.solve(load) for load in loads]
+    again = [second.solve(load) for load in reversed(loads)]
     for one, other in zip(once, reversed(again), strict=True):
         np.testing.assert_array_equal(one.displacement, other.displacement)
-        assert (one.min_det_f, one.iterations, one.cuts) == (
-            other.min_det_f,
-            other.iterations,
-            other.cuts,
-        )
+        for name in ("min_det_f", "iterations", "cuts"):
+            assert getattr(one, name) == getattr(other, name)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::mor_bench.errors.LockingWarning")
-@pytest.mark.parametrize("poisson", [0.48, 0.49, 0.499, 0.4999])
+@pytest.mark.parametrize("poisson", [0.49, 0.4999])
 @pytest.mark.parametrize(("law", "kind"), EVERY)
 def test_nearly_incompressible_converges(law: str, kind: tuple[str, bool], poisson: float) -> None:
     scene = scene_of(law, kind, poisson)
@@ -213,9 +184,7 @@ def test_nearly_incompressible_converges(law: str, kind: tuple[str, bool], poiss
     assert scene.material is not None
     assert scene.material.poisson_at_rest == pytest.approx(poisson, rel=1e-9)
     solution = model.solve(load)
-    assert np.linalg.norm(load - model.force(solution.displacement).force) <= 1e-8 * np.linalg.norm(
-        load
-    )
+    assert relative_residual(model, load, solution.displacement) <= 1e-8
     assert solution.min_det_f > 0
 
 
@@ -304,22 +273,12 @@ def test_the_solver_itself_refuses_what_is_not_a_finite_vector(bad: str, name: s
         wrong = good.copy()
         wrong[3] = {"huge": 1e160}.get(bad) or float(bad)
     load, start = (wrong, None) if name == "load 0" else (good, wrong)
-    if (
-        bad == "huge" and start is not None
-    ):  # no shape or kind of number is wrong, and the start does not matter
-        np.testing.assert_allclose(
-            model.solve(load, start).displacement, model.solve(load).displacement, rtol=0, atol=1e-9
-        )
+    if bad == "huge" and start is not None:  # a start may be of any size
+        ours, best = model.solve(load, start).displacement, model.solve(load).displacement
+        np.testing.assert_allclose(ours, best, rtol=0, atol=1e-9)
         return
-    with pytest.raises(
-        InvalidInputError,
-        match=name
-        + (
-            " must be within ±1e\\+30 N; got 1e\\+160"
-            if bad == "huge"
-            else " must be finite real numbers"
-        ),
-    ):
+    said = "within ±1e\\+30 N; got 1e\\+160" if bad == "huge" else "finite real numbers"
+    with pytest.raises(InvalidInputError, match=f"{name} must be {said}"):
         model.solve(load, start)
 
 
@@ -332,41 +291,43 @@ def test_solvers_and_tolerances_that_do_not_exist_are_refused(solver: str) -> No
             NewtonOptions(tolerance)
 
 
-@pytest.mark.parametrize("law", ["saint-venant-kirchhoff", "neo-hookean"])
-@pytest.mark.parametrize("solver", ["auto", "rotated-pcg", "jacobi-pcg"])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        pytest.param("auto"),
+        pytest.param("rotated-pcg"),
+        pytest.param("jacobi-pcg", marks=pytest.mark.slow),
+    ],
+)
 def test_a_column_beyond_its_buckling_load_is_never_called_stable_when_straight(
-    law: str, solver: SolverName
+    solver: SolverName,
 ) -> None:
-    """Euler's load is about 1 N; the residual of the straight column vanishes, whether or not it is pushed aside a little."""
+    """Euler's load is about 1 N. The straight column has no residual, but is unstable."""
     spec = mor_bench.load_scene("beam-coarse").spec.model_dump(mode="json")
-    spec["geometry"] = {"shape": "box", "size_m": [10.0, 1.0, 1.0], "cells": [30, 2, 2]}
+    spec["geometry"] = {"shape": "box", "size_m": [10.0, 1.0, 1.0], "cells": [20, 2, 2]}
     spec["loads"] |= {"region": "x-max", "patch_area_m2": 1.0}
-    spec["material"] = {"law": law, "young_pa": 500.0, "poisson": 0.3}
+    spec["material"] = {"law": "neo-hookean", "young_pa": 500.0, "poisson": 0.3}
     scene = mor_bench.load_scene(spec)
     model = FullOrderModel(scene, solver)
-    for push in ([-1.2, 0.0, 0.0], [-2.0, 0.0, 0.02], [-1.5, 0.03, 0.01], [-3.0, -0.1, 0.05]):
-        load = (scene.patch_weights.toarray()[4][:, None] * np.array(push)).ravel()[scene.free_dofs]
+    for push in ([-1.2, 0.0, 0.0], [-2.0, 0.0, 0.02], [-1.5, 0.03, 0.01]):
+        load = patch_load(scene, 4, push)
         try:
-            solution = model.solve(load)
+            u = model.solve(load).displacement
         except SolverError:
             continue
-        assert np.linalg.norm(
-            load - model.force(solution.displacement).force
-        ) <= 1e-8 * np.linalg.norm(load)
-        BandedCholesky(model.assembler.pattern).factor(model.linearise(solution.displacement)[1])
+        assert relative_residual(model, load, u) <= 1e-8
+        BandedCholesky(model.assembler.pattern).factor(model.linearise(u)[1])
 
 
 @pytest.mark.parametrize("kind", ELEMENTS)
 def test_stiffness_contrast_of_a_million(kind: tuple[str, bool]) -> None:
-    """Two bars in series, the second a million times softer: all of the stretch is in it."""
-    np.testing.assert_allclose(
-        make_bars(kind[0] == "tetrahedron", kind[1]).end_displacement(), Bars.stretch - 1, rtol=2e-6
-    )
+    bars = make_bars(kind[0] == "tetrahedron", kind[1])
+    np.testing.assert_allclose(bars.end_displacement(), Bars.stretch - 1, rtol=2e-6)
 
 
 @pytest.mark.parametrize(("law", "kind"), EVERY)
 def test_tiny_loads_have_proportional_answers(law: str, kind: tuple[str, bool]) -> None:
-    """Down to displacements of 1e-13 of the body, where laws that see F and not F - 1 have lost their digits."""
+    """Laws in terms of F lose their digits where displacements are 1e-13 of the body."""
     model = FullOrderModel(scene_of(law, kind))
     load = patch_load(model.scene, -1, [0.2, -1.0, 2.0])
     unit = model.solve(1e-3 * load).displacement / 1e-3
@@ -384,3 +345,63 @@ def test_an_ill_conditioned_stiffness_is_reported() -> None:
             warnings.simplefilter("always")
             _ = FullOrderModel(mor_bench.load_scene(spec)).rest_factor
         assert any(issubclass(warning.category, IllConditionedWarning) for warning in caught) == ill
+
+
+class Cubic:
+    """One unknown with the force q³; far from its solution, Newton converges linearly.
+
+    Its extent is so large that every step is round-off relative to it. An infinite energy at the
+    first linearisations hands the solve over to the safeguarded pass.
+    """
+
+    n_unknowns, extent, accelerator = 1, 1e30, None
+
+    def __init__(self, hopeless: int) -> None:
+        self._hopeless = hopeless
+
+    def force(self, q: Array) -> State:
+        return State(q**3, float(q[0] ** 4 / 4), 1.0)
+
+    def linearise(self, q: Array) -> tuple[State, Array]:
+        self._hopeless -= 1
+        state = self.force(q)
+        return replace(state, energy_j=np.inf) if self._hopeless >= 0 else state, 3 * q**2
+
+    def step(self, q: Array, tangent: Array, residual: Array, tolerance: float) -> Array:
+        return residual / tangent
+
+    def certify(self, q: Array) -> None:
+        pass
+
+    @property
+    def rest_tangent(self) -> Array:
+        raise NotImplementedError
+
+    rest_factor: Any = None
+
+
+@pytest.mark.parametrize("hopeless", [0, 1])
+def test_a_small_step_is_no_convergence_while_the_residual_falls(hopeless: int) -> None:
+    """The first case takes full Newton steps, the second the safeguarded pass."""
+    solution = solve_equilibrium(Cubic(hopeless), np.ones(1), np.array([1e3]))
+    assert solution.displacement[0] == pytest.approx(1.0, rel=1e-8)
+
+
+def test_small_corrections_of_a_tiny_answer_go_on_while_the_residual_falls() -> None:
+    """At 1e-10 of the body's size, corrections are round-off relative to the body."""
+    scene = scene_of("saint-venant-kirchhoff", ("hexahedron", False))
+    model, load = FullOrderModel(scene), patch_load(scene, -1, [0.2, -1.0, 2.0])
+    load = load * 1e-10 * model.extent / np.abs(model.rest_factor.solve(load)).max()
+    assert relative_residual(model, load, model.solve(load).displacement) <= 1e-8
+
+
+def test_a_prediction_that_moves_a_clamp_has_an_error_at_least_as_large() -> None:
+    scene = mor_bench.load_scene("beam-tiny")
+    force = np.zeros((1, scene.mesh.n_nodes, 3))
+    force.reshape(1, -1)[:, scene.free_dofs] = patch_load(scene, -1, [0.0, 0.1, 1.0])
+    u = mor_bench.load_method("fem").fit(scene, None).predict(force)
+    moved = u.copy()
+    moved[:, scene.fixed_nodes, 2] += 0.5 * np.abs(u).max()
+    indicated = [ErrorIndicator(scene)(force, v).relative_correction[0] for v in (u, moved)]
+    assert indicated[0] <= 1e-6
+    assert indicated[1] >= 0.99 * np.linalg.norm(moved - u) / np.linalg.norm(u)

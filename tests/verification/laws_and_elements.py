@@ -1,0 +1,133 @@
+"""Laws and elements that the verification tests go through, and solutions of their own."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.mechanics.assembly import Assembler, Discretisation
+from mor_bench.mechanics.banded import BandedCholesky
+from mor_bench.mechanics.elements import T4, shape_gradients
+from mor_bench.scene.interpolation import trilinear
+from mor_bench.scene.materials import (
+    Material,
+    MooneyRivlin,
+    NeoHookean,
+    Ogden,
+    SaintVenantKirchhoff,
+)
+from mor_bench.scene.mesh import box_mesh
+
+Array = NDArray[np.float64]
+LAWS: dict[str, Material] = {
+    "saint-venant-kirchhoff": SaintVenantKirchhoff(500.0, 0.4),
+    "neo-hookean": NeoHookean(500.0, 0.4),
+    "mooney-rivlin": MooneyRivlin(70.0, 20.0, 800.0),
+    "ogden": Ogden((100.0, -20.0), (2.1, -1.7), 800.0),
+}
+COMPRESSIBLE: dict[str, Material] = {
+    "saint-venant-kirchhoff": SaintVenantKirchhoff(1.0, 0.3),
+    "neo-hookean": NeoHookean(1.0, 0.3),
+    "mooney-rivlin": MooneyRivlin(0.15, 0.04, 0.8),
+    "ogden": Ogden((0.3, -0.08), (2.1, -1.7), 0.8),
+}
+ELEMENTS = [("hexahedron", False), ("hexahedron", True), ("tetrahedron", False)]
+EVERY = list(itertools.product(LAWS, ELEMENTS))
+
+
+def piola(law: Material, gradient: Array) -> Array:
+    """Return a law's first Piola-Kirchhoff stress (..., 3, 3), P = τ F⁻ᵀ with Kirchhoff's τ.
+
+    That of Saint Venant-Kirchhoff is P = F S.
+    """
+    eye, inverse = np.eye(3), np.swapaxes(np.linalg.inv(gradient), -1, -2)
+    left = gradient @ np.swapaxes(gradient, -1, -2)
+    j = np.linalg.det(gradient)[..., None, None]
+
+    def deviator(tensor: Array) -> Array:
+        return np.asarray(tensor - np.trace(tensor, axis1=-2, axis2=-1)[..., None, None] / 3 * eye)
+
+    if isinstance(law, SaintVenantKirchhoff):
+        strain = 0.5 * (np.swapaxes(gradient, -1, -2) @ gradient - eye)
+        trace = np.trace(strain, axis1=-2, axis2=-1)[..., None, None]
+        return np.asarray(gradient @ (law.lame_lambda * trace * eye + 2 * law.lame_mu * strain))
+    if isinstance(law, NeoHookean):
+        return np.asarray(
+            (law.lame_mu * (left - eye) + law.lame_lambda * np.log(j) * eye) @ inverse
+        )
+    if isinstance(law, MooneyRivlin):
+        bar = j ** (-2 / 3) * left
+        first = np.trace(bar, axis1=-2, axis2=-1)[..., None, None]
+        tau = deviator(2 * law.c10_pa * bar + 2 * law.c01_pa * (first * bar - bar @ bar))
+    else:
+        assert isinstance(law, Ogden)
+        values, vectors = np.linalg.eigh(left)
+        bar = j[..., 0] ** (-1 / 3) * np.sqrt(values)
+        powers = sum(mu * bar**alpha for mu, alpha in zip(law.mu_pa, law.alpha, strict=True))
+        tau = deviator(np.einsum("...ia,...a,...ja->...ij", vectors, powers, vectors))
+    return np.asarray((tau + law.bulk_pa * (j - 1) * j * eye) @ inverse)
+
+
+AMPLITUDE = 0.05 * np.array([1.0, -1.0, 0.5])
+
+
+def field(x: Array) -> Array:
+    """Return u = 0.05 sin(πx) sin(πy) sin(πz) (1, -1, 0.5)."""
+    return np.asarray(np.sin(np.pi * x).prod(axis=-1)[..., None] * AMPLITUDE)
+
+
+def field_gradient(x: Array) -> Array:
+    s, c = np.sin(np.pi * x), np.cos(np.pi * x)
+    x_slope = c[..., 0] * s[..., 1] * s[..., 2]
+    y_slope = s[..., 0] * c[..., 1] * s[..., 2]
+    z_slope = s[..., 0] * s[..., 1] * c[..., 2]
+    slopes = np.pi * np.stack([x_slope, y_slope, z_slope], axis=-1)
+    return np.asarray(AMPLITUDE[:, None] * slopes[..., None, :])
+
+
+def body_force(x: Array, law: Material) -> Array:
+    """Return the force, N/m³, that holds the field, by differences of the stress."""
+
+    def stress(x: Array) -> Array:
+        return piola(law, np.eye(3) + field_gradient(x))
+
+    h, total = 1e-3, np.zeros(x.shape)
+    for j, e in enumerate(h * np.eye(3)):
+        near, far = stress(x + e) - stress(x - e), stress(x + 2 * e) - stress(x - 2 * e)
+        total -= ((8 * near - far) / (12 * h))[..., j]
+    return total
+
+
+def manufactured_error(n: int, element: str, selective: bool, law: Material) -> tuple[float, float]:
+    """Return the L2 and H1 errors on n³ cells under the field's body force."""
+    mesh = box_mesh((1.0, 1.0, 1.0), (n, n, n), element == "tetrahedron")
+    if element == "hexahedron":
+        places = np.array(list(itertools.product((-1, 1), repeat=3))) / np.sqrt(3.0)
+        shape, derivatives = trilinear(places)
+        weights = np.ones(8)
+    else:
+        a, b = 0.58541020, 0.13819660
+        shape, weights = np.full((4, 4), b) + (a - b) * np.eye(4), np.full(4, 1 / 24)
+        derivatives = np.repeat(T4.derivatives, 4, axis=0)
+    gradients, det_j = shape_gradients(mesh.points, mesh.cells, derivatives)
+    volume = det_j * weights
+    x = np.einsum("qa,cai->cqi", shape, mesh.points[mesh.cells])
+    outer = np.any((mesh.points < 1e-9) | (mesh.points > 1 - 1e-9), axis=1)
+    free = 3 * int((~outer).sum())
+    dofs = np.full((mesh.n_nodes, 3), free)
+    dofs[~outer] = np.arange(free).reshape(-1, 3)
+    load = np.zeros(free + 1)
+    forces = np.einsum("qa,cq,cqi->cai", shape, volume, body_force(x, law))
+    np.add.at(load, dofs[mesh.cells], forces)
+    model = Assembler(Discretisation(mesh.points, mesh.cells, law, selective), dofs, free)
+    solver, u = BandedCholesky(model.pattern), np.zeros(free)
+    for _ in range(5):
+        state, values = model.force_and_tangent(u)
+        u += solver.factor(values).solve(load[:-1] - state.force)
+    nodal = np.append(u, 0.0)[dofs][mesh.cells]
+    difference = np.einsum("qa,cai->cqi", shape, nodal) - field(x)
+    slope = np.einsum("cai,cqaj->cqij", nodal, gradients) - field_gradient(x)
+    squares = volume * (difference**2).sum(axis=-1), volume * (slope**2).sum(axis=(-2, -1))
+    return float(np.sqrt(squares[0].sum())), float(np.sqrt(squares[1].sum()))

@@ -1,0 +1,35 @@
+"""Scenes with other laws and elements than shipped, loads on them, and checks of solutions."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+import mor_bench
+from mor_bench.hard_cases.setups import material_table
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.scene.scene import Scene, load_scene
+
+Array = NDArray[np.float64]
+
+
+def scene_of(
+    law: str, kind: tuple[str, bool], poisson: float = 0.4, base: str = "beam-tiny"
+) -> Scene:
+    """Return a shipped scene with another law, element and Poisson's ratio."""
+    spec = mor_bench.load_scene(base).spec.model_dump(mode="json")
+    discretisation = {"element": kind[0], "integration": "selective" if kind[1] else "full"}
+    return load_scene(
+        {**spec, "discretisation": discretisation, "material": material_table(law, 500.0, poisson)}
+    )
+
+
+def patch_load(scene: Scene, patch: int, force: list[float]) -> Array:
+    """Return a force, N, on a patch, over the free dofs."""
+    on_nodes = scene.patch_weights.toarray()[patch][:, None] * np.array(force)
+    return np.asarray(on_nodes.ravel()[scene.free_dofs])
+
+
+def relative_residual(model: FullOrderModel, load: Array, u: Array) -> float:
+    """Return the norm of the residual, relative to that of the load."""
+    return float(np.linalg.norm(load - model.force(u).force) / np.linalg.norm(load))
