@@ -3,8 +3,8 @@
     python -m tests.generator_process SPEC SHARD_SIZE
 
 reads lines ``start FOLDER WORKERS``, which prints a process number, and ``wait NUMBER``, which
-prints the exit status. Files are written in pieces with pauses between them, so that a signal at a random
-time often interrupts a write.
+prints the exit status. Files are written in pieces with pauses between them, so that a signal at a
+random time often interrupts a write.
 """
 
 from __future__ import annotations

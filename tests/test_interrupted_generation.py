@@ -6,14 +6,12 @@ import errno
 import io
 import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -84,22 +82,6 @@ class FullDisk:
         return File()
 
 
-@contextmanager
-def tmpfs(folder: Path) -> Iterator[Path]:
-    """Mount a file system of 16 kB in memory."""
-    folder.mkdir()
-    if not sys.platform.startswith("linux") or shutil.which("mount") is None:
-        pytest.skip("needs Linux and mount")
-    command = ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(folder)]
-    mounted = subprocess.run(command, capture_output=True, text=True, check=False)
-    if mounted.returncode:
-        pytest.skip(f"needs the right to mount a small file system: {mounted.stderr.strip()}")
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", str(folder)], check=True)
-
-
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """The files of 42 small shards."""
@@ -109,58 +91,30 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
         return files(generate(tiny_spec(20), workers=1, cache=cache))
 
 
-def check_until_done(
-    cache: Path, undisturbed: dict[str, bytes], make_room: Callable[[], None]
+@pytest.mark.slow
+def test_writes_may_fail_at_any_byte(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, bytes]
 ) -> None:
-    """Generate repeatedly, with more room each time, until the disk is no longer full."""
-    spec = tiny_spec(20)
-    folder = dataset_folder(spec, cache)
+    """Generate repeatedly on a full disk, with other room each time, until it succeeds."""
+    monkeypatch.setattr(generate_module, "SHARD_SIZE", SMALL)
+    rng, spec = np.random.default_rng(0), tiny_spec(20)
+    folder = dataset_folder(spec, tmp_path)
+    refusal = f"{folder}: cannot be written: No space left on device. Finished shards are kept"
     failures = 0
     while failures < 200:
-        make_room()
-        message = None
+        monkeypatch.setattr(store, "open", FullDisk(int(rng.integers(0, 80_000))), raising=False)
         try:
-            generate(spec, workers=1, cache=cache)
+            generate(spec, workers=1, cache=tmp_path)
+            break
         except StoreError as error:
             message = str(error)
+        assert message.startswith(refusal)
         assert not leftovers(folder)
-        if message is None:
-            break
-        assert message.startswith(f"{folder}: cannot be written: No space left on device. Finished")
         assert undisturbed.items() >= files(folder).items()
         failures += 1
+    assert not leftovers(folder)
     assert files(folder) == undisturbed
     assert failures >= 10
-
-
-@pytest.mark.slow
-def test_a_disk_that_is_full_ten_times(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, bytes]
-) -> None:
-    monkeypatch.setattr(generate_module, "SHARD_SIZE", SMALL)
-    rng, size_kb = np.random.default_rng(0), 16
-
-    def make_room() -> None:
-        nonlocal size_kb
-        size_kb += 4 * int(rng.integers(1, 20))
-        options = f"remount,size={size_kb}k"
-        subprocess.run(["mount", "-o", options, str(tmp_path / "disk")], check=True)
-
-    with tmpfs(tmp_path / "disk") as disk:
-        check_until_done(disk, undisturbed, make_room)
-
-
-@pytest.mark.slow
-def test_writes_that_fail_at_any_byte(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, bytes]
-) -> None:
-    monkeypatch.setattr(generate_module, "SHARD_SIZE", SMALL)
-    rng = np.random.default_rng(0)
-
-    def make_room() -> None:
-        monkeypatch.setattr(store, "open", FullDisk(int(rng.integers(0, 80_000))), raising=False)
-
-    check_until_done(tmp_path, undisturbed, make_room)
 
 
 def test_a_failed_write_leaves_the_earlier_file(

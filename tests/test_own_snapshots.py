@@ -197,6 +197,7 @@ def test_there_is_no_full_order_model_of_it(arrays: Arrays, tmp_path: Path) -> N
         mor_bench.load_dataset(path, tests=["2x"])
 
 
+@pytest.mark.slow
 def test_by_default_only_methods_run_that_learn_from_samples(
     arrays: Arrays, tmp_path: Path
 ) -> None:

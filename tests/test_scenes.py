@@ -175,7 +175,13 @@ def test_a_users_surface_becomes_a_scene_wherever_its_file_lies(tmp_path: Path) 
         load_scene(first.spec)
 
 
-@pytest.mark.parametrize("name", sorted({*list_suite("datasets")} - {"liver-hex-observed"}))
+SLOW = {"beam-fine", "liver-hex", "liver-tet"}
+QUICK = {*list_suite("datasets")} - SLOW - {"liver-hex-observed"}  # it has the loads of liver-hex
+
+
+@pytest.mark.parametrize(
+    "name", [*sorted(QUICK), *(pytest.param(n, marks=pytest.mark.slow) for n in sorted(SLOW))]
+)
 def test_every_load_patch_lies_on_the_surface_and_pushes_something_that_can_move(name: str) -> None:
     spec = load_generated_spec(name)
     for scene in map(load_scene, [spec, spec_of_set(spec, "unseen-regions")]):

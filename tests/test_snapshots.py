@@ -54,7 +54,6 @@ def test_the_sample_split_of_the_paper_has_its_counts() -> None:
         "beam-coarse": (5120, 1280),
         "beam-coarse-3-forces": (9888, 2472),
         "l-shape": (4800, 1200),
-        "liver-hex": (1600, 400),
     }
     for name, expected in counts.items():
         scene = load_scene(name)

@@ -40,9 +40,6 @@ _BOUNDS = np.array([[-0.13] * 3, [0.13] * 3])
 _SURFACE_SPACING_M = 0.0092
 _TETRAHEDRA_SPACING_M = 0.013
 
-BETWEEN_LOBES = (0.000115, -0.022708, 0.009457)
-"""Surface point on the floor of the notch between the lobes, m. The support is there."""
-
 
 def liver_level(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a smooth function of positions (n, 3), m: negative inside, 0 on the surface.

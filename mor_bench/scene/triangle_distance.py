@@ -10,56 +10,55 @@ from numpy.typing import NDArray
 
 
 @njit(cache=True, inline="always")
-def _dot(ax, ay, az, bx, by, bz):
-    return ax * bx + ay * by + az * bz
+def _minus(u, v):
+    return u[0] - v[0], u[1] - v[1], u[2] - v[2]
 
 
 @njit(cache=True, inline="always")
-def _to_segment(px, py, pz, ax, ay, az, bx, by, bz):
+def _dot(u, v):
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+@njit(cache=True, inline="always")
+def _cross(u, v):
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+@njit(cache=True, inline="always")
+def _to_segment(p, a, b):
     """Squared distance from p to a segment (Ericson, Real-Time Collision Detection, 5.1.2)."""
-    dx, dy, dz = bx - ax, by - ay, bz - az
-    length = _dot(dx, dy, dz, dx, dy, dz)
-    t = _dot(px - ax, py - ay, pz - az, dx, dy, dz)
+    d, q = _minus(b, a), _minus(p, a)
+    length = _dot(d, d)
     # A segment of zero length is a point.
-    t = min(max(t / length, 0.0), 1.0) if length > 0.0 else 0.0
-    rx, ry, rz = px - ax - t * dx, py - ay - t * dy, pz - az - t * dz
-    return _dot(rx, ry, rz, rx, ry, rz)
+    t = min(max(_dot(q, d) / length, 0.0), 1.0) if length > 0.0 else 0.0
+    r = q[0] - t * d[0], q[1] - t * d[1], q[2] - t * d[2]
+    return _dot(r, r)
 
 
 @njit(cache=True, inline="always")
-def _side(px, py, pz, a, b, nx, ny, nz):
-    """Whether p lies on the inner side of the edge a-b of a triangle with normal n."""
-    ex, ey, ez = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    qx, qy, qz = px - a[0], py - a[1], pz - a[2]
-    return _dot(ey * qz - ez * qy, ez * qx - ex * qz, ex * qy - ey * qx, nx, ny, nz) >= 0.0
+def _side(p, a, b, normal):
+    """Whether p lies on the inner side of the edge a-b of a triangle."""
+    return _dot(_cross(_minus(b, a), _minus(p, a)), normal) >= 0.0
 
 
 @njit(cache=True)
 def _distances(corners, points, out):
     for i in range(len(points)):
-        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        p = points[i, 0], points[i, 1], points[i, 2]
         least = np.inf
         for k in range(len(corners)):
-            a, b, c = corners[k, 0], corners[k, 1], corners[k, 2]
-            ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-            vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-            nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-            size = _dot(nx, ny, nz, nx, ny, nz)
-            if (
-                size > 0.0
-                and _side(px, py, pz, a, b, nx, ny, nz)
-                and _side(px, py, pz, b, c, nx, ny, nz)
-                and _side(px, py, pz, c, a, nx, ny, nz)
-            ):
-                height = _dot(px - a[0], py - a[1], pz - a[2], nx, ny, nz)
+            a = corners[k, 0, 0], corners[k, 0, 1], corners[k, 0, 2]
+            b = corners[k, 1, 0], corners[k, 1, 1], corners[k, 1, 2]
+            c = corners[k, 2, 0], corners[k, 2, 1], corners[k, 2, 2]
+            normal = _cross(_minus(b, a), _minus(c, a))
+            size = _dot(normal, normal)
+            inner = _side(p, a, b, normal) and _side(p, b, c, normal) and _side(p, c, a, normal)
+            if size > 0.0 and inner:
+                height = _dot(_minus(p, a), normal)
                 least = min(least, height * height / size)
             else:
-                least = min(
-                    least,
-                    _to_segment(px, py, pz, a[0], a[1], a[2], b[0], b[1], b[2]),
-                    _to_segment(px, py, pz, b[0], b[1], b[2], c[0], c[1], c[2]),
-                    _to_segment(px, py, pz, c[0], c[1], c[2], a[0], a[1], a[2]),
-                )
+                edges = min(_to_segment(p, a, b), _to_segment(p, b, c), _to_segment(p, c, a))
+                least = min(least, edges)
         out[i] = sqrt(least)
 
 

@@ -1,8 +1,8 @@
 """Samples: how they are drawn, generated, stored, read, split, and imported from other programs.
 
-Here: sampling plans, the store of HDF5 shards, generation on this machine or a cluster, splits, test
-sets, and what a method is given. Not here: methods, errors of predictions, or reports. This package
-imports only `errors`, `specs`, `scene` and `mechanics`.
+Here: sampling plans, the store of HDF5 shards, generation on this machine or a cluster, splits,
+test sets, and what a method is given. Not here: methods, errors of predictions, or reports.
+This package imports only `errors`, `specs`, `scene` and `mechanics`.
 
 Start with `dataset.py`: `load_dataset` reads a dataset as `Snapshots`. Then `sampling.py` (which
 forces act in sample i), `generate.py` with `solve.py` and `executors.py`, `store.py` and
