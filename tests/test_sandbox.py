@@ -1,0 +1,148 @@
+"""A sandboxed process: what it cannot see, how its failures are reported, and that it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from mor_bench.errors import SpecError
+from mor_bench.measure.method_session import FitRequest, MethodSession
+from mor_bench.sandbox.fork_server import CAN_FORK, ForkServer
+from mor_bench.sandbox.process import MethodFailedError, Restrictions, SandboxedProcess
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.dataset import Dataset
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[ForkServer | None]:
+    if not CAN_FORK:
+        yield None
+        return
+    with closing(ForkServer(MethodSession)) as started:
+        yield started
+
+
+def ask_fit(
+    process: SandboxedProcess, name: str, folder: Path, limit_s: float = 60.0, **parameters: Any
+) -> dict[str, Any]:
+    """Let a process fit a class of `tests.third_party` that needs no samples."""
+    surrogate, model = f"tests.third_party:{name}", folder / "model.safetensors"
+    request = FitRequest(surrogate, parameters, folder, model, 1, limit_s)
+    return process.ask("fit", limit_s, request=request)
+
+
+def is_gone(pid: int, within_s: float = 20.0) -> bool:
+    until = time.monotonic() + within_s
+    while time.monotonic() < until:
+        try:
+            if psutil.Process(pid).status() == psutil.STATUS_ZOMBIE:
+                return True
+        except psutil.NoSuchProcess:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ("hang", "fitting took longer than the limit of 1 s"),
+        ("memory", "fitting took more memory than the limit"),
+        ("segfault", "SIGSEGV"),
+        ("end", "ended with code 7"),
+        ("orphan", "ended with code 7"),
+        ("kill-group", "SIGKILL"),
+        ("odd-text", "crashed with RuntimeError: file ?"),
+    ],
+)
+def test_a_failure_is_named_and_leaves_no_process(
+    how: str, words: str, server: ForkServer | None, tiny_scene: Scene, tmp_path: Path
+) -> None:
+    limit_s = 1.0 if how == "hang" else 60.0
+    restrictions = Restrictions(memory_bytes=1.2e9)
+    with SandboxedProcess(MethodSession, restrictions, server, scene=tiny_scene) as process:
+        with pytest.raises(MethodFailedError) as caught:
+            ask_fit(process, "Broken", tmp_path, limit_s, how=how)
+        assert words in str(caught.value)
+    assert is_gone(process.pid)
+
+
+@pytest.mark.parametrize("how", ["print", "fork"])
+def test_prints_and_forks_of_a_method_are_no_answers(
+    how: str, server: ForkServer | None, tiny_scene: Scene, tmp_path: Path
+) -> None:
+    with SandboxedProcess(MethodSession, fork_server=server, scene=tiny_scene) as process:
+        assert ask_fit(process, "Broken", tmp_path, how=how)["fit_s"] > 0
+        forces = np.zeros((2, tiny_scene.mesh.n_nodes, 3))
+        out = tmp_path / "answers.npy"
+        answer = process.ask("predict", 60.0, forces=forces, out=out, threads=1)
+        assert answer == {"warnings": []}
+        assert np.load(out).shape == forces.shape
+
+
+@pytest.mark.skipif(not CAN_FORK, reason="fork servers are used on Linux only")
+def test_a_fork_server_that_a_method_ended_starts_again(tiny_scene: Scene, tmp_path: Path) -> None:
+    with closing(ForkServer(MethodSession)) as server:
+        with (
+            SandboxedProcess(MethodSession, fork_server=server, scene=tiny_scene) as process,
+            pytest.raises(MethodFailedError),
+        ):
+            ask_fit(process, "Broken", tmp_path, 1.0, how="kill-parent")
+        with SandboxedProcess(MethodSession, fork_server=server, scene=tiny_scene) as process:
+            assert ask_fit(process, "Zero", tmp_path)["fit_s"] > 0
+
+
+def test_an_error_keeps_its_type_and_text(server: ForkServer | None, tiny_scene: Scene) -> None:
+    with SandboxedProcess(MethodSession, fork_server=server, scene=tiny_scene) as process:
+        request = {"surrogate": "mor_bench.surrogates.pod:PODGalerkin", "where": "pod"}
+        with pytest.raises(SpecError, match="unknown key `n_mode`"):
+            process.ask("check", 60.0, configurations=[{"n_mode": 1}], **request)
+        with pytest.raises(MethodFailedError, match="crashed with AttributeError"):
+            process.ask("no such request", 60.0)
+
+
+@pytest.mark.parametrize("sealed", [True, False])
+def test_a_sealed_folder_cannot_be_seen_in_any_way(
+    sealed: bool, cache: Path, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shards = [str(path) for path in cache.glob("datasets/*/shard-*.h5")]
+    monkeypatch.setenv("MOR_BENCH_TEST_SHARDS", os.pathsep.join(shards))
+    restrictions = Restrictions(sealed=(cache,) if sealed else ())
+    with SandboxedProcess(MethodSession, restrictions, scene=tiny.scene) as process:
+        warnings = ask_fit(process, "Peeker", tmp_path, folders=[str(cache)])["warnings"]
+    (warning,) = (text for text in warnings if text.startswith("saw "))
+    seen = {item.split()[0] for item in json.loads(warning.removeprefix("saw "))}
+    # Programs are never allowed: they would not be under the seal.
+    assert seen == (set() if sealed else {"_list", "_open", "_hdf5", "_load"})
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKILL")
+def test_a_process_ends_with_a_parent_that_is_killed() -> None:
+    script = (
+        "import time\n"
+        "from mor_bench.measure.method_session import MethodSession\n"
+        "from mor_bench.sandbox.fork_server import CAN_FORK, ForkServer\n"
+        "from mor_bench.sandbox.process import SandboxedProcess\n"
+        "server = ForkServer(MethodSession) if CAN_FORK else None\n"
+        "process = SandboxedProcess(MethodSession, fork_server=server)\n"
+        "print(process.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout
+    pid = int(parent.stdout.readline())
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    assert is_gone(pid)
