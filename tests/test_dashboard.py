@@ -239,7 +239,7 @@ def dashboard(checkout: Path) -> Iterator[str]:
 
 
 def page(address: str, profile: Path) -> str:
-    """The document that a headless browser has made of a page when its scripts are done."""
+    """Document of a page after its scripts have run in a headless browser."""
     quiet = "no-first-run disable-background-networking disable-component-update disable-sync"
     plain = f"headless no-sandbox disable-gpu disable-quic no-proxy-server dump-dom {quiet}"
     options = [

@@ -33,7 +33,7 @@ class Noise:
 
     `process`: between fresh processes (Student's t with 3 degrees of freedom if `heavy`).
     `slow_processes`: share of processes that are slower by 5 to 10 %.
-    `query`: between queries, of which the share `tails` has Pareto's tail.
+    `query`: between queries; the share `tails` of them has Pareto's tail.
     `drift`: slow change of the machine over all rounds.
     """
 

@@ -77,7 +77,7 @@ def regimes(comparison: Comparison) -> list[dict[str, Any]]:
 
 
 def _missing(row: Row, regime: Mapping[str, Any], device: str) -> list[str]:
-    """What a row lacks of a regime, in words."""
+    """List in words the conditions of a regime that a row does not meet."""
     trained = row.training.iterations if row.training else None
     has = {
         "min_dofs": (row.n_dofs, "degrees of freedom"),

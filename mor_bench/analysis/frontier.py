@@ -172,7 +172,7 @@ def median_latency_ms(row: Row) -> float:
 
 
 def is_point(row: Row) -> bool:
-    """Whether a row has a place on the plane: it ran, was timed and was scored."""
+    """Tell whether a row has a place on the plane: it ran, was timed and was scored."""
     return row.status == "ok" and row.error is not None and 0 < median_latency_ms(row) < inf
 
 

@@ -180,7 +180,7 @@ def _merged(path: Path, commit_hash: str, figures: Mapping[str, Figures]) -> dic
 
 
 def describe(out: str | Path) -> Path:
-    """Name in benchmarks.json every benchmark of comparisons of which the folder has results.
+    """Name in benchmarks.json every benchmark of comparisons that has results in the folder.
 
     asv rewrites that file with only its own benchmarks whenever it runs. Its entries stay.
 

@@ -1,4 +1,4 @@
-"""What all figures share: size, colours, markers, ticks, saving, and labels that do not overlap."""
+"""Shared parts of all figures: size, colours, markers, ticks, saving, labels without overlap."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ class Entry:
 
     @property
     def trouble(self) -> str | None:
-        """What went wrong, in one line, or None."""
+        """Reason of a failure, a skip or missing predictions in one line, or None."""
         row = self.row
         if not self.ran:
             return f"{row.status}: {row.reason or 'no reason given'}"

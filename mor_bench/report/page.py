@@ -42,7 +42,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Section:
-    """What the page shows of one dataset.
+    """Content of the page about one dataset.
 
     Attributes
     ----------
