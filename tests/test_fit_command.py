@@ -72,11 +72,11 @@ def test_a_killed_fit_resumes_and_ends_with_the_same_bytes(cache: Path, tmp_path
     assert "goes on from iteration " in last.stderr
     assert "400 iterations, " in last.stdout
     assert not checkpoint.exists()
-    knobs = {"iterations": 400, "seed": 3}
-    whole = fit_tiny(path, knobs, tmp_path / "whole.safetensors", cache)
+    parameters = {"iterations": 400, "seed": 3}
+    whole = fit_tiny(path, parameters, tmp_path / "whole.safetensors", cache)
     assert out.read_bytes() == whole.out.read_bytes()
     assert f"ē {whole.error['mean_dof_m']:.2e} m" in last.stdout
-    other = fit_tiny(path, {**knobs, "seed": 4}, tmp_path / "b.safetensors", cache)
+    other = fit_tiny(path, {**parameters, "seed": 4}, tmp_path / "b.safetensors", cache)
     assert other.out.read_bytes() != whole.out.read_bytes()
 
 
@@ -84,14 +84,14 @@ def test_a_killed_fit_resumes_and_ends_with_the_same_bytes(cache: Path, tmp_path
 def test_a_killed_training_of_u_mesh_resumes_too(cache: Path, tmp_path: Path) -> None:
     pytest.importorskip("torch")
     load_dataset("beam-tiny", LIMIT, cache=cache)
-    knobs = {**NETWORK, "iterations": 300}
+    parameters = {**NETWORK, "iterations": 300}
     out, checkpoint = tmp_path / "model.safetensors", tmp_path / "kept"
     code = (
         "import tests.small_runs as t; t.checkpoint_always(); "
         "from mor_bench.cli.app import app; app()"
     )
     options = [f"--limit={LIMIT}", f"--cache={cache}", "--threads=1", f"--out={out}"]
-    options += [f"--checkpoint={checkpoint}", *(f"--set={k}={v}" for k, v in knobs.items())]
+    options += [f"--checkpoint={checkpoint}", *(f"--set={k}={v}" for k, v in parameters.items())]
 
     def iteration() -> int:
         if not checkpoint.exists():
@@ -113,15 +113,15 @@ def test_a_killed_training_of_u_mesh_resumes_too(cache: Path, tmp_path: Path) ->
     listener = Listener(training=lambda done, total, loss: seen.append(done))
     kept = {"checkpoint": checkpoint, "listener": listener}
     with pytest.raises(InvalidInputError, match="the checkpoint of another training"):
-        fit_tiny("umesh-small", {**knobs, "seed": 1}, out, cache, **kept)
-    fit_tiny("umesh-small", knobs, out, cache, **kept)
+        fit_tiny("umesh-small", {**parameters, "seed": 1}, out, cache, **kept)
+    fit_tiny("umesh-small", parameters, out, cache, **kept)
     assert seen[0] >= 100
     assert seen[-1] == 300
-    whole = fit_tiny("umesh-small", knobs, tmp_path / "whole.safetensors", cache)
+    whole = fit_tiny("umesh-small", parameters, tmp_path / "whole.safetensors", cache)
     assert out.read_bytes() == whole.out.read_bytes()
     other = tmp_path / "b.safetensors"
     with pytest.raises(InvalidInputError, match="model with `channels` 2; got one with"):
-        fit_tiny("umesh-small", {**knobs, "channels": 2}, other, cache, start_from=out)
+        fit_tiny("umesh-small", {**parameters, "channels": 2}, other, cache, start_from=out)
     assert not other.exists()
 
 
@@ -137,17 +137,17 @@ def test_a_fit_that_is_stopped_after_its_training_does_not_train_again(
 
     seen: list[int] = []
     listener = Listener(training=lambda done, total, loss: seen.append(done))
-    knobs = {**NETWORK, "iterations": 60, "validation_fraction": 0.0}
+    parameters = {**NETWORK, "iterations": 60, "validation_fraction": 0.0}
     out, checkpoint = tmp_path / "model.safetensors", tmp_path / ".model.safetensors.checkpoint"
     with monkeypatch.context() as patch:
         patch.setattr(UMesh, "save", stop)
         with pytest.raises(KeyboardInterrupt):
-            fit_tiny("umesh-small", knobs, out, cache, listener=listener)
+            fit_tiny("umesh-small", parameters, out, cache, listener=listener)
     assert checkpoint.exists()
-    fitted = fit_tiny("umesh-small", knobs, out, cache, listener=listener)
+    fitted = fit_tiny("umesh-small", parameters, out, cache, listener=listener)
     assert fitted.iterations == 60
     assert seen == [50, 60], "it trained once"
-    whole = fit_tiny("umesh-small", knobs, tmp_path / "whole.safetensors", cache)
+    whole = fit_tiny("umesh-small", parameters, tmp_path / "whole.safetensors", cache)
     assert out.read_bytes() == whole.out.read_bytes()
     assert {item.name for item in tmp_path.iterdir()} == {"model.safetensors", "whole.safetensors"}
 
@@ -197,10 +197,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("method", "knobs", "options", "kind", "message"), REFUSED)
+@pytest.mark.parametrize(("method", "parameters", "options", "kind", "message"), REFUSED)
 def test_an_impossible_fit_is_refused_before_anything_runs(
     method: str,
-    knobs: dict[str, Any],
+    parameters: dict[str, Any],
     options: dict[str, Any],
     kind: type[MorBenchError],
     message: str,
@@ -212,7 +212,7 @@ def test_an_impossible_fit_is_refused_before_anything_runs(
     source = "descent.toml" if method == "descent" else method
     given = {"out": "a.safetensors", "cache": "cache", **options}
     with pytest.raises(kind, match=message):
-        mor_bench.fit("beam-tiny", source, knobs, **given)
+        mor_bench.fit("beam-tiny", source, parameters, **given)
     assert set(folder.iterdir()) == before
 
 

@@ -251,7 +251,7 @@ def test_a_region_of_outputs_without_nodes_is_an_error_of_the_dataset(
 
 @pytest.mark.slow
 def test_errors_count_the_wanted_nodes_alone(tip_only: Path, cache: Path, tmp_path: Path) -> None:
-    tensor = "mor_bench.surrogates.pod_tensor:PODTensor"
+    tensor = "mor_bench.surrogates.pod_tensor:TensorPOD"
     path = method_file(tmp_path, "tensor", tensor, n_modes=10)
     comparison = mor_bench.run([tip_only], [path], out=tmp_path / "run", cache=cache, limit=LIMIT)
     data = mor_bench.load_dataset(tip_only, LIMIT, cache=cache)

@@ -206,14 +206,14 @@ from mor_bench.surrogates.{module} import {base}
 
 
 class Stopped({base}):
-    def _trained(self, networks, loss, data, generator):
+    def train(self, networks, loss, data, generator):
         calls = []
 
         def counted(rows):
             calls.append(1)
             return loss(rows)
 
-        known = super()._trained(networks, counted, data, generator)
+        known = super().train(networks, counted, data, generator)
         if "STOPPED" in os.environ:
             raise RuntimeError("stopped")
         warnings.warn(f"{{len(calls)}} steps")

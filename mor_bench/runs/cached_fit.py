@@ -28,12 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from mor_bench.digests import digest_of_arrays
 from mor_bench.machine import describe_machine, gpu_name
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.results.arrays import read_arrays, write_arrays
 from mor_bench.runs.code_digest import code_digest
 from mor_bench.runs.configurations import Configuration
-from mor_bench.runs.training_data import TrainingData, digest_of_arrays, digest_of_file
+from mor_bench.runs.training_data import TrainingData, digest_of_file
 from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.process import Restrictions, SandboxedProcess
 from mor_bench.snapshots.store import remove_leftovers, write_atomically

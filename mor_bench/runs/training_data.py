@@ -17,20 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.digests import digest_of_arrays
 from mor_bench.mechanics.indicator import ErrorIndicator
 from mor_bench.sandbox.handover import arrays_of, write_snapshots
 from mor_bench.sandbox.process import MethodFailedError
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-
-
-def digest_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """Return the SHA-256 of named arrays."""
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).data)
-    return digest.hexdigest()
 
 
 def digest_of_file(path: Path) -> str:
