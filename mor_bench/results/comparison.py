@@ -62,11 +62,6 @@ class Comparison:
     learning: list[LearningPoint] = field(default_factory=list)
     analysis: dict[str, Any] | None = field(default=None, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
-        # Dicts are accepted until every caller makes rows.
-        self.rows = [Row.model_validate(row) for row in self.rows]
-        self.learning = [LearningPoint.model_validate(point) for point in self.learning]
-
     @property
     def table(self) -> pd.DataFrame:
         """A row per configuration; nested figures in columns such as ``error.mean_dof_m``."""
@@ -80,7 +75,6 @@ class Comparison:
 
     def put(self, row: Row, samples: Mapping[str, NDArray[Any]] | None = None) -> None:
         """Add or replace a configuration's row and write everything, raw samples first."""
-        row = Row.model_validate(row)
         if samples:
             write_arrays(self.samples_path(row), samples)
         places = [

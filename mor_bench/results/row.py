@@ -5,7 +5,6 @@ None means that a figure was not measured. A float in a part that is present but
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from math import nan
 from typing import Annotated, Any, Literal
 
@@ -28,16 +27,6 @@ class Part(BaseModel):
     def as_dict(self) -> dict[str, Any]:
         """Return the JSON content; parts leave out what was not set."""
         return self.model_dump(exclude_unset=True)
-
-    # Readers that still treat a row as a dict; to be removed with the last of them.
-    def __getitem__(self, key: str) -> Any:
-        return self.as_dict()[key]
-
-    def get(self, key: str, default: Any = None) -> Any:
-        return self.as_dict().get(key, default)
-
-    def keys(self) -> Iterator[str]:
-        return iter(self.as_dict())
 
 
 class ErrorSummary(Part):
