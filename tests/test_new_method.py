@@ -94,8 +94,7 @@ def test_in_a_checkout_the_method_passes_check_the_battery_and_a_run(
     tmp_path: Path, cache: Path
 ) -> None:
     for folder in ("mor_bench", "methods", "datasets"):
-        ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=ignored)
+        shutil.copytree(ROOT / folder, tmp_path / folder)  # with the kernels that Numba compiled
     in_folder(tmp_path, "mor_bench", "new-method", "mine")
     assert "method, 3 quick" in in_folder(tmp_path, "mor_bench", "check", "methods/mine.toml")
     out = ["--cache", str(cache), "--out", "out"]

@@ -37,11 +37,9 @@ class LazyCommands(TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         if cmd_name not in COMMANDS:
             return None
-        file, summary = COMMANDS[cmd_name]
+        file, _ = COMMANDS[cmd_name]
         group = typer.main.get_group(import_module(f"mor_bench.cli.{file}").app)
-        command = group.commands[cmd_name]
-        command.help = command.help or summary
-        return command
+        return group.commands[cmd_name]
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         with formatter.section("Commands"):
