@@ -19,6 +19,7 @@ import pytest
 import mor_bench
 from mor_bench.analysis.frontier import compare
 from mor_bench.errors import InvalidInputError, SpecError, StoreError
+from mor_bench.options import FitOptions, Options, RunOptions
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import ErrorSummary, Latency, Row
 from mor_bench.runs.listener import Listener
@@ -147,6 +148,14 @@ def test_a_bad_option_is_refused_before_anything_runs(
     with pytest.raises(InvalidInputError, match=message):
         mor_bench.run(**{"datasets": ["beam-tiny"], "methods": ["fem"], "out": out, **bad})
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("function", "options"), [(mor_bench.run, RunOptions), (mor_bench.fit, FitOptions)]
+)
+def test_the_docstring_names_every_option(function: Any, options: type[Options]) -> None:
+    words = set(re.findall(r"\w+", function.__doc__))
+    assert words >= options.model_fields.keys()
 
 
 def test_method_files_and_the_folder_are_checked_before_anything_runs(

@@ -14,10 +14,11 @@ from mor_bench.measure.method_session import MethodSession
 from mor_bench.options import RunOptions
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.configurations import checked_specs, configurations_of
-from mor_bench.runs.dataset_run import DatasetRun, RunPart, StopRunError
+from mor_bench.runs.dataset_run import DatasetRun, RunPart
 from mor_bench.runs.listener import Listener
 from mor_bench.runs.run_context import RunContext
 from mor_bench.runs.run_folder import only_run_in, open_run
+from mor_bench.runs.timing_stage import StopRunError
 from mor_bench.sandbox.fork_server import CAN_FORK, ForkServer
 from mor_bench.specs import AnyDatasetSpec, ImportedDatasetSpec
 

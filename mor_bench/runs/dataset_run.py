@@ -53,8 +53,6 @@ from mor_bench.snapshots.generate import generation_seconds
 from mor_bench.snapshots.test_sets import available_sets
 from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec
 
-__all__ = ["DatasetRun", "RunPart", "StopRunError"]
-
 SINGULAR_VALUES = 400
 """Singular values of a large snapshot matrix that a figure shows; all would take minutes."""
 
