@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mor_bench
-from mor_bench.errors import InvalidInputError, SpecError
+from mor_bench.errors import InvalidInputError
 from mor_bench.method_loading import load_fitted
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.mesh import box_mesh
@@ -292,11 +292,6 @@ def test_a_batch_of_more_than_one_chunk_agrees_with_single_queries(
         np.testing.assert_allclose(single, batch[row], rtol=0, atol=2e-6 * np.abs(batch).max())
 
 
-def test_a_batch_size_beyond_the_samples_is_cut(data: Dataset) -> None:
-    method = fit(data.train[:7], iterations=2, batch_size=1000)
-    assert np.isfinite(method.predict(data.test.forces[0])).all()
-
-
 def test_the_linear_response_brings_most(improved: Any, fitted: Any, data: Dataset) -> None:
     linear = mor_bench.load_method("linear-fem").fit(data.scene, None)
     errors = [mean_error(method, data.test) for method in (improved, linear, fitted)]
@@ -404,11 +399,3 @@ def test_losses_are_not_rounded_with_the_products(data: Dataset) -> None:
     )
     losses = torch.from_numpy(method.validation_curve_)
     assert (losses.bfloat16().double() != losses).all()
-
-
-@pytest.mark.parametrize(
-    ("knob", "value"), [("channels", 0), ("schedule", "step"), ("learning_rate", 0.0), ("seed", -1)]
-)
-def test_hyperparameters_out_of_range_are_refused(knob: str, value: object) -> None:
-    with pytest.raises(SpecError, match=knob):
-        mor_bench.load_method("umesh", **{knob: value})

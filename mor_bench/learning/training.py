@@ -73,8 +73,7 @@ def train(
 
     Every epoch is a new permutation of the samples; a last, smaller batch is left out. The same
     problem and plan give the same weights to the last bit on one processor and number of threads,
-    whether the training is interrupted or not. No global random state is read or changed. The
-    network ends in evaluation mode.
+    interrupted or not. No global random state changes. The network ends in evaluation mode.
 
     Parameters
     ----------
@@ -103,9 +102,8 @@ def train(
     """
     options = options or TrainingOptions()
     loop = TrainingLoop(problem, plan, options, device_of(options))
-    checkpoint, fingerprint = options.checkpoint, ""
-    if checkpoint is not None:
-        fingerprint = _fingerprint(problem, options)
+    checkpoint = options.checkpoint
+    fingerprint = "" if checkpoint is None else _fingerprint(problem, options)
     if checkpoint is None or not resume(loop, checkpoint, fingerprint):
         loop.begin()
     start, first, written = perf_counter(), loop.iteration, perf_counter()

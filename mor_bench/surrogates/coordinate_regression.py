@@ -67,9 +67,21 @@ class CoordinateRegression(Surrogate, ABC):
     their displacements replace the force, and the linear extension of these replaces the linear
     response.
 
-    A subclass has the hyperparameters `input`, `n_input_modes` and `n_output_modes`, and
-    `derivatives` if it can learn from them. It learns g in `regress`, takes the arrays back in
-    `take`, and evaluates g in `coefficients`.
+    A subclass declares the parameters below as its hyperparameters, and `derivatives` if it can
+    learn from them. It learns g in `regress`, takes the arrays back in `take`, and evaluates g in
+    `coefficients`.
+
+    Parameters
+    ----------
+    input : {"linear-response", "force"}
+        What the coordinates z are taken of. The linear response gives far smaller errors, and needs
+        the scene's equations.
+    n_input_modes : int, optional
+        Length of z; capped at the rank of the input with a warning. If it may be None, that means
+        `usual_inputs`.
+    n_output_modes : int
+        Size of the basis Φ of the nonlinear rest, or of the displacement; capped at the rank with a
+        warning.
     """
 
     input: Input

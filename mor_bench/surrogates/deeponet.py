@@ -98,10 +98,10 @@ class DeepONet(OperatorSurrogate):
     are vector-valued, so that the three components share the branch. The POD trunk has no mean.
     After the training the trunk is a matrix.
 
+    The other parameters are those of `FieldSurrogate`.
+
     Parameters
     ----------
-    input : {"force", "linear-response"}
-        Input of the network; see `FieldSurrogate`. The linear response gives the smaller errors.
     trunk : {"network", "pod"}
         Source of the functions tₖ. POD modes are those of the displacement, or of its nonlinear
         rest.
@@ -112,14 +112,6 @@ class DeepONet(OperatorSurrogate):
         Number of functions; capped at the rank with POD.
     width, depth : int
         Units and number of the hidden layers in branch and trunk.
-    iterations : int
-        Adam steps. A number, not a time, so that the result does not depend on the machine's load.
-    batch_size : int
-        Samples per step.
-    learning_rate : float
-        Peak of the one-cycle schedule.
-    seed : int
-        Seed of the initial weights and the order of the samples.
     """
 
     input: Input = "force"

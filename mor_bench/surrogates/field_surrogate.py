@@ -35,7 +35,22 @@ class FieldSurrogate(Surrogate, ABC):
 
     The network G is trained in float32. In a scene with observed nodes, their displacements replace
     the force, and the linear extension of these replaces the linear response. The supports do not
-    move. A subclass defines the network, its loss, and how it is evaluated.
+    move. A subclass defines the network, its loss, and how it is evaluated, and declares the
+    parameters below as its hyperparameters.
+
+    Parameters
+    ----------
+    input : {"force", "linear-response"}
+        Input of the network. The linear response gives far smaller errors, and needs the scene's
+        equations.
+    iterations : int
+        Adam steps. A number, not a time, so that the result does not depend on the machine's load.
+    batch_size : int
+        Samples per step; at most all there are.
+    learning_rate : float
+        Peak of the one-cycle schedule.
+    seed : int
+        Seed of the initial weights and the order of the samples.
 
     Attributes
     ----------

@@ -186,22 +186,14 @@ class FourierNeuralOperator(OperatorSurrogate):
     Forces are spread over the grid as in U-Mesh; displacements are averaged. Every layer sees the
     whole grid, coarsely, which a load at one end of a body needs.
 
+    The other parameters are those of `FieldSurrogate`.
+
     Parameters
     ----------
-    input : {"force", "linear-response"}
-        Input of the network; see `FieldSurrogate`. The linear response gives the smaller errors.
     channels, layers : int
         Channels and number of layers.
     modes : int
         Wave numbers per axis, 0 to modes - 1 and their negatives; axes with fewer keep theirs.
-    iterations : int
-        Adam steps. A number, not a time, so that the result does not depend on the machine's load.
-    batch_size : int
-        Samples per step.
-    learning_rate : float
-        Peak of the one-cycle schedule.
-    seed : int
-        Seed of the initial weights and the order of the samples.
     """
 
     input: Input = "force"

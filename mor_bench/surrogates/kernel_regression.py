@@ -97,16 +97,10 @@ class PCAKernelRidge(GaussianSums):
     g is sought among the functions with g(0) = 0. Their kernel is k(z, z') - k(z, 0) k(0, z'), with
     k the Gaussian kernel.
 
+    `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
+
     Parameters
     ----------
-    input : {"linear-response", "force"}
-        What the coordinates z are taken of.
-    n_input_modes : int, optional
-        Length of z; 20 of the linear response and at most 200 of the force by default. Capped at
-        the rank of the input with a warning.
-    n_output_modes : int
-        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a
-        warning.
     n_points : int
         Largest number of training samples used, the first ones, which cover the load regions
         evenly; imported ones are shuffled. Each is compared with in every query, and the fit solves
@@ -155,16 +149,10 @@ class PCAGaussianProcess(GaussianSums):
     `MAX_ITERATIONS` steps of L-BFGS-B from one start. Then the mean is conditioned on the first
     `n_points` samples; only the mean is kept.
 
+    `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
+
     Parameters
     ----------
-    input : {"linear-response", "force"}
-        What the coordinates z are taken of.
-    n_input_modes : int, optional
-        Length of z; 20 of the linear response and 60 of the force by default. Capped at the rank of
-        the input with a warning.
-    n_output_modes : int
-        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a
-        warning.
     n_points : int
         Largest number of training samples that the mean is conditioned on: the first ones, which
         cover the load regions evenly; imported ones are shuffled.

@@ -232,23 +232,14 @@ class MeshGraphNet(OperatorSurrogate):
     effect over the whole body. Nodes know no positions but those of their neighbours relative to
     them.
 
+    The other parameters are those of `FieldSurrogate`.
+
     Parameters
     ----------
-    input : {"force", "linear-response"}
-        Input of the network; see `FieldSurrogate`. Take the linear response on bodies with more
-        edges than steps.
     width : int
         Features of nodes and edges, and units of the hidden layer of each perceptron.
     steps : int
         Message-passing steps, each with its own weights.
-    iterations : int
-        Adam steps. A number, not a time, so that the result does not depend on the machine's load.
-    batch_size : int
-        Samples per step.
-    learning_rate : float
-        Peak of the one-cycle schedule.
-    seed : int
-        Seed of the initial weights and the order of the samples.
     """
 
     input: Input = "force"

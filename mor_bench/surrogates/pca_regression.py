@@ -29,15 +29,10 @@ MAX_FEATURE_BYTES = 2 * 2**30
 class PCARegression(CoordinateRegression):
     """g(z) = W p(z), with p the monomials of z, by ridge regression; see `CoordinateRegression`.
 
+    `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
+
     Parameters
     ----------
-    input : {"linear-response", "force"}
-        What the coordinates z are taken of.
-    n_input_modes : int
-        Length of z; capped at the rank of the input with a warning.
-    n_output_modes : int
-        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a
-        warning.
     degree : int
         Highest degree of the monomials, 1 to 4; 1 is plain ridge regression. A fit is refused if
         they need more than `MAX_FEATURE_BYTES`.

@@ -45,15 +45,10 @@ class PODNN(NetworkRegression):
     see `mor_bench.reduction.sensitivity`; after O'Leary-Roseberry et al.: Derivative-informed
     neural operator, Journal of Computational Physics 496 (2024).
 
+    `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
+
     Parameters
     ----------
-    input : {"linear-response", "force"}
-        What the coordinates z are taken of.
-    n_input_modes : int
-        Length of z; capped at the rank of the input with a warning.
-    n_output_modes : int
-        Size of the basis Φ of the nonlinear rest, or of the displacement; capped at the rank with a
-        warning.
     n_hidden : int
         Units in each of the two hidden layers.
     derivatives : bool

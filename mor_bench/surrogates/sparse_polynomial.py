@@ -52,15 +52,10 @@ class SparsePolynomial(CoordinateRegression):
     samples are fitted. With derivatives the polynomial also matches those of the displacement with
     respect to the load, see `mor_bench.reduction.sensitivity`.
 
+    `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
+
     Parameters
     ----------
-    input : {"linear-response", "force"}
-        What the coordinates z are taken of.
-    n_input_modes : int
-        Length of z; capped at the rank of the input with a warning.
-    n_output_modes : int
-        Size of the basis Φ of the nonlinear rest, or of the displacement; capped at the rank with a
-        warning.
     max_terms : int
         Monomials to choose from; also at most two per training sample and derivative.
     ridge : float

@@ -24,8 +24,9 @@ from mor_bench.surrogates.coordinate_regression import (
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _mean_of_leaves(features, thresholds, children, roots, values, z, out):  # type: ignore[no-untyped-def]
-    """out (n, n_outputs) = mean over the trees of the leaf values of z (n, n_inputs) float32."""
+def _mean_of_leaves(features, thresholds, children, roots, values, z):  # type: ignore[no-untyped-def]
+    """Return the mean over the trees of the leaf values of z (n, n_inputs) float32."""
+    out = np.empty((len(z), values.shape[1]))
     for i in range(len(z)):
         row, answer = z[i], out[i]
         answer[:] = 0.0
@@ -39,6 +40,7 @@ def _mean_of_leaves(features, thresholds, children, roots, values, z, out):  # t
                 answer[k] += leaf[k]
         for k in range(len(answer)):
             answer[k] /= len(roots)
+    return out
 
 
 class TreeRegression(CoordinateRegression):
@@ -112,9 +114,8 @@ class TreeRegression(CoordinateRegression):
         return self._means(z) - self._at_rest
 
     def _means(self, z: Array) -> Array:
-        out = np.empty((len(z), self._n_outputs))
-        _mean_of_leaves(*self._trees, np.clip(z, -1e38, 1e38).astype(np.float32), out)
-        return out
+        single = np.clip(z, -1e38, 1e38).astype(np.float32)
+        return np.asarray(_mean_of_leaves(*self._trees, single))
 
 
 @dataclass(eq=False)
@@ -123,16 +124,10 @@ class PCARandomForest(TreeRegression):
 
     See `CoordinateRegression` for what it shares with others.
 
+    `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
+
     Parameters
     ----------
-    input : {"linear-response", "force"}
-        What the coordinates z are taken of.
-    n_input_modes : int, optional
-        Length of z; 20 of the linear response and 60 of the force by default. Capped at the rank of
-        the input with a warning.
-    n_output_modes : int
-        Size of the basis Φ of the displacement, or of its nonlinear rest; capped at the rank with a
-        warning.
     n_trees : int
         Number of trees, 1 to 1000.
     min_samples_leaf : int

@@ -47,16 +47,14 @@ class UMesh(FieldSurrogate):
     the grid's displacements u; the loss is taken of N u at the nodes. Padding voxels carry no loss.
     The same seed, samples, machine and number of threads give the same weights to the last bit.
 
+    The other parameters are those of `FieldSurrogate`.
+
     Parameters
     ----------
     channels : int
         c, channels of the first level; c·2^k at the bottom. 16 is enough on a processor.
     steps : int
         k, how often the grid is halved; it is padded at its high end to multiples of 2^k.
-    iterations : int
-        Adam steps. A number, not a time, so that the result does not depend on the machine's load.
-    batch_size : int
-        Samples per step; at most all there are.
     learning_rate : float
         Peak learning rate. Take about 3e-3 with "one-cycle".
     schedule : {"constant", "one-cycle"}
@@ -85,8 +83,6 @@ class UMesh(FieldSurrogate):
     validation_fraction : float
         Share of the training samples that is held out, in [0, 0.5], to stop the training when they
         gain nothing, and to keep the best weights.
-    seed : int
-        Seed of the initial weights and the order of the samples.
     inference : str
         Back end of the predictions, see `mor_bench.learning.inference`. "packed" differs from
         "eager" by rounding only. "auto" takes the fastest that is accurate enough, timed at the end
