@@ -394,8 +394,6 @@ def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding(
 
 
 def test_losses_are_not_rounded_with_the_products(data: Dataset) -> None:
-    method = fit(
-        data.train, iterations=2, batch_size=64, precision="bfloat16", validation_fraction=0.2
-    )
+    method = fit(data.train, iterations=2, precision="bfloat16", validation_fraction=0.2)
     losses = torch.from_numpy(method.validation_curve_)
     assert (losses.bfloat16().double() != losses).all()
