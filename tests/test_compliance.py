@@ -43,6 +43,7 @@ def by_back_solves(model: FullOrderModel, loads: NDArray[np.float64]) -> NDArray
     return out
 
 
+LIVER = pytest.param("liver-hex", marks=pytest.mark.slow)
 SCENES = {
     "H8, full": ("hexahedron", "full"),
     "H8, selective": ("hexahedron", "selective"),
@@ -50,7 +51,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("case", [*SCENES, "l-shape", "liver-hex"])
+@pytest.mark.parametrize("case", [*SCENES, "l-shape", LIVER])
 def test_columns_and_back_solves_give_the_same_response(case: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of locking
@@ -121,7 +122,7 @@ def test_more_columns_than_pay_are_not_used_or_not_kept(monkeypatch: pytest.Monk
     )
 
 
-@pytest.mark.parametrize("scene", ["l-shape", "liver-hex"])
+@pytest.mark.parametrize("scene", ["l-shape", LIVER])
 def test_many_right_hand_sides_are_solved_for_as_few(
     scene: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

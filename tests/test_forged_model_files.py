@@ -103,6 +103,7 @@ def test_a_class_that_no_method_names_is_refused(parts: Any, path: Path, name: s
     refused(path, forged({**header, "surrogate": name}, arrays))
 
 
+@pytest.mark.slow
 def test_forged_arrays_are_refused(parts: Any, path: Path) -> None:
     _, header, arrays = parts
     changes: list[dict[str, np.ndarray | None]] = [

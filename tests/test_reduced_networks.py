@@ -163,6 +163,7 @@ def test_the_loss_of_the_training_is_that_of_the_predictions(
     assert second.arrays_["loss_curve"][0] == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_derivatives_spare_samples(tiny: Dataset) -> None:
     few = tiny.train[::6]
     without, with_them = (
