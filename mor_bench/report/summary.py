@@ -101,7 +101,7 @@ def headline(comparison: Comparison, dataset: str) -> str:
     if not usable:
         return (
             "No configuration gave a usable result: "
-            f"{len(entries)} tried, none with a finite median error."
+            f"{len(entries)} tried, none has both a finite median error and a latency."
         )
     wanted = needs_text(needs)
     meeting = [entry for entry in usable if entry.meets_needs]
