@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from safetensors.numpy import save as serialise
 
 import mor_bench
 from mor_bench.errors import (
@@ -27,10 +26,10 @@ from mor_bench.errors import (
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.method_loading import make_surrogate
 from mor_bench.model_arrays import take_array, take_indices
-from mor_bench.model_file import model_digest, read_header_and_arrays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.surrogate import Surrogate
+from tests.model_files import rewrite
 from tests.suite_methods import SPECS, cheap_method
 from tests.third_party import Plain, Recorder, Zero
 
@@ -142,15 +141,6 @@ def test_wrong_arrays_with_a_valid_checksum_are_refused(
     rewrite(path, forge)
     with pytest.raises(StoreError, match=r"model\.safetensors"):
         mor_bench.load_surrogate(path)
-
-
-def rewrite(path: Path, forge: Callable[[dict[str, NDArray[Any]]], None], **header: str) -> None:
-    """Change the arrays and the header of a model file, with a checksum that fits."""
-    known, arrays = read_header_and_arrays(path)
-    forge(arrays)
-    known |= header
-    known["sha256"] = model_digest(known, arrays)
-    path.write_bytes(serialise(arrays, metadata=known))
 
 
 def test_fitting_again_forgets_the_first_fit_and_repeats_it(

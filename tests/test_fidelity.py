@@ -1,4 +1,4 @@
-"""Other meshes of the same body: interpolation between them, coarse and warm-started FEM, the discretisation error."""
+"""Other meshes of a body: interpolation, coarse and warm-started FEM, discretisation error."""
 
 from __future__ import annotations
 
@@ -229,6 +229,7 @@ def tip_deflection(scene: Scene, cells: tuple[int, int, int]) -> np.ndarray[Any,
     return np.array([-weights @ displacement.reshape(-1, 3)[tip, 2] / weights.sum()])
 
 
+@pytest.mark.slow
 def test_the_tip_of_the_coarse_beam_tends_to_its_independent_limit() -> None:
     """An independent study gives 0.417 m on 8 x 2 x 2 cells and 0.518 m in the limit."""
     scene = load_scene("beam-coarse")
@@ -316,6 +317,7 @@ def test_shipped_records_belong_to_the_shipped_datasets(name: str, tmp_path: Pat
     assert record["command"].startswith(f"mor-bench refine {name} ")
 
 
+@pytest.mark.slow
 def test_the_measured_error_arrives_in_every_row_and_page(cache: Path, tmp_path: Path) -> None:
     spec = load_generated_spec("beam-tiny")
     record = measured(spec, tmp_path)
@@ -334,6 +336,7 @@ def test_the_measured_error_arrives_in_every_row_and_page(cache: Path, tmp_path:
     assert "says nothing about the real body" in page
 
 
+@pytest.mark.slow
 def test_a_changed_dataset_shows_none_until_it_is_measured(
     changed: DatasetSpec, tmp_path: Path
 ) -> None:
@@ -359,7 +362,8 @@ def test_a_changed_dataset_shows_none_until_it_is_measured(
     [
         "",
         "{}",
-        '{"format": "mor-bench discretisation error", "schema_version": 1, "digest": "x", "error_m": "nan"}',
+        '{"format": "mor-bench discretisation error", "schema_version": 1, "digest": "x", '
+        '"error_m": "nan"}',
     ],
 )
 def test_a_damaged_record_is_named(changed: DatasetSpec, tmp_path: Path, damage: str) -> None:
@@ -380,7 +384,8 @@ def test_bad_arguments_are_one_clear_line(tmp_path: Path) -> None:
         ({"n_loads": 22}, r"got 22\."),
         (
             {"max_dofs": 974},
-            r"`max_dofs` must be at least 975, the unknowns of the first refinement of beam-tiny; got 974\.",
+            r"`max_dofs` must be at least 975, the unknowns of the first refinement of beam-tiny; "
+            r"got 974\.",
         ),
     ):
         with pytest.raises(InvalidInputError, match=message):

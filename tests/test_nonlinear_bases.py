@@ -49,7 +49,7 @@ def tiny_of(law: str) -> Scene:
 
 @pytest.mark.parametrize("law", LAWS)
 def test_modal_derivatives_are_those_of_the_tangent(law: str) -> None:
-    """Against the central difference of the assembled tangent along a mode, K₀ ψᵢⱼ = -(∂K/∂qⱼ) φᵢ."""
+    """K₀ ψᵢⱼ = -(∂K/∂qⱼ) φᵢ, by the central difference of the assembled tangent along a mode."""
     scene = tiny_of(law)
     model = FullOrderModel(scene)
     modes = linear_modes(scene, model, 3).modes
@@ -128,7 +128,7 @@ def test_force_and_tangent_on_the_manifold_are_derivatives_of_its_energy(law: st
 def test_small_loads_get_the_linear_response(
     name: str, knobs: dict[str, Any], tiny: Dataset
 ) -> None:
-    """The static correction holds under a load that no basis saw: the error falls with the square of the load."""
+    """Under a load that no basis saw, the error falls with the square of the load."""
     method = mor_bench.load_method(name, **knobs).fit(
         tiny.scene, tiny.train if name == "local-pod" else None
     )
@@ -144,7 +144,7 @@ def test_small_loads_get_the_linear_response(
 
 
 def test_the_quadratic_manifold_is_exact_to_second_order(tiny: Dataset) -> None:
-    """Under a load whose linear response lies in Φ, the error falls with the cube of the load; on Φ alone with its square."""
+    """If the linear response lies in Φ, the error is cubic in the load; on Φ alone quadratic."""
     model = FullOrderModel(tiny.scene)
     modes = linear_modes(tiny.scene, model, 3).modes
     linear = GalerkinProblem(model.assembler, modes)
@@ -203,7 +203,7 @@ def test_other_elements_and_integration(
 
 
 def test_a_load_is_answered_from_the_basis_of_its_direction(tiny: Dataset) -> None:
-    """Scaling a load changes no cluster; one cluster is a global basis, and clusters beyond the directions are not made."""
+    """Scaling a load changes no cluster, and there are no more clusters than directions."""
     method = LocalPOD(n_clusters=4, n_modes=3).fit(tiny.scene, tiny.train)
     assert len(method.problems_) == 4
     loads = tiny.test.forces[:8].reshape(8, -1)[:, tiny.scene.free_dofs]
@@ -234,6 +234,7 @@ def test_with_one_cluster_and_all_modes_local_pod_is_the_full_model_on_its_snaps
     )
 
 
+@pytest.mark.slow
 def test_of_clusters_of_like_loads_each_does_better_than_one_basis(cache: Path) -> None:
     """At five modes; at twenty the clusters gain little, see the method's limits."""
     data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
@@ -249,8 +250,9 @@ def test_of_clusters_of_like_loads_each_does_better_than_one_basis(cache: Path) 
     assert medians[1] < 0.85 * medians[0]
 
 
+@pytest.mark.slow
 def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_answers(cache: Path) -> None:
-    """Also at a loose tolerance small loads get the linear response, since the correction is of the sampled stiffness."""
+    """Small loads get the linear response even at a loose tolerance."""
     scene = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache).scene
     forces = draw_loads(scene, 0, 30).nodal_forces(scene.patch_weights)
     whole = mor_bench.load_method("quadratic-manifold", n_modes=4, cubature_tolerance=0.0).fit(
@@ -270,6 +272,7 @@ def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_answers(cache: Pat
     )
 
 
+@pytest.mark.slow
 def test_the_autoencoder_learns_what_linear_elasticity_lacks(cache: Path) -> None:
     pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
     data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
@@ -327,6 +330,7 @@ def test_the_polynomial_is_used_where_it_pays(tiny: Dataset) -> None:
     assert not polynomial_pays(FullOrderModel(tiny_of("neo-hookean")), 4)
 
 
+@pytest.mark.slow
 def test_the_autoencoder_says_that_it_cannot_start_from_another(
     tiny: Dataset, tmp_path: Path
 ) -> None:
@@ -338,6 +342,7 @@ def test_the_autoencoder_says_that_it_cannot_start_from_another(
         method.fit(tiny.scene, tiny.train)
 
 
+@pytest.mark.slow
 def test_no_load_in_a_batch_gives_exactly_no_displacement_of_the_autoencoder(tiny: Dataset) -> None:
     method = mor_bench.load_method("autoencoder", iterations=20).fit(tiny.scene, tiny.train)
     forces = tiny.test.forces[:5].copy()

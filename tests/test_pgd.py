@@ -1,4 +1,4 @@
-"""Separated representations, on functions that are separable, and of displacements under one load patch."""
+"""Separated representations of separable functions, and of displacements under one patch."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import mor_bench
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.reduction.separated import Separation, separate
 from mor_bench.snapshots.dataset import Dataset
-from mor_bench.surrogates.pgd import SeparatedLoad, _coordinates
+from mor_bench.surrogates.pgd import SeparatedLoad, load_coordinates
 
 Array = NDArray[np.float64]
 
 
 def functions(x: Array, kind: str) -> list[list[Array]]:
-    """Two families of factors of x (n, 3): polynomials of the first two coordinates, even and odd powers of the last."""
+    """Return two families of factors of x (n, 3): even and odd in the last coordinate."""
     first = np.stack([np.ones(len(x)), x[:, 0], x[:, 0] ** 2], axis=1)
     second = np.stack([np.ones(len(x)), x[:, 1], x[:, 1] ** 2, x[:, 1] ** 3], axis=1)
     even, odd = np.stack([x[:, 2] ** 2, x[:, 2] ** 4], axis=1), x[:, 2:] ** 3
@@ -67,7 +67,7 @@ def test_one_product_takes_one_term() -> None:
     assert separate(target, functions(x, "both"), 4, 0.0).residuals[-1] <= 1e-4
 
 
-def test_what_is_left_falls_with_every_term_and_is_what_is_left(tiny: Dataset) -> None:
+def test_the_residual_falls_with_every_term_and_is_the_true_one(tiny: Dataset) -> None:
     x = np.random.default_rng(0).uniform(-1, 1, (200, 3))
     target = np.exp(x @ np.random.default_rng(2).normal(size=(3, 5))) * x[:, 2:] ** 2
     found = separate(target, functions(x, "both"), 12, 1e-12)
@@ -78,11 +78,11 @@ def test_what_is_left_falls_with_every_term_and_is_what_is_left(tiny: Dataset) -
 
 
 def test_coordinates_are_the_patchs_own(tiny: Dataset) -> None:
-    """The centroid of a patch's area, by its surface points, and the force that the plan has drawn."""
+    """The centroid of a patch's area, and the force that the plan has drawn."""
     scene, forces = tiny.scene, tiny.train.forces
     points, shares = scene.patch_points(np.arange(len(scene.patch_nodes)))
     centroids = shares @ points
-    positions, vectors = _coordinates(scene.mesh.points, forces)
+    positions, vectors = load_coordinates(scene.mesh.points, forces)
     np.testing.assert_allclose(positions, centroids[tiny.train.regions], atol=1e-9)
     np.testing.assert_allclose(vectors, tiny.train.loads.vectors[:, 0], atol=1e-12)
 
@@ -103,12 +103,12 @@ def test_no_load_and_a_couple(base: str, tiny: Dataset) -> None:
 
 
 def test_a_separable_solution_of_patch_loads_is_found_in_unseen_regions(tiny: Dataset) -> None:
-    """Of first, second and third degree in the force, with the positions of the patches in one factor."""
+    """Of degrees one to three in the force, with the patch positions in one factor."""
     n_free = len(tiny.scene.free_dofs)
     vectors = np.random.default_rng(3).normal(size=(3, n_free))
 
     def displacements(forces: Array) -> Array:
-        positions, f = _coordinates(tiny.scene.mesh.points, forces)
+        positions, f = load_coordinates(tiny.scene.mesh.points, forces)
         x, y = positions[:, 0], positions[:, 1]
         products = [
             (1 + x) * f[:, 2],
@@ -127,7 +127,7 @@ def test_a_separable_solution_of_patch_loads_is_found_in_unseen_regions(tiny: Da
 
 
 def test_beside_the_linear_response_terms_are_of_second_degree_and_more(tiny: Dataset) -> None:
-    """Also where the samples' own first degree is another: small loads are answered by the linear response."""
+    """Small loads get the linear response, even if the samples have another first degree."""
     samples = replace(tiny.train, free_displacements=1.5 * tiny.train.free_displacements)
     method = SeparatedLoad(n_terms=30).fit(tiny.scene, samples)
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)

@@ -1,4 +1,4 @@
-"""Methods of others, as a comparison meets them: honest, broken, and curious about what they must predict."""
+"""Third parties' methods: honest ones, broken ones, and ones that look for the test set."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ class Leaky(Zero):
 
 
 class Peeker(Zero):
-    """Looks for the test set wherever it could be while it is fitted, knowing where everything lies; warns of what it finds."""
+    """Looks for the test set in memory and on disk while it is fitted; warns of what it finds."""
 
     def __init__(self, folders: list[str], dataset: str = "beam-tiny") -> None:
         self.folders = folders

@@ -160,7 +160,7 @@ class SeparatedLoad(Surrogate):
             self.compliance_ = Compliance(FullOrderModel(scene))
             responses = self.compliance_.respond(samples.forces.reshape(len(samples), -1))
             targets = targets - responses[:, scene.free_dofs]
-        positions, vectors = _coordinates(scene.mesh.points, samples.forces)
+        positions, vectors = load_coordinates(scene.mesh.points, samples.forces)
         frame, ends = _frame(positions[vectors.any(axis=1)], scene.mesh.points)
         largest = float(np.linalg.norm(vectors, axis=1).max())
         model = {"frame": frame, "ends": ends, "largest": np.array([largest])}
@@ -213,7 +213,7 @@ class SeparatedLoad(Surrogate):
 
     def answer(self, forces: Array) -> Array:
         scene = self.scene_
-        position, directions, powers = self.functions_(*_coordinates(scene.mesh.points, forces))
+        position, directions, powers = self.functions_(*load_coordinates(scene.mesh.points, forces))
         direction = np.concatenate([directions[degree] for degree in self._degrees], axis=1)
         terms = (
             (position @ self.by_position_)
@@ -232,7 +232,7 @@ class SeparatedLoad(Surrogate):
         return out.reshape(forces.shape)
 
 
-def _coordinates(points: Array, forces: Array) -> tuple[Array, Array]:
+def load_coordinates(points: Array, forces: Array) -> tuple[Array, Array]:
     """Return weighted centroids (n, 3), m, and sums (n, 3), N, of nodal forces (n, n_nodes, 3).
 
     The weights are the lengths of the forces. For a uniform traction with consistent nodal forces
