@@ -32,7 +32,7 @@ from tests.model_files import rewrite
 
 
 def needing(scene: Scene, error: float) -> Scene:
-    """The scene with another need."""
+    """Return the scene with another need."""
     return replace(
         scene,
         spec=scene.spec.model_copy(
@@ -46,6 +46,7 @@ def coarse(cache: Path) -> Dataset:
     return mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
 
 
+@pytest.mark.slow
 def test_the_least_number_of_modes_that_meets_the_need_is_chosen(coarse: Dataset) -> None:
     scene = needing(coarse.scene, 0.05)
     fitted = PODGalerkin("auto", 1e-3).fit(scene, coarse.train)
@@ -230,7 +231,7 @@ def test_hyper_reduction_is_sized_in_both_knobs(coarse: Dataset) -> None:
 
 
 def test_what_was_chosen_is_saved_and_loaded(tiny: Dataset, tmp_path: Path) -> None:
-    fitted = PODGalerkin("auto", "auto").fit(tiny.scene, tiny.train)
+    fitted = PODGalerkin("auto", "auto").fit(needing(tiny.scene, 0.2), tiny.train)
     path = tmp_path / "model.safetensors"
     fitted.save(path)
     loaded = mor_bench.load_surrogate(path)
@@ -284,6 +285,7 @@ tolerance = 1e-3
 """
 
 
+@pytest.mark.slow
 def test_the_record_of_a_fit_shows_what_was_chosen(tmp_path: Path, tiny: Dataset) -> None:
     write_snapshots(tmp_path / "train", tiny.train)
     session = MethodSession(tiny.scene)
@@ -333,6 +335,7 @@ def test_a_method_that_needs_no_equations_is_sized_on_imported_samples(
     assert chosen["n_output_modes"] in MODES
 
 
+@pytest.mark.slow
 def test_errors_of_the_wanted_nodes_decide(tiny: Dataset) -> None:
     """Elsewhere a reduced method answers nothing, which is no error."""
     needs = tiny.scene.spec.needs.model_copy(update={"outputs": "x-max", "error": 0.1})
