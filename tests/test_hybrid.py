@@ -61,7 +61,7 @@ class Nonsense(Surrogate):
 def test_a_start_that_is_nonsense_costs_time_and_not_the_answer(
     coarse: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Hybrid, "_unfitted", lambda self: Nonsense())
+    monkeypatch.setattr(Hybrid, "unfitted_start", lambda self: Nonsense())
     for knobs in ({"steps": 1}, {"tolerance": 1e-8}):
         assert error(Hybrid(**knobs).fit(coarse.scene, coarse.train), coarse, 10) < 1e-6
 

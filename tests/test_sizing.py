@@ -156,7 +156,7 @@ def test_the_search_finds_the_least_work_with_few_trials(
         tried.append(knobs)
         return score(knobs)
 
-    monkeypatch.setattr(Trials, "_tried", counted)
+    monkeypatch.setattr(Trials, "tried", counted)
     rungs = {
         "n_modes": MODES,
         "cubature_tolerance": (1e-1, 1e-2, 1e-3),

@@ -50,7 +50,7 @@ class _HiddenRest(RotatedRest):
         super().__init__(factor, *whole.turning_cells)
         self._hidden, self._rows = hidden, np.append(hidden[::3] // 3, whole.n_unknowns // 3)
         self._base = np.zeros(whole.n_unknowns)
-        _ = self._soft  # which copies share
+        self.soft(self.turned(None))  # computes what copies share
 
     def beside(self, base: Array) -> Self:
         """Return a copy for displacements q relative to a state of the whole body, (n_free,), m."""
@@ -96,19 +96,11 @@ class _HiddenModel(FullOrderModel):
             found.turned_rest = self.turned_rest.beside(base)
         return found
 
-    @property
-    def _turns(self) -> bool:
-        return self.solver in ("auto", "rotated-pcg")
-
     @cached_property
     def turned_rest(self) -> _HiddenRest:
         factor = self.rest_factor
         assert isinstance(factor, BandedFactor | MultigridFactor)
         return _HiddenRest(factor.single_precision(), self._whole, self.hidden)
-
-    def prepare(self) -> None:
-        """Factorise in advance of the queries."""
-        _ = self.turned_rest if self._turns else self.rest_factor
 
     def at(self, q: Array) -> Array:
         """Return displacements of the whole body, (n_free,), m."""
@@ -285,5 +277,5 @@ def forward_model(scene: Scene, solver: SolverName | None = None) -> FullOrderMo
     if scene.observed_nodes is not None:
         return ObservedModel(scene, solver)
     model = FullOrderModel(scene, solver)
-    _ = model.rest_factor
+    model.prepare()
     return model

@@ -115,16 +115,16 @@ class Trials:
 
     def whole_score(self, knobs: Mapping[str, Any]) -> Score:
         """Score a configuration on all folds, however large its error is."""
-        return self._tried(knobs, np.inf)
+        return self.tried(knobs, np.inf)
 
     def score(self, knobs: Mapping[str, Any]) -> Score:
         """Score a configuration; stop early if it is hopeless."""
         key = tuple(sorted(knobs.items()))
         if key not in self.scores:
-            self.scores[key] = self._tried(knobs)
+            self.scores[key] = self.tried(knobs)
         return self.scores[key]
 
-    def _tried(self, knobs: Mapping[str, Any], hopeless: float = HOPELESS) -> Score:
+    def tried(self, knobs: Mapping[str, Any], hopeless: float = HOPELESS) -> Score:
         make: Any = type(self._method)
         candidate: Sizeable = make(**{**self._method.parameters, **knobs})
         errors: list[float] = []

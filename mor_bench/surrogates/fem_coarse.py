@@ -53,7 +53,7 @@ class CoarseFEM(Surrogate):
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
         coarse = self._coarse(scene)
         self.model_ = FullOrderModel(coarse)
-        _ = self.model_.rest_factor
+        self.model_.prepare()
         self.interpolation_ = interpolation_matrix(coarse.mesh, scene.mesh.points)
         self.restriction_ = self.interpolation_.T.tocsr()
 

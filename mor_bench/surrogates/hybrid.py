@@ -88,10 +88,10 @@ class Hybrid(Surrogate):
     @property
     def needs_snapshots(self) -> bool:  # type: ignore[override]
         """Whether the start learns from snapshots."""
-        return self._unfitted().needs_snapshots
+        return self.unfitted_start().needs_snapshots
 
     def supports(self, scene: Scene) -> str | None:
-        return unknown_equations(scene) or self._unfitted().supports(scene)
+        return unknown_equations(scene) or self.unfitted_start().supports(scene)
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         if self.steps is not None and self.tolerance is not None:
@@ -99,7 +99,7 @@ class Hybrid(Surrogate):
                 f"`steps` and `tolerance` exclude each other; got {self.steps} and "
                 f"{self.tolerance}."
             )
-        self.start_ = self._unfitted()
+        self.start_ = self.unfitted_start()
         self.start_.time_limit_s = self.time_limit_s
         self.start_.fit(_all_outputs(scene), samples)
         arrays = {**self.start_.arrays_, **size_arrays(self.start_.sizes_)}
@@ -109,9 +109,9 @@ class Hybrid(Surrogate):
         if not hasattr(self, "start_"):  # it was not fitted here
             arrays = {name.removeprefix(START): array for name, array in model.items()}
             sizes = take_sizes(arrays)
-            self.start_ = self._unfitted().restore(_all_outputs(scene), arrays, sizes)
+            self.start_ = self.unfitted_start().restore(_all_outputs(scene), arrays, sizes)
         self.model_ = FullOrderModel(scene, "auto")
-        _ = self.model_.turned_rest
+        self.model_.prepare()
 
     def answer(self, forces: Array) -> Array:
         free = self.scene_.free_dofs
@@ -122,7 +122,7 @@ class Hybrid(Surrogate):
                 row[free] = self._solve(load, self._guess(force))
         return out.reshape(forces.shape)
 
-    def _unfitted(self) -> Surrogate:
+    def unfitted_start(self) -> Surrogate:
         return load_method(self.start, **(self.start_parameters or {}))
 
     def _guess(self, force: Array) -> Array | None:

@@ -127,7 +127,7 @@ class CubatureSurrogate(Surrogate):
         self.subspace_ = Subspace(scene, self.modes_)
         points = reduced_points(scene, self.cells_, self.weights_, nodal(scene, self.modes_))
         self.problem_ = CubatureProblem(points, extent_of(scene))
-        _ = self.problem_.rest_factor
+        self.problem_.prepare()
 
     def answer(self, forces: Array) -> Array:
         options = NewtonOptions(self.value("tolerance"))

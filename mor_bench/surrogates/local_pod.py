@@ -138,7 +138,8 @@ class LocalPOD(Surrogate):
             for cluster, basis in enumerate(self.bases_)
         ]
         self.compliance_ = Compliance(self.model_)
-        _ = [problem.rest_factor for problem in self.problems_]
+        for problem in self.problems_:
+            problem.prepare()
 
     def answer(self, forces: Array) -> Array:
         count(multiply_adds=len(forces) * (self.to_coordinates_.size + self.centroids_.size))

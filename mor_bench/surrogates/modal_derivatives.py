@@ -69,7 +69,7 @@ class ModalDerivatives(Surrogate):
         self.model_ = FullOrderModel(scene)
         self.problem_ = galerkin_or_polynomial(scene, self.model_, self.modes_, model)
         self.compliance_ = Compliance(self.model_)
-        _ = self.problem_.rest_factor
+        self.problem_.prepare()
 
     def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         out = np.zeros((len(forces), self.scene_.mesh.n_dofs))

@@ -82,7 +82,7 @@ class PODGalerkin(Surrogate):
         self.options_ = NewtonOptions(self.value("tolerance"))
         self.subspace_ = Subspace(scene, self.modes_)
         self.problem_ = GalerkinProblem(FullOrderModel(scene).assembler, self.modes_)
-        _ = self.problem_.rest_factor
+        self.problem_.prepare()
 
     def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         return self.subspace_.answer(

@@ -90,7 +90,7 @@ class QuadraticManifoldGalerkin(Surrogate):
         self.sampled_ = QuadraticManifold(modes[rows], self.manifold_.derivatives[rows])
         self.model_ = FullOrderModel(scene)
         self.compliance_ = Compliance(self.model_)
-        _ = self.linear_.rest_factor
+        self.linear_.prepare()
 
     def answer(self, forces: Array) -> Array:
         return answer_each(self.scene_, forces, self._solve)
