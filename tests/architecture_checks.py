@@ -27,7 +27,6 @@ FLOORS = (
         "training_options",
         "model_arrays",
         "model_file",
-        "legacy_hooks",
         "surrogate",
         "method_loading",
     ),

@@ -243,6 +243,7 @@ def test_a_model_of_other_observed_nodes_is_not_taken_from_the_cache(
     assert len(digests) == 3
 
 
+@pytest.mark.slow
 def test_by_default_the_methods_run_that_can(tmp_path: Path) -> None:
     path = written(tmp_path, TOP)
     chosen = [method.name for method in checked_specs([path], None, RunOptions())[1]]
