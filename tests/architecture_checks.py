@@ -50,7 +50,7 @@ MAX_FILE, MAX_FUNCTION, MAX_PARAMETERS, MAX_WIDTH = 400, 60, 6, 100
 
 FOR_TOOLS = re.compile(r"\s+# (type: ignore|noqa).*")
 
-PUBLIC_UNDERSCORES = {"_exit", "_replace", "_asdict", "_fields", "_getframe"}
+PUBLIC_UNDERSCORES = {"_exit", "_replace", "_asdict", "_fields", "_getframe", "_name"}
 """Documented names of the standard library that begin with an underscore."""
 
 WITHOUT_PUBLIC_NAME = {
