@@ -217,10 +217,10 @@ class FullOrderModel:
 
     def prepare(self) -> None:
         """Compute the factors that all solves share, so that no query has to."""
-        _ = self.turned_rest if self._turns else self.rest_factor
+        _ = self.turned_rest if self.turns else self.rest_factor
 
     @property
-    def _turns(self) -> bool:
+    def turns(self) -> bool:
         """Whether solves use the turned rest-state factor."""
         return self.solver in ("auto", "rotated-pcg")
 

@@ -92,7 +92,7 @@ class _HiddenModel(FullOrderModel):
         found = copy(self)
         found._base, found.beside_force = base, self._whole.force(base).force
         found._offset = found.beside_force[self.hidden]
-        if self._turns:
+        if self.turns:
             found.turned_rest = self.turned_rest.beside(base)
         return found
 
