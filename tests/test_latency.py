@@ -19,11 +19,11 @@ from mor_bench.measure.latency import (
     measure_latencies,
     probe_s,
 )
-from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.measure.timing import BATCHES, Timing, check_answers, timing_summary, why_unstable
 from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
 from mor_bench.snapshots.dataset import Dataset
+from tests.timed_methods import timed_method
 
 
 def timing(medians: list[float], others: float = 0.0, own: float = 1.0) -> Timing:
@@ -101,16 +101,7 @@ def test_a_group_of_methods_fits_into_half_of_the_free_memory() -> None:
 
 
 def timed(tiny: Dataset, folder: Path, name: str, **parameters: object) -> TimedMethod:
-    """A class of `tests.third_party` that is fitted in each process."""
-
-    def opened(server: ForkServer | None) -> SandboxedProcess:
-        process = SandboxedProcess(MethodSession, fork_server=server, scene=tiny.scene)
-        surrogate, model = f"tests.third_party:{name}", folder / "model.safetensors"
-        request = FitRequest(surrogate, parameters, folder, model, 1, 60.0)
-        process.ask("fit", 60.0, request=request)
-        return process
-
-    return TimedMethod(opened, 1e8)
+    return timed_method(tiny.scene, folder, f"tests.third_party:{name}", parameters)
 
 
 @pytest.fixture

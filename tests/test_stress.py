@@ -20,7 +20,7 @@ from mor_bench.hard_cases import case as case_module
 from mor_bench.hard_cases import mechanics_cases as mechanics
 from mor_bench.hard_cases import reduction_cases as reduction
 from mor_bench.hard_cases import setups
-from mor_bench.hard_cases.case import Case, Scenes, Subject
+from mor_bench.hard_cases.case import Scenes, Subject
 from mor_bench.hard_cases.catalogue import CASES, CaseResult, attempt, cases_for
 from mor_bench.hard_cases.suite import StressResults, stress
 from mor_bench.mechanics import model as model_module
@@ -31,7 +31,7 @@ from mor_bench.reduction.basis import Basis, pod
 from mor_bench.reduction.cubature import SparseWeights
 from mor_bench.report.hard_case_table import print_stress
 from mor_bench.scene import soundness
-from mor_bench.specs import MethodSpec, load_method_spec
+from mor_bench.specs import MethodSpec
 from mor_bench.surrogates import pod as pod_module
 from mor_bench.surrogates.fem import FullFEM
 from mor_bench.surrogates.hpod import HyperReducedPOD
@@ -318,10 +318,8 @@ PLANTS = {
 
 
 def verdict_on(plant: Plant, scenes: Scenes) -> str:
-    subject = Subject(load_method_spec(plant.method), "quick", scenes)
-    found = [case for case, _ in cases_for(subject, [plant.case]) if case.part == plant.part]
-    case: Case = found[0]
-    return attempt(case, subject, None).verdict
+    rows = tried(scenes, SPECS[plant.method], [plant.case])
+    return next(row.verdict for row in rows if row.part == plant.part)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,10 @@
-"""Whether timings can be trusted: `python -m tests.verification.timing_trust [comparisons]` on a machine that does nothing else.
+"""Check that timings can be trusted; run it on an otherwise idle machine.
 
-Identical code under two names, an injected slow-down of a tenth, re-runs against the stated intervals, and a busy neighbour;
-prints the four shares and exits with 1 if one misses its target. Takes about a quarter of an hour for 100 comparisons.
+    python -m tests.verification.timing_trust [comparisons]
+
+It times identical code under two names, code that is slowed by a tenth, reruns against the stated
+intervals, and a method beside a busy process. It prints four shares and exits with 1 if one misses
+its target. A hundred comparisons take about a quarter of an hour.
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,19 +22,17 @@ import numpy as np
 
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.latency_intervals import latency_intervals
-from mor_bench.measure.latency import PROTOCOLS, Queries, TimedMethod, measure_latencies
-from mor_bench.measure.method_session import FitRequest, MethodSession
+from mor_bench.measure.latency import PROTOCOLS, Queries, measure_latencies
 from mor_bench.measure.timing import Timing, why_unstable
 from mor_bench.results.comparison import Comparison
-from mor_bench.sandbox.fork_server import ForkServer
-from mor_bench.sandbox.process import SandboxedProcess
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.sampling import draw_loads
 from tests.synthetic import a_row
+from tests.timed_methods import timed_method
 
 DATASET = "beam-tiny"
 AT_ONCE = 20
-"""Comparisons, of three processes each, that are measured beside each other."""
+"""Comparisons, of three processes each, that are measured side by side."""
 
 RERUNS = 6
 RERUN_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -41,26 +42,6 @@ RERUN_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "fem-jacobi": ("mor_bench.surrogates.fem:FullFEM", {"solver": "jacobi-pcg"}),
     "linear-fem": ("mor_bench.surrogates.linear_fem:LinearFEM", {}),
 }
-
-
-@dataclass(frozen=True)
-class _Method:
-    """A method that needs no snapshots, fitted in each process."""
-
-    scene: Scene
-    folder: Path
-    surrogate: str
-    parameters: dict[str, Any]
-
-    def __call__(self, fork_server: ForkServer | None) -> SandboxedProcess:
-        worker = SandboxedProcess(MethodSession, fork_server=fork_server, scene=self.scene)
-        model = self.folder / "model.safetensors"
-        worker.ask(
-            "fit",
-            60.0,
-            request=FitRequest(self.surrogate, self.parameters, self.folder, model, 1, 60.0),
-        )
-        return worker
 
 
 def _queries(scene: Scene, folder: Path) -> Queries:
@@ -76,10 +57,8 @@ def _measured(
     processes: str = "full",
 ) -> dict[str, Timing]:
     protocol = replace(PROTOCOLS[processes], all_cores=False)
-    methods_here = {
-        name: TimedMethod(_Method(scene, folder, *method), 1e8) for name, method in methods.items()
-    }
-    timings = measure_latencies(methods_here, _queries(scene, folder), protocol, 1, seed=seed)
+    timed = {name: timed_method(scene, folder, *method) for name, method in methods.items()}
+    timings = measure_latencies(timed, _queries(scene, folder), protocol, 1, seed=seed)
     failed = {name: timing.failed for name, timing in timings.items() if timing.failed}
     if failed:
         raise SystemExit(f"failed: {failed}")
@@ -87,7 +66,7 @@ def _measured(
 
 
 def _matrix(timings: dict[str, Timing], folder: Path) -> dict[tuple[str, str], str]:
-    """The verdicts that the report's matrix gives on methods of equal errors, at the error of 1 % that all meet."""
+    """Return the verdicts of the report's matrix on methods of equal errors, at an error of 1 %."""
     comparison = Comparison(folder / "run", {}, settings={})
     regions = np.repeat(np.arange(13), 20)[:, None]
     comparison.add_dataset(
