@@ -41,7 +41,7 @@ def test_a_method_finds_no_test_sample_and_no_result(
     shards = [str(path) for path in cache.glob("datasets/*/shard-*.h5")]
     monkeypatch.setenv("MOR_BENCH_TEST_SHARDS", os.pathsep.join(shards))
     path = method_file(tmp_path, "peeker", "tests.third_party:Peeker", folders=folders)
-    row = run_small([path], tmp_path / "other", cache).rows[0]
+    row = run_small(["linear-fem", path], out, cache).rows[1]
     assert row.ok, row.reason
     assert seen_by(row) == []
     with pytest.warns(UserWarning, match="_open") as caught:  # it does look

@@ -5,5 +5,5 @@ that it concerns. A case judges what it computed; it never looks at a method's n
 comparison lives in `mor_bench.measure`.
 
 Start reading at `case` (what a case is), then `method_cases`. To add a case, write a function from
-a `Subject` to an `Outcome` and append it to the ``CASES`` of its file.
+a `Subject` to an `Outcome`, decorate it with `hard_case`, and name it in the ``CASES`` of its file.
 """

@@ -175,6 +175,13 @@ class Case:
     examine: Callable[[Subject], Outcome]
 
 
+def hard_case(
+    name: str, concerns: Callable[[Surrogate], bool], expected: str, part: str = ""
+) -> Callable[[Callable[[Subject], Outcome]], Case]:
+    """Make a `Case` of the function that examines it, as a decorator."""
+    return lambda examine: Case(name, part, expected, concerns, examine)
+
+
 def every(method: Surrogate) -> bool:
     """Accept any method."""
     return True

@@ -21,7 +21,7 @@ from mor_bench.errors import (
     SolverError,
     UnconstrainedBodyError,
 )
-from mor_bench.hard_cases.case import Case, Outcome, Subject, judged, scene_of, wrongly_handled
+from mor_bench.hard_cases.case import Outcome, Subject, hard_case, judged, scene_of, wrongly_handled
 from mor_bench.hard_cases.setups import (
     LIMIT_PA,
     Bars,
@@ -85,6 +85,11 @@ def _caught(kind: type[Warning]) -> Iterator[list[str]]:
     found += [str(warning.message) for warning in caught if issubclass(warning.category, kind)]
 
 
+@hard_case(
+    "inversion",
+    as_shipped,
+    "refused as inverted or without equilibrium beyond the limit load, never answered",
+)
 def inversion(subject: Subject) -> Outcome:
     """Compress a confined cell beyond its limit load, in one step and in ten."""
     inverted, not_found, wrong = 0, 0, []
@@ -114,6 +119,7 @@ def inversion(subject: Subject) -> Outcome:
     )
 
 
+@hard_case("snap-through", as_shipped, "limit point reported with its lowest tangent eigenvalue")
 def snap_through(subject: Subject) -> Outcome:
     """Compare the limit load of an arch with the top of its displacement-driven path."""
     arch = make_arch()
@@ -147,6 +153,11 @@ def snap_through(subject: Subject) -> Outcome:
     )
 
 
+@hard_case(
+    "near-incompressible",
+    full_order,
+    "converges; locking reported and cured by selective integration",
+)
 def near_incompressible(subject: Subject) -> Outcome:
     """Bend a cantilever of nearly incompressible material with full and selective integration."""
     solver, size, cells = _solver(subject), [4.0, 1.0, 1.0], [12, 3, 3]
@@ -174,6 +185,7 @@ def near_incompressible(subject: Subject) -> Outcome:
     )
 
 
+@hard_case("slender", full_order, "terminates; locking reported")
 def slender(subject: Subject) -> Outcome:
     """Bend a beam of 100:1 and compare its locking with the discretisation error by refinement.
 
@@ -201,6 +213,7 @@ def slender(subject: Subject) -> Outcome:
     return judged(good, happened, deflections=deflections, exact=SLENDER_EXACT, reported=reported)
 
 
+@hard_case("huge-step", full_order, "converges or cuts back; cut-backs counted")
 def huge_step(subject: Subject) -> Outcome:
     """Apply a large load at once, and a load beyond the limit with at most three cut-backs."""
     scene = scene_of(subject.scenes.spec, material=material_table("neo-hookean", 500.0, 0.4))
@@ -233,6 +246,7 @@ def _cuts_beyond_the_limit(max_cuts: int) -> tuple[int | None, str]:
     return None, "answered"
 
 
+@hard_case("distortion", as_shipped, "patch test within 1e-12")
 def distortion(subject: Subject) -> Outcome:
     """Run the patch test on distorted meshes of every element."""
     errors = {
@@ -247,6 +261,11 @@ def distortion(subject: Subject) -> Outcome:
     )
 
 
+@hard_case(
+    "stiffness-contrast",
+    as_shipped,
+    "correct answer; condition number reported, with a warning if few digits are left",
+)
 def stiffness_contrast(subject: Subject) -> Outcome:
     """Stretch bars with a stiffness ratio of a million, and build a very slender beam."""
     off, conditions, reported = 0.0, [], []
@@ -286,6 +305,7 @@ FREE: dict[str, tuple[list[Any], tuple[str, ...]]] = {
 """Supports that leave rigid motions free, and these motions."""
 
 
+@hard_case("unconstrained", as_shipped, "clear error that names the free rigid motions")
 def unconstrained(subject: Subject) -> Outcome:
     """Build models of bodies that can move freely."""
     wrong = []
@@ -328,6 +348,7 @@ def _bad_meshes() -> dict[str, Callable[[], object]]:
     return attempts
 
 
+@hard_case("bad-mesh", as_shipped, "typed error")
 def bad_mesh(subject: Subject) -> Outcome:
     """Use meshes with NaN, infinity, flat or inverted cells, and wrong connectivity."""
     meshes = _bad_meshes()
@@ -338,43 +359,13 @@ def bad_mesh(subject: Subject) -> Outcome:
 
 
 CASES = (
-    Case(
-        "inversion",
-        "",
-        "refused as inverted or without equilibrium beyond the limit load, never answered",
-        as_shipped,
-        inversion,
-    ),
-    Case(
-        "snap-through",
-        "",
-        "limit point reported with its lowest tangent eigenvalue",
-        as_shipped,
-        snap_through,
-    ),
-    Case(
-        "near-incompressible",
-        "",
-        "converges; locking reported and cured by selective integration",
-        full_order,
-        near_incompressible,
-    ),
-    Case("slender", "", "terminates; locking reported", full_order, slender),
-    Case("huge-step", "", "converges or cuts back; cut-backs counted", full_order, huge_step),
-    Case("distortion", "", "patch test within 1e-12", as_shipped, distortion),
-    Case(
-        "stiffness-contrast",
-        "",
-        "correct answer; condition number reported, with a warning if few digits are left",
-        as_shipped,
-        stiffness_contrast,
-    ),
-    Case(
-        "unconstrained",
-        "",
-        "clear error that names the free rigid motions",
-        as_shipped,
-        unconstrained,
-    ),
-    Case("bad-mesh", "", "typed error", as_shipped, bad_mesh),
+    inversion,
+    snap_through,
+    near_incompressible,
+    slender,
+    huge_step,
+    distortion,
+    stiffness_contrast,
+    unconstrained,
+    bad_mesh,
 )

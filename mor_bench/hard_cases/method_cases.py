@@ -20,6 +20,7 @@ from mor_bench.hard_cases.case import (
     Subject,
     answers,
     every,
+    hard_case,
     judged,
     learner,
     rms,
@@ -48,6 +49,9 @@ ADDED = 0.1
 FLAGGED = 0.9
 """Share of the loads of an unseen kind that must be flagged."""
 
+LARGER = ("2x", "4x")
+"""Test sets of larger loads, of which only those larger than any in training are unlike."""
+
 FALSE_ALARMS = 0.02
 """Largest share of loads in range that may be flagged."""
 
@@ -74,6 +78,7 @@ def _bad_forces(good: Array) -> dict[str, Any]:
     }
 
 
+@hard_case("bad-forces", every, "typed error, nothing kept")
 def bad_forces(subject: Subject) -> Outcome:
     """Predict for arrays with NaN, infinity, wrong shapes and wrong types."""
     method, good = subject.fitted, subject.data.test.forces[0]
@@ -117,6 +122,7 @@ def _bad_snapshots(good: Snapshots) -> dict[str, Snapshots | None]:
     }
 
 
+@hard_case("bad-snapshots", learner, "typed error, nothing kept")
 def bad_snapshots(subject: Subject) -> Outcome:
     """Fit on snapshots with NaN, infinity, wrong shapes and wrong types."""
     data = subject.data
@@ -202,6 +208,9 @@ def out_of_distribution(name: str, subject: Subject) -> Outcome:
     )
 
 
+@hard_case(
+    "zero-force", every, f"‖u‖ <= {ZERO_FORCE:g} of the root mean square of the training samples"
+)
 def zero_force(subject: Subject) -> Outcome:
     """Predict without any force."""
     answer = subject.fitted.predict(np.zeros((subject.data.scene.mesh.n_nodes, 3)))
@@ -213,6 +222,7 @@ def zero_force(subject: Subject) -> Outcome:
     )
 
 
+@hard_case("symmetry", every, f"full-order {MIRRORED:g}; others measured and published")
 def symmetry(subject: Subject) -> Outcome:
     """Predict mirrored loads: y → 1 m - y maps beam-tiny and its support to themselves."""
     data, exact = subject.data, isinstance(subject.fresh(), FullFEM)
@@ -235,6 +245,7 @@ def symmetry(subject: Subject) -> Outcome:
     )
 
 
+@hard_case("determinism", every, "identical", "two runs")
 def two_runs(subject: Subject) -> Outcome:
     """Predict twice, and fit twice."""
     forces = subject.data.test.forces[:8]
@@ -254,6 +265,9 @@ def two_runs(subject: Subject) -> Outcome:
     )
 
 
+@hard_case(
+    "determinism", every, "identical, or a stated difference of round-off", "batch of 1 and of 8"
+)
 def batches(subject: Subject) -> Outcome:
     """Predict eight loads together and one by one."""
     forces = subject.data.test.forces[:8]
@@ -267,6 +281,7 @@ def batches(subject: Subject) -> Outcome:
     )
 
 
+@hard_case("low-precision", every, "adds at most 10 % of the error", "float32 forces")
 def float32_forces(subject: Subject) -> Outcome:
     """Predict for loads in single precision."""
     return _low_precision(
@@ -274,6 +289,9 @@ def float32_forces(subject: Subject) -> Outcome:
     )
 
 
+@hard_case(
+    "low-precision", every, "adds at most 10 % of the error, or refused", "bfloat16 inference"
+)
 def bfloat16_inference(subject: Subject) -> Outcome:
     """Let PyTorch compute a network in bfloat16."""
     method, torch = subject.fitted, sys.modules.get("torch")
@@ -311,44 +329,23 @@ def _low_precision(subject: Subject, predict: Callable[[Surrogate, Array], Array
     )
 
 
-LARGER = ("2x", "4x")
-"""Test sets of larger loads, of which only those larger than any in training are unlike."""
-
-FLAG = "error published with p95 and max; flagged as out of range"
-
 CASES = (
-    Case("bad-forces", "", "typed error, nothing kept", every, bad_forces),
-    Case("bad-snapshots", "", "typed error, nothing kept", learner, bad_snapshots),
+    bad_forces,
+    bad_snapshots,
     *(
-        Case("out-of-distribution", part, FLAG, every, partial(out_of_distribution, part))
-        for part in ("2x", "4x", "unseen-regions", "unseen-directions", "several-forces")
+        Case(
+            "out-of-distribution",
+            test_set,
+            "error published with p95 and max; flagged as out of range",
+            every,
+            partial(out_of_distribution, test_set),
+        )
+        for test_set in (*LARGER, "unseen-regions", "unseen-directions", "several-forces")
     ),
-    Case(
-        "zero-force",
-        "",
-        f"‖u‖ <= {ZERO_FORCE:g} of the root mean square of the training samples",
-        every,
-        zero_force,
-    ),
-    Case(
-        "symmetry", "", f"full-order {MIRRORED:g}; others measured and published", every, symmetry
-    ),
-    Case("determinism", "two runs", "identical", every, two_runs),
-    Case(
-        "determinism",
-        "batch of 1 and of 8",
-        "identical, or a stated difference of round-off",
-        every,
-        batches,
-    ),
-    Case(
-        "low-precision", "float32 forces", "adds at most 10 % of the error", every, float32_forces
-    ),
-    Case(
-        "low-precision",
-        "bfloat16 inference",
-        "adds at most 10 % of the error, or refused",
-        every,
-        bfloat16_inference,
-    ),
+    zero_force,
+    symmetry,
+    two_runs,
+    batches,
+    float32_forces,
+    bfloat16_inference,
 )

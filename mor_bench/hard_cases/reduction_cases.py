@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import MorBenchError, RankDeficientWarning
 from mor_bench.hard_cases.case import (
-    Case,
     Outcome,
     Subject,
     answers,
+    hard_case,
     judged,
     learner,
     with_samples,
@@ -42,6 +42,11 @@ def _poor(train: Snapshots) -> dict[str, Snapshots]:
     }
 
 
+@hard_case(
+    "poor-snapshots",
+    learner,
+    "cut to the rank with a warning, basis orthonormal to 1e-12, or a typed error",
+)
 def poor_snapshots(subject: Subject) -> Outcome:
     """Fit on snapshots with fewer independent directions than the method has modes."""
     wrong, shown = [], []
@@ -132,6 +137,12 @@ def _optimality(matrix: Array, target: Array, found: SparseWeights) -> tuple[flo
     )
 
 
+@hard_case(
+    "nnls",
+    hyper_reduced,
+    "residual and optimality hold when recomputed",
+    "duplicated and badly scaled columns",
+)
 def nnls_columns(subject: Subject) -> Outcome:
     """Solve non-negative least squares with repeated and badly scaled columns."""
     found = []
@@ -156,6 +167,7 @@ def nnls_columns(subject: Subject) -> Outcome:
     )
 
 
+@hard_case("nnls", hyper_reduced, "honest failure", "one iteration only")
 def nnls_cap(subject: Subject) -> Outcome:
     """Stop non-negative least squares after one iteration."""
     matrix, tolerance = np.random.default_rng(0).random((30, 50)), 1e-6
@@ -169,6 +181,7 @@ def nnls_cap(subject: Subject) -> Outcome:
     return judged(False, f"accepted with a residual of {residual:.2g}")
 
 
+@hard_case("ecsw-all-cells", hyper_reduced, "equals plain POD to 1e-10")
 def ecsw_all_cells(subject: Subject) -> Outcome:
     """Keep every cell in the cubature, which must then equal plain POD."""
     data, forces = subject.data, subject.data.test.forces[:20]
@@ -184,21 +197,4 @@ def ecsw_all_cells(subject: Subject) -> Outcome:
     )
 
 
-CASES = (
-    Case(
-        "poor-snapshots",
-        "",
-        "cut to the rank with a warning, basis orthonormal to 1e-12, or a typed error",
-        learner,
-        poor_snapshots,
-    ),
-    Case(
-        "nnls",
-        "duplicated and badly scaled columns",
-        "residual and optimality hold when recomputed",
-        hyper_reduced,
-        nnls_columns,
-    ),
-    Case("nnls", "one iteration only", "honest failure", hyper_reduced, nnls_cap),
-    Case("ecsw-all-cells", "", "equals plain POD to 1e-10", hyper_reduced, ecsw_all_cells),
-)
+CASES = (poor_snapshots, nnls_columns, nnls_cap, ecsw_all_cells)
