@@ -145,6 +145,7 @@ def test_configurations_are_timed_in_turns_and_fail_alone(
     assert turns == sorted(turns)
 
 
+@pytest.mark.slow
 def test_answers_that_are_worse_while_timed_are_found(
     tiny: Dataset, queries: Queries, tmp_path: Path
 ) -> None:

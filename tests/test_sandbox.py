@@ -92,6 +92,7 @@ def test_prints_and_forks_of_a_method_are_no_answers(
         assert np.load(out).shape == forces.shape
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not CAN_FORK, reason="fork servers are used on Linux only")
 def test_a_fork_server_that_a_method_ended_starts_again(tiny_scene: Scene, tmp_path: Path) -> None:
     with closing(ForkServer(MethodSession)) as server:
