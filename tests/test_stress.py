@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 
 from mor_bench import surrogate
@@ -22,11 +21,6 @@ from mor_bench.hard_cases.case import LONGEST, Scenes, Subject
 from mor_bench.hard_cases.catalogue import CASES, CaseResult, attempt, cases_for
 from mor_bench.hard_cases.suite import StressResults, stress
 from mor_bench.mechanics import model as model_module
-from mor_bench.mechanics.assembly import Assembler, Discretisation
-from mor_bench.mechanics.newton import Solution
-from mor_bench.mechanics.stability import LimitPoint, limit_load
-from mor_bench.reduction.basis import Basis, pod
-from mor_bench.reduction.cubature import SparseWeights
 from mor_bench.report.hard_case_table import print_stress
 from mor_bench.scene import soundness
 from mor_bench.specs import MethodSpec
@@ -36,6 +30,14 @@ from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.pod import PODGalerkin
 from tests.commands import mor_bench_command
 from tests.suite_methods import SPECS
+from tests.wrong_replacements import (
+    all_weights_one,
+    pod_without_warning,
+    shifted,
+    solved,
+    too_high_a_limit,
+    unevenly_weighted,
+)
 
 ANY_SOLVER = ("near-incompressible", "slender", "huge-step")
 ONE_SOLVER = ("inversion", "snap-through", "distortion", "stiffness-contrast", "unconstrained")
@@ -209,41 +211,6 @@ def test_a_third_party_s_failure_costs_its_own_rows_only(tmp_path: Path, cache: 
     assert "ended with code 7" in found.rows[0].happened
 
 
-def solved(*_: Any, **__: Any) -> Solution:
-    return Solution(np.array([-0.5]), 0.5, 1, 0)
-
-
-def too_high_a_limit(*arguments: Any) -> LimitPoint:
-    limit = limit_load(*arguments)
-    assert limit is not None
-    return replace(limit, factor=0.2)
-
-
-def pod_without_warning(
-    snapshots: NDArray[np.float64], n_modes: int | None = None, **_: Any
-) -> Basis:
-    basis = pod(snapshots)
-    return Basis(basis.modes[:, :n_modes], basis.singular_values)
-
-
-def unevenly_weighted(mesh: Any, law: Any = setups.LAW, selective: bool = False) -> Assembler:
-    dofs = np.arange(mesh.n_dofs).reshape(-1, 3)
-    weights = 1 + 0.1 * np.arange(mesh.n_cells)
-    body = Discretisation(mesh.points, mesh.cells, law, selective)
-    return Assembler(body, dofs, mesh.n_dofs, weights)
-
-
-def all_weights_one(matrix: NDArray[np.float64], *_: Any, **__: Any) -> SparseWeights:
-    return SparseWeights(np.ones(matrix.shape[1]), 0.0, 0.0, 0.0, 1)
-
-
-def shifted(self: FullFEM, forces: ArrayLike) -> NDArray[np.float64]:
-    answer = _predict(self, forces)
-    answer[..., -1, 1] += 1e-9
-    return answer
-
-
-_predict = FullFEM.predict
 COLUMNS = "duplicated and badly scaled columns"
 
 
