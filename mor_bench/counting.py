@@ -70,7 +70,7 @@ def count(
     element_evaluations: int = 0,
     multiply_adds: int = 0,
 ) -> None:
-    """Add work to the active counter, if there is one. Reduced work is counted in the totals too."""
+    """Add work to the active counter, if there is one; totals include reduced work."""
     if _running is None:
         return
     _running.factorisations += factorisations

@@ -1,4 +1,4 @@
-"""The comparison with other codes: that they solve our problem, and that one which does not is refused. Times are not asserted."""
+"""Other codes solve our problem, and one that solves another is refused; times do not count."""
 
 from __future__ import annotations
 

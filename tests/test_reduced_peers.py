@@ -1,4 +1,4 @@
-"""The comparison with other codes' reduced-order models: that they solve our equations, and that one which does not is refused."""
+"""Reduced models of other codes solve our equations, and one that solves others is refused."""
 
 from __future__ import annotations
 

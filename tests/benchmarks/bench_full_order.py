@@ -1,4 +1,4 @@
-"""The full-order model on one thread: its kernels, a factorisation, a whole solve, its memory, its steps and its error."""
+"""The full-order model on one thread: kernels, a factorisation, a solve, memory and error."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ def median_load(scene: Any) -> Any:
 class FullOrder:
     """One call each, from rest, at the median load and the deformed state that it leads to.
 
-    The scenes take different kernels: two sizes of Saint Venant-Kirchhoff in H8, neo-Hookean with selective integration, T4.
+    The scenes take different kernels: two sizes of Saint Venant-Kirchhoff in H8, neo-Hookean with
+    selective integration, T4.
     """
 
     params = ("beam-tiny", "beam-coarse", "beam-nearly-incompressible", "liver-tet")

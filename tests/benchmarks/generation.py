@@ -1,11 +1,12 @@
-"""Cost of generation against the number of samples: rate, seconds and memory per size, each in a fresh folder.
+"""Rate, seconds and memory of generation against the number of samples.
 
     python -m tests.benchmarks.generation
     python -m tests.benchmarks.generation --samples 100 --samples 1000 --samples 33600
 
-Each size is generated in a process of its own, by so many workers of one thread. Seconds are the whole call's, with the
-scene and the start of the workers; "long run/s" is the rate beyond the first shard, which the parent solves alone.
-Peak memory is the largest resident set of the parent, which also solves the first shard, and of any one worker.
+Each size is generated in a process of its own, by so many workers of one thread. Seconds are the
+whole call's, with the scene and the start of the workers; "long run/s" is the rate beyond the first
+shard, which the parent solves alone. Peak memory is the largest resident set of the parent, which
+also solves the first shard, and of any one worker.
 """
 
 from __future__ import annotations

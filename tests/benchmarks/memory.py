@@ -6,7 +6,7 @@ import sys
 
 
 def peak_mb(of_children: bool = False) -> float:
-    """Largest resident set of this process, or of any of its children that have ended, MiB; NaN on Windows, which does not say."""
+    """Return the peak memory of this process or of its ended children, MiB; NaN on Windows."""
     if sys.platform == "win32":
         return float("nan")
     import resource

@@ -1,9 +1,10 @@
-"""How fast the back ends of `mor_bench.learning.inference` answer single queries of the U-Net, for its sizes and the suite's grids.
+"""Latency of single queries of the U-Net, by back end, network size and grid.
 
     python -m tests.benchmarks.network_latency --out network-latency.csv
 
-The networks have random weights, of which times do not depend. All back ends of one network take turns, so that what else the
-machine does slows all; each row has the median, the 95th percentile and the shortest of all queries, network only.
+The networks have random weights, of which times do not depend. All back ends of one network take
+turns, so that what else the machine does slows all; each row has the median, the 95th percentile
+and the shortest of all queries, network only.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""Publish the dashboard of asv's results, and of comparisons exported beside them, as a folder that needs no internet.
+"""Publish the dashboard of asv's results and comparisons as a folder that needs no internet.
 
     python -m tests.benchmarks.publish
     python -m http.server --directory .asv/html
 
-As `asv publish`, but its page loads jQuery, Flot and Bootstrap from copies in the folder instead of from the internet, and
-comparisons that `mor-bench export asv` wrote are shown even if `asv run` has rewritten its list of benchmarks since.
+As `asv publish`, but its page loads jQuery, Flot and Bootstrap from copies in the folder instead of
+from the internet, and comparisons that `mor-bench export asv` wrote are shown even if `asv run` has
+rewritten its list of benchmarks since.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ def make_offline(folder: Path) -> None:
     def local(match: re.Match[str]) -> str:
         if match["url"] not in LOCAL:
             raise MorBenchError(
-                f"{page}: loads {match['url']}, of which {COPIES} has no copy; add one, and its licence."
+                f"{page}: loads {match['url']}, of which {COPIES} has no copy; "
+                "add one, and its licence."
             )
         kind = 'rel="stylesheet" ' if match["tag"] == "link" else 'onerror="js_load_failure()" '
         return f'<{match["tag"]} {kind}{match["where"]}="offline/{LOCAL[match["url"]]}">'

@@ -1,9 +1,10 @@
-"""Cost of the full-order solve against the size of the mesh: seconds and memory from 1e3 to 3e5 unknowns, and the slopes.
+"""Seconds and memory of the full-order solve against the size of the mesh, 1e3 to 3e5 unknowns.
 
     python -m tests.benchmarks.scaling
 
-Each size is a cantilever of the beams' proportions, material and loads, in a process of its own on one thread. Set-up is
-the mesh, the pattern and the rest-state factor, from the import on; a solve is the median over the loads.
+Each size is a cantilever of the beams' proportions, material and loads, in a process of its own on
+one thread. Set-up is the mesh, the pattern and the rest-state factor, from the import on; a solve
+is the median over the loads.
 """
 
 from __future__ import annotations
