@@ -1,4 +1,4 @@
-"""Bases, cubature and Galerkin projection: their laws, and poor snapshots."""
+"""Galerkin projection and its cubature against the full-order model."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import mor_bench
-from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.cubature import ecsw_system
@@ -21,45 +20,7 @@ from mor_bench.surrogates.pod import PODGalerkin
 
 @pytest.fixture(scope="module")
 def coarse(cache: Path) -> Dataset:
-    return mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
-
-
-def test_the_basis_is_orthonormal_at_200_modes_of_fast_decay() -> None:
-    rng = np.random.default_rng(0)
-    left, right = (np.linalg.qr(rng.normal(size=(300, 250)))[0] for _ in range(2))
-    snapshots = left * 10.0 ** -np.linspace(0, 11, 250) @ right.T
-    modes = pod(snapshots, 200).modes
-    assert np.linalg.norm(modes.T @ modes - np.eye(200), 2) <= 1e-12
-
-
-def test_the_basis_is_optimal_and_its_error_is_the_tail(coarse: Dataset) -> None:
-    snapshots = coarse.train.free_displacements
-    basis = pod(snapshots, 10)
-    rest = snapshots - snapshots @ basis.modes @ basis.modes.T
-    assert np.linalg.norm(rest) == pytest.approx(
-        np.linalg.norm(basis.singular_values[10:]), rel=1e-10
-    )
-
-
-@pytest.mark.parametrize("kind", ["duplicates", "one", "with zeros", "r above the rank"])
-def test_poor_snapshots_are_cut_to_their_rank_with_a_warning(kind: str, tiny: Dataset) -> None:
-    snapshots = tiny.train.free_displacements
-    chosen = {
-        "duplicates": np.repeat(snapshots[:4], 5, axis=0),
-        "one": snapshots[:1],
-        "with zeros": np.vstack([snapshots[:3], np.zeros((9, snapshots.shape[1]))]),
-        "r above the rank": snapshots[:6],
-    }[kind]
-    rank = {"duplicates": 4, "one": 1, "with zeros": 3, "r above the rank": 6}[kind]
-    with pytest.warns(UserWarning, match=f"rank {rank}"):
-        basis = pod(chosen, 20)
-    assert basis.modes.shape[1] == rank
-    assert np.linalg.norm(basis.modes.T @ basis.modes - np.eye(rank)) <= 1e-12
-
-
-def test_zero_snapshots_span_nothing() -> None:
-    with pytest.raises(InvalidInputError, match="all zero"):
-        pod(np.zeros((5, 8)))
+    return mor_bench.load_dataset("beam-coarse", limit=320, cache=cache)
 
 
 def test_projected_tangent_and_force(coarse: Dataset) -> None:

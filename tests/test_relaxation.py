@@ -46,24 +46,25 @@ def model(law: str = "saint-venant-kirchhoff", element: str = "H8") -> FullOrder
 
 def loads(of: FullOrderModel, numbers: list[int], factor: float = 1.0) -> NDArray[np.float64]:
     drawn = draw_loads(of.scene, 0, 200)[np.array(numbers)]
-    return (
-        factor
-        * drawn.nodal_forces(of.scene.patch_weights).reshape(len(numbers), -1)[
-            :, of.scene.free_dofs
-        ]
-    )
+    forces = drawn.nodal_forces(of.scene.patch_weights).reshape(len(numbers), -1)
+    return factor * forces[:, of.scene.free_dofs]
 
 
-@pytest.mark.parametrize("element", ELEMENTS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    ("law", "element"),
+    [
+        pytest.param(law, element, marks=() if law != "ogden" else pytest.mark.slow)
+        for law in LAWS
+        for element in ELEMENTS
+    ],
+)
 def test_it_rests_where_the_full_order_solve_ends(law: str, element: str) -> None:
     full = model(law, element)
     relaxed = DynamicRelaxation(full)
     for load in loads(full, [14, 133], 3.0):
         exact, found = full.solve(load).displacement, relaxed.solve(load, 1e-7, 5000)
-        assert np.linalg.norm(
-            load - full.force(found.displacement).force
-        ) <= 1.001e-7 * np.linalg.norm(load)
+        residual = np.linalg.norm(load - full.force(found.displacement).force)
+        assert residual <= 1.001e-7 * np.linalg.norm(load)
         assert found.min_det_f == pytest.approx(full.force(found.displacement).min_det_f, rel=1e-12)
         assert np.linalg.norm(found.displacement - exact) <= 2e-6 * np.linalg.norm(exact)
         assert found.cuts == 0
@@ -72,9 +73,7 @@ def test_it_rests_where_the_full_order_solve_ends(law: str, element: str) -> Non
 def test_mass_and_frequencies_at_rest() -> None:
     full = model()
     relaxed, pattern = DynamicRelaxation(full), full.assembler.pattern
-    stiffness = np.zeros((pattern.n, pattern.n))
-    stiffness[pattern.rows, pattern.indices] = full.rest_tangent
-    stiffness += np.triu(stiffness, 1).T
+    stiffness = pattern.symmetric(full.rest_tangent).toarray()
     values = scipy.linalg.eigh(stiffness, np.diag(relaxed.mass), eigvals_only=True)
     assert 1.0 <= values[-1] <= 0.5 * (1 + relaxation.MARGIN)
     assert relaxed.lowest == pytest.approx(values[0], rel=1e-6)
@@ -111,7 +110,7 @@ def test_an_inverted_body_is_never_an_answer() -> None:
     assert len(refused) < 12
 
 
-def test_a_body_that_came_to_rest_inverted_is_let_go_once_more() -> None:
+def test_a_body_that_rests_inverted_is_released_once_more() -> None:
     full = model("mooney-rivlin")
     relaxed = DynamicRelaxation(full)
     for load in loads(full, [20, 27, 38], 20.0):
