@@ -50,10 +50,7 @@ def test_other_answers_are_refused(tiny: Dataset) -> None:
     assert len(said) == len(METHODS) + 1 - len(fitted)
     pod = fitted["pod"]
     load = tiny.test.forces[:1], tiny.test.displacements[:1]
-    compare(
-        *load,
-        [Ours(name, fitted[name], pod) for name in ("pod", *SAME_AS_POD) if name in fitted],
-        rounds=1,
-    )  # type: ignore[arg-type]
+    same = [Ours(name, fitted[name], pod) for name in ("pod", *SAME_AS_POD) if name in fitted]  # type: ignore[arg-type]
+    compare(*load, same, rounds=1)
     with pytest.raises(DisagreementError, match="another problem"):
         compare(*load, [Ours("hpod", fitted["hpod"], pod)], rounds=1)  # type: ignore[arg-type]

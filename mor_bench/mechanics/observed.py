@@ -22,6 +22,7 @@ from mor_bench.errors import LockingWarning, NoEquilibriumError, SolverError, Un
 from mor_bench.mechanics.assembly import State
 from mor_bench.mechanics.banded import BandedFactor
 from mor_bench.mechanics.compliance import Compliance
+from mor_bench.mechanics.load_steps import LoadSteps
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.multigrid import MultigridFactor
 from mor_bench.mechanics.newton import NewtonOptions, Solution
@@ -223,21 +224,20 @@ class ObservedModel:
 
     def _solved(self, response: Array, options: NewtonOptions) -> Solution | SolverError:
         """Solve from the linear response; if that fails, in increments from rest."""
-        u, reached, increment, iterations, cuts = np.zeros(len(response)), 0.0, 1.0, 0, 0
+        u, steps, iterations = np.zeros(len(response)), LoadSteps(1.0), 0
         while True:
-            target = min(1.0, reached + increment)
-            found = self._beside(u + (target - reached) * response, options.tolerance)
+            base = u + (steps.target - steps.reached) * response
+            found = self._beside(base, options.tolerance)
             if isinstance(found, Solution):
-                iterations += found.iterations
-                if target == 1.0:
-                    return replace(found, iterations=iterations, cuts=cuts)
-                u, reached, increment = found.displacement, target, 2.0 * increment
+                iterations, u = iterations + found.iterations, found.displacement
+                steps.accept()
+                if steps.complete:
+                    return replace(found, iterations=iterations, cuts=steps.cuts)
                 continue
-            cuts += 1
-            increment *= 0.5
-            if cuts > options.max_cuts:
+            steps.cut()
+            if steps.cuts > options.max_cuts:
                 return NoEquilibriumError(
-                    f"no stable equilibrium found: stopped at {reached:.4g} of the observed "
+                    f"no stable equilibrium found: stopped at {steps.reached:.4g} of the observed "
                     f"displacement; {found}"
                 )
 

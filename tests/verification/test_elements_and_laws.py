@@ -48,7 +48,7 @@ def test_taylor(law: str, kind: tuple[str, bool]) -> None:
             there = model.force(u + h * direction)
             energy = there.energy_j - state.energy_j - h * direction @ state.force
             force = there.force - state.force - h * stiffness @ direction
-            remainders.append((abs(energy), float(np.linalg.norm(force))))
+            remainders.append((float(abs(energy)), float(np.linalg.norm(force))))
         worst = min(worst, *np.log10(np.divide(remainders[0], remainders[1])) / 3)
     assert worst >= 1.95
 
