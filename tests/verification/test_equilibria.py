@@ -16,6 +16,7 @@ import mor_bench
 from mor_bench.errors import (
     IllConditionedWarning,
     InvalidInputError,
+    InvertedElementError,
     LockingWarning,
     SolverError,
     SpecError,
@@ -405,3 +406,18 @@ def test_a_prediction_that_moves_a_clamp_has_an_error_at_least_as_large() -> Non
     indicated = [ErrorIndicator(scene)(force, v).relative_correction[0] for v in (u, moved)]
     assert indicated[0] <= 1e-6
     assert indicated[1] >= 0.99 * np.linalg.norm(moved - u) / np.linalg.norm(u)
+
+
+class Mirrored(Cubic):
+    """The same with inverted cells at every state."""
+
+    extent = 1.0
+
+    def force(self, q: Array) -> State:
+        return replace(super().force(q), min_det_f=-1.0)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_mirrored_state_without_residual_is_refused() -> None:
+    with pytest.raises(InvertedElementError, match="det F <= 0"):
+        solve_equilibrium(Mirrored(0), np.ones(1), np.full(1, 1.1))
