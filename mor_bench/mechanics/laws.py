@@ -10,6 +10,9 @@ class in `mor_bench.scene.materials`.
 the strain-displacement matrix at F (Bonet & Wood, section 9.4). It is in this file because numba
 recompiles a function only after a change in its own file. Saint Venant-Kirchhoff on H8 has its own,
 vectorised kernel.
+
+Longer than 400 lines because numba recompiles a function only after a change in its own file, so
+laws and the kernels that call them stay together.
 """
 
 from __future__ import annotations

@@ -246,13 +246,8 @@ def sparse_nnls(
         if gradient[entering] <= LEAST_GRADIENT * size:
             break
         iterations += 1
-        # A dependent column, or one that cannot have a positive weight, would enter for ever.
-        if not columns.append(entering):
-            rejected[entering] = True
-            continue
-        trial = columns.coefficients()
-        if trial[-1] <= 0:
-            columns.remove(entering)
+        trial = _appended(columns, entering)
+        if trial is None:
             rejected[entering] = True
             continue
         rejected = unusable.copy()
@@ -261,6 +256,20 @@ def sparse_nnls(
     found = SparseWeights.of(matrix, target, columns.weights(x), iterations)
     _check(found, tolerance)
     return found
+
+
+def _appended(columns: ActiveColumns, entering: int) -> Array | None:
+    """Append a column and return the coefficients; None if it cannot have a positive weight.
+
+    A dependent column, or one with a negative weight, would enter for ever.
+    """
+    if not columns.append(entering):
+        return None
+    trial = columns.coefficients()
+    if trial[-1] > 0:
+        return trial
+    columns.remove(entering)
+    return None
 
 
 def _positive(columns: ActiveColumns, x: Array, trial: Array) -> tuple[Array, int]:

@@ -89,17 +89,9 @@ def empirical_cubature(
     max_iterations : int, optional
         Most columns added or removed; 3 n by default.
 
-    Returns
-    -------
-    SparseWeights
-        Non-negative; its residual, at most `EXACT`, is that of the equations for the weights.
-
-    Raises
-    ------
-    InvalidInputError
-        If an entry is not finite.
-    CubatureError
-        If the equations are not solved within the iterations, or the matrix is zero.
+    Returns non-negative weights with the residual, at most `EXACT`, of their equations. Raises
+    `InvalidInputError` if an entry is not finite, and `CubatureError` if the matrix is zero or the
+    equations are not solved within the iterations.
     """
     equations = _equations(matrix, tolerance)
     target = equations.sum(axis=1)

@@ -42,8 +42,7 @@ def sensitivities(
 ) -> Sensitivities:
     """Differentiate f(u) = B t at the snapshots: du/dt = K(u)⁻¹ B.
 
-    Each sample takes one factorisation and 3k back-solves. B are unit forces along the axes on the
-    patches that the sample loads; samples never leave these directions.
+    Each sample takes one factorisation and 3k back-solves. B are unit forces on its own patches.
 
     Parameters
     ----------
@@ -58,8 +57,7 @@ def sensitivities(
     Returns
     -------
     Sensitivities
-        Inputs and outputs are zero, which fits any linear map, where K(u) is not positive definite.
-        A warning counts those samples.
+        Zero, which fits any linear map, where K(u) is not positive definite; a warning says so.
 
     Raises
     ------
@@ -70,9 +68,7 @@ def sensitivities(
     """
     loads, scene = snapshots.loads, snapshots.scene
     if not isinstance(loads, PatchLoads):
-        raise InvalidInputError(
-            "derivatives with respect to the load need snapshots of forces on patches."
-        )
+        raise InvalidInputError("derivatives along the load need snapshots of patch forces.")
     n, k = loads.patches.shape
     inputs, outputs = np.zeros((n, 3 * k, axes.shape[1])), np.zeros((n, 3 * k, modes.shape[1]))
     at_rest = _RestResponses(model, axes, modes, of_force)
