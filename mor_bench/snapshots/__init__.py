@@ -5,6 +5,6 @@ test sets, and what a method is given. Not here: methods, errors of predictions,
 This package imports only `errors`, `specs`, `scene` and `mechanics`.
 
 Start with `dataset.py`: `load_dataset` reads a dataset as `Snapshots`. Then `sampling.py` (which
-forces act in sample i), `generate.py` with `solve.py` and `executors.py`, `store.py` and
-`manifest.py` (files), `split.py` and `test_sets.py`.
+forces act in sample i: kinds of load and sampling plans), `generate.py` with `solve.py` and
+`executors.py`, `store.py` and `manifest.py` (files), `split.py` and `test_sets.py`.
 """
