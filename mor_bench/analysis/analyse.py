@@ -19,11 +19,11 @@ from mor_bench.results.comparison import Comparison
 def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -> dict[str, Any]:
     """Draw all conclusions from the rows and raw samples of a comparison.
 
-    All intervals hold 95 %. Those of errors come from a bootstrap over the load regions of the test
-    set, the same for all methods, and over training seeds where there are several. Those of
-    latencies come from the spread between fresh processes; what the configurations share cancels
-    in ratios. Nothing is corrected for the number of comparisons: of twenty equal pairs, one may be
-    called different.
+    All intervals have a level of 95 %. Errors are resampled by a bootstrap over the load regions of
+    the test set, the same for all methods, and over training seeds if there are several. Intervals
+    of latencies come from the spread between fresh processes; effects that all configurations share
+    cancel in ratios. Nothing is corrected for the number of comparisons: about one in twenty pairs
+    of equal methods is called different.
 
     Parameters
     ----------
@@ -34,16 +34,16 @@ def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -
     Returns
     -------
     dict
-        `rows`: value, low and high of the headlines of each configuration.
-        `time_at_error`, `error_at_time`: those of `mor_bench.analysis.frontier.compare` with
+        `rows`: value, low and high of the main figures of each configuration.
+        `time_at_error`, `error_at_time`: records of `mor_bench.analysis.frontier.compare` with
         `exists` (whether a real configuration meets the target), `low`, `high` (None where not
         reached) and `not_reached`, the share of resamples that do not reach the target.
         `pairwise`: for each ordered pair of methods and error, the ratio of their times and the
         verdict on the first.
         `break_even`, `profile`, `hidden`, `regimes`, `tuning`: see the functions of these names.
-        `clusters`: what the bootstrap of each dataset resamples, and their number.
-        `timing`: the processes of each dataset, and the relative standard deviations of what is
-        specific to a configuration and of what all share; None if there is only one process.
+        `clusters`: the resampled units of each dataset's bootstrap, and their number.
+        `timing`: the processes of each dataset, and two relative standard deviations: one specific
+        to each configuration, one common to all. None if there is only one process.
     """
     analysis: dict[str, Any] = {
         "settings": {"n_resamples": n_resamples, "seed": seed, "level": LEVEL},
@@ -73,6 +73,6 @@ def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -
 
 
 def needed_error(comparison: Comparison, dataset: str) -> float | None:
-    """Relative L2 error that a dataset's file asks for, as a fraction; None if it asks for none."""
+    """Relative L2 error that a dataset's file requires, as a fraction; None if it requires none."""
     value = (comparison.datasets.get(dataset, {}).get("needs") or {}).get("error")
     return None if value is None else float(value)

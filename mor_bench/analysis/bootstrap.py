@@ -24,7 +24,7 @@ def student_t(level: float, df: float) -> float:
 def cluster_numbers(regions: NDArray[np.int64] | None, n_samples: int) -> NDArray[np.int64]:
     """Number the load regions of each test sample from 0, as an (n_samples, k) array.
 
-    Each sample is a cluster of its own where fewer than two regions are known.
+    If fewer than two regions are known, each sample is a cluster of its own.
     """
     if regions is not None and len(regions) == n_samples:
         names, numbers = np.unique(regions, return_inverse=True)
@@ -54,7 +54,7 @@ def resample_weights(
     Returns
     -------
     (n_samples, n) int32
-        No column is all zero.
+        Each column has a positive count.
     """
     n_clusters = int(clusters.max()) + 1
     weights = np.empty((len(clusters), n), dtype=np.int32)
@@ -74,7 +74,7 @@ def resample_weights(
 def weighted_medians(
     values: NDArray[np.float64], weights: NDArray[np.int32]
 ) -> NDArray[np.float64]:
-    """Medians (n,) of values (n_samples,), repeated as the weights (n_samples, n) say."""
+    """Medians (n,) of values (n_samples,), with integer weights (n_samples, n)."""
     order = np.argsort(values)
     ordered, below = values[order], np.cumsum(weights[order], axis=0, dtype=np.int32)
     size = below[-1]
@@ -83,7 +83,7 @@ def weighted_medians(
 
 
 def weighted_means(values: NDArray[np.float64], weights: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Means (n,) of values (n_samples,), repeated as the weights (n_samples, n) say."""
+    """Means (n,) of values (n_samples,), with integer weights (n_samples, n)."""
     with np.errstate(invalid="ignore"):
         failed = ~np.isfinite(values)
         means = np.where(failed, 0.0, values) @ weights / weights.sum(axis=0)
@@ -95,9 +95,9 @@ def weighted_means(values: NDArray[np.float64], weights: NDArray[np.int32]) -> N
 def widening(n_clusters: int) -> float:
     """Factor that corrects the spread of resamples of few clusters; 1.16 for 13 clusters.
 
-    Resamples of K clusters vary too little, by sqrt((K - 1) / K). Percentiles assume a normal
-    distribution, but Student's t with K - 1 degrees of freedom applies (Hesterberg 2015, What
-    teachers should know about the bootstrap).
+    Resamples of K clusters vary too little, by the factor sqrt((K - 1) / K). Percentiles assume a
+    normal distribution, but Student's t with K - 1 degrees of freedom applies (Hesterberg 2015,
+    What teachers should know about the bootstrap).
     """
     from scipy.special import ndtri
 

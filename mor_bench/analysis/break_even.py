@@ -17,8 +17,8 @@ def break_even(rows: Sequence[Row], at_error: Sequence[dict[str, Any]]) -> list[
     """Count the queries after which the offline time of a method pays off, at each error.
 
     The count is the offline time (data and fit) divided by the time that a query saves. It compares
-    the method's fastest configuration at that error with the fastest full-order configuration
-    that is at least as accurate.
+    two configurations: the method's fastest at that error, and the fastest full-order one that is
+    at least as accurate.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def break_even(rows: Sequence[Row], at_error: Sequence[dict[str, Any]]) -> list[
     -------
     list of dict
         `queries`, or None with the `verdict` (``never``, ``not reached``, ``unknown``) and its
-        `reason`; and the figures that the count follows from.
+        `reason`; and the figures from which the count is computed.
     """
     ran = [row for row in rows if row.status == "ok"]
     return [_break_even(ran, record) for record in at_error if record["method"] != FULL_ORDER]

@@ -12,7 +12,7 @@ from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 
 HIDDEN_WORSE = 1.2
-"""Ratio of the errors on the hidden and the shipped test set that is never called worse."""
+"""Ratio of the errors on the hidden and the shipped test set up to which none is called worse."""
 
 
 def hidden(
@@ -20,9 +20,9 @@ def hidden(
 ) -> list[dict[str, Any]]:
     """Compare the errors of each configuration on the hidden and on the shipped test set.
 
-    `worse` if the ratio of the medians exceeds `limit`, which follows from the sizes of both sets:
-    the half-width of the shipped set's interval on the log scale, times
-    sqrt(1 + n shipped / n hidden), but at least `HIDDEN_WORSE`.
+    A configuration is `worse` if the ratio of the medians exceeds `limit`. On the log scale, the
+    limit is the half-width of the shipped set's interval times sqrt(1 + n shipped / n hidden), but
+    at least log `HIDDEN_WORSE`.
     """
     out = []
     for row in rows:
@@ -48,9 +48,9 @@ def hidden(
 
 
 def regimes(comparison: Comparison) -> list[dict[str, Any]]:
-    """Say whether each method was tested in the regime that its file names, and what was missing.
+    """Compare each method's tests with the regime that its file names; list unmet conditions.
 
-    Empty if no file names a regime.
+    The list is empty if no file names a regime.
     """
     out: list[dict[str, Any]] = []
     if not any((method or {}).get("regime") for method in comparison.methods.values()):
@@ -97,9 +97,9 @@ def _missing(row: Row, regime: Mapping[str, Any], device: str) -> list[str]:
 
 
 def tuning(comparison: Comparison) -> list[dict[str, Any]]:
-    """Compare what each method tried on each dataset with its tuning budget.
+    """Compare the tuning of each method on each dataset with its tuning budget.
 
-    The seconds are those of fitting, failed fits included.
+    The seconds are those of fitting, including failed fits.
     """
     budget = comparison.settings.get("budget") or {}
     out = []

@@ -48,12 +48,12 @@ class Draws:
     rows : list of Row
         The rows that have a latency and an error.
     log_latencies, log_errors : (n_rows, n) float64
-        Natural logarithms. Resample i of all rows has the same load regions and processes.
+        Natural logarithms. Resample i uses the same load regions and processes in all rows.
     intervals : dict
         By label: the intervals of `rel_l2_median`, `mean_dof_m` and `latency_ms`, where there are
         raw samples.
     clusters, timing : dict
-        What was resampled, and the spread between processes; empty without raw samples.
+        The resampled units, and the spread between processes; empty without raw samples.
     """
 
     rows: list[Row]
@@ -122,7 +122,7 @@ def _timing_facts(raw: Mapping[str, Samples]) -> dict[str, Any]:
 
 
 class _Resampler:
-    """Bootstrap of errors: all configurations with as many test samples share their resamples."""
+    """Bootstrap of errors. Configurations with equal numbers of test samples share resamples."""
 
     def __init__(
         self, regions: NDArray[Any] | None, n: int, generator: np.random.Generator
@@ -144,10 +144,10 @@ class _Resampler:
         return self._weights[n_samples]
 
     def median_errors(self, samples: Samples) -> NDArray[np.float64]:
-        """Draw median relative L2 errors over load regions and, where there are several, seeds.
+        """Draw median relative L2 errors over load regions and, if there are several, over seeds.
 
-        Another training seed changes the error by the ratio of its median to the geometric mean
-        of all seeds' medians.
+        Drawing another training seed multiplies the error by the ratio of that seed's median to the
+        geometric mean of all seeds' medians.
         """
         values = np.asarray(samples["relative_l2"], dtype=float)
         weights, factor = self._resamples(len(values))
@@ -165,7 +165,7 @@ class _Resampler:
         return np.asarray(draws * self.generator.choice(ratios, draws.size))
 
     def mean_interval(self, mean_dof_m: NDArray[Any]) -> Interval:
-        """Interval of the mean over the test set of each sample's error, m."""
+        """Interval of the mean of the samples' errors over the test set, m."""
         e = np.asarray(mean_dof_m, dtype=float)
         weights, factor = self._resamples(len(e))
         bounds = float(e.min()), float(e.max())
@@ -173,14 +173,14 @@ class _Resampler:
 
 
 def finite_or_none(value: float) -> float | None:
-    """Replace an infinite figure by None, which is what JSON can hold."""
+    """Replace an infinite figure by None, because JSON has no infinity."""
     return float(value) if isfinite(value) else None
 
 
 def headlines(row: Row, draws: Draws) -> dict[str, Any]:
     """Value, low and high of the median error, the mean error and the median latency of a row.
 
-    An interval of the latency that was stored with the row takes precedence.
+    A latency interval that was stored with the row takes precedence.
     """
     error, latency = row.error, row.latency_ms
     intervals = draws.intervals[row.label]

@@ -24,7 +24,7 @@ TARGET_TIMES_MS = (0.1, 1.0, 3.0, 10.0, 33.0, 100.0)
 """Median latencies of one query, ms."""
 
 EXACT = 1e-16
-"""Stands for an error of zero, which has no logarithm: the round-off of double precision."""
+"""Replaces an error of zero, which has no logarithm: the round-off of double precision."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def non_dominated(points: Sequence[Point]) -> list[Point]:
 
 def _interpolate(x: float, x0: float, y0: float, x1: float, y1: float) -> float:
     span = log(x1) - log(x0)
-    if span == 0:  # neighbouring floats may have one logarithm
+    if span == 0:  # neighbouring floats may have the same logarithm
         return min(y0, y1)
     share = (log(x) - log(x0)) / span
     return exp(log(y0) + share * (log(y1) - log(y0)))
@@ -56,7 +56,7 @@ def _interpolate(x: float, x0: float, y0: float, x1: float, y1: float) -> float:
 def time_at_error(points: Sequence[Point], target: float) -> dict[str, Any]:
     """Return the interpolated latency at an error, and the fastest real configuration there.
 
-    If the fastest configuration of all meets the target, its latency is both. None: not reached.
+    If the fastest configuration of all meets the target, both are its latency. None: not reached.
     """
     front = non_dominated(points)
     real = next((p for p in front if p.error <= target), None)
@@ -103,18 +103,19 @@ def frontier_draws(
     """Compute `time_at_error` and `error_at_time` for many resamples at once.
 
     Parameters
+    Parameters
     ----------
     log_latencies, log_errors : (n_configurations, n) float64
-        Natural logarithms of ms and of relative L2 errors; no error is below `EXACT`.
+        Natural logarithms of latencies in ms and of relative L2 errors; no error is below `EXACT`.
     errors, times_ms : sequence of float
         Targets.
 
     Returns
     -------
     (n_errors, n) float64
-        Logarithms of the latencies at the errors, infinite where not reached.
+        Logarithms of the latencies at the errors; infinite where not reached.
     (n_times, n) float64
-        Logarithms of the errors at the latencies, infinite where not reached.
+        Logarithms of the errors at the latencies; infinite where not reached.
     """
     order = np.lexsort((log_errors, log_latencies), axis=0)
     latency, error = (
@@ -157,7 +158,7 @@ def _share(x: float, start: NDArray[np.float64], end: NDArray[np.float64]) -> ND
 
 
 def number_or_inf(value: float | None) -> float:
-    """A figure of a row; infinite if there is none, or if it is not a number."""
+    """Return a figure of a row; infinity if it is missing or not a number."""
     return inf if value is None or isnan(value) else float(value)
 
 
@@ -172,14 +173,14 @@ def median_latency_ms(row: Row) -> float:
 
 
 def is_point(row: Row) -> bool:
-    """Tell whether a row has a place on the plane: it ran, was timed and was scored."""
+    """Return whether a row ran, was timed and was scored, so that it has an error and a latency."""
     return row.status == "ok" and row.error is not None and 0 < median_latency_ms(row) < inf
 
 
 def compare(rows: Sequence[Row]) -> dict[str, Any]:
     """Time at error and error at time of all methods on all datasets.
 
-    A method without a usable row reaches nothing.
+    A method without a usable row reaches no target.
     """
     at_error, at_time = [], []
     for dataset, method in dict.fromkeys((row.dataset, row.method) for row in rows):

@@ -1,6 +1,7 @@
 """Uncertainty of latencies that were measured in a few fresh processes.
 
-Queries agree far better within a process than between processes. So processes count, not queries.
+Queries agree far better within a process than between processes. So the number of processes sets
+the uncertainty, not the number of queries.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ TYPICAL_SPREAD = 0.014
 """Relative standard deviation of a configuration's median between processes, quiet machine."""
 
 TYPICAL_DRIFT = 0.02
-"""Relative standard deviation of a drift that all configurations share, between runs minutes apart.
+"""Relative standard deviation of a drift common to all configurations, between runs minutes apart.
 
 It is 0.7 % within a run, and it cancels in ratios.
 """
 
 PRIOR_DF = 2.0
-"""Degrees of freedom of the typical values: two processes may agree by chance to 0.01 %."""
+"""Degrees of freedom of the typical values: two processes can agree to 0.01 % by chance."""
 
 Samples = Mapping[str, NDArray[Any]]
-"""Raw samples of a configuration: `latency_ms` (n,), and of each query its `process` and `round`.
+"""Raw samples of a configuration: `latency_ms`, `process` and `round` of each query, (n,) each.
 
 A missing `process` or `round` counts as a single one.
 """
@@ -42,7 +43,7 @@ class Spread:
     df: float
 
     def moderated(self, typical: float) -> Spread:
-        """Mix in a typical spread; with a single process the typical spread remains."""
+        """Pool with a typical spread; with a single process, only the typical spread counts."""
         df = self.df + PRIOR_DF
         return Spread(sqrt((self.df * self.sd**2 + PRIOR_DF * typical**2) / df), df)
 
@@ -54,11 +55,11 @@ class Spreads:
     Attributes
     ----------
     common : Spread
-        Shared by all configurations of a process, such as the machine's drift. Cancels in ratios.
+        Common to all configurations of a process, such as the machine's drift. Cancels in ratios.
     specific : Spread
         The rest, pooled over the configurations.
     own : (n,) float64
-        The specific part of each configuration alone; NaN with a single process.
+        Specific standard deviation of each configuration alone; NaN with a single process.
     """
 
     common: Spread
@@ -95,8 +96,8 @@ def _cube(all_samples: Sequence[Samples]) -> NDArray[np.float64]:
 def spreads_of(all_samples: Sequence[Samples]) -> Spreads:
     """Estimate the spread between processes by a two-way analysis of variance of the log medians.
 
-    The configurations were timed in turn, so process p and round r are the same moment for all.
-    With a single configuration all spread counts as specific.
+    The configurations were timed in turns, so process p and round r are the same moment for all.
+    With a single configuration, all spread counts as specific.
     """
     cube = _cube(all_samples)
     n, degrees = len(cube), np.maximum(np.isfinite(cube).any(axis=2).sum(axis=1) - 1.0, 0.0)
@@ -148,9 +149,9 @@ def n_processes_of(samples: Samples) -> int:
 
 
 def _latency_interval(samples: Samples, pooled: Spreads) -> tuple[float, float]:
-    """Prediction interval of one configuration, ms, from the larger of two spreads.
+    """Prediction interval of one configuration, ms.
 
-    These are the spread pooled over all configurations, and the configuration's own.
+    It uses the larger of two spreads: the pooled one and the configuration's own.
     """
     own = spreads_of([samples]).own[0]
     common = pooled.common.moderated(TYPICAL_DRIFT)
@@ -166,21 +167,21 @@ def _latency_interval(samples: Samples, pooled: Spreads) -> tuple[float, float]:
 
 
 def _without(total: float, part: float) -> float:
-    """Standard deviation that remains of a total after an independent part is removed."""
+    """Standard deviation that remains after an independent part is removed from a total."""
     return sqrt(max(total**2 - part**2, 0.0))
 
 
 def latency_intervals(samples_by_label: Mapping[str, Samples]) -> dict[str, tuple[float, float]]:
     """Return the 95 % prediction intervals for the medians of a repeated measurement, in ms.
 
-    The repetition follows the same protocol with as many fresh processes, so an interval contains
-    the noise of both measurements. More processes average out the specific noise, not a drift that
-    they share. A drift slower than the whole run cannot be known from the run.
+    The repetition uses the same protocol and as many fresh processes, so an interval contains the
+    noise of both measurements. More processes average out the specific noise, but not a drift that
+    they share. A run cannot show a drift that is slower than the run.
 
     Parameters
     ----------
     samples_by_label : mapping of mapping
-        Raw samples of configurations that were timed together; those without any are left out.
+        Raw samples of configurations that were timed together; empty ones are left out.
     """
     timed = {label: s for label, s in samples_by_label.items() if len(s.get("latency_ms", ()))}
     if not timed:
@@ -190,7 +191,7 @@ def latency_intervals(samples_by_label: Mapping[str, Samples]) -> dict[str, tupl
 
 
 def verdict_of(low: float, high: float) -> str:
-    """Verdict on the first of two, from the interval of the log ratio of their latencies."""
+    """Verdict on the first of two configurations, from the interval of their log latency ratio."""
     return "faster" if high < 0 else "slower" if low > 0 else "undecided"
 
 
@@ -200,10 +201,10 @@ def latency_draws(
     n: int,
     generator: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Draw log latencies (n_configurations, n) as other sets of processes would give them.
+    """Draw log latencies (n_configurations, n) as repeated measurements would give them.
 
-    A draw is the sum of a part that all configurations share, which cancels in ratios, and a part
-    of each configuration. Both follow Student's t with the pooled degrees of freedom.
+    A draw is the sum of a part that is common to all configurations and cancels in ratios, and a
+    part of each configuration. Both follow Student's t with the pooled degrees of freedom.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ def add_intervals(
         `time_at_error` and `error_at_time` of the dataset; changed in place.
     draws : Draws
     needed : float or None
-        Relative L2 error that the dataset needs: a further target of the pairs.
+        Relative L2 error that the dataset requires: one more target of the pairs.
     """
     wanted = {needed} if needed and isfinite(needed) and needed > 0 else set()
     targets = sorted({*TARGET_ERRORS, *wanted}, reverse=True)
@@ -86,9 +86,9 @@ def _method_draws(
 def _add_interval(record: Record, key: str, draws: NDArray[np.float64]) -> None:
     low, high = (np.exp(end) for end in central_interval(draws))
     value = record[key]
-    if value is not None:  # a median of few samples can lie outside the quantiles of its resamples
+    if value is not None:  # the median of few samples can lie outside its bootstrap quantiles
         low, high = min(low, value), max(high, value)
-    if key == "error":  # draws of an error of zero lie at the round-off
+    if key == "error":  # draws of an error of zero equal the round-off
         low, high = (0.0 if end <= EXACT else end for end in (low, high))
     record.update(
         exists=record["best"] is not None, low=finite_or_none(low), high=finite_or_none(high)
@@ -114,10 +114,8 @@ def _measured_times(
 def _pair(values: dict[str, float], times: LogTimes, target: float) -> Record:
     """Ratio of the times of two methods at an error; an end is None if one may not reach it.
 
-    Parameters
-    ----------
-    values : dict
-        By method, a first: the log latency at the error, infinite if not reached.
+    `values` holds the log latency at the error by method, the first method first; infinite if not
+    reached.
     """
     missing = [name for name, value in values.items() if not isfinite(value)]
     if missing:

@@ -1,7 +1,7 @@
 """Performance profile: how many problems each method solves within a factor of the fastest.
 
-Source: Dolan, Moré 2002, Benchmarking optimization software with performance profiles. Only the
-fastest method and the one that solves most can be read from it: the order of the others depends on
+Source: Dolan, Moré 2002, Benchmarking optimization software with performance profiles. A profile
+shows the fastest method and the one that solves most problems. The order of the others depends on
 which methods take part (Gould, Scott 2016).
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 
 
 def profile(at_error: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Compute the performance profile over problems, each a dataset at an error.
+    """Compute the performance profile. A problem is a dataset at an error.
 
     Problems that no method solves are left out and counted.
 
@@ -24,7 +24,7 @@ def profile(at_error: Sequence[dict[str, Any]]) -> dict[str, Any]:
     Returns
     -------
     dict
-        `problems`: (dataset, error) of each; `n_unsolved`; `n_datasets`; `factors`: by method the
+        `problems`: (dataset, error) of each; `n_unsolved`; `n_datasets`; `factors`: by method, the
         factor of each problem, None where not solved.
     """
     times: dict[tuple[str, float], dict[str, float]] = {}

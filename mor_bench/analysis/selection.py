@@ -1,11 +1,11 @@
-"""Choose the cheapest configuration that meets what a scene needs, from the rows of a comparison.
+"""Choose the cheapest configuration that meets a scene's requirements, from a comparison's rows.
 
 A configuration qualifies only if its 95 % upper bounds meet the limits, on the test set and on a
-fresh one. One that left a test load without an answer never qualifies, nor does an unknown figure.
+fresh one. It does not qualify if a figure is unknown or a test load has no answer.
 
-Among those that qualify, the one with the least offline cost is chosen: data generation and
-fitting are paid again for every new body, material or support. Offline seconds are compared to two
-digits and whole seconds, because repeated trainings differ by less. Then the lower latency counts.
+The qualifying configuration with the least offline cost is chosen: data generation and fitting are
+paid again for every new body, material or support. Offline seconds are rounded to two digits and
+whole seconds, because repeated trainings differ by less. A tie goes to the lower latency.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ class Requirements:
     Attributes
     ----------
     error
-        Median relative l2 error over the test set.
+            Median relative L2 error over the test set, as a fraction.
     latency_ms
         Median latency of one query, ms.
     memory_bytes
-        Peak memory of a process that predicts.
+            Peak memory of a predicting process, bytes.
     offline_s
-        Core-seconds of data generation and seconds of fitting together.
+            Sum of data generation, core-seconds, and fitting, seconds.
 
     Raises
     ------
@@ -64,14 +64,14 @@ class Requirements:
 
 @dataclass(frozen=True)
 class Relaxation:
-    """One limit whose change alone lets a configuration qualify.
+    """One limit that would let a configuration qualify if it alone changed.
 
     Attributes
     ----------
     name : str
         Name of the requirement.
     asked, needed : float
-        The limit, and the least limit that suffices.
+        The present limit, and the strictest one that suffices.
     row : Row
         The configuration that then qualifies.
     """
@@ -93,7 +93,7 @@ class Pick:
     choice, runner_up : Row or None
         The cheapest configuration that qualifies, and the cheapest of another method.
     relaxations : list of Relaxation
-        Without a choice: the requirements that could be relaxed alone.
+        Without a choice: the single limits whose relaxation suffices.
     nearest : Row or None
         Without a choice: the configuration that exceeds the limits by the smallest factor.
     unknown : list of str
@@ -122,7 +122,7 @@ class Pick:
     kind: str = ""
 
     def as_json(self) -> dict[str, Any]:
-        """Return everything for `json.dumps`; infinite errors are strings."""
+        """Return everything for `json.dumps`; infinite errors become strings."""
         rows = {name: getattr(self, name) for name in ("choice", "runner_up", "nearest")}
         content = {
             **vars(self),
@@ -136,7 +136,7 @@ class Pick:
         return plain
 
     def text(self) -> str:
-        """Return a few lines for people."""
+        """Return a few lines of text for readers."""
         limits = [limit_text(name, limit) for name, limit in self.requirements.asked.items()]
         counted = f"{self.n_configurations} configurations"
         excluded = (
@@ -230,7 +230,7 @@ def choose(rows: Sequence[Row], requirements: Requirements, dataset: str) -> Pic
 def offline_rank(row: Row) -> tuple[bool, float]:
     """Return offline seconds for comparison: two digits, whole seconds.
 
-    A row whose data have no known cost comes last, by the cost of its fit.
+    Rows with unknown data cost come last, ordered by fitting time.
     """
     if row.offline_s is None:
         return True, inf
@@ -240,7 +240,7 @@ def offline_rank(row: Row) -> tuple[bool, float]:
 
 
 def _answers_all(row: Row) -> bool:
-    """Tell whether a configuration answered every test load and every fresh one."""
+    """Return whether a configuration answered every test load and every fresh load."""
     return row.ok and row.n_failed == 0 and not (row.hidden and row.hidden.rel_l2_max == inf)
 
 
@@ -257,7 +257,7 @@ def _excesses(row: Row, requirements: Requirements) -> dict[str, float]:
 
 
 def _nearest(rows: Sequence[Row], requirements: Requirements) -> Row | None:
-    """Return the row whose largest excess over a limit, as a factor, is the least."""
+    """Return the row with the smallest largest factor over a limit."""
 
     def excess(row: Row) -> float:
         return max(_excesses(row, requirements).values(), default=0.0)
@@ -267,7 +267,7 @@ def _nearest(rows: Sequence[Row], requirements: Requirements) -> Row | None:
 
 
 def _relaxation(name: str, asked: Mapping[str, float], rows: Sequence[Row]) -> Relaxation | None:
-    """Return the least limit on one figure that lets a row qualify; None if no limit does."""
+    """Return the strictest limit on one figure that lets a row qualify; None if there is none."""
     others = {other: limit for other, limit in asked.items() if other != name}
     able = [row for row in rows if _meets(row, others) and figure(row, name) < inf]
     row = min(able, key=lambda row: (figure(row, name), _rank(row)), default=None)

@@ -27,12 +27,12 @@ COLUMNS = ("result", "params", "version", *(f"stats_{name}" for name in STATISTI
 """asv's columns of a result."""
 
 Key = tuple[str, ...]
-"""Values of a benchmark's parameters, each as Python prints it, which is how asv stores them."""
+"""Values of a benchmark's parameters, stored by asv as Python prints them."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A value with its statistics: NaN means not measured, None means failed."""
+    """A value with its statistics. NaN means not measured, and None means failed."""
 
     value: float | None
     statistics: Mapping[str, float] = field(default_factory=dict)
@@ -42,7 +42,7 @@ Figures = dict[Key, Figure]
 
 
 def to_columns(figures: Figures) -> list[Any]:
-    """Arrange figures in asv's order, that of the product of the parameters' values."""
+    """List figures in asv's order: the product of the parameters' values."""
     parameters = [list(dict.fromkeys(column)) for column in zip(*figures, strict=True)]
     listed = [figures.get(key, Figure(math.nan)) for key in itertools.product(*parameters)]
     columns = [[figure.statistics.get(name) for figure in listed] for name in STATISTICS]
@@ -68,12 +68,12 @@ def from_columns(content: list[Any]) -> Figures:
 
 
 def read_file(path: Path, kind: str) -> dict[str, Any] | None:
-    """Read one of asv's files without its version; None if it does not exist.
+    """Read one of asv's files without its version number; None if it does not exist.
 
     Raises
     ------
     StoreError
-        If it is not a file of asv, or of another version.
+        If the file is not asv's, or has another version.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -97,13 +97,13 @@ def write_file(path: Path, content: Mapping[str, Any], kind: str) -> None:
 
 
 def machine_name(ran_on: Mapping[str, Any], name: str | None) -> str:
-    """Check a machine's name on the dashboard, by default this machine's.
+    """Check and return the name of a machine on the dashboard; the default is this machine's.
 
     Raises
     ------
     InvalidInputError
-        If the name has other characters than a file may have, or the comparison ran on another
-        machine than this one and no name is given.
+        If the name has characters that a file name must not have, or if no name is given and the
+        comparison ran on another machine.
     """
     if name is None:
         here = describe_machine()
@@ -123,7 +123,7 @@ def machine_name(ran_on: Mapping[str, Any], name: str | None) -> str:
 
 
 def describe_for_asv(ran_on: Mapping[str, Any], name: str) -> dict[str, str]:
-    """Describe a machine as asv does, so that both results are under one machine."""
+    """Describe a machine as asv does, so that asv files both results under one machine."""
     here = name == platform.node()
     return {
         "arch": platform.machine() if here else "",
@@ -143,12 +143,12 @@ def _memory() -> str:
 
 
 def commit_and_date(commit: str | None) -> tuple[str, int]:
-    """Look up the hash of a commit of the working folder's checkout, and its date, ms since 1970.
+    """Look up the hash of a commit in the working folder's checkout, and its date, ms since 1970.
 
     Raises
     ------
     InvalidInputError
-        If the working folder is not in a checkout of mor-bench, or there is no such commit.
+        If the working folder is not in a checkout of mor-bench, or the commit does not exist.
     """
     top = _git("rev-parse", "--show-toplevel")
     project = Path(top) / "pyproject.toml" if top else None

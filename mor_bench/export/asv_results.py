@@ -1,8 +1,8 @@
 """A comparison as result files of asv (airspeed velocity), whose dashboard shows many commits.
 
-OUT/benchmarks.json                    the benchmarks; entries of asv's own are left unchanged
-OUT/MACHINE/machine.json               left unchanged if it exists
-OUT/MACHINE/COMMIT-mor-bench-py*.json  the figures of one commit; asv's own have other file names
+OUT/benchmarks.json                    the benchmarks; asv's own entries are kept
+OUT/MACHINE/machine.json               kept if it exists
+OUT/MACHINE/COMMIT-mor-bench-py*.json  the figures of one commit, apart from asv's own files
 
 Every figure is better when lower, because asv reports an increase as a regression.
 """
@@ -38,14 +38,9 @@ PARAMETERS = ("configuration", "setting")
 
 @dataclass(frozen=True)
 class _Quantity:
-    """A figure of a row, times `factor` or inverted, as a benchmark of asv.
+    """A figure of a row as a benchmark of asv, multiplied by `factor` or inverted.
 
-    Attributes
-    ----------
-    kind, unit, about : str
-        As asv shows them.
-    part, name : str
-        The figure's place in the row.
+    `kind`, `unit` and `about` are asv's texts. `part` and `name` locate the figure in the row.
     """
 
     kind: str
@@ -100,7 +95,7 @@ QUANTITIES = {
     "peak_memory_predict": _memory("predict", "Peak resident memory of queries."),
     **{f"query_in_batch_{size}": _batch(size) for size in ("8", "64", "512")},
 }
-"""Exported figures by the last part of the benchmark's name."""
+"""Exported figures, by the last part of the benchmark's name."""
 
 
 def export_asv(
@@ -112,27 +107,27 @@ def export_asv(
 ) -> list[Path]:
     """Add a comparison's figures for one commit to asv's folder; return the written files.
 
-    Existing results stay, except those of the same configuration in the same setting. A skipped
+    Results of the same configuration in the same setting are replaced; others are kept. A skipped
     configuration is left out; a failed one is a failure in asv too.
 
     Parameters
     ----------
     comparison : Comparison
-        A setting is its profile and, for each row, split, sample counts and threads.
+        A setting is its profile and, for each row, the split, sample counts and threads.
     out : path
         `results_dir` of asv.conf.json; created if it does not exist.
     commit : str, optional
         Name or hash of the commit that ran the comparison. Default: the one that is checked out.
     machine : str, optional
-        Name of the machine on the dashboard. Default: this machine's, if the comparison ran on it.
+        Name of the machine on the dashboard. Default: this machine, if the comparison ran on it.
 
     Raises
     ------
     InvalidInputError
-        If the working folder is not a checkout of mor-bench or has no such commit, if the
-        comparison ran on another machine and `machine` is not given, or if no row has finished.
+        If the working folder is not a checkout of mor-bench or lacks the commit, if the comparison
+        ran on another machine and `machine` is not given, or if no row has finished.
     StoreError
-        If a file in `out` is not one of asv's, or of another version.
+        If a file in `out` is not asv's, or has another version.
     """
     out = Path(out)
     commit_hash, date = commit_and_date(commit)
@@ -166,7 +161,7 @@ def export_asv(
 
 
 def _merged(path: Path, commit_hash: str, figures: Mapping[str, Figures]) -> dict[str, Any]:
-    """Add figures to the results that a file has, in asv's columns."""
+    """Merge figures into the results of a file, in asv's columns."""
     before = _read_results(path) or {"results": {}, "commit_hash": commit_hash}
     if before["commit_hash"] != commit_hash:
         raise StoreError(
@@ -180,14 +175,14 @@ def _merged(path: Path, commit_hash: str, figures: Mapping[str, Figures]) -> dic
 
 
 def describe(out: str | Path) -> Path:
-    """Name in benchmarks.json every benchmark of comparisons that has results in the folder.
+    """List in benchmarks.json every comparison benchmark that has results in the folder.
 
-    asv rewrites that file with only its own benchmarks whenever it runs. Its entries stay.
+    When asv runs, it rewrites that file with only its own benchmarks. Its entries are kept.
 
     Raises
     ------
     StoreError
-        If a file in `out` is not one of asv's, or of another version.
+        If a file in `out` is not asv's, or has another version.
     """
     out = Path(out)
     found = [_read_results(path) or {} for path in sorted(out.glob("*/*-mor-bench-py*.json"))]
@@ -242,7 +237,7 @@ def _ours(content: Mapping[str, Any]) -> bool:
 
 
 def _figures(comparison: Comparison) -> dict[str, Figures]:
-    """Figures of each benchmark; quantities that no row has are left out."""
+    """Collect the figures of each benchmark; a benchmark without figures is left out."""
     figures: dict[str, Figures] = {}
     rows = [row for row in comparison.rows if row.status != "skipped"]
     for row, (name, quantity) in itertools.product(rows, QUANTITIES.items()):
@@ -267,7 +262,7 @@ def _setting(comparison: Comparison, row: Row) -> str:
 def _statistics(row: Row) -> dict[str, float]:
     """asv's 99 % interval and quartiles of the median latency, s.
 
-    They follow from the row's 95 % interval for a lognormal variable.
+    They are computed from the row's 95 % interval for a lognormal variable.
     """
     latency = row.latency_ms
     if latency is None or latency.low is None or latency.high is None:

@@ -39,7 +39,7 @@ def export_numpy(data: Dataset, out: str | Path) -> list[Path]:
 def snapshot_arrays(data: Dataset) -> dict[str, NDArray[Any]]:
     """Return training and test samples in the schema of `mor_bench.scene.snapshot_file`.
 
-    The parts alternate, so that the first n samples hold both in about their proportion.
+    Training and test samples alternate, so the first n samples hold both in about their proportion.
     """
     parts = (data.train, data.test)
     places = np.concatenate([(np.arange(len(part)) + 0.5) / len(part) for part in parts])
@@ -58,7 +58,7 @@ def snapshot_arrays(data: Dataset) -> dict[str, NDArray[Any]]:
 
 
 def _quoted(text: str) -> str:
-    """Quote a text as TOML: as JSON does, with the delete character escaped, and no surrogates."""
+    """Quote a text as TOML: as JSON, with the delete character escaped and no surrogates."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 

@@ -14,23 +14,23 @@ from mor_bench.snapshots.store import write_atomically
 from mor_bench.surrogate import Surrogate
 
 ONNX_AGREES = 1e-5
-"""Largest allowed difference between ONNX Runtime and the method, of the largest displacement."""
+"""Largest allowed difference between ONNX Runtime and the method, over the largest displacement."""
 
 
 def export_onnx(model: str | Path, out: str | Path) -> tuple[Path, float | None]:
     """Write the network of a fitted model, with its scaling, as an ONNX file of float32.
 
-    The input is `forces` (n, n_nodes, 3), N, for any n; in a scene with observed nodes it is their
+    The input is `forces` (n, n_nodes, 3), N, for any n. In a scene with observed nodes, it is their
     displacements, m. The output is `displacements` of the same shape, m. The file contains the
-    weights and uses standard operations only. Scene and units are in its metadata. If ONNX Runtime
-    is installed, its answers to some random loads are compared with the method's before writing.
+    weights and uses standard operations only. Its metadata describe the scene and the units. If
+    ONNX Runtime is installed, its answers to random loads are compared with the method's first.
 
     Parameters
     ----------
     model : path
         A fitted model, see `Surrogate.save`.
     out : path
-        The file; an existing one is not overwritten.
+        The new file; an existing one is not overwritten.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def export_onnx(model: str | Path, out: str | Path) -> tuple[Path, float | None]
     StoreError
         If the model is damaged.
     UnavailableBackendError
-        If onnx is not installed, or cannot hold the network.
+        If onnx is not installed, or ONNX cannot represent the network.
     MorBenchError
         If the method has no network, or the answers differ by more than `ONNX_AGREES`.
     """

@@ -1,4 +1,4 @@
-"""Checks of the files that an export is about to write."""
+"""Check of the files that an export is about to write."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mor_bench.errors import InvalidInputError
 
 
 def new_file(out: str | Path, suffix: str, *beside: str) -> Path:
-    """Check the name of a file that is to be written, and that nothing is overwritten.
+    """Check the ending of a new file's name, and that no file is overwritten.
 
     Parameters
     ----------
@@ -16,12 +16,12 @@ def new_file(out: str | Path, suffix: str, *beside: str) -> Path:
     suffix : str
         Required ending, such as ``.npz``.
     *beside : str
-        Endings of further files of the same name that must not exist either.
+        Other endings: files with the same stem and these endings must not exist.
 
     Raises
     ------
     InvalidInputError
-        If the ending is another one, or one of the files exists.
+        If the ending is wrong, or one of the files exists.
     """
     out = Path(out)
     if out.suffix != suffix:

@@ -33,9 +33,9 @@ def export_vtu(
     """Write a sample's reference and the models' predictions as VTU; return the files.
 
     Each file holds the mesh at rest with the point data `displacement`, m, and `force`, N. The file
-    of a model also has `error`, its displacement minus the reference's, m. ParaView's filter Warp
-    By Vector shows the deformed body. A scene with an embedded surface adds a second file for each,
-    with the surface.
+    of a model also has `error`, m: its displacement minus the reference. ParaView's filter Warp By
+    Vector shows the deformed body. In a scene with an embedded surface, a second file for each
+    holds that surface.
 
     Parameters
     ----------
@@ -45,14 +45,15 @@ def export_vtu(
     out : path
         Folder; created if it does not exist.
     part : {"train", "test"} or the name of a test set
-        A test set must have been read with the dataset.
+        The dataset must have been read with that test set.
     models : sequence of paths
-        Fitted models, see `Surrogate.save`. Each file is named after its model's.
+        Fitted models, see `Surrogate.save`. Each file is named after its model's file.
 
     Raises
     ------
     InvalidInputError
-        If there is no such part or sample, a model is of another dataset, or two have one name.
+        If the part or sample does not exist, a model belongs to another dataset, or two models have
+        the same name.
     StoreError
         If a model is damaged.
     SolverError
@@ -104,7 +105,7 @@ def _model_of(scene: Scene, path: str | Path) -> Surrogate:
 
 
 def _observed(scene: Scene) -> list[int] | None:
-    """Nodes whose displacements methods are given; None if they are given forces."""
+    """Nodes with given displacements; None if methods are given forces."""
     return None if scene.observed_nodes is None else scene.observed_nodes.tolist()
 
 
@@ -117,7 +118,7 @@ def _write(
     body.write(path, binary=True)
     if surface is None:
         return [path]
-    # The force stays at the nodes: a sum over nodes cannot be interpolated.
+    # The force remains at the nodes: a sum over nodes cannot be interpolated.
     carried = {
         name: scene.to_surface @ values for name, values in fields.items() if name != "force"
     }

@@ -1,4 +1,4 @@
-"""Checkpoints, from which a stopped training resumes and ends with the same bits."""
+"""Checkpoints: a stopped training resumes and ends with bit-identical weights."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class _Numbers(BaseModel):
 
 
 def fingerprint_of(parts: Mapping[str, object], arrays: Mapping[str, Tensor]) -> str:
-    """Return the SHA-256 of what decides a training: values that JSON can hold, and arrays."""
+    """Return the SHA-256 of everything that determines a training: JSON values and arrays."""
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode())
     for name in sorted(arrays):
         array = arrays[name].detach().cpu().contiguous().numpy()
@@ -42,7 +42,7 @@ def fingerprint_of(parts: Mapping[str, object], arrays: Mapping[str, Tensor]) ->
 
 
 def write_checkpoint(loop: TrainingLoop, path: Path, fingerprint: str) -> None:
-    """Write atomically what decides how a training goes on, unless the training is diverging."""
+    """Write the state of a training atomically, unless the training is diverging."""
     from safetensors.torch import save
 
     tensors = _prefixed("network.", loop.network.state_dict()) | _prefixed("best.", loop.best)
@@ -60,7 +60,7 @@ def write_checkpoint(loop: TrainingLoop, path: Path, fingerprint: str) -> None:
 
 
 def resume(loop: TrainingLoop, path: Path, fingerprint: str) -> bool:
-    """Continue from a checkpoint if there is one; return whether there is.
+    """Resume from a checkpoint if it exists; return whether it does.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def resume(loop: TrainingLoop, path: Path, fingerprint: str) -> bool:
 
 
 def _restore(loop: TrainingLoop, numbers: _Numbers, tensors: Mapping[str, Tensor]) -> None:
-    """Set a training to the state in a checkpoint, after checking it."""
+    """Check the state in a checkpoint, and set a training to it."""
     for name, value in numbers:
         setattr(loop, name, value)
     _check_numbers(loop)

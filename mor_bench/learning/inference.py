@@ -1,11 +1,11 @@
 """Back ends that compute a network's answers on processors, and the choice of the fastest one.
 
-torch's own convolutions are slow for single samples: every call copies the weights into oneDNN's
-layout, or does without oneDNN. The back ends are:
+torch's own convolutions are slow for single samples. Every call copies the weights into oneDNN's
+layout, or does not use oneDNN. The back ends are:
 
-- ``eager``: the network as it is.
-- ``packed``: a copy whose convolutions are oneDNN's, with weights packed once and the activation
-  fused. These are the operations that torch.compile emits for frozen graphs; called directly, they
+- ``eager``: the network unchanged.
+- ``packed``: a copy with oneDNN's convolutions, whose weights are packed once and whose activation
+  is fused. torch.compile emits these operations for frozen graphs; called directly, they
   need no compiler.
 - ``packed-bfloat16``: the same with weights and activations in bfloat16 and sums in float32.
 - ``onnx``: ONNX Runtime, float32.
@@ -29,16 +29,17 @@ from mor_bench.learning.packed_network import packed
 Backend = Literal["eager", "packed", "onnx", "packed-bfloat16"]
 
 BACKENDS: tuple[Backend, ...] = get_args(Backend)
-"""From plain to elaborate. Each must be clearly faster than the choice among those before it."""
+"""Back ends from simple to complex. Each must be clearly faster than the choice before it."""
 
 CLEAR_GAIN: dict[Backend, float] = {"packed": 1.1, "onnx": 1.5, "packed-bfloat16": 1.2}
-"""Required speed-up over the plainer choice, away from measured ratios: noise seldom changes it."""
+"""Required speed-up over the simpler choice. It is far from measured ratios, so noise matters
+little."""
 
 ADDED_ERROR = 0.1
-"""Largest change of the answers (root mean square), as a share of the network's own error."""
+"""Largest change of the answers (root mean square), as a fraction of the network's own error."""
 
 TURNS, QUERIES = 5, 3
-"""Timed turns of each back end, and timed queries per turn, after one warm-up query."""
+"""Timed rounds of each back end, and timed queries per round, after one warm-up query."""
 
 
 class Inference:
@@ -49,15 +50,15 @@ class Inference:
     Parameters
     ----------
     network : nn.Module
-        Fitted, on the processor, with one input and one output tensor. Later changes of weights
-        have no effect.
+        A fitted network on the processor, with one input and one output tensor. Later changes of
+        its weights have no effect.
     backend : str
         One of `BACKENDS`.
 
     Raises
     ------
     UnavailableBackendError
-        If this machine, or this network, does not allow the back end; the message gives the reason.
+        If this machine or this network does not support the back end.
     """
 
     def __init__(self, network: nn.Module, backend: Backend = "eager") -> None:
@@ -79,7 +80,7 @@ class Inference:
 
 
 def inference_or_eager(network: nn.Module, backend: Backend) -> Inference:
-    """Return a network with a back end; with "eager" and a warning if that is not available."""
+    """Return a network with a back end; if that is not available, warn and use "eager"."""
     try:
         return Inference(network, backend)
     except UnavailableBackendError as error:
@@ -100,9 +101,9 @@ class Choice:
     ----------
     inference : Inference
     milliseconds : dict
-        Shortest time of a single query on one thread, for each back end that qualified.
+        Shortest time of a single query on one thread, ms, for each back end that qualified.
     left_out : dict
-        Why each of the others did not qualify.
+        Reasons why the others did not qualify.
     """
 
     inference: Inference
@@ -114,17 +115,17 @@ class Choice:
 def choose_inference(
     network: nn.Module, inputs: Tensor, errors: Callable[[Inference], Tensor]
 ) -> Choice:
-    """Choose the fastest back end that is accurate enough and clearly faster than plainer ones.
+    """Choose the fastest back end that is accurate enough and clearly faster than simpler ones.
 
-    Back ends are timed with single queries on one thread. One qualifies if it changes the answers
-    by at most `ADDED_ERROR` of the network's own error (root mean squares over all samples and
-    values).
+    Back ends are timed with single queries on one thread. A back end qualifies if it changes the
+    answers by at most `ADDED_ERROR` of the network's own error. Both are root mean squares over all
+    samples and values.
 
     Parameters
     ----------
     network : nn.Module
     inputs : (n, ...) float32
-        Samples, each of which may be a timed query.
+        Samples to draw the timed queries from.
     errors : callable
         Returns the errors of a back end's answers on some samples, as an array of any shape.
     """
@@ -158,7 +159,7 @@ def choose_inference(
 
 
 def fastest_ms(able: dict[Backend, Inference], inputs: Tensor) -> dict[str, float]:
-    """Return the shortest time of a single query for each back end, in turns, on one thread, ms."""
+    """Return the shortest time of a single query per back end, timed in turns on one thread, ms."""
     shortest: dict[str, float] = dict.fromkeys(able, float("inf"))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

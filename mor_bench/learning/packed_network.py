@@ -1,4 +1,4 @@
-"""Networks whose convolutions are oneDNN's, with weights packed once instead of in every call."""
+"""Networks with oneDNN's convolutions, whose weights are packed once and not in every call."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from mor_bench.errors import UnavailableBackendError
 
 ALLOWED_DIFFERENCE = {torch.float32: 1e-4, torch.bfloat16: 2e-2}
-"""Largest relative difference from torch's convolution that rounding explains."""
+"""Largest relative difference from torch's convolution that is explained by rounding."""
 
 FUSED: dict[type[nn.Module], str] = {nn.ReLU: "relu", nn.SiLU: "swish"}
 """Activations that oneDNN applies within a convolution, and its names for them."""
@@ -24,7 +24,7 @@ def packed(network: nn.Module, dtype: torch.dtype = torch.float32) -> nn.Module:
     Raises
     ------
     UnavailableBackendError
-        If this torch, this processor or this network does not allow it.
+        If this torch, this processor or this network does not support it.
     """
     if dtype == torch.bfloat16 and any(weight.is_complex() for weight in network.parameters()):
         raise UnavailableBackendError("bfloat16 has no complex numbers.")
@@ -45,7 +45,7 @@ def reason_against_packing(dtype: torch.dtype) -> str | None:
     if dtype == torch.bfloat16 and not processor_has_bfloat16():
         return "this processor has no bfloat16 instructions."
     generator = torch.Generator().manual_seed(0)
-    # `skip_init`: the usual initialisation would draw from torch's global random state.
+    # `skip_init`: the default initialisation would draw from torch's global random state.
     layer = nn.utils.skip_init(nn.Conv3d, 2, 3, 3, padding=1)  # type: ignore[no-untyped-call]
     layer.requires_grad_(False)
     x = torch.randn(1, 2, 4, 3, 3, generator=generator).to(dtype)
@@ -54,7 +54,7 @@ def reason_against_packing(dtype: torch.dtype) -> str | None:
     expected = layer(x.float()).relu()
     try:
         found = _PackedConvolution(layer.to(dtype), "relu")(x)
-    except (AttributeError, RuntimeError, TypeError) as error:  # internal operations may change
+    except (AttributeError, RuntimeError, TypeError) as error:  # torch may change these internals
         return (
             f"torch {torch.__version__} does not offer oneDNN's convolutions as expected: "
             f"{type(error).__name__}."
@@ -66,14 +66,14 @@ def reason_against_packing(dtype: torch.dtype) -> str | None:
 
 
 def processor_has_bfloat16() -> bool:
-    """Return whether the processor multiplies bfloat16; emulation would be slower than float32."""
+    """Return whether the processor multiplies bfloat16; emulation is slower than float32."""
     # torch 2.10 and later
     capabilities: dict[str, Any] = getattr(torch.cpu, "get_capabilities", dict)()
     return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
 
 
 class _PackedConvolution(nn.Module):
-    """oneDNN's convolution with packed weights, and the activation that follows."""
+    """oneDNN's convolution with packed weights, and the activation after it."""
 
     def __init__(self, layer: nn.Conv2d | nn.Conv3d, activation: str | None) -> None:
         super().__init__()
@@ -127,7 +127,7 @@ class _Rounded(nn.Module):
 
 
 def _pack_layers(module: nn.Module) -> int:
-    """Replace the convolutions and the activations behind them; return how many."""
+    """Replace the convolutions and the activations after them; return their number."""
     n_packed = 0
     children = list(module.named_children())
     following = [child for _, child in children[1:]] if isinstance(module, nn.Sequential) else []

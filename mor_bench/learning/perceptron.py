@@ -1,4 +1,4 @@
-"""A multilayer perceptron, as a torch module that is trained, and as arrays that answer."""
+"""A multilayer perceptron: a torch module for training, and NumPy functions for answers."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ NAMES = ("first", "first_bias", "second", "second_bias", "last")
 class Perceptron(nn.Module):
     """x ↦ W₃ᵀ s(W₂ᵀ s(W₁ᵀ x + b₁) + b₂) with s(x) = x / (1 + exp(-x)).
 
-    Both hidden layers have the same width, and the last layer has no bias. The weights are drawn
-    with variance 1 / inputs, in the order of the parameters; the biases are zero.
+    Both hidden layers have the same width, and the last layer has no bias. The initial weights have
+    the variance 1 / inputs and are drawn in the order of the parameters. The biases are zero.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ def named_shapes(
 
 
 def taken(model: Mapping[str, Array], prefix: str) -> list[Array]:
-    """Return the weights that `named` put into a model."""
+    """Return the weights that `named` stored in a model."""
     return [model[f"{prefix}.{name}"] for name in NAMES]
 
 

@@ -1,4 +1,4 @@
-"""Training of networks: Adam steps within a time limit, resumable to the same last bit."""
+"""Training of networks: Adam steps within a time limit, resumable with bit-identical results."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from mor_bench.training_options import TrainingOptions
 from mor_bench.version import __version__
 
 TIME_CHECKS = {5: 3.0, 100: 1.0}
-"""Iterations after which the whole time is estimated, and the multiple of the limit allowed.
+"""Iterations after which the total time is estimated, and the allowed multiple of the limit.
 
-The first check is generous: a machine that is busy for a moment must not end a training. The very
-first iteration is not timed, since it builds what the others reuse.
+The first check is generous: a short load on the machine must not end a training. The first
+iteration is not timed, because it includes one-time set-up.
 """
 
 CHECKPOINT_EVERY_S = 30.0
@@ -28,18 +28,17 @@ CHECKPOINT_EVERY_S = 30.0
 
 @dataclass(frozen=True)
 class Training:
-    """Result of a training, beside the weights.
+    """Result of a training, apart from the weights.
 
     Attributes
     ----------
     loss_curve : (n_intervals,) float64
         Mean loss per `training_loop.LOSS_INTERVAL` iterations.
     validation_curve : (n_validations,) float64
-        Loss of the held-out samples, at intervals of 1 / `training_loop.VALIDATIONS` of all
-        iterations.
+        Loss of the held-out samples, `training_loop.VALIDATIONS` times in a whole training.
     iterations : int
-        The planned number, which repeats the training. After an early stop not all of them were
-        done.
+        The planned number of iterations; the same number repeats the training. An early stop does
+        fewer.
     """
 
     loss_curve: NDArray[np.float64]
@@ -48,12 +47,12 @@ class Training:
 
 
 def device_of(options: TrainingOptions) -> torch.device:
-    """Return the device that trains; "auto" is the first CUDA device if there is one.
+    """Return the training device; "auto" is the first CUDA device if there is one.
 
     Raises
     ------
     InvalidInputError
-        If CUDA is asked for and there is none.
+        If CUDA is requested and there is none.
     """
     available = torch.cuda.is_available()
     if options.device == "cuda" and not available:
@@ -71,19 +70,19 @@ def train(
 ) -> Training:
     """Change the weights of a network to lower a loss.
 
-    Every epoch is a new permutation of the samples; a last, smaller batch is left out. The same
-    problem and plan give the same weights to the last bit on one processor and number of threads,
-    interrupted or not. No global random state changes. The network ends in evaluation mode.
+    Every epoch is a new permutation of the samples; an incomplete last batch is left out. The same
+    problem and plan give bit-identical weights on one processor and number of threads, interrupted
+    or not. No global random state changes. The network ends in evaluation mode.
 
     Parameters
     ----------
     problem : LearningProblem
     plan : TrainingPlan
     options : TrainingOptions, optional
-        Device, seconds to fill, and checkpoint, which is also written at the end: the caller
-        deletes it once the model is saved. ``start_from`` is left to the caller.
+        Device, training time and checkpoint. The checkpoint is also written at the end; the caller
+        deletes it once the model is saved. The caller handles ``start_from``.
     time_limit_s : float, optional
-        Seconds that the training may take. It ends early if it would take longer.
+        Time limit for the training, s.
 
     Returns
     -------
@@ -94,7 +93,7 @@ def train(
     MorBenchError
         If the loss is not finite.
     OutOfTimeError
-        If the first iterations show that all of them exceed the limit.
+        If the first iterations show that the training would exceed the limit.
     StoreError
         If the checkpoint is damaged.
     InvalidInputError
@@ -125,7 +124,7 @@ def train(
 
 
 def _fingerprint(problem: LearningProblem, options: TrainingOptions) -> str:
-    """Identify a training by its data, first weights, time to fill, and versions."""
+    """Identify a training by its data, initial weights, training time and versions."""
     content = fingerprint_of(problem.knobs, {**problem.arrays, **problem.network.state_dict()})
     versions = [__version__, torch.__version__]
     return fingerprint_of(

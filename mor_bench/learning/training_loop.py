@@ -1,4 +1,4 @@
-"""The training loop: Adam steps, losses, early stopping, and iterations sized to a given time."""
+"""The training loop: Adam steps, losses, early stopping, and iterations that fit a given time."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from mor_bench.learning.training_plan import LearningProblem, TrainingPlan, rate
 from mor_bench.training_options import TrainingOptions
 
 LOSS_INTERVAL = 50
-"""Iterations per point of the loss curve; more points would cost time and show mostly noise."""
+"""Iterations per point of the loss curve; more points would cost time and mostly show noise."""
 
 VALIDATIONS, PATIENCE = 50, 15
-"""Validations in a whole training, and how many in a row without a lower loss stop it."""
+"""Validations in a whole training, and validations without a lower loss that stop it early."""
 
 TRIAL_ITERATIONS, TRIAL_SHARE = 20, 0.1
-"""Iterations of the trial that sizes a training to seconds, and the share that it may take.
+"""Iterations of the trial that sets the length of a timed training, and its share of the time.
 
-The trial has three iterations at least.
+The trial has at least three iterations.
 """
 
 
 class TrainingLoop:
-    """A training under way, with everything that decides how it goes on.
+    """A running training with its complete state.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class TrainingLoop:
     total, n_summed
         Sum and number of the losses since the last point of the curve.
     rows, held, order : (n,) int64
-        Indices of the samples to learn from, of the held-out ones, and of those left in this epoch.
+        Indices of the training samples, of the held-out samples, and of those left in this epoch.
     best : dict of Tensor
         Weights with the lowest validation loss.
     """
@@ -99,12 +99,12 @@ class TrainingLoop:
             self.iterations = self._iterations_in(self.options.fit_seconds)
 
     def _iterations_in(self, seconds: float) -> int:
-        """Return how many iterations fit in the given time, from a trial that is undone."""
+        """Return how many iterations fit in the given time, from a discarded trial."""
         weights, drawn = deepcopy(self.network.state_dict()), self.generator.get_state()
         trial_options = TrainingOptions(device=self.options.device)
         trial = TrainingLoop(self.problem, self.plan, trial_options, self.device)
         trial.iterations, trial.rows = self.plan.iterations, self.rows
-        trial.step()  # the first step builds what the others reuse
+        trial.step()  # the first step includes one-time set-up
         start = now = self._now()
         done = 0
         while done < 3 or (done < TRIAL_ITERATIONS and now - start < TRIAL_SHARE * seconds):
@@ -118,7 +118,7 @@ class TrainingLoop:
         self.network.load_state_dict(weights)
         self.generator.set_state(drawn)
         left = seconds - (self._now() - start)
-        # With fewer iterations than `VALIDATIONS`, every iteration is followed by a validation.
+        # With fewer iterations than `VALIDATIONS`, a validation follows every iteration.
         if left > VALIDATIONS * (validation + each):
             return max(1, int((left - VALIDATIONS * validation) / each))
         return max(1, int(left / (validation + each)))
@@ -192,7 +192,7 @@ class TrainingLoop:
             )
 
     def finish(self) -> None:
-        """Record the losses left over by an early stop, and take the best validated weights."""
+        """Record the remaining losses after an early stop, and load the best validated weights."""
         if self.n_summed:
             self.curve.append(float(self.total) / self.n_summed)
             self._check_finite(self.curve[-1])

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 Schedule = Literal["constant", "one-cycle"]
 Precision = Literal["float32", "bfloat16"]
 Loss = Callable[[Tensor], Tensor]
-"""Mean loss of the samples with the given indices, (n,) int64 on the device of the training."""
+"""Mean loss of the samples with the given indices, (n,) int64 on the training device."""
 
 WARM_UP = 0.1
 """Share of a one-cycle schedule during which the learning rate rises."""
@@ -37,8 +37,8 @@ class TrainingPlan:
         Precision of the products in the forward and backward pass. Weights and their updates are
         float32.
     validation_fraction : float
-        Share of the training samples that is held out, at random, to stop the training early; 0 for
-        none.
+        Fraction of the training samples, chosen at random, that is held out for early stopping; 0
+        for none.
     """
 
     iterations: int
@@ -57,19 +57,17 @@ class LearningProblem:
     Attributes
     ----------
     network : nn.Module
-        On the device of the training.
+        On the training device.
     loss : Loss
-        Taken with the network in training mode in a step, and in evaluation mode on held-out
-        samples.
+        Computed in training mode in a step, and in evaluation mode on held-out samples.
     n_samples : int
         Number of training samples, including held-out ones.
     generator : torch.Generator
-        On the processor. It draws the order of the samples, and whatever the loss draws from it.
+        A generator on the processor. It draws the order of the samples; the loss may use it too.
     arrays : mapping of Tensor
-        What the loss computes with. It identifies a training: a checkpoint of other arrays is
-        refused.
+        Constants of the loss. They identify a training: a checkpoint with other arrays is refused.
     knobs : mapping
-        Parameters of the method, which identify a training too; JSON must be able to hold them.
+        Hyperparameters of the method as JSON values; they identify a training too.
     """
 
     network: nn.Module

@@ -1,8 +1,8 @@
 """Output for readers: console tables, figures and one HTML page.
 
-What lives here: sentences and tables made from a comparison and its analysis, drawings, and the
-page's templates in `templates/`.
-What may not: conclusions and statistics, which belong to `mor_bench.analysis`, and measurements.
+Here: sentences and tables made from a comparison and its analysis, drawings, and the page's
+templates in `templates/`.
+Not here: conclusions and statistics (`mor_bench.analysis`), and measurements.
 Start with `entries.py`, which joins rows and conclusions; then `page.py` and `console_tables.py`.
 The columns of the large table stand in `console_columns.py`, and those of the page in
 `page_columns.py`.

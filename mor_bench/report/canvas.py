@@ -27,13 +27,10 @@ from mor_bench.snapshots.store import write_atomically
 
 DPI = 150
 WIDTH_IN = 9.4
-"""Width in inches; its 1,410 pixels are what a README shows without scaling up."""
+"""Width in inches, equal to 1,410 pixels, the width of a README."""
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
-"""Okabe and Ito's palette, which colour-blind readers can tell apart.
-
-Its yellow is illegible on white and is replaced by a brown.
-"""
+"""Okabe and Ito's palette for colour-blind readers, with brown instead of its pale yellow."""
 
 MARKERS = ("o", "s", "^", "D", "P", "X", "v", "*", "<", ">", "h")
 
@@ -44,13 +41,8 @@ INK, GREY, LIGHT = "#222222", "#8a8a8a", "#d9d9d9"
 class Picture:
     """A figure that is drawn but not saved.
 
-    Attributes
-    ----------
-    kind : str
-        Part of its file name, such as ``learning-curves``.
-    title, caption : str
-        What it shows, and how to read it.
-    figure : Figure
+    `kind` is a part of its file name, such as ``learning-curves``. `title` and `caption` describe
+    the figure and explain how to read it.
     """
 
     kind: str
@@ -61,7 +53,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure on disk: its dataset, PNG file, title, and a caption that says how to read it."""
+    """A figure on disk: its dataset, PNG file, title, and a caption that explains it."""
 
     dataset: str
     path: Path
@@ -87,7 +79,7 @@ def styles_of(comparison: Comparison) -> dict[str, Style]:
 
 
 def new_figure(height_in: float, title: str) -> Figure:
-    """Make an empty figure of the common width that belongs to no global state."""
+    """Make an empty figure of the common width, outside matplotlib's global state."""
     figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     figure.suptitle(plain(title), x=0.01, ha="left", fontsize=13, color=INK)
@@ -95,7 +87,7 @@ def new_figure(height_in: float, title: str) -> Figure:
 
 
 def dress(axes: Axes) -> None:
-    """Give plots their common look: light grid, no box."""
+    """Give plots their common style: light grid, no box."""
     axes.grid(True, which="major", color="#e6e6e6", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=9, colors=INK, which="both")
@@ -125,7 +117,7 @@ def save(picture: Picture, comparison: Comparison, dataset: str) -> Drawn:
 
 
 def plain(text: str) -> str:
-    """Escape a text so that matplotlib sees no formula."""
+    """Escape a text so that matplotlib does not read it as a formula."""
     return text.replace("$", r"\$")
 
 
@@ -146,7 +138,7 @@ _OFFSETS = (
     (0, 14),
     (0, -14),
 )
-"""Positions around a point, in typographic points, the best first."""
+"""Offsets from a point, in typographic points, best first."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +158,7 @@ def annotate(
     keep_free: Sequence[Artist] = (),
     radius: float = 5.0,
 ) -> None:
-    """Write notes where nothing else is; a note without room is left out.
+    """Write notes on free space; omit a note that has no room.
 
     Parameters
     ----------
@@ -175,13 +167,13 @@ def annotate(
     notes : sequence of Note
         The most important first.
     lines : sequence of (n, 2) arrays
-        Polylines in data coordinates that notes should preferably not cross.
+        Polylines in data coordinates that notes avoid if possible.
     keep_free : sequence of Artist
         Texts that must not be covered.
     radius : float
         Radius of the markers, in typographic points.
     """
-    # matplotlib types the figure's canvas without the methods of this class
+    # matplotlib's type of a figure's canvas lacks the methods of this class.
     canvas: Any = FigureCanvasAgg(axes.get_figure(root=True))
     canvas.draw()
     renderer = canvas.get_renderer()

@@ -46,7 +46,7 @@ def _set_cell(found: SetErrors) -> str:
 
 
 def out_of_range(entries: Sequence[Entry]) -> TextTable | None:
-    """Build the table of range flags: do methods that learn flag the loads with large errors?"""
+    """Build the table of range flags: do trained methods flag the loads with large errors?"""
     flagged = [entry for entry in entries if entry.row.range]
     names = dict.fromkeys(name for entry in flagged for name in entry.row.sets)
     rows = []
@@ -76,7 +76,7 @@ def out_of_range(entries: Sequence[Entry]) -> TextTable | None:
 
 
 def _recall_cell(found: SetErrors | FlagCounts, median: float) -> str:
-    """Error, flagged share and recall on a test set, in lines."""
+    """Error, flagged share and recall on a test set, one per line."""
     recall = "none beyond"
     if found.recall is not None:
         recall = f"recall {percent(found.recall)} % of {found.n_unusual}"
@@ -85,7 +85,7 @@ def _recall_cell(found: SetErrors | FlagCounts, median: float) -> str:
 
 
 def hidden_table(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> TextTable | None:
-    """Build the table of errors on the hidden test set beside those on the shipped one."""
+    """Build the table of errors on the hidden test set and on the shipped one."""
     by_label = {entry.label: entry for entry in entries}
     rows = []
     for record in analysis["hidden"]:
@@ -115,7 +115,7 @@ def hidden_table(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> 
 
 
 def tuning_table(dataset: str, analysis: Analysis) -> TextTable | None:
-    """Build the table of what each method tried of its tuning budget."""
+    """Build the table of tuning budgets and their use by each method."""
     rows = []
     for record in analysis["tuning"]:
         allowed = record["configurations_allowed"], record["seconds_allowed"]
@@ -134,7 +134,7 @@ def _of(value: float, allowed: float | None, shown: Callable[[Any], str] = numbe
 
 
 def regimes_table(analysis: Analysis) -> TextTable | None:
-    """Build the table of whether each method was tested in the regime that its file names."""
+    """Build the table of regimes: was each method tested in the regime that its file names?"""
     rows = [
         [record["method"], record["says"], "yes" if record["in_regime"] else record["verdict"]]
         for record in analysis["regimes"]

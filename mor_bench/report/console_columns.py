@@ -14,24 +14,18 @@ from mor_bench.report.number_format import DASH, metres, number, percent, span
 from mor_bench.report.text_table import Cell, figure_cell
 
 LABEL_WIDTH = 25
-"""Characters that the label keeps; columns are left out to make this room."""
+"""Least width of the label, in characters; columns are left out to make room for it."""
 
 REQUIRED = 9
-"""Weight of the columns that are never left out for lack of figures."""
+"""Least weight of the columns that are shown even without figures."""
 
 
 @dataclass(frozen=True)
 class Column:
     """A column of the configuration table.
 
-    Attributes
-    ----------
-    heading : str
-        At most two lines.
-    cell : callable
-        Maps an `Entry` to its text.
-    weight : int
-        Columns of small weight are left out first where the terminal is narrow.
+    `heading` has at most two lines. `cell` maps an `Entry` to its text. On a narrow terminal,
+    columns of small `weight` are left out first.
     """
 
     heading: str
@@ -40,7 +34,7 @@ class Column:
 
 
 def _bounded(value: float | None) -> str:
-    """Percent, or a bound below 0.01 %; the CSV file and the page have the digits."""
+    """Percent, or "<0.01"; the CSV file and the page have all digits."""
     return "<0.01" if value is not None and 0 < value < 1e-4 else percent(value)
 
 
@@ -93,7 +87,7 @@ COLUMNS = (
 
 
 def _columns_for(entries: Sequence[Entry], width: int) -> tuple[list[Column], int]:
-    """Choose the columns that leave the label its room; return them and that room."""
+    """Choose columns that leave enough room for the label; return them and that room."""
 
     def needed(column: Column) -> int:
         return 1 + max(map(len, [*column.heading.split("\n"), *map(column.cell, entries)]))
@@ -109,7 +103,7 @@ def _columns_for(entries: Sequence[Entry], width: int) -> tuple[list[Column], in
 
 
 def configuration_table(entries: Sequence[Entry], width: int) -> Table:
-    """Build a row per configuration within a width in characters."""
+    """Build the table of configurations, one per row, within a width in characters."""
     columns, room = _columns_for(entries, width)
     table = Table(box=SIMPLE_HEAD, padding=0, show_edge=False)
     table.add_column("configuration", overflow="fold", max_width=room)

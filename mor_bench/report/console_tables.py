@@ -63,7 +63,7 @@ def _target_parts(shown: TextTable, width: int) -> list[RenderableType]:
 def _pairwise_parts(
     comparison: Comparison, dataset: str, analysis: Analysis
 ) -> list[RenderableType]:
-    """Who is faster at the error that the dataset needs, if at least two methods reach it."""
+    """Compare speeds at the error that the dataset requires, if two or more methods reach it."""
     error = needs_of(comparison, dataset).error
     pairs = pairs_at(comparison, dataset, error, analysis)
     if len(pairs.methods) < 2:
@@ -81,7 +81,7 @@ def _pairwise_parts(
 
 
 def _out_of_range_parts(entries: Sequence[Entry]) -> list[RenderableType]:
-    """Range flags on the named test sets, for the best configuration of each method that learns."""
+    """Range flags on the named test sets, for the best configuration of each trained method."""
     best = {entry.label for entry in best_per_method(entries)}
     found = out_of_range([entry for entry in entries if entry.label in best and entry.row.sets])
     if found is None:
@@ -147,7 +147,7 @@ def print_tables(
         for name in dataset_names(comparison):
             group = _dataset_group(comparison, name, console.width, analysis)
             console.print(group, highlight=False)
-    # A redirected stream with a legacy code page must not end a long run with an error.
+    # A redirected stream with a legacy code page must not make a long run fail at its end.
     encoding = console.encoding or "utf-8"
     console.file.write(captured.get().encode(encoding, "replace").decode(encoding))
     console.file.flush()

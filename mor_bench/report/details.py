@@ -1,4 +1,4 @@
-"""The further tables of the page, in reading order; a table without data is left out."""
+"""The page's additional tables, in reading order; a table without data is left out."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mor_bench.results.comparison import Comparison
 
 
 def dataset_details(comparison: Comparison, dataset: str, analysis: Analysis) -> list[TextTable]:
-    """List the further tables of a dataset."""
+    """List the additional tables of a dataset."""
     entries = entries_of(comparison, dataset, analysis)
     tables = [
         *pairwise(comparison, dataset, analysis),

@@ -1,4 +1,4 @@
-"""Rows with conclusions about each: does it meet the needs, is it on the front, its intervals."""
+"""Rows with conclusions about each: whether it meets the needs, is on the front, and intervals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class Needs:
-    """Accuracy and speed that a dataset asks for; infinite where it asks for none.
+    """Accuracy and speed that a dataset requires; infinite where it requires none.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class Entry:
 
     @property
     def unstable(self) -> Sequence[str]:
-        """Reasons why the timing is not reliable; empty if it is, or if it was not checked."""
+        """Reasons why the timing is not reliable; empty if it is reliable or was not checked."""
         latency = self.row.latency_ms
         if latency is None or latency.stable is not False:
             return []
@@ -116,7 +116,7 @@ class Entry:
 
     @property
     def trouble(self) -> str | None:
-        """Reason of a failure, a skip or missing predictions in one line, or None."""
+        """Reason for a failure, a skip or missing predictions in one line, or None."""
         row = self.row
         if not self.ran:
             return f"{row.status}: {row.reason or 'no reason given'}"
@@ -172,7 +172,8 @@ def entries_of(
 
 
 def _intervals(record: Mapping[str, Any]) -> dict[str, Interval]:
-    """Intervals of a record of the analysis that have a lower end; an upper None is infinite."""
+    """Intervals of an analysis record that have a lower end; a missing upper end is infinite."""
+    """Return the configuration with the smallest ē of each method that ran."""
     figures = {name: record[name] for name in ("rel_l2_median", "mean_dof_m", "latency_ms")}
     return {
         name: (f["low"], inf if f["high"] is None else f["high"])

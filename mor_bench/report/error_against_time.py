@@ -29,7 +29,7 @@ from mor_bench.report.number_format import explain_short_names, number, short_sw
 from mor_bench.results.comparison import Comparison
 
 FLOOR_PERCENT = 1e-4
-"""Smaller errors are drawn here: the round-off of the full-order model would squash all else."""
+"""Floor of the plotted errors: the full-order model's round-off would compress the scale."""
 
 FRONT_LINE = (0, (4, 2))
 """Dashes of the Pareto front."""

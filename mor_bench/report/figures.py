@@ -13,7 +13,7 @@ from mor_bench.report.worst_samples import worst_samples
 from mor_bench.results.comparison import Comparison
 
 ALL = "all datasets"
-"""Stands for the name of a dataset where a figure is over all of them."""
+"""Replaces the dataset's name in figures about all datasets."""
 
 
 def write_figures(comparison: Comparison, analysis: Analysis) -> list[Drawn]:

@@ -22,7 +22,7 @@ def ordered(found: StressResults) -> list[CaseResult]:
 
 
 def print_stress(found: StressResults, console: Console) -> None:
-    """Print all rows and the counts, then the names of those that fell short."""
+    """Print all rows and the counts, then the names of the methods that fell short."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     longest = max((len(row.method) for row in found.rows), default=0)
     for heading, width in (

@@ -1,4 +1,4 @@
-"""Tables of what was measured beside error and latency: timing, memory, work, trainings."""
+"""Tables of secondary measurements: timing, memory, work, trainings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mor_bench.report.text_table import Cell, TextTable, figure_cell, table_of
 
 
 def timing(entries: Sequence[Entry]) -> TextTable | None:
-    """Build the table of what each timing rests on, on more threads and in batches."""
+    """Build the table of timing conditions, and of latencies with more threads and in batches."""
     columns: dict[str, Cell] = {
         "processes": figure_cell("latency_ms", "n_processes", whole),
         "queries": figure_cell("latency_ms", "n_queries", whole),
@@ -35,7 +35,7 @@ def _stable(entry: Entry) -> str:
 
 
 def resources(entries: Sequence[Entry]) -> TextTable | None:
-    """Build the table of memory, model size and the countable work of a query."""
+    """Build the table of memory, model size and the counted work of a query."""
     if not any(entry.row.memory_bytes or entry.row.cost for entry in entries):
         return None
     columns: dict[str, Cell] = {
@@ -56,7 +56,7 @@ def resources(entries: Sequence[Entry]) -> TextTable | None:
 
 
 def _on_mesh(key: str) -> Cell:
-    """Count of a mesh's sparse matrices, without the cheap dense reduced ones."""
+    """Count for a mesh's sparse matrices, without the cheap dense reduced ones."""
 
     def cell(entry: Entry) -> str:
         total, reduced = entry.figure("cost", key), entry.figure("cost", f"reduced_{key}")

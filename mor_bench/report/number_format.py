@@ -7,7 +7,7 @@ from math import isfinite
 from typing import Any
 
 DASH = "–"
-"""Stands for a figure that was not measured."""
+"""Placeholder of a figure that was not measured."""
 
 SHORT_NAMES = {
     "n_modes": "r",
@@ -78,6 +78,6 @@ def short_swept(swept: Mapping[str, Any]) -> str:
 
 
 def explain_short_names(all_swept: Iterable[Mapping[str, Any]]) -> str:
-    """Say in one line what the short names stand for; empty if there are none."""
+    """Explain the short names in one line; empty if there are none."""
     keys = dict.fromkeys(key for swept in all_swept for key in swept)
     return ", ".join(f"{short_name(key)} = {key}" for key in keys if short_name(key) != key)

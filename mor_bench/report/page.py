@@ -44,18 +44,8 @@ class Event:
 class Section:
     """Content of the page about one dataset.
 
-    Attributes
-    ----------
-    name, title, headline : str
-    facts : list of (str, str)
-        What was run.
-    configurations : ConfigurationTable
-    basis, short_names : str
-        Sentences under the tables.
-    events : list of Event
-    targets, details : list of TextTable
-        Time at error and error at time, and the tables after the figures.
-    figures : list of Drawn
+    `facts` describe the run. `basis` and `short_names` are sentences under the tables. `targets`
+    are time at error and error at time; `details` are the tables after the figures.
     """
 
     name: str
@@ -138,7 +128,7 @@ def _events(entries: Sequence[Entry], notes: Sequence[tuple[str, str]]) -> list[
 
 
 def _facts(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> list[tuple[str, str]]:
-    """List what was run: the dataset's description, its split, its needs, and counts of rows."""
+    """List facts about the run: the dataset's description, its split, its needs, counts of rows."""
     spec, rows = comparison.datasets.get(dataset, {}), [entry.row for entry in entries]
     unused = _values(row.n_unused for row in rows)
     split = f"by {_values(row.split for row in rows)}; "
@@ -165,7 +155,7 @@ def _facts(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> li
 
 
 def _values(found: Iterable[object]) -> str:
-    """The different values, in order; a dash if there are none."""
+    """Join the different values, in order; a dash if there are none."""
     return ", ".join(dict.fromkeys(map(str, found))) or "–"
 
 

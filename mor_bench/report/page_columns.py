@@ -10,7 +10,7 @@ from mor_bench.report.number_format import DASH, bytes_text, metres, number, per
 from mor_bench.report.text_table import Cell, figure_cell
 
 INTERVAL = "95 %"
-"""Heading of the columns of intervals, which are left out if there are no intervals."""
+"""Heading of the columns of intervals; they are left out if there are no intervals."""
 
 
 def _median_latency(entry: Entry) -> str:
@@ -63,7 +63,7 @@ SINGLE: dict[str, Cell] = {
 
 @dataclass(frozen=True)
 class ConfigurationRow:
-    """An entry and its cells below `ConfigurationTable.groups` and then `single`."""
+    """An entry and its cells, in the order of `ConfigurationTable.groups` and then `single`."""
 
     entry: Entry
     cells: list[str]
@@ -79,7 +79,7 @@ class ConfigurationTable:
 
 
 def configuration_columns(entries: Sequence[Entry]) -> ConfigurationTable:
-    """Build a row per configuration of a dataset."""
+    """Build the table of configurations of a dataset, one per row."""
     certain = any(entry.intervals for entry in entries)
     groups = {
         group: {name: cell for name, cell in columns.items() if certain or name != INTERVAL}

@@ -1,9 +1,9 @@
-"""The tables of the U-Mesh paper filled from our own rows, beside the paper's figures.
+"""The tables of the U-Mesh paper with our own figures beside the published ones.
 
 Source of the published figures: Mendizabal, Márquez-Neila, Cotin: Simulation of hyperelastic
-materials in real-time using deep learning, Medical Image Analysis 2020. They are from its tables of
-error measures (one per scene) and its two comparisons with POD. Its networks ran on a GeForce 1080
-Ti. Its errors are over a random split, and its slopes and maxima are from the captions.
+materials in real-time using deep learning, Medical Image Analysis 2020. The figures come from its
+tables of error measures (one per scene) and its two comparisons with POD. The slopes and maxima
+come from the captions. The paper's networks ran on a GeForce 1080 Ti, on a random split.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ Size = tuple[int, int]
 
 
 def _size(entry: Entry) -> Size | None:
-    """Size of a configuration that is such a network and ran."""
+    """Size of a configuration if it is a network of the paper's kind and ran, else None."""
     channels, steps = (entry.row.parameters.get(name) for name in ("channels", "steps"))
     if entry.ran and isinstance(channels, int) and isinstance(steps, int):
         return channels, steps
@@ -72,8 +72,8 @@ def _size(entry: Entry) -> Size | None:
 def error_measures(dataset: str, entries: Sequence[Entry]) -> TextTable | None:
     """Build the paper's table of error measures; None if no such network ran.
 
-    It has a row per network that ran, beside the paper's network of the same size, and then a row
-    for each other network of the paper.
+    Each network that ran has a row beside the paper's network of the same size. The paper's other
+    networks follow, one per row.
     """
     ours = [(entry, size) for entry in entries if (size := _size(entry)) is not None]
     if not ours:
@@ -114,7 +114,7 @@ def _measured(entry: Entry) -> list[str]:
 
 
 def _measures(label: str, size: Size, ours: Sequence[str], paper: Published | None) -> list[str]:
-    """One row of the table of error measures: our figures and the paper's take turns."""
+    """Build a row of the table of error measures: our figures and the paper's alternate."""
     printed = [DASH] * len(ours)
     if paper:
         lengths = (paper.mean_m, paper.std_m, paper.max_m, paper.slope)
@@ -131,8 +131,8 @@ def _as_printed(value: float | None) -> str:
 def same_error_or_time(dataset: str, entries: Sequence[Entry]) -> list[TextTable]:
     """Build the paper's two comparisons with its best network: at the same error and time.
 
-    The first shows each method's fastest configuration that is as accurate as the network, the
-    second its most accurate configuration that is as fast. Empty if no network ran.
+    The first shows each method's fastest configuration that is as accurate as the network. The
+    second shows its most accurate configuration that is as fast. Empty if no network ran.
     """
     network = _best_network(entries)
     if network is None:
@@ -160,7 +160,7 @@ def same_error_or_time(dataset: str, entries: Sequence[Entry]) -> list[TextTable
 
 
 def _best_network(entries: Sequence[Entry]) -> Entry | None:
-    """The most accurate network with a latency, whatever its method is called."""
+    """Return the most accurate network with a latency, under any method name."""
     networks = [entry for entry in entries if _size(entry) is not None]
     best = min(networks, key=lambda e: e.mean_error_m, default=None)
     if best is None or not (isfinite(best.mean_error_m) and isfinite(best.latency_ms)):
@@ -171,7 +171,7 @@ def _best_network(entries: Sequence[Entry]) -> Entry | None:
 def _least(
     methods: Sequence[str], entries: Sequence[Entry], cost: Callable[[Entry], float]
 ) -> dict[str, Entry | None]:
-    """For each method the entry of least cost; None if it has none."""
+    """Return the entry of least cost for each method; None if it has none."""
     return {m: min((e for e in entries if e.method == m), key=cost, default=None) for m in methods}
 
 

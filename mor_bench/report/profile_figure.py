@@ -31,7 +31,7 @@ def performance_profile(analysis: Analysis, styles: dict[str, Style]) -> Picture
     for i, (method, factors) in enumerate(solving.items()):
         style = styles[method]
         x = np.array([1.0, *factors, end])
-        # A shift of about a thousandth separates staircases that coincide.
+        # A shift of about a thousandth separates coincident staircases.
         solved = np.array([0, *range(1, len(factors) + 1), len(factors)]) / n
         y = 100 * (solved + 0.0015 * (i - len(solving) / 2))
         axes.step(x, y, where="post", color=style.colour, linewidth=1.6)

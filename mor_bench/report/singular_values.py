@@ -1,4 +1,4 @@
-"""The figure of singular values: decay of the training snapshots, and the ranks that were tried."""
+"""The figure of singular values: decay of the training snapshots, and the tested ranks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mor_bench.report.number_format import percent
 from mor_bench.results.comparison import Comparison
 
 ROUND_OFF = 1e-12
-"""Smaller relative singular values are not shown: they are the decomposition's round-off."""
+"""Smaller relative singular values are not shown: they are round-off of the decomposition."""
 
 SIGMA = r"$\sigma_i\,/\,\sigma_1$"
 TAIL = r"energy tail $\sqrt{\sum_{i>r}\sigma_i^2\,/\,\sum_i\sigma_i^2}$"

@@ -33,11 +33,8 @@ FACTORS = (1.0, 1.5, 2.0, 5.0, 10.0, 100.0)
 def target_table(comparison: Comparison, dataset: str, kind: str, analysis: Analysis) -> TextTable:
     """Build the table of time at error or error at time, a row per method.
 
-    A cell has the interpolated value, the best real configuration and the 95 % interval.
-
-    Parameters
-    ----------
-    kind : {"time_at_error", "error_at_time"}
+    A cell has the interpolated value, the best real configuration and the 95 % interval. `kind` is
+    "time_at_error" or "error_at_time".
     """
     swept = {row.label: short_swept(row.swept) for row in comparison.rows if row.dataset == dataset}
     of_time = kind == "time_at_error"
@@ -70,7 +67,7 @@ def _target_heading(record: Mapping[str, Any]) -> str:
 
 
 def _target_interval(record: Mapping[str, Any], shown: Callable[[float | None], str]) -> str:
-    """Interval of a target; it says so where enough resamples do not reach the target."""
+    """Format the interval of a target; mention it if many resamples do not reach the target."""
     low, high = record["low"], record["high"]
     if low == high == 0:
         return ""
@@ -82,14 +79,14 @@ def _target_interval(record: Mapping[str, Any], shown: Callable[[float | None], 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Who is faster than whom at an error.
+    """Ratios of speed of the pairs of methods at an error.
 
     Attributes
     ----------
     methods, absent : list of str
         Methods that reach the error, and those that do not.
     cells : list of list of str
-        For each of `methods` a row: ``+2.3`` where it is 2.3 times faster than the column's method,
+        A row for each of `methods`: ``+2.3`` where it is 2.3 times faster than the column's method,
         ``-2.3`` where it is slower, ``?1.1`` where it is undecided.
     intervals : list of list of str
         95 % intervals of these factors.
@@ -124,7 +121,7 @@ def _factor(record: Mapping[str, Any]) -> tuple[str, str]:
     """Factor of a pair with its sign, and its interval."""
     ratio, low, high = (record[name] for name in ("ratio", "low", "high"))
     sign = {"faster": "+", "slower": "-", "undecided": "?"}[record["verdict"]]
-    if sign != "-":  # the ratio is one of times; a speed-up is its inverse
+    if sign != "-":  # the record holds a ratio of times, the inverse of a speed-up
         ratio, low, high = (None if x is None else 1 / x for x in (ratio, high, low))
     interval = f"{'0' if low is None else number(low)}–{'∞' if high is None else number(high)}"
     return f"{sign}{number(ratio)}", interval
@@ -157,7 +154,7 @@ def pairwise(comparison: Comparison, dataset: str, analysis: Analysis) -> list[T
 def break_even_table(
     dataset: str, analysis: Analysis, entries: Sequence[Entry]
 ) -> TextTable | None:
-    """Build the table of break-even queries and of what they follow from."""
+    """Build the table of break-even queries and of the figures behind them."""
     by_label = {entry.label: entry for entry in entries}
     rows = []
     for record in analysis["break_even"]:
@@ -205,7 +202,7 @@ def profile_table(analysis: Analysis) -> TextTable | None:
 
 
 def profile_note(found: Mapping[str, Any]) -> str:
-    """Explain the problems of a performance profile, and what can be read from it."""
+    """Explain the problems of a performance profile, and how to read it."""
     n_datasets = found["n_datasets"]
     over = f"{n_datasets} datasets" if n_datasets > 1 else "one dataset"
     targets = ", ".join(f"{percent(target)} %" for target in TARGET_ERRORS)

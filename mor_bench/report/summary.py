@@ -1,4 +1,4 @@
-"""Sentences that console and page share: the headline, warnings, notes and what intervals cover."""
+"""Sentences for console and page: headline, warnings, notes, and the basis of the intervals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MESH_NOTE = "an error below it is an error against this mesh and says nothing ab
 
 
 def warnings_of(entries: Sequence[Entry]) -> list[tuple[str, str]]:
-    """List each warning once, after the label of the configuration, or how many, that gave it."""
+    """List each warning once, after the configuration's label or the number of configurations."""
     labels: dict[str, list[str]] = {}
     for entry in entries:
         for warning in entry.row.warnings:
@@ -22,9 +22,9 @@ def warnings_of(entries: Sequence[Entry]) -> list[tuple[str, str]]:
 
 
 def notes_of(comparison: Comparison, dataset: str, analysis: Analysis) -> list[tuple[str, str]]:
-    """List doubts about a configuration or method: its name, and the doubt.
+    """List doubts as pairs of the name of a configuration or method and the doubt.
 
-    These are unstable timings, a hidden test set that disagrees, and untested regimes.
+    Doubts are unstable timings, a hidden test set that disagrees, and untested regimes.
     """
     entries = entries_of(comparison, dataset)
     unstable: dict[str, list[str]] = {}
@@ -53,7 +53,7 @@ def _first_of(labels: Sequence[str]) -> str:
 
 
 def interval_basis(dataset: str, analysis: Analysis) -> str:
-    """Say in a sentence what the intervals of a dataset rest on; empty if there are none."""
+    """Describe in a sentence the basis of a dataset's intervals; empty if there are none."""
     parts = [
         f"Intervals hold 95 %: errors over {c['n']} {c['of']}"
         for c in analysis["clusters"]
@@ -95,7 +95,7 @@ def needs_text(needs: Needs) -> str:
 
 
 def headline(comparison: Comparison, dataset: str) -> str:
-    """Name the fastest configuration that meets the needs, or the nearest to meeting them."""
+    """Name the fastest configuration that meets the needs, or the one nearest to meeting them."""
     entries, needs = entries_of(comparison, dataset), needs_of(comparison, dataset)
     usable = [e for e in entries if e.ran and isfinite(e.error) and isfinite(e.latency_ms)]
     if not usable:

@@ -1,4 +1,4 @@
-"""A table of texts that console and page draw in their own way."""
+"""A table of texts; console and page draw it in different ways."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class TextTable:
     Attributes
     ----------
     title, note : str
-        What it shows, and how to read it.
+        The table's content, and how to read it.
     headings : sequence of str
     rows : sequence of sequence of str
         The first cell names the row. A cell may have several lines; the first is the main one.
@@ -35,15 +35,7 @@ def table_of(
 ) -> TextTable | None:
     """Build a row per configuration that ran; columns and rows without a figure are left out.
 
-    Parameters
-    ----------
-    columns : dict
-        By heading, a function from an entry to its cell.
-
-    Returns
-    -------
-    TextTable or None
-        None if no figure is left.
+    `columns` maps a heading to a function from an entry to its cell. None if no figure is left.
     """
     ran = [entry for entry in entries if entry.ran]
     cells = {heading: [cell(entry) for entry in ran] for heading, cell in columns.items()}

@@ -69,8 +69,8 @@ def learning_curves(
 def loss_curves(comparison: Comparison, dataset: str, styles: dict[str, Style]) -> Picture | None:
     """Draw losses over the course of the training, a panel per method; None without trainings.
 
-    Validation losses are dashed. Losses of different methods measure different things, so each
-    method has its own axis.
+    Validation losses are dashed. Each method has its own axis, because methods minimise different
+    losses.
     """
     trained: dict[str, list[Row]] = {}
     for row in comparison.rows:
@@ -99,7 +99,7 @@ def loss_curves(comparison: Comparison, dataset: str, styles: dict[str, Style]) 
 
 
 def _loss_panel(axes: Axes, comparison: Comparison, rows: Sequence[Row]) -> bool:
-    """Draw the losses of one method's configurations; return whether some are of validation."""
+    """Draw the losses of one method's configurations; return whether any is a validation loss."""
     validated = False
     dress(axes)
     for i, row in enumerate(rows):

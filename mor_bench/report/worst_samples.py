@@ -32,7 +32,7 @@ REFERENCE, REFERENCE_EDGE = "#7fb2d6", "#33607f"
 REST, PREDICTION, FORCE = "#c4c4c4", "#D55E00", "#222222"
 
 AZIMUTH, ELEVATION = np.deg2rad(-68.0), np.deg2rad(20.0)
-"""Direction of view: x runs to the right, z up, and the faces y-min and z-max are visible."""
+"""View direction: x points right, z points up; the faces y-min and z-max are visible."""
 
 CAPTION = (
     "The test sample with the largest e of each method's configuration with the smallest ē: "
@@ -46,7 +46,7 @@ CAPTION = (
 
 @dataclass(frozen=True)
 class WorstSample:
-    """The predicted test sample of a configuration with the largest e; arrays are (n_nodes, 3).
+    """The test sample with the largest e of a configuration; arrays are (n_nodes, 3).
 
     Attributes
     ----------
@@ -54,9 +54,9 @@ class WorstSample:
     prediction, reference : array
         Displacements, m; the prediction is NaN if there is none.
     forces : array
-        N.
+        Nodal forces, N.
     error_m, relative_l2 : float
-        Of this sample.
+        Errors of this sample.
     """
 
     entry: Entry
@@ -133,7 +133,7 @@ def _limits(
 ) -> NDArray[np.float64]:
     """Screen box (2, 2) of all shapes and arrows.
 
-    Displacements of wild predictions are cut at half a diagonal of the body.
+    Displacements of wild predictions are clipped at half a diagonal of the body.
     """
     span = _diagonal(mesh)
     shapes = [mesh.points, *(arrow for arrow in arrows if arrow is not None)]
@@ -153,7 +153,7 @@ def _diagonal(mesh: Mesh) -> float:
 
 
 def _arrow(mesh: Mesh, sample: WorstSample) -> NDArray[np.float64] | None:
-    """Start and end (2, 3) of the total force: it ends on the surface if it pushes, else starts."""
+    """Start and end (2, 3) of the total force: a push ends on the surface, a pull starts there."""
     size, total = np.linalg.norm(sample.forces, axis=1), sample.forces.sum(axis=0)
     if not size.sum() > 0 or not np.linalg.norm(total) > 0:
         return None
@@ -201,13 +201,13 @@ def _draw_edges(
 
 
 def _normals(points: NDArray[np.float64], facets: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Outward normals (n_facets, 3), twice as long as the facet's area."""
+    """Outward normals (n_facets, 3); their length is twice the facet's area."""
     corners = points[facets]
     return np.asarray(np.cross(corners[:, 2] - corners[:, 0], corners[:, -1] - corners[:, 1]))
 
 
 def _facing(points: NDArray[np.float64], facets: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mark the facets whose outer side is visible."""
+    """Mark the facets with a visible outer side."""
     return np.asarray(_project(_normals(points, facets))[1] > 0)
 
 
