@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.counting import count
+from mor_bench.counting import count, is_counting
 from mor_bench.errors import UnsupportedSceneError
 from mor_bench.mechanics.elements import H8, element_of, shape_gradients
 from mor_bench.mechanics.kernels import (
@@ -189,17 +189,22 @@ class Assembler:
         self, u: Array, dofs: NDArray[np.int32], force: Array, values: Array
     ) -> tuple[float, float]:
         """Add forces and, where ``values`` is not empty, tangents; return energy and min det F."""
-        count(element_evaluations=self.n_cells, multiply_adds=self._multiply_adds[len(values) > 0])
+        if is_counting():
+            work = self._multiply_adds[len(values) > 0]
+            count(element_evaluations=self.n_cells, multiply_adds=work)
+        gradients = self._gradients
         out: tuple[float, float]
         if not self._vectorised:
-            law = self.material.law, self._parameters
-            cells = dofs, self._gradients, self._weights
-            out = general_force(u, *cells, *law, self._slots, force, values)
+            law, parameters, weights = self.material.law, self._parameters, self._weights
+            out = general_force(
+                u, dofs, gradients, weights, law, parameters, self._slots, force, values
+            )
         elif len(values) == 0:
-            out = internal_force(u, dofs, self._gradients, self._w_lam, self._w_mu, force)
+            out = internal_force(u, dofs, gradients, self._w_lam, self._w_mu, force)
         else:
-            cells = dofs, self._gradients, self._w_lam
-            out = internal_force_and_tangent(u, *cells, self._w_mu, self._slots, force, values)
+            out = internal_force_and_tangent(
+                u, dofs, gradients, self._w_lam, self._w_mu, self._slots, force, values
+            )
         return out
 
     def force(self, u: Array) -> State:

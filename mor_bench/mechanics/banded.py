@@ -9,7 +9,7 @@ from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpbtrf, dpbtrs
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from mor_bench.counting import cholesky_multiply_adds, count, triangular_multiply_adds
+from mor_bench.counting import cholesky_multiply_adds, count, is_counting, triangular_multiply_adds
 from mor_bench.mechanics.linear import NotPositiveDefiniteError, n_columns
 from mor_bench.mechanics.pattern import Pattern
 from mor_bench.scene.dofs import dofs_of_nodes
@@ -196,8 +196,10 @@ class SingleBandedFactor:
 
     def solve_in_place(self, x: NDArray[np.float32]) -> None:
         """Overwrite right-hand sides x (m, n), in the factor's order, by the solutions."""
-        n, width = self._columns.shape
-        count(back_solves=len(x), multiply_adds=len(x) * triangular_multiply_adds(n, width - 1))
+        if is_counting():
+            n, width = self._columns.shape
+            work = triangular_multiply_adds(n, width - 1)
+            count(back_solves=len(x), multiply_adds=len(x) * work)
         banded_solve(self._columns, x)
 
 

@@ -158,12 +158,10 @@ def _push_forward(H, S, g, w_lam, w_mu, h, h_lam, h_mu, t, M):
             h2 = g2 + H[6 * LANES + l] * g0 + H[7 * LANES + l] * g1 + H[8 * LANES + l] * g2
             wl, wm = w_lam[l], w_mu[l]
             h[x * LANES + l], h[y * LANES + l], h[z * LANES + l] = h0, h1, h2
-            h_lam[x * LANES + l] = wl * h0
-            h_lam[y * LANES + l] = wl * h1
-            h_lam[z * LANES + l] = wl * h2
-            h_mu[x * LANES + l] = wm * h0
-            h_mu[y * LANES + l] = wm * h1
-            h_mu[z * LANES + l] = wm * h2
+            l0, l1, l2 = wl * h0, wl * h1, wl * h2
+            n0, n1, n2 = wm * h0, wm * h1, wm * h2
+            h_lam[x * LANES + l], h_lam[y * LANES + l], h_lam[z * LANES + l] = l0, l1, l2
+            h_mu[x * LANES + l], h_mu[y * LANES + l], h_mu[z * LANES + l] = n0, n1, n2
             t[x * LANES + l] = S[l] * g0 + S[3 * LANES + l] * g1 + S[4 * LANES + l] * g2
             t[y * LANES + l] = S[3 * LANES + l] * g0 + S[1 * LANES + l] * g1 + S[5 * LANES + l] * g2
             t[z * LANES + l] = S[4 * LANES + l] * g0 + S[5 * LANES + l] * g1 + S[2 * LANES + l] * g2
