@@ -24,13 +24,13 @@ CELLS = ("hexahedron", "tetra")
 def read_mesh(path: Path, unit_m: float) -> tuple[Mesh, PointSets]:
     """Read the H8 or T4 cells of a mesh file, and its named sets of nodes.
 
-    Cells of fewer dimensions only name nodes, see `mor_bench.scene.point_sets`. Unused nodes are
+    Cells of lower dimension only name nodes, see `mor_bench.scene.point_sets`. Unused nodes are
     dropped, cells are oriented and nodes may be renumbered, see `mor_bench.scene.soundness`.
 
     Parameters
     ----------
     path : Path
-        A file that meshio reads, or one in version 1 of Gmsh's format.
+        A file in a format of meshio, or in version 1 of Gmsh's format.
     unit_m : float
         Length of the file's unit, m.
 
@@ -108,7 +108,7 @@ def _positions(raw: meshio.Mesh, unit_m: float) -> NDArray[np.float64]:
 
 
 def read_with_meshio(path: Path) -> meshio.Mesh:
-    """Read a file silently: discard what meshio prints, and raise where it would exit.
+    """Read a file with meshio, without its output, and raise an error where meshio would exit.
 
     Raises
     ------
@@ -127,8 +127,8 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
         return read_gmsh1(path)
     if suffix == ".inp":
         check_abaqus(path)
-    # Ansys and Gmsh both write .msh. If the format is given, meshio says what is wrong with the
-    # file.
+    # Ansys and Gmsh both write .msh. With a given format, meshio's message explains the error in
+    # the file.
     file_format = "gmsh" if suffix == ".msh" and head.startswith(b"$") else None
     printed = StringIO()
     try:

@@ -23,7 +23,7 @@ _TYPES = dict(enumerate(_NAMES.split(), start=1))
 
 
 def is_gmsh1(head: bytes) -> bool:
-    """Whether a file that begins with these bytes is in version 1 of Gmsh's format."""
+    """Return whether a file with these first bytes is in version 1 of Gmsh's format."""
     return head.lstrip().startswith(b"$NOD")
 
 
@@ -63,7 +63,7 @@ def read_gmsh1(path: Path) -> meshio.Mesh:
 
 
 def _section(lines: Sequence[str], name: str) -> list[list[str]]:
-    """Return the words of each line between `$NAME` with the number of lines, and `$ENDNAME`."""
+    """Return the words of each line between `$NAME` with its number of lines, and `$ENDNAME`."""
     stripped = [line.strip() for line in lines]
     if f"${name}" not in stripped or f"$END{name}" not in stripped:
         raise ValueError(f"${name} or $END{name} is missing")

@@ -15,7 +15,7 @@ from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.mesh import KUHN, Mesh, box_mesh
 
 MAX_POINTS = 1_000_000
-"""Largest number of grid points. With more, 128 channels of one sample need half a gigabyte."""
+"""Largest number of grid points; with 128 channels, this many points need half a gigabyte."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def grid_map(mesh: Mesh, shape: tuple[int, int, int] | None = None) -> GridMap:
         )
     low, high = mesh.bounds
     length_x, length_y, length_z = (float(length) for length in high - low)
-    # Rounding is monotone, so nodes on the bounding box do not fall outside of this box.
+    # Rounding is monotone, so nodes on the bounding box stay in this box.
     box = box_mesh((length_x, length_y, length_z), (nx - 1, ny - 1, nz - 1))
     return GridMap((nx, ny, nz), interpolation_matrix(box, mesh.points - low))
 
@@ -121,7 +121,7 @@ def default_shape(mesh: Mesh) -> tuple[int, int, int]:
     """Return the points per axis of a grid about as dense as the nodes of the body.
 
     Each node owns a cube of edge h = (volume of the body / n_nodes)^(1/3). An axis of length L gets
-    round(L / h) points, at least 2. A coarser grid may pay where training is short.
+    round(L / h) points, at least 2. A coarser grid may be better for a short training.
 
     Raises
     ------

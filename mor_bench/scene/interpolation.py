@@ -1,4 +1,4 @@
-"""Interpolation from the nodes of a mesh to points of its body, by shape functions of the cells."""
+"""Interpolation from the nodes of a mesh to points in its body, by shape functions of the cells."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _hexahedron(
         shape, derivatives = trilinear(xi)
         miss = points - np.einsum("na,nai->ni", shape, corners)
         jacobian = np.einsum("nai,nad->nid", corners, derivatives)
-        # The map may fold outside the cell. There it is enough to see that the point is outside.
+        # The map may fold outside the cell. There, only the fact that the point is outside matters.
         folded = np.abs(np.linalg.det(jacobian)) <= 1e-12 * size**3
         jacobian[folded] = np.eye(3) * size[folded, None, None]
         step = np.linalg.solve(jacobian, miss[:, :, None])[:, :, 0]
@@ -116,7 +116,7 @@ def interpolation_matrix(mesh: Mesh, points: NDArray[np.float64]) -> sp.csr_arra
         row, column = np.nonzero(in_box.all(axis=2))
         tried = candidates[row, column]
         shape, outside = locate(cells.corners[tried], points[searched[row]])
-        # If several cells contain a point, the best one is written last and stays.
+        # If several cells contain a point, the best one is written last and remains.
         order = np.argsort(-outside, kind="stable")
         order = order[outside[order] <= OUTSIDE]
         cell_of[searched[row[order]]], shape_of[searched[row[order]]] = tried[order], shape[order]

@@ -1,9 +1,9 @@
-"""The suite's liver: a smooth body of two lobes, given by an equation, for meshes of any size.
+"""The suite's liver: a smooth body with two lobes, defined by an equation, for any mesh size.
 
-Two ellipsoids, a large right and a flat left lobe, are blended; a third ellipsoid is cut out
-between them. Each has a quadratic form q = |A(x - c)|² - 1 that is negative inside. With the
-softened minimum min_k(q) = -log Σ exp(-k q) / k the body is where max_k(min_k(q_right, q_left),
--q_notch) < 0. That function is smooth everywhere, and so is the surface.
+Two ellipsoids, a large right lobe and a flat left lobe, are blended. A third ellipsoid between them
+is cut out. Each ellipsoid has a quadratic form q = |A(x - c)|² - 1, which is negative inside. The
+softened minimum is min_k(q) = -log Σ exp(-k q) / k. The body is where
+max_k(min_k(q_right, q_left), -q_notch) < 0. This function and its surface are smooth everywhere.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _TETRAHEDRA_SPACING_M = 0.013
 def liver_level(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a smooth function of positions (n, 3), m: negative inside, 0 on the surface.
 
-    It has no unit and is no distance.
+    It has no unit and is not a distance.
     """
     pose = Rotation.from_euler("xyz", _POSE, degrees=True).as_matrix()
     own = points / _UNIT_M @ pose
@@ -61,9 +61,9 @@ def liver_level(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def liver_surface() -> Surface:
     """Return the closed surface of the liver, 0.2 m long along x.
 
-    It is the boundary of a mesh of finer tetrahedra without slivers; its vertices are on the level
-    set to round-off. In 15 x 14 x 15 cells it has 726 H8 and 1,118 nodes; U-Mesh's liver has 732
-    and 1,109.
+    It is the boundary of a mesh of finer tetrahedra without slivers. Its vertices lie on the level
+    set to round-off. A grid of 15 x 14 x 15 cells gives 726 H8 and 1,118 nodes; U-Mesh's liver has
+    732 and 1,109.
     """
     mesh = tetrahedral_mesh(liver_level, _BOUNDS, _SURFACE_SPACING_M)
     used, number = np.unique(mesh.boundary_facets, return_inverse=True)

@@ -1,7 +1,7 @@
 """Load patches: a uniform traction on a surface of fixed area, as consistent weights.
 
-A force on a single node is a pressure that grows without bound under mesh refinement, and it
-inverts elements. A patch of fixed area is the same load on every mesh.
+A force on a single node is a pressure that grows without bound under mesh refinement and inverts
+elements. A patch of fixed area is the same load on every mesh.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ POINTS_PER_PATCH = 256
 """Least number of surface quadrature points in a patch."""
 
 MAX_SURFACE_POINTS = 200_000
-"""Largest number of quadrature points. With more, a patch is tiny compared with its facet."""
+"""Largest number of quadrature points. A patch that needs more is tiny compared with its facet."""
 
 MAX_PIECES = 1_000_000
-"""Largest number of pieces of long triangles. Thin triangles need many."""
+"""Largest number of pieces of long triangles. Thin triangles need many pieces."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,8 @@ def cut_patches(
 ) -> Patches:
     """Return the patches around some points of a surface.
 
-    A patch is the part of the facets nearest to its centre with the given area. So a patch at an
-    edge is as large as any other. A force F on it is a uniform traction F / area.
+    A patch is the nearest part of the facets with the given area. So a patch at an edge is as large
+    as any other. A force F on it is a uniform traction F / area.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def _shares(
     distance = np.round(distance / (sqrt(area_m2) * 1e-9))
     order = near[np.argsort(distance, kind="stable")]
     distance = np.sort(distance)
-    # Points at the same distance get the same fraction, so that a symmetric patch stays symmetric.
+    # Points at the same distance get the same fraction, so a symmetric patch stays symmetric.
     ends = np.flatnonzero(np.append(np.diff(distance) > 0, True))
     filled = np.cumsum(areas[order])[ends]
     last = min(int(np.searchsorted(filled, area_m2)), len(ends) - 1)
@@ -168,11 +168,11 @@ def _nearest(
     centre: NDArray[np.float64],
     area_m2: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return points around a centre with enough area, or all; and their distances, m."""
+    """Return points around a centre with enough area, or all points; and their distances, m."""
     distance = np.linalg.norm(points - centre, axis=1)
     reach = 2 * sqrt(area_m2 / pi)
     while reach < distance.max():
-        # Points about as far as the furthest one belong together, so the last 0.1 % does not count.
+        # A margin of 0.1 % keeps points at about the same distance together.
         near = np.flatnonzero(distance <= reach)
         if areas[distance <= 0.999 * reach].sum() > area_m2:
             return near, distance[near]
@@ -243,12 +243,8 @@ def _halved(
 ) -> tuple[NDArray[np.float64], sp.csr_array]:
     """Cut triangles across their longest edges until no edge is longer than a length, m.
 
-    Returns
-    -------
-    corners : (n_pieces, 3, 3) float64
-        m.
-    to_corners : (3 n_pieces, n_surface_points) sparse float64
-        Maps values at the surface's points to values at the corners.
+    Returns the corners (n_pieces, 3, 3) float64, m, and a sparse map (3 n_pieces, n_surface_points)
+    from values at the surface's points to values at the corners.
     """
     owner, shares = np.arange(len(facets)), np.tile(np.eye(3), (len(facets), 1, 1))
     while True:
@@ -271,7 +267,7 @@ def _halved(
 def spread_out(points: NDArray[np.float64], n: int) -> NDArray[np.int64]:
     """Return the sorted numbers of n evenly distributed points, by farthest-point sampling.
 
-    The first is the point nearest to the mean of all.
+    The first is the point nearest to the mean of all points.
     """
     chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmin())]
     distance = np.full(len(points), np.inf)

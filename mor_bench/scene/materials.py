@@ -1,6 +1,6 @@
 """Hyperelastic laws: their parameters, split into a volumetric part and the rest.
 
-Selective integration needs the split: it takes the volumetric part from the cell's mean gradient.
+Selective integration needs this split: it uses the cell's mean gradient in the volumetric part.
 """
 
 from __future__ import annotations
@@ -13,13 +13,7 @@ from mor_bench.specs import MooneyRivlinMaterial, OgdenMaterial, TwoLameMaterial
 
 
 class Material(ABC):
-    """A hyperelastic law.
-
-    Attributes
-    ----------
-    law : int
-        Number of the law in `mor_bench.mechanics.laws`.
-    """
+    """A hyperelastic law; `law` is its number in `mor_bench.mechanics.laws`."""
 
     law: ClassVar[int]
 
@@ -86,9 +80,9 @@ class _TwoLame(Material):
 class SaintVenantKirchhoff(_TwoLame):
     """W(E) = λ/2 tr(E)² + μ tr(E²), with the Green-Lagrange strain E.
 
-    Exact in large rotations, wrong in large strains: it softens in compression (limit point at
-    stretch 1/√3). A mirrored element, diag(-1, 1, 1), stores no energy, so only det F shows an
-    inversion.
+    The law is exact for large rotations and wrong for large strains: it softens in compression,
+    with a limit point at stretch 1/√3. A mirrored element, diag(-1, 1, 1), stores no energy, so
+    only det F shows an inversion.
     """
 
     law = 0

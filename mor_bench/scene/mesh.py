@@ -1,4 +1,4 @@
-"""Meshes of hexahedra (H8) or tetrahedra (T4), with the regular grid they lie in, if any."""
+"""Meshes of hexahedra (H8) or tetrahedra (T4), with their regular grid, if any."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def l_mesh(
     Parameters
     ----------
     size_m, cells, tetrahedra
-        Of the box, see `box_mesh`. Its regular grid is kept.
+        See `box_mesh`. The box's regular grid is kept.
     cut_cells : two ints
         Hexahedra to remove along x and along z.
     """
@@ -124,7 +124,7 @@ def l_mesh(
 
 
 def along_longest_axis(points: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the order (n,) of points (n, 3) along the longest axis, then the second, the third.
+    """Return the order (n,) of points (n, 3), sorted along the longest axis first.
 
     This numbering gives a slender body a small bandwidth.
     """

@@ -25,10 +25,10 @@ _NO_ROWS = np.zeros(0, dtype=np.int64)
 def named_point_sets(mesh: meshio.Mesh, path: Path) -> PointSets:
     """Return the sets of nodes that a file names; sets with the same name are joined.
 
-    Sources: point sets (Abaqus NSET, also in `*NODE, NSET=…`), the nodes of cell sets (ELSET) and
-    of Gmsh's physical groups of any dimension, and point data of zeros and ones (VTK). A group
-    without a name goes by its number, after its dimension if groups of other dimensions have that
-    number. An Abaqus file must have passed `check_abaqus`.
+    Sources: point sets (Abaqus NSET, also in `*NODE, NSET=…`); the nodes of cell sets (ELSET) and
+    of Gmsh's physical groups of any dimension; point data of zeros and ones (VTK). A group without
+    a name is called by its number. If groups of other dimensions have the same number, the
+    dimension comes first. An Abaqus file must have passed `check_abaqus`.
     """
     found: dict[str, list[NDArray[np.int64]]] = {}
     abaqus = path.suffix.lower() == ".inp"
@@ -56,7 +56,7 @@ def _cell_sets(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
     for name, members in mesh.cell_sets.items():
         if not name.startswith("gmsh:"):
             rows = [_NO_ROWS if part is None else np.asarray(part, np.int64) for part in members]
-            # A set that was defined before later cells has no entry for them.
+            # A set defined before later cells has no rows for them.
             sets.append((name, (rows + [_NO_ROWS] * len(mesh.cells))[: len(mesh.cells)]))
     return sets
 
@@ -96,7 +96,7 @@ def _keywords(path: Path, keyword: str, parameter: str) -> list[str | None]:
 
 
 def check_abaqus(path: Path) -> None:
-    """Raise `SpecError` if an Abaqus file has two NSET of one name, or two NODE blocks.
+    """Raise `SpecError` if an Abaqus file has two NSET with the same name, or two NODE blocks.
 
     meshio would read only one of them.
     """
@@ -116,13 +116,13 @@ def check_abaqus(path: Path) -> None:
 def _abaqus_blocks(mesh: meshio.Mesh, path: Path) -> list[tuple[str, _Rows]]:
     """Return the sets named in lines `*ELEMENT, ELSET=…`, and remove meshio's version of them.
 
-    meshio assigns these sets to wrong cells if a line has none.
+    If a line has no set, meshio assigns these sets to wrong cells.
     """
     names = _keywords(path, "ELEMENT", "ELSET")
     for name in {*names} - {None, *_keywords(path, "ELSET", "ELSET")}:
         mesh.cell_sets.pop(name, None)
     n_blocks = len(mesh.cells)
-    if len(names) != n_blocks:  # an included file has cells: their owners are not known
+    if len(names) != n_blocks:  # an included file has cells, whose sets are not known
         return []
     every = [np.arange(len(block)) for block in mesh.cells]
     return [

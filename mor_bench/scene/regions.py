@@ -25,12 +25,12 @@ ON_FACE = 1e-9
 
 @dataclass(frozen=True)
 class Cloud:
-    """The points that regions are searched in: the nodes of a mesh, or the points of a surface.
+    """The candidate points of regions: the nodes of a mesh, or the points of a surface.
 
     Attributes
     ----------
     points : (n_points, 3) float64
-        m.
+        Positions, m.
     on_surface : (n,) int64
         Numbers of the points on the surface.
     sets : mapping of str to (n,) int64

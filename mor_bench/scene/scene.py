@@ -1,4 +1,4 @@
-"""A scene: mesh, material, supports, load patches and needs. Every method is given one."""
+"""A scene: mesh, material, supports, load patches and needs. Every method is given a scene."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Scene:
     embedded_surface : Facets or None
         The smooth surface from which a mesh of voxels was made. Loads act on it.
     point_sets : mapping of str to (n,) int64
-        Named sets of nodes of a mesh file.
+        Named sets of nodes from a mesh file.
     """
 
     spec: AnyDatasetSpec
@@ -74,7 +74,7 @@ class Scene:
 
     @property
     def selective(self) -> bool:
-        """Whether the volumetric energy comes from the cells' mean gradients."""
+        """Whether the volumetric energy is computed from the cells' mean gradients."""
         return self.generated.discretisation.integration == "selective"
 
     @cached_property
@@ -121,7 +121,7 @@ class Scene:
 
     @cached_property
     def surface(self) -> Facets:
-        """The surface that loads act on: the embedded surface, or else the mesh's boundary."""
+        """The loaded surface: the embedded surface, or else the mesh's boundary."""
         return self.embedded_surface or Facets(self.mesh.points, self.mesh.boundary_facets)
 
     @cached_property
@@ -173,7 +173,7 @@ class Scene:
 
     @cached_property
     def loaded_facets(self) -> NDArray[np.int64]:
-        """(n_facets, 4 or 3) part of the surface on which patches lie."""
+        """(n_facets, 4 or 3) facets on which patches may lie."""
         return self.surface.within(self._loaded_points)
 
     @cached_property
@@ -210,8 +210,8 @@ class Scene:
     def patch_weights(self) -> sp.csr_array:
         """(n_patches, n_nodes) nodal weights of a force on each patch; rows sum to 1.
 
-        They are the consistent load of a uniform traction. From an embedded surface it goes to the
-        nodes of the cells around it.
+        They are the consistent load of a uniform traction. An embedded surface passes it to the
+        nodes of the surrounding cells.
         """
         if self.embedded_surface:
             points, shares = self.patch_points(np.arange(len(self.patch_nodes)))
@@ -219,7 +219,7 @@ class Scene:
         return _rows_to_one(sp.csr_array(self.patches.areas @ self.patches.values))
 
     def prepare(self) -> Scene:
-        """Find all regions now, so that an empty one raises `SpecError` here; return the scene."""
+        """Find all regions now, so an empty region raises `SpecError` here; return the scene."""
         loads = () if self.material is None else ("patch_weights",)
         for name in (*loads, "output_nodes", "observed_nodes"):
             getattr(self, name)
@@ -231,7 +231,7 @@ def _rows_to_one(matrix: sp.csr_array) -> sp.csr_array:
 
 
 def as_spec(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> AnyDatasetSpec:
-    """Return the spec of a dataset that is given by name, path, dict or spec."""
+    """Return the spec of a dataset, given by name, path, dict or spec."""
     if isinstance(source, DatasetSpec | ImportedDatasetSpec):
         return source
     return load_dataset_spec(source)
@@ -270,14 +270,14 @@ def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
     Parameters
     ----------
     scene : Scene
-        Of a box or an L.
+        A scene with a box or an L.
     cells : three ints
         Cells per axis.
 
     Raises
     ------
     UnsupportedSceneError
-        If the scene is neither, or has no such mesh.
+        If the scene is neither, or cannot have such a mesh.
     """
     geometry = scene.generated.geometry
     name = f"{scene.name} with {' x '.join(map(str, cells))} cells"
@@ -303,9 +303,9 @@ def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
 
 
 def refined(scene: Scene) -> Scene:
-    """Return the same body and supports on a mesh with eight cells for each.
+    """Return the same body and supports on a mesh with each cell divided into eight.
 
-    Its load patches may not exist. The steps of an embedded surface's voxels stay as they are.
+    Its load patches may not exist. The steps in the surface of voxels remain.
     """
     geometry = scene.generated.geometry
     if isinstance(geometry, BoxGeometry) and scene.mesh.grid_shape is not None:
@@ -317,7 +317,7 @@ def refined(scene: Scene) -> Scene:
 
 
 def _without_patches(spec: DatasetSpec) -> Scene:
-    """Build a scene whose load region has not been looked at."""
+    """Build a scene without searching its load region."""
     mesh, surface, point_sets = _body(spec)
     element = "tetrahedron" if mesh.cells.shape[1] == 4 else "hexahedron"
     if element != spec.discretisation.element:
@@ -338,7 +338,7 @@ def _body(
 ) -> tuple[Mesh, Facets | None, Mapping[str, NDArray[np.int64]]]:
     """Return mesh, embedded surface and named sets of nodes of a geometry.
 
-    Readers and mesh generators are imported where they are needed, since that takes a while.
+    Readers and mesh generators are imported on demand, because their import is slow.
     """
     geometry, tetrahedra = spec.geometry, spec.discretisation.element == "tetrahedron"
     if isinstance(geometry, LShapeGeometry):

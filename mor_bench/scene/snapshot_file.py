@@ -1,4 +1,4 @@
-"""Snapshots of another program: arrays in an NPZ or HDF5 file.
+"""Snapshots from another program: arrays in an NPZ or HDF5 file.
 
 Required: `points` (n_nodes, 3), m; `cells` (n_cells, 8 or 4) in VTK order, counted from 0; `forces`
 and `displacements` (n, n_nodes, 3), N and m. Optional: `fixed_nodes` (n_fixed,); `regions` (n,), or
@@ -29,7 +29,7 @@ STILL = 1e-9
 """Displacement of a fixed node that counts as zero, as a fraction of the largest displacement."""
 
 MAX_SIZE = {"forces": 1e30, "displacements": 1e30}
-"""Largest allowed values, N and m. Their squares and products are far from overflow."""
+"""Largest allowed values, N and m. Their squares and products do not overflow."""
 
 REQUIRED = ("points", "cells", "forces", "displacements")
 OPTIONAL = ("fixed_nodes", "regions", "test")
@@ -94,7 +94,7 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
         if suffix == ".npz":
             with zipfile.ZipFile(
                 path
-            ):  # numpy reads other files too, but they hold no named arrays
+            ):  # numpy also reads other files, but these hold no named arrays
                 pass
             with np.load(path, allow_pickle=False) as content:
                 _check_names(content.files)
@@ -152,7 +152,7 @@ def _checked(arrays: Mapping[str, NDArray[Any]]) -> ImportedArrays:
         regions = regions.astype(np.int64).reshape(n, -1)
         if not regions.size or regions.min() < 0:
             raise SpecError("`regions` must be ids from 0 on.")
-    # Adding zero makes -0.0 and 0.0 the same bytes.
+    # Adding zero gives -0.0 and 0.0 the same bytes.
     seen = {hashlib.sha256((force + 0.0).tobytes()).digest() for force in forces}
     if len(seen) < n:
         raise SpecError(f"`forces`: {n - len(seen)} samples repeat others.")
@@ -177,7 +177,7 @@ def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
     }
     for name in (*REQUIRED, *OPTIONAL):
         array = arrays.get(name)
-        if array is None or (name == "fixed_nodes" and array.size == 0):  # empty: any type will do
+        if array is None or (name == "fixed_nodes" and array.size == 0):  # empty: any type is valid
             continue
         kinds = _KINDS.get(name, "fiu")
         if array.dtype.kind not in kinds:

@@ -1,4 +1,4 @@
-"""Checks of a mesh that was made elsewhere, and its renumbering."""
+"""Checks of an imported mesh, and its renumbering."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _TURNED = {4: [1, 0, 2, 3], 8: [4, 5, 6, 7, 0, 1, 2, 3]}
 
 
 def tidied(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[Mesh, NDArray[np.int64]]:
-    """Return a mesh without unused nodes, with oriented cells, numbered for a small bandwidth.
+    """Return a mesh without unused nodes, with oriented cells and a small bandwidth.
 
     Parameters
     ----------
     points : (n_points, 3) float64
-        m.
+        Positions, m.
     cells : (n_cells, 8) or (n_cells, 4) int64
 
     Returns
@@ -61,9 +61,9 @@ def tidied(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[Mesh,
 
 
 def in_grid(mesh: Mesh) -> Mesh:
-    """Return the mesh with the axis-parallel regular grid that it lies in, if there is one.
+    """Return the mesh with its axis-parallel regular grid, if it has one.
 
-    Each node must be at a grid point of its own, and no cell may be larger than the spacing.
+    Each node must have its own grid point, and no cell may be larger than the spacing.
     """
     low, size = mesh.points.min(axis=0), np.ptp(mesh.points, axis=0)
     near = IN_GRID * float(np.linalg.norm(size))
@@ -80,7 +80,7 @@ def in_grid(mesh: Mesh) -> Mesh:
 
 
 def check_numbers(points: NDArray[np.float64], cells: NDArray[np.int64]) -> None:
-    """Raise `SpecError` if a mesh is empty, not finite, or a cell has a wrong node."""
+    """Raise `SpecError` if a mesh is empty or not finite, or a cell has a wrong node number."""
     if not len(points) or not len(cells):
         raise SpecError("there must be points and cells; got none.")
     if cells.ndim != 2 or cells.shape[1] not in FACES:
@@ -102,8 +102,8 @@ def sound_cells(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArra
     Raises
     ------
     SpecError
-        If nodes coincide, a cell is flat, inverted or repeated, more than two cells share a face or
-        two lie on one side of it, or some cells are not connected through faces.
+        If nodes coincide; a cell is flat, inverted or repeated; more than two cells share a face;
+        two cells lie on the same side of a face; or some cells are not connected through faces.
     """
     near = SAME_PLACE * float(np.linalg.norm(np.ptp(points, axis=0)))
     pairs = cKDTree(points).query_pairs(near, output_type="ndarray")
@@ -120,7 +120,7 @@ def sound_cells(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArra
 
 
 def outwards(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the cells, inverted ones reoriented: any tetrahedra, but hexahedra only if all.
+    """Orient the cells: reverse inverted tetrahedra, but hexahedra only if all are inverted.
 
     Raises
     ------
@@ -166,7 +166,7 @@ def _check_overlap(cells: NDArray[np.int64], numbers: NDArray[np.int64]) -> None
         raise SpecError(
             f"{int((shared > 2).sum())} faces belong to more than two cells: cells overlap."
         )
-    # Seen from outside, the cells on either side of a face go round it in opposite directions.
+    # Seen from outside, the two cells at a face number its corners in opposite directions.
     corners = FACES[cells.shape[1]]
     faces = cells[:, corners].reshape(-1, corners.shape[1])
     second = faces[np.arange(len(faces)), (faces.argmin(axis=1) + 1) % faces.shape[1]]
@@ -178,7 +178,7 @@ def _check_overlap(cells: NDArray[np.int64], numbers: NDArray[np.int64]) -> None
 
 
 def _check_parts(faces: NDArray[np.int64]) -> None:
-    """Raise `SpecError` if some cells are not connected through faces; an edge is a hinge."""
+    """Raise `SpecError` if some cells are not connected through faces. An edge is a hinge."""
     cell = np.repeat(np.arange(len(faces)), faces.shape[1])
     belongs = sp.csr_array((np.ones(faces.size), (cell, faces.ravel())))
     n_parts = connected_components(sp.csr_array(belongs @ belongs.T), directed=False)[0]
@@ -196,7 +196,7 @@ def _face_numbers(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 def _numbering(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the order along the longest axis if it reduces the bandwidth, else the present order.
 
-    The banded solver takes this order or that of reverse Cuthill-McKee, whichever is better.
+    The banded solver uses this order or reverse Cuthill-McKee, whichever has less bandwidth.
     """
     order = along_longest_axis(points)
     new, old = np.ptp(inverse_of(order)[cells], axis=1).max(), np.ptp(cells, axis=1).max()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mor_bench.scene.mesh import HEX_CORNERS, Mesh, along_longest_axis, inverse_of
 
 _THIRDS = list(product(range(3), repeat=3))
-"""Places of the 27 nodes of a hexahedron that is cut in eight, in half edges along its axes."""
+"""Positions of the 27 nodes of a divided hexahedron, in half edges along its axes."""
 
 HEX_PARENTS = [
     [
@@ -20,7 +20,7 @@ HEX_PARENTS = [
     ]
     for third in _THIRDS
 ]
-"""The corners whose mean each of the 27 nodes is."""
+"""The corners that are averaged for each of the 27 nodes."""
 
 HEX_CHILDREN = np.array(
     [[_THIRDS.index(tuple(origin + place)) for place in HEX_CORNERS] for origin in HEX_CORNERS]
@@ -39,7 +39,7 @@ _TET_INNER = {
 
 
 def subdivide(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
-    """Return a mesh with eight cells for each, without a grid.
+    """Return a mesh with eight cells for each cell, without a grid.
 
     Cutting the corners off a tetrahedron leaves an octahedron. It is cut along its shortest
     diagonal.
@@ -47,9 +47,9 @@ def subdivide(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
     Returns
     -------
     mesh : Mesh
-        Nodes are numbered along the body's longest axis, which keeps the bandwidth small.
+        Nodes are numbered along the body's longest axis, for a small bandwidth.
     parents : (n_nodes, 8) int64
-        Each new node is the mean of these old nodes, which occur equally often.
+        Each new node is the mean of these old nodes; all occur equally often.
     """
     hexahedra = mesh.cells.shape[1] == 8
     local = HEX_PARENTS if hexahedra else TET_PARENTS

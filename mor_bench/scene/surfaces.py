@@ -1,4 +1,4 @@
-"""Closed triangulated surfaces: reading from STL or OBJ, checks, and a test for enclosed points."""
+"""Closed triangulated surfaces: readers of STL and OBJ, checks, and a test for enclosed points."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Surface:
 def inside(surface: Surface, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return whether each point (n, 3), m, lies in the body, by the surface's winding number.
 
-    For a point on the surface itself, to round-off, the answer may be either.
+    For a point on the surface, to round-off, the answer may be either.
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     return np.asarray(winding_numbers(surface.points[surface.triangles], points) > 0.5)
@@ -57,12 +57,12 @@ def read_surface(path: str | Path, unit_m: float = 1.0) -> Surface:
     """Read a closed surface from an STL or OBJ file.
 
     Equal vertices are merged, polygons become fans of triangles, and a surface that is oriented
-    inwards is reversed. Crossings of the surface with itself are not detected.
+    inwards is reversed. Self-intersections of the surface are not detected.
 
     Parameters
     ----------
     path : str or Path
-        Ends in .stl or .obj.
+        A file name that ends in .stl or .obj.
     unit_m : float, default 1
         The file's unit of length, m; 0.01 for centimetres.
 
@@ -70,10 +70,10 @@ def read_surface(path: str | Path, unit_m: float = 1.0) -> Surface:
     ------
     SpecError
         If the file is missing or unreadable, has no triangles or a NaN, or its surface is not
-        closed, not consistently oriented or encloses nothing. The message names the file.
+        closed, not consistently oriented or encloses nothing.
     """
     corners = read_triangles(Path(path), unit_m)
-    # Adding zero turns -0.0 into 0.0, so that vertices of neighbouring triangles are equal.
+    # Adding zero turns -0.0 into 0.0, so vertices of neighbouring triangles are equal.
     vertices, number = np.unique(corners.reshape(-1, 3) + 0.0, axis=0, return_inverse=True)
     triangles = number.reshape(-1, 3)
     triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]

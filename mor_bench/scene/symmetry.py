@@ -11,18 +11,14 @@ from scipy.spatial import cKDTree
 from mor_bench.scene.scene import Scene
 
 SAME_PLACE = 1e-6
-"""Distance below which a mirrored node matches another, as a fraction of the body's diagonal."""
+"""Largest distance between a mirrored node and its match, as a fraction of the body's diagonal."""
 
 
 @dataclass(frozen=True)
 class Mirror:
-    """Reflection in the plane through the middle of the body, normal to an axis.
+    """Reflection in the plane through the middle of the body, normal to `axis`.
 
-    Attributes
-    ----------
-    axis : int
-    nodes : (n_nodes,) int64
-        The node at the mirror image of each node; its own inverse.
+    `nodes` (n_nodes,) int64 gives the node at the mirror image of each node; it is its own inverse.
     """
 
     axis: int

@@ -1,10 +1,10 @@
 """Tetrahedral meshes of level sets by isosurface stuffing (Labelle & Shewchuk, SIGGRAPH 2007).
 
-The lattice is body-centred cubic: it has the corners and centres of cubes. Its tetrahedra have two
-neighbouring centres and an edge of the face between them. Long edges join points of one kind; short
-edges, √3/2 as long, join points of both kinds. A lattice point close to the surface moves onto it;
-then tetrahedra that still cross the surface are cut. The authors prove dihedral angles between
-10.7° and 164.8° for their stencils. The diagonals here may differ from theirs in places.
+The lattice is body-centred cubic: it consists of the corners and centres of cubes. Each
+tetrahedron has two neighbouring centres and an edge of the face between them. Long edges join two
+corners or two centres. Short edges, √3/2 as long, join a corner and a centre. A lattice point close
+to the surface moves onto it. Then tetrahedra that still cross the surface are cut. The authors
+prove dihedral angles between 10.7° and 164.8° for their stencils. Some diagonals here may differ.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Level = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 CLOSE_LONG, CLOSE_SHORT = 0.24999, 0.41189
 """Fractions of a long and of a short edge within which a lattice point moves onto the surface.
 
-Values of their table 1 with the best smallest angle.
+The values give the best smallest angle in the paper's table 1.
 """
 
 BISECTIONS = 60
@@ -33,9 +33,9 @@ BISECTIONS = 60
 def _lattice(
     bounds: NDArray[np.float64], spacing: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return points (n, 3), tetrahedra (m, 4) and integer places (n, 3) of a lattice over bounds.
+    """Return points (n, 3), tetrahedra (m, 4) and coordinates (n, 3) of a lattice over bounds.
 
-    Places count half cubes. The first and the last edge of a tetrahedron are long.
+    The coordinates are integers, in half cubes. The first and last edge of a tetrahedron are long.
     """
     n = np.ceil((bounds[1] - bounds[0]) / spacing).astype(np.int64) + 2
     start = bounds.mean(axis=0) - spacing * n / 2
@@ -57,7 +57,7 @@ def _lattice(
 
 
 def _crossed_edges(cells: NDArray[np.int64], side: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the distinct edges (n, 2) of tetrahedra (m, 4) from a point inside to one outside.
+    """Return the distinct edges (n, 2) of tetrahedra (m, 4) from an inner to an outer point.
 
     A point's side is 1 inside, 0 on the surface, or -1 outside.
     """
@@ -99,10 +99,10 @@ def _snap(
     at: NDArray[np.float64],
     close: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Move points onto their nearest crossing if it is close, in place; return which moved.
+    """Move points onto their nearest crossing if it is close, in place; return the moved points.
 
-    Edges (n, 2) have a crossing at the fraction `at` (n,); it is close within the fraction `close`
-    (n,).
+    Edges (n, 2) have a crossing at the fraction `at` (n,) of their length. It is close within the
+    fraction `close` (n,).
     """
     step = points[edges[:, 1]] - points[edges[:, 0]]
     crossing = points[edges[:, 0]] + at[:, None] * step
@@ -111,7 +111,7 @@ def _snap(
     chosen = np.flatnonzero(part < np.tile(close, 2))
     chosen = chosen[np.argsort(-distance[chosen], kind="stable")]
     point = edges.T.ravel()[chosen]
-    points[point] = np.tile(crossing, (2, 1))[chosen]  # the nearest is written last and stays
+    points[point] = np.tile(crossing, (2, 1))[chosen]  # the nearest is written last and remains
     moved = np.zeros(len(points), dtype=bool)
     moved[point] = True
     return moved
@@ -131,10 +131,10 @@ def _cut(
     side : (n_points,) int64
         1 for points inside, 0 on the surface, -1 outside.
     places : (n_points, 3) int64
-        Places of the points in the lattice.
+        Lattice coordinates of the points.
     edges : (n_edges, 2) int64
-        From inside to outside, in ascending order. The crossing of edge k is point ``n_points +
-        k``.
+        From inside to outside, in ascending order. The crossing of edge k is point
+        ``n_points + k``.
     """
     cells = np.take_along_axis(cells, np.argsort(-side[cells], axis=1, kind="stable"), axis=1)
     n_in, n_out = (side[cells] > 0).sum(axis=1), (side[cells] < 0).sum(axis=1)
@@ -144,8 +144,8 @@ def _cut(
         return np.where(side[n] < 0, len(side) + np.searchsorted(keys, p * len(side) + n), n)
 
     def rank(p: NDArray[np.int64], n: NDArray[np.int64]) -> NDArray[np.int64]:
-        # A face's trapezium has a diagonal from each of its points inside. The one of higher rank
-        # is used. The rank depends on the face only, so both cells agree. If only one of the cut
+        # A face's trapezium has a diagonal from each of its inner points. The one of higher rank is
+        # used. The rank depends on the face only, so both cells agree. If only one of the cut
         # edges is long, the diagonal ends on it.
         is_short = (places[p] - places[n])[..., 0] % 2
         return np.asarray(2 * is_short + (places[p] // 2).sum(axis=-1) % 2)

@@ -37,7 +37,7 @@ def _to_segment(p, a, b):
 
 @njit(cache=True, inline="always")
 def _side(p, a, b, normal):
-    """Whether p lies on the inner side of the edge a-b of a triangle."""
+    """Return whether p lies on the inner side of the edge a-b of a triangle."""
     return _dot(_cross(_minus(b, a), _minus(p, a)), normal) >= 0.0
 
 
@@ -65,8 +65,8 @@ def _distances(corners, points, out):
 def distances(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the distance (n,) of points (n, 3) from the nearest triangle (m, 3, 3).
 
-    The nearest point of a triangle is in its interior if the prism over it contains the point, and
-    otherwise on an edge. A triangle without area counts as its edges.
+    If the prism over a triangle contains a point, the nearest point is in the triangle's interior.
+    Otherwise it is on an edge. A triangle without area counts as its edges.
     """
     out = np.empty(len(points))
     _distances(

@@ -15,10 +15,9 @@ from numba import njit
 def winding_numbers(corners, points):
     """Return the generalised winding number (n,) of triangles (m, 3, 3) around points (n, 3).
 
-    For a closed surface it is 1 inside and 0 outside. It is the sum of the triangles' solid angles,
-    each by van Oosterom & Strackee (1983), eq. 8: tan(Ω/2) is a·(b × c) / (|a||b||c| + (a·b)|c| +
-    (b·c)|a| + (c·a)|b|). Without rays no ray can hit an edge, see Jacobson, Kavan & Sorkine-Hornung
-    (2013).
+    For a closed surface it is 1 inside and 0 outside. It is the sum of the triangles' solid angles.
+    Van Oosterom & Strackee (1983), eq. 8: tan(Ω/2) = a·(b × c) / (|a||b||c| + (a·b)|c| + (b·c)|a| +
+    (c·a)|b|). There are no rays, so none can hit an edge (Jacobson, Kavan & Sorkine-Hornung 2013).
     """
     windings = np.empty(len(points))
     for n in range(len(points)):
@@ -47,10 +46,10 @@ def winding_numbers(corners, points):
 
 @njit(inline="always")
 def _separated(v, half):
-    """Whether an axis separates a triangle (3, 3) from a cube of half edge `half` at the origin.
+    """Return whether an axis separates a triangle (3, 3) from a cube of half edge `half`.
 
-    The thirteen axes of Akenine-Möller (2001) are the cube's three, their nine cross products with
-    the triangle's edges, and its normal.
+    The cube is at the origin. The thirteen axes of Akenine-Möller (2001) are the cube's three,
+    their nine cross products with the triangle's edges, and the triangle's normal.
     """
     for i in range(3):
         if min(v[0, i], v[1, i], v[2, i]) > half or max(v[0, i], v[1, i], v[2, i]) < -half:
@@ -70,9 +69,9 @@ def _separated(v, half):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def met_cells(corners, shape, half):
-    """Return which cells (nx, ny, nz) of a grid the triangles (m, 3, 3) meet.
+    """Return whether each cell (nx, ny, nz) of a grid meets a triangle (m, 3, 3).
 
-    Each cell is taken as a cube of half edge `half` around its centre.
+    Each cell is replaced by a cube of half edge `half` around its centre.
     """
     met = np.zeros(shape, dtype=np.bool_)
     v = np.empty((3, 3))

@@ -1,4 +1,4 @@
-"""Hexahedral mesh of any closed surface: the cells of a regular grid that overlap its body."""
+"""Hexahedral mesh of any closed surface: the grid cells that overlap its body."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mor_bench.scene.surfaces import Surface, inside
 from mor_bench.scene.triangles import met_cells
 
 TOUCHED = 1e-10
-"""Depth, in half edges of a cell, up to which a surface only touches the cell.
+"""Depth of a mere contact between a surface and a cell, in half edges of the cell.
 
 It is well above round-off, and a tenth of the tolerance of `interpolation_matrix`.
 """
@@ -25,19 +25,19 @@ def _overlapping(
 ) -> NDArray[np.bool_]:
     """Return whether each cell (nx, ny, nz) of the bounding box shares volume with the body.
 
-    The cells' centres are (n_cells, 3).
+    `centres` are the cells' centres (n_cells, 3).
     """
     low, high = surface.bounds
     corners = ((surface.points - low) / (high - low) * cells)[surface.triangles]
     entered, touched = (
         np.asarray(met_cells(corners, cells, 0.5 * (1 + sign * TOUCHED))) for sign in (-1, 1)
     )
-    # Cells that no triangle touches and that share faces are all inside or all outside. So one test
-    # for each connected part is enough.
+    # Connected cells that no triangle touches are all inside or all outside. So one test for each
+    # connected part is enough.
     part = label(~touched)[0]
     first = np.unique(part, return_index=True)[1][1 if touched.any() else 0 :]
     overlaps = entered | np.append(False, inside(surface, centres[first]))[part]
-    # Cells that are touched but not entered need a test each.
+    # Each cell that is touched but not entered needs its own test.
     only_touched = touched & ~entered
     overlaps[only_touched] = inside(surface, centres[only_touched.ravel()])
     return np.asarray(overlaps)
@@ -46,8 +46,8 @@ def _overlapping(
 def voxel_mesh(surface: Surface, cells: tuple[int, int, int]) -> Mesh:
     """Return the H8 cells of a regular grid over a surface's bounding box that overlap its body.
 
-    Every point of the surface lies in a cell, since points of the body are near it. A cell that the
-    body only touches, as with a face in a plane of the grid, is left out.
+    Every point of the surface lies in a cell, because points of the body are near it. A cell that
+    only touches the body, such as along a grid plane, is left out.
 
     Parameters
     ----------
@@ -58,12 +58,12 @@ def voxel_mesh(surface: Surface, cells: tuple[int, int, int]) -> Mesh:
     Returns
     -------
     Mesh
-        In the grid, with nodes and cells in the order of `box_mesh`. Its surface has steps.
+        A mesh in the grid, with nodes and cells in the order of `box_mesh`. Its surface has steps.
 
     Raises
     ------
     SpecError
-        If some cells are not connected through faces. An edge or a corner alone would be a hinge.
+        If some cells are not connected through faces. A single edge or corner would be a hinge.
     """
     low, high = surface.bounds
     box = box_mesh(tuple((high - low).tolist()), cells)
