@@ -26,10 +26,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from mor_bench.errors import InvalidInputError
+from mor_bench.specs.loads_spec import SplitBy
 
 Device = Literal["auto", "cpu", "cuda"]
 Profile = Literal["quick", "full"]
-SplitBy = Literal["region", "sample", "direction"]
 
 CORES = os.cpu_count() or 1
 

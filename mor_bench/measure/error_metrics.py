@@ -6,7 +6,7 @@ dropped.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,10 @@ class SampleErrors:
     relative_l2: NDArray[np.float64]
     max_nodal_m: NDArray[np.float64]
     amplitude_m: NDArray[np.float64]
+
+
+ERRORS = tuple(field.name for field in fields(SampleErrors))
+"""Names of the errors of a sample."""
 
 
 def sample_errors(

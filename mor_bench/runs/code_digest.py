@@ -50,6 +50,19 @@ def code_digest(surrogate: str, folder: Path | None = None) -> str:
 
 
 @cache
+def measuring_digest() -> str:
+    """Return eight digits of a digest of the code that scores and times, `mor_bench.measure`.
+
+    Scores and timings in the cache are kept under it, so that a new metric or timing rule
+    measures again.
+    """
+    digest = hashlib.sha256()
+    for path in sorted((SOURCES / OWN / "measure").glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:8]
+
+
+@cache
 def library_versions() -> dict[str, str]:
     """Return the versions of the installed libraries that results depend on."""
     found = {"python": platform.python_version()}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import MissingDependencyError, MorBenchError, UnsupportedSceneError
-from mor_bench.measure.error_metrics import SampleErrors, summary
+from mor_bench.measure.error_metrics import ERRORS, SampleErrors, summary
 from mor_bench.measure.method_session import CURVES
 from mor_bench.measure.range_flags import Flags
 from mor_bench.results.row import ErrorSummary, Row, SetErrors, Status, TrainingRecord
@@ -42,8 +42,7 @@ def n_failed(score: Score) -> int:
 
 def error_summary(score: Score) -> ErrorSummary:
     """Summarise the errors on a test set."""
-    names = ("mean_dof_m", "relative_l2", "max_nodal_m", "amplitude_m")
-    return ErrorSummary(**summary(SampleErrors(*(score[name] for name in names))))
+    return ErrorSummary(**summary(SampleErrors(**{name: score[name] for name in ERRORS})))
 
 
 def set_errors(score: Score, flags: Flags | None = None, seed: int | None = None) -> SetErrors:

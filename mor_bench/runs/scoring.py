@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.measure.error_metrics import SampleErrors, sample_errors
+from mor_bench.measure.error_metrics import ERRORS, SampleErrors, sample_errors
 from mor_bench.measure.indicator_quality import Indicated
 from mor_bench.runs.cached_fit import LOAD_LIMIT_S, CachedFit, FitRecord
+from mor_bench.runs.code_digest import measuring_digest
 from mor_bench.runs.fitting import fit_configuration
 from mor_bench.runs.training_data import TestSet
 from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
@@ -64,7 +65,7 @@ class _Scorer:
 
     def score(self, test: TestSet) -> Score:
         """Return the scores on a test set, from the cache if it has them."""
-        name = f"score-{test.digest[:20]}"
+        name = f"score-{measuring_digest()}-{test.digest[:20]}"
         found = self.cached.arrays(name)
         if found is None:
             found = self._measured(test)
@@ -89,9 +90,8 @@ class _Scorer:
                 indicated.add(start, forces, predicted)
                 found = self.worker.ask("flag", LOAD_LIMIT_S, forces=forces)["flagged"]
                 flags = None if found is None or flags is None else flags + found
-        names = ("mean_dof_m", "relative_l2", "max_nodal_m", "amplitude_m")
         score: Score = {
-            name: np.concatenate([getattr(part, name) for part in errors]) for name in names
+            name: np.concatenate([getattr(part, name) for part in errors]) for name in ERRORS
         }
         if flags is not None:
             score["flagged"] = np.asarray(flags, dtype=bool)
@@ -125,7 +125,7 @@ class _Scorer:
     def cost(self) -> dict[str, float] | None:
         """Return the counted work per query, from the cache if it has it."""
         test = self.cached.data.sets["test"]
-        path = self.cached.folder / f"cost-{test.digest[:20]}.json"
+        path = self.cached.folder / f"cost-{measuring_digest()}-{test.digest[:20]}.json"
         with suppress(OSError, ValueError):
             kept: dict[str, float] | None = json.loads(path.read_bytes())
             return kept

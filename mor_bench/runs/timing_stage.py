@@ -19,6 +19,7 @@ from mor_bench.measure.latency import (
 from mor_bench.measure.timing import Timing, check_answers, timing_summary
 from mor_bench.results.row import AllThreadsLatency, Latency, Memory, Row
 from mor_bench.runs.cached_fit import CachedFit
+from mor_bench.runs.code_digest import measuring_digest
 from mor_bench.runs.extra_stages import Stage
 from mor_bench.sandbox.process import MethodFailedError
 
@@ -64,7 +65,7 @@ def time_configurations(stage: Stage, fits: Mapping[str, CachedFit]) -> None:
 
 def _timing_name(stage: Stage) -> str:
     protocol = PROTOCOLS[stage.context.options.profile]
-    digest = stage.training_data.sets["test"].digest[:12]
+    digest = f"{measuring_digest()}-{stage.training_data.sets['test'].digest[:12]}"
     threads = stage.environment.threads
     return f"timing-{protocol.processes}x{protocol.rounds}-{threads}-{digest}"
 
