@@ -6,11 +6,11 @@ countable work where it happens, and `count` ignores the report unless a counter
     count(back_solves=1, multiply_adds=2 * n_nonzeros)
 
 Counts follow from sizes, sparsity patterns and numbers of iterations, never from a clock or a
-hardware counter. They differ between machines or numbers of threads only where round-off changes
+hardware counter. They depend on the machine or the number of threads only where round-off changes
 a number of iterations.
 
-A report that is ignored takes about 0.13 µs besides its arguments. Where that is more than 1 % of
-a query, or where an argument is costly, the report stands under `if is_counting():` (0.04 µs).
+An ignored report takes about 0.13 µs besides its arguments. If that is more than 1 % of a query, or
+if an argument is costly, put the report under `if is_counting():` (0.04 µs).
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ class Cost:
     Attributes
     ----------
     factorisations : int
-        Factorised matrices of any size; `multiply_adds` tells how large they were. Inverses of
-        3x3 blocks do not count.
+        Factorised matrices of any size; `multiply_adds` depends on their size. Inverses of 3x3
+        blocks do not count.
     back_solves : int
         Right-hand sides solved with both triangular factors of a matrix of any size, or by one
-        multigrid cycle. A sweep that serves eight right-hand sides counts as eight.
+        multigrid cycle. A sweep over eight right-hand sides counts as eight.
     reduced_factorisations, reduced_back_solves : int
-        The part of the above that used dense matrices of a reduced basis. The rest used sparse
-        matrices of a mesh.
+        The part of the above with dense matrices of a reduced basis. The rest has sparse matrices
+        of a mesh.
     element_evaluations : int
-        Cells whose internal force, or force and tangent, was integrated, times the number of
-        integrations.
+        Integrated cells times the number of integrations of the internal force, or of force and
+        tangent.
     multiply_adds : int
-        Multiplications, with or without an addition, of all of the above and of every product of
+        Multiplications, with or without an addition, in all of the above and in every product of
         matrices and vectors. A division, root, power or logarithm counts as one, in single and
         double precision. These do not count: additions and comparisons alone; norms and sums in
         the surrounding loop (below 1 % of the whole); padding; stored zeros.
@@ -83,7 +83,7 @@ def count(
 
 @contextmanager
 def counted() -> Iterator[Cost]:
-    """Count the work of this process inside the block; an enclosing counter gets it too."""
+    """Count the work of this process inside the block, also for an enclosing counter."""
     global _running
     enclosing, _running = _running, Cost()
     cost = _running
@@ -96,7 +96,7 @@ def counted() -> Iterator[Cost]:
 
 @contextmanager
 def uncounted() -> Iterator[None]:
-    """Leave out work that is done once and kept: it belongs to no query."""
+    """Exclude work that is done once and cached, because it belongs to no query."""
     global _running
     enclosing, _running = _running, None
     try:

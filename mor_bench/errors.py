@@ -1,7 +1,7 @@
-"""The errors that this package raises on purpose, under one base class, and its warnings.
+"""The errors that this package raises on purpose, with one base class, and its warnings.
 
-A caller judges an error by its class and attributes; the text is for people. It names the value
-that is wrong, the allowed values and the given value.
+Callers should use the class and attributes of an error; its text is for people. The text names the
+wrong value, the allowed values and the given value.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class UnknownRangeError(MorBenchError, RuntimeError):
 
 
 class UnsupportedSceneError(MorBenchError):
-    """A method cannot handle a scene; the message says why."""
+    """A method cannot handle a scene; the message gives the reason."""
 
 
 class SolverError(MorBenchError, RuntimeError):
@@ -44,7 +44,7 @@ class SolverError(MorBenchError, RuntimeError):
     Attributes
     ----------
     cuts : int or None
-        Number of times that the load increment was halved, if the solve steps the load.
+        Number of halvings of the load increment, if the solve steps the load.
     """
 
     def __init__(self, message: str, *, cuts: int | None = None) -> None:
@@ -62,9 +62,9 @@ class LimitPointError(NoEquilibriumError):
     Attributes
     ----------
     load_factor : float or None
-        Share of the load at which the path ends.
+        Fraction of the load at the end of the path.
     lowest_eigenvalue : float or None
-        Lowest eigenvalue of the tangent there, relative to that at rest.
+        Lowest eigenvalue of the tangent at the end of the path, relative to that at rest.
     """
 
     def __init__(
@@ -83,13 +83,7 @@ class InvertedElementError(SolverError):
 
 
 class UnconstrainedBodyError(MorBenchError, ValueError):
-    """The supports leave rigid motions free.
-
-    Attributes
-    ----------
-    free_motions : tuple of str
-        Names of the free motions.
-    """
+    """The supports leave rigid motions free; `free_motions` names them."""
 
     def __init__(self, message: str, *, free_motions: tuple[str, ...] = ()) -> None:
         super().__init__(message)
@@ -109,7 +103,7 @@ class NewerSchemaError(StoreError):
 
 
 class WorkerError(MorBenchError, RuntimeError):
-    """Workers for data generation were lost, or cannot be reached or used."""
+    """Worker processes for data generation were lost, or cannot be reached or used."""
 
 
 class MissingDependencyError(MorBenchError, ImportError):
@@ -117,7 +111,7 @@ class MissingDependencyError(MorBenchError, ImportError):
 
 
 class UnavailableBackendError(MorBenchError, RuntimeError):
-    """A network cannot be computed by the chosen backend; the message says why."""
+    """The chosen back end cannot compute a network; the message gives the reason."""
 
 
 class RankDeficientWarning(UserWarning):
@@ -125,11 +119,11 @@ class RankDeficientWarning(UserWarning):
 
 
 class IllConditionedWarning(UserWarning):
-    """The condition number of the stiffness at rest is so large that answers lose most digits."""
+    """The stiffness at rest is so ill-conditioned that answers lose most digits."""
 
 
 class DamagedFileWarning(UserWarning):
-    """A stored file is damaged and is made again."""
+    """A stored file is damaged and is regenerated."""
 
 
 class LockingWarning(UserWarning):
@@ -137,4 +131,4 @@ class LockingWarning(UserWarning):
 
 
 class FallbackWarning(UserWarning):
-    """A faster way is not available, so a slower one is used."""
+    """A faster implementation is not available, so a slower one is used."""

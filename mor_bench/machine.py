@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 @contextmanager
 def pinned_threads(threads: int) -> Iterator[None]:
-    """Limit BLAS, OpenMP and, where it is loaded, torch to a number of threads."""
+    """Limit the threads of BLAS, OpenMP and, if it is loaded, torch."""
     torch: Any = sys.modules.get("torch")
     before = torch.get_num_threads() if torch else None
     with threadpool_limits(threads):
@@ -30,8 +30,8 @@ def pinned_threads(threads: int) -> Iterator[None]:
 
 
 def peak_memory_bytes() -> int:
-    """Return the most memory that this process has had resident."""
-    # getrusage would report the parent's peak where that is higher.
+    """Return the peak resident memory of this process, bytes."""
+    # getrusage would report the parent's peak if that is higher.
     try:
         with open("/proc/self/status", encoding="ascii") as status:
             return next(int(line.split()[1]) * 1024 for line in status if line.startswith("VmHWM:"))
@@ -51,14 +51,14 @@ def _processor() -> str:
 
 
 def gpu_name() -> str:
-    """Return the name of the CUDA device that trains."""
+    """Return the name of the CUDA device for training."""
     import torch
 
     return str(torch.cuda.get_device_name(0))
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return processor, cores, memory, load, system, and the versions that timings depend on.
+    """Return processor, cores, memory, load, system, and the versions that affect timings.
 
     ``load`` is the mean number of running processes over the last 1, 5 and 15 minutes.
     """

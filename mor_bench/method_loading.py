@@ -1,4 +1,4 @@
-"""Make methods by name, and read fitted ones from their files."""
+"""Make methods by name, and read fitted methods from files."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def load_method(source: str | Path, **parameters: Any) -> Surrogate:
 
 
 def make_surrogate(surrogate: type[Any], parameters: Mapping[str, Any]) -> Surrogate:
-    """Check hyperparameters and construct; a class of `fit` and `predict` alone is adapted.
+    """Check hyperparameters and construct; adapt a class that only has `fit` and `predict`.
 
     Raises
     ------
     SpecError
-        If a hyperparameter is unknown, or its value is of the wrong type or range.
+        If a hyperparameter is unknown, or its value has the wrong type or range.
     MorBenchError
         If the class has no `fit` and `predict`.
     """
@@ -62,14 +62,13 @@ def make_surrogate(surrogate: type[Any], parameters: Mapping[str, Any]) -> Surro
 
 
 class AdaptedMethod(Surrogate):
-    """A class that knows nothing of `Surrogate` and has the methods ``fit(scene, snapshots)`` and
-    ``predict(forces)``; it cannot be saved.
+    """Adapter of a class that does not inherit from `Surrogate`; it cannot be saved.
 
     Parameters
     ----------
     adapted : type
-        The class. Its attributes `needs_snapshots`, True by default, and `takes_observations`,
-        False by default, are used.
+        A class with the methods ``fit(scene, snapshots)`` and ``predict(forces)``. Its attributes
+        `needs_snapshots` (default True) and `takes_observations` (default False) are used.
     parameters : dict
         Its checked hyperparameters.
     """
@@ -111,13 +110,13 @@ class AdaptedMethod(Surrogate):
 def load_surrogate(path: str | Path) -> Surrogate:
     """Read a fitted model written by `Surrogate.save`.
 
-    Only classes that a method of the suite names are imported: a file cannot run its own code.
+    Only classes of the suite's methods are imported: a file cannot run its own code.
 
     Raises
     ------
     StoreError
-        If the file is missing, damaged, of another format or a newer schema, or names a class
-        that no method names.
+        If the file is missing, damaged, of another format or a newer schema, or names a class that
+        belongs to no method.
     """
     model = read_model(path)
     known = {load_method_spec(file).surrogate for file in list_suite("methods").values()}
@@ -129,7 +128,7 @@ def load_surrogate(path: str | Path) -> Surrogate:
 
 
 def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surrogate:
-    """Read a fitted model of a known class and scene; otherwise as `load_surrogate`."""
+    """Read a fitted model of a known class and scene; raises as `load_surrogate`."""
     model = read_model(path)
     expected = class_path(surrogate)
     if model.surrogate != expected:
@@ -140,7 +139,7 @@ def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surroga
 def _fitted(
     path: str | Path, surrogate: type[Any], scene: Scene | None, model: StoredModel
 ) -> Surrogate:
-    """Make the method of a file's content; without a scene, for the scene of its header."""
+    """Make the method from a file's content; without a scene, build that of its header."""
     try:
         method = make_surrogate(surrogate, json.loads(model.parameters))
         scene = scene or load_scene(json.loads(model.scene))

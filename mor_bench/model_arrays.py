@@ -1,4 +1,4 @@
-"""Check the arrays that a model consists of, whether they were learned or read from a file."""
+"""Checks of the arrays of a model, learned or read from a file."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def take_array(
     Parameters
     ----------
     shape : tuple of int or None
-        The shape it must have; None stands for any length but 0.
+        Required shape; None stands for any length but 0.
     dtype : dtype
-        The type it must have.
+        Required type.
 
     Raises
     ------
@@ -47,12 +47,12 @@ def take_array(
 
 
 def take_indices(model: Mapping[str, NDArray[Any]], name: str, size: int) -> NDArray[np.int64]:
-    """Return one array of different integers in [0, size), at least one of them.
+    """Return one array of at least one distinct integer in [0, size).
 
     Raises
     ------
     InvalidInputError
-        If the array is missing or not of this kind.
+        If the array is missing or has other content.
     """
     if name not in model:
         raise InvalidInputError(f"the array `{name}` is missing.")
@@ -69,13 +69,7 @@ def take_indices(model: Mapping[str, NDArray[Any]], name: str, size: int) -> NDA
 
 
 def check_finite(owner: str, model: Mapping[str, NDArray[Any]]) -> None:
-    """Check that a learned model is made of finite arrays.
-
-    Raises
-    ------
-    InvalidInputError
-        Otherwise.
-    """
+    """Raise `InvalidInputError` unless all arrays of a learned model are finite."""
     for name, array in model.items():
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
             raise InvalidInputError(f"`{name}` of a {owner} must be an array of numbers.")

@@ -36,13 +36,13 @@ class StoredModel:
     parameters, scene : str
         Hyperparameters and the dataset's file, as JSON.
     arrays : dict of str to array
-        The model itself.
+        The arrays from `Surrogate.learn`.
     load_range : dict of str to array
-        Range of the training loads, as `LoadRange.arrays`; empty if it is not known.
+        Range of the training loads, as `LoadRange.arrays`; empty if unknown.
     sizes : dict of str to Any
         Values chosen for hyperparameters set to "auto".
     timings_ms : dict of str to float
-        Times by which the fit chose between equivalent ways to predict.
+        Times, ms, by which the fit chose between equivalent ways to predict.
     """
 
     surrogate: str
@@ -55,7 +55,7 @@ class StoredModel:
 
 
 class Startable(Protocol):
-    """What `weights_to_start_from` needs of a `mor_bench.Surrogate`."""
+    """The members of `mor_bench.Surrogate` that `weights_to_start_from` uses."""
 
     @property
     def architecture(self) -> tuple[str, ...]: ...
@@ -64,12 +64,12 @@ class Startable(Protocol):
 
 
 def class_path(surrogate: type[Any]) -> str:
-    """Return ``module:Class``, by which files name a class."""
+    """Return ``module:Class``, the name of a class in files."""
     return f"{surrogate.__module__}:{surrogate.__qualname__}"
 
 
 def write_model(path: str | Path, model: StoredModel) -> None:
-    """Write a model file, the same bytes for the same model."""
+    """Write a model file; the same model always gives the same bytes."""
     from safetensors.numpy import save as serialise
 
     arrays = {
@@ -117,14 +117,14 @@ def read_model(path: str | Path) -> StoredModel:
 
 
 def read_header_and_arrays(path: str | Path) -> tuple[dict[str, str], Arrays]:
-    """Read a model file as it is stored, with the checksum verified; raises as `read_model`."""
+    """Read a model file's raw content and verify its checksum; raises as `read_model`."""
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(str(path), framework="numpy") as file:
             header = file.metadata() or {}
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-    # AttributeError and TypeError: a dtype that NumPy does not have.
+    # AttributeError and TypeError: NumPy lacks the dtype.
     except (SafetensorError, OSError, ValueError, AttributeError, TypeError) as error:
         raise StoreError(f"{path}: not a readable safetensors file: {error}") from None
     if header.get("format") != FORMAT:
@@ -140,7 +140,7 @@ def read_header_and_arrays(path: str | Path) -> tuple[dict[str, str], Arrays]:
 
 
 def model_digest(header: Mapping[str, str], arrays: Mapping[str, NDArray[Any]]) -> str:
-    """SHA-256 of all that a model file holds, except the digest itself."""
+    """SHA-256 of the content of a model file, except the digest itself."""
     digest = hashlib.sha256(
         json.dumps({key: header[key] for key in sorted(header) if key != "sha256"}).encode()
     )
@@ -151,7 +151,7 @@ def model_digest(header: Mapping[str, str], arrays: Mapping[str, NDArray[Any]]) 
 
 
 def size_arrays(sizes: Mapping[str, Any]) -> Arrays:
-    """Return chosen values as arrays that a file can hold; words as the bytes of their letters."""
+    """Return chosen values as arrays for a file; words become the bytes of their letters."""
     return {
         SIZE + name: np.frombuffer(value.encode(), np.uint8)
         if isinstance(value, str)
@@ -161,7 +161,7 @@ def size_arrays(sizes: Mapping[str, Any]) -> Arrays:
 
 
 def take_sizes(arrays: Arrays) -> dict[str, Any]:
-    """Take the arrays of `size_arrays` out of a model's arrays and return the chosen values."""
+    """Remove the arrays of `size_arrays` from a model's arrays; return the chosen values."""
     return {
         name: array.tobytes().decode() if array.dtype == np.uint8 else array.item()
         for name, array in _taken(SIZE, arrays).items()
@@ -169,14 +169,14 @@ def take_sizes(arrays: Arrays) -> dict[str, Any]:
 
 
 def weights_to_start_from(path: str | Path, method: Startable) -> Arrays:
-    """Read the arrays of a saved model of a method's class and architecture, from any scene.
+    """Read the arrays of a saved model with the method's class and architecture, from any scene.
 
     Raises
     ------
     StoreError
         If the file is missing, damaged or of a newer schema.
     InvalidInputError
-        If it is of another class or architecture.
+        If it has another class or architecture.
     """
     header, arrays = read_header_and_arrays(path)
     surrogate = type(method)
@@ -210,16 +210,16 @@ def fitting_arrays(
     shapes: Mapping[str, tuple[int | None, ...]],
     dtype: type[np.floating[Any]],
 ) -> Arrays:
-    """Return those arrays of `weights_to_start_from` that have the given names, checked.
+    """Return the checked arrays of `weights_to_start_from` with the given names and shapes.
 
-    They must be finite and of the given shapes, where None stands for any length but 0.
+    None in a shape stands for any length but 0.
 
     Raises
     ------
     StoreError
-        If one is missing, of another dtype, or not finite.
+        If an array is missing, has another dtype, or is not finite.
     InvalidInputError
-        If one is of another shape.
+        If an array has another shape.
     """
     for name, shape in shapes.items():
         if name not in arrays or arrays[name].dtype != dtype:
@@ -246,7 +246,7 @@ def _prefixed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
 
 
 def _taken(prefix: str, arrays: Arrays) -> Arrays:
-    """Take the arrays whose names begin with a prefix out of a model's arrays."""
+    """Remove the arrays whose names begin with a prefix from a model's arrays; return them."""
     names = [name for name in arrays if name.startswith(prefix)]
     return {name.removeprefix(prefix): arrays.pop(name) for name in names}
 
@@ -259,10 +259,10 @@ def _positive(time: NDArray[Any]) -> float:
 
 
 def _in_order(content: bytes) -> bytes:
-    """Sort the metadata of a safetensors file: the library writes it in a changing order."""
+    """Sort the metadata of a safetensors file, because the library's order varies."""
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.loads(content[8:end])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
     text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)  # the arrays stay aligned
+    text += b" " * (-len(text) % 8)  # keeps the arrays aligned
     return len(text).to_bytes(8, "little") + text + content[end:]

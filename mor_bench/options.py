@@ -36,18 +36,18 @@ CORES = os.cpu_count() or 1
 
 @dataclass(frozen=True)
 class CommandLine:
-    """How the command line shows an option.
+    """Appearance of an option on the command line.
 
     Attributes
     ----------
     flag : str
-        By default the option's name with hyphens.
+        Name of the flag. Default: the option's name with hyphens.
     metavar : str or None
         Placeholder of the value in the help.
     default : str or None
         Description of a default that depends on something else.
     scale : float
-        The option's value is this factor times the number on the command line.
+        Factor from the number on the command line to the option's value.
     """
 
     flag: str = ""
@@ -64,7 +64,7 @@ Cluster = Annotated[
 
 
 class Options(BaseModel):
-    """A frozen group of options, checked when it is made."""
+    """A frozen group of options, checked at construction."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -103,7 +103,7 @@ class FolderOptions(Options):
 
 
 class DataOptions(FolderOptions):
-    """Options of everything that reads a dataset."""
+    """Options of every command that reads a dataset."""
 
     limit: Annotated[
         int | None,
@@ -118,7 +118,7 @@ class DataOptions(FolderOptions):
 
 
 class TrainOptions(DataOptions):
-    """Options of everything that fits."""
+    """Options of every command that fits."""
 
     split: Annotated[
         SplitBy | None,
@@ -210,7 +210,7 @@ class RunOptions(TrainOptions):
 
 
 def command_line(options: type[Options]) -> Iterator[tuple[str, FieldInfo, CommandLine]]:
-    """Yield each option's name, its field and how the command line shows it."""
+    """Yield each option's name, its field and its appearance on the command line."""
     for name, field in options.model_fields.items():
         shown = next((item for item in field.metadata if isinstance(item, CommandLine)), None)
         shown = shown or CommandLine()

@@ -1,4 +1,4 @@
-"""How a method that trains does so: device, time, checkpoint and starting weights."""
+"""Options of a training: device, time, checkpoint and initial weights."""
 
 from __future__ import annotations
 
@@ -11,25 +11,24 @@ from mor_bench.options import Device as Device
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """Options of a training. They are not hyperparameters: a model file does not hold them.
+    """Options of a training. They are not hyperparameters and not part of a model file.
 
     Attributes
     ----------
     device : {"auto", "cpu", "cuda"}
-        Where the training computes. "auto" takes a CUDA device if there is one.
+        Device of the training. "auto" uses a CUDA device if there is one.
     fit_seconds : float or None
-        Time for the training, s. The number of iterations that fit in it is estimated from the
-        first ones and reported as ``iterations_``; the hyperparameter ``iterations`` with that
-        number repeats the model. None: use the hyperparameter ``iterations``.
+        Time for the training, s. The number of iterations that fit is estimated from the first
+        ones and reported as ``iterations_``. The hyperparameter ``iterations`` with that number
+        repeats the model. None: use the hyperparameter ``iterations``.
     checkpoint : Path or None
-        File that the training state is written to now and then, and at the end. If it exists, the
-        training resumes from it and ends with the same bits as an uninterrupted one. The caller
-        deletes it once the model is saved.
+        File for the training state, written regularly and at the end. If it exists, the training
+        resumes from it and gives bit-identical results. The caller deletes it once the model is
+        saved.
     start_from : Path or None
-        A saved model of the same class and `Surrogate.architecture` whose weights the training
-        starts from.
+        A saved model of the same class and `Surrogate.architecture` with the initial weights.
     progress : callable or None
-        Called now and then with the iterations done, all iterations, and the loss.
+        Called regularly with the finished iterations, all iterations, and the loss.
     """
 
     device: Device = "cpu"

@@ -2,7 +2,7 @@
 
 OUT/results.json       schema version, machine, rows, learning curves
 OUT/results.csv        the same rows, flat
-OUT/comparison.json    what follows from all rows together, see `mor_bench.analysis.analyse.analyse`
+OUT/comparison.json    conclusions from all rows, see `mor_bench.analysis.analyse.analyse`
 OUT/samples/*.h5       raw latencies and per-sample errors of each row, arrays of each dataset
 OUT/figures/*.png, OUT/report.html
 """
@@ -93,7 +93,7 @@ class Comparison:
         return next(row for row in self.rows if (row.dataset, row.label) == (dataset, label))
 
     def add_samples(self, row: Row, samples: Mapping[str, NDArray[Any]]) -> None:
-        """Write more raw samples of a row beside the existing ones."""
+        """Write further raw samples of a row beside the existing ones."""
         write_arrays(self.samples_path(row), {**self.samples(row), **samples})
 
     def add_dataset(

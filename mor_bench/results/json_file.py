@@ -1,4 +1,4 @@
-"""JSON files of results; NaN and infinity, which JSON does not know, become strings."""
+"""JSON files of results; NaN and infinity become strings, because JSON lacks them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The typed rows of results.json: `Row` for a configuration, `LearningPoint` for a learning curve.
 
-None means that a figure was not measured. A float in a part that is present but unknown is NaN.
+None means that a figure was not measured. NaN means that a measured part lacks this figure.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ Real = Annotated[
     float,
     WithJsonSchema({"anyOf": [{"type": "number"}, {"enum": ["nan", "inf", "-inf"]}]}),
 ]
-"""A float; JSON has no NaN or infinity, so a file holds them as strings."""
+"""A float. Files hold NaN and infinity as strings, because JSON lacks them."""
 
 Status = Literal["ok", "failed", "skipped"]
 
@@ -25,19 +25,19 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, ser_json_inf_nan="constants")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the JSON content; parts leave out what was not set."""
+        """Return the JSON content; fields that were not set are left out."""
         return self.model_dump(exclude_unset=True)
 
 
 class ErrorSummary(Part):
-    """Errors of a test set, as `mor_bench.measure.error_metrics.summary` gives them.
+    """Errors of a test set, from `mor_bench.measure.error_metrics.summary`.
 
     Attributes
     ----------
     mean_dof_m, std_dof_m, max_dof_m : float
         Mean, standard deviation and maximum of the mean absolute error per degree of freedom, m.
     rel_l2_median, rel_l2_p95, rel_l2_max : float
-        Relative l2 error: median, 95th percentile and maximum.
+        Relative L2 error, as a fraction: median, 95th percentile and maximum.
     max_nodal_m : float
         Largest nodal error, m.
     slope : float
@@ -65,15 +65,15 @@ class SetErrors(Part):
     n, n_failed : int
         Samples, and samples without a prediction.
     n_flagged : int or None
-        Samples that the method flagged as out of range; None if it cannot tell.
+        Samples that the method flagged as out of range; None if the method has no flags.
     mean_dof_m, rel_l2_median, rel_l2_p95, rel_l2_max : float
-        As in `ErrorSummary`.
+        See `ErrorSummary`.
     n_unusual, n_unusual_flagged : int or None
-        Samples with an unusually large error, and those of them that were flagged.
+        Samples with an unusually large error, and flagged samples among them.
     recall : float or None
         Flagged share of the unusual samples.
     seed : int or None
-        Seed of a test set that was drawn anew.
+        Seed of a newly drawn test set.
     """
 
     seed: int | None = None
@@ -103,9 +103,9 @@ class Latency(Part):
     n_queries, n_processes : int
         Timed queries, and fresh processes that answered them.
     stable : bool or None
-        Whether the timing can be relied on.
+        Whether the timing is reliable.
     unstable_because : list of str
-        Why it cannot.
+        Reasons why it is not.
     """
 
     median: Real
@@ -127,21 +127,21 @@ class AllThreadsLatency(Part):
 
 
 class Offline(Part):
-    """Offline cost, s: core-seconds of data generation (None if unknown) and seconds of fitting."""
+    """Offline cost: data generation, core-seconds (None if unknown), and fitting, s."""
 
     data: Real | None
     fit: Real
 
 
 class Memory(Part):
-    """Peak resident memory of a process while fitting and while predicting, bytes."""
+    """Peak resident memory of a process during fitting and during prediction, bytes."""
 
     fit: int | float
     predict: int | float | None = None
 
 
 class IndicatorQuality(Part):
-    """How well errors estimated from the equilibrium residual agree with measured errors.
+    """Agreement of errors estimated from the equilibrium residual with measured errors.
 
     Attributes
     ----------
@@ -172,16 +172,16 @@ class FlagCounts(Part):
 
 
 class RangeFlags(Part):
-    """How well the method's range flags find large errors.
+    """Quality of the method's range flags as a warning of large errors.
 
     Attributes
     ----------
     in_range : str
         Test set that defines the usual error.
     usual_rel_l2 : float
-        95th percentile of the relative l2 error there.
+        95th percentile of the relative L2 error on this set, as a fraction.
     n, n_flagged : int
-        Samples there, and false alarms among them.
+        Samples in this set, and false alarms among them.
     false_alarms : float
         Share of false alarms.
     test : FlagCounts
@@ -216,7 +216,7 @@ class Spread(Part):
 
 
 class SeedTraining(Part):
-    """One training: its seed, its seconds, its errors and, if it failed, why."""
+    """One training: its seed, its fitting time (s), its errors, and the reason for a failure."""
 
     seed: int
     fit_s: Real | None
@@ -251,20 +251,22 @@ class Row(Part):
 
     Attributes
     ----------
+    Attributes
+    ----------
     dataset, split, method, label : str
-        What ran; the label names the swept parameters.
+        Names of what ran; the label lists the swept parameters.
     parameters, swept : dict
         All given parameters, and those that the sweep varies.
     sizes : dict
         Values chosen for parameters that were "auto".
     status, reason : str
-        "ok", "failed" or "skipped", and why.
+        "ok", "failed" or "skipped", and the reason.
     n_train, n_test, n_unused, n_failed : int
         Samples; `n_failed` test samples have no prediction.
     n_dofs, threads : int
         Degrees of freedom of the mesh, and threads of a prediction.
     error : ErrorSummary or None
-        On the main test set.
+        Errors on the main test set.
     latency_ms, all_threads_ms : Latency, AllThreadsLatency or None
     throughput : dict or None
         Queries per second by batch size.
@@ -279,14 +281,14 @@ class Row(Part):
         Named test sets.
     range : RangeFlags or None
     hidden : SetErrors or None
-        A test set that was drawn after all fits.
+        A test set drawn after all fits.
     training : TrainingRecord or None
     seeds : SeedSpread or None
     discretisation_error_m, discretisation_rel_l2 : float or None
         Error of the dataset's mesh against the limit of fine meshes: mean, m; relative median.
     warnings : list of str
     tuning_s : float or None
-        Seconds of the tuning budget that the configuration used.
+        Tuning budget that the configuration used, s.
     """
 
     dataset: str
@@ -329,16 +331,16 @@ class Row(Part):
         return self.status == "ok"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the JSON content with every key of a row."""
+        """Return the JSON content with all keys of a row."""
         return {**self.model_dump(), **self.model_dump(exclude_unset=True)}
 
     def with_parts(self, **changes: Any) -> Row:
-        """Return a copy in which some fields are replaced."""
+        """Return a copy with some fields replaced."""
         return self.model_copy(update=changes)
 
 
 class LearningPoint(Part):
-    """One point of a learning curve: number of training samples, seconds of the fit and error."""
+    """One point of a learning curve: training samples, fitting time (s) and error."""
 
     dataset: str
     method: str

@@ -1,4 +1,4 @@
-"""The JSON Schema of results.json: `python -m mor_bench.results.schema` writes it anew."""
+"""The JSON Schema of results.json; `python -m mor_bench.results.schema` rewrites it."""
 
 from __future__ import annotations
 

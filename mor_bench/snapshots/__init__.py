@@ -1,7 +1,7 @@
-"""Samples: how they are drawn, generated, stored, read, split, and imported from other programs.
+"""Samples: drawing, generation, storage, reading, splits, and import from other programs.
 
 Here: sampling plans, the store of HDF5 shards, generation on this machine or a cluster, splits,
-test sets, and what a method is given. Not here: methods, errors of predictions, or reports.
+test sets, and the queries of methods. Not here: methods, errors of predictions, or reports.
 This package imports only `errors`, `specs`, `scene` and `mechanics`.
 
 Start with `dataset.py`: `load_dataset` reads a dataset as `Snapshots`. Then `sampling.py` (which

@@ -1,4 +1,4 @@
-"""Check training samples before a method learns from them."""
+"""Checks of training samples before a method learns from them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def checked_samples(owner: str, scene: Scene, snapshots: Snapshots | None) -> Sn
     Raises
     ------
     InvalidInputError
-        If there are none, or they are of a wrong shape or dtype, not finite, or all zero.
+        If there are none, or they have a wrong shape or dtype, are not finite, or are all zero.
     """
     if snapshots is None or len(snapshots) == 0:
         raise InvalidInputError(f"{owner} needs at least one training sample; got none.")

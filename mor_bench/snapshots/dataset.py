@@ -1,4 +1,4 @@
-"""Snapshots in memory, and datasets read from their shards with the split that their file names."""
+"""Snapshots in memory, and datasets with their split, read from shards."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, Sp
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """Lock and return an array. All methods share it, so none may change it."""
+    """Lock and return an array that all methods share."""
     array.setflags(write=False)
     return array
 
 
 @dataclass(frozen=True)
 class Snapshots:
-    """Pairs of nodal forces and displacements. Those of a dataset are read-only.
+    """Pairs of nodal forces and displacements. The arrays of a dataset are read-only.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Snapshots:
     free_displacements : (n_samples, n_free) float64
         Displacements of the free dofs, m. Supports do not move.
     min_det_f : (n_samples,) float64
-        Least det F of each sample; NaN for imported samples.
+        Smallest det F of each sample; NaN for imported samples.
     """
 
     scene: Scene = field(repr=False)
@@ -51,7 +51,7 @@ class Snapshots:
 
     @classmethod
     def empty(cls, scene: Scene) -> Snapshots:
-        """Return no samples of a scene."""
+        """Return an empty set of samples for a scene."""
         loads = NodalLoads(np.zeros((0, scene.mesh.n_nodes, 3)), np.zeros((0, 1), dtype=np.int64))
         return cls(scene, loads, np.zeros((0, len(scene.free_dofs))), np.zeros(0))
 
@@ -74,7 +74,7 @@ class Snapshots:
 
     @cached_property
     def given(self) -> Given:
-        """What methods are given: the forces, or displacements of the observed nodes.
+        """Input of the methods: the forces, or the displacements of the observed nodes.
 
         Displacements are zero at all other nodes.
         """
@@ -113,9 +113,9 @@ class Dataset:
     n_refused : int
         Samples without a valid equilibrium. They are stored with the reason and are in no part.
     n_unused : int
-        Valid samples in neither part: some of their forces are held out and some are not.
+        Valid samples in neither part, because only some of their forces are held out.
     tests : dict of str to Snapshots
-        The named test sets that were requested, see `mor_bench.snapshots.test_sets`.
+        The requested named test sets, see `mor_bench.snapshots.test_sets`.
     """
 
     scene: Scene = field(repr=False)
@@ -141,21 +141,21 @@ def load_dataset(
     source : str, Path, dict, DatasetSpec or ImportedDatasetSpec
         Name of a dataset in the suite, path of a TOML, a dict with the same keys, or a spec.
     limit : int, optional
-        Read the first samples only. They cover the load regions evenly.
+        Use only the first samples. They cover the load regions evenly.
     split : {"region", "sample", "direction"}, optional
         Replaces the split in the file.
     tests : sequence of str
-        Named test sets to read as well, see `mor_bench.snapshots.test_sets`.
+        Named test sets to read too, see `mor_bench.snapshots.test_sets`.
     workers, cluster, cache, progress : optional
-        How to generate, see `mor_bench.snapshots.generate.generate`.
+        Options of generation, see `mor_bench.snapshots.generate.generate`.
 
     Raises
     ------
     SpecError
         If the dataset is not valid.
     InvalidInputError
-        If ``limit`` or ``workers`` is less than 1, ``cluster`` is no address or given beside
-        ``workers``, or a part of the split would be empty.
+        If ``limit`` or ``workers`` is less than 1, ``cluster`` is not an address or is given
+        together with ``workers``, or a part of the split would be empty.
     StoreError, WorkerError, MissingDependencyError
         If generation fails, see `mor_bench.snapshots.generate.generate`.
     """
@@ -183,7 +183,7 @@ def load_dataset(
 def _split(
     spec: DatasetSpec, by: SplitBy, main: _Store, others: Mapping[SetName, _Store]
 ) -> Dataset:
-    """Return the valid samples of a dataset and its test sets, in parts."""
+    """Split the valid samples of a dataset; read its test sets."""
     if n := repeated([(store.scene, store.loads) for store in (main, *others.values())]):
         raise InvalidInputError(
             f"{spec.name}: {n} samples repeat others; check `seed` and `magnitude_n`."

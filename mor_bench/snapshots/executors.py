@@ -1,4 +1,4 @@
-"""Where shards are solved: in this process, in a process pool, or on a Dask cluster."""
+"""Executors that solve shards: this process, a process pool, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _ADDRESS = r"tcp://([^\s:/]+|\[[0-9a-fA-F:.]+\]):\d{1,5}"
 
 @dataclass(frozen=True)
 class Pool:
-    """An executor with a limit of submitted tasks, which may change over time."""
+    """An executor with a maximum number of submitted tasks, which may change over time."""
 
     executor: Executor
     window: Callable[[], int]
@@ -114,7 +114,7 @@ class _InThisProcess(Executor):
 
 
 def _end_with(parent: int) -> None:
-    """Let this worker exit after its parent was killed. Otherwise it would wait for ever."""
+    """Make this worker exit after its parent was killed. Otherwise it would wait for ever."""
 
     def watch() -> None:
         _wait_for_end_of_parent(parent)
@@ -167,7 +167,7 @@ def worker_pool(workers: int) -> Iterator[Pool]:
 
 @contextmanager
 def cluster_pool(address: str) -> Iterator[Pool]:
-    """Connect to a Dask cluster. Its workers may come and go; lost tasks are solved again.
+    """Connect to a Dask cluster. If a worker is lost, another one solves its tasks again.
 
     Raises
     ------
@@ -206,7 +206,7 @@ def cluster_pool(address: str) -> Iterator[Pool]:
 
 
 def _connected(address: str, connect: Callable[[], Client]) -> Client:
-    """Return a client; its own timeout does not work if the peer accepts and stays silent."""
+    """Return a client. Its own timeout has no effect on a peer that accepts and stays silent."""
     made: Future[Client] = Future()
 
     def attempt() -> None:
@@ -225,7 +225,7 @@ def _connected(address: str, connect: Callable[[], Client]) -> Client:
 
 
 def _close(client: Client) -> None:
-    """Close a client without the traceback that it logs if the scheduler is gone."""
+    """Close a client, without the traceback that it logs after the loss of its scheduler."""
     log = logging.getLogger("distributed.client")
     before, log.disabled = log.disabled, True
     try:
@@ -245,7 +245,7 @@ def _wait_for_worker(client: Client, address: str) -> None:
 
 
 def _check_installed(client: Client, address: str) -> None:
-    """Check that all workers can import the tasks. A worker that cannot would never answer."""
+    """Check that all workers can import the tasks; otherwise a worker would never answer."""
     module = "mor_bench.snapshots.solve"
     try:
         scheduler = client.run_on_scheduler(find_spec, module)

@@ -1,4 +1,4 @@
-"""A test set that is generated only when it is needed, so that no method can know it."""
+"""A test set that is generated after all fits, so no method can be tuned to it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from mor_bench.snapshots.split import split_samples
 from mor_bench.specs import DatasetSpec, Split, SplitBy
 
 MAX_FRESH = 400
-"""Largest number of samples. They are solved in one process while the run waits."""
+"""Largest number of samples. One process solves them while the run waits."""
 
 
 def fresh_test_set(spec: DatasetSpec, scene: Scene, by: SplitBy, seed: int, n: int) -> Snapshots:
     """Return a new test set of the same distribution, with other draws in the held-out part.
 
-    It is solved here and kept in memory only.
+    This process solves the samples and keeps them in memory only.
 
     Parameters
     ----------
@@ -28,11 +28,11 @@ def fresh_test_set(spec: DatasetSpec, scene: Scene, by: SplitBy, seed: int, n: i
     scene : Scene
         The dataset's scene.
     by : {"region", "sample", "direction"}
-        How training and test samples are split.
+        Property that separates test samples from training samples.
     seed : int
         Seed of the draws, instead of the dataset's.
     n : int
-        Largest number of samples, at most `MAX_FRESH`. There are fewer if the plan has fewer.
+        Largest number of samples, at most `MAX_FRESH` and the number in the plan.
 
     Raises
     ------

@@ -34,14 +34,14 @@ SHARD_SIZE = 100
 """Samples per shard."""
 
 ROUND_OFF = 1e-9
-"""Relative difference of loads that counts as another processor's round-off."""
+"""Relative difference of loads that is accepted as round-off of another processor."""
 
 Progress = Callable[[int, int], None]
-"""Called with the number of finished samples and of wanted samples."""
+"""Callback for the number of finished samples and the number of wanted samples."""
 
 
 class GenerationOptions(TypedDict, total=False):
-    """How missing samples are generated; see `generate`."""
+    """Options for generating missing samples; see `generate`."""
 
     workers: int | None
     cache: Path | None
@@ -55,12 +55,12 @@ def default_cache() -> Path:
 
 
 def dataset_key(spec: DatasetSpec) -> str:
-    """Return a digest of everything that decides a dataset's samples, with the versions."""
+    """Return a digest of everything that determines a dataset's samples, including versions."""
     return f"{spec.digest()}-v{SCHEMA_VERSION}.{GENERATOR_VERSION}"
 
 
 def dataset_folder(spec: DatasetSpec, cache: Path | None) -> Path:
-    """Return the folder of a dataset, or of another one with the same samples if it exists."""
+    """Return the folder of a dataset, or an existing folder of a dataset with the same samples."""
     parent = Path(cache or default_cache()) / "datasets"
     own = parent / f"{spec.name}-{dataset_key(spec)}"
     return own if own.exists() else min(parent.glob(f"*-{dataset_key(spec)}"), default=own)
@@ -94,7 +94,7 @@ class _Plan:
         return range(-(-self.n_wanted // SHARD_SIZE))
 
     def n_wanted_of(self, number: int) -> int:
-        """Return how many of a shard's samples are wanted. It has more if a limit ends in it."""
+        """Return the number of wanted samples of a shard; it may hold more than a limit."""
         return min(SHARD_SIZE, self.n_wanted - number * SHARD_SIZE)
 
     def loads(self, number: int) -> PatchLoads:
@@ -113,7 +113,7 @@ class _Plan:
         return Task(self.key, self._problem, number * SHARD_SIZE, self.loads(number))
 
     def has(self, number: int) -> bool:
-        """Whether a shard exists, is sound, and is the right one; warn if it exists but is not."""
+        """Return whether the right shard exists undamaged; warn if it exists but is not."""
         path = shard_path(self.folder, number)
         try:
             shard = read_shard(path)
@@ -173,37 +173,37 @@ def generate(
     progress: Progress | None = None,
     cluster: str | None = None,
 ) -> Path:
-    """Generate the shards of a dataset that are missing or damaged; return its folder.
+    """Generate the missing or damaged shards of a dataset; return its folder.
 
-    Several processes may generate the same dataset into the same folder. Only a few shards per
-    worker are in memory. Interruptions, workers and clusters do not change a bit of the result;
-    processors with other instructions agree to the solver's tolerance.
+    Several processes may generate the same dataset in the same folder. Only a few shards per worker
+    are in memory. Interruptions, workers and clusters do not change a bit of the result. Processors
+    with other instructions agree to the solver's tolerance.
 
     Parameters
     ----------
     spec : DatasetSpec
     limit : int, optional
-        Generate the first samples only.
+        Generate only the first samples.
     workers : int, optional
         Number of processes. Default: all cores. 1 solves in this process.
     cache : Path, optional
-        Cache folder. Default: the user's.
+        Cache folder. Default: the user's cache folder.
     progress : callable, optional
         Called with (finished samples, wanted samples) before the first and after each shard.
     cluster : str, optional
-        Address of a Dask scheduler whose workers solve instead, ``tcp://host:port``. They need this
-        version of mor-bench and no shared disk; one thread each gives the best rate.
+        Address of a Dask scheduler, ``tcp://host:port``, whose workers solve instead. They need
+        this version of mor-bench and no shared disk; one thread each gives the best rate.
 
     Raises
     ------
     InvalidInputError
-        If ``workers`` is less than 1, ``cluster`` is no address, or both are given.
+        If ``workers`` is less than 1, ``cluster`` is not an address, or both are given.
     StoreError
         If the folder cannot be written, as on a full disk, or holds files of a newer schema.
     WorkerError
         If workers were killed, or the cluster cannot be reached. Finished shards are kept.
     MissingDependencyError
-        If ``cluster`` is given without the extra of that name.
+        If ``cluster`` is given and the extra `cluster` is not installed.
     """
     check_pool(workers, cluster)
     scene, folder = load_scene(spec), dataset_folder(spec, cache)
@@ -237,7 +237,7 @@ def _prepare_folder(plan: _Plan, spec: DatasetSpec) -> list[int]:
 def _owner(folder: Path, spec: DatasetSpec) -> DatasetSpec:
     """Return the specification for a folder's manifest.
 
-    It is that of another dataset with the same samples if the folder has that dataset's name.
+    If the folder is named after another dataset with the same samples, return that dataset's.
     """
     if folder.name != f"{spec.name}-{dataset_key(spec)}":
         with suppress(StoreError, FileNotFoundError):
@@ -248,7 +248,7 @@ def _owner(folder: Path, spec: DatasetSpec) -> DatasetSpec:
 
 
 class _Count:
-    """Counts the wanted samples that exist, and reports them."""
+    """Counts and reports the wanted samples that exist."""
 
     def __init__(self, plan: _Plan, missing: list[int], progress: Progress | None) -> None:
         self._plan, self._progress = plan, progress
@@ -296,7 +296,7 @@ def generation_seconds(spec: DatasetSpec, cache: Path | None, n_samples: int) ->
     """
     times = []
     for path in sorted(dataset_folder(spec, cache).glob("seconds-*.txt")):
-        with suppress(ValueError, OSError):  # a lost timing does no harm
+        with suppress(ValueError, OSError):  # a missing timing does no harm
             times.append(float(path.read_text()))
     if not times:
         return None

@@ -1,4 +1,4 @@
-"""What a method is given for a query: forces, or displacements of a part of the surface."""
+"""The input of a query: forces, or displacements of a part of the surface."""
 
 from __future__ import annotations
 
@@ -12,18 +12,12 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene
 
 MAX_FORCE_N = 1e30
-"""Largest accepted component of a force, N, or displacement, m: its cube must not overflow."""
+"""Largest accepted component of a force, N, or displacement, m; its cube does not overflow."""
 
 
 @dataclass(frozen=True, eq=False)
 class Forces:
-    """Nodal forces.
-
-    Attributes
-    ----------
-    values : (n, n_nodes, 3) or (n_nodes, 3) float64
-        N.
-    """
+    """Nodal forces `values` (n, n_nodes, 3) or (n_nodes, 3) float64, N."""
 
     values: NDArray[np.float64]
 
@@ -43,13 +37,13 @@ class Forces:
 
     @property
     def query(self) -> NDArray[np.float64]:
-        """What `Surrogate.predict` takes for these: the plain array."""
+        """Argument of `Surrogate.predict`: the plain array."""
         return self.values
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedDisplacements:
-    """Displacements of the observed nodes of a scene, from which all others are to be found.
+    """Displacements of the observed nodes of a scene; methods predict all others.
 
     Attributes
     ----------
@@ -78,7 +72,7 @@ class ObservedDisplacements:
 
     @property
     def query(self) -> Self:
-        """What `Surrogate.predict` takes for these: the object itself."""
+        """Argument of `Surrogate.predict`: the object itself."""
         return self
 
 
@@ -86,7 +80,7 @@ Given = Forces | ObservedDisplacements
 
 
 def given_of(scene: Scene, values: NDArray[Any]) -> Given:
-    """Wrap plain values as what the methods of a scene are given."""
+    """Wrap plain values in the class of the scene's queries."""
     if scene.observed_nodes is None:
         return Forces(values)
     return ObservedDisplacements(values, scene.observed_nodes)
@@ -95,17 +89,14 @@ def given_of(scene: Scene, values: NDArray[Any]) -> Given:
 def checked_given(scene: Scene, given: ArrayLike) -> Given:
     """Check a query and return it with values of shape (n, n_nodes, 3) in float64.
 
-    Displacements of nodes that are not observed become zero.
-
-    Parameters
-    ----------
-    given : array or Forces, or ObservedDisplacements for a scene with observed nodes
+    Displacements of nodes that are not observed become zero. For a scene with observed nodes,
+    `given` must be `ObservedDisplacements`; otherwise an array or `Forces`.
 
     Raises
     ------
     InvalidInputError
-        If forces are given instead of displacements or the other way round; on a wrong shape or
-        dtype, NaN, infinity or a value beyond `MAX_FORCE_N`.
+        If forces are given instead of displacements or vice versa; for a wrong shape or dtype, NaN,
+        infinity or a value beyond `MAX_FORCE_N`.
     """
     observed, seen = scene.observed_nodes, isinstance(given, ObservedDisplacements)
     if seen != (observed is not None):

@@ -1,4 +1,4 @@
-"""Loads and samples of a dataset whose snapshots come from another program."""
+"""Loads and samples of a dataset with snapshots from another program."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from mor_bench.specs import ImportedDatasetSpec
 
 @dataclass(frozen=True)
 class NodalLoads:
-    """Loads as the forces on all nodes.
+    """Loads given as forces on all nodes.
 
     Attributes
     ----------
     forces : (n_samples, n_nodes, 3) float64
-        N.
+        Nodal forces, N.
     patches : (n_samples, k) int64
         Load-region ids; zeros if the file has none.
     """
@@ -39,7 +39,7 @@ class NodalLoads:
 
 
 def read_samples(spec: ImportedDatasetSpec, limit: int | None = None) -> ImportedArrays:
-    """Read the first samples of an imported dataset, or all; errors as in `read_arrays`."""
+    """Read the first or all samples of an imported dataset; errors as in `read_arrays`."""
     arrays = read_arrays(spec.snapshots.file)
     first = slice(limit)
     return replace(

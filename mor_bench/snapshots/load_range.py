@@ -1,9 +1,9 @@
-"""The range of the training loads in compact form, and which loads lie outside it.
+"""The range of the training loads in compact form, and a check for loads outside it.
 
-A load is out of range if it is larger than any training load, spread over more nodes, or acts at
-places or in directions without training loads. Smaller loads, and pushing where training only
-pulled, are not flagged. If displacements are given instead of forces, there is no range: the body
-hides what moved it.
+A load is out of range if it is larger than any training load or spread over more nodes. It is also
+out of range at nodes or in directions without training loads. Smaller loads are not flagged, and
+neither are pushes if training only pulled. There is no range for observed displacements: the loads
+behind them are unknown.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ LARGER = 1.01
 """Largest size of a load in range, relative to the largest training load."""
 
 WIDER = 1.25
-"""Largest width of a load in range, relative to the widest training load. Three patches at once
-are 2 to 3 times as wide as one."""
+"""Largest width of a load in range, relative to the widest training load. Three simultaneous
+patches are 2 to 3 times as wide as one."""
 
 MOST_STRANGE = 10.0
-"""Largest strangeness of a load in range. It is 3 if training pulled equally in all directions."""
+"""Largest novelty score (`LoadRange.strangeness`) of a load in range. It is 3 if training pulled
+equally in all directions."""
 
 REGULARISATION = 0.01
-"""ε of the strangeness: a force at a node or in a direction without training loads scores 1/ε."""
+"""ε of the novelty score: a force at a node or in a direction without training loads scores 1/ε."""
 
 CHUNK = 256
 """Samples whose nodal forces are in memory at the same time."""
@@ -39,16 +40,16 @@ CHUNK = 256
 
 @dataclass(frozen=True)
 class LoadRange:
-    """Size, width, places and directions of the training loads.
+    """Size, width, nodes and directions of the training loads.
 
     Attributes
     ----------
     size_n : float
         Largest sum over the nodes of |f_i|, N.
     width : float
-        Largest (Σ|f_i|)² / Σ|f_i|²: the number of nodes that equal forces act on.
+        Largest (Σ|f_i|)² / Σ|f_i|²; for equal forces, this is the number of loaded nodes.
     nodes : (n_loaded,) int64
-        Nodes at which some sample has a force, in ascending order.
+        Nodes with a force in some sample, in ascending order.
     moments : (n_loaded, 3, 3) float64
         M_i = Σ f_i f_iᵀ / Σ |f_i|² over the samples: symmetric, semi-definite, of unit trace.
     """
@@ -60,7 +61,7 @@ class LoadRange:
 
     @classmethod
     def of(cls, snapshots: Snapshots) -> Self:
-        """Return the range of training samples; their nodal forces are made in chunks."""
+        """Return the range of training samples; their nodal forces are computed in chunks."""
         moments = np.zeros((snapshots.scene.mesh.n_nodes, 3, 3))
         size = width = 0.0
         for nodes, forces in _chunks(snapshots):
@@ -73,7 +74,7 @@ class LoadRange:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]], n_nodes: int) -> Self:
-        """Return the range of the arrays of `arrays`, for a mesh of ``n_nodes`` nodes.
+        """Return the range from the arrays of `arrays`, for a mesh of ``n_nodes`` nodes.
 
         Raises
         ------
@@ -111,7 +112,7 @@ class LoadRange:
         }
 
     def excludes(self, forces: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return flags (n,) of the loads (n, n_nodes, 3), N, out of range; zero loads never are."""
+        """Return which loads (n, n_nodes, 3), N, are out of range, (n,); zero loads never are."""
         size, width = _sizes_and_widths(forces)
         return np.asarray(
             (size > LARGER * self.size_n)
@@ -120,14 +121,14 @@ class LoadRange:
         )
 
     def strangeness(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mean over the nodes, weighted by |f_i|, of d_iᵀ (M_i + ε)⁻¹ d_i.
+        """Return the novelty score: the mean of d_iᵀ (M_i + ε)⁻¹ d_i over nodes, weighted by |f_i|.
 
         d_i = f_i / |f_i| is the direction of the force. M_i is zero without training loads.
 
         Parameters
         ----------
         forces : (n, n_nodes, 3) float64
-            N.
+            Nodal forces, N.
 
         Returns
         -------
@@ -151,7 +152,7 @@ class LoadRange:
 
 
 def _chunks(snapshots: Snapshots) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Yield nodes (n_loaded,) and the forces on them (n, n_loaded, 3), N, chunk by chunk."""
+    """Yield nodes (n_loaded,) and the forces on them (n, n_loaded, 3), N, in chunks."""
     loads = snapshots.loads
     for start in range(0, len(loads), CHUNK):
         some = loads[start : start + CHUNK]

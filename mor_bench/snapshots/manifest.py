@@ -1,4 +1,4 @@
-"""The manifest of a dataset's folder: what is needed to generate it again, and its environments."""
+"""The manifest of a dataset's folder: the specification to regenerate it, and environments."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Manifest:
     n_samples : int
         Size of the whole dataset.
     shard_size : int
-        Samples per shard. The last one may have fewer.
+        Samples per shard. The last shard may have fewer.
     environments : tuple of dict of str to str
         Versions and platform of each environment that generated shards, in order of first use.
     """
@@ -65,19 +65,19 @@ def _digest(content: dict[str, Any]) -> str:
 
 
 def this_environment() -> dict[str, str]:
-    """Return the platform and the versions that decide a sample's last bits."""
+    """Return the platform and the versions that determine a sample's last bits."""
     libraries = {name: version(name) for name in ("numpy", "scipy", "numba", "h5py")}
     system = {"platform": platform.platform(), "machine": platform.machine()}
     return {"mor-bench": __version__, "python": platform.python_version(), **libraries, **system}
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Read the manifest of a dataset's folder and check it.
+    """Read and check the manifest of a dataset's folder.
 
     Raises
     ------
     StoreError
-        If the file is foreign, of another schema, or damaged.
+        If the file is not a manifest, has another schema, or is damaged.
     FileNotFoundError
         If it does not exist.
     """
@@ -103,7 +103,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def keep_sources(folder: Path, spec: DatasetSpec) -> None:
-    """Copy a dataset's mesh and surface files into its folder, so that the folder is enough."""
+    """Copy a dataset's mesh and surface files into its folder, so that the folder is complete."""
     for file in _sources(spec.model_dump(mode="json")):
         kept = _kept(folder, file)
         if not kept.is_file():
@@ -142,7 +142,7 @@ def update_manifest(folder: Path, manifest: Manifest, *, solves: bool) -> None:
     manifest : Manifest
         The wanted content, without environments.
     solves : bool
-        Whether shards will be generated now. Then this environment is added.
+        Whether shards will be generated now, so that this environment is added.
     """
     try:
         environments = read_manifest(folder).environments

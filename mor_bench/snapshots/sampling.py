@@ -1,11 +1,11 @@
-"""Sampling plans: which forces act on which patches in sample i.
+"""Sampling plans: the forces and patches of sample i.
 
-With one patch at a time, sample i acts on patch i modulo the number of patches. So every first part
-of a dataset covers the load region evenly. With several patches, or a total number of samples, all
-admissible combinations of patches stand in one random order and are used cyclically. With more than
-`MAX_COMBINATIONS`, each sample draws its own.
+With one patch at a time, sample i acts on patch i modulo the number of patches. So the first n
+samples always cover the load region evenly. With several patches, or a total number of samples, all
+admissible combinations of patches are listed in one random order and used cyclically. If there are
+more than `MAX_COMBINATIONS`, each sample draws its own combination.
 
-Each force has up to three coordinates in the unit interval that give its direction and magnitude:
+Each force has up to three coordinates in the unit interval, which give its direction and magnitude:
 
 random
     from a generator with seed (seed, i);
@@ -109,7 +109,7 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
 
 
 def _combinations(scene: Scene) -> NDArray[np.int64] | None:
-    """Return the patches (n_combinations, k) loaded together, in order of use; None if too many."""
+    """Return the jointly loaded patches (n_combinations, k) in order of use; None if too many."""
     loads = scene.generated.loads
     if loads.samples_per_patch:
         return np.arange(len(scene.patch_nodes))[:, None]
@@ -124,7 +124,7 @@ def _combinations(scene: Scene) -> NDArray[np.int64] | None:
 
 @lru_cache(maxsize=2)
 def far_apart(centres: bytes, k: int, distance: float) -> NDArray[np.int64] | None:
-    """Return all sets (n, k) of k points that are pairwise a distance or more apart.
+    """Return all sets (n, k) of k points with pairwise distances of at least `distance`.
 
     None if there are more than `MAX_COMBINATIONS`.
 
@@ -134,7 +134,7 @@ def far_apart(centres: bytes, k: int, distance: float) -> NDArray[np.int64] | No
         The points (n_points, 3) float64, m, as bytes.
     k : int
     distance : float
-        m.
+        Smallest distance, m.
 
     Raises
     ------
@@ -161,7 +161,7 @@ def far_apart(centres: bytes, k: int, distance: float) -> NDArray[np.int64] | No
 
 
 def _apart(scene: Scene, number: int) -> NDArray[np.int64]:
-    """Return the patches (k,) of one sample, each drawn from those far enough from all before."""
+    """Return the patches (k,) of one sample, each drawn far enough from all before it."""
     loads, centres = scene.generated.loads, scene.patch_centres
     generator = np.random.default_rng([loads.seed, 0xC0B1, number])
     for _ in range(MAX_DRAWS):
@@ -238,7 +238,7 @@ def _tangents(normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 
 def repeated(parts: Sequence[tuple[Scene, PatchLoads]]) -> int:
-    """Return how many samples of some sets of loads, all on one body, repeat others."""
+    """Return how many samples repeat others, in several sets of loads on one body."""
     rows = [
         np.hstack([scene.patch_nodes[loads.patches], loads.vectors.reshape(len(loads), -1)])
         for scene, loads in parts

@@ -22,7 +22,7 @@ from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.snapshots.store import STATUSES, Shard
 
 GENERATOR_VERSION = 3
-"""Increase it when a change of the full-order model or of the sampling changes samples.
+"""Increase this version if a change of the full-order model or sampling changes samples.
 
 It is part of a dataset's folder name.
 """
@@ -30,14 +30,14 @@ It is part of a dataset's folder name.
 
 @dataclass(frozen=True)
 class Task:
-    """The samples of one shard that are to be solved.
+    """The unsolved samples of one shard.
 
     Attributes
     ----------
     dataset : str
         See `Shard`.
     problem : bytes
-        From `pack`.
+        Output of `pack`.
     start : int
         Number of the first sample.
     loads : PatchLoads
@@ -54,14 +54,14 @@ class Task:
 
 @dataclass(frozen=True)
 class Solved:
-    """A shard, and the time of its solves, s."""
+    """A shard, and the solving time, s."""
 
     shard: Shard
     seconds: float
 
 
 def pack(scene: Scene) -> bytes:
-    """Serialise what a worker needs: mesh, material, supports and patch weights."""
+    """Serialise the input of a worker: mesh, material, supports and patch weights."""
     mesh = replace(scene.mesh)  # a copy without cached properties
     return pickle.dumps(
         (replace(scene, mesh=mesh, embedded_surface=None, point_sets={}), scene.patch_weights)

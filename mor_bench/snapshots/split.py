@@ -1,4 +1,4 @@
-"""Which samples are for training and which for the test."""
+"""Split of samples into training and test parts."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def split_samples(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the sorted row numbers of the training and of the test samples.
 
-    By sample, any samples are held out. By region, whole load regions are, whatever the number of
-    samples. By direction, forces in a cone around a random axis are. A sample of several forces is
-    for the test if all of them are held out, and for training if none is. The fraction of regions,
-    or of the sphere, is such that the test gets its fraction of these samples.
+    The split holds out any samples, whole load regions, or forces in a cone around a random axis. A
+    sample of several forces is for the test if all of them are held out, and for training if none
+    is. The fraction of regions, or of the sphere, is chosen such that the test part gets its
+    fraction of the used samples.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def split_imported(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the sorted row numbers of imported training and test samples, see `split_samples`.
 
-    The direction of a sample is that of the sum of its forces.
+    The direction of a sample is the direction of the sum of its forces.
 
     Raises
     ------

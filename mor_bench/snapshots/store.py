@@ -32,7 +32,7 @@ HEADER_BYTES = 512
 STATUSES = ("ok", "inverted", "no-equilibrium")
 
 STALE_AFTER_S = 3600.0
-"""Age at which a temporary file counts as a leftover of any process, s. No write takes as long."""
+"""Age after which a temporary file is a leftover of some process, s. No write takes as long."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Shard:
     vectors : (n, k, 3) float64
         Forces on the patches, N.
     displacements : (n, n_free) float64
-        At the free dofs, m; NaN where the status is not `ok`.
+        Displacements of the free dofs, m; NaN where the status is not `ok`.
     min_det_f : (n,) float64
     status : (n,) uint8
         Index into `STATUSES`.
@@ -78,13 +78,13 @@ _FIELDS = {
 
 
 def host_name() -> str:
-    """Return the name of this machine as it stands in names of temporary files."""
+    """Return this machine's name in the form used in names of temporary files."""
     return re.sub(r"[^0-9A-Za-z-]", "-", platform.node())
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that it exists complete or not at all, even if the process is killed."""
-    # The name identifies the writer, also among machines that share the folder.
+    """Write a file so that it is complete or absent, even if the process is killed."""
+    # The name identifies the writer, even if several machines share the folder.
     writer = f"{host_name()}.{os.getpid()}.{secrets.token_hex(4)}"
     temporary = path.with_name(f".{path.name}.{writer}.tmp")
     try:
@@ -109,7 +109,7 @@ def remove_leftovers(folder: Path, of: str = "*") -> None:
 
 
 def _writer_is_dead(temporary: Path) -> bool:
-    """Whether the writer is a dead process of this machine; False if that cannot be known."""
+    """Return whether the writer is a dead process of this machine; False if unknown."""
     named = re.fullmatch(r"\..*\.(?P<host>[^.]*)\.(?P<pid>\d+)\.[0-9a-f]+\.tmp", temporary.name)
     # On Windows signal 0 would end the process.
     if named is None or named["host"] != host_name() or sys.platform == "win32":
@@ -124,7 +124,7 @@ def _writer_is_dead(temporary: Path) -> bool:
 
 
 def shard_bytes(shard: Shard) -> bytes:
-    """Return a shard as the content of a file. The same shard always gives the same bytes."""
+    """Return the content of a shard's file. The same shard always gives the same bytes."""
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", userblock_size=HEADER_BYTES) as file:
         file.attrs["dataset"], file.attrs["start"] = shard.dataset, shard.start
@@ -146,12 +146,12 @@ def write_shard(path: Path, shard: Shard) -> None:
 
 
 def read_shard(path: Path) -> Shard:
-    """Read a shard and check it.
+    """Read and check a shard.
 
     Raises
     ------
     StoreError
-        If the file is unreadable, foreign, of another schema, truncated, or any bit has changed.
+        If the file is unreadable, truncated, changed, not a shard, or of another schema.
     FileNotFoundError
         If it does not exist.
     """

@@ -7,10 +7,10 @@ in-range
 unseen-regions
     Forces on a part of the surface where no load of the main set acts.
 unseen-directions
-    Forces perpendicular to the surface's normal if those of the main set are along it, and the
-    reverse. If the main set has directions all over the sphere, use the split by direction instead.
+    Tangential forces if the main set has normal ones, and vice versa. If the main set has
+    directions all over the sphere, use the split by direction instead.
 several-forces
-    Three forces at once, far apart, if the main set has one.
+    Three simultaneous forces, far apart, if the main set has one.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SetName = Literal["in-range", "2x", "4x", "unseen-regions", "unseen-directions",
 SET_NAMES: tuple[SetName, ...] = get_args(SetName)
 
 SEED_SHIFT = 1_000_003
-"""Difference between the seed of the main set and that of the others."""
+"""Difference between the seeds of the main set and of the other sets."""
 
 N_SEVERAL = 3
 
@@ -64,7 +64,7 @@ def available_sets(spec: DatasetSpec) -> list[SetName]:
 
 
 def spec_of_set(spec: DatasetSpec, name: SetName) -> DatasetSpec:
-    """Return a named test set as a dataset, which is generated and stored as any other.
+    """Return a named test set as a dataset with its own generation and storage.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def with_test_sets(spec: DatasetSpec) -> list[DatasetSpec]:
 
 
 def check_regions(spec: DatasetSpec) -> None:
-    """Check that the loads of the set `unseen-regions` act apart from those of the main set.
+    """Check that the loads of `unseen-regions` act apart from those of the main set.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def check_regions(spec: DatasetSpec) -> None:
 
 
 def _farthest(centres: NDArray[np.float64], distance: float) -> int:
-    """Return how many points, chosen greedily from the first on, are all a distance apart."""
+    """Count greedily chosen points with pairwise distances of at least `distance`, m."""
     chosen: list[NDArray[np.float64]] = []
     for centre in centres:
         if all(np.linalg.norm(centre - other) >= distance for other in chosen):
