@@ -16,6 +16,9 @@ def test_the_source_tree_keeps_its_laws(check: str) -> None:
 
 
 LOW, HIGH = "mor_bench/specs/low.py", "mor_bench/report/high.py"
+LONG = "def f():\n" + "    x = 1\n" * 60
+KERNEL = "@njit(cache=True)\n" + LONG
+REASON = "# Longer than 60 lines because…\n"
 
 PLANTED: list[tuple[str, Tree]] = [
     ("arrows_back", {LOW: "from mor_bench.report.high import draw", HIGH: ""}),
@@ -28,7 +31,10 @@ PLANTED: list[tuple[str, Tree]] = [
     ("private_names", {HIGH: "low._f()"}),
     ("private_names", {HIGH: "monkeypatch.setattr(low, '_f', 1)"}),
     ("long_files", {LOW: "\n" * 401}),
-    ("long_functions", {LOW: "def f():\n" + "    x = 1\n" * 60}),
+    ("long_functions", {LOW: LONG}),
+    ("long_functions", {LOW: REASON + LONG}),
+    ("long_functions", {LOW: KERNEL}),
+    ("long_functions", {LOW: REASON + "x = 1\n\n\n" + KERNEL}),
     ("many_parameters", {LOW: "class A:\n    def f(self, a, b, c, d, e, f, *, g): ..."}),
     ("names_twice", {LOW: "", "tests/low.py": ""}),
     ("names_twice", {"mor_bench/specs/code.py": ""}),
@@ -57,6 +63,11 @@ ALLOWED: list[tuple[str, Tree]] = [
     ("private_names", {LOW: "os._exit(1)"}),
     ("long_files", {LOW: '"""Tables.\n\nLonger than 400 lines because…"""' + "\n" * 401}),
     ("long_functions", {LOW: 'def f():\n    """' + "\n" * 80 + '    """\n'}),
+    ("long_functions", {LOW: REASON + "# it is faster.\n" + KERNEL}),
+    (
+        "long_functions",
+        {LOW: KERNEL.replace("():", '():\n    """Run.\n\n    Longer than 60 lines because…"""')},
+    ),
     ("many_parameters", {LOW: "def f(self, a, b, c, d, e, f): ..."}),
     ("many_parameters", {LOW: "@njit(cache=True)\ndef f(a, b, c, d, e, f, g): ..."}),
 ]

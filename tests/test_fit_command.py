@@ -152,37 +152,47 @@ def test_a_fit_that_is_stopped_after_its_training_does_not_train_again(
     assert {item.name for item in tmp_path.iterdir()} == {"model.safetensors", "whole.safetensors"}
 
 
-Refusal = tuple[str, dict[str, Any], dict[str, Any], type[MorBenchError], str]
+Request = tuple[str, dict[str, Any], dict[str, Any]]
+"""Method, its parameters, and the options of a fit."""
+
 INVALID = InvalidInputError
-REFUSED: list[Refusal] = [
-    ("descent", {"iteration": 3}, {}, SpecError, "unknown key `iteration`"),
-    ("descent", {"iterations": 0}, {}, SpecError, "iterations"),
-    ("linear-fem", {"seed": 1}, {}, SpecError, "unknown key `seed`"),
-    ("linear-fem", {}, {"device": "cuda"}, INVALID, "LinearFEM has no training that `device`"),
+REFUSED: list[tuple[Request, type[MorBenchError], str]] = [
+    (("descent", {"iteration": 3}, {}), SpecError, "unknown key `iteration`"),
+    (("descent", {"iterations": 0}, {}), SpecError, "iterations"),
+    (("linear-fem", {"seed": 1}, {}), SpecError, "unknown key `seed`"),
+    (("linear-fem", {}, {"device": "cuda"}), INVALID, "LinearFEM has no training that `device`"),
     (
-        "pod",
-        {},
-        {"fit_seconds": 3.0, "start_from": "other.safetensors"},
+        ("pod", {}, {"fit_seconds": 3.0, "start_from": "other.safetensors"}),
         INVALID,
         "no training that `fit_seconds`, `start_from` could act on",
     ),
-    ("descent", {}, {"fit_seconds": 0.0}, INVALID, "`fit_seconds` must be a number above 0; got 0"),
-    ("descent", {}, {"fit_seconds": float("nan")}, INVALID, "`fit_seconds` must be a number above"),
-    ("descent", {}, {"threads": 0}, INVALID, "`threads` must be an integer in"),
-    ("descent", {}, {"device": "gpu"}, INVALID, "`device` must be 'auto' or 'cpu' or 'cuda'; got"),
-    ("descent", {}, {"seeds": 3}, INVALID, "unknown option `seeds`"),
     (
-        "descent",
-        {},
-        {"start_from": "other.safetensors"},
+        ("descent", {}, {"fit_seconds": 0.0}),
+        INVALID,
+        "`fit_seconds` must be a number above 0; got 0",
+    ),
+    (
+        ("descent", {}, {"fit_seconds": float("nan")}),
+        INVALID,
+        "`fit_seconds` must be a number above",
+    ),
+    (("descent", {}, {"threads": 0}), INVALID, "`threads` must be an integer in"),
+    (
+        ("descent", {}, {"device": "gpu"}),
+        INVALID,
+        "`device` must be 'auto' or 'cpu' or 'cuda'; got",
+    ),
+    (("descent", {}, {"seeds": 3}), INVALID, "unknown option `seeds`"),
+    (
+        ("descent", {}, {"start_from": "other.safetensors"}),
         INVALID,
         "`start_from` must be a model of class 'tests.third_party:Descent'; got",
     ),
-    ("descent", {}, {"start_from": "text"}, MorBenchError, "not a readable safetensors file"),
-    ("descent", {}, {"out": "nowhere/a"}, INVALID, "`out`: .* cannot be written: No such file"),
-    ("descent", {}, {"out": "."}, INVALID, "is a folder"),
-    ("descent", {}, {"checkpoint": "a.safetensors"}, INVALID, "must be another file than `out`"),
-    ("descent", {}, {"checkpoint": "nowhere/c"}, INVALID, "`checkpoint`: .* cannot be written"),
+    (("descent", {}, {"start_from": "text"}), MorBenchError, "not a readable safetensors file"),
+    (("descent", {}, {"out": "nowhere/a"}), INVALID, "`out`: .* cannot be written: No such file"),
+    (("descent", {}, {"out": "."}), INVALID, "is a folder"),
+    (("descent", {}, {"checkpoint": "a.safetensors"}), INVALID, "must be another file than `out`"),
+    (("descent", {}, {"checkpoint": "nowhere/c"}), INVALID, "`checkpoint`: .* cannot be written"),
 ]
 
 
@@ -197,16 +207,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("method", "parameters", "options", "kind", "message"), REFUSED)
+@pytest.mark.parametrize(("wanted", "kind", "message"), REFUSED)
 def test_an_impossible_fit_is_refused_before_anything_runs(
-    method: str,
-    parameters: dict[str, Any],
-    options: dict[str, Any],
+    wanted: Request,
     kind: type[MorBenchError],
     message: str,
     folder: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    method, parameters, options = wanted
     monkeypatch.chdir(folder)
     before = set(folder.iterdir())
     source = "descent.toml" if method == "descent" else method
