@@ -1,4 +1,4 @@
-"""An autoencoder's latent space between the linear response and the nonlinear rest."""
+"""An autoencoder's latent space between the linear response and the nonlinear remainder."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LATENT_WEIGHT = 0.01
 
 
 class _LinearRest(NetworkRegression):
-    """Fixed choices of the autoencoder, which are no hyperparameters."""
+    """Fixed choices of the autoencoder, which are not hyperparameters."""
 
     input: Input = "linear-response"
     n_output_modes: int = 40
@@ -34,20 +34,19 @@ class _LinearRest(NetworkRegression):
 
 @dataclass(eq=False)
 class Autoencoder(_LinearRest):
-    """A latent space of the nonlinear rest, u = K₀⁻¹f + Φ (D(R(z)) - D(R(0))).
+    """A latent space of the nonlinear remainder, u = K₀⁻¹f + Φ (D(R(z)) - D(R(0))).
 
-    The encoder E and the decoder D are trained to reproduce the rest's coordinates
-    c = Φᵀ(u - K₀⁻¹f). The regression R is trained to find E(c) from coordinates z of the linear
-    response, and D∘R to find c. The loss is the sum of the three squared errors. Only D and R are
-    kept. As in Fulton et al.: Latent-space dynamics for reduced deformable simulation, Computer
-    Graphics Forum 38 (2019), the networks work between principal coordinates; there the latent
-    coordinates are found by solving the equations. See `CoordinateRegression` for what it shares
-    with others.
+    The encoder E and the decoder D are trained to reproduce the remainder's coordinates
+    c = Φᵀ(u - K₀⁻¹f). The regression R maps coordinates z of the linear response to E(c). It is
+    trained with D, so that D∘R gives c. The loss is the sum of the three squared errors. Only D and
+    R are kept. The networks work between principal coordinates, as in Fulton et al.: Latent-space
+    dynamics for reduced deformable simulation, Computer Graphics Forum 38 (2019). The paper solves
+    equations for the latent coordinates. See also `CoordinateRegression`.
 
     Parameters
     ----------
     n_latent : int
-        Latent coordinates.
+        Number of latent coordinates.
     n_input_modes : int
         Length of z; capped at the rank of the linear responses with a warning.
     iterations : int

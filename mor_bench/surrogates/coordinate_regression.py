@@ -1,4 +1,4 @@
-"""What regressions between principal coordinates of the load and of the displacement share."""
+"""Base class of regressions between principal coordinates of the load and of the displacement."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class CoordinateSamples:
     z : (n, n_inputs) float64
         Inputs.
     values : (n, n_outputs) float64
-        Wanted g(z), m.
+        Target g(z), m.
     weights : (n, 1) float64
         Factors that make errors relative to the displacement.
     directions, slopes : (n, d, n_inputs) and (n, d, n_outputs) float64, or None
@@ -62,26 +62,25 @@ class CoordinateRegression(Surrogate, ABC):
     """u = K₀⁻¹f + Φ g(z) with z coordinates of K₀⁻¹f, or u = Φ g(z) with z coordinates of f.
 
     No mean is subtracted, and g(0) = 0: no force gives no displacement. With the linear response as
-    input only the nonlinear rest is learned. With the force as input nothing is known of load
-    regions without training samples, and no equations are needed. In a scene with observed nodes,
-    their displacements replace the force, and the linear extension of these replaces the linear
-    response.
+    input, g learns only the nonlinear remainder. With the force as input, g needs no equations, but
+    it knows nothing about load regions without training samples. In a scene with observed nodes,
+    their displacements replace the force, and their linear extension replaces the linear response.
 
     A subclass declares the parameters below as its hyperparameters, and `derivatives` if it can
-    learn from them. It learns g in `regress`, takes the arrays back in `take`, and evaluates g in
-    `coefficients`.
+    learn from them. `regress` learns g, `take` restores its arrays, and `coefficients` evaluates
+    it.
 
     Parameters
     ----------
     input : {"linear-response", "force"}
-        What the coordinates z are taken of. The linear response gives far smaller errors, and needs
-        the scene's equations.
+        Source of the coordinates z. The linear response gives far smaller errors, and needs the
+        scene's equations.
     n_input_modes : int, optional
-        Length of z; capped at the rank of the input with a warning. If it may be None, that means
+        Length of z; capped at the rank of the input with a warning. Where None is allowed, it means
         `usual_inputs`.
     n_output_modes : int
-        Size of the basis Φ of the nonlinear rest, or of the displacement; capped at the rank with a
-        warning.
+        Size of the basis Φ of the nonlinear remainder, or of the displacement; capped at the rank
+        with a warning.
     """
 
     input: Input
@@ -90,10 +89,10 @@ class CoordinateRegression(Surrogate, ABC):
     derivatives: bool = False
 
     usual_inputs: ClassVar[Mapping[str, int]] = {"linear-response": 20, "force": 60}
-    """Length of z, by input, if `n_input_modes` is None."""
+    """Length of z for each input, if `n_input_modes` is None."""
 
     evenness: ClassVar[float] = 0.5
-    """Of the sizes of z, see `input_axes`."""
+    """Evenness of the sizes of z, see `input_axes`."""
 
     integers: ClassVar[frozenset[str]] = frozenset()
     """Names of the arrays that are int32; all others are float64."""
@@ -104,13 +103,13 @@ class CoordinateRegression(Surrogate, ABC):
 
     @abstractmethod
     def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
-        """Learn g. `axes_` and `modes_` are those of the samples' coordinates."""
+        """Learn g in the coordinates of `axes_` and `modes_`; return its arrays."""
 
     @abstractmethod
     def shapes(
         self, model: Arrays, n_inputs: int, n_outputs: int
     ) -> Mapping[str, tuple[int | None, ...]]:
-        """Return the shapes that the arrays of `regress` must have; None is any length but 0."""
+        """Return the required shapes of the arrays of `regress`; None is any length but 0."""
 
     @abstractmethod
     def take(self, model: dict[str, NDArray[Any]]) -> None:
@@ -188,7 +187,7 @@ class CoordinateRegression(Surrogate, ABC):
         return self.answer(observed.values)
 
     def _to_coordinates(self, axes: Array) -> Array:
-        """Return the matrix (n_dofs, n_inputs) with z = fᵀ of it."""
+        """Return the matrix (n_dofs, n_inputs) that maps a load f to z = fᵀ times the matrix."""
         if self.input == "linear-response":
             return self.response_.to_coordinates(axes)
         return self._on_all_dofs(axes)
@@ -200,9 +199,9 @@ class CoordinateRegression(Surrogate, ABC):
 
 
 def _shuffled(samples: Snapshots) -> Snapshots:
-    """Return imported snapshots in a fixed random order, since kernels see only the first ones.
+    """Return imported snapshots in a fixed random order, because kernels use only the first ones.
 
-    They may come load region by load region; generated ones cover the regions evenly.
+    Imported snapshots may be ordered by load region; generated ones cover the regions evenly.
     """
     if isinstance(samples.loads, PatchLoads):
         return samples

@@ -39,7 +39,7 @@ class DeepONetNetwork(FieldNetwork):
     modes : (n_dofs, n_functions) float32 or None
         Values of tₖ at the nodes; None for a trunk network.
     n_functions, width, depth : int
-        Number of functions, and units and number of the hidden layers of branch and trunk.
+        Number of functions; units and number of the hidden layers of branch and trunk.
     """
 
     axes: Tensor
@@ -93,23 +93,21 @@ class DeepONet(OperatorSurrogate):
     """A branch network for the load, and functions of the position from a trunk network or POD.
 
     Lu, Jin, Pang, Zhang, Karniadakis, "Learning nonlinear operators via DeepONet"; for the POD
-    trunk Lu et al., "A comprehensive and fair comparison of two neural operators". Here the branch
-    sees principal coordinates of the input instead of its values at sensors. The trunk's functions
-    are vector-valued, so that the three components share the branch. The POD trunk has no mean.
-    After the training the trunk is a matrix.
-
-    The other parameters are those of `FieldSurrogate`.
+    trunk Lu et al., "A comprehensive and fair comparison of two neural operators". Here the input
+    of the branch is principal coordinates instead of values at sensors. The trunk's functions are
+    vector-valued, so the three components share the branch. The POD trunk has no mean. After
+    training, the trunk is a matrix. The other parameters are those of `FieldSurrogate`.
 
     Parameters
     ----------
     trunk : {"network", "pod"}
-        Source of the functions tₖ. POD modes are those of the displacement, or of its nonlinear
-        rest.
+        Source of the functions tₖ. POD modes are computed from the displacement, or from its
+        nonlinear remainder.
     n_input_modes : int
-        Principal coordinates of the input; capped at its rank. Keep many for forces, whose
-        coordinates are all of about one size.
+        Principal coordinates of the input; capped at its rank. Keep many for forces, because the
+        coordinates of forces have similar sizes.
     n_functions : int
-        Number of functions; capped at the rank with POD.
+        Number of functions; with POD, capped at the rank.
     width, depth : int
         Units and number of the hidden layers in branch and trunk.
     """

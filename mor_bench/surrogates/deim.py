@@ -32,29 +32,29 @@ from mor_bench.surrogates.hyper_reduced import (
 Array = NDArray[np.float64]
 
 FORCE_MODES = (10, 20, 40, 80, 160)
-"""Values that "auto" chooses from."""
+"""Candidates for "auto"."""
 
 
 @dataclass(eq=False)
 class InterpolatedPOD(Surrogate):
-    """POD-Galerkin whose nonlinear force is interpolated from a few of its entries.
+    """POD-Galerkin with a nonlinear force that is interpolated from a few of its entries.
 
-    The linear part of the force is projected exactly. The rest n(u) = f(u) - K₀u is sought in the
-    span of the leading modes U of its training snapshots:
-    f_r(q) = ΦᵀK₀Φ q + ΦᵀU (PᵀU)⁻¹ Pᵀ n(Φq), where Pᵀ picks as many dofs as U has columns
+    The linear part of the force is projected exactly. The remainder n(u) = f(u) - K₀u is
+    approximated in the span of the leading modes U of its training snapshots:
+    f_r(q) = ΦᵀK₀Φ q + ΦᵀU (PᵀU)⁻¹ Pᵀ n(Φq), where Pᵀ selects as many dofs as U has columns
     (Chaturantabut & Sorensen 2010). Only the cells that touch these dofs are integrated. The
-    tangent is not symmetric and there is no potential: nothing keeps the model stable.
+    tangent is not symmetric and there is no potential, so stability is not guaranteed.
 
     Parameters
     ----------
     n_modes : int or "auto"
-        Size r of the basis Φ; capped at the snapshots' rank with a warning. "auto", here and for
-        `n_force_modes` and `tolerance`: as little work as meets the scene's need, see
+        Size r of the basis Φ; capped at the snapshots' rank with a warning. "auto", also for
+        `n_force_modes` and `tolerance`: the cheapest values that meet the scene's need, see
         `mor_bench.reduction.sizing`.
     n_force_modes : int or "auto"
         Columns of U, and dofs sampled; capped at the rank of the nonlinear forces with a warning.
     selection : {"greedy", "pivoted-qr"}
-        Choice of the dofs: as Chaturantabut & Sorensen, or by pivoted QR (Q-DEIM, Drmač & Gugercin
+        Choice of the dofs: by Chaturantabut & Sorensen, or by pivoted QR (Q-DEIM, Drmač & Gugercin
         2016).
     n_force_snapshots : int
         Training snapshots whose forces span U, spread evenly over the training set.

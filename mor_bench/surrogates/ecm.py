@@ -19,10 +19,10 @@ Array = NDArray[np.float64]
 class EmpiricalCubaturePOD(CubatureSurrogate):
     """POD-Galerkin over a few weighted cells that integrate a basis of the reduced forces exactly.
 
-    ``cubature_tolerance`` is the share of the reduced cell forces that the basis may lack, in the
-    Frobenius norm over cells, snapshots and modes; 0 keeps every cell with weight 1 (Hernández,
-    Caicedo, Ferrer 2017). The weights sum to the number of cells. The other parameters are those
-    of `CubatureSurrogate`.
+    ``cubature_tolerance`` is the fraction of the reduced cell forces that the basis may miss, in
+    the Frobenius norm over cells, snapshots and modes; 0 keeps every cell with weight 1
+    (Hernández, Caicedo, Ferrer 2017). The weights sum to the number of cells. The other parameters
+    are those of `CubatureSurrogate`.
     """
 
     def choose_cells(

@@ -1,4 +1,4 @@
-"""Total Lagrangian explicit dynamics, relaxed to the static equilibrium, as a contestant."""
+"""Total Lagrangian explicit dynamics as a method, relaxed to the static equilibrium."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class ExplicitDynamics(Surrogate):
     Parameters
     ----------
     tolerance : float
-        Norm of the residual relative to that of the load at which the body rests, in (0, 1].
+        Norm of the residual at rest relative to that of the load, in (0, 1].
     start : {"rest", "linear-response"}
-        Initial displacement. Codes of this family start at rest, since they hold no stiffness;
+        Initial displacement. Codes of this family start at rest, because they hold no stiffness;
         "linear-response" costs a back-solve with the factor of the stiffness at rest.
     max_steps : int
         Steps after which the solve fails. A second attempt, after divergence, has as many.

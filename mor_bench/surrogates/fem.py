@@ -1,4 +1,4 @@
-"""The full-order model as a contestant."""
+"""The full-order model as a method."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from mor_bench.surrogate import Surrogate
 class FullFEM(Surrogate):
     """The nonlinear solve on the whole mesh.
 
-    Observed nodes are held at their displacements, and all other nodes carry no force. That is
+    Observed nodes are held at their displacements, and all other nodes carry no force. This is
     exact if every loaded node is observed, see `mor_bench.mechanics.observed`.
 
     Parameters
     ----------
     tolerance : float
-        Norm of the residual relative to that of the load at which the solve stops, in (0, 1].
+        Largest norm of the final residual relative to that of the load, in (0, 1].
     solver : str, optional
-        One of `mor_bench.mechanics.model.SOLVERS`; by default the scene's.
+        One of `mor_bench.mechanics.model.SOLVERS`. Default: the scene's solver.
     """
 
     tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8

@@ -24,7 +24,7 @@ from mor_bench.surrogate import Surrogate
 class CoarseFEM(Surrogate):
     """Full-order FEM with fewer cells: u = P u_c(Pᵀ f).
 
-    P holds the coarse shape functions at the scene's nodes; Pᵀ keeps the sum of the forces and
+    P holds the coarse shape functions at the scene's nodes; Pᵀ preserves the sum of the forces and
     their moments. The supports of the coarse mesh come from the same regions.
 
     Parameters
@@ -32,7 +32,7 @@ class CoarseFEM(Surrogate):
     coarsening : int
         Divisor of the scene's cells per axis, at least 2; the results are rounded up.
     tolerance : float
-        Norm of the residual relative to that of the load at which the solve stops, in (0, 1].
+        Largest norm of the final residual relative to that of the load, in (0, 1].
     """
 
     coarsening: Annotated[int, Field(ge=2)] = 2
@@ -41,7 +41,7 @@ class CoarseFEM(Surrogate):
     needs_snapshots: ClassVar = False
 
     def supports(self, scene: Scene) -> str | None:
-        """Return the reason why there is no coarser mesh, or why nothing would hold it."""
+        """Return the reason why there is no coarser mesh, or why it has no supports."""
         if reason := unknown_equations(scene):
             return reason
         try:

@@ -1,4 +1,4 @@
-"""The full-order model started from a known solution under a similar load instead of from rest."""
+"""The full-order model, started from a known solution under a similar load."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from mor_bench.surrogates.free_dofs import answer_each
 Array = NDArray[np.float64]
 
 N_COORDINATES = 12
-"""Principal coordinates of the linear response in which loads are compared."""
+"""Number of principal coordinates of the linear response in which loads are compared."""
 
 NEAR = 0.5
 """Largest distance between the linear responses of a known solution and of the query, as a
-fraction of the norm of the latter."""
+fraction of the norm of the query's."""
 
 
 @dataclass(eq=False)
 class WarmFEM(Surrogate):
     """The full-order solve, started at u* + K₀⁻¹(f - f*), with a known solution u* under a load f*.
 
-    A solution is used only if its linear response lies within `NEAR` of the query's; otherwise the
+    A solution is used only if its linear response lies within `NEAR` of the query's. Otherwise the
     solve starts at the linear response. A bad start costs time but never changes the answer: the
     tolerance and the checks are those of full-order FEM.
 
@@ -47,7 +47,7 @@ class WarmFEM(Surrogate):
         solution of this object, as in an interactive simulation. Then answers depend on the order
         of the queries, within the tolerance, and a loaded model begins at rest.
     tolerance : float
-        Norm of the residual relative to that of the load at which the solve stops, in (0, 1].
+        Largest norm of the final residual relative to that of the load, in (0, 1].
     n_starts : int
         Training samples kept for "nearest"; the first ones, which cover the load regions evenly.
     """
@@ -58,7 +58,7 @@ class WarmFEM(Surrogate):
 
     @property
     def needs_snapshots(self) -> bool:  # type: ignore[override]
-        """Whether solutions are taken from the training samples."""
+        """Whether known solutions come from the training samples."""
         return self.start == "nearest"
 
     def supports(self, scene: Scene) -> str | None:
@@ -100,7 +100,7 @@ class WarmFEM(Surrogate):
         return found
 
     def _shift(self, load: Array, linear: Array) -> Array:
-        """Return what the nearest known solution adds to its linear response, (n_free,) m.
+        """Return the nearest known solution minus its linear response, (n_free,) m.
 
         It is zero if no solution is near.
         """

@@ -1,4 +1,4 @@
-"""Networks from a field at the nodes to another, and the surrogate that trains such a network."""
+"""Networks between fields at the nodes, and the surrogate that trains such a network."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from mor_bench.learning.training_plan import Loss, TrainingPlan
 from mor_bench.surrogates.field_surrogate import Arrays, FieldSurrogate
 
 SECOND_MOMENT_DECAY = 0.99
-"""Adam's β₂. Short trainings gain from a short memory."""
+"""Adam's β₂. Short trainings need a short memory."""
 
 
 class FieldNetwork(nn.Module, ABC):
-    """A network G from a field at the nodes to another.
+    """A network G between fields at the nodes.
 
-    Its weights have no values until `initialise` or loading sets them: no random number is drawn.
-    Constants are buffers that `state_dict` leaves out.
+    `initialise` or loading sets its weights; the constructor draws no random number. Constants are
+    buffers that `state_dict` leaves out.
     """
 
     @abstractmethod
     def encode(self, fields: Tensor) -> Tensor:
-        """(n, n_nodes, 3) → features (n, ...) that depend on no weight: once per sample."""
+        """(n, n_nodes, 3) → features (n, ...), once per sample: they depend on no weight."""
 
     @abstractmethod
     def forward(self, features: Tensor) -> Tensor:
@@ -37,14 +37,14 @@ class FieldNetwork(nn.Module, ABC):
         """Work of `encode` and `forward` for one sample, after `precompute`."""
 
     def precompute(self) -> None:
-        """Compute what depends on the weights but not on the input."""
+        """Compute the parts that depend on the weights but not on the input."""
 
 
 class OperatorSurrogate(FieldSurrogate):
     """A `FieldSurrogate` with a `FieldNetwork`.
 
-    It is trained with the mean squared error over the components of all nodes. G(0) is subtracted
-    in the training too.
+    The training loss is the mean squared error over the components of all nodes. G(0) is subtracted
+    in training too.
     """
 
     network_: FieldNetwork
@@ -103,7 +103,7 @@ class SelfInitialised(ABC, nn.Module):
 
     @abstractmethod
     def initialise(self, generator: torch.Generator) -> None:
-        """Give all weights values, drawn from the given generator only."""
+        """Draw all weights from the given generator only."""
 
 
 def initialise(network: nn.Module, generator: torch.Generator) -> None:

@@ -1,4 +1,4 @@
-"""What all surrogates share whose network maps a field at the nodes to a field at the nodes."""
+"""Base class of surrogates with a network between fields at the nodes."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class FieldSurrogate(Surrogate, ABC):
     """u = s (G(x) - G(0)) from the scaled force x, or u = K₀⁻¹f + s (G(x) - G(0)) from x ~ K₀⁻¹f.
 
     The network G is trained in float32. In a scene with observed nodes, their displacements replace
-    the force, and the linear extension of these replaces the linear response. The supports do not
-    move. A subclass defines the network, its loss, and how it is evaluated, and declares the
-    parameters below as its hyperparameters.
+    the force, and their linear extension replaces the linear response. The supports do not move.
+    A subclass defines the network, its loss and its evaluation. It declares the parameters below as
+    its hyperparameters.
 
     Parameters
     ----------
@@ -44,9 +44,9 @@ class FieldSurrogate(Surrogate, ABC):
         Input of the network. The linear response gives far smaller errors, and needs the scene's
         equations.
     iterations : int
-        Adam steps. A number, not a time, so that the result does not depend on the machine's load.
+        Adam steps. A number instead of a time makes results independent of the machine's load.
     batch_size : int
-        Samples per step; at most all there are.
+        Samples per step; at most all samples.
     learning_rate : float
         Peak of the one-cycle schedule.
     seed : int
@@ -57,7 +57,7 @@ class FieldSurrogate(Surrogate, ABC):
     network_ : nn.Module
         G.
     input_scale_, output_scale_ : float
-        What the input, N or m, and the learned displacement, m, are divided by.
+        Divisors of the input, N or m, and of the learned displacement, m.
     loss_curve_ : (n_intervals,) float64
         Training loss, in units of ``output_scale_`` squared.
     iterations_ : int
@@ -74,7 +74,7 @@ class FieldSurrogate(Surrogate, ABC):
     """Whether G(0) is subtracted, so that no load gives exactly no displacement."""
 
     chunk: ClassVar[int] = 64
-    """Samples per forward pass of a prediction; it bounds the memory of a long batch."""
+    """Samples per forward pass of a prediction; limits the memory of a long batch."""
 
     curves: ClassVar[tuple[str, ...]] = ("loss_curve",)
     """Curves of `Training` that the model keeps."""
@@ -85,7 +85,7 @@ class FieldSurrogate(Surrogate, ABC):
 
     @abstractmethod
     def build_network(self, constants: Arrays) -> nn.Module:
-        """Return the network without values.
+        """Return the network with unset weights.
 
         Raises
         ------
@@ -99,13 +99,13 @@ class FieldSurrogate(Surrogate, ABC):
 
     @abstractmethod
     def training_data(self, network: Any, inputs: Tensor, targets: Tensor) -> dict[str, Tensor]:
-        """Return what the loss computes with, from scaled samples (n, n_nodes, 3)."""
+        """Return the loss's arrays from scaled samples (n, n_nodes, 3)."""
 
     @abstractmethod
     def loss_function(
         self, network: Any, data: dict[str, Tensor], generator: torch.Generator
     ) -> Loss:
-        """Return the loss; the generator draws what is random in it."""
+        """Return the loss; it draws random numbers from the generator."""
 
     @abstractmethod
     def plan(self) -> TrainingPlan:
@@ -120,7 +120,7 @@ class FieldSurrogate(Surrogate, ABC):
         """Return the multiply-adds of G for one sample."""
 
     def constants(self, inputs: Array, targets: Array) -> dict[str, Array]:
-        """Return arrays that the network needs beside the scene, from scaled samples."""
+        """Return arrays that the network needs besides the scene, from scaled samples."""
         return {}
 
     def scale(self, values: Array) -> float:
@@ -128,17 +128,17 @@ class FieldSurrogate(Surrogate, ABC):
         return float(np.sqrt(np.mean(np.square(values)))) or 1.0
 
     def turned(self, weights: dict[str, Tensor], source: Arrays, target: Arrays) -> Any:
-        """Return weights of a model of other constants and scales, converted for this one."""
+        """Convert the weights of a model with other constants and scales; return them."""
         return weights
 
     def finish(self, inputs: Tensor, targets: Tensor) -> None:
-        """Do what is left once ``network_`` is trained, with scaled samples on the processor."""
+        """Finish the fit after training ``network_``, with scaled samples on the processor."""
 
     def precompute(self) -> None:
-        """Compute what depends on the weights of ``network_`` but not on the input."""
+        """Compute the parts of ``network_`` that depend on its weights but not on the input."""
 
     def set_up(self, scene: Scene) -> None:
-        """Make what the network needs of the scene, unless that is there already."""
+        """Compute the scene's part of the network, unless it exists already."""
         if self.input == "linear-response" and not hasattr(self, "response_"):
             self.response_ = linear_response(scene)
 
@@ -179,7 +179,7 @@ class FieldSurrogate(Surrogate, ABC):
         return train(problem, self.plan(), self.training, self.time_limit_s)
 
     def _start_from(self, network: nn.Module, path: Path, model: Arrays) -> None:
-        """Take the weights of a saved model of this architecture, from this scene or another."""
+        """Load the weights of a saved model with this architecture, for this scene or another."""
         found = weights_to_start_from(path, self)
         own = _constants(model)
         shapes: dict[str, tuple[int | None, ...]] = {
@@ -234,7 +234,7 @@ class FieldSurrogate(Surrogate, ABC):
     def answer(self, forces: Array) -> Array:
         if len(forces) == 0:
             return np.zeros(forces.shape)
-        if is_counting():  # with one scaling of each input and each output
+        if is_counting():  # includes one scaling of each input and each output
             count(multiply_adds=len(forces) * (self.n_products() + 2 * self.scene_.mesh.n_dofs))
         inputs = self._network_input(forces)
         chunks = torch.split(_single(inputs / self.input_scale_), self.chunk)
@@ -251,7 +251,7 @@ class FieldSurrogate(Surrogate, ABC):
         return self.answer(observed.values)
 
     def _network_input(self, given: Array) -> Array:
-        """Return what is given, or the linear response to it, m, (n, n_nodes, 3) both."""
+        """Return the given values, or the linear response to them, m, both (n, n_nodes, 3)."""
         if self.input == "force":
             return given
         flat = given.reshape(len(given), self.scene_.mesh.n_dofs)

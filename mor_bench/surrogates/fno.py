@@ -37,9 +37,9 @@ class SpectralConvolution(SelfInitialised):
     """A channel matrix for each of the lowest wave numbers: (x, y, z, n, c) → (x, y, z, n, c).
 
     It is a circular convolution with a smooth real kernel. The discrete Fourier transforms are
-    products with the few rows that are kept, one axis after another. On grids this small, that
-    takes a fourth of the time of torch's fast transforms. The order of summation does not depend on
-    the number of threads.
+    products with a few rows, one axis after another. On these small grids, the products take a
+    quarter of the time of torch's fast transforms. Their order of summation does not depend on the
+    number of threads.
 
     Parameters
     ----------
@@ -61,13 +61,13 @@ class SpectralConvolution(SelfInitialised):
         super().__init__()
         self.shape, self.channels = shape, channels
         kept = [wave_numbers(n, modes) for n in shape]
-        # Values are real, so along z half of the wave numbers are enough: the rest are conjugates.
+        # Values are real, so half of the wave numbers along z are enough: the rest are conjugates.
         half = kept[2][(2 * kept[2] >= 0) | (2 * kept[2] == -shape[2])]
         kept[2] = np.abs(half)
         for axis, (n, numbers) in enumerate(zip(shape, kept, strict=True)):
             factors = np.exp(-2j * np.pi * np.outer(numbers, np.arange(n)) / n).astype(np.complex64)
             back = factors.conj().T / n
-            if axis == 2:  # each stands for its conjugate too, unless it is its own
+            if axis == 2:  # each also counts for its conjugate, unless it is its own conjugate
                 back = back * np.where((2 * numbers) % n == 0, 1.0, 2.0)
             add_constants(
                 self,
@@ -80,7 +80,7 @@ class SpectralConvolution(SelfInitialised):
         self.weight = nn.Parameter(torch.empty(prod(self.counts), channels, channels, 2))
 
     def initialise(self, generator: torch.Generator) -> None:
-        """Draw weights with mean square 1 / channels, which keeps the size of the signal."""
+        """Draw weights with mean square 1 / channels, which preserves the size of the signal."""
         nn.init.normal_(self.weight, std=(2 * self.channels) ** -0.5, generator=generator)
 
     def forward(self, values: Tensor) -> Tensor:
@@ -103,7 +103,7 @@ class SpectralConvolution(SelfInitialised):
 
 
 def wave_numbers(n: int, modes: int) -> NDArray[np.int64]:
-    """Return the wave numbers of n points whose absolute value is below `modes`, each once."""
+    """Return the wave numbers of n points with an absolute value below `modes`, each once."""
     numbers = np.fft.fftfreq(n, 1.0 / n).round().astype(np.int64)
     return numbers[np.abs(numbers) < modes]
 
@@ -111,17 +111,17 @@ def wave_numbers(n: int, modes: int) -> NDArray[np.int64]:
 class FNO(FieldNetwork):
     """Li et al., "Fourier neural operator for parametric partial differential equations", sec. 4.
 
-    Lifting to channels, layers σ(W v + K v) with a pointwise W and a spectral convolution K, and a
-    pointwise projection. As in the paper, the position is part of the input, and the grid is padded
-    at its high ends.
+    The network lifts the input to channels, applies layers σ(W v + K v) with a pointwise W and a
+    spectral convolution K, and projects pointwise. As in the paper, the position is part of the
+    input, and the grid is padded at its high ends.
 
     Parameters
     ----------
     grid : PaddedGrid
-        Without padding.
+        Grid without padding.
     spread : bool
-        Whether the input adds up on the grid, as forces do. Otherwise each grid point takes the
-        mean of the nodes around it.
+        Whether the input adds up on the grid, as forces do. Otherwise the value at each grid point
+        is the mean of the nodes around it.
     channels, modes, layers : int
     """
 
@@ -151,7 +151,7 @@ class FNO(FieldNetwork):
         return values.permute(0, 2, 3, 4, 1)
 
     def forward(self, features: Tensor) -> Tensor:
-        values = features.permute(1, 2, 3, 0, 4)  # points first, for the transforms
+        values = features.permute(1, 2, 3, 0, 4)  # the transforms need points first
         nx, ny, nz, n, _ = values.shape
         values = self.lift(torch.cat([values, self.positions.expand(-1, -1, -1, n, -1)], dim=-1))
         ends = [(0, -(-side // PADDING)) for side in (nz, ny, nx)]
@@ -183,17 +183,16 @@ class FNO(FieldNetwork):
 class FourierNeuralOperator(OperatorSurrogate):
     """A Fourier neural operator on the regular grid around the body; see `FNO`.
 
-    Forces are spread over the grid as in U-Mesh; displacements are averaged. Every layer sees the
-    whole grid, coarsely, which a load at one end of a body needs.
-
-    The other parameters are those of `FieldSurrogate`.
+    Forces are spread over the grid as in U-Mesh; displacements are averaged. Every layer covers the
+    whole grid at low resolution, so a load at one end of a body acts everywhere. The other
+    parameters are those of `FieldSurrogate`.
 
     Parameters
     ----------
     channels, layers : int
         Channels and number of layers.
     modes : int
-        Wave numbers per axis, 0 to modes - 1 and their negatives; axes with fewer keep theirs.
+        Wave numbers per axis, 0 to modes - 1 and their negatives; axes with fewer keep all.
     """
 
     input: Input = "force"

@@ -1,4 +1,4 @@
-"""What projection methods share: one solve per load over the free dofs, and saved polynomials."""
+"""Shared parts of projection methods: solves over the free dofs, and saved polynomials."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def answer_each(scene: Scene, forces: Array, solve: Callable[[Array], Array]) ->
     Parameters
     ----------
     forces : (n, n_nodes, 3) float64
-        N.
+        Nodal forces, N.
     solve : callable
-        From a load (n_free,), N, to displacements (n_free,), m.
+        Maps a load (n_free,), N, to displacements (n_free,), m.
 
     Returns
     -------
@@ -41,7 +41,7 @@ def answer_each(scene: Scene, forces: Array, solve: Callable[[Array], Array]) ->
 def galerkin_or_polynomial(
     scene: Scene, model: FullOrderModel, modes: Array, arrays: Mapping[str, NDArray[Any]]
 ) -> GalerkinProblem | TensorProblem:
-    """Return the reduced problem of a basis: its polynomial if it was saved, or the projection.
+    """Return the saved polynomial of a basis as its reduced problem, or else the projection.
 
     Raises
     ------

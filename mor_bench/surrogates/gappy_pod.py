@@ -28,18 +28,17 @@ class GappyPOD(Surrogate):
     Everson and Sirovich: Karhunen-Loève procedure for gappy data, J. Opt. Soc. Am. A 12 (1995),
     equations 8 to 10, with Tikhonov's regularisation: a minimises
     ‖Φ_o a - u_o‖² + λ² m² Σ (a_i / s_i)². Here Φ_o are the observed rows of the modes, s_i is the
-    root mean square of a_i over the training samples, and m that of ‖u_o‖. The method knows no
-    equations and no forces. At observed nodes, too, it returns the fit, which may differ from
-    what was observed.
+    root mean square of a_i over the training samples, and m that of ‖u_o‖. The method uses no
+    equations and no forces. At observed nodes, it also returns the fit, which may differ from the
+    observed values.
 
     Parameters
     ----------
     n_modes : int
         Size of the basis; capped at the snapshots' rank with a warning.
     regularisation : float
-        λ >= 0: about the relative error of the observation, and of what the modes cannot
-        represent. Use a positive value: with 0, modes that are hardly visible at the observed
-        nodes fit noise.
+        λ >= 0: about the relative error of the observation and of the projection on the modes. Use
+        a positive value: with 0, modes that are hardly visible at the observed nodes fit noise.
     """
 
     n_modes: Annotated[int, Field(ge=1)] = 40
@@ -80,7 +79,7 @@ class GappyPOD(Surrogate):
 
 
 def _observed_places(scene: Scene) -> NDArray[np.int64]:
-    """Return the places of the observed dofs among the free ones."""
+    """Return the indices of the observed dofs among the free ones."""
     nodes = scene.observed_nodes
     assert nodes is not None
     return np.searchsorted(scene.free_dofs, dofs_of_nodes(nodes))

@@ -19,18 +19,18 @@ Array = NDArray[np.float64]
 class HyperReducedPOD(CubatureSurrogate):
     """POD-Galerkin over a few weighted cells only, chosen by non-negative least squares.
 
-    The weights keep the reduced force of the projected snapshots to a relative residual of
-    ``cubature_tolerance`` (Farhat et al. 2014). They do not sum to the number of cells, and volume
-    is not preserved. Since no weight is negative, a potential exists and the tangent is symmetric.
+    The weights reproduce the reduced force of the projected snapshots to a relative residual of
+    ``cubature_tolerance`` (Farhat et al. 2014). They do not sum to the number of cells, so volume
+    is not preserved. No weight is negative, so a potential exists and the tangent is symmetric.
 
     Parameters
     ----------
     n_modes, cubature_tolerance, n_cubature_snapshots, tolerance
-        As for `CubatureSurrogate`.
+        See `CubatureSurrogate`.
     sampling : {"cells", "points"}
         "cells": integrate every point of a chosen cell, as published. "points": a second cubature
         to the same tolerance keeps few points of these cells, each with its own weight (Yano &
-        Patera 2019 choose points so). Positive det F is then checked at these points only.
+        Patera 2019 choose points in this way). Then positive det F is checked at these points only.
     """
 
     sampling: Literal["cells", "points"] = "points"

@@ -1,4 +1,4 @@
-"""Hybrid: the answer of another method, corrected as in the full-order solve."""
+"""Hybrid: the answer of another method, corrected by steps of the full-order solve."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from mor_bench.surrogate import Surrogate
 Array = NDArray[np.float64]
 
 START = "start."
-"""Prefix of the names of the start's arrays."""
+"""Prefix of the names of the starting method's arrays."""
 
 WORSE = 1.0
-"""Largest residual after the corrections, as a share of the load; above it the solve starts at
-rest."""
+"""Largest residual after the corrections, as a fraction of the load. Above it, the solve starts
+at rest."""
 
 NEAR, SURE = 0.5, 0.7
-"""Corrections below the first share of the answer, with det F above the second at the centres of
-all cells, need no check of det F at every quadrature point."""
+"""If corrections are below the first fraction of the answer, and det F is above the second at the
+centres of all cells, det F is not checked at every quadrature point."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _least_det_f(u, cell_nodes, gradients):  # type: ignore[no-untyped-def]
     """Return the smallest det F at the cells' centres.
 
-    The displacements (n_free_nodes + 1, 3), m, end with that of fixed nodes.
+    The last row of u (n_free_nodes + 1, 3), m, is the displacement of fixed nodes.
     """
     least, F = np.inf, np.empty((3, 3))
     for k in range(len(cell_nodes)):
@@ -61,11 +61,11 @@ def _least_det_f(u, cell_nodes, gradients):  # type: ignore[no-untyped-def]
 class Hybrid(Surrogate):
     """The full-order solve from the answer of any other method.
 
-    With `steps`, it repeats u ← u + R K₀⁻¹ Rᵀ (f - f_int(u)), where the stiffness at rest K₀ turns
-    with the body (see `mor_bench.mechanics.rotated`), under Anderson acceleration. Near the
-    solution each step divides the error by about ten; stability is not checked. With `tolerance`
-    instead, it makes the whole solve with all its checks, started at the answer. An answer with
-    det F <= 0, or one that is no better than none, is dropped for the solve from rest.
+    With `steps`, it repeats u ← u + R K₀⁻¹ Rᵀ (f - f_int(u)) under Anderson acceleration. R rotates
+    the stiffness at rest K₀ with the body (see `mor_bench.mechanics.rotated`). Near the solution
+    each step divides the error by about ten; stability is not checked. With `tolerance` instead,
+    the whole solve with all its checks starts at the answer. If the answer has det F <= 0, or is no
+    better than zero, the solve starts at rest.
 
     Parameters
     ----------
@@ -74,10 +74,9 @@ class Hybrid(Surrogate):
     start_parameters : dict
         Hyperparameters of that method that differ from its file.
     steps : int, optional
-        Corrections, 1 to 100; without a tolerance 1 by default.
+        Corrections, 1 to 100; 1 by default if there is no tolerance.
     tolerance : float, optional
-        Instead of steps: norm of the residual relative to that of the load at which to stop, in
-        (0, 1].
+        Largest norm of the final residual relative to that of the load, in (0, 1]. Replaces steps.
     """
 
     start: str = "pod-tensor"
@@ -87,7 +86,7 @@ class Hybrid(Surrogate):
 
     @property
     def needs_snapshots(self) -> bool:  # type: ignore[override]
-        """Whether the start learns from snapshots."""
+        """Whether the starting method learns from snapshots."""
         return self.unfitted_start().needs_snapshots
 
     def supports(self, scene: Scene) -> str | None:
@@ -106,7 +105,7 @@ class Hybrid(Surrogate):
         return {START + name: array for name, array in arrays.items()}
 
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
-        if not hasattr(self, "start_"):  # it was not fitted here
+        if not hasattr(self, "start_"):  # the model was loaded, not fitted
             arrays = {name.removeprefix(START): array for name, array in model.items()}
             sizes = take_sizes(arrays)
             self.start_ = self.unfitted_start().restore(_all_outputs(scene), arrays, sizes)
@@ -126,7 +125,7 @@ class Hybrid(Surrogate):
         return load_method(self.start, **(self.start_parameters or {}))
 
     def _guess(self, force: Array) -> Array | None:
-        """Return the start's answer on the free dofs, m; None if it has none."""
+        """Return the starting method's answer on the free dofs, m; None if it has none."""
         try:
             guess = self.start_.predict(force).ravel()[self.scene_.free_dofs]
         except SolverError:
@@ -155,7 +154,7 @@ class Hybrid(Surrogate):
 
 
 def _all_outputs(scene: Scene) -> Scene:
-    """Return the scene with displacements wanted at all nodes: a start must be complete."""
+    """Return the scene with outputs at all nodes, because a starting answer must be complete."""
     if len(scene.output_nodes) == scene.mesh.n_nodes:
         return scene
     return replace(

@@ -1,4 +1,4 @@
-"""What the hyper-reduced methods share: training coordinates, nodal modes, a model over cells."""
+"""Base of hyper-reduced methods: training coordinates, nodal modes, a model over cells."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 def training_coordinates(displacements: Array, modes: Array, n_snapshots: int) -> Array:
     """Return coordinates (n, r) of at most ``n_snapshots`` snapshots.
 
-    They are spread evenly over the snapshots that are not zero. The modes are orthonormal.
+    They are spread evenly over the nonzero snapshots. The modes are orthonormal.
     """
     moved = np.flatnonzero(displacements.any(axis=1))
     chosen = np.unique(np.linspace(0, len(moved) - 1, n_snapshots).astype(int))
@@ -57,7 +57,7 @@ def reduced_points(
 
 
 CUBATURE_TOLERANCES = (3e-2, 1e-2, 3e-3, 1e-3)
-"""Values that "auto" chooses from."""
+"""Candidates for "auto"."""
 
 
 @dataclass(eq=False)
@@ -67,10 +67,11 @@ class CubatureSurrogate(Surrogate):
     Parameters
     ----------
     n_modes : int or "auto"
-        Size r of the basis; capped at the snapshots' rank with a warning. "auto", here and for the
-        tolerances: as little work as meets the scene's need, see `mor_bench.reduction.sizing`.
+        Size r of the basis; capped at the snapshots' rank with a warning. "auto", also for the
+        tolerances: the cheapest values that meet the scene's need, see
+        `mor_bench.reduction.sizing`.
     cubature_tolerance : float or "auto"
-        Error allowed to the cubature, in [0, 1). A smaller value keeps more cells: slower, and
+        Allowed error of the cubature, in [0, 1). A smaller value keeps more cells: slower, and
         closer to plain POD. 0 keeps every cell.
     n_cubature_snapshots : int
         Training snapshots whose reduced forces are matched, spread evenly over the training set.
@@ -98,10 +99,7 @@ class CubatureSurrogate(Surrogate):
     ) -> tuple[NDArray[np.int64], Array]:
         """Return the kept cells, and their weights (n,) or those of their points (n, n_points).
 
-        Parameters
-        ----------
-        q : (n_snapshots, r) float64
-            Coordinates of snapshots in the basis.
+        `q` (n_snapshots, r) float64 are coordinates of snapshots in the basis.
         """
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:

@@ -29,16 +29,18 @@ LENGTHS = (1e-2, 1e3)
 """Bounds on length scales; inputs are of the order of one."""
 
 N_LEADING, MAX_ITERATIONS = 5, 30
-"""Leading outputs that choose length scales, and steps of L-BFGS-B; a step with 40 takes 1 s."""
+"""Leading outputs used to choose length scales, and steps of L-BFGS-B; a step with 40 outputs
+takes 1 s."""
 
 SHORTEST = 1e-6
-"""Shortest length in a model; loads divided by it can be squared."""
+"""Smallest length in a model; loads divided by it can be squared without overflow."""
 
 LARGEST = 1e50
-"""Largest ratio of points to length scales; its square, and products with any load, are finite."""
+"""Largest ratio of points to length scales; its square and products with loads are finite."""
 
 LEAST_NOISE = 1e-10
-"""Share of the variance of the targets, added at the origin, where the value is known."""
+"""Smallest noise, used at the origin, where the value is known; a fraction of the targets'
+variance."""
 
 
 def gaussian_kernel(a: Array, b: Array) -> Array:
@@ -79,14 +81,14 @@ class GaussianSums(CoordinateRegression):
         self._exponents = np.vstack(rows)
 
     def coefficients(self, z: Array) -> Array:
-        per_load = self._exponents.size + self.weights_.size + 2 * z.shape[1]  # exp counts one
+        per_load = self._exponents.size + self.weights_.size + 2 * z.shape[1]  # exp counts as one
         count(multiply_adds=len(z) * per_load)
         left = np.empty((len(z), len(self._exponents)))
         left[:, :-2], left[:, -2] = z, 1.0
         left[:, -1] = -0.5 * ((z / self.lengths_) ** 2).sum(axis=1)
         exponents = left @ self._exponents
         out = np.exp(exponents, out=exponents) @ self.weights_
-        out[~z.any(axis=1)] = 0.0  # there the sum is round-off
+        out[~z.any(axis=1)] = 0.0  # the sum there is round-off
         return np.asarray(out)
 
 
@@ -102,12 +104,12 @@ class PCAKernelRidge(GaussianSums):
     Parameters
     ----------
     n_points : int
-        Largest number of training samples used, the first ones, which cover the load regions
-        evenly; imported ones are shuffled. Each is compared with in every query, and the fit solves
-        with a dense matrix of this size.
+        Largest number of training samples. The first ones are used, which cover the load regions
+        evenly; imported ones are shuffled. Every query is compared with each of them, and the fit
+        solves with a dense matrix of this size.
     length_scale : float, optional
-        Of the kernel, where coordinates have root mean squares of the order of one; 8 for the
-        linear response and 100 for the force by default.
+        Length scale of the kernel, for coordinates with root mean squares of the order of one.
+        Default: 8 for the linear response and 100 for the force.
     ridge : float
         Tikhonov weight, relative to the kernel's largest value.
     """
@@ -154,10 +156,10 @@ class PCAGaussianProcess(GaussianSums):
     Parameters
     ----------
     n_points : int
-        Largest number of training samples that the mean is conditioned on: the first ones, which
+        Largest number of training samples that condition the mean. The first ones are used, which
         cover the load regions evenly; imported ones are shuffled.
     n_optimised : int
-        Largest number of these that choose length scales, variance and noise.
+        Largest number of these samples used to choose length scales, variance and noise.
     """
 
     input: Input = "linear-response"
@@ -179,7 +181,7 @@ class PCAGaussianProcess(GaussianSums):
         )
         chosen = GaussianProcessRegressor(kernel, alpha=0.0, optimizer=_optimised)
         with warnings.catch_warnings():
-            # The length of an input without effect ends at its upper bound.
+            # The length scale of an input without effect reaches its upper bound.
             warnings.simplefilter("ignore", ConvergenceWarning)
             chosen.fit(z[: self.n_optimised], targets[: self.n_optimised, :N_LEADING] / scale)
         variance = chosen.kernel_.k1.k1.constant_value
@@ -195,7 +197,7 @@ class PCAGaussianProcess(GaussianSums):
 
 
 def _optimised(objective: Any, start: Any, bounds: Any) -> tuple[Array, float]:
-    """Return where the negative likelihood is least, and its value there."""
+    """Return the minimiser of the negative likelihood, and its minimum."""
     found = minimize(
         objective,
         start,

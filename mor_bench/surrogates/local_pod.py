@@ -27,17 +27,17 @@ from mor_bench.surrogates.free_dofs import answer_each, galerkin_or_polynomial
 Array = NDArray[np.float64]
 
 N_COORDINATES = 12
-"""Principal coordinates of the linear response in which loads are compared."""
+"""Number of principal coordinates of the linear response in which loads are compared."""
 
 OVERLAP = 0.5
-"""Nearest samples of other clusters that a basis learns from too, as a fraction of its own."""
+"""Nearest samples of other clusters in the training of a basis, as a fraction of its own."""
 
 N_WATCHED = 300
-"""Samples of a cluster that decide where det F is watched."""
+"""Samples of a cluster that decide where det F is monitored."""
 
 LINEAR_WEIGHT = 0.2
 """Weight of the linear responses among the snapshots. The static correction supplies them, but the
-basis must be able to turn and bend them."""
+basis must be able to rotate and bend them."""
 
 
 @dataclass(eq=False)
@@ -45,16 +45,16 @@ class LocalPOD(Surrogate):
     """Clustered snapshots, a POD basis for each cluster, and Galerkin projection on one of them.
 
     Amsallem, Zahr, Farhat: Nonlinear model order reduction based on local reduced-order bases,
-    IJNME 92 (2012). There the basis changes along a path. Here it is chosen once per load, by the
-    direction of the linear response K₀⁻¹f in a few principal coordinates. Each basis spans the
-    nonlinear parts u - K₀⁻¹f of its snapshots and, with a small weight, their linear responses.
-    The static correction adds what it lacks of the linear response.
+    IJNME 92 (2012). In the paper, the basis changes along a path. Here it is chosen once per load,
+    by the direction of the linear response K₀⁻¹f in a few principal coordinates. Each basis spans
+    the nonlinear parts u - K₀⁻¹f of its snapshots and, with a small weight, their linear responses.
+    The static correction adds the part of the linear response outside the basis.
 
     Parameters
     ----------
     n_clusters : int
-        Clusters, by k-means with a fixed seed; at most as many as there are directions of training
-        samples. 1 is global POD. More clusters pay if bases are small.
+        Clusters, by k-means with a fixed seed; at most the number of different directions of
+        training samples. 1 is global POD. Use more clusters if bases are small.
     n_modes : int
         Size of each basis; capped at its snapshots' rank with a warning.
     tolerance : float
@@ -106,14 +106,14 @@ class LocalPOD(Surrogate):
         centroids: Array,
         labels: NDArray[np.int64],
     ) -> list[Array]:
-        """Return a basis (n_free, r) for each cluster, from its samples and near ones of others."""
+        """Return a basis (n_free, r) per cluster, from its samples and near ones of others."""
         distances = np.linalg.norm(directions[:, None] - centroids, axis=2)
         both = np.hstack([displacements - linear, LINEAR_WEIGHT * linear])
         both = both.reshape(len(linear), 2, -1)
         bases = []
         for cluster in range(len(centroids)):
             own, others = np.flatnonzero(labels == cluster), np.flatnonzero(labels != cluster)
-            # A small cluster still fills its basis.
+            # Neighbours fill the basis of a small cluster.
             n_near = max(round(OVERLAP * len(own)), self.n_modes - len(own))
             near = others[np.argsort(distances[others, cluster], kind="stable")[:n_near]]
             chosen = both[np.append(own, near)].reshape(-1, both.shape[2])
@@ -146,7 +146,7 @@ class LocalPOD(Surrogate):
         return answer_each(self.scene_, forces, self._solve)
 
     def nearest(self, load: Array) -> int:
-        """Return the cluster whose directions are nearest to that of a load (n_free,), N."""
+        """Return the cluster with directions nearest to that of a load (n_free,), N."""
         direction = _directions((load @ self.to_coordinates_)[None])
         return int(((direction - self.centroids_) ** 2).sum(axis=1).argmin())
 

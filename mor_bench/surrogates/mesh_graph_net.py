@@ -35,10 +35,8 @@ EDGES = {
 class Graph(nn.Module):
     """The edges of a mesh, each once in either direction.
 
-    Attributes
-    ----------
-    senders, receivers : (n_edges,) int64 tensor
-        Nodes at the ends, sorted by receiver, then sender.
+    `senders` and `receivers` (n_edges,) int64 are the nodes at the ends, sorted by receiver, then
+    sender.
     """
 
     senders: Tensor
@@ -75,7 +73,7 @@ class Graph(nn.Module):
         return _gather(nodal, self.receivers, self.incoming)
 
     def to_receivers(self, messages: Tensor) -> Tensor:
-        """(n_edges, n, c) → (n_nodes, n, c): the sum over the edges that each node receives."""
+        """(n_edges, n, c) → (n_nodes, n, c): the sum over the edges that arrive at each node."""
         summed: Any = _SegmentSum
         total: Tensor = summed.apply(messages, self.receivers, self.incoming)
         return total
@@ -100,7 +98,7 @@ def _segment_sum(messages: Tensor, table: Tensor) -> Tensor:
 
 
 class _Gather(torch.autograd.Function):
-    """Rows by index; unlike torch's own, the backward pass never adds atomically."""
+    """Rows by index, with a backward pass in a fixed order; torch's own adds atomically."""
 
     @staticmethod
     def forward(ctx: Any, nodal: Tensor, ends: Tensor, table: Tensor) -> Tensor:
@@ -134,8 +132,8 @@ class _SegmentSum(torch.autograd.Function):
 class MessagePassing(nn.Module):
     """One step: e ← e + f(e, v_sender, v_receiver), v ← v + g(v, Σ e), with perceptrons f and g.
 
-    The first layer of f is three products. Those with node values are taken at the nodes, since
-    there are about five times as many edges.
+    The first layer of f is three products. The products with node values are computed at the nodes,
+    because there are about five times as many edges.
     """
 
     def __init__(self, width: int) -> None:
@@ -168,9 +166,8 @@ class MessagePassing(nn.Module):
 class GraphNetwork(FieldNetwork):
     """Pfaff et al., "Learning mesh-based simulation with graph networks", section 3.
 
-    Encode, process, decode. Node features are the input and whether the node is fixed; edge
-    features are the relative position and the length. Each step carries information one edge
-    further.
+    Encode, process, decode. Node features are the input and a flag for fixed nodes; edge features
+    are the relative position and the length. Each step carries information one edge further.
     """
 
     fixed: Tensor
@@ -227,11 +224,9 @@ class MeshGraphNet(OperatorSurrogate):
     """Message passing along the edges of the mesh; see `GraphNetwork`.
 
     The paper's network adds the velocity of one time step; this one answers with the displacement
-    under a load. A node sees as many edges far as there are steps. From the force alone it
-    therefore knows nothing of loads or supports further away. The linear response carries their
-    effect over the whole body. Nodes know no positions but those of their neighbours relative to
-    them.
-
+    under a load. Information at a node comes from as many edges away as there are steps. So with
+    the force alone, a node knows nothing about more distant loads or supports. The linear response
+    carries their effect over the whole body. Nodes know only their neighbours' relative positions.
     The other parameters are those of `FieldSurrogate`.
 
     Parameters

@@ -22,25 +22,24 @@ from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates.free_dofs import galerkin_or_polynomial
 
 N_WATCHED = 300
-"""Linear responses to the largest loads that decide where det F is watched."""
+"""Linear responses to the largest loads that decide where det F is monitored."""
 
 
 @dataclass(eq=False)
 class ModalDerivatives(Surrogate):
-    """A basis from the equations alone: principal linear responses to the scene's loads, and how
-    they bend.
+    """Galerkin on principal linear responses to the scene's loads and their modal derivatives.
 
-    Static correction adds what the basis lacks of the linear response
-    (`mor_bench.reduction.static_correction`). The basis knows where the loads of the scene act;
-    other loads get a linear response beyond it.
+    The basis is computed from the equations alone. Static correction adds the part of the linear
+    response outside the basis (`mor_bench.reduction.static_correction`). The basis covers only the
+    loads of the scene. For other loads, the added part is linear.
 
     Parameters
     ----------
     n_linear : int
-        Linear modes n, whose n (n + 1) / 2 modal derivatives are computed; at most as many as the
-        linear responses span.
+        Linear modes n, whose n (n + 1) / 2 modal derivatives are computed; at most the rank of the
+        linear responses.
     n_modes : int
-        Size of the basis that is kept; capped at the rank with a warning.
+        Size of the kept basis; capped at the rank with a warning.
     tolerance : float
         Norm of the reduced residual relative to that of the reduced load, in (0, 1].
     """

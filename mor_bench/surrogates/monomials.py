@@ -15,10 +15,10 @@ from mor_bench.errors import InvalidInputError
 
 Array = NDArray[np.float64]
 Levels = list[tuple[NDArray[np.int64], NDArray[np.int64]]]
-"""For each degree from 2 on: which monomial of the degree below, times which variable."""
+"""For each degree from 2: the parent monomial one degree lower, and the variable to multiply."""
 
 Term = tuple[int, ...]
-"""A monomial by its variables, rising; a variable stands once for each power."""
+"""A monomial as its variables in ascending order; a variable is repeated for each power."""
 
 MAX_DEGREE = 8
 
@@ -51,13 +51,7 @@ def _monomials(z, parents, variables, out):  # type: ignore[no-untyped-def]
 
 
 class Monomials:
-    """Monomials by rising degree, the variables first.
-
-    Parameters
-    ----------
-    n_variables : int
-    levels : Levels
-    """
+    """Monomials by ascending degree, beginning with the variables."""
 
     def __init__(self, n_variables: int, levels: Levels) -> None:
         starts = np.cumsum([0, n_variables, *(len(parents) for parents, _ in levels)])
@@ -86,15 +80,15 @@ def monomial_derivatives(z: Array, direction: Array, levels: Levels) -> Array:
 
 
 def cheapest_terms(costs: Array, n_terms: int) -> list[Term]:
-    """Return the monomials with the least sums of their factors' costs, the cheapest first.
+    """Return the monomials with the smallest sums of their factors' costs, the cheapest first.
 
-    Every term but the first follows from one other, which costs no more: its last variable is
+    Every term but the first follows from another term that costs no more: its last variable is
     repeated, or raised by one. Therefore the divisors of a term come before it.
 
     Parameters
     ----------
     costs : (n_variables,) float64
-        Rising.
+        Costs in ascending order.
     n_terms : int
     """
     found: list[Term] = []
@@ -112,7 +106,7 @@ def cheapest_terms(costs: Array, n_terms: int) -> list[Term]:
 
 
 def sparse_levels(terms: list[Term], n_variables: int) -> tuple[Levels, NDArray[np.int32]]:
-    """Return levels that give some terms and all variables, and the place of each term there."""
+    """Return levels with the given terms and all variables, and the index of each term in them."""
     by_degree: list[list[Term]] = [[] for _ in range(max(map(len, terms)))]
     for term in terms:
         by_degree[len(term) - 1].append(term)
@@ -138,7 +132,7 @@ def terms_from_array(array: NDArray[Any], n_variables: int) -> list[Term]:
     Raises
     ------
     InvalidInputError
-        Unless each term is rising, occurs once, and has its divisors among the terms.
+        Unless each term is ascending, occurs once, and has its divisors among the terms.
     """
     right = array.ndim == 2 and 1 <= array.shape[1] <= MAX_DEGREE and array.size > 0
     terms = [tuple(int(v) for v in row if v >= 0) for row in array] if right else []

@@ -1,4 +1,4 @@
-"""What regressions between principal coordinates share that are perceptrons."""
+"""Base class of regressions between principal coordinates by perceptrons."""
 
 from __future__ import annotations
 
@@ -24,11 +24,8 @@ LEARNING_RATE = 3e-3
 class NetworkRegression(CoordinateRegression):
     """A `CoordinateRegression` by perceptrons, which a subclass names and trains.
 
-    Attributes
-    ----------
-    loss_curve_ : (n_intervals,) float64
-    iterations_ : int
-        Number of iterations that repeats the training.
+    `loss_curve_` is (n_intervals,) float64. `iterations_` is the number of iterations that repeats
+    the training.
     """
 
     iterations: int
@@ -38,14 +35,14 @@ class NetworkRegression(CoordinateRegression):
 
     @abstractmethod
     def networks(self, n_inputs: int, n_outputs: int) -> Mapping[str, tuple[int, int, int]]:
-        """Return inputs, hidden units and outputs of the perceptrons that predict, by name."""
+        """Return inputs, hidden units and outputs of the perceptrons for predictions, by name."""
 
     @abstractmethod
     def values(self, z: Array) -> Array:
         """Return the answer of the networks at z (n, n_inputs), (n, n_outputs)."""
 
     def on_device(self, arrays: Mapping[str, Array]) -> dict[str, Tensor]:
-        """Return arrays in float32 on the device of the training."""
+        """Return arrays in float32 on the training device."""
         device = device_of(self.training)
         return {
             name: torch.from_numpy(array.astype(np.float32)).to(device)

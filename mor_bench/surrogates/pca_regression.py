@@ -22,7 +22,7 @@ from mor_bench.surrogates.coordinate_regression import (
 from mor_bench.surrogates.monomials import Monomials, monomial_indices, n_monomials
 
 MAX_FEATURE_BYTES = 2 * 2**30
-"""Largest size of the monomials of all training samples; a fit holds some copies of them."""
+"""Largest size of the monomials of all training samples, bytes; a fit holds several copies."""
 
 
 @dataclass(eq=False)

@@ -1,4 +1,4 @@
-"""PGD: displacements in separated form over position, direction and magnitude of one load."""
+"""PGD: separated displacements over position, direction and magnitude of one load."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ FLAT = 1e-6
 """Smallest extent of the load positions along a coordinate axis, relative to the body."""
 
 LEAST_WEIGHED = 0.02
-"""Errors are divided by the magnitude of the load, but at most by 1 / this share of the largest."""
+"""Errors are divided by the load's magnitude, but at least by this fraction of the largest
+magnitude."""
 
 Levels = list[tuple[NDArray[np.int64], NDArray[np.int64]]]
 
@@ -42,7 +43,7 @@ class LoadFunctions:
     Attributes
     ----------
     frame : (4, n_axes) float64
-        From a position x to coordinates s = x @ frame[:3] + frame[3] in [-1, 1].
+        Maps a position x to coordinates s = x @ frame[:3] + frame[3] in [-1, 1].
     ends : (2, n_axes) float64
         Bounds of s in training.
     largest : float
@@ -99,21 +100,21 @@ class SeparatedLoad(Surrogate):
     """u(x; s, d, m) = u₀(x) + Σ_k X_k(x) S_k(s) D_k(d) M_k(m), by alternating least squares.
 
     The load position is a coordinate of the solution (Niroomandi, González, Alfaro, Cueto, Chinesta
-    2013, section 3); the terms are fitted to samples instead of to the equations (Ibáñez et al.
-    2018). Every load is taken for one patch: s is the centroid of the nodal forces weighted by
-    their lengths, d and m are direction and length of their sum. S are polynomials in the principal
-    axes of the positions. Since u is an analytic function of the force, a homogeneous polynomial D
-    of degree j goes with powers M of m from m^j on, of the same parity. No force gives no
+    2013, section 3). The terms are fitted to samples instead of to the equations (Ibáñez et al.
+    2018). Every load is treated as one patch: s is the centroid of the nodal forces weighted by
+    their lengths; d and m are direction and length of their sum. S are polynomials in the principal
+    axes of the positions. u is an analytic function of the force, so a homogeneous polynomial D of
+    degree j has factors M that are powers of m from m^j, of the same parity. No force gives no
     displacement.
 
-    Several patches are answered as if they were one at their centroid; `out_of_range` flags them.
-    Positions outside the bounding box of training's move to its nearest point.
+    Several patches are treated as one at their centroid; `out_of_range` flags them. Positions
+    outside the bounding box of the training positions move to its nearest point.
 
     Parameters
     ----------
     base : {"linear-response", "none"}
-        u₀. "linear-response": K₀⁻¹f from the nodal forces, so that terms have degree 2 or more and
-        learn only the nonlinear part. "none": nothing; the equations need not be known.
+        u₀. "linear-response": K₀⁻¹f from the nodal forces; terms have degree 2 or more and learn
+        only the nonlinear part. "none": zero, which needs no equations.
     n_terms : int
         Upper bound on the terms of the sum.
     position_degree : int
@@ -142,7 +143,7 @@ class SeparatedLoad(Surrogate):
 
     @property
     def _degrees(self) -> range:
-        """Degrees in the force of the families of terms."""
+        """Degrees in the force, one for each family of terms."""
         return range(2 if self.base == "linear-response" else 1, self.force_degree + 1)
 
     def _functions_of(self, model: Mapping[str, NDArray[Any]]) -> LoadFunctions:
@@ -165,7 +166,7 @@ class SeparatedLoad(Surrogate):
         largest = float(np.linalg.norm(vectors, axis=1).max())
         model = {"frame": frame, "ends": ends, "largest": np.array([largest])}
         position, directions, powers = self._functions_of(model)(positions, vectors)
-        # Errors count relative to the load, so that small loads are fitted, too.
+        # Errors are relative to the load, so small loads are fitted too.
         magnitude = np.linalg.norm(vectors, axis=1) / (largest or 1.0)
         weights = 1.0 / np.maximum(magnitude, LEAST_WEIGHED)
         families: list[Family] = [
@@ -235,7 +236,7 @@ class SeparatedLoad(Surrogate):
 def load_coordinates(points: Array, forces: Array) -> tuple[Array, Array]:
     """Return weighted centroids (n, 3), m, and sums (n, 3), N, of nodal forces (n, n_nodes, 3).
 
-    The weights are the lengths of the forces. For a uniform traction with consistent nodal forces
+    The weights are the lengths of the forces. For a uniform traction with consistent nodal forces,
     the centroid is that of its patch; for no force it is the origin.
     """
     lengths = np.sqrt(np.einsum("nai,nai->na", forces, forces))

@@ -1,4 +1,4 @@
-"""POD-Galerkin: the equilibrium sought in the span of the leading modes of the snapshots."""
+"""POD-Galerkin: the equilibrium in the span of the leading modes of the snapshots."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ class PODGalerkin(Surrogate):
     n_modes : int, "auto" or "energy"
         Size r of the basis; capped at the snapshots' rank with a warning. "auto": the smallest that
         meets the scene's need, see `mor_bench.reduction.sizing`. "energy": chosen by
-        `energy_tolerance`, which must be given then and only then.
+        `energy_tolerance`, which only this value requires and allows.
     tolerance : float or "auto"
         Norm of the reduced residual relative to that of the reduced load, in (0, 1].
     energy_tolerance : float, optional
         Keep the fewest modes n with √(Σ_{j>n} sⱼ² / Σ sⱼ²) at or below this; s are the singular
         values.
     inner_product : {"euclidean", "stiffness"}
-        Inner product in which the modes are orthonormal: that of the free displacements, or uᵀK₀v
-        with the stiffness at rest. Keep the default: the other one does not pay off.
+        Inner product in which the modes are orthonormal: of the free displacements, or uᵀK₀v
+        with the stiffness at rest. Keep the default; the other one brings no benefit.
     """
 
     n_modes: Annotated[int, Field(ge=1)] | Literal["auto", "energy"] = 20

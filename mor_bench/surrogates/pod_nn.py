@@ -29,7 +29,7 @@ from mor_bench.surrogates.coordinate_regression import Array, CoordinateSamples,
 from mor_bench.surrogates.network_regression import NetworkRegression
 
 DERIVATIVE_WEIGHT = 0.1
-"""Weight of the squared error of a sample's derivatives beside that of its displacement."""
+"""Weight of the squared error of a sample's derivatives relative to its displacement's."""
 
 
 @dataclass(eq=False)
@@ -38,8 +38,8 @@ class PODNN(NetworkRegression):
 
     Hesthaven, Ubbiali: Non-intrusive reduced order modeling of nonlinear problems using neural
     networks, Journal of Computational Physics 363 (2018). With the linear response as input, the
-    learned rest is of second order in the load, so that value and slope at rest are subtracted. See
-    `CoordinateRegression` for what it shares with others.
+    learned remainder is of second order in the load, so value and slope at rest are subtracted. See
+    also `CoordinateRegression`.
 
     With derivatives the network also matches those of the displacement with respect to the load,
     see `mor_bench.reduction.sensitivity`; after O'Leary-Roseberry et al.: Derivative-informed
@@ -52,7 +52,7 @@ class PODNN(NetworkRegression):
     n_hidden : int
         Units in each of the two hidden layers.
     derivatives : bool
-        Whether derivatives are matched; needs the scene's equations. Worth it if samples are few.
+        Whether to match derivatives; needs the scene's equations. Use it if samples are few.
     iterations : int
         Adam steps with batches of `BATCH_SIZE` samples.
     seed : int

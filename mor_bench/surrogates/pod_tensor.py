@@ -24,7 +24,7 @@ from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
 
 N_WATCHED = 300
-"""Training samples, spread evenly, that decide where det F is watched."""
+"""Training samples, spread evenly, that decide where det F is monitored."""
 
 
 @dataclass(eq=False)
@@ -32,16 +32,16 @@ class TensorPOD(Surrogate):
     """POD-Galerkin without a mesh: Newton's method on the quartic polynomial of the reduced energy.
 
     The answers are those of plain POD (Barbič and James 2005); only the wanted outputs are
-    expanded. The polynomial does not know det F: it is watched at the few quadrature points where
-    the training samples had their smallest values. A state below these values is checked on the
-    whole mesh. If it is inverted or unstable, plain POD with its safeguarded increments solves
-    again.
+    expanded. The polynomial does not contain det F. So det F is monitored at the few quadrature
+    points where the training samples had their smallest values. A state below these values is
+    checked on the whole mesh. If it is inverted or unstable, plain POD solves again with its
+    safeguarded increments.
 
     Parameters
     ----------
     n_modes : int or "auto"
         Size r of the basis; capped at the snapshots' rank with a warning. Memory and time of a
-        query grow as r⁴. "auto": as little work as meets the scene's need, see
+        query grow as r⁴. "auto": the cheapest value that meets the scene's need, see
         `mor_bench.reduction.sizing`.
     tolerance : float or "auto"
         Norm of the reduced residual relative to that of the reduced load, in (0, 1].

@@ -30,26 +30,26 @@ from mor_bench.surrogates.free_dofs import answer_each
 Array = NDArray[np.float64]
 
 N_CUBATURE_LOADS = 200
-"""Loads whose equilibria on the manifold train the cubature."""
+"""Number of loads whose equilibria on the manifold train the cubature."""
 
 
 @dataclass(eq=False)
 class QuadraticManifoldGalerkin(Surrogate):
     """Few linear modes, each bent by its modal derivatives: u = Φq + ½ Σ qᵢqⱼψᵢⱼ.
 
-    Static correction adds what Φ lacks of the linear response
-    (`mor_bench.reduction.static_correction`). ECSW keeps few cells, trained on equilibria of the
-    manifold itself, without a full-order solve. Jain and Tiso (Simulation-free hyper-reduction for
-    geometrically nonlinear structural dynamics, J. Comput. Nonlinear Dynam. 13 (2018)) lift linear
-    solutions instead. The static correction uses the stiffness of the kept cells, so that small
-    loads get the linear response whatever the cubature.
+    Static correction adds the part of the linear response outside Φ
+    (`mor_bench.reduction.static_correction`). ECSW keeps few cells. It is trained on equilibria of
+    the manifold itself, without a full-order solve. Jain and Tiso (Simulation-free hyper-reduction
+    for geometrically nonlinear structural dynamics, J. Comput. Nonlinear Dynam. 13 (2018)) lift
+    linear solutions instead. The static correction uses the stiffness of the kept cells, so small
+    loads get the linear response with any cubature.
 
     Parameters
     ----------
     n_modes : int
         Unknowns q; capped at the rank of the linear responses to the scene's loads with a warning.
     cubature_tolerance : float
-        Relative residual of the reduced forces allowed to the cubature, in [0, 1); 0 keeps all
+        Allowed relative residual of the reduced forces in the cubature, in [0, 1); 0 keeps all
         cells.
     tolerance : float
         Norm of the reduced residual relative to that of the reduced load, in (0, 1].

@@ -1,4 +1,4 @@
-"""Sparse polynomial: high degrees in the leading coordinates of the input, low ones in the rest."""
+"""Sparse polynomial: high degrees in the leading coordinates of the input, low in the others."""
 
 from __future__ import annotations
 
@@ -31,26 +31,27 @@ from mor_bench.surrogates.monomials import (
 )
 
 DECADES = (0.5, 1.0, 1.5, 2.0, 3.0)
-"""Tried costs of a factor, beside the size of its coordinate: small ones favour high degrees."""
+"""Tried costs of a factor, added to the size of its coordinate: small ones favour high degrees."""
 
 HELD_OUT = 5
-"""One in this many training samples, in random order, is held out to choose the terms."""
+"""Inverse fraction of the training samples, chosen at random, that are held out to choose the
+terms."""
 
 DERIVATIVE_WEIGHT = 0.1
-"""Weight of the squared error of the derivatives beside that of the values."""
+"""Weight of the squared error of the derivatives relative to that of the values."""
 
 
 @dataclass(eq=False)
 class SparsePolynomial(CoordinateRegression):
     """g(z) = W p(z), with p a sparse set of monomials of z; see `CoordinateRegression`.
 
-    For each factor zᵢ a term costs log₁₀(σ₁ / σᵢ), with σᵢ the coordinate's root mean square, plus
-    a number of decades that is the same for all factors. The cheapest terms are used, as in
+    Each factor zᵢ of a term costs log₁₀(σ₁ / σᵢ), with σᵢ the coordinate's root mean square, plus a
+    number of decades that is the same for all factors. The cheapest terms are used, as in
     anisotropic total-degree spaces (Nobile, Tempone, Webster: An anisotropic sparse grid stochastic
     collocation method, SIAM Journal on Numerical Analysis 46 (2008)). The numbers of decades and of
-    terms are those with the least error on a held-out fifth of the training samples; then all
-    samples are fitted. With derivatives the polynomial also matches those of the displacement with
-    respect to the load, see `mor_bench.reduction.sensitivity`.
+    terms minimise the error on a held-out fifth of the training samples. Then all samples are
+    fitted. With derivatives, the polynomial also matches those of the displacement with respect to
+    the load, see `mor_bench.reduction.sensitivity`.
 
     `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
 
@@ -62,12 +63,12 @@ class SparsePolynomial(CoordinateRegression):
         Tikhonov weight relative to the mean squared feature, with features scaled to unit root mean
         square.
     derivatives : bool
-        Whether derivatives are matched; needs the scene's equations. Worth it if samples are few.
+        Whether to match derivatives; needs the scene's equations. Use it if samples are few.
 
     Attributes
     ----------
     terms_ : list of tuple of int
-        The monomials, each by its variables; the cheapest first.
+        The monomials as tuples of variables; the cheapest first.
     """
 
     input: Input = "linear-response"
@@ -89,16 +90,11 @@ class SparsePolynomial(CoordinateRegression):
         return {"weights": weights, "terms": terms_to_array(terms)}
 
     def choose_terms(self, samples: CoordinateSamples, smallness: Array) -> list[Term]:
-        """Return the terms with the least error on held-out samples.
+        """Return the terms with the smallest error on held-out samples.
 
-        The triangular factor of all terms holds those of the first n for every n: as in Gram and
-        Schmidt's process, each further term adds one product to the prediction.
-
-        Parameters
-        ----------
-        samples : CoordinateSamples
-        smallness : (n_inputs,) float64
-            log₁₀(σ₁ / σᵢ) of the coordinates, rising.
+        The triangular factor of all terms contains that of the first n terms, for every n. As in
+        the Gram-Schmidt process, each further term adds one product to the prediction. `smallness`
+        (n_inputs,) float64 is log₁₀(σ₁ / σᵢ) of the coordinates, ascending.
         """
         n = len(samples.z)
         if n < HELD_OUT:

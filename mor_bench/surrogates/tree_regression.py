@@ -44,11 +44,11 @@ def _mean_of_leaves(features, thresholds, children, roots, values, z):  # type: 
 
 
 class TreeRegression(CoordinateRegression):
-    """g(z) = t(z) - t(0), with t the mean of the leaves that z falls to in each tree.
+    """g(z) = t(z) - t(0), with t the mean over all trees of the leaf value at z.
 
-    The nodes of all trees stand in one list, each node before its children. At an inner node,
-    `features` is the input that is compared with `thresholds`, in single precision as in
-    scikit-learn, and `children` are the nodes for "not above" and "above". At a leaf `features` is
+    One list holds the nodes of all trees, each node before its children. At an inner node,
+    `features` is the index of the input to compare with `thresholds`, in single precision as in
+    scikit-learn. `children` are the nodes for "not above" and "above". At a leaf, `features` is
     -1, and `children` holds the row of `values` twice.
     """
 
@@ -60,7 +60,7 @@ class TreeRegression(CoordinateRegression):
 
     @abstractmethod
     def ensemble(self) -> Any:
-        """Return an unfitted ensemble of scikit-learn."""
+        """Return an unfitted scikit-learn ensemble."""
 
     def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         z, targets = samples.z, samples.values
@@ -122,8 +122,6 @@ class TreeRegression(CoordinateRegression):
 class PCARandomForest(TreeRegression):
     """A random forest between principal coordinates (Breiman, Machine Learning 45, 2001).
 
-    See `CoordinateRegression` for what it shares with others.
-
     `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
 
     Parameters
@@ -131,7 +129,7 @@ class PCARandomForest(TreeRegression):
     n_trees : int
         Number of trees, 1 to 1000.
     min_samples_leaf : int
-        Least number of samples in a leaf; larger numbers make a smaller model.
+        Smallest number of samples in a leaf; larger numbers make a smaller model.
     seed : int
         Seed of the random draws of each tree.
     """
@@ -155,7 +153,7 @@ class PCARandomForest(TreeRegression):
 class PCAExtraTrees(PCARandomForest):
     """Extremely randomised trees (Geurts, Ernst and Wehenkel, Machine Learning 63, 2006).
 
-    Each split takes the best of one random threshold per input; every tree learns from all samples.
+    Each split is the best of one random threshold per input; every tree learns from all samples.
     The parameters are those of `PCARandomForest`.
     """
 

@@ -29,10 +29,10 @@ from mor_bench.surrogates.umesh.onnx_model import UMeshParts, umesh_graph
 from mor_bench.surrogates.umesh.padded_grid import PaddedGrid, padded_grid
 
 N_CHOOSING = 32
-"""Training samples, evenly spread, that choose the back end of the predictions."""
+"""Training samples, evenly spread, used to choose the back end of the predictions."""
 
 SMALLEST_SIZE = 0.1
-"""Relative errors count relative to at least this share of the root mean square of all samples."""
+"""Smallest denominator of relative errors, as a fraction of all samples' root mean square."""
 
 
 @final
@@ -42,10 +42,10 @@ class UMesh(FieldSurrogate):
 
     Mendizabal, Márquez-Neila, Cotin, "Simulation of hyperelastic materials in real-time using Deep
     Learning". It is trained with Adam and the mean squared error over the components of all nodes,
-    in float32 unless `precision` or `inference` says otherwise. A mesh that lies in no regular grid
-    gets one (`mor_bench.scene.grid`): the network sees the forces Nᵀ f on the grid and answers with
-    the grid's displacements u; the loss is taken of N u at the nodes. Padding voxels carry no loss.
-    The same seed, samples, machine and number of threads give the same weights to the last bit.
+    in float32 unless `precision` or `inference` changes that. A mesh without its own regular grid
+    gets one (`mor_bench.scene.grid`). The network maps the forces Nᵀ f on the grid to the grid's
+    displacements u; the loss is computed from N u at the nodes. Padding voxels have no loss. The
+    same seed, samples, machine and number of threads give bit-identical weights.
 
     The other parameters are those of `FieldSurrogate`.
 
@@ -54,48 +54,49 @@ class UMesh(FieldSurrogate):
     channels : int
         c, channels of the first level; c·2^k at the bottom. 16 is enough on a processor.
     steps : int
-        k, how often the grid is halved; it is padded at its high end to multiples of 2^k.
+        k, number of times the grid is halved; it is padded at its high end to multiples of 2^k.
     learning_rate : float
-        Peak learning rate. Take about 3e-3 with "one-cycle".
+        Peak learning rate. Use about 3e-3 with "one-cycle".
     schedule : {"constant", "one-cycle"}
         "one-cycle" rises for a tenth of the iterations, then falls to zero along half a cosine.
-        Prefer it for short trainings.
+        Use it for short trainings.
     second_moment_decay : float
-        Adam's β₂, in (0, 1). Short trainings gain from 0.95 to 0.99.
+        Adam's β₂, in (0, 1). Use 0.95 to 0.99 for short trainings.
     normalisation : {"rms", "max", "none"}
-        What inputs and answers of the network are divided by: their root mean square over training
-        samples, nodes and components, their largest magnitude, or 1 (N and m).
+        Divisor of the network's inputs and answers: their root mean square over training samples,
+        nodes and components, their largest magnitude, or 1 (N and m).
     input : {"force", "linear-response"}
-        Input of the network. With the linear response K₀⁻¹f it learns the nonlinear rest,
+        Input of the network. With the linear response K₀⁻¹f it learns the nonlinear remainder,
         u = K₀⁻¹f + network, which gives far smaller errors.
     activation : {"relu", "silu"}
-        Of the convolutions; the paper has "relu".
+        Activation of the convolutions; the paper uses "relu".
     zero_at_rest : bool
         Subtract the network's answer to no force, also in training, so that no force gives no
         displacement.
     mirrored : bool
-        Train on random mirror images too, where the scene has planes of symmetry.
+        Also train on random mirror images, if the scene has planes of symmetry.
     loss : {"absolute", "relative"}
         The mean squared error, or each sample's part of it divided by the sample's mean square
         (or by `SMALLEST_SIZE` of the root mean square over all samples, if that is larger).
     precision : {"float32", "bfloat16"}
         Precision of the products in training.
     validation_fraction : float
-        Share of the training samples that is held out, in [0, 0.5], to stop the training when they
-        gain nothing, and to keep the best weights.
+        Fraction of the training samples, in [0, 0.5], that is held out for early stopping. The best
+        weights on them are kept.
     inference : str
         Back end of the predictions, see `mor_bench.learning.inference`. "packed" differs from
-        "eager" by rounding only. "auto" takes the fastest that is accurate enough, timed at the end
-        of the fit; where two are nearly as fast, another fit may choose the other.
+        "eager" by rounding only. "auto" chooses the fastest that is accurate enough, timed at the
+        end of the fit. If two are nearly as fast, another fit may choose the other.
 
     Attributes
     ----------
     network_ : UNet
     inference_ : Inference
-        The network as `predict` calls it.
+        The network in the form that `predict` calls.
     grid_ : PaddedGrid
     validation_curve_ : (n_validations,) float64
-        Loss of the held-out samples, at intervals of a fiftieth of the iterations; empty without.
+        Loss of the held-out samples, at intervals of a fiftieth of the iterations; empty if none
+        are held out.
     """
 
     channels: Annotated[int, Field(ge=1, le=512)] = 128
@@ -170,7 +171,7 @@ class UMesh(FieldSurrogate):
             if self.zero_at_rest:
                 answer = answer - self._at_nodes(zero, network)
             errors = (answer - y).square().sum(dim=(1, 2))
-            # Not a product of vectors, which autocast would round.
+            # Not a product of vectors, because autocast would round it.
             return (errors * weights[rows]).sum() * (1.0 / y.numel())
 
         return loss

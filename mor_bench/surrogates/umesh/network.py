@@ -26,7 +26,7 @@ class DoubleConvolution(nn.Sequential):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        # Where the first side is 2, oneDNN's bfloat16 gradient of the weights reads unset memory.
+        # If the first side is 2, oneDNN's bfloat16 gradient of the weights reads unset memory.
         in_full = torch.is_autocast_enabled("cpu") and x.shape[2] == 2
         with torch.autocast("cpu", enabled=False) if in_full else nullcontext():
             for layer in self:
@@ -35,7 +35,7 @@ class DoubleConvolution(nn.Sequential):
 
 
 def _n_weights(module: nn.Module) -> int:
-    """Return the number of entries of the weights, without the biases."""
+    """Return the number of weights, without the biases."""
     return sum(parameter.numel() for parameter in module.parameters() if parameter.dim() > 1)
 
 
@@ -43,17 +43,17 @@ class UNet(nn.Module):
     """3D U-Net from 3 force components to 3 displacement components per grid point.
 
     Mendizabal, Márquez-Neila, Cotin, "Simulation of hyperelastic materials in real-time using Deep
-    Learning", section "U-Net architecture". The paper calls c·2^k, the channels at the bottom, the
-    feature space size.
+    Learning", section "U-Net architecture". The paper's feature space size is c·2^k, the number of
+    channels at the bottom.
 
     Parameters
     ----------
     channels : int
         c, channels of the first level; each level down has twice as many.
     steps : int
-        k, how often the grid is halved. Every side of the grid must be a multiple of 2^k.
+        k, number of times the grid is halved. Every side of the grid must be a multiple of 2^k.
     activation : {"relu", "silu"}
-        The paper's is ReLU; SiLU is smooth, as the displacement is.
+        The paper uses ReLU. SiLU is smooth, as the displacement is.
     """
 
     def __init__(self, channels: int, steps: int, activation: Activation = "relu") -> None:
@@ -100,15 +100,15 @@ class UNet(nn.Module):
 
 
 def empty_network(channels: int, steps: int, activation: Activation = "relu") -> UNet:
-    """Return a U-Net without values, on torch's "meta" device: no random number is drawn."""
+    """Return a U-Net with unset weights on torch's "meta" device; no random number is drawn."""
     with torch.device("meta"):
         return UNet(channels, steps, activation)
 
 
 def draw_weights(network: UNet, generator: torch.Generator) -> UNet:
-    """Give a network of `empty_network` He-normal weights and zero biases.
+    """Set He-normal weights and zero biases in a network of `empty_network`.
 
-    They are drawn from the given generator only. The paper names no initialisation.
+    They are drawn from the given generator only. The paper does not specify the initialisation.
     """
     network.to_empty(device="cpu")
     for layer in network.modules():

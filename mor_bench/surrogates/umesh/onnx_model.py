@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 
 MAX_RESPONSE_DOFS = 4096
-"""Most unknowns of a linear response that is written, as a dense matrix of 64 MiB."""
+"""Largest number of unknowns of a linear response that is written, as a dense 64 MiB matrix."""
 
 
 @dataclass(frozen=True)
 class UMeshParts:
-    """What a U-Mesh predicts with.
+    """The parts of a U-Mesh that its predictions use.
 
     Attributes
     ----------
@@ -34,11 +34,11 @@ class UMeshParts:
     grid : PaddedGrid
     network : UNet
     scales : tuple of float
-        What the input, and the network's answer, are scaled by.
+        Scales of the input and of the network's answer.
     at_rest : (n_nodes, 3) or None
-        What is subtracted from every answer of the network, scaled.
+        Scaled offset that is subtracted from every answer of the network.
     response : LinearResponse or None
-        The input is this linear response, and the network answers with the nonlinear rest.
+        If given, it is the network's input, and the network answers with the nonlinear remainder.
     """
 
     scene: Scene
@@ -81,7 +81,7 @@ def umesh_graph(parts: UMeshParts) -> onnx.ModelProto:
         x = graph.add("Sub", x, graph.constant(parts.at_rest))
     if response is not None:
         x = graph.add("Add", graph.add("Mul", x, _scalar(graph, output_scale)), given)
-    if parts.at_rest is not None:  # another runtime rounds the network at rest differently
+    if parts.at_rest is not None:  # other runtimes round the network at rest differently
         largest = graph.add("ReduceMax", graph.add("Abs", loads), axes=[1, 2], keepdims=1)
         x = graph.add("Mul", x, graph.add("Sign", largest))
     free_nodes = np.full((n_nodes, 1), output_scale if response is None else 1.0, dtype=np.float32)
@@ -136,9 +136,9 @@ def _linear_response(
 def _sparse_product(graph: GraphBuilder, matrix: sp.csr_array[np.float32], values: str) -> str:
     """Add A v along the second of three axes.
 
-    ONNX has no sparse product: for each row of A, as many rows of v are gathered as its longest row
-    has entries, and their weighted sum is taken. Where every row of A has at most one entry, and
-    that is 1, rows are only moved.
+    ONNX has no sparse product. So for each row of A, the graph gathers as many rows of v as the
+    longest row of A has entries, and computes their weighted sum. If every row of A has at most one
+    entry, equal to 1, rows are only moved.
     """
     lengths = np.diff(matrix.indptr)
     longest, n_columns = max(int(lengths.max()), 1), matrix.shape[1]

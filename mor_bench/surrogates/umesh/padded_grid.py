@@ -1,4 +1,4 @@
-"""Nodes of a mesh to and from the padded regular grid that the U-Net sees."""
+"""Map between the nodes of a mesh and the padded regular grid of the U-Net."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from torch import Tensor
 from mor_bench.scene.grid import GridMap
 
 SMALLEST_SHARE = 1e-3
-"""Least sum of the weights at a grid point for a full mean: beside the body means fade out."""
+"""Smallest sum of weights at a grid point for a full mean; below it, means fade to zero."""
 
 
 @dataclass(frozen=True)
 class PaddedGrid:
     """A regular grid whose sides are multiples of 2^k, and its map from and to mesh nodes.
 
-    Values lie channels-last in memory, as `Snapshots` has them: on a box without padding the grid
-    is the nodal array itself.
+    Values are channels-last in memory, as in `Snapshots`. On a box without padding, the grid is the
+    nodal array itself.
 
     Attributes
     ----------
     grid : GridMap
-        With the padding; weights in float32.
+        The grid with its padding; weights in float32.
     places : (n_nodes,) int64 tensor or None
-        The grid point on which each node lies, if each lies on one of its own. Values are then
-        moved, which takes a fourth of the time of a sparse product.
+        The grid point of each node, if every node has its own. Then values are moved, which takes a
+        quarter of the time of a sparse product.
     """
 
     grid: GridMap
@@ -43,7 +43,7 @@ class PaddedGrid:
 
     @property
     def multiply_adds(self) -> int:
-        """Work of `to_grid` and `to_nodes` for one sample; none where values are only moved."""
+        """Work of `to_grid` and `to_nodes` for one sample; none if values are only moved."""
         return 0 if self.places is not None else 6 * int(self.grid.weights.nnz)
 
     def to_grid(self, forces: Tensor) -> Tensor:
@@ -61,8 +61,8 @@ class PaddedGrid:
     def displacements_to_grid(self, displacements: Tensor) -> Tensor:
         """(n, n_nodes, 3) → (n, 3, x, y, z): means of the nodes around each grid point.
 
-        The means are weighted by N; padding holds zeros. Where each node lies on a grid point of
-        its own, the values are moved.
+        The means are weighted by N; padding holds zeros. If each node has its own grid point, the
+        values are moved.
         """
         if self.places is not None:
             return self.to_grid(displacements)
@@ -83,7 +83,7 @@ class PaddedGrid:
 class _ToNodes(torch.autograd.Function):
     """N u, with the gradient Nᵀ g.
 
-    Both add in a fixed order on any number of threads; the backward pass of torch's indexing adds
+    Both add in a fixed order on any number of threads. The backward pass of torch's indexing adds
     atomically.
     """
 
