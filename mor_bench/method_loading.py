@@ -104,7 +104,10 @@ class AdaptedMethod(Surrogate):
         return np.asarray(self.method_.predict(forces))
 
     def save(self, path: str | Path) -> None:
-        raise MorBenchError(f"{class_path(self._class)} is no Surrogate and cannot be saved.")
+        raise MorBenchError(
+            f"{class_path(self._class)} is not a subclass of mor_bench.Surrogate and cannot be "
+            "saved."
+        )
 
 
 def load_surrogate(path: str | Path) -> Surrogate:
@@ -122,7 +125,7 @@ def load_surrogate(path: str | Path) -> Surrogate:
     known = {load_method_spec(file).surrogate for file in list_suite("methods").values()}
     if model.surrogate not in known:
         raise StoreError(
-            f"{path}: class {model.surrogate!r} is not named by any method of the suite."
+            f"{path}: class {model.surrogate!r} is not used by any method of the suite."
         )
     return _fitted(path, load_class(model.surrogate), None, model)
 
@@ -158,6 +161,6 @@ def _fitted(
         RecursionError,
     ) as error:
         raise StoreError(
-            f"{path}: its content does not make a {model.surrogate.partition(':')[2]}: {error}"
+            f"{path}: its content does not describe a {model.surrogate.partition(':')[2]}: {error}"
         ) from None
     return method

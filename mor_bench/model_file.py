@@ -190,7 +190,7 @@ def weights_to_start_from(path: str | Path, method: Startable) -> Arrays:
         saved = check_parameters(surrogate, json.loads(header["parameters"]))
     except (MorBenchError, KeyError, ValueError, TypeError, RecursionError) as error:
         raise StoreError(
-            f"{path}: its parameters are not those of a {surrogate.__qualname__}: {error}"
+            f"{path}: its parameters do not match the class {surrogate.__qualname__}: {error}"
         ) from None
     unlike = [name for name in method.architecture if saved[name] != method.parameters[name]]
     if unlike:
@@ -233,7 +233,7 @@ def fitting_arrays(
         ):
             wanted = ", ".join("at least 1" if n is None else str(n) for n in shape)
             raise InvalidInputError(
-                f"{path}: to start from it here, `{name}` must be of shape ({wanted}); "
+                f"{path}: `start_from`: the array `{name}` must be of shape ({wanted}); "
                 f"got {array.shape}."
             )
         if not np.isfinite(array).all():

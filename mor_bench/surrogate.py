@@ -239,7 +239,10 @@ class Surrogate:
             version, or displacements are given instead of forces.
         """
         if not hasattr(self, "scene_") and type(self).fit is not Surrogate.fit:
-            raise UnknownRangeError(f"{type(self).__name__} overrides `fit` and notes no range.")
+            raise UnknownRangeError(
+                f"{type(self).__name__} overrides `fit`, so the range of its training loads is "
+                "not known."
+            )
         given = self._checked(forces)
         if not self.needs_snapshots:
             flags = np.zeros(len(given), dtype=bool)
@@ -251,8 +254,9 @@ class Surrogate:
             )
         else:
             raise UnknownRangeError(
-                f"the range of the training loads of this {type(self).__name__} is not known: its "
-                "class overrides `fit`, or its file is of an older version; then fit it again."
+                f"the range of the training loads of this {type(self).__name__} is not "
+                "known. Its class overrides `fit`, or its file is from an older version "
+                "and must be fitted again."
             )
         return flags.reshape(np.shape(forces)[:-2])
 
@@ -271,7 +275,7 @@ class Surrogate:
         given = self._checked(forces)
         if self.scene_.observed_nodes is not None:
             raise UnsupportedSceneError(
-                f"{self.scene_.name}: no error can be indicated: {NO_FORCES}."
+                f"{self.scene_.name}: the error cannot be estimated: {NO_FORCES}."
             )
         predicted = np.asarray(displacements)
         if predicted.dtype.kind != "f" or predicted.shape != np.shape(forces):
@@ -283,8 +287,8 @@ class Surrogate:
         left_out = np.delete(predicted, self.scene_.output_nodes, axis=1)
         if np.isnan(left_out).any():
             raise InvalidInputError(
-                "`displacements` must be given at all nodes; "
-                "those that `needs.outputs` leaves out hold NaN."
+                "`displacements` must be given at all nodes; the nodes outside "
+                "`needs.outputs` hold NaN."
             )
         return self._indicator(given.values, predicted)
 
@@ -330,7 +334,7 @@ class Surrogate:
 
         Both are (n, n_nodes, 3) float32; see `mor_bench.export`.
         """
-        raise MorBenchError(f"{type(self).__name__} has no network that could be written as ONNX.")
+        raise MorBenchError(f"{type(self).__name__} has no network to write as ONNX.")
 
     def forget(self) -> None:
         """Become unfitted: drop every attribute but hyperparameters and options."""

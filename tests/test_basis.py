@@ -162,7 +162,7 @@ def test_poor_snapshots_are_cut_to_their_rank(
         "r above the rank": (snapshots[:6], 6),
     }[kind]
     product = stiffness if weighted else None
-    said = f"20 modes were asked for, but the {len(chosen)} snapshots have rank {rank}"
+    said = f"20 modes were requested, but the {len(chosen)} snapshots have rank {rank}"
     with pytest.warns(RankDeficientWarning, match=said):
         modes = pod(chosen, 20, inner_product=product).modes
     assert modes.shape[1] == rank

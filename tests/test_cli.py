@@ -163,7 +163,7 @@ def test_generate_prints_the_folder_of_the_dataset_and_of_its_test_sets(tmp_path
         ("refine beam-tiny --max-dofs 900 --cache .", "`max_dofs` must be at least 975"),
         (
             "generate beam-tiny --workers 2 --cluster tcp://127.0.0.1:1 --cache .",
-            "`workers` and `cluster` exclude each other",
+            "`workers` and `cluster` cannot be used together",
         ),
         (
             "generate beam-tiny --cluster host --cache .",

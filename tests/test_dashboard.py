@@ -178,11 +178,11 @@ def test_an_impossible_export_is_refused_and_nothing_is_written(checkout: Path) 
     assert not out.exists()
     out.mkdir()
     (out / "benchmarks.json").write_text('{"version": 3}')
-    with pytest.raises(StoreError, match=r"asv's benchmarks in version 3; .* knows version 2"):
+    with pytest.raises(StoreError, match=r"asv's benchmarks in version 3; .* reads version 2"):
         export_asv(comparison(row("fem"), **elsewhere), out, machine="abacus")
     assert [path.name for path in out.iterdir()] == ["benchmarks.json"]
     (checkout / "pyproject.toml").unlink()
-    with pytest.raises(InvalidInputError, match="is in no git checkout of mor-bench"):
+    with pytest.raises(InvalidInputError, match="is not in a git checkout of mor-bench"):
         export_asv(fem, out)
 
 

@@ -379,13 +379,14 @@ def test_bad_arguments_are_one_clear_line(tmp_path: Path) -> None:
         ({"levels": 0}, r"`levels` must be an integer in \[1, 10\]; got 0\."),
         (
             {"n_loads": 0},
-            r"`loads` must be an integer in \[1, 21\], the load patches of beam-tiny; got 0\.",
+            r"`loads` must be an integer in \[1, 21\], the number of load patches of beam-tiny; "
+            r"got 0\.",
         ),
         ({"n_loads": 22}, r"got 22\."),
         (
             {"max_dofs": 974},
-            r"`max_dofs` must be at least 975, the unknowns of the first refinement of beam-tiny; "
-            r"got 974\.",
+            r"`max_dofs` must be at least 975, the number of unknowns of the first refinement of "
+            r"beam-tiny; got 974\.",
         ),
     ):
         with pytest.raises(InvalidInputError, match=message):

@@ -112,7 +112,7 @@ def test_a_killed_training_of_u_mesh_resumes_too(cache: Path, tmp_path: Path) ->
     seen: list[int] = []
     listener = Listener(training=lambda done, total, loss: seen.append(done))
     kept = {"checkpoint": checkpoint, "listener": listener}
-    with pytest.raises(InvalidInputError, match="the checkpoint of another training"):
+    with pytest.raises(InvalidInputError, match="the checkpoint belongs to another training"):
         fit_tiny("umesh-small", {**parameters, "seed": 1}, out, cache, **kept)
     fit_tiny("umesh-small", parameters, out, cache, **kept)
     assert seen[0] >= 100
@@ -160,11 +160,15 @@ REFUSED: list[tuple[Request, type[MorBenchError], str]] = [
     (("descent", {"iteration": 3}, {}), SpecError, "unknown key `iteration`"),
     (("descent", {"iterations": 0}, {}), SpecError, "iterations"),
     (("linear-fem", {"seed": 1}, {}), SpecError, "unknown key `seed`"),
-    (("linear-fem", {}, {"device": "cuda"}), INVALID, "LinearFEM has no training that `device`"),
+    (
+        ("linear-fem", {}, {"device": "cuda"}),
+        INVALID,
+        "LinearFEM has no training, so these options have no effect: `device`",
+    ),
     (
         ("pod", {}, {"fit_seconds": 3.0, "start_from": "other.safetensors"}),
         INVALID,
-        "no training that `fit_seconds`, `start_from` could act on",
+        "these options have no effect: `fit_seconds`, `start_from`",
     ),
     (
         ("descent", {}, {"fit_seconds": 0.0}),
@@ -191,7 +195,11 @@ REFUSED: list[tuple[Request, type[MorBenchError], str]] = [
     (("descent", {}, {"start_from": "text"}), MorBenchError, "not a readable safetensors file"),
     (("descent", {}, {"out": "nowhere/a"}), INVALID, "`out`: .* cannot be written: No such file"),
     (("descent", {}, {"out": "."}), INVALID, "is a folder"),
-    (("descent", {}, {"checkpoint": "a.safetensors"}), INVALID, "must be another file than `out`"),
+    (
+        ("descent", {}, {"checkpoint": "a.safetensors"}),
+        INVALID,
+        "`checkpoint` and `out` must be different files",
+    ),
     (("descent", {}, {"checkpoint": "nowhere/c"}), INVALID, "`checkpoint`: .* cannot be written"),
 ]
 
@@ -268,7 +276,7 @@ class FixedLength(Descent):
 
 def test_a_method_that_ignores_the_seconds_is_reported(cache: Path, tmp_path: Path) -> None:
     path = method_file(tmp_path, "fixed", "tests.test_fit_command:FixedLength")
-    with pytest.warns(UserWarning, match="FixedLength did not size its training to seconds"):
+    with pytest.warns(UserWarning, match="FixedLength ignored `fit_seconds`"):
         fitted = fit_tiny(path, {}, tmp_path / "a.safetensors", cache, fit_seconds=5.0)
     assert fitted.out.exists()
 

@@ -108,7 +108,9 @@ POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 OPEN = POINTS + "f 1 3 2\nf 1 2 4\nf 2 3 4\n"
 CLOSED = OPEN + "f 1 4 3\n"
 NOT_CLOSED = r"the surface is not closed: 3 of its 6 edges are not shared by exactly two"
-TWISTED = r"the triangles are not consistently oriented: across 3 of 6 edges they turn over\.$"
+TWISTED = (
+    r"the triangles are not consistently oriented: the orientation flips across 3 of 6 edges\.$"
+)
 
 
 @pytest.mark.parametrize(
@@ -256,7 +258,7 @@ def test_a_cell_is_kept_if_the_body_enters_it_and_not_if_it_touches_it(
 def test_cells_that_only_an_edge_joins_are_refused() -> None:
     part = boundary(box_mesh((1.0, 1.0, 1.0), (1, 1, 1)))
     both = joined(part, Surface(part.points + np.array([1, 1, 0]), part.triangles))
-    message = r"^the 16 cells of the body in a grid of 4 x 4 x 2 form 2 parts that no face joins"
+    message = r"^the 16 cells of the body in a grid of 4 x 4 x 2 form 2 parts that share no face"
     with pytest.raises(SpecError, match=message):
         voxel_mesh(both, (4, 4, 2))
 

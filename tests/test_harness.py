@@ -134,8 +134,8 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"memory_limit_bytes": 1.0}, "`memory_limit_bytes` must be a number of at least 1e"),
     ({"test_seed": 0}, "`test_seed` must differ from the seed of beam-tiny"),
     ({"sed": 3}, "unknown option `sed`; did you mean 'seeds'?"),
-    ({"methods": []}, "must name at least one each"),
-    ({"datasets": []}, "must name at least one each"),
+    ({"methods": []}, "must each hold at least one name"),
+    ({"datasets": []}, "must each hold at least one name"),
     ({"datasets": ["beam-tiny"] * 2}, "two datasets are called 'beam-tiny'"),
 ]
 

@@ -71,7 +71,7 @@ def test_wrong_hyperparameters_are_refused(coarse: Dataset) -> None:
         Hybrid(start_parameters={"n_mode": 3}, steps=1).fit(coarse.scene, coarse.train)
     with pytest.raises(SpecError):
         Hybrid("pod-tenser", steps=1).fit(coarse.scene, coarse.train)
-    with pytest.raises(InvalidInputError, match="`steps` and `tolerance` exclude each other"):
+    with pytest.raises(InvalidInputError, match="`steps` and `tolerance` cannot be used together"):
         Hybrid(steps=1, tolerance=1e-2).fit(coarse.scene, coarse.train)
 
 

@@ -216,8 +216,8 @@ def _without(start: str) -> Callable[..., object]:
     ]
 
 
-UNLIKE = "not those of the training: "
-SAMPLES = "samples are not those of the training"
+UNLIKE = "do not match the training: "
+SAMPLES = "samples do not match the training"
 FORGERIES: dict[str, tuple[Callable[..., object], str]] = {
     "infinite iterations": (_number("iterations", float("inf")), "`iterations`: "),
     "a negative iteration": (_number("iteration", -50), "`iteration`: "),

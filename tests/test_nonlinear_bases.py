@@ -338,7 +338,7 @@ def test_the_autoencoder_says_that_it_cannot_start_from_another(
     method = mor_bench.load_method("autoencoder", iterations=2).fit(tiny.scene, tiny.train)
     method.save(tmp_path / "model.safetensors")
     method.training = TrainingOptions(start_from=tmp_path / "model.safetensors")
-    with pytest.raises(InvalidInputError, match=r"`start_from`: .* lacks its encoder"):
+    with pytest.raises(InvalidInputError, match=r"`start_from`: .* lacks the encoder"):
         method.fit(tiny.scene, tiny.train)
 
 

@@ -168,7 +168,7 @@ def test_forces_are_not_taken_for_displacements_nor_displacements_for_forces(
         mor_bench.load_method("linear-fem").fit(tiny.scene).predict(given)
     with pytest.raises(InvalidInputError, match="must be displacements of observed nodes"):
         linear.predict(given.values)
-    with pytest.raises(InvalidInputError, match="are of other nodes"):
+    with pytest.raises(InvalidInputError, match="belong to other nodes"):
         linear.predict(ObservedDisplacements(given.values, np.arange(5)))
 
 
@@ -180,7 +180,7 @@ def test_gappy_pod_needs_something_to_complete(tiny: Dataset) -> None:
 def test_without_forces_no_error_is_indicated_and_no_range_is_known(
     linear: Surrogate, gappy: Surrogate, data: Dataset
 ) -> None:
-    with pytest.raises(UnsupportedSceneError, match="no error can be indicated"):
+    with pytest.raises(UnsupportedSceneError, match="the error cannot be estimated"):
         linear.indicate_error(data.test.given[0], data.test.displacements[0])
     with pytest.raises(UnknownRangeError, match=NO_FORCES):
         gappy.out_of_range(data.test.given)

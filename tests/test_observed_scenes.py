@@ -92,7 +92,7 @@ def test_a_table_that_observes_nothing_is_refused(observed: Any, message: str) -
 def test_a_scene_with_nothing_hidden_is_refused() -> None:
     geometry = {"shape": "box", "size_m": [2.0, 1.0, 1.0], "cells": [6, 1, 1]}
     with pytest.raises(
-        SpecError, match="every node that is free to move: nothing is left to be found"
+        SpecError, match="every node that is free to move: no displacement is left to compute"
     ):
         scene_of({"region": "surface"}, geometry=geometry)
 

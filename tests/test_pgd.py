@@ -168,7 +168,6 @@ def test_outside_the_positions_of_training_it_answers_as_at_their_edge(tiny: Dat
 def test_several_forces_are_named_as_the_reason() -> None:
     scene = mor_bench.load_scene("beam-coarse-3-forces")
     assert (
-        SeparatedLoad().supports(scene)
-        == "its coordinates are those of one load patch, and here several act at once"
+        SeparatedLoad().supports(scene) == "it handles one load patch, and here several act at once"
     )
     assert SeparatedLoad().supports(mor_bench.load_scene("beam-tiny")) is None

@@ -287,9 +287,11 @@ def test_the_evidence_is_the_newest_finished_run_of_the_same_dataset(
     stiffer = {**content, "material": {**content["material"], "young_pa": 501.0}}
     assert newest_run(load_dataset_spec(stiffer), runs) is None
     assert newest_run(spec, tmp_path) is None
-    with pytest.raises(InvalidInputError, match="holds another beam-tiny"):
+    with pytest.raises(InvalidInputError, match="has results for another version of beam-tiny"):
         mor_bench.pick(stiffer, comparison=small_run)
-    with pytest.raises(InvalidInputError, match="holds no beam-coarse; it holds beam-tiny"):
+    with pytest.raises(
+        InvalidInputError, match="has no results for beam-coarse; it has results for beam-tiny"
+    ):
         mor_bench.pick("beam-coarse", comparison=small_run)
 
 

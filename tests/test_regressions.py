@@ -278,6 +278,8 @@ def test_more_monomials_than_fit_into_memory_are_refused(
     train = tiny.train[:40]
     monkeypatch.setattr(pca_regression, "MAX_FEATURE_BYTES", 8 * 65 * 40)
     mor_bench.load_method("pca-regression", n_input_modes=10, degree=2).fit(tiny.scene, train)
-    message = r"`degree` 2 of 11 input modes gives 77 monomials, .* lower it or `n_input_modes`"
+    message = (
+        r"`degree` 2 of 11 input modes gives 77 monomials, .* lower `degree` or `n_input_modes`"
+    )
     with pytest.raises(InvalidInputError, match=message):
         mor_bench.load_method("pca-regression", n_input_modes=11, degree=2).fit(tiny.scene, train)

@@ -150,7 +150,7 @@ TOO_MANY = r"`n_patches` must be in \[1, \d+\], the number of points of the load
 @pytest.mark.parametrize(
     ("loads", "message"),
     [
-        ({"min_distance_m": 5.0}, r"must leave some 3 of the 21 patches that far apart; 5 leaves"),
+        ({"min_distance_m": 5.0}, r"no 3 of the 21 patches are 5 m apart"),
         ({"min_distance_m": None}, r"`min_distance_m` must be given with `simultaneous` > 1"),
         ({"samples": None, "samples_per_patch": 3}, r"with `simultaneous` > 1 `samples` must be"),
         ({"samples": None}, ONE_OF),

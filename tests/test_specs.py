@@ -142,7 +142,7 @@ LOADED_BOX = "[0.2, 0.0, 0.0], [4.0, 0.0, 0.95]"
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("min_distance_m = 1.0", "min_distance_m = 9.0", "that far apart; 9 leaves none"),
+        ("min_distance_m = 1.0", "min_distance_m = 9.0", "patches are 9 m apart"),
         (
             LOADED_BOX,
             "[0.2, 0.0, 0.0], [4.0, 0.0, 1.0]",

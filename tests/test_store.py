@@ -97,7 +97,7 @@ def test_a_file_truncated_anywhere_says_so(content: bytes) -> None:
         message = "truncated" if length >= HEADER_BYTES else "header|not a shard"
         with pytest.raises(StoreError, match=message):
             parse_shard(content[:length], "it")
-    with pytest.raises(StoreError, match="its length is not that in its header"):
+    with pytest.raises(StoreError, match="its length differs from the length in its header"):
         parse_shard(content + b"\0", "it")
 
 
@@ -132,7 +132,7 @@ DAMAGE: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "truncated": (lambda content: content[:-9], "truncated"),
     "foreign": (lambda content: b"PK" + content, "not a shard"),
     "foreign HDF5": (lambda content: foreign_hdf5(), "not a shard"),
-    "other fields": (lambda content: with_other_fields(), "not that of a shard"),
+    "other fields": (lambda content: with_other_fields(), "the content is not a shard"),
     "empty": (lambda content: b"", "not a shard"),
     "older": (lambda content: of_schema(content, 1), "version 1.*generate the dataset again"),
 }
@@ -173,7 +173,7 @@ def test_a_sound_shard_of_other_samples_is_generated_again(
         changes = CHANGES[other](shard) if other in CHANGES else {}
         write_shard(path, replace(shard.first(9) if other == "fewer" else shard, **changes))
     assert files(folder) != before
-    with pytest.warns(DamagedFileWarning, match="holds other samples than it should"):
+    with pytest.warns(DamagedFileWarning, match="holds the wrong samples"):
         generate(SPEC, workers=1, cache=tmp_path)
     assert files(folder) == before
 
@@ -275,7 +275,7 @@ ADDRESS = "tcp://127.0.0.1:8786"
     ("options", "message"),
     [
         ({"workers": 0}, "`workers` must be an integer >= 1; got 0"),
-        ({"workers": 2, "cluster": ADDRESS}, "`workers` and `cluster` exclude each other"),
+        ({"workers": 2, "cluster": ADDRESS}, "`workers` and `cluster` cannot be used together"),
         ({"cluster": "127.0.0.1:8786"}, r"tcp://host:port; got '127.0.0.1:8786'"),
         ({"cluster": "tcp://127.0.0.1"}, "tcp://host:port"),
         ({"cluster": "http://127.0.0.1:8786"}, "tcp://host:port"),

@@ -333,7 +333,7 @@ def test_a_method_whose_library_is_missing_is_not_applicable(
         ({"profile": "slow"}, "`profile` must be quick or full; got 'slow'"),
         ({"cases": ["zero-forces"]}, "got 'zero-forces'; did you mean 'zero-force'?"),
         ({"methods": ["podd"]}, "unknown method 'podd'"),
-        ({"methods": "pod"}, "`methods` must be a list"),
+        ({"methods": "pod"}, "`methods` must be a non-empty list"),
         ({"methods": ["fem"], "cases": ["nnls"]}, "none of the cases nnls concerns fem"),
     ],
 )

@@ -191,7 +191,7 @@ def test_a_damaged_checkpoint_is_dropped_and_the_time_before_a_stop_counts(
     stopped = with_damaged_checkpoint(1)
     began = stopped.checkpoint.stat().st_mtime - 100.0
     (stopped.folder / "training.json").write_text(json.dumps({"taken_s": 30.0, "began": began}))
-    with pytest.raises(MethodFailedError, match="the limit of 120 s: 130 s until it was stopped"):
+    with pytest.raises(MethodFailedError, match="the limit of 120 s; it was stopped after 130 s"):
         fit_configuration(stopped, 120.0)
     assert stopped.checkpoint.exists()
     # The checkpoint is damaged, so the time that it had taken is lost with it.

@@ -62,7 +62,7 @@ def files(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     return {name: folder / f"{name}.safetensors" for name in SMALL}
 
 
-@pytest.mark.filterwarnings("ignore:.* modes were asked for")
+@pytest.mark.filterwarnings("ignore:.* modes were requested")
 @pytest.mark.parametrize("name", ["deeponet", "pod-deeponet"])
 def test_the_branch_is_turned_into_the_bases_of_other_samples(
     name: str, tiny: Dataset, tmp_path: Path
@@ -174,7 +174,7 @@ def test_on_another_mesh_weights_are_taken_where_they_have_the_same_meaning(
         knobs, path = {"modes": 4}, tmp_path / "fno.safetensors"
         make(name, **knobs).fit(tiny.scene, tiny.train[:12]).save(path)
     with pytest.raises(
-        InvalidInputError, match=r"to start from it here, `\S+` must be of shape \(.*\); got \("
+        InvalidInputError, match=r"`start_from`: the array `\S+` must be of shape \(.*\); got \("
     ):
         started(make(name, **knobs), path, samples)
 
@@ -223,7 +223,7 @@ def test_forged_parameters_are_refused(knobs: str, files: dict[str, Path], tmp_p
     path = tmp_path / "forged.safetensors"
     write_model(path, replace(read_model(files["mesh-graph-net"]), parameters=knobs))
     with pytest.raises(
-        StoreError, match="its parameters are not those of a MeshGraphNet"
+        StoreError, match="its parameters do not match the class MeshGraphNet"
     ) as raised:
         weights_to_start_from(path, make("mesh-graph-net"))
     assert "\n" not in str(raised.value)

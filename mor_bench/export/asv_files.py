@@ -81,11 +81,11 @@ def read_file(path: Path, kind: str) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise StoreError(f"{path}: not a file of asv: {error!r}") from None
+        raise StoreError(f"{path}: not an asv file: {error!r}") from None
     if version != VERSION[kind]:
         raise StoreError(
-            f"{path}: asv's {kind} in version {version}; "
-            f"this version of mor-bench knows version {VERSION[kind]}."
+            f"{path}: the file has asv's {kind} in version {version}; this version of "
+            f"mor-bench reads version {VERSION[kind]}."
         )
     return dict(content)
 
@@ -116,8 +116,8 @@ def machine_name(ran_on: Mapping[str, Any], name: str | None) -> str:
         name = platform.node()
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise InvalidInputError(
-            "`machine` must consist of letters, digits, '.', '-' and '_', "
-            f"and not begin with a mark; got {name!r}."
+            "`machine` must consist of letters, digits, '.', '-' and '_', and begin with "
+            f"a letter, a digit or '_'; got {name!r}."
         )
     return name
 
@@ -155,8 +155,8 @@ def commit_and_date(commit: str | None) -> tuple[str, int]:
     text = project.read_text(encoding="utf-8") if project and project.is_file() else ""
     if tomllib.loads(text).get("project", {}).get("name") != "mor-bench":
         raise InvalidInputError(
-            f"{Path().resolve()} is in no git checkout of mor-bench, "
-            "which must hold the commit that ran the comparison."
+            f"{Path().resolve()} is not in a git checkout of mor-bench; use the checkout "
+            "with the commit that ran the comparison."
         )
     wanted = f"{commit or 'HEAD'}^{{commit}}"
     found = _git("rev-parse", "--verify", "--quiet", "--end-of-options", wanted)

@@ -56,7 +56,7 @@ def export_onnx(model: str | Path, out: str | Path) -> tuple[Path, float | None]
     if difference is not None and not difference <= ONNX_AGREES:
         raise MorBenchError(
             f"{model}: ONNX Runtime's answers differ from the method's by {difference:.1e} "
-            "of the largest; nothing was written."
+            "of the largest displacement; nothing was written."
         )
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(out, written)

@@ -68,8 +68,8 @@ def export_vtu(
     names = ["reference", *(Path(model).stem for model in models)]
     if len(set(names)) < len(names):
         raise InvalidInputError(
-            "files would have one name: models must differ in name, "
-            f"and none be called 'reference'; got {', '.join(names[1:])}."
+            "models must have different names, and none may be called 'reference'; got "
+            f"{', '.join(names[1:])}."
         )
     force, reference = samples.forces[sample], samples.displacements[sample]
     fields = [{"displacement": reference, "force": force}]
@@ -99,7 +99,7 @@ def _model_of(scene: Scene, path: str | Path) -> Surrogate:
     fitted = model.scene_
     if fitted.spec.physics() != scene.spec.physics() or _observed(fitted) != _observed(scene):
         raise InvalidInputError(
-            f"{path}: the model was fitted to {fitted.name!r}, not to {scene.name!r} as it is."
+            f"{path}: the model was fitted to {fitted.name!r}, not to the current {scene.name!r}."
         )
     return model
 

@@ -146,11 +146,11 @@ def _check_arguments(
             near = get_close_matches(name, CASE_NAMES, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else "."
             raise InvalidInputError(
-                f"`cases` must be of {', '.join(CASE_NAMES)}; got {name!r}{hint}"
+                f"`cases` must be names of {', '.join(CASE_NAMES)}; got {name!r}{hint}"
             )
     if methods is not None and (isinstance(methods, str | Path) or not methods):
         raise InvalidInputError(
-            f"`methods` must be a list of names or paths, not empty; got {methods!r}."
+            f"`methods` must be a non-empty list of names or paths; got {methods!r}."
         )
 
 

@@ -83,8 +83,8 @@ def resume(loop: TrainingLoop, path: Path, fingerprint: str) -> bool:
         ) from None
     if header.get("format") != FORMAT or header.get("fingerprint") != fingerprint:
         raise InvalidInputError(
-            f"{path}: the checkpoint of another training (parameters, seconds, samples or "
-            "version); name another file, or delete it."
+            f"{path}: the checkpoint belongs to another training (other parameters, "
+            "seconds, samples or version); choose another file, or delete this one."
         )
     try:
         if header.pop("sha256") != fingerprint_of(header, tensors):
@@ -147,7 +147,7 @@ def _check_tensors(loop: TrainingLoop, tensors: Mapping[str, Tensor]) -> None:
     expected = _expected_tensors(loop)
     if tensors.keys() != expected.keys():
         unlike = ", ".join(sorted(tensors.keys() ^ expected.keys()))
-        raise ValueError(f"its tensors are not those of the training: {unlike}")
+        raise ValueError(f"its tensors do not match the training: {unlike}")
     for name, like in expected.items():
         found = tensors[name]
         if (found.dtype, found.shape) != (like.dtype, like.shape) or not found.isfinite().all():
@@ -167,7 +167,7 @@ def _check_tensors(loop: TrainingLoop, tensors: Mapping[str, Tensor]) -> None:
         or not torch.isin(order, rows).all()
         or len(set(order.tolist())) < len(order)
     ):
-        raise ValueError("its samples are not those of the training")
+        raise ValueError("its samples do not match the training")
 
 
 def _expected_tensors(loop: TrainingLoop) -> dict[str, Tensor]:

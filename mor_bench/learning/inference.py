@@ -85,8 +85,8 @@ def inference_or_eager(network: nn.Module, backend: Backend) -> Inference:
         return Inference(network, backend)
     except UnavailableBackendError as error:
         warnings.warn(
-            f"inference by {backend!r} is not available: {error} "
-            "The network answers by 'eager', more slowly.",
+            f"the inference back end {backend!r} is not available: {error} The slower back "
+            "end 'eager' is used instead.",
             FallbackWarning,
             stacklevel=2,
         )

@@ -88,7 +88,7 @@ class GraphBuilder:
                 raise UnavailableBackendError(
                     f"{node.op} {node.target} has no translation to ONNX."
                 )
-        raise AssertionError("a traced network without output")
+        raise AssertionError("the traced network has no output")
 
     def _layer(self, layer: nn.Module, x: str) -> str:
         if isinstance(layer, nn.ReLU):

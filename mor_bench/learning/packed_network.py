@@ -27,7 +27,7 @@ def packed(network: nn.Module, dtype: torch.dtype = torch.float32) -> nn.Module:
         If this torch, this processor or this network does not support it.
     """
     if dtype == torch.bfloat16 and any(weight.is_complex() for weight in network.parameters()):
-        raise UnavailableBackendError("bfloat16 has no complex numbers.")
+        raise UnavailableBackendError("bfloat16 does not support complex numbers.")
     reason = reason_against_packing(dtype)
     if reason is not None:
         raise UnavailableBackendError(reason)

@@ -118,8 +118,9 @@ def _meshes(scene: Scene, plan: RefinementPlan) -> tuple[list[Scene], list[dict[
         if finer.mesh.n_dofs > plan.max_dofs:
             if len(meshes) == 1:
                 raise InvalidInputError(
-                    f"`max_dofs` must be at least {finer.mesh.n_dofs}, the unknowns of the first "
-                    f"refinement of {scene.name}; got {plan.max_dofs}."
+                    f"`max_dofs` must be at least {finer.mesh.n_dofs}, the number of "
+                    f"unknowns of the first refinement of {scene.name}; got "
+                    f"{plan.max_dofs}."
                 )
             return meshes, [_size(finer)]
         meshes.append(finer)
@@ -270,8 +271,8 @@ def refine(
     n_patches = len(scene.patch_nodes)
     if not 1 <= plan.n_loads <= n_patches:
         raise InvalidInputError(
-            f"`loads` must be an integer in [1, {n_patches}], the load patches of {spec.name}; "
-            f"got {plan.n_loads}."
+            f"`loads` must be an integer in [1, {n_patches}], the number of load patches "
+            f"of {spec.name}; got {plan.n_loads}."
         )
     if not 1 <= plan.levels <= 10:
         raise InvalidInputError(f"`levels` must be an integer in [1, 10]; got {plan.levels}.")
@@ -302,7 +303,8 @@ def _record(
     solved = [record for record in records if record["error_m"] is not None]
     if not solved:
         raise SolverError(
-            f"{spec.name}: no load has an equilibrium on every mesh; the first: {loads[0].reason}"
+            f"{spec.name}: no load has an equilibrium on every mesh; the reason for the "
+            f"first load: {loads[0].reason}"
         )
     options = f"--loads {plan.n_loads} --levels {plan.levels} --max-dofs {plan.max_dofs}"
     return {

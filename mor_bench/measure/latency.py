@@ -290,7 +290,7 @@ class _Turns:
                 references = self.queries.references[found["checked"]]
                 errors = sample_errors(answers, references, self.queries.nodes).relative_l2
             except (OSError, ValueError, IndexError, KeyError, TypeError) as error:
-                raise MethodFailedError(f"its answers cannot be read: {error}") from None
+                raise MethodFailedError(f"the method's answers cannot be read: {error}") from None
         self.timing.checked += list(zip(found["checked"], errors.tolist(), strict=True))
         return found
 

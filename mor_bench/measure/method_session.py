@@ -184,8 +184,8 @@ class MethodSession(Session):
             return {"flagged": None}
         if flagged.shape != (len(forces),):
             raise InvalidInputError(
-                f"`out_of_range` must return {len(forces)} flags for as many loads; "
-                f"it returned shape {flagged.shape}."
+                f"`out_of_range` must return {len(forces)} flags, one per load; it "
+                f"returned shape {flagged.shape}."
             )
         return {"flagged": [bool(flag) for flag in flagged]}
 
@@ -233,7 +233,7 @@ class MethodSession(Session):
             turn = self._timed_queries(n, floor_s, most_s)
         if {answer.shape for answer in turn.kept.values()} - {shape}:
             raise InvalidInputError(
-                f"a single load of shape {shape} is not answered in that shape."
+                f"the answer to a single load of shape {shape} has another shape."
             )
         np.save(out, np.array(list(turn.kept.values())).reshape(-1, *shape), allow_pickle=False)
         return {

@@ -163,8 +163,8 @@ def check_answers(timing: Timing, scored: NDArray[np.float64]) -> None:
     then, now = float(np.median(scored[numbers.astype(int)])), float(np.median(errors))
     if now > ERROR_FACTOR * then + ERROR_ADDEND:
         raise MethodFailedError(
-            f"its median relative l2 error is {now:.3g} while it is timed, "
-            f"on loads on which it was scored with {then:.3g}"
+            f"during timing, the median relative l2 error is {now:.3g}; the scored error "
+            f"on the same loads is {then:.3g}"
         )
 
 

@@ -196,8 +196,9 @@ class FullOrderModel:
             factor = solver.factor(self.rest_tangent)
         except NotPositiveDefiniteError:
             raise SolverError(
-                f"{self.scene.name}: the stiffness at rest is not positive definite in double "
-                "precision; the material may be too nearly incompressible, or the body too slender."
+                f"{self.scene.name}: the stiffness at rest is not positive definite in "
+                "double precision; Poisson's ratio may be too close to 0.5, or the body "
+                "too slender."
             ) from None
         if isinstance(factor, BandedFactor):
             self._warn_if_ill_conditioned(factor)
@@ -208,9 +209,9 @@ class FullOrderModel:
         if condition > ILL_CONDITIONED:
             digits = max(0, int(15.9 - np.log10(condition)))
             warnings.warn(
-                f"{self.scene.name}: the condition number of the stiffness at rest is about "
-                f"{condition:.0e}, above {ILL_CONDITIONED:.0e}: displacements have some {digits} "
-                "correct digits.",
+                f"{self.scene.name}: the condition number of the stiffness at rest is "
+                f"about {condition:.0e}, above {ILL_CONDITIONED:.0e}: displacements have "
+                f"about {digits} correct digits.",
                 IllConditionedWarning,
                 stacklevel=3,
             )

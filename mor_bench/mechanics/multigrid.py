@@ -124,8 +124,8 @@ class MultigridFactor:
             missed = float(np.linalg.norm(left) / np.linalg.norm(rhs / scale))
         if not missed <= ACCEPTED_RESIDUAL:
             raise SolverError(
-                "multigrid does not solve with the stiffness at rest: the residual is "
-                f"{missed:.1e} of the load after {MAX_CYCLES} cycles. The body may be too slender; "
-                'try `solver = "superlu"`.'
+                "multigrid does not converge for the stiffness at rest: the residual is "
+                f"{missed:.1e} of the load after {MAX_CYCLES} cycles. The body may be too "
+                'slender; try `solver = "superlu"`.'
             )
         return np.asarray(solution * scale)

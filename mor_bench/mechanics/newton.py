@@ -300,11 +300,12 @@ def _by_newton(
             if attempt.min_det_f <= 0 or (first.converged and first.min_det_f <= 0):
                 largest = min(attempt.min_det_f, first.min_det_f)
                 raise InvertedElementError(
-                    f"elements invert: {story}; the largest det F <= 0 tried was {largest:.3g}.",
+                    f"elements invert: {story}; the largest det F among the inverted "
+                    f"states was {largest:.3g}.",
                     cuts=steps.cuts,
                 )
             raise NoEquilibriumError(
                 f"no stable equilibrium found: {story}; "
-                "`mor_bench.mechanics.stability.limit_load` finds where its path ends.",
+                "`mor_bench.mechanics.stability.limit_load` finds the limit load.",
                 cuts=steps.cuts,
             )

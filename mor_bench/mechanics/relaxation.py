@@ -123,8 +123,8 @@ class DynamicRelaxation:
                 break
         if status == MET:
             raise InvertedElementError(
-                f"elements invert: after {done} steps the body rests with a least det F of "
-                f"{min_det:.3g}."
+                f"elements invert: after {done} steps the body is at rest, and its "
+                f"smallest det F is {min_det:.3g}."
             )
         residual = np.inf
         if np.isfinite(u).all():

@@ -153,9 +153,9 @@ def solve_on_path(problem: AssembledProblem, load: Array) -> Array:
     limit = limit_load(problem, load)
     if limit is not None:
         raise LimitPointError(
-            "no stable equilibrium on the path from rest: it ends at "
-            f"{limit.factor:.6g} of the load, where the lowest tangent eigenvalue is "
-            f"{limit.lowest_eigenvalue:.3g} of that at rest.",
+            f"no stable equilibrium: the path from rest ends at {limit.factor:.6g} of the "
+            f"load. There, the lowest tangent eigenvalue is {limit.lowest_eigenvalue:.3g} "
+            "of its value at rest.",
             load_factor=limit.factor,
             lowest_eigenvalue=limit.lowest_eigenvalue,
         )

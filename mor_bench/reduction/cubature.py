@@ -294,7 +294,7 @@ def _check(found: SparseWeights, tolerance: float) -> None:
     if found.relative_residual > tolerance * (1 + 1e-9) > 0:
         raise CubatureError(
             f"cubature reached a relative residual of {found.relative_residual:.3g} in "
-            f"{iterations} iterations; `tolerance` asks for {tolerance:.3g}.",
+            f"{iterations} iterations; the `tolerance` is {tolerance:.3g}.",
             relative_residual=found.relative_residual,
         )
     if found.passive_gradient > OPTIMAL or (tolerance == 0 and found.dual_gradient > OPTIMAL):

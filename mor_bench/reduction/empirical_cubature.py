@@ -62,8 +62,8 @@ def cell_basis(matrix: Array, tolerance: float) -> Array:
     enough = np.flatnonzero(tails <= max(tolerance, 1e-12) * total)
     if not len(enough):
         raise CubatureError(
-            f"the basis of the cell forces leaves out {rest / total:.3g} of them; "
-            f"`cubature_tolerance` asks for {tolerance:.3g}."
+            f"the basis of the cell forces has a relative error of {rest / total:.3g}; "
+            f"`cubature_tolerance` is {tolerance:.3g}."
         )
     kept = int(enough[0]) or 1
     return np.ascontiguousarray((vt[:kept] @ rows).T)
@@ -125,7 +125,7 @@ def empirical_cubature(
     if found.relative_residual > EXACT * (1 + 1e-6):
         raise CubatureError(
             f"cubature reached a relative residual of {found.relative_residual:.3g} in "
-            f"{iterations} iterations; {EXACT:g} is needed."
+            f"{iterations} iterations; it must be at most {EXACT:g}."
         )
     return found
 

@@ -105,7 +105,7 @@ class InterpolatedProblem:
                 story = steps.story(iterations)
                 if min_det <= 0:
                     raise InvertedElementError(
-                        f"sampled elements invert: {story}; det F <= 0 was {min_det:.3g}."
+                        f"sampled elements invert: {story}; the smallest det F was {min_det:.3g}."
                     )
                 raise NoEquilibriumError(
                     f"no equilibrium of the interpolated force found: {story}; "

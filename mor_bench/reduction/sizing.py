@@ -82,7 +82,8 @@ def validation_folds(snapshots: Snapshots) -> list[tuple[NDArray[np.int64], NDAr
     n = len(snapshots)
     if n < 2:
         raise InvalidInputError(
-            'a parameter set to "auto" needs at least two training samples, to hold some out.'
+            'a parameter set to "auto" needs at least two training samples, because some '
+            "are held out."
         )
     generator = np.random.default_rng(SEED)
     ids, ranks = np.unique(snapshots.loads.patches, return_inverse=True)
@@ -250,11 +251,13 @@ def choose_sizes(
         reached = trials.whole_score(best).error
         if not np.isfinite(reached):
             why = trials.refusal or "no candidate predicts half of the held-out samples."
-            raise InvalidInputError(f"no {', '.join(open_rungs)} could be chosen: {why}")
+            raise InvalidInputError(
+                f"no {', '.join(open_rungs)} can be chosen automatically: {why}"
+            )
         said = ", ".join(f"{name} = {value}" for name, value in best.items())
         warnings.warn(
-            f"{scene.name} needs a relative l2 of {need:g} (median); the most accurate candidate, "
-            f"{said}, reaches {reached:.3g} on the training samples held out.",
+            f"{scene.name} needs a median relative l2 error of {need:g}. The most accurate "
+            f"candidate, {said}, reaches {reached:.3g} on held-out training samples.",
             stacklevel=3,
         )
     return best

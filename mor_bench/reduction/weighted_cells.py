@@ -36,7 +36,7 @@ def weighted_cells(
         or not ((cells >= 0) & (cells < n_cells)).all()
     ):
         raise InvalidInputError(
-            f"`cells` must be integers in [0, {n_cells - 1}], as many as there are weights."
+            f"`cells` must be integers in [0, {n_cells - 1}], one for each weight."
         )
     if len(np.unique(cells)) != len(cells):
         raise InvalidInputError("`cells` must be different integers.")

@@ -143,7 +143,7 @@ def checked_specs(
         If nothing is given, or two datasets or methods have the same name.
     """
     if not datasets or (methods is not None and not methods):
-        raise InvalidInputError("`datasets` and `methods` must name at least one each.")
+        raise InvalidInputError("`datasets` and `methods` must each hold at least one name.")
     specs = [load_dataset_spec(dataset, options.suite) for dataset in datasets]
     if methods is None:
         methods = _default_methods(specs, options)

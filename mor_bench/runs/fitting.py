@@ -100,8 +100,8 @@ def _worker_for(cached: CachedFit) -> SandboxedProcess:
 def _time_left(limit_s: float, taken_s: float) -> float:
     if taken_s >= limit_s:
         raise MethodFailedError(
-            f"fitting took longer than the limit of {limit_s:g} s: "
-            f"{taken_s:.0f} s until it was stopped"
+            f"fitting took longer than the limit of {limit_s:g} s; it was stopped after "
+            f"{taken_s:.0f} s"
         )
     return limit_s - taken_s
 

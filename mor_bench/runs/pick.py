@@ -119,10 +119,13 @@ def _decisive(content: Mapping[str, Any]) -> dict[str, Any]:
 def _check_evidence(comparison: Comparison, spec: AnyDatasetSpec) -> None:
     if spec.name not in comparison.datasets:
         held = ", ".join(comparison.datasets) or "nothing"
-        raise InvalidInputError(f"{comparison.out} holds no {spec.name}; it holds {held}.")
+        raise InvalidInputError(
+            f"{comparison.out} has no results for {spec.name}; it has results for {held}."
+        )
     if not _holds(comparison, spec):
         raise InvalidInputError(
-            f"{comparison.out} holds another {spec.name}: the dataset's file has changed since."
+            f"{comparison.out} has results for another version of {spec.name}: the "
+            "dataset's file has changed since the run."
         )
 
 

@@ -75,8 +75,8 @@ def only_run_in(folder: Path) -> Iterator[None]:
         other = int(number) if psutil.Process(int(number)).create_time() == created else None
     if other not in (None, os.getpid()):
         raise InvalidInputError(
-            f"{folder}: another run, process {other}, writes there; "
-            "wait for it or choose another folder."
+            f"{folder}: another run (process {other}) writes to this folder; wait for it "
+            "or choose another folder."
         )
     lock.write_text(f"{os.getpid()} {psutil.Process().create_time()!r}")
     try:

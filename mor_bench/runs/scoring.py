@@ -113,11 +113,11 @@ class _Scorer:
         try:
             predicted = np.load(out, allow_pickle=False)
         except (OSError, ValueError) as error:
-            raise MethodFailedError(f"its predictions cannot be read: {error}") from None
+            raise MethodFailedError(f"the method's predictions cannot be read: {error}") from None
         if predicted.shape != forces.shape or predicted.dtype != np.float64:
             raise MethodFailedError(
-                f"its predictions have shape {predicted.shape} and are {predicted.dtype}; "
-                f"expected {forces.shape} and float64"
+                f"the method's predictions have shape {predicted.shape} and are "
+                f"{predicted.dtype}; expected {forces.shape} and float64"
             )
         out.unlink()
         return np.asarray(predicted)

@@ -127,8 +127,8 @@ def fit(
         iterations = getattr(unfitted, "iterations_", None)
         if chosen.fit_seconds is not None and iterations is None:
             warnings.warn(
-                f"{type(unfitted).__name__} did not size its training to seconds: "
-                "its parameter `iterations` counted.",
+                f"{type(unfitted).__name__} ignored `fit_seconds`: it trained for the "
+                "number of its parameter `iterations`.",
                 stacklevel=2,
             )
         error = _test_error(unfitted, data.test)
@@ -154,7 +154,7 @@ def _training(unfitted: Surrogate, options: FitOptions) -> TrainingOptions:
     named = ", ".join(f"`{name}`" for name, value in given.items() if value)
     if named and not unfitted.trains():
         raise InvalidInputError(
-            f"{type(unfitted).__name__} has no training that {named} could act on."
+            f"{type(unfitted).__name__} has no training, so these options have no effect: {named}."
         )
     training = training_options(options)
     if options.start_from is None:
@@ -167,7 +167,7 @@ def _check_checkpoint(checkpoint: Path, out: Path) -> None:
     _check_writable("checkpoint", checkpoint)
     if checkpoint.resolve() == out.resolve():
         raise InvalidInputError(
-            f"`checkpoint` must be another file than `out`; got {checkpoint} for both."
+            f"`checkpoint` and `out` must be different files; got {checkpoint} for both."
         )
     remove_leftovers(checkpoint.parent, checkpoint.name)
 

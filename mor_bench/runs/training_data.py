@@ -102,7 +102,7 @@ class TrainingData:
         if not unchanged:
             shutil.rmtree(self.folder, ignore_errors=True)
             write_snapshots(self.folder, self.train)
-            raise MethodFailedError("it wrote over the training samples")
+            raise MethodFailedError("the method overwrote the training samples")
 
     @cached_property
     def digest(self) -> str:

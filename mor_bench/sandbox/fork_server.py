@@ -106,15 +106,13 @@ class ForkServer:
             except (FileNotFoundError, ConnectionRefusedError):
                 if monotonic() > until or self._process.poll() is not None:
                     raise errors.MorBenchError(
-                        "the server that methods' processes are forked from does not start."
+                        "the fork server of the methods' processes does not start."
                     ) from None
                 sleep(0.02)
         connection.sendall(stderr_path.encode() + b"\n")
         pid = connection.recv(8, socket.MSG_WAITALL)
         if len(pid) < 8:
-            raise errors.MorBenchError(
-                "the server that methods' processes are forked from has died."
-            )
+            raise errors.MorBenchError("the fork server of the methods' processes has died.")
         return connection, int.from_bytes(pid, "little")
 
     def exit_code(self, pid: int, within_s: float = 5.0) -> int:

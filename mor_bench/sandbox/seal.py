@@ -56,8 +56,8 @@ def seal(folders: Sequence[Path], exempt: Path | None = None) -> None:
         exempted = exempt_prefix is not None and real.startswith(exempt_prefix)
         if real.startswith(prefixes) and not exempted:
             raise PermissionError(
-                f"{os.fsdecode(path)}: a method may not look at datasets and results "
-                "while it is compared."
+                f"{os.fsdecode(path)}: a method must not read datasets or results during a "
+                "comparison."
             )
 
     def refuse(event: str, arguments: tuple[Any, ...]) -> None:
@@ -65,7 +65,7 @@ def seal(folders: Sequence[Path], exempt: Path | None = None) -> None:
             for argument in arguments[:2]:
                 check(argument)
         elif event in PROGRAM_EVENTS:
-            raise PermissionError(f"{event}: a method may not start programs while it is compared.")
+            raise PermissionError(f"{event}: a method must not start programs during a comparison.")
 
     sys.addaudithook(refuse)
     _guard_hdf5(check)

@@ -56,7 +56,8 @@ def read_gmsh1(path: Path) -> meshio.Mesh:
         )
     except KeyError as error:
         raise SpecError(
-            f"{path}: invalid Gmsh 1 file: there is no node, or no element type, {error}."
+            f"{path}: invalid Gmsh 1 file: it has no node, or no element type, with the "
+            f"number {error}."
         ) from None
     except ValueError as error:
         raise SpecError(f"{path}: invalid Gmsh 1 file: {error}.") from None

@@ -194,8 +194,8 @@ def _quadrature(surface: Facets, facets: NDArray[np.int64], area_m2: float) -> _
             return _Quadrature(corners.mean(axis=1), vectors, sp.csr_array(mean @ to_corners))
     least = POINTS_PER_PATCH * len(facets) * longest**2 / MAX_SURFACE_POINTS
     raise SpecError(
-        f"`patch_area_m2` must be at least about {least:.3g}, "
-        f"for facets with edges of up to {longest:.3g} m; got {area_m2}."
+        f"`patch_area_m2` must be at least about {least:.3g} m², because facets have edges "
+        f"of up to {longest:.3g} m; got {area_m2}."
     )
 
 

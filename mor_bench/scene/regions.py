@@ -67,8 +67,8 @@ def region_points(cloud: Cloud, region: Region) -> NDArray[np.int64]:
         if not isinstance(region, str):
             shown = region.model_dump(exclude={"near_surface": {"sha256"}})
         raise SpecError(
-            f"region {shown} holds no node of the mesh, "
-            f"whose bounds are {low.tolist()} to {high.tolist()} m."
+            f"region {shown} holds no node of the mesh; the mesh extends from "
+            f"{low.tolist()} to {high.tolist()} m."
         )
     return np.sort(found)
 
@@ -98,8 +98,8 @@ def _nearest(cloud: Cloud, region: NearestRegion) -> NDArray[np.int64]:
     point, n = region.nearest_m
     if n > len(cloud.on_surface):
         raise SpecError(
-            f"`nearest_m` must ask for at most {len(cloud.on_surface)} nodes, "
-            f"all of the surface; got {n}."
+            f"`nearest_m` must ask for at most {len(cloud.on_surface)} nodes, the number "
+            f"of nodes on the surface; got {n}."
         )
     tree = cKDTree(cloud.points[cloud.on_surface])
     return np.asarray(cloud.on_surface[tree.query(point, k=[*range(1, n + 1)])[1]])

@@ -114,8 +114,8 @@ class Scene:
             )
         if len(seen) == len(free):
             raise SpecError(
-                "`observed.region` holds every node that is free to move: "
-                "nothing is left to be found."
+                "`observed.region` holds every node that is free to move: no displacement "
+                "is left to compute."
             )
         return seen
 

@@ -155,7 +155,7 @@ def _checked(arrays: Mapping[str, NDArray[Any]]) -> ImportedArrays:
     # Adding zero gives -0.0 and 0.0 the same bytes.
     seen = {hashlib.sha256((force + 0.0).tobytes()).digest() for force in forces}
     if len(seen) < n:
-        raise SpecError(f"`forces`: {n - len(seen)} samples repeat others.")
+        raise SpecError(f"`forces`: {n - len(seen)} samples have the same forces as others.")
     if test is not None:
         if not np.isin(test, [0, 1]).all():
             raise SpecError(f"`test` must hold {_WORDS['biu']}; got {test.min()} to {test.max()}.")

@@ -160,7 +160,7 @@ def _extreme_volumes(
 
 def _check_overlap(cells: NDArray[np.int64], numbers: NDArray[np.int64]) -> None:
     if len(np.unique(np.sort(cells, axis=1), axis=0)) < len(cells):
-        raise SpecError("some cells are there twice.")
+        raise SpecError("some cells occur twice.")
     shared = np.bincount(numbers)
     if shared.max() > 2:
         raise SpecError(
@@ -183,7 +183,7 @@ def _check_parts(faces: NDArray[np.int64]) -> None:
     belongs = sp.csr_array((np.ones(faces.size), (cell, faces.ravel())))
     n_parts = connected_components(sp.csr_array(belongs @ belongs.T), directed=False)[0]
     if n_parts > 1:
-        raise SpecError(f"the mesh must be one body; it is {n_parts} parts that no face joins.")
+        raise SpecError(f"the mesh must be one body; it has {n_parts} parts that share no face.")
 
 
 def _face_numbers(cells: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -95,8 +95,8 @@ def _turned_outwards(surface: Surface) -> Surface:
         )
     if n_twisted := len(edges) - len(np.unique(edges, axis=0)):
         raise SpecError(
-            "the triangles are not consistently oriented: "
-            f"across {n_twisted} of {len(sharing)} edges they turn over."
+            "the triangles are not consistently oriented: the orientation flips across "
+            f"{n_twisted} of {len(sharing)} edges."
         )
     if abs(surface.volume_m3) <= FLAT * np.linalg.norm(np.diff(surface.bounds, axis=0)) ** 3:
         raise SpecError("the surface encloses no volume.")

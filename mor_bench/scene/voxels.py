@@ -72,7 +72,8 @@ def voxel_mesh(surface: Surface, cells: tuple[int, int, int]) -> Mesh:
     n_parts = label(kept)[1]
     if n_parts > 1:
         raise SpecError(
-            f"the {kept.sum()} cells of the body in a grid of {' x '.join(map(str, cells))} "
-            f"form {n_parts} parts that no face joins; use more cells."
+            f"the {kept.sum()} cells of the body in a grid of "
+            f"{' x '.join(map(str, cells))} form {n_parts} parts that share no face; use "
+            "more cells."
         )
     return part_of(box, kept.ravel())

@@ -80,7 +80,7 @@ def check_pool(workers: int | None, cluster: str | None) -> None:
         raise InvalidInputError(f"`workers` must be an integer >= 1; got {workers}.")
     if cluster is not None and workers is not None:
         raise InvalidInputError(
-            "`workers` and `cluster` exclude each other: a cluster uses all workers it has."
+            "`workers` and `cluster` cannot be used together: a cluster uses all its workers."
         )
     if cluster is not None and not re.fullmatch(_ADDRESS, cluster):
         raise InvalidInputError(

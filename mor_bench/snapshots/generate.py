@@ -128,7 +128,7 @@ class _Plan:
         if named and self._is_filled(shard) and self._is_loaded(shard, self.loads(number)):
             return True
         warnings.warn(
-            f"{path}: holds other samples than it should. It is generated again.",
+            f"{path}: holds the wrong samples. It is generated again.",
             DamagedFileWarning,
             stacklevel=3,
         )

@@ -116,7 +116,10 @@ def checked_given(scene: Scene, given: ArrayLike) -> Given:
         )
     if isinstance(given, ObservedDisplacements) and observed is not None:
         if not np.array_equal(given.nodes, observed):
-            raise InvalidInputError(f"{scene.name}: the displacements are of other nodes.")
+            raise InvalidInputError(
+                f"{scene.name}: the displacements belong to other nodes than "
+                "`Scene.observed_nodes`."
+            )
         known = np.zeros(array.shape, dtype=array.dtype)
         known[..., observed, :] = array[..., observed, :]
         array = known

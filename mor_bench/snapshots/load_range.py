@@ -83,8 +83,8 @@ class LoadRange:
         """
         if set(arrays) != {"limits", "nodes", "moments"}:
             raise InvalidInputError(
-                "the range of the training loads must be the arrays limits, nodes and moments; "
-                f"got {', '.join(sorted(arrays))}."
+                "the range of the training loads must consist of the arrays limits, nodes "
+                f"and moments; got {', '.join(sorted(arrays))}."
             )
         limits, nodes, moments = arrays["limits"], arrays["nodes"], arrays["moments"]
         positive = np.isfinite(limits) & (limits >= 0)

@@ -154,8 +154,8 @@ def far_apart(centres: bytes, k: int, distance: float) -> NDArray[np.int64] | No
         sets, allowed = np.hstack([sets[row], new[:, None]]), allowed[row]
     if not len(sets):
         raise SpecError(
-            f"`min_distance_m` must leave some {k} of the {len(points)} patches that far apart; "
-            f"{distance:g} leaves none."
+            f"`min_distance_m` is too large: no {k} of the {len(points)} patches are "
+            f"{distance:g} m apart."
         )
     return sets
 

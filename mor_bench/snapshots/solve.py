@@ -119,8 +119,8 @@ def solve_task(task: Task) -> Solved:
     """
     if task.generator_version != GENERATOR_VERSION:
         raise WorkerError(
-            f"a worker generates samples of version {GENERATOR_VERSION}, "
-            f"but version {task.generator_version} is wanted; update its mor-bench."
+            f"a worker generates samples of version {GENERATOR_VERSION}, but version "
+            f"{task.generator_version} is required; update its mor-bench."
         )
     model, weights = _kept.of(task.problem)
     loads = task.loads

@@ -179,7 +179,7 @@ def parse_shard(content: bytes, where: str) -> Shard:
     if header_line(version, length, digest) != head:
         raise StoreError(f"{where}: damaged: the header has changed.")
     if not isinstance(length, int) or len(body) > length:
-        raise StoreError(f"{where}: damaged: its length is not that in its header.")
+        raise StoreError(f"{where}: damaged: its length differs from the length in its header.")
     if len(body) < length:
         raise StoreError(
             f"{where}: truncated: only {HEADER_BYTES + len(body):,} of "
@@ -195,7 +195,7 @@ def parse_shard(content: bytes, where: str) -> Shard:
                 **{name: file[name][()] for name in _FIELDS},
             )
     except (OSError, KeyError) as error:
-        raise StoreError(f"{where}: the content is not that of a shard: {error}") from None
+        raise StoreError(f"{where}: the content is not a shard: {error}") from None
 
 
 def check_version(version: object, where: str) -> None:

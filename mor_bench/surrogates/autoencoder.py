@@ -69,8 +69,8 @@ class Autoencoder(_LinearRest):
     def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         if self.training.start_from is not None:
             raise InvalidInputError(
-                "`start_from`: the file of an autoencoder lacks its encoder, so that no training "
-                "can start from it."
+                "`start_from`: the file of an autoencoder lacks the encoder, so no "
+                "training can start from it."
             )
         scale = float(np.sqrt((samples.values**2).sum(axis=1).mean()))
         data = self.on_device(

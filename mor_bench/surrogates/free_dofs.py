@@ -53,6 +53,6 @@ def galerkin_or_polynomial(
     problem = TensorProblem.of_arrays(scene, arrays)
     if problem.n_unknowns != modes.shape[1]:
         raise InvalidInputError(
-            f"the polynomial must be that of {modes.shape[1]} modes; got {problem.n_unknowns}."
+            f"the polynomial must have {modes.shape[1]} modes; got {problem.n_unknowns}."
         )
     return problem

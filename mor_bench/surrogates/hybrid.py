@@ -95,7 +95,7 @@ class Hybrid(Surrogate):
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         if self.steps is not None and self.tolerance is not None:
             raise InvalidInputError(
-                f"`steps` and `tolerance` exclude each other; got {self.steps} and "
+                f"`steps` and `tolerance` cannot be used together; got {self.steps} and "
                 f"{self.tolerance}."
             )
         self.start_ = self.unfitted_start()

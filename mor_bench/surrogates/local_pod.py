@@ -71,8 +71,8 @@ class LocalPOD(Surrogate):
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         if self.n_modes > len(samples):
             warnings.warn(
-                f"{self.n_modes} modes were asked for, but the {len(samples)} snapshots have at "
-                f"most rank {len(samples)}: their linear responses fill the basis.",
+                f"{self.n_modes} modes were requested, but the {len(samples)} snapshots "
+                f"have at most rank {len(samples)}. Linear responses fill the basis.",
                 RankDeficientWarning,
                 stacklevel=3,
             )

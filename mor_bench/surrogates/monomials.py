@@ -147,6 +147,6 @@ def terms_from_array(array: NDArray[Any], n_variables: int) -> list[Term]:
     )
     if not right:
         raise InvalidInputError(
-            f"`terms` must hold monomials of {n_variables} variables, each with its divisors."
+            f"`terms` must hold monomials of {n_variables} variables, together with their divisors."
         )
     return terms

@@ -54,9 +54,9 @@ class PCARegression(CoordinateRegression):
         n = n_monomials(n_variables, self.degree)
         if 8 * n * n_samples > MAX_FEATURE_BYTES:
             raise InvalidInputError(
-                f"`degree` {self.degree} of {n_variables} input modes gives {n:,} monomials, too "
-                f"many for {n_samples:,} samples: {8e-9 * n * n_samples:.1f} GB; lower it or "
-                "`n_input_modes`."
+                f"`degree` {self.degree} of {n_variables} input modes gives {n:,} "
+                f"monomials, too many for {n_samples:,} samples: "
+                f"{8e-09 * n * n_samples:.1f} GB; lower `degree` or `n_input_modes`."
             )
         features = Monomials(n_variables, monomial_indices(n_variables, self.degree))(samples.z)
         feature_scale = np.sqrt((features**2).mean(axis=0))

@@ -136,7 +136,7 @@ class SeparatedLoad(Surrogate):
 
     def supports(self, scene: Scene) -> str | None:
         if not isinstance(scene.spec, ImportedDatasetSpec) and scene.spec.loads.simultaneous > 1:
-            return "its coordinates are those of one load patch, and here several act at once"
+            return "it handles one load patch, and here several act at once"
         return (
             unknown_equations(scene) if self.base == "linear-response" else super().supports(scene)
         )

@@ -99,7 +99,9 @@ class TreeRegression(CoordinateRegression):
         if not ((features >= -1) & (features < n_inputs)).all():
             raise InvalidInputError(f"`features` must be in [-1, {n_inputs - 1}].")
         if not ((children[inner] > behind) & (children[inner] < n_nodes)).all():
-            raise InvalidInputError("`children` of an inner node must be nodes behind it.")
+            raise InvalidInputError(
+                "`children` of an inner node must be nodes with larger numbers."
+            )
         if not ((children[~inner] >= 0) & (children[~inner] < len(model["values"]))).all():
             raise InvalidInputError("`children` of a leaf must be a row of `values`.")
         if not ((roots >= 0) & (roots < n_nodes)).all():
