@@ -10,10 +10,10 @@
 
 The packages, from the ground up; each imports only from those before it:
 
-`specs` and `options` hold what a user may write. `scene`, `mechanics`, `snapshots` and `reduction`
-compute. `surrogate.py` is the interface of a method, `learning` and `surrogates` the methods.
-`sandbox`, `measure`, `results`, `analysis` and `runs` make a comparison, `hard_cases` the stress
-tests, and `report`, `export` and `cli` show them. Start reading with `surrogate.py`, then
+`specs` and `options` define the input of users. `scene`, `mechanics`, `snapshots` and `reduction`
+compute. `surrogate.py` is the interface of a method; `learning` and `surrogates` hold the methods.
+`sandbox`, `measure`, `results`, `analysis` and `runs` make a comparison. `hard_cases` holds the
+stress tests. `report`, `export` and `cli` show the results. Start reading with `surrogate.py`, then
 `surrogates/pod.py`, then `runs/compare.py`.
 """
 
@@ -61,7 +61,7 @@ __all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name at its first use, so that `import mor_bench` is fast."""
+    """Import a public name on first use, so that `import mor_bench` is fast."""
     if name not in _HOMES:
         raise AttributeError(f"module 'mor_bench' has no attribute {name!r}")
     from importlib import import_module

@@ -31,7 +31,7 @@ class NotFittedError(MorBenchError, RuntimeError):
 
 
 class UnknownRangeError(MorBenchError, RuntimeError):
-    """A method does not know the range of its training loads, so it cannot flag extrapolation."""
+    """The range of a method's training loads is unknown, so it cannot flag extrapolation."""
 
 
 class UnsupportedSceneError(MorBenchError):

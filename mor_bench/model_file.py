@@ -246,7 +246,7 @@ def _prefixed(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
 
 
 def _taken(prefix: str, arrays: Arrays) -> Arrays:
-    """Remove the arrays whose names begin with a prefix from a model's arrays; return them."""
+    """Remove the arrays with a prefix in their names from a model's arrays; return them."""
     names = [name for name in arrays if name.startswith(prefix)]
     return {name.removeprefix(prefix): arrays.pop(name) for name in names}
 

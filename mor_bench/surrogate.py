@@ -38,31 +38,31 @@ Array = NDArray[np.float64]
 
 
 class Surrogate:
-    """A map from what is given, nodal forces or observed displacements, to nodal displacements.
+    """A map from nodal forces, or observed displacements, to nodal displacements.
 
-    A subclass is a dataclass of hyperparameters, ``@dataclass(eq=False)``, with three verbs.
-    `learn` returns the arrays that are the model, `prepare` makes what a query needs from them, and
-    `answer` predicts. Pydantic's `Field` in the annotations gives the range of a hyperparameter.
-    This base class checks all input, saves, loads, and forgets an earlier fit.
+    A subclass is a dataclass of hyperparameters, ``@dataclass(eq=False)``, with three methods.
+    `learn` returns the model as arrays, `prepare` computes from them everything else that a query
+    needs, and `answer` predicts. Pydantic's `Field` in the annotations gives the range of a
+    hyperparameter. This base class checks all input, saves, loads, and discards earlier fits.
     """
 
     needs_snapshots: ClassVar[bool] = True
-    """Whether `learn` uses snapshots; their cost is charged only to methods that do."""
+    """True if `learn` uses snapshots; their cost is charged only to methods that do."""
 
     takes_observations: ClassVar[bool] = False
-    """Whether displacements of a part of the surface can be given instead of forces; true of a
-    class with `answer_observed`."""
+    """True if the input may be displacements of a part of the surface instead of forces. A
+    class that defines `answer_observed` sets it."""
 
     architecture: ClassVar[tuple[str, ...]] = ()
-    """Hyperparameters that decide names, shapes or meaning of the weights: a training starts only
-    from a model with the same values."""
+    """Hyperparameters that determine names, shapes or meaning of the weights. A training can start
+    only from a model with the same values."""
 
     sized: ClassVar[Mapping[str, Sequence[Any]]] = {}
-    """Values that a hyperparameter set to "auto" may take, from cheap to accurate; see
+    """Candidates for a hyperparameter set to "auto", from cheap to accurate; see
     `mor_bench.reduction.sizing`."""
 
     time_limit_s: float | None = None
-    """Time limit for `fit`, s. A method that predicts that it will exceed it raises
+    """Time limit for `fit`, s. A method that predicts that it will exceed the limit raises
     `OutOfTimeError`."""
 
     training: TrainingOptions = TrainingOptions()
@@ -75,7 +75,7 @@ class Surrogate:
     """Values chosen for hyperparameters set to "auto"."""
 
     timings_ms_: dict[str, float]
-    """Times by which the fit chose between equivalent ways to predict, on its machine."""
+    """Times, ms, by which the fit chose between equivalent ways to predict, on its machine."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -83,7 +83,7 @@ class Surrogate:
             cls.takes_observations = True
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
-        """Return the arrays that are the model.
+        """Return the model as arrays.
 
         Parameters
         ----------
@@ -94,7 +94,7 @@ class Surrogate:
         return {}
 
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
-        """Make what a query needs; called after `learn` and after loading.
+        """Compute everything else that a query needs; called after `learn` and after loading.
 
         Raises
         ------
@@ -107,11 +107,11 @@ class Surrogate:
         raise MorBenchError(f"{type(self).__name__} has neither `answer` nor `predict`.")
 
     def answer_observed(self, observed: ObservedDisplacements) -> Array:
-        """As `answer`, from displacements of the observed nodes; they are zero at all others."""
+        """Answer displacements of the observed nodes instead of forces; they are zero elsewhere."""
         raise UnsupportedSceneError(f"{type(self).__name__} cannot be used: {NO_FORCES}.")
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
-        """Learn from snapshots, forgetting earlier fits.
+        """Learn from snapshots and discard earlier fits.
 
         Parameters
         ----------
@@ -156,7 +156,7 @@ class Surrogate:
         model: Mapping[str, NDArray[Any]],
         sizes: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Become fitted from ``arrays_`` and ``sizes_`` of a fitted model.
+        """Restore a fitted model from its ``arrays_`` and ``sizes_``.
 
         Raises
         ------
@@ -192,7 +192,7 @@ class Surrogate:
         Raises
         ------
         InvalidInputError
-            On a wrong shape or dtype, NaN or infinity.
+            For a wrong shape or dtype, NaN or infinity.
         NotFittedError
             Before `fit`.
         SolverError
@@ -212,11 +212,11 @@ class Surrogate:
 
     @classmethod
     def trains(cls) -> bool:
-        """Whether `fit` uses `training`: true of methods with ``iterations`` and ``seed``."""
+        """Return whether `fit` uses `training`: the class has ``iterations`` and ``seed``."""
         return {"iterations", "seed"} <= inspect.signature(cls.__init__).parameters.keys()
 
     def supports(self, scene: Scene) -> str | None:
-        """Return None, or the reason why the method cannot handle a scene."""
+        """Return the reason why the method cannot handle a scene, or None if it can."""
         return None if self.takes_observations or scene.observed_nodes is None else NO_FORCES
 
     def value(self, name: str) -> Any:
@@ -229,13 +229,13 @@ class Surrogate:
     def out_of_range(self, forces: ArrayLike) -> NDArray[np.bool_]:
         """Flag loads outside the range of the training loads, as a bool array of shape () or (n,).
 
-        A flag is no bound on the error, see `mor_bench.snapshots.load_range`. A method that needs
-        no snapshots flags nothing. The forces and errors are those of `predict`.
+        A flag is not a bound on the error, see `mor_bench.snapshots.load_range`. A method that
+        needs no snapshots flags nothing. The parameter and errors are those of `predict`.
 
         Raises
         ------
         UnknownRangeError
-            If the range is not known: the class overrides `fit`, the model's file is of an older
+            If the range is unknown: the class overrides `fit`, the model's file has an older
             version, or displacements are given instead of forces.
         """
         if not hasattr(self, "scene_") and type(self).fit is not Surrogate.fit:
@@ -263,14 +263,14 @@ class Surrogate:
     def indicate_error(self, forces: ArrayLike, displacements: ArrayLike) -> Indication:
         """Estimate the error of predictions, m, from the equilibrium residual.
 
-        Forces and displacements must have the same shape, and displacements hold all nodes.
+        Forces and displacements must have the same shape. Displacements must cover all nodes.
 
         Raises
         ------
         InvalidInputError, NotFittedError
-            As `predict`; also if displacements are only given where outputs are wanted.
+            As in `predict`; also if displacements are given only at the wanted outputs.
         UnsupportedSceneError
-            If the scene's equations, or the forces, are not known.
+            If the scene's equations or the forces are unknown.
         """
         given = self._checked(forces)
         if self.scene_.observed_nodes is not None:
@@ -312,7 +312,7 @@ class Surrogate:
         NotFittedError
             Before `fit`.
         MorBenchError
-            If the class overrides `fit`, so that its model is not known.
+            If the class overrides `fit`, so that its model is unknown.
         """
         if not hasattr(self, "scene_"):
             raise NotFittedError(f"{type(self).__name__} must be fitted before it is saved.")
@@ -337,7 +337,7 @@ class Surrogate:
         raise MorBenchError(f"{type(self).__name__} has no network to write as ONNX.")
 
     def forget(self) -> None:
-        """Become unfitted: drop every attribute but hyperparameters and options."""
+        """Delete the fit: every attribute except hyperparameters and options."""
         for name in vars(self).keys() - {*self.parameters, "training", "time_limit_s"}:
             delattr(self, name)
 

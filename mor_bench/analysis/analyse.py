@@ -36,8 +36,8 @@ def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -
     dict
         `rows`: value, low and high of the main figures of each configuration.
         `time_at_error`, `error_at_time`: records of `mor_bench.analysis.frontier.compare` with
-        `exists` (whether a real configuration meets the target), `low`, `high` (None where not
-        reached) and `not_reached`, the share of resamples that do not reach the target.
+        three additions. `exists`: whether a real configuration meets the target. `low`, `high`:
+        None where not reached. `not_reached`: share of resamples that do not reach the target.
         `pairwise`: for each ordered pair of methods and error, the ratio of their times and the
         verdict on the first.
         `break_even`, `profile`, `hidden`, `regimes`, `tuning`: see the functions of these names.

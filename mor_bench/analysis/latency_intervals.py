@@ -68,7 +68,6 @@ class Spreads:
 
 
 def _log_medians(samples: Samples) -> dict[tuple[int, int], float]:
-    """Logarithm of the median latency of each process and round."""
     times = np.asarray(samples["latency_ms"], dtype=float)
     process, turn = (
         np.asarray(samples[name]) if name in samples else np.zeros(len(times), dtype=int)
@@ -122,7 +121,6 @@ def spreads_of(all_samples: Sequence[Samples]) -> Spreads:
 
 
 def _nan_median(cube: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Median over the last axis; NaN where all values are NaN."""
     out = np.full(cube.shape[:-1], nan)
     seen = np.isfinite(cube).any(axis=-1)
     out[seen] = np.nanmedian(cube[seen], axis=-1)
@@ -130,7 +128,6 @@ def _nan_median(cube: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _nan_mean(array: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """Mean over an axis; NaN where all values are NaN."""
     return np.asarray(np.nansum(array, axis=axis) / np.isfinite(array).sum(axis=axis))
 
 

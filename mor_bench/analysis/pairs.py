@@ -24,7 +24,7 @@ from mor_bench.results.row import Row
 
 Record = dict[str, Any]
 LogTimes = dict[str, dict[float, NDArray[np.float64]]]
-"""By method and error: draws of the logarithm of the time at that error."""
+"""Draws of the logarithm of the time at an error, by method and error."""
 
 
 def add_intervals(
@@ -73,7 +73,6 @@ def add_intervals(
 def _method_draws(
     method: str, draws: Draws, targets: Sequence[float]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """`frontier_draws` of one method; infinite if it has no usable row."""
     mine = [i for i, row in enumerate(draws.rows) if row.method == method]
     if not mine:
         n = draws.log_latencies.shape[1]

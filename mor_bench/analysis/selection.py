@@ -93,7 +93,7 @@ class Pick:
     choice, runner_up : Row or None
         The cheapest configuration that qualifies, and the cheapest of another method.
     relaxations : list of Relaxation
-        Without a choice: the single limits whose relaxation suffices.
+        Without a choice: the limits that suffice if relaxed alone.
     nearest : Row or None
         Without a choice: the configuration that exceeds the limits by the smallest factor.
     unknown : list of str
@@ -240,7 +240,6 @@ def offline_rank(row: Row) -> tuple[bool, float]:
 
 
 def _answers_all(row: Row) -> bool:
-    """Return whether a configuration answered every test load and every fresh load."""
     return row.ok and row.n_failed == 0 and not (row.hidden and row.hidden.rel_l2_max == inf)
 
 

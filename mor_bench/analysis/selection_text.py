@@ -30,7 +30,6 @@ def limit_text(name: str, limit: float, round_up: bool = False) -> str:
 
 
 def _rounded_up(value: float, digits: int = 3) -> str:
-    """Round a number up to three digits."""
     if not 0 < value < inf:
         return f"{value:g}"
     step = 10.0 ** (floor(log10(value)) - digits + 1)

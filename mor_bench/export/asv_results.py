@@ -124,8 +124,8 @@ def export_asv(
     Raises
     ------
     InvalidInputError
-        If the working folder is not a checkout of mor-bench or lacks the commit, if the comparison
-        ran on another machine and `machine` is not given, or if no row has finished.
+        If the working folder is not a checkout of mor-bench or lacks the commit; if no row has
+        finished; or if `machine` is not given and the comparison ran on another machine.
     StoreError
         If a file in `out` is not asv's, or has another version.
     """

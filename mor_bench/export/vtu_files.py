@@ -105,7 +105,6 @@ def _model_of(scene: Scene, path: str | Path) -> Surrogate:
 
 
 def _observed(scene: Scene) -> list[int] | None:
-    """Nodes with given displacements; None if methods are given forces."""
     return None if scene.observed_nodes is None else scene.observed_nodes.tolist()
 
 

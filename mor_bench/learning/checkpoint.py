@@ -119,7 +119,6 @@ def _restore(loop: TrainingLoop, numbers: _Numbers, tensors: Mapping[str, Tensor
 
 
 def _check_numbers(loop: TrainingLoop) -> None:
-    """Raise `ValueError` unless the training can have reached these numbers."""
     iteration, iterations = loop.iteration, loop.iterations
     ended = iteration == iterations
 
@@ -143,7 +142,6 @@ def _check_numbers(loop: TrainingLoop) -> None:
 
 
 def _check_tensors(loop: TrainingLoop, tensors: Mapping[str, Tensor]) -> None:
-    """Raise `ValueError` unless the training can have reached these tensors."""
     expected = _expected_tensors(loop)
     if tensors.keys() != expected.keys():
         unlike = ", ".join(sorted(tensors.keys() ^ expected.keys()))

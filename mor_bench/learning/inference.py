@@ -4,9 +4,8 @@ torch's own convolutions are slow for single samples. Every call copies the weig
 layout, or does not use oneDNN. The back ends are:
 
 - ``eager``: the network unchanged.
-- ``packed``: a copy with oneDNN's convolutions, whose weights are packed once and whose activation
-  is fused. torch.compile emits these operations for frozen graphs; called directly, they
-  need no compiler.
+- ``packed``: a copy with oneDNN's convolutions, fused activations and weights packed once.
+  torch.compile emits these operations for frozen graphs; called directly, they need no compiler.
 - ``packed-bfloat16``: the same with weights and activations in bfloat16 and sums in float32.
 - ``onnx``: ONNX Runtime, float32.
 """

@@ -115,8 +115,6 @@ class _Upsampling(nn.Module):
 
 
 class _Rounded(nn.Module):
-    """A bfloat16 network between float32 tensors."""
-
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network

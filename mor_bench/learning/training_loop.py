@@ -83,7 +83,7 @@ class TrainingLoop:
 
     @property
     def stopped(self) -> bool:
-        """Whether the validation loss has not fallen for `PATIENCE` validations."""
+        """True if the validation loss has not fallen for `PATIENCE` validations."""
         if not self.validated:
             return False
         return len(self.validated) - 1 - int(np.argmin(self.validated)) >= PATIENCE
@@ -124,7 +124,6 @@ class TrainingLoop:
         return max(1, int(left / (validation + each)))
 
     def _now(self) -> float:
-        """Return the wall time after synchronising the device."""
         if self.device.type == "cuda":
             torch.cuda.synchronize()
         return perf_counter()
@@ -153,13 +152,11 @@ class TrainingLoop:
             self.validate()
 
     def _products(self) -> AbstractContextManager[object]:
-        """Set the precision of the products."""
         if self.plan.precision == "bfloat16":
             return torch.autocast(self.device.type, torch.bfloat16)
         return nullcontext()
 
     def _record(self) -> None:
-        """Append the mean loss since the last point of the curve."""
         self.curve.append(float(self.total) / self.n_summed)
         self._check_finite(self.curve[-1])
         self.total, self.n_summed = torch.zeros((), device=self.device), 0

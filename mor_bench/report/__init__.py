@@ -4,6 +4,5 @@ Here: sentences and tables made from a comparison and its analysis, drawings, an
 templates in `templates/`.
 Not here: conclusions and statistics (`mor_bench.analysis`), and measurements.
 Start with `entries.py`, which joins rows and conclusions; then `page.py` and `console_tables.py`.
-The columns of the large table stand in `console_columns.py`, and those of the page in
-`page_columns.py`.
+`console_columns.py` and `page_columns.py` define the columns of the large table.
 """

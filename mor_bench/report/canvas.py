@@ -206,7 +206,6 @@ def annotate(
 
 
 def _write(axes: Axes, note: Note, offset: tuple[int, int], further: float) -> Annotation:
-    """Write a note at an offset from its point."""
     dx, dy = offset
     text = axes.annotate(
         plain(note.text),

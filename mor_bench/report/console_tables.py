@@ -48,7 +48,6 @@ def _titled(title: str, *parts: RenderableType) -> list[RenderableType]:
 
 
 def _target_parts(shown: TextTable, width: int) -> list[RenderableType]:
-    """Time at error, or error at time."""
     table = _empty_table()
     table.add_column("method", overflow="fold", min_width=8)
     cell_width = len(NOT_REACHED) if width >= 100 else 8
@@ -189,7 +188,7 @@ def print_discretisation(record: Mapping[str, Any], console: Console) -> None:
 
 
 def print_plan(plan: Plan, console: Console) -> None:
-    """Print what a run would do, a row per dataset and configuration, and its estimated time."""
+    """Print the plan of a run, a row per dataset and configuration, and its estimated time."""
     table = Table(box=SIMPLE_HEAD, padding=(0, 1), show_edge=False)
     for heading in ("dataset", "step"):
         table.add_column(heading)

@@ -103,7 +103,6 @@ def error_measures(dataset: str, entries: Sequence[Entry]) -> TextTable | None:
 
 
 def _measured(entry: Entry) -> list[str]:
-    """Our figures of a network; the training time is in minutes."""
     fit_s = entry.figure("offline_s", "fit")
     errors = ("mean_dof_m", "std_dof_m", "max_dof_m", "slope")
     return [

@@ -118,7 +118,6 @@ def pairs_at(comparison: Comparison, dataset: str, target: float, analysis: Anal
 
 
 def _factor(record: Mapping[str, Any]) -> tuple[str, str]:
-    """Factor of a pair with its sign, and its interval."""
     ratio, low, high = (record[name] for name in ("ratio", "low", "high"))
     sign = {"faster": "+", "slower": "-", "undecided": "?"}[record["verdict"]]
     if sign != "-":  # the record holds a ratio of times, the inverse of a speed-up

@@ -170,7 +170,6 @@ def _arrow(mesh: Mesh, sample: WorstSample) -> NDArray[np.float64] | None:
 def _draw_sample(
     axes: Axes, mesh: Mesh, sample: WorstSample, arrow: NDArray[np.float64] | None
 ) -> None:
-    """Draw the body at rest, the reference, the prediction and the force."""
     facets = mesh.boundary_facets
     _draw_edges(axes, mesh.points, facets, {"colors": REST, "linewidths": 0.5, "zorder": 1})
     _draw_surface(axes, mesh.points + sample.reference, facets)
@@ -194,7 +193,6 @@ def _draw_sample(
 def _draw_edges(
     axes: Axes, points: NDArray[np.float64], facets: NDArray[np.int64], look: dict[str, Any]
 ) -> None:
-    """Draw the edges of facets, each once."""
     pairs = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
     edges = np.unique(np.sort(pairs, axis=1), axis=0)
     axes.add_collection(LineCollection(list(_project(points)[0][edges]), **look))

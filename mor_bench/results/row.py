@@ -327,7 +327,7 @@ class Row(Part):
 
     @property
     def ok(self) -> bool:
-        """Whether the configuration ran to the end."""
+        """True if the configuration ran to the end."""
         return self.status == "ok"
 
     def as_dict(self) -> dict[str, Any]:

@@ -147,7 +147,6 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
 
 
 def _reason(error: BaseException, text: str, suffix: str) -> str:
-    """Return why meshio could not read a file."""
     if isinstance(error, UnicodeDecodeError):
         binary = "neither text nor a binary file of the length given in its header"
         broken = binary if suffix == ".stl" else "damaged, or in another format"

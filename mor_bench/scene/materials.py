@@ -54,8 +54,6 @@ def poisson_of(bulk_pa: float, shear_pa: float) -> float:
 
 @dataclass(frozen=True)
 class _TwoLame(Material):
-    """A law with Lamé's two parameters at rest."""
-
     young_pa: float
     poisson: float
 

@@ -74,7 +74,7 @@ class Scene:
 
     @property
     def selective(self) -> bool:
-        """Whether the volumetric energy is computed from the cells' mean gradients."""
+        """True if the volumetric energy is computed from the cells' mean gradients."""
         return self.generated.discretisation.integration == "selective"
 
     @cached_property
@@ -134,7 +134,6 @@ class Scene:
 
     @cached_property
     def _loaded_points(self) -> NDArray[np.int64]:
-        """Numbers of the surface's points in the load region."""
         on_surface = np.unique(self.surface.facets)
         sets = {} if self.embedded_surface else self.point_sets
         cloud = Cloud(self.surface.points, on_surface, sets)

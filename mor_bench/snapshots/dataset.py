@@ -154,8 +154,8 @@ def load_dataset(
     SpecError
         If the dataset is not valid.
     InvalidInputError
-        If ``limit`` or ``workers`` is less than 1, ``cluster`` is not an address or is given
-        together with ``workers``, or a part of the split would be empty.
+        If ``limit`` or ``workers`` is less than 1, or a part of the split would be empty. Also if
+        ``cluster`` is not an address or is given together with ``workers``.
     StoreError, WorkerError, MissingDependencyError
         If generation fails, see `mor_bench.snapshots.generate.generate`.
     """
@@ -183,7 +183,6 @@ def load_dataset(
 def _split(
     spec: DatasetSpec, by: SplitBy, main: _Store, others: Mapping[SetName, _Store]
 ) -> Dataset:
-    """Split the valid samples of a dataset; read its test sets."""
     if n := repeated([(store.scene, store.loads) for store in (main, *others.values())]):
         raise InvalidInputError(
             f"{spec.name}: {n} samples repeat others; check `seed` and `magnitude_n`."

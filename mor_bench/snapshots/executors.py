@@ -61,7 +61,6 @@ class Pool:
 
     @staticmethod
     def _finished(waiting: set[Future[_R]]) -> Iterator[_R]:
-        """Wait for some tasks, remove them from the set, and yield their results."""
         done, _ = wait(waiting, return_when=FIRST_COMPLETED)
         waiting -= done
         while done:

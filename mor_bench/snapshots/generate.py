@@ -248,8 +248,6 @@ def _owner(folder: Path, spec: DatasetSpec) -> DatasetSpec:
 
 
 class _Count:
-    """Counts and reports the wanted samples that exist."""
-
     def __init__(self, plan: _Plan, missing: list[int], progress: Progress | None) -> None:
         self._plan, self._progress = plan, progress
         self._done = plan.n_wanted - sum(map(plan.n_wanted_of, missing))
@@ -267,8 +265,6 @@ class _Count:
 def _fill(
     plan: _Plan, missing: list[int], count: _Count, workers: int | None, cluster: str | None = None
 ) -> None:
-    """Solve the missing shards, and write each as soon as it is finished."""
-
     def tasks() -> Iterator[Task]:
         for number in missing:
             if plan.has(number):  # another process has generated it in the meantime

@@ -35,7 +35,7 @@ REGULARISATION = 0.01
 """ε of the novelty score: a force at a node or in a direction without training loads scores 1/ε."""
 
 CHUNK = 256
-"""Samples whose nodal forces are in memory at the same time."""
+"""Number of samples with nodal forces in memory at the same time."""
 
 
 @dataclass(frozen=True)

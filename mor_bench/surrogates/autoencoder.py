@@ -95,7 +95,6 @@ class Autoencoder(_LinearRest):
 def _loss(
     encoder: nn.Module, decoder: nn.Module, regression: nn.Module, data: dict[str, Tensor]
 ) -> Loss:
-    """Return the sum of the three squared errors."""
     nothing = torch.zeros_like(data["inputs"][:1])
 
     def loss(rows: Tensor) -> Tensor:

@@ -63,8 +63,9 @@ class CoordinateRegression(Surrogate, ABC):
 
     No mean is subtracted, and g(0) = 0: no force gives no displacement. With the linear response as
     input, g learns only the nonlinear remainder. With the force as input, g needs no equations, but
-    it knows nothing about load regions without training samples. In a scene with observed nodes,
-    their displacements replace the force, and their linear extension replaces the linear response.
+    it has no information about load regions without training samples. In a scene with observed
+    nodes, their displacements replace the force, and their linear extension replaces the linear
+    response.
 
     A subclass declares the parameters below as its hyperparameters, and `derivatives` if it can
     learn from them. `regress` learns g, `take` restores its arrays, and `coefficients` evaluates

@@ -58,7 +58,7 @@ class WarmFEM(Surrogate):
 
     @property
     def needs_snapshots(self) -> bool:  # type: ignore[override]
-        """Whether known solutions come from the training samples."""
+        """True if known solutions come from the training samples."""
         return self.start == "nearest"
 
     def supports(self, scene: Scene) -> str | None:

@@ -99,7 +99,7 @@ class OperatorSurrogate(FieldSurrogate):
 
 
 class SelfInitialised(ABC, nn.Module):
-    """A layer of a kind that `initialise` does not know."""
+    """A layer that initialises itself instead of by `initialise`."""
 
     @abstractmethod
     def initialise(self, generator: torch.Generator) -> None:

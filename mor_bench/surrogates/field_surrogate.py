@@ -71,7 +71,7 @@ class FieldSurrogate(Surrogate, ABC):
     seed: int
 
     zero_at_rest: bool = True
-    """Whether G(0) is subtracted, so that no load gives exactly no displacement."""
+    """Subtract G(0); then no load gives exactly no displacement."""
 
     chunk: ClassVar[int] = 64
     """Samples per forward pass of a prediction; limits the memory of a long batch."""

@@ -79,7 +79,6 @@ class GappyPOD(Surrogate):
 
 
 def _observed_places(scene: Scene) -> NDArray[np.int64]:
-    """Return the indices of the observed dofs among the free ones."""
     nodes = scene.observed_nodes
     assert nodes is not None
     return np.searchsorted(scene.free_dofs, dofs_of_nodes(nodes))

@@ -31,8 +31,8 @@ WORSE = 1.0
 at rest."""
 
 NEAR, SURE = 0.5, 0.7
-"""If corrections are below the first fraction of the answer, and det F is above the second at the
-centres of all cells, det F is not checked at every quadrature point."""
+"""Bounds for skipping the check of det F at every quadrature point: corrections below the first
+fraction of the answer, and det F above the second at the centres of all cells."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
@@ -86,7 +86,7 @@ class Hybrid(Surrogate):
 
     @property
     def needs_snapshots(self) -> bool:  # type: ignore[override]
-        """Whether the starting method learns from snapshots."""
+        """True if the starting method learns from snapshots."""
         return self.unfitted_start().needs_snapshots
 
     def supports(self, scene: Scene) -> str | None:

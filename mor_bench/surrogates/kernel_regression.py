@@ -147,8 +147,8 @@ class PCAGaussianProcess(GaussianSums):
 
     The prior covariance is a Gaussian kernel with a length scale for each input, the same for all
     outputs; g(0) = 0 is an observation without noise. Length scales, variance and noise maximise
-    the likelihood of the first `n_optimised` samples and the first `N_LEADING` outputs, in at most
-    `MAX_ITERATIONS` steps of L-BFGS-B from one start. Then the mean is conditioned on the first
+    the likelihood of the first `n_optimised` samples and the first `N_LEADING` outputs. L-BFGS-B
+    takes at most `MAX_ITERATIONS` steps from one start. Then the mean is conditioned on the first
     `n_points` samples; only the mean is kept.
 
     `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
@@ -197,7 +197,6 @@ class PCAGaussianProcess(GaussianSums):
 
 
 def _optimised(objective: Any, start: Any, bounds: Any) -> tuple[Array, float]:
-    """Return the minimiser of the negative likelihood, and its minimum."""
     found = minimize(
         objective,
         start,

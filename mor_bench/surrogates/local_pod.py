@@ -164,7 +164,6 @@ class LocalPOD(Surrogate):
 
 
 def _of_cluster(model: Mapping[str, NDArray[Any]], cluster: int) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a cluster's polynomial."""
     ending = f".{cluster}"
     return {
         name.removesuffix(ending): np.ascontiguousarray(array)

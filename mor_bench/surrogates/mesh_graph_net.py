@@ -225,9 +225,9 @@ class MeshGraphNet(OperatorSurrogate):
 
     The paper's network adds the velocity of one time step; this one answers with the displacement
     under a load. Information at a node comes from as many edges away as there are steps. So with
-    the force alone, a node knows nothing about more distant loads or supports. The linear response
-    carries their effect over the whole body. Nodes know only their neighbours' relative positions.
-    The other parameters are those of `FieldSurrogate`.
+    the force alone, a node has no information about more distant loads or supports. The linear
+    response carries their effect over the whole body. Nodes use only relative positions of
+    neighbours. The other parameters are those of `FieldSurrogate`.
 
     Parameters
     ----------

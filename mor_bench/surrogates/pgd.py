@@ -103,8 +103,8 @@ class SeparatedLoad(Surrogate):
     2013, section 3). The terms are fitted to samples instead of to the equations (Ibáñez et al.
     2018). Every load is treated as one patch: s is the centroid of the nodal forces weighted by
     their lengths; d and m are direction and length of their sum. S are polynomials in the principal
-    axes of the positions. u is an analytic function of the force, so a homogeneous polynomial D of
-    degree j has factors M that are powers of m from m^j, of the same parity. No force gives no
+    axes of the positions. u is an analytic function of the force. So the factors M of a homogeneous
+    polynomial D of degree j are powers of m from m^j, with the parity of j. No force gives no
     displacement.
 
     Several patches are treated as one at their centroid; `out_of_range` flags them. Positions
@@ -183,7 +183,6 @@ class SeparatedLoad(Surrogate):
         }
 
     def _coefficients(self, terms: Sequence[Term], families: list[Family]) -> dict[str, Array]:
-        """Return the coefficients of each term in all functions, (n_functions, n_terms)."""
         starts = np.cumsum([0, *(direction.shape[1] for _, direction, _ in families)])
         by_position = np.zeros((families[0][0].shape[1], len(terms)))
         by_direction = np.zeros((int(starts[-1]), len(terms)))

@@ -106,7 +106,6 @@ class PODNN(NetworkRegression):
         ]
 
     def _loss(self, network: Perceptron, data: dict[str, Tensor]) -> Loss:
-        """Return the mean squared error of the coordinates, and of their derivatives if given."""
         z, wanted, weights = data["inputs"], data["outputs"], data["weights"]
         known, rest = data.get("directions"), torch.zeros_like(z[:1])
 

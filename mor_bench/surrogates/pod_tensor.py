@@ -83,7 +83,6 @@ class TensorPOD(Surrogate):
         return self.subspace_.answer(forces, self._solve)
 
     def _solve(self, load: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the reduced coordinates under a reduced load."""
         q = (
             self.problem_.quick(load, self.tolerance_)
             if 0 < np.abs(load).max() <= MAX_LOAD_N

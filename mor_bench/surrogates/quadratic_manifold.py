@@ -30,7 +30,7 @@ from mor_bench.surrogates.free_dofs import answer_each
 Array = NDArray[np.float64]
 
 N_CUBATURE_LOADS = 200
-"""Number of loads whose equilibria on the manifold train the cubature."""
+"""Number of loads for the training of the cubature on the manifold."""
 
 
 @dataclass(eq=False)

@@ -45,13 +45,13 @@ DERIVATIVE_WEIGHT = 0.1
 class SparsePolynomial(CoordinateRegression):
     """g(z) = W p(z), with p a sparse set of monomials of z; see `CoordinateRegression`.
 
-    Each factor zᵢ of a term costs log₁₀(σ₁ / σᵢ), with σᵢ the coordinate's root mean square, plus a
-    number of decades that is the same for all factors. The cheapest terms are used, as in
-    anisotropic total-degree spaces (Nobile, Tempone, Webster: An anisotropic sparse grid stochastic
-    collocation method, SIAM Journal on Numerical Analysis 46 (2008)). The numbers of decades and of
-    terms minimise the error on a held-out fifth of the training samples. Then all samples are
-    fitted. With derivatives, the polynomial also matches those of the displacement with respect to
-    the load, see `mor_bench.reduction.sensitivity`.
+    Each factor zᵢ of a term costs log₁₀(σ₁ / σᵢ) plus a number of decades. σᵢ is the coordinate's
+    root mean square, and all factors have the same number of decades. The cheapest terms are used,
+    as in anisotropic total-degree spaces (Nobile, Tempone, Webster: An anisotropic sparse grid
+    stochastic collocation method, SIAM Journal on Numerical Analysis 46 (2008)). The numbers of
+    decades and of terms minimise the error on a held-out fifth of the training samples. Then all
+    samples are fitted. With derivatives, the polynomial also matches those of the displacement with
+    respect to the load, see `mor_bench.reduction.sensitivity`.
 
     `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
 

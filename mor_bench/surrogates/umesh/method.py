@@ -76,8 +76,8 @@ class UMesh(FieldSurrogate):
     mirrored : bool
         Also train on random mirror images, if the scene has planes of symmetry.
     loss : {"absolute", "relative"}
-        The mean squared error, or each sample's part of it divided by the sample's mean square
-        (or by `SMALLEST_SIZE` of the root mean square over all samples, if that is larger).
+        Mean squared error, without or with division by each sample's mean square. The divisor
+        uses at least `SMALLEST_SIZE` of the root mean square over all samples.
     precision : {"float32", "bfloat16"}
         Precision of the products in training.
     validation_fraction : float

@@ -35,7 +35,6 @@ class DoubleConvolution(nn.Sequential):
 
 
 def _n_weights(module: nn.Module) -> int:
-    """Return the number of weights, without the biases."""
     return sum(parameter.numel() for parameter in module.parameters() if parameter.dim() > 1)
 
 
