@@ -131,7 +131,7 @@ def load_surrogate(path: str | Path) -> Surrogate:
 
 
 def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surrogate:
-    """Read a fitted model of a known class and scene; raises as `load_surrogate`."""
+    """Read a fitted model of a known class and scene; errors as in `load_surrogate`."""
     model = read_model(path)
     expected = class_path(surrogate)
     if model.surrogate != expected:
@@ -142,7 +142,7 @@ def load_fitted(path: str | Path, surrogate: type[Any], scene: Scene) -> Surroga
 def _fitted(
     path: str | Path, surrogate: type[Any], scene: Scene | None, model: StoredModel
 ) -> Surrogate:
-    """Make the method from a file's content; without a scene, build that of its header."""
+    """Make the method from a file's content. Without a scene, build the scene in its header."""
     try:
         method = make_surrogate(surrogate, json.loads(model.parameters))
         scene = scene or load_scene(json.loads(model.scene))

@@ -117,7 +117,7 @@ def read_model(path: str | Path) -> StoredModel:
 
 
 def read_header_and_arrays(path: str | Path) -> tuple[dict[str, str], Arrays]:
-    """Read a model file's raw content and verify its checksum; raises as `read_model`."""
+    """Read a model file's raw content and verify its checksum; errors as in `read_model`."""
     from safetensors import SafetensorError, safe_open
 
     try:

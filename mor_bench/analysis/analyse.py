@@ -20,10 +20,10 @@ def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -
     """Draw all conclusions from the rows and raw samples of a comparison.
 
     All intervals have a level of 95 %. Errors are resampled by a bootstrap over the load regions of
-    the test set, the same for all methods, and over training seeds if there are several. Intervals
-    of latencies come from the spread between fresh processes; effects that all configurations share
-    cancel in ratios. Nothing is corrected for the number of comparisons: about one in twenty pairs
-    of equal methods is called different.
+    the test set, and over training seeds if there are several. All methods share the resamples.
+    Intervals of latencies come from the spread between fresh processes; effects that all
+    configurations share cancel in ratios. Nothing is corrected for the number of comparisons: about
+    one in twenty pairs of equal methods is called different.
 
     Parameters
     ----------

@@ -102,7 +102,7 @@ def machine_name(ran_on: Mapping[str, Any], name: str | None) -> str:
     Raises
     ------
     InvalidInputError
-        If the name has characters that a file name must not have, or if no name is given and the
+        If the name has characters that are not allowed in file names, or if it is missing and the
         comparison ran on another machine.
     """
     if name is None:

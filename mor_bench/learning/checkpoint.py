@@ -20,7 +20,7 @@ FORMAT = "mor-bench checkpoint"
 
 
 class _Numbers(BaseModel):
-    """The part of a checkpoint that is not tensors."""
+    """Iteration counts and loss curves of a checkpoint."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -100,7 +100,7 @@ def resume(loop: TrainingLoop, path: Path, fingerprint: str) -> bool:
 
 
 def _restore(loop: TrainingLoop, numbers: _Numbers, tensors: Mapping[str, Tensor]) -> None:
-    """Check the state in a checkpoint, and set a training to it."""
+    """Check a checkpoint's state and load it into a training."""
     for name, value in numbers:
         setattr(loop, name, value)
     _check_numbers(loop)
@@ -169,7 +169,7 @@ def _check_tensors(loop: TrainingLoop, tensors: Mapping[str, Tensor]) -> None:
 
 
 def _expected_tensors(loop: TrainingLoop) -> dict[str, Tensor]:
-    """Return tensors of the names, types and shapes that a checkpoint must hold."""
+    """Return tensors with the required names, types and shapes of a checkpoint."""
     weights, n_rows = loop.network.state_dict(), loop.problem.n_samples - loop.n_held
     batch_size = min(loop.plan.batch_size, n_rows)
     n_drawn = batch_size * ((loop.iteration - 1) % (n_rows // batch_size) + 1)

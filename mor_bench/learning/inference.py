@@ -31,8 +31,8 @@ BACKENDS: tuple[Backend, ...] = get_args(Backend)
 """Back ends from simple to complex. Each must be clearly faster than the choice before it."""
 
 CLEAR_GAIN: dict[Backend, float] = {"packed": 1.1, "onnx": 1.5, "packed-bfloat16": 1.2}
-"""Required speed-up over the simpler choice. It is far from measured ratios, so noise matters
-little."""
+"""Required speed-up over the simpler choice. Measured ratios are far from it, so noise seldom
+changes the choice."""
 
 ADDED_ERROR = 0.1
 """Largest change of the answers (root mean square), as a fraction of the network's own error."""

@@ -110,7 +110,7 @@ def training(entries: Sequence[Entry]) -> TextTable | None:
 
 
 def seeds(entries: Sequence[Entry]) -> TextTable | None:
-    """Build the table of how errors scatter over the seeds of the training."""
+    """Build the table of the spread of errors over training seeds."""
     rows = []
     for entry in entries:
         found = entry.row.seeds

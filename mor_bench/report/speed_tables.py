@@ -86,8 +86,8 @@ class Pairs:
     methods, absent : list of str
         Methods that reach the error, and those that do not.
     cells : list of list of str
-        A row for each of `methods`: ``+2.3`` where it is 2.3 times faster than the column's method,
-        ``-2.3`` where it is slower, ``?1.1`` where it is undecided.
+        A row for each of `methods`. ``+2.3``: it is 2.3 times faster than the column's method.
+        ``-2.3``: it is slower. ``?1.1``: undecided.
     intervals : list of list of str
         95 % intervals of these factors.
     """

@@ -22,7 +22,7 @@ def warnings_of(entries: Sequence[Entry]) -> list[tuple[str, str]]:
 
 
 def notes_of(comparison: Comparison, dataset: str, analysis: Analysis) -> list[tuple[str, str]]:
-    """List doubts as pairs of the name of a configuration or method and the doubt.
+    """List doubts, each after the name of its configuration or method.
 
     Doubts are unstable timings, a hidden test set that disagrees, and untested regimes.
     """

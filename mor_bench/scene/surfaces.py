@@ -69,8 +69,8 @@ def read_surface(path: str | Path, unit_m: float = 1.0) -> Surface:
     Raises
     ------
     SpecError
-        If the file is missing or unreadable, has no triangles or a NaN, or its surface is not
-        closed, not consistently oriented or encloses nothing.
+        If the file is missing or unreadable, or has no triangles or a NaN. Also if its surface is
+        not closed or not consistently oriented, or encloses nothing.
     """
     corners = read_triangles(Path(path), unit_m)
     # Adding zero turns -0.0 into 0.0, so vertices of neighbouring triangles are equal.

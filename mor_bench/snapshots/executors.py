@@ -174,7 +174,7 @@ def cluster_pool(address: str) -> Iterator[Pool]:
         If the extra `cluster` is not installed.
     WorkerError
         If the scheduler cannot be reached, is lost, has no workers or lacks this version of
-        mor-bench, or if workers repeatedly die on the same shard.
+        mor-bench. Also if workers repeatedly die on the same shard.
     """
     try:
         from distributed import Client, KilledWorker

@@ -41,8 +41,8 @@ class InterpolatedPOD(Surrogate):
 
     The linear part of the force is projected exactly. The remainder n(u) = f(u) - K₀u is
     approximated in the span of the leading modes U of its training snapshots:
-    f_r(q) = ΦᵀK₀Φ q + ΦᵀU (PᵀU)⁻¹ Pᵀ n(Φq), where Pᵀ selects as many dofs as U has columns
-    (Chaturantabut & Sorensen 2010). Only the cells that touch these dofs are integrated. The
+    f_r(q) = ΦᵀK₀Φ q + ΦᵀU (PᵀU)⁻¹ Pᵀ n(Φq) (Chaturantabut & Sorensen 2010). Pᵀ selects as many
+    dofs as U has columns. Only the cells that touch these dofs are integrated. The
     tangent is not symmetric and there is no potential, so stability is not guaranteed.
 
     Parameters

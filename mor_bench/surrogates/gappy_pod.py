@@ -27,8 +27,8 @@ class GappyPOD(Surrogate):
 
     Everson and Sirovich: Karhunen-Loève procedure for gappy data, J. Opt. Soc. Am. A 12 (1995),
     equations 8 to 10, with Tikhonov's regularisation: a minimises
-    ‖Φ_o a - u_o‖² + λ² m² Σ (a_i / s_i)². Here Φ_o are the observed rows of the modes, s_i is the
-    root mean square of a_i over the training samples, and m that of ‖u_o‖. The method uses no
+    ‖Φ_o a - u_o‖² + λ² m² Σ (a_i / s_i)². Φ_o are the observed rows of the modes. s_i and m are
+    the root mean squares of a_i and ‖u_o‖ over the training samples. The method uses no
     equations and no forces. At observed nodes, it also returns the fit, which may differ from the
     observed values.
 

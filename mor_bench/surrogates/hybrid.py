@@ -31,8 +31,8 @@ WORSE = 1.0
 at rest."""
 
 NEAR, SURE = 0.5, 0.7
-"""Bounds for skipping the check of det F at every quadrature point: corrections below the first
-fraction of the answer, and det F above the second at the centres of all cells."""
+"""Largest correction, as a fraction of the answer, and smallest det F at the cells' centres for
+which det F is not checked at every quadrature point."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})

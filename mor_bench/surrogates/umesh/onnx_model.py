@@ -136,9 +136,9 @@ def _linear_response(
 def _sparse_product(graph: GraphBuilder, matrix: sp.csr_array[np.float32], values: str) -> str:
     """Add A v along the second of three axes.
 
-    ONNX has no sparse product. So for each row of A, the graph gathers as many rows of v as the
-    longest row of A has entries, and computes their weighted sum. If every row of A has at most one
-    entry, equal to 1, rows are only moved.
+    ONNX has no sparse product. So the graph computes a weighted sum of rows of v for each row of A.
+    All sums have as many terms as the longest row of A has entries. If every row of A has at most
+    one entry, equal to 1, rows are only moved.
     """
     lengths = np.diff(matrix.indptr)
     longest, n_columns = max(int(lengths.max()), 1), matrix.shape[1]
