@@ -103,7 +103,6 @@ def frontier_draws(
     """Compute `time_at_error` and `error_at_time` for many resamples at once.
 
     Parameters
-    Parameters
     ----------
     log_latencies, log_errors : (n_configurations, n) float64
         Natural logarithms of latencies in ms and of relative L2 errors; no error is below `EXACT`.

@@ -31,13 +31,13 @@ class Requirements:
     Attributes
     ----------
     error
-            Median relative L2 error over the test set, as a fraction.
+        Median relative L2 error over the test set, as a fraction.
     latency_ms
         Median latency of one query, ms.
     memory_bytes
-            Peak memory of a predicting process, bytes.
+        Peak memory of a predicting process, bytes.
     offline_s
-            Sum of data generation, core-seconds, and fitting, seconds.
+        Sum of data generation, core-seconds, and fitting, seconds.
 
     Raises
     ------
@@ -256,7 +256,7 @@ def _excesses(row: Row, requirements: Requirements) -> dict[str, float]:
 
 
 def _nearest(rows: Sequence[Row], requirements: Requirements) -> Row | None:
-    """Return the row with the smallest largest factor over a limit."""
+    """Return the row that exceeds the limits by the smallest factor."""
 
     def excess(row: Row) -> float:
         return max(_excesses(row, requirements).values(), default=0.0)

@@ -1,4 +1,4 @@
-"""Networks with oneDNN's convolutions, whose weights are packed once and not in every call."""
+"""Networks with oneDNN's convolutions and weights that are packed once, not in every call."""
 
 from __future__ import annotations
 
