@@ -65,6 +65,7 @@ def is_gone(pid: int, within_s: float = 20.0) -> bool:
         ("orphan", "ended with code 7"),
         ("kill-group", "SIGKILL"),
         ("odd-text", "crashed with RuntimeError: file ?"),
+        ("in-library", "Singular matrix (third_party.py, line "),
     ],
 )
 def test_a_failure_is_named_and_leaves_no_process(

@@ -156,6 +156,7 @@ def test_faster_than_the_baseline(
         while max(ratios, default=0.0) < race.least_speedup and len(ratios) < ATTEMPTS:
             ratios.append(ratio_of_times(baseline, method, force))
     apart = float(np.linalg.norm(predicted - expected) / np.linalg.norm(expected))
+    print(f"{name}: {max(ratios):.1f} times as fast as {race.baseline}; answers {apart:.2g} apart")
     benchmark.extra_info.update({"ratio": max(ratios), "least": race.least_speedup, "apart": apart})
     assert apart <= race.difference
     assert max(ratios) >= race.least_speedup, f"{name}: {[round(ratio, 2) for ratio in ratios]}"

@@ -125,6 +125,8 @@ class Broken(Zero):
             time.sleep(60)
         if self.how == "odd-text":
             raise RuntimeError("file \udcff")
+        if self.how == "in-library":
+            np.linalg.inv(np.zeros((1, 1)))
         return self
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:

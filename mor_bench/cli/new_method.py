@@ -34,7 +34,8 @@ def new_method(
     """Write a TOML and a Python file for a new method. Both work, and are yours to change."""
     toml, source = write_method(name, folder)
     print(toml, source, sep="\n")
-    print(f"Next: mor-bench check {toml}; mor-bench run beam-tiny -m {toml}")
+    tests = f"pytest -k {name}; " if source.parent != toml.parent else ""
+    print(f"Next: mor-bench check {toml}; {tests}mor-bench run beam-tiny -m {toml}")
 
 
 def write_method(name: str, folder: Path) -> tuple[Path, Path]:

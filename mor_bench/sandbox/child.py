@@ -11,15 +11,22 @@ import os
 import pickle
 import signal
 import sys
+import sysconfig
 import warnings
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
+from traceback import walk_tb
 from typing import Any, BinaryIO
 
 from mor_bench.errors import MorBenchError
 from mor_bench.sandbox.seal import seal
 from mor_bench.sandbox.session import Session, session_class
+
+LIBRARIES = tuple(
+    f"{sysconfig.get_path(part)}{os.sep}" for part in ("stdlib", "purelib", "platlib")
+)
+"""Folders of the standard library and of installed packages."""
 
 
 class _Child:
@@ -52,10 +59,18 @@ class _Child:
             except MorBenchError as error:
                 answer = {"error": type(error).__name__, "message": _printable(error)}
             except (Exception, SystemExit) as error:  # foreign code runs here
-                message = f"crashed with {type(error).__name__}: {_printable(error)}"
-                answer = {"error": None, "message": message}
+                answer = {"error": None, "message": _crash(error)}
         notes = [_printable(w.message) for w in caught if issubclass(w.category, UserWarning)]
         return {**answer, "warnings": list(dict.fromkeys(notes))}
+
+
+def _crash(error: BaseException) -> str:
+    """Return what happened and where, as far as possible outside installed packages."""
+    places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
+    own = [place for place in places if not place[0].startswith(("<", *LIBRARIES))]
+    file, line = (own or places)[-1]
+    where = f"{Path(file).name}, line {line}"
+    return _printable(f"crashed with {type(error).__name__}: {error} ({where})")
 
 
 def _printable(error: object) -> str:
