@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,9 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def digest_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> str:
-    """Return the SHA-256 of names, dtypes, shapes and values of arrays, in the order of names."""
-    digest = hashlib.sha256()
+def digest_of_arrays(
+    arrays: Mapping[str, NDArray[Any]], parts: Mapping[str, object] | None = None
+) -> str:
+    """Return the SHA-256 of names, dtypes, shapes and values of arrays, in the order of names.
+
+    If `parts` are given, their JSON comes first; what is no JSON value is converted to text.
+    """
+    text = "" if parts is None else json.dumps(parts, sort_keys=True, default=str)
+    digest = hashlib.sha256(text.encode())
     for name in sorted(arrays):
         digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
         digest.update(np.ascontiguousarray(arrays[name]).data)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.digests import digest_of_arrays
 from mor_bench.errors import InvalidInputError, MorBenchError, StoreError
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import check_parameters
@@ -141,13 +141,7 @@ def read_header_and_arrays(path: str | Path) -> tuple[dict[str, str], Arrays]:
 
 def model_digest(header: Mapping[str, str], arrays: Mapping[str, NDArray[Any]]) -> str:
     """SHA-256 of the content of a model file, except the digest itself."""
-    digest = hashlib.sha256(
-        json.dumps({key: header[key] for key in sorted(header) if key != "sha256"}).encode()
-    )
-    for name in sorted(arrays):
-        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
-    return digest.hexdigest()
+    return digest_of_arrays(arrays, {key: header[key] for key in header if key != "sha256"})
 
 
 def size_arrays(sizes: Mapping[str, Any]) -> Arrays:

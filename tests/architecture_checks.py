@@ -18,7 +18,7 @@ from pathlib import Path
 Tree = dict[str, str]
 
 FLOORS = (
-    ("errors", "counting", "machine", "version"),
+    ("errors", "counting", "digests", "machine", "version"),
     ("specs", "options"),
     ("scene",),
     ("mechanics",),

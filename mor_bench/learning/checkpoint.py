@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
+from mor_bench.digests import digest_of_arrays
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.learning.training_loop import LOSS_INTERVAL, TrainingLoop
 from mor_bench.snapshots.store import write_atomically
@@ -33,12 +33,8 @@ class _Numbers(BaseModel):
 
 def fingerprint_of(parts: Mapping[str, object], arrays: Mapping[str, Tensor]) -> str:
     """Return the SHA-256 of everything that determines a training: JSON values and arrays."""
-    digest = hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode())
-    for name in sorted(arrays):
-        array = arrays[name].detach().cpu().contiguous().numpy()
-        digest.update(f"{name} {array.dtype} {array.shape}".encode())
-        digest.update(array.data)
-    return digest.hexdigest()
+    plain = {name: tensor.detach().cpu().numpy() for name, tensor in arrays.items()}
+    return digest_of_arrays(plain, parts)
 
 
 def write_checkpoint(loop: TrainingLoop, path: Path, fingerprint: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -16,45 +16,10 @@ MAX_FORCE_N = 1e30
 
 
 @dataclass(frozen=True, eq=False)
-class Forces:
-    """Nodal forces `values` (n, n_nodes, 3) or (n_nodes, 3) float64, N."""
+class _NodalValues:
+    """Vectors at nodes, `values` (n, n_nodes, 3) or (n_nodes, 3) float64."""
 
     values: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
-        found = np.asarray(self.values, dtype)
-        return found.copy() if copy else found
-
-    def __getitem__(self, index: Any) -> Self:
-        return type(self)(self.values[index])
-
-    def with_values(self, values: NDArray[np.float64]) -> Self:
-        """Return other values of the same kind."""
-        return type(self)(values)
-
-    @property
-    def query(self) -> NDArray[np.float64]:
-        """Argument of `Surrogate.predict`: the plain array."""
-        return self.values
-
-
-@dataclass(frozen=True, eq=False)
-class ObservedDisplacements:
-    """Displacements of the observed nodes of a scene; methods predict all others.
-
-    Attributes
-    ----------
-    values : (n, n_nodes, 3) or (n_nodes, 3) float64
-        Displacements, m. Methods ignore the values at other nodes; they may be NaN.
-    nodes : (n_observed,) int64
-        The observed nodes, `Scene.observed_nodes`.
-    """
-
-    values: NDArray[np.float64]
-    nodes: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.values)
@@ -67,8 +32,32 @@ class ObservedDisplacements:
         return self.with_values(self.values[index])
 
     def with_values(self, values: NDArray[np.float64]) -> Self:
-        """Return other displacements of the same nodes."""
-        return type(self)(values, self.nodes)
+        """Return other values of the same kind, at the same nodes."""
+        return replace(self, values=values)
+
+
+class Forces(_NodalValues):
+    """Nodal forces `values` (n, n_nodes, 3) or (n_nodes, 3) float64, N."""
+
+    @property
+    def query(self) -> NDArray[np.float64]:
+        """Argument of `Surrogate.predict`: the plain array."""
+        return self.values
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedDisplacements(_NodalValues):
+    """Displacements of the observed nodes of a scene; methods predict all others.
+
+    Attributes
+    ----------
+    values : (n, n_nodes, 3) or (n_nodes, 3) float64
+        Displacements, m. Methods ignore the values at other nodes; they may be NaN.
+    nodes : (n_observed,) int64
+        The observed nodes, `Scene.observed_nodes`.
+    """
+
+    nodes: NDArray[np.int64]
 
     @property
     def query(self) -> Self:
