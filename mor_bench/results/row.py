@@ -251,8 +251,6 @@ class Row(Part):
 
     Attributes
     ----------
-    Attributes
-    ----------
     dataset, split, method, label : str
         Names of what ran; the label lists the swept parameters.
     parameters, swept : dict

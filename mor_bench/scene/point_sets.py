@@ -85,7 +85,7 @@ def _physical_groups(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
 
 
 def _keywords(path: Path, keyword: str, parameter: str) -> list[str | None]:
-    """Return the value of a parameter in each line of a keyword in an Abaqus file."""
+    """Return a parameter's value from each line of an Abaqus file with a keyword."""
     lines = re.findall(
         rf"^\*{keyword}\s*((?:,.*)?)$",
         path.read_text(encoding="utf-8", errors="replace"),

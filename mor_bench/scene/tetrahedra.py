@@ -125,16 +125,9 @@ def _cut(
 ) -> NDArray[np.int64]:
     """Return the parts (m, 4), of any orientation, of tetrahedra (n, 4) inside the surface.
 
-    Parameters
-    ----------
-    cells : (n, 4) int64
-    side : (n_points,) int64
-        1 for points inside, 0 on the surface, -1 outside.
-    places : (n_points, 3) int64
-        Lattice coordinates of the points.
-    edges : (n_edges, 2) int64
-        From inside to outside, in ascending order. The crossing of edge k is point
-        ``n_points + k``.
+    `side` (n_points,) is 1 for points inside, 0 on the surface, -1 outside. `places` (n_points, 3)
+    are lattice coordinates. `edges` (n_edges, 2) go from inside to outside, in ascending order. The
+    crossing of edge k is point ``n_points + k``.
     """
     cells = np.take_along_axis(cells, np.argsort(-side[cells], axis=1, kind="stable"), axis=1)
     n_in, n_out = (side[cells] > 0).sum(axis=1), (side[cells] < 0).sum(axis=1)

@@ -17,7 +17,8 @@ def winding_numbers(corners, points):
 
     For a closed surface it is 1 inside and 0 outside. It is the sum of the triangles' solid angles.
     Van Oosterom & Strackee (1983), eq. 8: tan(Ω/2) = a·(b × c) / (|a||b||c| + (a·b)|c| + (b·c)|a| +
-    (c·a)|b|). There are no rays, so none can hit an edge (Jacobson, Kavan & Sorkine-Hornung 2013).
+    (c·a)|b|). Unlike ray casting, it has no special case at edges (Jacobson, Kavan &
+    Sorkine-Hornung 2013).
     """
     windings = np.empty(len(points))
     for n in range(len(points)):

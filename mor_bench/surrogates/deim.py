@@ -40,10 +40,10 @@ class InterpolatedPOD(Surrogate):
     """POD-Galerkin with a nonlinear force that is interpolated from a few of its entries.
 
     The linear part of the force is projected exactly. The remainder n(u) = f(u) - K₀u is
-    approximated in the span of the leading modes U of its training snapshots:
-    f_r(q) = ΦᵀK₀Φ q + ΦᵀU (PᵀU)⁻¹ Pᵀ n(Φq) (Chaturantabut & Sorensen 2010). Pᵀ selects as many
-    dofs as U has columns. Only the cells that touch these dofs are integrated. The
-    tangent is not symmetric and there is no potential, so stability is not guaranteed.
+    approximated in the span of the leading modes U of its training snapshots: f_r(q) = ΦᵀK₀Φ q +
+    ΦᵀU (PᵀU)⁻¹ Pᵀ n(Φq) (Chaturantabut & Sorensen 2010). Pᵀ selects as many dofs as U has columns.
+    Only the cells that touch these dofs are integrated. The tangent is not symmetric and there is
+    no potential, so stability is not guaranteed.
 
     Parameters
     ----------

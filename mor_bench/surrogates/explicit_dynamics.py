@@ -29,7 +29,7 @@ class ExplicitDynamics(Surrogate):
         Initial displacement. Codes of this family start at rest, because they hold no stiffness;
         "linear-response" costs a back-solve with the factor of the stiffness at rest.
     max_steps : int
-        Steps after which the solve fails. A second attempt, after divergence, has as many.
+        Steps after which the solve fails. A second attempt, after divergence, has the same limit.
     """
 
     tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-4

@@ -13,7 +13,7 @@ from mor_bench.learning.training_plan import Loss, TrainingPlan
 from mor_bench.surrogates.field_surrogate import Arrays, FieldSurrogate
 
 SECOND_MOMENT_DECAY = 0.99
-"""Adam's β₂. Short trainings need a short memory."""
+"""Adam's β₂. A value smaller than Adam's default suits short trainings."""
 
 
 class FieldNetwork(nn.Module, ABC):
@@ -117,7 +117,7 @@ def initialise(network: nn.Module, generator: torch.Generator) -> None:
 
 
 def perceptron(*widths: int) -> nn.Sequential:
-    """Return linear layers with SiLU between them, without values."""
+    """Return linear layers with SiLU between them, with unset weights."""
     layers: list[nn.Module] = []
     for n_in, n_out in pairwise(widths):
         layers += [linear(n_in, n_out), nn.SiLU()]
@@ -125,7 +125,7 @@ def perceptron(*widths: int) -> nn.Sequential:
 
 
 def linear(n_in: int, n_out: int) -> nn.Linear:
-    """Return a linear layer without values."""
+    """Return a linear layer with unset weights."""
     layer: nn.Linear = nn.utils.skip_init(nn.Linear, n_in, n_out)  # type: ignore[no-untyped-call]
     return layer
 

@@ -46,7 +46,7 @@ class SpectralConvolution(SelfInitialised):
     shape : three ints
         Points per axis.
     modes : int
-        Wave numbers per axis, 0 to modes - 1 and their negatives; fewer where an axis has fewer.
+        Wave numbers per axis, 0 to modes - 1 and their negatives; axes with fewer keep all.
     channels : int
     """
 
@@ -96,7 +96,7 @@ class SpectralConvolution(SelfInitialised):
 
     @property
     def multiply_adds(self) -> int:
-        """Work for one sample; a complex product counts four."""
+        """Work for one sample; a complex product counts as four."""
         (nx, ny, nz), (kx, ky, kz), c = self.shape, self.counts, self.channels
         transform = kx * nx * ny * nz + kx * ky * ny * nz + kx * ky * kz * nz
         return 4 * (2 * c * transform + kx * ky * kz * c * c)
