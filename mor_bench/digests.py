@@ -16,7 +16,7 @@ def digest_of_arrays(
 ) -> str:
     """Return the SHA-256 of names, dtypes, shapes and values of arrays, in the order of names.
 
-    If `parts` are given, their JSON comes first; what is no JSON value is converted to text.
+    If `parts` are given, their JSON comes first; other values are converted to text.
     """
     text = "" if parts is None else json.dumps(parts, sort_keys=True, default=str)
     digest = hashlib.sha256(text.encode())

@@ -54,7 +54,7 @@ def resample_weights(
     Returns
     -------
     (n_samples, n) int32
-        Each column has a positive count.
+        Each column has at least one positive count.
     """
     n_clusters = int(clusters.max()) + 1
     weights = np.empty((len(clusters), n), dtype=np.int32)

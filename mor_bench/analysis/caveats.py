@@ -12,7 +12,7 @@ from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 
 HIDDEN_WORSE = 1.2
-"""Ratio of the errors on the hidden and the shipped test set up to which none is called worse."""
+"""Largest ratio of hidden to shipped test error that is never called worse."""
 
 
 def hidden(

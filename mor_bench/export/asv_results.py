@@ -4,7 +4,7 @@ OUT/benchmarks.json                    the benchmarks; asv's own entries are kep
 OUT/MACHINE/machine.json               kept if it exists
 OUT/MACHINE/COMMIT-mor-bench-py*.json  the figures of one commit, apart from asv's own files
 
-Every figure is better when lower, because asv reports an increase as a regression.
+For every figure, lower is better, because asv reports an increase as a regression.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def _merged(path: Path, commit_hash: str, figures: Mapping[str, Figures]) -> dic
 def describe(out: str | Path) -> Path:
     """List in benchmarks.json every comparison benchmark that has results in the folder.
 
-    When asv runs, it rewrites that file with only its own benchmarks. Its entries are kept.
+    When asv runs, it rewrites that file with only its own benchmarks. This function keeps them.
 
     Raises
     ------

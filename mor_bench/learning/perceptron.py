@@ -87,7 +87,7 @@ def slope_at_rest(weights: Sequence[Array]) -> Array:
 
 
 def named(prefix: str, weights: Sequence[Array]) -> dict[str, Array]:
-    """Return weights as arrays of a model."""
+    """Return weights as arrays of a model; the prefix begins their names."""
     return {f"{prefix}.{name}": weight for name, weight in zip(NAMES, weights, strict=True)}
 
 

@@ -46,7 +46,7 @@ def _set_cell(found: SetErrors) -> str:
 
 
 def out_of_range(entries: Sequence[Entry]) -> TextTable | None:
-    """Build the table of range flags: do trained methods flag the loads with large errors?"""
+    """Build the table of range flags of trained methods for loads with large errors."""
     flagged = [entry for entry in entries if entry.row.range]
     names = dict.fromkeys(name for entry in flagged for name in entry.row.sets)
     rows = []
@@ -134,7 +134,7 @@ def _of(value: float, allowed: float | None, shown: Callable[[Any], str] = numbe
 
 
 def regimes_table(analysis: Analysis) -> TextTable | None:
-    """Build the table of regimes: was each method tested in the regime that its file names?"""
+    """Build the table of tests in the regime that each method's file names."""
     rows = [
         [record["method"], record["says"], "yes" if record["in_regime"] else record["verdict"]]
         for record in analysis["regimes"]

@@ -173,7 +173,6 @@ def entries_of(
 
 def _intervals(record: Mapping[str, Any]) -> dict[str, Interval]:
     """Intervals of an analysis record that have a lower end; a missing upper end is infinite."""
-    """Return the configuration with the smallest ē of each method that ran."""
     figures = {name: record[name] for name in ("rel_l2_median", "mean_dof_m", "latency_ms")}
     return {
         name: (f["low"], inf if f["high"] is None else f["high"])
@@ -183,7 +182,7 @@ def _intervals(record: Mapping[str, Any]) -> dict[str, Interval]:
 
 
 def best_per_method(entries: Sequence[Entry]) -> list[Entry]:
-    """Return for each method that ran the configuration with the smallest ē."""
+    """Return the configuration with the smallest ē of each method that ran."""
     ran = [entry for entry in entries if entry.ran]
     methods = dict.fromkeys(entry.method for entry in ran)
     return [

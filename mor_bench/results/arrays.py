@@ -15,7 +15,7 @@ from mor_bench.snapshots.store import write_atomically
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Read what `write_arrays` wrote."""
+    """Read named arrays from an HDF5 file."""
     with h5py.File(path, "r") as file:
         return {key: np.asarray(file[key][()]) for key in file}
 

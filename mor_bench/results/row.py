@@ -252,7 +252,7 @@ class Row(Part):
     Attributes
     ----------
     dataset, split, method, label : str
-        Names of what ran; the label lists the swept parameters.
+        Names; the label lists the swept parameters.
     parameters, swept : dict
         All given parameters, and those that the sweep varies.
     sizes : dict

@@ -32,7 +32,7 @@ class Facets:
     Attributes
     ----------
     points : (n_points, 3) float64
-        m.
+        Positions, m.
     facets : (n_facets, 4 or 3) int64
         Point numbers, oriented outwards.
     """
@@ -54,7 +54,7 @@ class _Quadrature:
     Attributes
     ----------
     points : (n_points, 3) float64
-        m.
+        Positions, m.
     vectors : (n_points, 3) float64
         Outward normals whose lengths are the points' areas, m².
     values : (n_points, n_surface_points) sparse float64
@@ -75,7 +75,7 @@ class Patches:
     areas : (n_patches, n_points) sparse float64
         Area of each point in a patch, m²; rows sum to the patch's area up to round-off.
     points : (n_points, 3) float64
-        m.
+        Positions, m.
     values : (n_points, n_surface_points) sparse float64
         Shape functions of the facets at the points.
     normals : (n_points, 3) float64

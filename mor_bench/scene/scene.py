@@ -167,7 +167,7 @@ class Scene:
 
     @property
     def patch_centres(self) -> NDArray[np.float64]:
-        """(n_patches, 3) m."""
+        """(n_patches, 3) positions of the patches' centres, m."""
         return self.surface.points[self.patch_nodes]
 
     @cached_property

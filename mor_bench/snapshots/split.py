@@ -23,9 +23,9 @@ def split_samples(
     """Return the sorted row numbers of the training and of the test samples.
 
     The split holds out any samples, whole load regions, or forces in a cone around a random axis. A
-    sample of several forces is for the test if all of them are held out, and for training if none
-    is. The fraction of regions, or of the sphere, is chosen such that the test part gets its
-    fraction of the used samples.
+    sample of several forces is a test sample if all of its forces are held out, and a training
+    sample if none is held out. The fraction of regions, or of the sphere, is chosen such that the
+    test part gets its fraction of the used samples.
 
     Raises
     ------

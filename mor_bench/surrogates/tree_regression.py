@@ -25,7 +25,7 @@ from mor_bench.surrogates.coordinate_regression import (
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mean_of_leaves(features, thresholds, children, roots, values, z):  # type: ignore[no-untyped-def]
-    """Return the mean over the trees of the leaf values of z (n, n_inputs) float32."""
+    """Return the leaf values at z (n, n_inputs) float32, averaged over the trees."""
     out = np.empty((len(z), values.shape[1]))
     for i in range(len(z)):
         row, answer = z[i], out[i]
