@@ -107,7 +107,7 @@ class Surrogate:
         raise MorBenchError(f"{type(self).__name__} has neither `answer` nor `predict`.")
 
     def answer_observed(self, observed: ObservedDisplacements) -> Array:
-        """Answer displacements of the observed nodes instead of forces; they are zero elsewhere."""
+        """Return the same as `answer`, from displacements of the observed nodes, zero elsewhere."""
         raise UnsupportedSceneError(f"{type(self).__name__} cannot be used: {NO_FORCES}.")
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:

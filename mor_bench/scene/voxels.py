@@ -14,7 +14,7 @@ from mor_bench.scene.surfaces import Surface, inside
 from mor_bench.scene.triangles import met_cells
 
 TOUCHED = 1e-10
-"""Depth of a mere contact between a surface and a cell, in half edges of the cell.
+"""Largest depth of a mere contact between a surface and a cell, in half edges of the cell.
 
 It is well above round-off, and a tenth of the tolerance of `interpolation_matrix`.
 """

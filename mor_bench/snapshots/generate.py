@@ -94,7 +94,7 @@ class _Plan:
         return range(-(-self.n_wanted // SHARD_SIZE))
 
     def n_wanted_of(self, number: int) -> int:
-        """Return the number of wanted samples of a shard; it may hold more than a limit."""
+        """Return the number of wanted samples of a shard; the shard may hold more."""
         return min(SHARD_SIZE, self.n_wanted - number * SHARD_SIZE)
 
     def loads(self, number: int) -> PatchLoads:
@@ -113,7 +113,7 @@ class _Plan:
         return Task(self.key, self._problem, number * SHARD_SIZE, self.loads(number))
 
     def has(self, number: int) -> bool:
-        """Return whether the right shard exists undamaged; warn if it exists but is not."""
+        """Return whether the right shard exists; warn if an existing one is damaged or wrong."""
         path = shard_path(self.folder, number)
         try:
             shard = read_shard(path)
@@ -237,7 +237,7 @@ def _prepare_folder(plan: _Plan, spec: DatasetSpec) -> list[int]:
 def _owner(folder: Path, spec: DatasetSpec) -> DatasetSpec:
     """Return the specification for a folder's manifest.
 
-    If the folder is named after another dataset with the same samples, return that dataset's.
+    If the folder is named after another dataset with the same samples, it is that dataset's.
     """
     if folder.name != f"{spec.name}-{dataset_key(spec)}":
         with suppress(StoreError, FileNotFoundError):

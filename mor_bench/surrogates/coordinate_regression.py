@@ -188,7 +188,7 @@ class CoordinateRegression(Surrogate, ABC):
         return self.answer(observed.values)
 
     def _to_coordinates(self, axes: Array) -> Array:
-        """Return the matrix (n_dofs, n_inputs) that maps a load f to z = fᵀ times the matrix."""
+        """Return the matrix A (n_dofs, n_inputs) with z = fᵀA for a load f."""
         if self.input == "linear-response":
             return self.response_.to_coordinates(axes)
         return self._on_all_dofs(axes)

@@ -31,8 +31,8 @@ WORSE = 1.0
 at rest."""
 
 NEAR, SURE = 0.5, 0.7
-"""Largest correction, as a fraction of the answer, and smallest det F at the cells' centres for
-which det F is not checked at every quadrature point."""
+"""Limits for skipping the check of det F at all quadrature points: largest correction, as a
+fraction of the answer, and smallest det F at the cells' centres."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
