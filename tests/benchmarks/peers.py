@@ -49,20 +49,23 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
 import typer
 from numpy.typing import NDArray
+from pydantic import Field
 from rich.console import Console
 from rich.table import Table
 from scipy.sparse.linalg import spsolve
 
 import mor_bench
+from mor_bench.cli.option_groups import with_options
 from mor_bench.machine import describe_machine
 from mor_bench.mechanics.model import SOLVERS, FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.options import CommandLine, Options
 from mor_bench.scene.materials import SaintVenantKirchhoff
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.sampling import draw_loads
@@ -226,15 +229,7 @@ class Felupe(Contender):
         self._size = float(np.linalg.norm(forces.ravel()[self._free]))
 
     def _check(
-        self,
-        dx: Array,
-        x: Any,
-        f: Array,
-        xtol: float,
-        ftol: float,
-        dof1: Any,
-        dof0: Any,
-        items: Any,
+        self, *, dx: Array, f: Array, ftol: float, dof1: Any, **_: Any
     ) -> tuple[float, float, bool]:
         residual = float(np.linalg.norm(f[dof1])) / self._size
         return float(np.linalg.norm(dx)), residual, residual <= ftol
@@ -454,9 +449,33 @@ class Row:
     residuals: list[float] = field(default_factory=list)
     differences: list[float] = field(default_factory=list)
 
+    residual_name: ClassVar[str] = "relative residual"
+
     @property
     def medians_ms(self) -> Array:
         return np.median(self.times_ms, axis=1)
+
+    @property
+    def shown_steps(self) -> str:
+        """The fewest and the most steps."""
+        return "-".join(map(str, sorted({min(self.steps), max(self.steps)})))
+
+    def check(self, residual: float, u: Array, expected: Array) -> None:
+        """Record the residual of an answer and its difference from the expected one.
+
+        Raises
+        ------
+        DisagreementError
+            If one of them is above its tolerance.
+        """
+        self.residuals.append(residual)
+        self.differences.append(float(np.linalg.norm(u - expected) / np.linalg.norm(expected)))
+        if not (residual <= MAX_RESIDUAL and self.differences[-1] <= MAX_DIFFERENCE):
+            raise DisagreementError(
+                f"{self.name} solves another problem: its {self.residual_name} is "
+                f"{residual:.2g} (allowed: {TOLERANCE:g}), its displacement differs by "
+                f"{self.differences[-1]:.2g} (allowed: {MAX_DIFFERENCE:g})."
+            )
 
 
 def timed(contender: Contender, forces: Array) -> tuple[float, int]:
@@ -510,22 +529,8 @@ def compare(scene: Scene, forces: Array, contenders: Sequence[Contender], rounds
                 if turn == 0:
                     row.steps.append(steps)
                     u = contender.displacement().ravel()[free]
-                    row.residuals.append(
-                        float(
-                            np.linalg.norm(target - model.force(u).force) / np.linalg.norm(target)
-                        )
-                    )
-                    row.differences.append(
-                        float(np.linalg.norm(u - reference) / np.linalg.norm(reference))
-                    )
-                    if not (
-                        row.residuals[-1] <= MAX_RESIDUAL and row.differences[-1] <= MAX_DIFFERENCE
-                    ):
-                        raise DisagreementError(
-                            f"{row.name} solves another problem: its relative residual is "
-                            f"{row.residuals[-1]:.2g} (allowed: {TOLERANCE:g}), its displacement "
-                            f"differs by {row.differences[-1]:.2g} (allowed: {MAX_DIFFERENCE:g})."
-                        )
+                    residual = np.linalg.norm(target - model.force(u).force)
+                    row.check(float(residual / np.linalg.norm(target)), u, reference)
     return rows
 
 
@@ -541,13 +546,12 @@ def print_rows(console: Console, rows: Sequence[Row]) -> None:
         for column in columns:
             table.add_column(column, justify="right")
     for row in rows:
-        steps = "-".join(map(str, sorted({min(row.steps), max(row.steps)})))
         checks = (f"{max(row.residuals):.1e}", f"{max(row.differences):.1e}")
         times.add_row(
             row.name,
             f"{np.median(row.medians_ms):.2f}",
             f"{np.min(row.times_ms):.2f}",
-            steps,
+            row.shown_steps,
             *checks,
         )
         ratio = row.medians_ms / rows[0].medians_ms
@@ -568,6 +572,73 @@ def pin_threads(module: str, threads: int) -> None:
         )
 
 
+class TimingOptions(Options):
+    """Options of the comparisons with other codes."""
+
+    loads: Annotated[int, Field(ge=1, description="Loads of each dataset.")] = 5
+    rounds: Annotated[int, Field(ge=1, description="Solves of each load.")] = 3
+    threads: Annotated[int, Field(ge=1, description="Threads of every contender.")] = 1
+    report: Annotated[
+        Path | None,
+        Field(description="Also write everything to this file."),
+        CommandLine("--json", metavar="FILE"),
+    ] = None
+
+    def write(self, content: dict[str, Any]) -> None:
+        """Write the report, if it is wanted."""
+        if self.report is not None:
+            whole = {"machine": describe_machine(), "threads": self.threads, **content}
+            self.report.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+
+
+@contextmanager
+def ends_at_disagreement(console: Console) -> Iterator[None]:
+    """Say why there is no comparison, and exit, if a contender solves another problem."""
+    try:
+        yield
+    except DisagreementError as error:
+        console.print(f"no comparison: {error}", style="red", markup=False)
+        raise typer.Exit(1) from None
+
+
+def installed_entries(console: Console, solvers: Sequence[str]) -> list[Entry]:
+    """Return our solvers with these names, and the installed peers; say which are skipped."""
+    unknown = set(solvers) - set(SOLVERS)
+    if unknown:
+        raise typer.BadParameter(
+            f"--solver must be one of {', '.join(SOLVERS)}; got {', '.join(sorted(unknown))}."
+        )
+    entries = [*(own_entry(name) for name in SOLVERS if name in solvers), *PEERS]
+    for entry in entries:
+        if entry.missing:
+            console.print(
+                f"{entry.label}: skipped, not installed: pip install {' '.join(entry.missing)}",
+                markup=False,
+            )
+    return [entry for entry in entries if not entry.missing]
+
+
+def compare_on(
+    name: str, entries: Sequence[Entry], options: TimingOptions, console: Console
+) -> dict[str, Any]:
+    """Compare on one dataset, print the tables, and return their content."""
+    scene = mor_bench.load_scene(name)
+    samples, forces = pick_loads(scene, options.loads)
+    norms = [float(np.linalg.norm(load.ravel()[scene.free_dofs])) for load in forces]
+    console.rule(
+        f"{name}: {scene.mesh.n_cells} cells, {len(scene.free_dofs)} unknowns, "
+        f"{options.threads} thread(s)"
+    )
+    sizes = zip(samples, norms, strict=True)
+    shown = ", ".join(f"sample {i} |f| = {norm:.3g} N" for i, norm in sizes)
+    console.print(f"Loads: {shown}", highlight=False)
+    with ends_at_disagreement(console):
+        rows = compare(scene, forces, [entry.make(scene) for entry in entries], options.rounds)
+    print_rows(console, rows)
+    return {"samples": samples, "load_norms_n": norms, "contenders": [vars(row) for row in rows]}
+
+
+@with_options
 def main(
     dataset: Annotated[
         list[str] | None,
@@ -575,63 +646,19 @@ def main(
             help="Repeat for more; by default beam-coarse and beam-fine.", show_default=False
         ),
     ] = None,
-    loads: Annotated[int, typer.Option(min=1, help="Loads of each dataset.")] = 5,
-    rounds: Annotated[int, typer.Option(min=1, help="Solves of each load.")] = 3,
-    threads: Annotated[int, typer.Option(min=1, help="Threads of every contender.")] = 1,
     solver: Annotated[
         list[str] | None,
         typer.Option(help=f"Our solvers; by default {', '.join(OWN_SOLVERS)}.", show_default=False),
     ] = None,
-    as_json: Annotated[
-        Path | None, typer.Option("--json", help="Also write everything to this file.")
-    ] = None,
+    *,
+    options: TimingOptions,
 ) -> None:
     """Time the full-order model beside other finite-element codes."""
-    pin_threads("tests.benchmarks.peers", threads)
+    pin_threads("tests.benchmarks.peers", options.threads)
     console = Console()
-    unknown = set(solver or ()) - set(SOLVERS)
-    if unknown:
-        raise typer.BadParameter(
-            f"--solver must be one of {', '.join(SOLVERS)}; got {', '.join(sorted(unknown))}."
-        )
-    entries = [*(own_entry(name) for name in SOLVERS if name in (solver or OWN_SOLVERS)), *PEERS]
-    for entry in entries:
-        if entry.missing:
-            console.print(
-                f"{entry.label}: skipped, not installed: pip install {' '.join(entry.missing)}",
-                markup=False,
-            )
-    report: dict[str, Any] = {"machine": describe_machine(), "threads": threads, "datasets": {}}
-    for name in dataset or ("beam-coarse", "beam-fine"):
-        scene = mor_bench.load_scene(name)
-        samples, forces = pick_loads(scene, loads)
-        norms = [float(np.linalg.norm(load.ravel()[scene.free_dofs])) for load in forces]
-        console.rule(
-            f"{name}: {scene.mesh.n_cells} cells, {len(scene.free_dofs)} unknowns, "
-            f"{threads} thread(s)"
-        )
-        console.print(
-            "Loads: "
-            + ", ".join(
-                f"sample {i} |f| = {norm:.3g} N" for i, norm in zip(samples, norms, strict=True)
-            ),
-            highlight=False,
-        )
-        try:
-            rows = compare(
-                scene, forces, [entry.make(scene) for entry in entries if not entry.missing], rounds
-            )
-        except DisagreementError as error:
-            console.print(f"no comparison: {error}", style="red", markup=False)
-            raise typer.Exit(1) from None
-        print_rows(console, rows)
-        report["datasets"][name] = {
-            "samples": samples,
-            "load_norms_n": norms,
-            "contenders": [vars(row) for row in rows],
-        }
-    if as_json:
-        as_json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    entries = installed_entries(console, solver or OWN_SOLVERS)
+    names = dataset or ["beam-coarse", "beam-fine"]
+    options.write({"datasets": {n: compare_on(n, entries, options, console) for n in names}})
 
 
 if __name__ == "__main__":

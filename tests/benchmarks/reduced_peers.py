@@ -57,8 +57,7 @@ from copy import copy
 from dataclasses import dataclass, field
 from importlib import import_module
 from io import StringIO
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import typer
@@ -66,9 +65,9 @@ from rich.console import Console
 from rich.table import Table
 
 import mor_bench
+from mor_bench.cli.option_groups import with_options
 from mor_bench.counting import counted
 from mor_bench.errors import MissingDependencyError, UnsupportedSceneError
-from mor_bench.machine import describe_machine
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.cubature import ecsw_system
@@ -80,12 +79,14 @@ from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.pod import PODGalerkin
 from tests.benchmarks.peers import (
     KRATOS,
-    MAX_DIFFERENCE,
     MAX_STEPS,
     TOLERANCE,
     Array,
     Contender,
     DisagreementError,
+    Row,
+    TimingOptions,
+    ends_at_disagreement,
     installed,
     kratos_modules,
     kratos_newton,
@@ -101,7 +102,6 @@ SAME_AS_POD = ("pod-tensor",)
 """Methods that solve the equations of `pod` in another way."""
 BUILDERS = {"global": "GlobalROMBuilderAndSolver", "elemental": "ROMBuilderAndSolver"}
 UNKNOWNS = ["DISPLACEMENT_X", "DISPLACEMENT_Y", "DISPLACEMENT_Z"]
-MAX_RESIDUAL = 1.01 * TOLERANCE
 TURN_MS = 10.0
 """A contender that is faster than this solves several times in its turn."""
 
@@ -359,21 +359,14 @@ def make_contenders(
 
 
 @dataclass
-class Row:
+class ReducedRow(Row):
     """What one contender did, for each load."""
 
-    name: str
-    n_cells: int | None
-    times_ms: list[list[float]] = field(default_factory=list)
-    steps: list[int] = field(default_factory=list)
-    residuals: list[float] = field(default_factory=list)
-    differences: list[float] = field(default_factory=list)
+    n_cells: int | None = None
     errors_m: list[float] = field(default_factory=list)
     relative_l2: list[float] = field(default_factory=list)
 
-    @property
-    def medians_ms(self) -> Array:
-        return np.median(self.times_ms, axis=1)
+    residual_name: ClassVar[str] = "relative reduced residual"
 
     @property
     def best_ms(self) -> Array:
@@ -382,7 +375,7 @@ class Row:
 
 def compare(
     forces: Array, references: Array, contenders: Sequence[Reduced], rounds: int
-) -> list[Row]:
+) -> list[ReducedRow]:
     """Time the contenders and check what they answer.
 
     Parameters
@@ -397,7 +390,7 @@ def compare(
 
     Returns
     -------
-    list of Row
+    list of ReducedRow
         In the order of the contenders. `residuals` and `differences` are those with the equations
         and the answers of their twins, where there is one; `errors_m` are means over the nodes of
         the Euclidean error.
@@ -407,7 +400,7 @@ def compare(
     DisagreementError
         If an answer is not that of its twin, or leaves a reduced residual above the tolerance.
     """
-    rows = [Row(contender.name, contender.n_cells) for contender in contenders]
+    rows = [ReducedRow(contender.name, n_cells=contender.n_cells) for contender in contenders]
     for load, reference in zip(forces, references, strict=True):
         for contender, row in zip(contenders, rows, strict=True):
             contender.set_up(load)
@@ -419,7 +412,8 @@ def compare(
                 row.times_ms[-1].append(time_ms)
                 u = contender.displacement()
                 if contender.twin is not None:
-                    _check(row, contender.twin, u, load)
+                    residual = reduced_residual(contender.twin, u, load)
+                    row.check(residual, u, contender.twin.predict(load))
                 if turn == 0:
                     row.steps.append(steps)
                     row.errors_m.append(float(np.linalg.norm(u - reference, axis=1).mean()))
@@ -439,19 +433,7 @@ def _turn(contender: Reduced, load: Array) -> tuple[float, int]:
     ), steps
 
 
-def _check(row: Row, twin: Twin, u: Array, load: Array) -> None:
-    expected = twin.predict(load)
-    row.residuals.append(reduced_residual(twin, u, load))
-    row.differences.append(float(np.linalg.norm(u - expected) / np.linalg.norm(expected)))
-    if not (row.residuals[-1] <= MAX_RESIDUAL and row.differences[-1] <= MAX_DIFFERENCE):
-        raise DisagreementError(
-            f"{row.name} solves another problem: its relative reduced residual is "
-            f"{row.residuals[-1]:.2g} (allowed: {TOLERANCE:g}), its displacement differs by "
-            f"{row.differences[-1]:.2g} (allowed: {MAX_DIFFERENCE:g})."
-        )
-
-
-def speed_ups(rows: Sequence[Row]) -> Array | None:
+def speed_ups(rows: Sequence[ReducedRow]) -> Array | None:
     """Return speed-ups (n_rows, n_loads) over the faster POD of Kratos; None without Kratos."""
     pods = [row.best_ms for row in rows if row.name.startswith("Kratos POD")]
     if not pods:
@@ -463,7 +445,7 @@ def _digits(value: float) -> str:
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
-def print_rows(console: Console, rows: Sequence[Row], n_modes: int) -> None:
+def print_rows(console: Console, rows: Sequence[ReducedRow], n_modes: int) -> None:
     """Times, checks and errors, the slowest first."""
     times = Table(title=f"r = {n_modes}: from nodal forces to all nodal displacements")
     errors = Table(title=f"r = {n_modes}: checks, largest, and errors against the full order")
@@ -479,7 +461,7 @@ def print_rows(console: Console, rows: Sequence[Row], n_modes: int) -> None:
         times.add_row(
             row.name,
             "" if row.n_cells is None else str(row.n_cells),
-            "-".join(map(str, sorted({min(row.steps), max(row.steps)}))),
+            row.shown_steps,
             _digits(float(np.median(row.medians_ms))),
             _digits(float(np.min(row.times_ms))),
             "" if faster is None else _digits(float(np.median(faster[i]))),
@@ -493,6 +475,7 @@ def print_rows(console: Console, rows: Sequence[Row], n_modes: int) -> None:
     console.print(times, errors)
 
 
+@with_options
 def main(
     dataset: Annotated[str, typer.Option(help="Name, or path of a TOML.")] = "beam-fine",
     modes: Annotated[
@@ -500,41 +483,32 @@ def main(
         typer.Option(min=1, help="Repeat for more; by default 3, 10 and 20.", show_default=False),
     ] = None,
     train: Annotated[int, typer.Option(min=1, help="Training snapshots.")] = 300,
-    loads: Annotated[int, typer.Option(min=1, help="Test loads.")] = 5,
-    rounds: Annotated[int, typer.Option(min=1, help="Solves of each load.")] = 3,
-    threads: Annotated[int, typer.Option(min=1, help="Threads of every contender.")] = 1,
     method: Annotated[
         list[str] | None,
         typer.Option(help=f"Our methods; by default {', '.join(METHODS)}.", show_default=False),
     ] = None,
-    as_json: Annotated[
-        Path | None, typer.Option("--json", help="Also write everything to this file.")
-    ] = None,
+    *,
+    options: TimingOptions,
 ) -> None:
     """Time reduced-order models beside those of Kratos."""
-    pin_threads("tests.benchmarks.reduced_peers", threads)
+    pin_threads("tests.benchmarks.reduced_peers", options.threads)
     console = Console()
     data = mor_bench.load_dataset(dataset, limit=2 * train)
-    if len(data.train) < train or len(data.test) < loads:
+    if len(data.train) < train or len(data.test) < options.loads:
         raise typer.BadParameter(
             f"the first {2 * train} samples of {dataset} are {len(data.train)} for training and "
             f"{len(data.test)} for tests; "
-            f"--train and --loads ask for {train} and {loads}."
+            f"--train and --loads ask for {train} and {options.loads}."
         )
     scene, snapshots = data.scene, data.train[:train]
-    chosen = np.linspace(0, len(data.test) - 1, loads).astype(int)
+    chosen = np.linspace(0, len(data.test) - 1, options.loads).astype(int)
     forces, references = data.test[chosen].forces, data.test[chosen].displacements
     console.rule(
         f"{dataset}: {scene.mesh.n_cells} cells, {len(scene.free_dofs)} unknowns, "
-        f"{train} training snapshots, {threads} thread(s)"
+        f"{train} training snapshots, {options.threads} thread(s)"
     )
-    report: dict[str, Any] = {
-        "machine": describe_machine(),
-        "threads": threads,
-        "dataset": dataset,
-        "train": train,
-    }
-    report |= {"test_samples": chosen.tolist(), "modes": {}}
+    report: dict[str, Any] = {"dataset": dataset, "train": train, "modes": {}}
+    report["test_samples"] = chosen.tolist()
     said: set[str] = set()
 
     def say(line: str) -> None:
@@ -543,16 +517,12 @@ def main(
         said.add(line)
 
     for n_modes in modes or (3, 10, 20):
-        try:
+        with ends_at_disagreement(console):
             contenders = make_contenders(scene, snapshots, n_modes, method or METHODS, say)
-            rows = compare(forces, references, contenders, rounds)
-        except DisagreementError as error:
-            console.print(f"no comparison: {error}", style="red", markup=False)
-            raise typer.Exit(1) from None
+            rows = compare(forces, references, contenders, options.rounds)
         print_rows(console, rows, n_modes)
         report["modes"][n_modes] = [vars(row) for row in rows]
-    if as_json:
-        as_json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    options.write(report)
 
 
 if __name__ == "__main__":
