@@ -108,9 +108,7 @@ POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 OPEN = POINTS + "f 1 3 2\nf 1 2 4\nf 2 3 4\n"
 CLOSED = OPEN + "f 1 4 3\n"
 NOT_CLOSED = r"the surface is not closed: 3 of its 6 edges are not shared by exactly two"
-TWISTED = (
-    r"the triangles are not consistently oriented: the orientation flips across 3 of 6 edges\.$"
-)
+TWISTED = r"are not consistently oriented: the orientation flips across 3 of 6 edges\.$"
 
 
 @pytest.mark.parametrize(
