@@ -30,7 +30,7 @@ N_COORDINATES = 12
 """Number of principal coordinates of the linear response in which loads are compared."""
 
 OVERLAP = 0.5
-"""Nearest samples of other clusters in the training of a basis, as a fraction of its own."""
+"""Number of near samples of other clusters that also train a basis, relative to its own."""
 
 N_WATCHED = 300
 """Samples of a cluster that decide where det F is monitored."""

@@ -96,5 +96,5 @@ class TensorPOD(Surrogate):
 
     @cached_property
     def _plain(self) -> GalerkinProblem:
-        """The same equations over the mesh."""
+        """Plain POD: the same equations, integrated over the mesh."""
         return GalerkinProblem(FullOrderModel(self.scene_).assembler, self.modes_)

@@ -34,8 +34,7 @@ DECADES = (0.5, 1.0, 1.5, 2.0, 3.0)
 """Tried costs of a factor, added to the size of its coordinate: small ones favour high degrees."""
 
 HELD_OUT = 5
-"""Inverse fraction of the training samples, chosen at random, that are held out to choose the
-terms."""
+"""One in this many training samples, chosen at random, is held out to choose the terms."""
 
 DERIVATIVE_WEIGHT = 0.1
 """Weight of the squared error of the derivatives relative to that of the values."""
