@@ -3,6 +3,7 @@
 Run ``python -m tests.verification.planted_bugs``, with ``--workers 2`` for two at once. It reads
 `planted_bugs.toml`, writes `planted_bugs.json` and `PLANTED_BUGS.md` beside this file, and fails if
 a bug goes unnoticed. Only the quick tests of this folder run, unless a bug says ``slow = true``.
+``--again`` takes a fraction of the time: it runs the recorded tests until one notices the bug.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import sys
 import tempfile
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -41,8 +42,22 @@ SELECTIONS = {
 }
 """Expressions of pytest's -k; compiling and a few tests take most of the time."""
 
-Caught = dict[str, list[str]]
-"""Bug → `file::function` of the tests that notice it."""
+
+@dataclass(frozen=True)
+class Record:
+    """Tests that notice a bug, as `file::function`."""
+
+    tests: list[str]
+    again: str = ""
+    """The one that noticed it once more, after the run that recorded all; empty if none ran."""
+
+    @classmethod
+    def read(cls) -> dict[str, Record]:
+        """Return the record of every bug by its name."""
+        if not RECORD.exists():
+            return {}
+        content = json.loads(RECORD.read_text(encoding="utf-8"))
+        return {bug: cls(**entry) for bug, entry in content.items()}
 
 
 @dataclass(frozen=True)
@@ -88,9 +103,12 @@ BUGS = _read_bugs()
 
 
 def run(
-    tree: Path, tests: str, slow: bool = False, limit_s: float = LIMIT_S
+    tree: Path, tests: str | list[str], slow: bool = False, limit_s: float = LIMIT_S
 ) -> tuple[list[str], bool]:
-    """Return the failing test functions of a copy, in order, and whether any test ran."""
+    """Return the failing test functions of a copy, in order, and whether any test ran.
+
+    Tests are an expression of pytest's -k, or test functions that run until one fails.
+    """
     environment = os.environ | {
         "NUMBA_CACHE_DIR": str(tree / ".numba"),
         "PYTHONDONTWRITEBYTECODE": "1",
@@ -98,8 +116,11 @@ def run(
         "PYTHONPATH": str(tree),
         "OMP_NUM_THREADS": "1",
     }
-    command = [sys.executable, "-m", "pytest", str(FOLDER), "-v", "--tb=no", "-k", tests]
-    command += ["-p", "no:cacheprovider", "--ignore", str(FOLDER / "test_planted_bugs.py")]
+    command = [sys.executable, "-m", "pytest", "-v", "--tb=no", "-p", "no:cacheprovider"]
+    if isinstance(tests, str):
+        command += [str(FOLDER), "-k", tests, "--ignore", str(FOLDER / "test_planted_bugs.py")]
+    else:
+        command += ["-x", *(f"{FOLDER}/{test}" for test in tests)]
     command += ["-m", ""] if slow else []
     try:
         output = subprocess.run(
@@ -121,14 +142,16 @@ def prepare(tree: Path) -> list[str]:
     return failed if ran else ["no test ran"]
 
 
-def plant(bug: Bug, tree: Path) -> list[str]:
+def plant(bug: Bug, tree: Path, tests: list[str]) -> list[str]:
     """Return the tests that notice a bug in a copy, and restore the copy.
+
+    Where tests are given, they run until one notices it, instead of the bug's own selection.
 
     Numba finds compiled kernels by the path and content of the source, so the copy is reused.
     """
     before, planted = bug.sources(tree)
     (tree / bug.file).write_text(planted, encoding="utf-8")
-    failed, _ = run(tree, bug.selection, bug.slow)
+    failed, _ = run(tree, tests or bug.selection, bug.slow)
     (tree / bug.file).write_text(before, encoding="utf-8")
     shutil.rmtree(tree / ".numba")
     shutil.copytree(tree / ".numba-clean", tree / ".numba")
@@ -136,8 +159,13 @@ def plant(bug: Bug, tree: Path) -> list[str]:
     return failed
 
 
-def plant_all(bugs: list[Bug], workers: int) -> Caught | None:
-    """Plant each bug in one of several copies; None if tests fail without a bug."""
+def plant_all(
+    bugs: list[Bug], workers: int, known: dict[str, Record]
+) -> dict[str, list[str]] | None:
+    """Return the tests that notice each bug in a copy; None if tests fail without a bug.
+
+    The known tests of a bug run until one notices it; a bug without any has its own selection.
+    """
     with (
         tempfile.TemporaryDirectory(prefix="planted-") as folder,
         ThreadPoolExecutor(workers) as pool,
@@ -154,7 +182,7 @@ def plant_all(bugs: list[Bug], workers: int) -> Caught | None:
         def plant_somewhere(bug: Bug) -> list[str]:
             tree = free.get()
             try:
-                return plant(bug, tree)
+                return plant(bug, tree, known[bug.name].tests if bug.name in known else [])
             finally:
                 free.put(tree)
 
@@ -162,8 +190,10 @@ def plant_all(bugs: list[Bug], workers: int) -> Caught | None:
         return dict(zip([bug.name for bug in bugs], noticed, strict=True))
 
 
-def write_table(caught: Caught) -> None:
-    """Write the table for readers."""
+def write(records: dict[str, Record]) -> None:
+    """Write the record and the table for readers."""
+    content = {name: asdict(record) for name, record in records.items()}
+    RECORD.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     lines = [
         "# Planted bugs",
         "",
@@ -171,15 +201,25 @@ def write_table(caught: Caught) -> None:
         "notices it first names the broken law. All tests per bug are in `planted_bugs.json`.",
         "Both are written by `python -m tests.verification.planted_bugs`.",
         "",
-        "| bug | file | broken law | tests |",
-        "|---|---|---|---|",
+        "*Again* names the test that noticed the bug once more in a later and shorter run, of the",
+        "recorded tests until one fails (`--again`). The column *tests* is then older; it counts",
+        "only tests that still exist. Tests belong to the quick suite unless marked slow.",
+        "",
+        "| bug | file | broken law | tests | again |",
+        "|---|---|---|---|---|",
     ]
     for bug in BUGS:
-        tests = caught.get(bug.name, [])
-        law = tests[0].split("::test_")[1].replace("_", " ") if tests else "**unnoticed**"
+        record = records[bug.name]
+        law = _law(record.tests[0]) if record.tests else "**unnoticed**"
+        again = _law(record.again) if record.again else "not run"
+        again += ", slow" * (bug.slow and bool(record.again))
         file = bug.file.removeprefix("mor_bench/")
-        lines.append(f"| {bug.name} | `{file}` | {law} | {len(tests)} |")
+        lines.append(f"| {bug.name} | `{file}` | {law} | {len(record.tests)} | {again} |")
     TABLE.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _law(test: str) -> str:
+    return test.split("::test_")[1].replace("_", " ")
 
 
 def main() -> int:
@@ -191,19 +231,28 @@ def main() -> int:
         default=[],
         help="plant only bugs whose name contains one of these texts; keep the record of others",
     )
+    parser.add_argument(
+        "--again",
+        action="store_true",
+        help="run only the tests on record, until one notices the bug; keep the record of others",
+    )
     arguments = parser.parse_args()
     wanted = arguments.only or [""]
     bugs = [bug for bug in BUGS if any(text in bug.name for text in wanted)]
     for bug in bugs:
         bug.sources()
-    found = plant_all(bugs, arguments.workers)
+    known = Record.read()
+    found = plant_all(bugs, arguments.workers, known if arguments.again else {})
     if found is None:
         return 1
-    known: Caught = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
-    caught = {bug.name: found.get(bug.name, known.get(bug.name, [])) for bug in BUGS}
-    RECORD.write_text(json.dumps(caught, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    write_table(caught)
-    unnoticed = [name for name, tests in caught.items() if not tests]
+    records = {bug.name: known.get(bug.name, Record([])) for bug in BUGS}
+    for name, tests in found.items():
+        if arguments.again and tests:
+            records[name] = Record(records[name].tests or tests, tests[0])
+        else:
+            records[name] = Record(tests)
+    write(records)
+    unnoticed = [name for name, record in records.items() if not record.tests]
     for name in unnoticed:
         print(f"unnoticed: {name}")
     return int(bool(unnoticed))
