@@ -58,7 +58,7 @@ class CommandLine:
 
 Cluster = Annotated[
     str | None,
-    Field(description="Dask scheduler whose workers generate samples and fit: tcp://host:port."),
+    Field(description="Dask scheduler, tcp://host:port; its workers generate samples and fit."),
     CommandLine(metavar="ADDRESS"),
 ]
 
@@ -123,7 +123,7 @@ class TrainOptions(DataOptions):
     split: Annotated[
         SplitBy | None,
         Field(description="Property that separates test samples from training samples."),
-        CommandLine(default="as the dataset says"),
+        CommandLine(default="the dataset's split"),
     ] = None
     device: Annotated[
         Device,
@@ -133,7 +133,7 @@ class TrainOptions(DataOptions):
         float | None,
         Field(
             gt=0,
-            description="Train for about this many seconds, not for a fixed number of iterations.",
+            description="Train for about this many seconds instead of a number of iterations.",
         ),
         CommandLine(metavar="SECONDS"),
     ] = None
@@ -147,7 +147,7 @@ class FitOptions(TrainOptions):
         Field(
             ge=1,
             le=CORES,
-            description="Threads of the fit; another number may change the last bits.",
+            description="Number of threads for the fit; another number may change the last digits.",
         ),
         CommandLine(metavar="N", default="all cores"),
     ] = None
@@ -158,7 +158,7 @@ class FitOptions(TrainOptions):
     ] = None
     start_from: Annotated[
         Path | None,
-        Field(description="Model of the same method whose weights initialise the training."),
+        Field(description="Model of the same method; the training starts from its weights."),
         CommandLine(metavar="FILE"),
     ] = None
 
@@ -172,35 +172,48 @@ class RunOptions(TrainOptions):
     ] = "quick"
     threads: Annotated[
         int,
-        Field(ge=1, le=CORES, description="Threads of a prediction; fitting uses all cores."),
+        Field(
+            ge=1, le=CORES, description="Number of threads for a prediction; fits use all cores."
+        ),
         CommandLine(metavar="N"),
     ] = 1
     jobs: Annotated[
         int,
-        Field(ge=1, le=CORES, description="Number of fits at once, which share the cores."),
+        Field(ge=1, le=CORES, description="Number of fits at the same time; they share the cores."),
         CommandLine(metavar="N"),
     ] = 1
     cluster: Cluster = None
     test_seed: Annotated[
         Literal["fresh"] | Annotated[int, Field(ge=0)] | None,
         Field(
-            description="Also score on a test set drawn after all fits, by this seed or a new one."
+            description=(
+                "Also score on a test set that is drawn after all fits, with this seed or a "
+                "fresh one."
+            )
         ),
         CommandLine(metavar="N|fresh"),
     ] = None
     seeds: Annotated[
         int | None,
-        Field(ge=1, le=100, description="Trainings of each configuration that has a seed."),
+        Field(
+            ge=1,
+            le=100,
+            description=(
+                "Number of trainings, each with its own seed, for configurations that have a seed."
+            ),
+        ),
         CommandLine(metavar="N", default="1; full: 3"),
     ] = None
     time_limit_s: Annotated[
         float | None,
-        Field(gt=0, description="Total fitting time per method and dataset."),
+        Field(
+            gt=0, description="Limit of the total fitting time per method and dataset, in seconds."
+        ),
         CommandLine("--time-limit", metavar="SECONDS", default="1200; full: 1800"),
     ] = None
     memory_limit_bytes: Annotated[
         float | None,
-        Field(ge=1e8, description="Memory limit of a method's process."),
+        Field(ge=1e8, description="Memory limit of a method's process, in GB."),
         CommandLine("--memory-limit", metavar="GB", default="3/4 of the memory", scale=1e9),
     ] = None
     retime: Annotated[

@@ -333,7 +333,7 @@ def test_the_measured_error_arrives_in_every_row_and_page(cache: Path, tmp_path:
     assert str(record["error_m"]) in (tmp_path / "out" / "results.csv").read_text()
     page = render(run)[-1].read_text(encoding="utf-8")
     assert page.count(f"<td>{record['error_m']:.1e}</td>") >= len(run.rows)
-    assert "says nothing about the real body" in page
+    assert "is not evidence about the real body" in page
 
 
 @pytest.mark.slow

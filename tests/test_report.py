@@ -211,7 +211,7 @@ def test_the_page_lists_every_configuration_once_and_nothing_unmeasured(
     table = page.split("<h3>Configurations</h3>")[1].split("</table>")[0]
     assert table.count("<tr class=") == len(comparison.rows)
     text = text_of(page)
-    for word in ("results.json", "samples/", "x-min", "2.4", "never extrapolates"):
+    for word in ("results.json", "samples/", "x-min", "2.4", "Nothing is extrapolated"):
         assert word in text
     for absent in ("Timing", "Memory and cost", "Named test sets", "Hidden test set", "Tuning"):
         assert f"<h3>{absent}" not in page
@@ -301,7 +301,7 @@ def test_the_page_has_a_section_for_all_that_was_measured(
     page = render(rich, analysis)[-1].read_text(encoding="utf-8")
     titles = re.findall("<h3>(.*?)</h3>", page)
     assert [title for title in titles if not title.startswith("Who is faster")] == [
-        "What was run",
+        "Scene and settings",
         "Configurations",
         "Failures, skips and warnings",
         "Time at error: median latency at a median relative L2 error",
@@ -327,7 +327,7 @@ def test_the_page_has_a_section_for_all_that_was_measured(
         "errors over 13 load regions, latencies over 5 processes that differ by",
         "6 of 5 (over)",
         "flagged 41.7 % of 60",
-        "Who is faster at 1 %, the error that is needed",
+        "Who is faster at 1 %, the required error",
     ):
         assert said in text
 
@@ -341,7 +341,7 @@ def test_the_console_shows_doubts_and_pairs(
     assert re.search(r"^linear-fem .*\d~ ", text, re.MULTILINE)
     assert "linear-fem: timing not stable: processes differ by 14 %" in text
     assert "pca-regression [n_input_modes=5]: the median error is" in text
-    assert "Who is faster at 1 %, the error that is needed" in text
+    assert "Who is faster at 1 %, the required error" in text
     assert re.search(r"^\(1\) fem +· +\+[\d.]+ +-[\d.]+", text, re.MULTILINE)
 
 
@@ -360,7 +360,7 @@ def test_the_matrix_of_pairs_carries_factors_and_intervals(
     matrix = next(
         table
         for table in dataset_details(rich, "beam-coarse", analysis)
-        if "1 %, the error" in table.title
+        if "1 %, the required error" in table.title
     )
     assert matrix.rows[1][1] == f"-{ratio}\n{low}–{high}"
     assert matrix.rows[0][2] == f"+{ratio}\n{low}–{high}"

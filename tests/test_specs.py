@@ -95,7 +95,7 @@ discretisation = { element = "tetrahedron", integration = "selective" } -> must 
 loads.region = { sphere_m = [[0.0, 0.0, 9.0], 0.5] } -> holds no node of the mesh
 loads.region = { sphere_m = [[2.0, 0.0, 1.0], 0.1] } -> no facet of the surface
 loads.region = { sphere_m = [[2.0, 0.0, 1.0], -0.1] } -> must be greater than 0; got -0.1.
-loads.patch_area_m2 = 1e-9 -> at least about 0. … for facets with edges of up to 0.5 m; got 1e-09
+loads.patch_area_m2 = 1e-9 -> at least about 0. … facets have edges of up to 0.5 m; got 1e-09
 loads.patch_area_m2 = 2.5 -> must be in (0, 2], the area of the load region; got 2.5.
 loads.patch_area_m2 = 0.0 -> `loads.patch_area_m2` must be greater than 0; got 0.0.
 loads.magnitude_n = [2.0, 1.0] -> `loads.magnitude_n`: the lower bound must not exceed the upper

@@ -29,7 +29,7 @@ COMMANDS = {
 
 
 class LazyCommands(TyperGroup):
-    """Subcommands whose files are imported only when they are used."""
+    """Subcommands; each file is imported only when its command is used."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(COMMANDS)

@@ -36,7 +36,9 @@ app.add_typer(export, name="export")
 @with_options
 def vtu(
     dataset: DatasetName,
-    sample: Annotated[int, typer.Option(min=0, help="Number of the sample in its part.")],
+    sample: Annotated[
+        int, typer.Option(min=0, help="Number of the sample in its part, counted from 0.")
+    ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write to.")],
     part: Annotated[str, typer.Option(help="train, test, or the name of a test set.")] = "test",
     model: Annotated[
@@ -99,7 +101,8 @@ def asv(
     out: Annotated[
         Path,
         typer.Option(
-            metavar="DIR", help="Folder of asv's results; .asv/results with our asv.conf.json."
+            metavar="DIR",
+            help="Folder of asv's results; the asv.conf.json of mor-bench uses .asv/results.",
         ),
     ],
     commit: Annotated[
@@ -111,7 +114,11 @@ def asv(
     ] = None,
     machine: Annotated[
         str | None,
-        typer.Option(help="Name of the machine that made the run. [default: this one, if it is]"),
+        typer.Option(
+            help=(
+                "Name of the machine that made the run. [default: this machine, if it made the run]"
+            )
+        ),
     ] = None,
 ) -> None:
     """Write the figures of a comparison for asv.

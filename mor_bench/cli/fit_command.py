@@ -32,7 +32,9 @@ def fit(
         typer.Option(
             "--set",
             metavar="PARAMETER=VALUE",
-            help="Hyperparameter to change; repeat for more. [default: as the method file says]",
+            help=(
+                "Hyperparameter to change; repeat for more. [default: values of the method file]"
+            ),
         ),
     ] = None,
     seed: Annotated[

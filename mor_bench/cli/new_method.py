@@ -31,7 +31,7 @@ def new_method(
         ),
     ] = Path(),
 ) -> None:
-    """Write a TOML and a Python file for a new method. Both work, and are yours to change."""
+    """Write a TOML and a Python file for a new method. Both work; change them step by step."""
     toml, source = write_method(name, folder)
     print(toml, source, sep="\n")
     tests = f"pytest -k {name}; " if source.parent != toml.parent else ""

@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 
 from mor_bench.options import CommandLine, DataOptions, Options, command_line
 
-DatasetName = Annotated[str, typer.Argument(help="Name or TOML file.")]
+DatasetName = Annotated[str, typer.Argument(help="Name or TOML file of a dataset.")]
 MethodNames = Annotated[
     list[str] | None,
     typer.Option("--method", "-m", help="Name or TOML file of a method; repeat for more."),

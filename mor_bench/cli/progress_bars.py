@@ -50,7 +50,7 @@ class _Bars:
     progress: Progress
     tasks: dict[str, TaskID] = field(default_factory=dict)
     begun: dict[str, tuple[int, float]] = field(default_factory=dict)
-    """Number done and time at the first call: earlier work is no part of the rate."""
+    """Number done and time at the first call: earlier work does not count for the rate."""
 
     printed_at: dict[str, float] = field(default_factory=dict)
 

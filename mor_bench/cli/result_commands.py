@@ -1,4 +1,4 @@
-"""`mor-bench report` and `mor-bench pick`: what a finished run says."""
+"""`mor-bench report` and `mor-bench pick`: tables and conclusions of a finished run."""
 
 from __future__ import annotations
 
@@ -26,27 +26,29 @@ class PickOptions(FolderOptions):
 
     error: Annotated[
         float | None,
-        Field(description="Largest relative l2 error, median over the test set; 0.01 is 1 %."),
+        Field(description="Upper limit of the median relative l2 error; 0.01 is 1 %."),
         CommandLine(default="the dataset's need"),
     ] = None
     latency_ms: Annotated[
         float | None,
-        Field(description="Largest median latency of one query, in ms."),
+        Field(description="Upper limit of the median latency of one query, in ms."),
         CommandLine("--latency", metavar="MS", default="the dataset's need"),
     ] = None
     memory_bytes: Annotated[
         float | None,
-        Field(description="Largest resident memory of the predicting process, in MB."),
+        Field(description="Upper limit of the resident memory of the predicting process, in MB."),
         CommandLine("--memory", metavar="MB", default="any", scale=1e6),
     ] = None
     offline_s: Annotated[
         float | None,
-        Field(description="Largest time for data (core-seconds) and fit together, in seconds."),
+        Field(
+            description="Upper limit of the offline time in seconds: data (core-seconds) plus fit."
+        ),
         CommandLine("--offline", metavar="SECONDS", default="any"),
     ] = None
     comparison: Annotated[
         Path | None,
-        Field(description="Folder of the run to take the evidence from."),
+        Field(description="Folder of the run that provides the evidence."),
         CommandLine("--run", metavar="DIR", default="the newest finished run, or a new one"),
     ] = None
 
@@ -76,7 +78,7 @@ def pick(
 ) -> None:
     """Name the cheapest configuration that meets a dataset's needs, with the evidence.
 
-    If there is none, the exit code is 1 and the output says which need to relax.
+    If there is none, the exit code is 1 and the output says how far the needs must be relaxed.
     """
     with show_progress(make_console(stderr=True)) as listener:
         chosen = mor_bench.pick(dataset, listener=listener, **options.model_dump())

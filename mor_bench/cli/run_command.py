@@ -26,7 +26,7 @@ def run(
     datasets: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Names or TOML files. [default: beam-coarse]",
+            help="Names or TOML files of datasets. [default: beam-coarse]",
             show_default=False,
         ),
     ] = None,

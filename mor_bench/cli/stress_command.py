@@ -51,7 +51,8 @@ def stress(
 ) -> None:
     """Try the hard cases on the full-order model and on methods.
 
-    The table shows the expected and the actual behaviour. Falling short is no error.
+    The table shows the expected and the actual behaviour. The exit code is 0 even if a method
+    falls short.
     """
     if out is not None and not out.resolve().parent.is_dir():
         raise InvalidInputError(f"`--out`: there is no folder {out.resolve().parent}.")

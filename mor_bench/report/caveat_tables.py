@@ -67,17 +67,18 @@ def out_of_range(entries: Sequence[Entry]) -> TextTable | None:
         )
     headings = ["configuration", "usual error (%)", "false alarms", "test", *names]
     note = (
-        "Usual error: the configuration's 95th percentile of the relative L2 error in range "
-        "(on the set named under the false alarms). False alarms: flagged loads of that set. "
-        "Each test set shows the median error, the share of flagged loads, and the recall: "
-        "the flagged share of the loads whose error is larger than usual."
+        "Usual error: the configuration's 95th percentile of the relative L2 error in "
+        "range (on the set named under the false alarms). False alarms: flagged loads of "
+        "that set. Each test set shows the median error, the share of flagged loads, and "
+        "the recall. Recall: the flagged share of the loads with errors larger than "
+        "usual."
     )
     return TextTable("Out of range", note, headings, rows) if rows else None
 
 
 def _recall_cell(found: SetErrors | FlagCounts, median: float) -> str:
     """Error, flagged share and recall on a test set, one per line."""
-    recall = "none beyond"
+    recall = "no unusual errors"
     if found.recall is not None:
         recall = f"recall {percent(found.recall)} % of {found.n_unusual}"
     flagged = percent((found.n_flagged or 0) / found.n)
@@ -108,8 +109,8 @@ def hidden_table(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> 
     headings = ["configuration", "samples", "median (%)", "p95 (%)", "max (%)"]
     headings += ["shipped: median (%)", "ratio", "verdict"]
     note = (
-        "Fresh loads of the same distribution that no author of a method has seen. "
-        "Worse: by more than the numbers of samples explain."
+        "Fresh loads of the same distribution that no author of a method has seen. Worse: "
+        "the errors differ by more than the numbers of samples explain."
     )
     return TextTable("Hidden test set", note, headings, rows) if rows else None
 
@@ -122,7 +123,7 @@ def tuning_table(dataset: str, analysis: Analysis) -> TextTable | None:
         if record["dataset"] == dataset and allowed != (None, None):
             configurations = _of(record["configurations"], allowed[0], str)
             rows.append([record["method"], configurations, _of(record["seconds"], allowed[1])])
-    note = "Configurations and fitting time of each method, out of the budget that all share."
+    note = "Configurations and fitting time of each method, out of the common tuning budget."
     headings = ["method", "configurations", "fitting (s)"]
     return TextTable("Tuning budget", note, headings, rows) if rows else None
 

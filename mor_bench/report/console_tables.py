@@ -75,7 +75,7 @@ def _pairwise_parts(
         texts = (Text(cell, style={"+": "green", "-": "red"}.get(cell[0], "dim")) for cell in line)
         table.add_row(Text(f"({i + 1}) {method}"), *texts)
     absent = f" Not reached by {', '.join(pairs.absent)}." if pairs.absent else ""
-    title = f"Who is faster at {percent(error)} %, the error that is needed"
+    title = f"Who is faster at {percent(error)} %, the required error"
     return _titled(title, table, Text(PAIRWISE_LEGEND + absent, style="dim"))
 
 
@@ -174,7 +174,7 @@ def print_discretisation(record: Mapping[str, Any], console: Console) -> None:
             console.print(Text(excluded, style="red"))
     for kind, meshes in (
         ("meshes", record["meshes"]),
-        ("left out for their size", record["left_out"]),
+        ("left out because of their size", record["left_out"]),
     ):
         shown = (f"{mesh['n_cells']:,} cells ({mesh['n_dofs']:,} dofs)" for mesh in meshes)
         if meshes:

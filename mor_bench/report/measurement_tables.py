@@ -22,7 +22,7 @@ def timing(entries: Sequence[Entry]) -> TextTable | None:
     columns["stable"] = _stable
     note = (
         "Latencies were measured in fresh processes, the configurations in turn. "
-        "Collector: mean time of garbage collection per query, which the latencies contain. "
+        "Collector: mean time of garbage collection per query, included in the latencies. "
         "Queries/s: throughput in batches of 8, 64 and 512."
     )
     return table_of("Timing", note, entries, columns)
@@ -72,14 +72,14 @@ def indicated(entries: Sequence[Entry]) -> TextTable | None:
         "5 %": figure_cell("indicator", "ratio_p5"),
         "95 %": figure_cell("indicator", "ratio_p95"),
         "rank correlation": figure_cell("indicator", "rank_correlation"),
-        "that of the residual": figure_cell("indicator", "residual_rank_correlation"),
+        "rank correlation of the residual": figure_cell("indicator", "residual_rank_correlation"),
     }
     note = (
-        "Indicated: the first correction that the full-order solve would make to a prediction, "
-        "relative to the prediction, as an estimate of its relative L2 error "
-        "(`Surrogate.indicate_error`). It costs about one iteration of that solve. "
-        "The residual relative to the load is shown for comparison. "
-        "Measured over some samples of the test set, without exact answers."
+        "Indicated: an estimate of the relative L2 error (`Surrogate.indicate_error`). It "
+        "is the first correction that the full-order solve would make, relative to the "
+        "prediction. It costs about one iteration of that solve. For comparison, the "
+        "residual relative to the load is shown. Measured on a part of the test set; "
+        "exact answers are left out."
     )
     return table_of("Indicated errors", note, entries, columns)
 
@@ -100,11 +100,11 @@ def training(entries: Sequence[Entry]) -> TextTable | None:
                     number(found.validation_loss),
                 ]
             )
-    headings = ["configuration", "device", "iterations", "asked (s)", "fit (s)"]
-    headings += ["last loss", "of validation"]
+    headings = ["configuration", "device", "iterations", "requested (s)", "fit (s)"]
+    headings += ["last loss", "validation loss"]
     note = (
-        "Asked: the seconds for which the number of iterations was chosen. "
-        "The parameter `iterations` with this number repeats the training."
+        "Requested: the seconds for which the number of iterations was chosen. The "
+        "parameter `iterations` with this number repeats the training."
     )
     return TextTable("Training", note, headings, rows) if rows else None
 
@@ -128,9 +128,9 @@ def seeds(entries: Sequence[Entry]) -> TextTable | None:
     statistics = ("median", "min–max", "st. dev.")
     named = [f"{name}: {what}" for name in ("rel. L2 (%)", "ē (m)") for what in statistics]
     note = (
-        "The same configuration trained with other seeds; all other tables show the first seed. "
-        "The figures are of the trainings' median relative L2 errors and of their ē. "
-        "A failed training has an infinite error."
+        "The same configuration trained with other seeds; all other tables show the first "
+        "seed. The figures describe the median relative L2 error and ē of these "
+        "trainings. A failed training has an infinite error."
     )
     headings = ["configuration", "trained", *named, "failed"]
     return TextTable("Training seeds", note, headings, rows) if rows else None

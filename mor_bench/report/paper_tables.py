@@ -143,8 +143,8 @@ def same_error_or_time(dataset: str, entries: Sequence[Entry]) -> list[TextTable
     return [
         _comparison(
             "Comparison at the same error",
-            f"The fastest configuration of each method with ē ≤ {error} m, "
-            f"that of {network.label}.",
+            f"The fastest configuration of each method with ē ≤ {error} m, the error of "
+            f"{network.label}.",
             _least(methods, accurate, lambda e: e.latency_ms),
             SAME_ERROR if dataset == COMPARED else {},
         ),

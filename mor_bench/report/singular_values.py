@@ -29,11 +29,11 @@ SIGMA = r"$\sigma_i\,/\,\sigma_1$"
 TAIL = r"energy tail $\sqrt{\sum_{i>r}\sigma_i^2\,/\,\sum_i\sigma_i^2}$"
 
 CAPTION = (
-    "Grey: singular values of the training snapshots over the largest. "
-    "Black: the root of the energy that r modes leave out. "
-    "It is the relative root-mean-square error of the best linear basis of r modes on the training "
-    "snapshots. On those, no method that predicts within a basis of r modes can be better. "
-    "Markers: the ranks that were tried."
+    "Grey: singular values of the training snapshots relative to the largest. Black: the "
+    "root of the energy that r modes leave out. It is the relative root-mean-square error "
+    "of the best linear basis of r modes on the training snapshots. On these snapshots, "
+    "no method with a linear basis of r modes can be more accurate. Markers: the ranks "
+    "that were tried."
 )
 
 

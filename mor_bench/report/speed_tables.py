@@ -142,7 +142,7 @@ def pairwise(comparison: Comparison, dataset: str, analysis: Analysis) -> list[T
             ]
             for method, *lines in zip(pairs.methods, pairs.cells, pairs.intervals, strict=True)
         ]
-        of_need = ", the error that is needed" if target == needed else ""
+        of_need = ", the required error" if target == needed else ""
         note = f"{PAIRWISE_LEGEND} Below: the 95 % interval of that factor."
         note += f" Not reached by {', '.join(pairs.absent)}." if pairs.absent else ""
         title = f"Who is faster at {percent(target)} %{of_need}"
@@ -206,11 +206,10 @@ def profile_note(found: Mapping[str, Any]) -> str:
     over = f"{n_datasets} datasets" if n_datasets > 1 else "one dataset"
     targets = ", ".join(f"{percent(target)} %" for target in TARGET_ERRORS)
     return (
-        f"A problem is a dataset at an error: {over} at {targets}. "
-        f"At least one method solves {len(found['problems'])} of them. "
-        f"The {found['n_unsolved']} that no method solves are left out. "
-        "Shown is the share that a method solves within a factor of the fastest method's time. "
-        "Only who is first and who solves most can be read from it. "
-        "The order of the others depends on which methods take part."
-        + (" With one dataset this says nothing about other scenes." if n_datasets == 1 else "")
-    )
+        f"A problem is a dataset at an error: {over} at {targets}. At least one method "
+        f"solves {len(found['problems'])} of them. The {found['n_unsolved']} that no "
+        "method solves are left out. Shown is the share that a method solves within a "
+        "factor of the fastest method's time. It only shows which method is fastest and "
+        "which solves the most problems. The order of the others depends on which methods "
+        "take part."
+    ) + (" With one dataset this says nothing about other scenes." if n_datasets == 1 else "")

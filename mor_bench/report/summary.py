@@ -9,7 +9,7 @@ from mor_bench.report.entries import Analysis, Entry, Needs, entries_of, needs_o
 from mor_bench.report.number_format import metres, number, percent
 from mor_bench.results.comparison import Comparison
 
-MESH_NOTE = "an error below it is an error against this mesh and says nothing about the real body"
+MESH_NOTE = "an error below it is not evidence about the real body"
 
 
 def warnings_of(entries: Sequence[Entry]) -> list[tuple[str, str]]:
@@ -55,7 +55,7 @@ def _first_of(labels: Sequence[str]) -> str:
 def interval_basis(dataset: str, analysis: Analysis) -> str:
     """Describe in a sentence the basis of a dataset's intervals; empty if there are none."""
     parts = [
-        f"Intervals hold 95 %: errors over {c['n']} {c['of']}"
+        f"95 % intervals: errors over {c['n']} {c['of']}"
         for c in analysis["clusters"]
         if c["dataset"] == dataset
     ]
@@ -124,8 +124,8 @@ def headline(comparison: Comparison, dataset: str) -> str:
         if factor > 1
     ]
     return (
-        f"No configuration meets the needs ({wanted}). "
-        f"Nearest is {nearest.label}: {_figures(nearest)}, {' and '.join(over)}."
+        f"No configuration meets the needs ({wanted}). The nearest is {nearest.label}: "
+        f"{_figures(nearest)}, {' and '.join(over)}."
     )
 
 

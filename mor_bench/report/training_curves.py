@@ -94,7 +94,7 @@ def loss_curves(comparison: Comparison, dataset: str, styles: dict[str, Style]) 
         "Each method has its own unit of loss."
     )
     if any(validated):
-        caption += " Dashed: loss on samples that were held out of the training."
+        caption += " Dashed: loss on held-out samples."
     return Picture("loss-curves", "Loss curves", caption, figure)
 
 

@@ -35,12 +35,12 @@ AZIMUTH, ELEVATION = np.deg2rad(-68.0), np.deg2rad(20.0)
 """View direction: x points right, z points up; the faces y-min and z-max are visible."""
 
 CAPTION = (
-    "The test sample with the largest e of each method's configuration with the smallest ē: "
-    "a mean hides it. "
-    "Samples without a prediction cannot be drawn; the title gives their number. "
-    "Filled: the reference. Lines: the prediction. Grey: the body at rest. "
-    "Deformations are not magnified, and all panels have the same scale. "
-    "The arrow shows the direction and place of the force, not its size."
+    "Each panel shows a method's configuration with the smallest ē, on its test sample "
+    "with the largest e. A mean hides such samples. Samples without a prediction cannot "
+    "be drawn; the title gives their number. Filled: the reference. Lines: the "
+    "prediction. Grey: the body at rest. Deformations are not magnified, and all panels "
+    "have the same scale. The arrow shows the direction and place of the force, not its "
+    "size."
 )
 
 
