@@ -69,6 +69,8 @@ def test_in_a_checkout_the_files_join_the_suite_and_keep_the_laws_of_the_tree(
         ("json", "Python has a module or keyword"),
         ("class", "Python has a module or keyword"),
         ("none", "Python has a module or keyword"),
+        ("field", "its class would be called Field, a name that its file imports"),
+        ("scene", "its class would be called Scene"),
         ("pod", "'pod' is a method of the suite"),
     ],
 )

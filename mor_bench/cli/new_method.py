@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import keyword
 import re
 import sys
@@ -81,6 +82,19 @@ def _check_name(name: str, module: str, in_checkout: bool) -> None:
     known = keyword.iskeyword(module) or keyword.iskeyword(_class_name(name))
     if known or module in sys.stdlib_module_names or (not in_checkout and find_spec(module)):
         raise SpecError(f"{name!r}: Python has a module or keyword of this name; choose another.")
+    if _class_name(name) in _imported_names():
+        raise SpecError(
+            f"{name!r}: its class would be called {_class_name(name)}, "
+            "a name that its file imports; choose another."
+        )
+
+
+def _imported_names() -> set[str]:
+    source = _filled("new_method.py.txt", {"title": "Title", "class_name": "Method"})
+    imports = [
+        n for n in ast.walk(ast.parse(source)) if isinstance(n, (ast.Import, ast.ImportFrom))
+    ]
+    return {alias.asname or alias.name for node in imports for alias in node.names}
 
 
 def _filled(template: str, words: dict[str, str]) -> str:
