@@ -22,7 +22,14 @@ from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 from pydantic.fields import FieldInfo
 
 from mor_bench.errors import InvalidInputError
@@ -66,7 +73,15 @@ Cluster = Annotated[
 class Options(BaseModel):
     """A frozen group of options, checked at construction."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _truth_values_are_for_flags(cls, value: Any, info: ValidationInfo) -> Any:
+        is_flag = cls.model_fields[str(info.field_name)].annotation is bool
+        if value is not None and isinstance(value, bool) != is_flag:
+            raise ValueError("true and false are the values of flags, and of nothing else")
+        return value
 
     def __init__(self, **values: Any) -> None:
         try:

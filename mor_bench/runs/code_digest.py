@@ -51,13 +51,16 @@ def code_digest(surrogate: str, folder: Path | None = None) -> str:
 
 @cache
 def measuring_digest() -> str:
-    """Return eight digits of a digest of the code that scores and times, `mor_bench.measure`.
+    """Return eight digits of a digest of the code that scores and times.
+
+    It covers `mor_bench.measure` and the two modules of this package that call it.
 
     Scores and timings in the cache are kept under it, so that a new metric or timing rule
     measures again.
     """
     digest = hashlib.sha256()
-    for path in sorted((SOURCES / OWN / "measure").glob("*.py")):
+    runs = [Path(__file__).with_name(name) for name in ("scoring.py", "timing_stage.py")]
+    for path in [*sorted((SOURCES / OWN / "measure").glob("*.py")), *runs]:
         digest.update(path.read_bytes())
     return digest.hexdigest()[:8]
 

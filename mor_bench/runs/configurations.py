@@ -140,8 +140,12 @@ def checked_specs(
     SpecError
         If a dataset, a method or a parameter is not valid.
     InvalidInputError
-        If nothing is given, or two datasets or methods have the same name.
+        If nothing is given, or one name instead of a list, or two datasets or methods have the
+        same name.
     """
+    for name, given in (("datasets", datasets), ("methods", methods)):
+        if isinstance(given, str | Path | Mapping):
+            raise InvalidInputError(f"`{name}` must be a list of names; got {given!r}.")
     if not datasets or (methods is not None and not methods):
         raise InvalidInputError("`datasets` and `methods` must each hold at least one name.")
     specs = [load_dataset_spec(dataset, options.suite) for dataset in datasets]
