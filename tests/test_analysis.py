@@ -77,7 +77,7 @@ def at_error(analysis: Record, method: str, target: float) -> Record:
 
 
 @pytest.mark.parametrize("n_configurations", [1, 2, 5, 12])
-def test_draws_of_the_frontier_are_its_points_in_each_resample(n_configurations: int) -> None:
+def test_frontier_draws_are_the_frontier_points_of_each_resample(n_configurations: int) -> None:
     generator = np.random.default_rng(n_configurations)
     shape = (n_configurations, 60)
     latencies = generator.normal(0, 1.5, shape).round(1)  # rounded, so that there are ties
@@ -95,7 +95,7 @@ def test_draws_of_the_frontier_are_its_points_in_each_resample(n_configurations:
             assert np.exp(found[:, i]) == pytest.approx(plain)
 
 
-def test_the_analysis_is_json_repeatable_and_keeps_the_frontier(
+def test_the_analysis_is_valid_json_and_repeatable_and_keeps_the_frontier(
     comparison: Comparison, analysis: Record
 ) -> None:
     again = analyse(comparison, n_resamples=300)
@@ -138,7 +138,7 @@ def test_a_stored_interval_of_the_latency_is_kept(tmp_path: Path) -> None:
     assert {r["target_rel_l2_median"] for r in found["time_at_error"]} == {*TARGET_ERRORS}
 
 
-def test_intervals_of_targets_contain_their_value_or_say_that_it_is_not_reached(
+def test_target_intervals_contain_their_value_or_report_a_target_out_of_reach(
     analysis: Record,
 ) -> None:
     for record in analysis["time_at_error"]:
@@ -153,7 +153,7 @@ def test_intervals_of_targets_contain_their_value_or_say_that_it_is_not_reached(
     assert near["low"] is not None
 
 
-def test_pairs_are_antisymmetric_and_say_who_is_faster(analysis: Record) -> None:
+def test_pairs_are_antisymmetric_and_name_the_faster_method(analysis: Record) -> None:
     opposite = {"faster": "slower", "slower": "faster"}
     n = len(METHODS)
     assert len(analysis["pairwise"]) == n * (n - 1) * len(TARGET_ERRORS)
@@ -171,7 +171,7 @@ def test_pairs_are_antisymmetric_and_say_who_is_faster(analysis: Record) -> None
 
 
 @pytest.mark.slow
-def test_equal_methods_are_seldom_called_different_and_ten_percent_are_found(
+def test_equal_methods_rarely_differ_and_a_difference_of_ten_percent_is_found(
     tmp_path: Path,
 ) -> None:
     wrong, right = [], []
@@ -267,7 +267,7 @@ def scored(
     )
 
 
-def test_break_even_by_hand() -> None:
+def test_break_even_matches_hand_computed_values() -> None:
     rows = [
         scored("fem", "loose", 0.005, 1.0, 0.0),
         scored("fem", "tight", 1e-9, 2.0, 0.0),
@@ -290,7 +290,7 @@ def test_break_even_by_hand() -> None:
     assert found["far"]["verdict"] == "not reached"
 
 
-def test_performance_profile_by_hand() -> None:
+def test_the_performance_profile_matches_hand_computed_values() -> None:
     times = {
         ("x", 0.1): (1.0, 2.0),
         ("x", 0.01): (4.0, None),
@@ -310,7 +310,7 @@ def test_performance_profile_by_hand() -> None:
     assert share_within([], 1.0) == 0.0
 
 
-def test_tuning_counts_what_was_tried_of_the_budget(tmp_path: Path) -> None:
+def test_tuning_reports_the_used_and_the_allowed_budget(tmp_path: Path) -> None:
     made = Comparison(tmp_path, {}, settings={"budget": {"configurations": 2, "seconds": 15.0}})
     made.rows = [scored("a", f"a{i}", 0.1, 1.0) for i in range(2)]
     made.rows.append(a_row("a", label="a2", status="skipped"))
@@ -339,7 +339,7 @@ def test_tuning_counts_what_was_tried_of_the_budget(tmp_path: Path) -> None:
         ({"gpu": True}, "gpu", ""),
     ],
 )
-def test_a_method_is_in_its_regime_only_where_nothing_is_missing(
+def test_a_method_is_in_its_regime_only_if_all_its_conditions_hold(
     tmp_path: Path, regime: Record, device: str, lacks: str
 ) -> None:
     made = Comparison(tmp_path, {}, settings={"device": device})
@@ -362,7 +362,7 @@ def test_a_method_is_in_its_regime_only_where_nothing_is_missing(
         (0.0, 0.0, (0.0, 0.0), {"worse": False}),
     ],
 )
-def test_a_hidden_set_is_worse_only_beyond_what_its_size_explains(
+def test_a_hidden_set_is_called_worse_only_beyond_its_sampling_error(
     shipped: float, fresh: float, interval: tuple[float, float] | None, expected: Record
 ) -> None:
     plain = scored("a", "a", shipped, 1.0)

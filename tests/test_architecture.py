@@ -46,7 +46,7 @@ PLANTED: list[tuple[str, Tree]] = [
 
 
 @pytest.mark.parametrize(("check", "tree"), PLANTED)
-def test_every_check_sees_a_planted_violation(check: str, tree: Tree) -> None:
+def test_every_check_finds_a_planted_violation(check: str, tree: Tree) -> None:
     tree = {
         path: source.replace(f"import {LOW}", "import mor_bench.specs.low")
         for path, source in tree.items()

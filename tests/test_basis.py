@@ -74,7 +74,7 @@ def test_200_modes_are_orthonormal_in_any_inner_product(
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_no_basis_leaves_less_of_the_snapshots(
+def test_no_other_basis_has_a_smaller_projection_error(
     route: str, weighted: bool, tiny: Dataset, stiffness: Any
 ) -> None:
     snapshots, product = tiny.train.free_displacements, stiffness if weighted else None
@@ -88,7 +88,7 @@ def test_no_basis_leaves_less_of_the_snapshots(
     assert left == pytest.approx(np.linalg.norm(values[10:]), rel=accuracy)
 
 
-def test_the_randomised_basis_is_nearly_the_exact_one_and_the_same_in_every_run(
+def test_the_randomised_basis_is_close_to_the_exact_one_and_repeatable(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     snapshots = decaying(640, 720, 400, 12)
@@ -107,7 +107,7 @@ def test_the_randomised_basis_is_nearly_the_exact_one_and_the_same_in_every_run(
 
 
 @pytest.mark.parametrize(("tolerance", "decades"), [(0.3, 8), (1e-2, 8), (1e-4, 8), (0.6, 0.5)])
-def test_the_energy_left_out_decides_the_number_of_modes(
+def test_the_energy_tolerance_decides_the_number_of_modes(
     route: str, tolerance: float, decades: float
 ) -> None:
     snapshots = decaying(400, 300, 200, decades)
@@ -122,7 +122,7 @@ def by_energy(found: Basis, tolerance: float) -> int:
     return int((np.cumsum(squares[::-1])[::-1] > tolerance**2 * squares.sum()).sum())
 
 
-def test_a_large_matrix_is_decomposed_at_random_if_few_modes_are_wanted(
+def test_a_large_matrix_gets_a_randomised_decomposition_if_few_modes_are_requested(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     snapshots = decaying(400, 700, 390, 6)
@@ -138,7 +138,7 @@ def test_a_large_matrix_is_decomposed_at_random_if_few_modes_are_wanted(
     assert many.modes.shape[1] == by_energy(exact, 1e-3)
 
 
-def test_a_remembered_decomposition_equals_a_fresh_one(tiny: Dataset, stiffness: Any) -> None:
+def test_a_cached_decomposition_equals_a_fresh_one(tiny: Dataset, stiffness: Any) -> None:
     snapshots = tiny.train.free_displacements
     fresh = {r: pod(snapshots, r).modes for r in (30, 10)}
     with remembering():
@@ -151,7 +151,7 @@ def test_a_remembered_decomposition_equals_a_fresh_one(tiny: Dataset, stiffness:
 
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("kind", ["duplicates", "one", "with zeros", "r above the rank"])
-def test_poor_snapshots_are_cut_to_their_rank(
+def test_a_basis_has_at_most_the_rank_of_its_snapshots(
     kind: str, route: str, weighted: bool, tiny: Dataset, stiffness: Any
 ) -> None:
     snapshots = tiny.train.free_displacements
@@ -202,7 +202,7 @@ def test_single_precision_snapshots_have_the_rank_of_single_precision(tiny: Data
         assert pod(np.repeat(snapshots[:4], 5, axis=0), 20).modes.shape[1] == 4
 
 
-def test_the_inner_product_does_not_change_the_answers_of_the_same_span(tiny: Dataset) -> None:
+def test_bases_of_the_same_span_predict_the_same_in_any_inner_product(tiny: Dataset) -> None:
     few = tiny.train[:12]  # with as many modes as samples, both bases span the samples
     plain, weighted = (
         PODGalerkin(12, 1e-12, inner_product=product).fit(tiny.scene, few)
@@ -215,7 +215,7 @@ def test_the_inner_product_does_not_change_the_answers_of_the_same_span(tiny: Da
     assert scaled.extent == pytest.approx(1e-3 * plain.problem_.extent)
 
 
-def test_a_method_takes_its_modes_by_energy(tiny: Dataset) -> None:
+def test_a_method_can_choose_its_modes_by_energy(tiny: Dataset) -> None:
     fitted = PODGalerkin("energy", energy_tolerance=1e-2).fit(tiny.scene, tiny.train)
     assert fitted.modes_.shape[1] == by_energy(pod(tiny.train.free_displacements), 1e-2)
     for wrong in (PODGalerkin("energy"), PODGalerkin(5, energy_tolerance=1e-2)):

@@ -76,7 +76,9 @@ def test_columns_and_back_solves_give_the_same_response(case: str) -> None:
 
 
 @pytest.mark.parametrize("solver", ["cholesky", "superlu", "pardiso", "jacobi-pcg"])
-def test_loads_without_columns_are_solved_for(tiny: Dataset, solver: SolverName) -> None:
+def test_loads_without_stored_columns_are_solved_directly(
+    tiny: Dataset, solver: SolverName
+) -> None:
     """On other nodes, on more than pays, and on supports, in one batch with those with columns."""
     if solver == "pardiso":
         pytest.importorskip("pypardiso")
@@ -99,7 +101,9 @@ def test_loads_without_columns_are_solved_for(tiny: Dataset, solver: SolverName)
     assert not compliance.respond(np.zeros((2, n))).any()
 
 
-def test_more_columns_than_pay_are_not_used_or_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_columns_that_do_not_pay_are_neither_used_nor_stored(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     scene = load_scene("beam-coarse")
     model = FullOrderModel(scene)
     n, bandwidth = len(scene.free_dofs), BandedCholesky(model.assembler.pattern).bandwidth
@@ -123,7 +127,7 @@ def test_more_columns_than_pay_are_not_used_or_not_kept(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("scene", ["l-shape", LIVER])
-def test_many_right_hand_sides_are_solved_for_as_few(
+def test_many_right_hand_sides_give_the_same_solutions_as_few(
     scene: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By blocks, in natural order and reordered, the last block shorter than the others."""

@@ -73,7 +73,7 @@ def pod(tiny: Dataset) -> Surrogate:
     return mor_bench.load_method("pod", n_modes=5).fit(tiny.scene, tiny.train)
 
 
-def test_a_query_has_one_answer_alone_and_in_a_batch(fitted: Surrogate, tiny: Dataset) -> None:
+def test_a_query_has_the_same_answer_alone_and_in_a_batch(fitted: Surrogate, tiny: Dataset) -> None:
     forces = tiny.test.forces[:4].copy()
     before = forces.copy()
     batch = fitted.predict(forces)
@@ -86,14 +86,14 @@ def test_a_query_has_one_answer_alone_and_in_a_batch(fitted: Surrogate, tiny: Da
     assert fitted.predict(forces[:0]).shape == (0, *forces.shape[1:])
 
 
-def test_no_force_moves_nothing(fitted: Surrogate, tiny: Dataset) -> None:
+def test_zero_force_gives_zero_displacement(fitted: Surrogate, tiny: Dataset) -> None:
     if fitted.parameters.get("zero_at_rest") is False:
         pytest.skip("the published U-Mesh has biases, so that it moves a little without a force")
     rms = np.sqrt((tiny.train.displacements**2).mean())
     assert np.linalg.norm(fitted.predict(np.zeros((tiny.scene.mesh.n_nodes, 3)))) <= 1e-3 * rms
 
 
-def test_a_prediction_is_far_better_than_none(
+def test_a_prediction_is_far_better_than_zero_displacement(
     request: pytest.FixtureRequest, fitted: Surrogate, tiny: Dataset
 ) -> None:
     if fitted.parameters.get("input") == "force":
@@ -155,7 +155,7 @@ def test_fitting_again_forgets_the_first_fit_and_repeats_it(
 
 
 @pytest.mark.parametrize("name", sorted(SPECS))
-def test_every_method_leaves_checks_and_files_to_the_base_class(name: str) -> None:
+def test_every_method_inherits_checks_and_files_from_the_base_class(name: str) -> None:
     """So that the laws below hold for all methods, though they are tested on one."""
     surrogate = type(cheap_method(name))
     for verb in ("fit", "predict", "restore", "save", "forget", "out_of_range", "indicate_error"):
@@ -177,7 +177,7 @@ def test_bad_forces_are_refused(pod: Surrogate, tiny: Dataset, bad: str) -> None
         pod.predict(force)
 
 
-def test_lists_and_other_real_dtypes_are_taken(pod: Surrogate, tiny: Dataset) -> None:
+def test_lists_and_other_real_dtypes_are_accepted(pod: Surrogate, tiny: Dataset) -> None:
     force = np.round(tiny.test.forces[0], 3)
     np.testing.assert_allclose(pod.predict(force.tolist()), pod.predict(force), atol=1e-15)
     assert pod.predict(force.astype(np.float32)).dtype == np.float64
@@ -212,7 +212,7 @@ def test_a_forged_header_is_refused(pod: Surrogate, tmp_path: Path, key: str) ->
         mor_bench.load_surrogate(path)
 
 
-def test_unfitted_methods_say_so(tiny: Dataset, tmp_path: Path) -> None:
+def test_unfitted_methods_raise_an_error_that_says_so(tiny: Dataset, tmp_path: Path) -> None:
     method = mor_bench.load_method("pod")
     with pytest.raises(NotFittedError):
         method.predict(tiny.test.forces[0])
@@ -287,7 +287,7 @@ def test_a_plain_class_with_fit_and_predict_is_adapted(tiny: Dataset, tmp_path: 
         make_surrogate(dict, {})
 
 
-def test_a_class_that_overrides_fit_and_predict_knows_no_range_and_no_file(
+def test_a_class_that_overrides_fit_and_predict_has_no_load_range_and_cannot_be_saved(
     tiny: Dataset, tmp_path: Path
 ) -> None:
     method = make_surrogate(Recorder, {"notes": str(tmp_path / "notes"), "spoil": "nothing"})
@@ -299,7 +299,7 @@ def test_a_class_that_overrides_fit_and_predict_knows_no_range_and_no_file(
         method.save(tmp_path / "model.safetensors")
 
 
-def test_arrays_of_a_model_are_checked() -> None:
+def test_invalid_arrays_of_a_model_are_refused() -> None:
     model = {"a": np.zeros((2, 3)).T, "i": np.array([0, 4])}
     assert take_array(model, "a", (3, None)).flags.c_contiguous
     for name, shape, dtype in (

@@ -38,7 +38,7 @@ def one_cell(n_points: int, n_nodes: int) -> tuple[np.ndarray, np.ndarray, np.nd
     )
 
 
-def test_the_vectorised_kernel_multiplies_as_often_as_is_said() -> None:
+def test_the_vectorised_kernel_does_the_declared_number_of_multiplications() -> None:
     kernel = interpreted(kernels)
     u, gradients, w = one_cell(8, 8)
     arguments = (
@@ -68,7 +68,9 @@ LAWS = {
 
 @pytest.mark.parametrize("n_nodes", [4, 8])
 @pytest.mark.parametrize("name", LAWS)
-def test_the_general_kernel_multiplies_as_often_as_is_said(name: str, n_nodes: int) -> None:
+def test_the_general_kernel_does_the_declared_number_of_multiplications(
+    name: str, n_nodes: int
+) -> None:
     law, parameters = LAWS[name]
     kernel = interpreted(laws)["general_force"]
     u, gradients, weights = one_cell(1, n_nodes)
@@ -85,7 +87,9 @@ def test_the_general_kernel_multiplies_as_often_as_is_said(name: str, n_nodes: i
 
 @pytest.mark.parametrize("r", [1, 2, 3, 6, 9])
 @pytest.mark.parametrize("symmetric", [True, False])
-def test_the_kernel_of_points_multiplies_as_often_as_is_said(r: int, symmetric: bool) -> None:
+def test_the_kernel_of_points_does_the_declared_number_of_multiplications(
+    r: int, symmetric: bool
+) -> None:
     kernel, rng = interpreted(point_kernels)["integrate"], np.random.default_rng(0)
     q = counted_array(0.1 * rng.normal(size=r))
     modes = counted_array(0.3 * rng.normal(size=(1, r, 9)))
@@ -97,7 +101,7 @@ def test_the_kernel_of_points_multiplies_as_often_as_is_said(r: int, symmetric: 
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_stresses_at_points_multiply_as_often_as_is_said(name: str) -> None:
+def test_stresses_at_points_take_the_declared_number_of_multiplications(name: str) -> None:
     law, parameters = LAWS[name]
     kernel = interpreted(laws)["point_stresses"]
     gradient = counted_array(0.1 * np.random.default_rng(0).normal(size=(1, 9)))

@@ -103,7 +103,7 @@ def test_the_worst_sample_of_a_headline_is_the_maximum(made: Comparison) -> None
         ("slower", 2.0, 1.6, 2.5, "-2", "1.6–2.5"),
     ],
 )
-def test_the_factor_of_a_pair_and_its_interval_are_inverted_together(
+def test_inverting_a_pair_inverts_its_factor_and_its_interval(
     verdict: str, ratio: float, low: float | None, high: float | None, cell: str, interval: str
 ) -> None:
     made = Comparison(Path(), {}, rows=[a_row("a"), a_row("b")])

@@ -119,7 +119,9 @@ def test_exported_arrays_read_back_with_the_same_parts(
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows forbids such file names")
 @pytest.mark.parametrize("name", ["😀", 'a"b\\c', "tab\tdel\x7fesc\x1bé"])
-def test_any_file_name_and_title_is_read_in_again(name: str, tiny: Dataset, tmp_path: Path) -> None:
+def test_files_with_any_name_and_title_can_be_read_back(
+    name: str, tiny: Dataset, tmp_path: Path
+) -> None:
     spec = tiny.scene.spec.model_copy(update={"title": name, "source": name + "\n\x00"})
     data = replace(tiny, scene=replace(tiny.scene, spec=spec))
     npz, toml = export_numpy(data, tmp_path / f"{name}.npz")
@@ -128,7 +130,9 @@ def test_any_file_name_and_title_is_read_in_again(name: str, tiny: Dataset, tmp_
     assert (again.title, again.source) == (spec.title, spec.source)
 
 
-def test_snapshots_without_regions_are_exported_without(tiny: Dataset, tmp_path: Path) -> None:
+def test_snapshots_without_regions_are_exported_without_regions(
+    tiny: Dataset, tmp_path: Path
+) -> None:
     npz, toml = export_numpy(tiny, tmp_path / "tiny.npz")
     with np.load(npz) as file:
         arrays = {name: file[name] for name in file.files if name != "regions"}

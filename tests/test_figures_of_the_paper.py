@@ -42,7 +42,7 @@ def test_both_splits_use_all_samples(beam: Dataset, random_split: Dataset) -> No
         assert (len(data.train), len(data.test), data.n_refused) == (6400 - n_test, n_test, 0)
 
 
-def test_linear_methods_err_as_expected_on_both_splits(
+def test_linear_methods_have_the_expected_errors_on_both_splits(
     beam: Dataset, random_split: Dataset
 ) -> None:
     for data in (beam, random_split):
@@ -59,7 +59,9 @@ def test_pod_improves_with_its_rank_and_ecsw_stays_within_a_fifth(beam: Dataset)
         assert reduced <= 1.2 * plain[r]
 
 
-def test_quick_umesh_errs_at_most_a_millimetre_on_the_random_split(random_split: Dataset) -> None:
+def test_quick_umesh_has_an_error_of_at_most_a_millimetre_on_the_random_split(
+    random_split: Dataset,
+) -> None:
     """Its 4,500 iterations take about ten minutes on two cores."""
     torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
     if not torch.cuda.is_available():

@@ -177,7 +177,7 @@ def expected(beam: tuple[str, Mesh, meshio.Mesh]) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_every_format_gives_the_answer_of_the_box_it_came_from(
+def test_every_format_gives_the_solution_of_its_original_box(
     name: str,
     beam: tuple[str, Mesh, meshio.Mesh],
     expected: NDArray[np.float64],
@@ -209,7 +209,7 @@ def test_nodes_are_numbered_for_a_small_band_and_the_grid_is_found(
     np.testing.assert_array_equal(read.grid_index, mesh.grid_index)
 
 
-def test_only_a_regular_grid_is_taken_for_one() -> None:
+def test_only_a_regular_grid_is_recognised_as_one() -> None:
     mesh = replace(box_mesh(SIZE, CELLS), grid_shape=None, grid_index=None)
     assert in_grid(mesh).grid_shape == (7, 3, 3)
     uneven = mesh.points + 0.02 * np.sin(2 * np.pi / 1.2 * mesh.points * [1, 0, 0])
@@ -226,7 +226,7 @@ HEX = box_mesh((2.0, 1.0, 1.0), (2, 1, 1))
 @pytest.mark.parametrize(
     "line", ["*NODE, NSET=held", "*Node,nset=held", "*NODE, INPUT=, NSET = held"]
 )
-def test_a_set_in_the_line_of_abaqus_nodes_holds_them_all(line: str, tmp_path: Path) -> None:
+def test_a_set_in_the_node_line_of_abaqus_holds_all_its_nodes(line: str, tmp_path: Path) -> None:
     rows = [f"{i + 1}, {x:g}, {y:g}, {z:g}" for i, (x, y, z) in enumerate(HEX.points)]
     cells = [", ".join(str(n) for n in (i + 1, *(cell + 1))) for i, cell in enumerate(HEX.cells)]
     lines = [line, *rows, "*ELEMENT, TYPE=C3D8", *cells, "*NSET, NSET=left", "1, 2,", "3, 4", ""]
@@ -330,7 +330,7 @@ EMPTY: list[tuple[dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("region", "message"), EMPTY)
 @pytest.mark.parametrize("where", ["support", "load"])
-def test_empty_and_unknown_regions_are_named(
+def test_empty_and_unknown_regions_give_an_error_that_names_them(
     region: dict[str, Any], message: str, where: str, folder: Path
 ) -> None:
     region = placed(region, folder)
@@ -367,7 +367,7 @@ def test_the_distance_from_a_triangle_is_that_of_its_nearest_sample() -> None:
     assert distances(triangle, points) == pytest.approx([0.7, 1.0, np.sqrt(0.5)])
 
 
-def test_a_missing_or_changed_file_is_named(folder: Path) -> None:
+def test_a_missing_or_changed_file_gives_an_error_that_names_it(folder: Path) -> None:
     with pytest.raises(SpecError, match=r"`geometry.file`: .*nowhere.vtu: no such file; got"):
         mor_bench.load_scene(of_file(folder / "nowhere.vtu"))
     with pytest.raises(SpecError, match="no such file"):
@@ -391,7 +391,7 @@ def test_half_a_binary_surface_is_refused_in_one_line(folder: Path) -> None:
         read_triangles(path, 1.0)
 
 
-def test_files_are_closed_again(folder: Path) -> None:
+def test_files_are_closed_after_reading(folder: Path) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         read_triangles(folder / "plane.stl", 1.0)

@@ -252,7 +252,7 @@ def test_cuda_is_refused_where_there_is_none(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_swept_parameter_has_its_first_value_and_the_error_is_that_of_the_test_part(
+def test_a_fit_takes_the_first_swept_value_and_scores_on_the_test_part(
     cache: Path, tmp_path: Path
 ) -> None:
     fitted = fit_tiny("pca-regression", {"n_output_modes": 4}, tmp_path / "a.safetensors", cache)
@@ -281,7 +281,7 @@ def test_a_method_that_ignores_the_seconds_is_reported(cache: Path, tmp_path: Pa
     assert fitted.out.exists()
 
 
-def test_a_method_that_is_given_displacements_is_scored_on_its_answers_to_them(
+def test_a_method_that_is_given_displacements_is_scored_on_its_predictions_from_them(
     cache: Path, tmp_path: Path
 ) -> None:
     content = load_generated_spec("beam-tiny").model_dump(mode="json")

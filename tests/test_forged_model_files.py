@@ -85,7 +85,7 @@ def test_forged_json_is_refused(parts: Any, path: Path, key: str, text: str) -> 
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
-def test_a_scene_whose_file_never_ends_is_refused(parts: Any, path: Path) -> None:
+def test_an_endless_scene_file_is_refused(parts: Any, path: Path) -> None:
     _, header, arrays = parts
     os.mkfifo(path.parent / "pipe")
     for endless in ("/dev/zero", str(path.parent / "pipe")):

@@ -156,7 +156,7 @@ def test_points_are_inside_the_sphere_where_its_equation_says_so() -> None:
     np.testing.assert_array_equal(inside(sphere(0.014), points[clear]), expected)
 
 
-def test_the_winding_number_is_whole_however_near_an_edge_or_a_corner() -> None:
+def test_the_winding_number_is_an_integer_even_next_to_an_edge_or_a_corner() -> None:
     """A ray through an edge, a diagonal of a face or a corner would be counted twice, or never."""
     share = np.random.default_rng(0).random((200, 12, 1))
     on_edges = (share * CUBE_CORNERS[:, 0] + (1 - share) * CUBE_CORNERS[:, 1]).reshape(-1, 3)
@@ -197,7 +197,7 @@ def clipped(polygon: NDArray[np.float64], low: NDArray[np.float64]) -> NDArray[n
     return polygon
 
 
-def test_a_triangle_meets_the_cells_in_which_clipping_leaves_something_of_it() -> None:
+def test_a_triangle_meets_a_cell_if_clipping_it_to_the_cell_leaves_something() -> None:
     rng = np.random.default_rng(0)
     size = rng.choice([0.1, 1.0, 5.0], size=(60, 1, 1)) * rng.uniform(-1.5, 1.5, size=(60, 3, 3))
     for triangle in rng.uniform(-0.5, 3.5, size=(60, 1, 3)) + size:
@@ -209,7 +209,7 @@ def test_a_triangle_meets_the_cells_in_which_clipping_leaves_something_of_it() -
 @pytest.mark.parametrize(
     "mesh", [box_mesh((0.3, 0.5, 0.7), (3, 4, 7)), l_mesh((0.3, 0.5, 0.7), (3, 4, 7), (1, 3))]
 )
-def test_the_voxels_of_a_body_of_whole_cells_are_its_cells(mesh: Mesh) -> None:
+def test_a_body_made_of_whole_cells_has_these_cells_as_voxels(mesh: Mesh) -> None:
     offset, surface = np.array([0.1, -7.0, 3.3]), boundary(mesh)
     voxels = voxel_mesh(Surface(surface.points + offset, surface.triangles), (3, 4, 7))
     np.testing.assert_array_equal(voxels.cells, mesh.cells)
@@ -245,7 +245,7 @@ def test_every_point_of_a_surface_lies_in_a_cell(
 
 
 @pytest.mark.parametrize(("depth", "n_cells"), [(-1e-6, 3), (0.0, 3), (1e-12, 3), (1e-6, 4)])
-def test_a_cell_is_kept_if_the_body_enters_it_and_not_if_it_touches_it(
+def test_a_cell_is_kept_if_the_body_enters_it_but_not_if_it_only_touches_it(
     depth: float, n_cells: int
 ) -> None:
     surface = boundary(l_mesh((2.0, 1.0, 2.0), (2, 1, 2), (1, 1)))
@@ -253,7 +253,7 @@ def test_a_cell_is_kept_if_the_body_enters_it_and_not_if_it_touches_it(
     assert voxel_mesh(Surface(points, surface.triangles), (2, 1, 2)).n_cells == n_cells
 
 
-def test_cells_that_only_an_edge_joins_are_refused() -> None:
+def test_cells_joined_only_by_an_edge_are_refused() -> None:
     part = boundary(box_mesh((1.0, 1.0, 1.0), (1, 1, 1)))
     both = joined(part, Surface(part.points + np.array([1, 1, 0]), part.triangles))
     message = r"^the 16 cells of the body in a grid of 4 x 4 x 2 form 2 parts that share no face"
@@ -293,7 +293,7 @@ def check_tetrahedra(mesh: Mesh) -> None:
 
 
 @pytest.mark.parametrize("spacing_m", [0.05, 0.03, 0.0213, 0.0147])
-def test_tetrahedra_of_a_sphere_are_well_shaped_and_end_on_it(spacing_m: float) -> None:
+def test_tetrahedra_of_a_sphere_are_well_shaped_and_have_its_surface(spacing_m: float) -> None:
     mesh = tetrahedral_mesh(sphere_level, ALL_AROUND, spacing_m)
     check_tetrahedra(mesh)
     on_boundary = mesh.points[np.unique(mesh.boundary_facets)]
@@ -359,7 +359,7 @@ def test_a_body_without_a_sound_mesh_is_refused(
 # --- the liver ------------------------------------------------------------------------------------
 
 
-def test_the_liver_is_a_closed_surface_of_its_length_on_its_level_set() -> None:
+def test_the_liver_is_a_closed_surface_on_its_level_set_with_the_given_length() -> None:
     surface = liver_surface()
     n_edges = check_closed(surface.triangles)
     # Euler's formula for one part without a handle.
@@ -391,7 +391,7 @@ def test_the_liver_is_held_in_the_notch_between_its_lobes() -> None:
     assert (liver_level(near[ends].mean(axis=1)) > 0.02).any()
 
 
-def test_the_liver_of_tetrahedra_is_as_fine_as_the_papers_and_has_the_surfaces_volume() -> None:
+def test_the_liver_of_tetrahedra_is_as_fine_as_in_the_paper_and_keeps_the_volume() -> None:
     mesh = liver_tetrahedra()
     check_tetrahedra(mesh)
     assert (mesh.n_cells, mesh.n_nodes) == (4567, 1118)

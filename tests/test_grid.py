@@ -41,7 +41,7 @@ def irregular(draw: st.DrawFn) -> Mesh:
 
 @settings(max_examples=60, deadline=None)
 @given(irregular(), SHAPES, st.integers(0, 99))
-def test_forces_keep_sum_moment_and_work_and_linear_displacements_are_exact(
+def test_forces_keep_sum_moment_and_work_and_linear_displacements_stay_exact(
     mesh: Mesh, shape: tuple[int, int, int] | None, seed: int
 ) -> None:
     generator = np.random.default_rng(seed)
@@ -69,7 +69,7 @@ def test_forces_keep_sum_moment_and_work_and_linear_displacements_are_exact(
     np.testing.assert_allclose(found, mesh.points @ gradient + constant, rtol=0, atol=near)
 
 
-def test_weights_are_the_product_of_three_linear_ones() -> None:
+def test_weights_are_products_of_three_linear_weights() -> None:
     """For a node a quarter, a half and three quarters between two points: 8 weights by hand."""
     points = np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0], [0, 0, 1], [1.25, 0.5, 0.75]])
     mesh = Mesh(points, np.array([[0, 1, 2, 4], [0, 1, 4, 3], [0, 4, 2, 3], [1, 4, 3, 2]]))
@@ -80,7 +80,7 @@ def test_weights_are_the_product_of_three_linear_ones() -> None:
 
 
 @pytest.mark.parametrize("tetrahedra", [False, True])
-def test_a_meshs_own_grid_changes_no_bit(tetrahedra: bool) -> None:
+def test_the_own_grid_of_a_mesh_changes_no_bit(tetrahedra: bool) -> None:
     ell = l_mesh((2.0, 0.7, 1.1), (4, 2, 3), (2, 1), tetrahedra)
     for mesh in (box_mesh((2.0, 1.0, 1.0), (6, 2, 3), tetrahedra), ell):
         assert mesh.grid_index is not None
@@ -96,7 +96,7 @@ def test_a_meshs_own_grid_changes_no_bit(tetrahedra: bool) -> None:
     assert grid_map(ell).weights.shape == (ell.n_nodes, 60)
 
 
-def test_nodes_on_the_bounding_box_are_inside_whatever_the_round_off() -> None:
+def test_nodes_on_the_bounding_box_are_inside_despite_round_off() -> None:
     box = irregular_box((1.0, 1.0, 1.0), (3, 3, 3), tetrahedra=True)
     generator = np.random.default_rng(0)
     for _ in range(30):
@@ -118,7 +118,7 @@ def test_the_default_grid_is_as_dense_as_the_nodes(
     assert default_shape(mesh) == grid_map(mesh).shape == expected
 
 
-def test_the_default_grid_of_half_a_bounding_box_counts_the_body_only() -> None:
+def test_the_default_grid_is_sized_by_the_volume_of_the_body() -> None:
     ell = l_mesh((4.0, 4.0, 4.0), (12, 12, 12), (6, 6))
     assert prod(default_shape(ell)) == pytest.approx(ell.n_nodes * 4 / 3, rel=0.1)
 

@@ -34,7 +34,9 @@ def row_of(comparison: Comparison, label: str) -> Row:
     return comparison.row("beam-tiny", label)
 
 
-def test_every_configuration_has_a_row_and_a_broken_one_its_reason(small_run: Comparison) -> None:
+def test_every_configuration_has_a_row_and_a_broken_one_gives_its_reason(
+    small_run: Comparison,
+) -> None:
     assert [row.label for row in small_run.rows] == [
         "linear-fem",
         "pod-swept [n_modes=3]",
@@ -84,7 +86,7 @@ def test_a_row_holds_every_figure(small_run: Comparison, cache: Path) -> None:
     assert linear.data == 0.0  # it does not learn from data
 
 
-def test_the_raw_samples_give_the_figures_of_the_row(small_run: Comparison) -> None:
+def test_the_figures_of_a_row_follow_from_its_raw_samples(small_run: Comparison) -> None:
     row = row_of(small_run, "pod-swept [n_modes=3]")
     assert row.error is not None
     samples = small_run.samples(row)
@@ -117,7 +119,7 @@ def test_results_of_a_run_read_back_as_they_were(small_run: Comparison) -> None:
     assert (small_run.out / "comparison.json").exists()
 
 
-def test_a_listener_is_told_of_every_row(small_run: Comparison, heard: Heard) -> None:
+def test_a_listener_receives_every_row(small_run: Comparison, heard: Heard) -> None:
     label = "pod-swept [n_modes=3]"
     mine = [event for event in heard.events if label in event]
     assert mine == [f"start 2/6 {label}", f"fitted {label} None", f"timed {label} True"]
@@ -191,7 +193,7 @@ def test_a_folder_that_holds_no_run_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_method_spoils_only_its_own_row_and_other_errors_keep_every_digit(
+def test_a_broken_method_spoils_only_its_row_and_other_errors_keep_every_digit(
     small_run: Comparison, tmp_path: Path
 ) -> None:
     recorders = [
@@ -265,7 +267,7 @@ def test_a_region_of_outputs_without_nodes_is_an_error_of_the_dataset(
 
 
 @pytest.mark.slow
-def test_errors_count_the_wanted_nodes_alone(tip_only: Path, cache: Path, tmp_path: Path) -> None:
+def test_errors_count_only_the_requested_nodes(tip_only: Path, cache: Path, tmp_path: Path) -> None:
     tensor = "mor_bench.surrogates.pod_tensor:TensorPOD"
     path = method_file(tmp_path, "tensor", tensor, n_modes=10)
     comparison = mor_bench.run([tip_only], [path], out=tmp_path / "run", cache=cache, limit=LIMIT)

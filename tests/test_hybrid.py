@@ -58,7 +58,7 @@ class Nonsense(Surrogate):
         return np.broadcast_to(-2.0 * self.scene_.mesh.points, forces.shape).copy()
 
 
-def test_a_start_that_is_nonsense_costs_time_and_not_the_answer(
+def test_a_nonsense_start_costs_time_but_gives_the_right_answer(
     coarse: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Hybrid, "unfitted_start", lambda self: Nonsense())
@@ -75,7 +75,9 @@ def test_wrong_hyperparameters_are_refused(coarse: Dataset) -> None:
         Hybrid(steps=1, tolerance=1e-2).fit(coarse.scene, coarse.train)
 
 
-def test_sizes_chosen_for_the_start_are_saved_with_it(coarse: Dataset, tmp_path: Path) -> None:
+def test_sizes_chosen_for_the_start_are_saved_with_the_model(
+    coarse: Dataset, tmp_path: Path
+) -> None:
     method = Hybrid("pod-tensor", {"n_modes": 3, "tolerance": "auto"}, steps=1).fit(
         coarse.scene, coarse.train
     )
@@ -100,7 +102,9 @@ def test_indicated_errors_agree_with_measured_ones(coarse: Dataset, name: str) -
     assert single.relative_correction[0] == indicated.relative_correction[3]
 
 
-def test_indication_at_an_equilibrium_and_at_none(coarse: Dataset) -> None:
+def test_the_indicated_error_vanishes_at_an_equilibrium_and_is_infinite_without_a_prediction(
+    coarse: Dataset,
+) -> None:
     fem = mor_bench.load_method("fem", tolerance=1e-10).fit(coarse.scene, None)
     force = coarse.test.forces[:2]
     exact = fem.indicate_error(force, fem.predict(force))

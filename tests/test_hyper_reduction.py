@@ -61,7 +61,9 @@ def whole_mesh(scene: Scene, weights: Array, modes: Array) -> GalerkinProblem:
 
 
 @pytest.mark.parametrize(("law", "kind"), EVERY)
-def test_points_sum_to_what_is_assembled(law: str, kind: tuple[str, bool]) -> None:
+def test_sums_over_points_equal_the_assembled_force_and_tangent(
+    law: str, kind: tuple[str, bool]
+) -> None:
     scene = scene_of(law, kind)
     rng = np.random.default_rng(0)
     modes = np.linalg.qr(rng.normal(size=(len(scene.free_dofs), 7)))[0]
@@ -100,7 +102,7 @@ def solved(scene: Scene, n: int) -> Snapshots:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("law", "kind"), EVERY)
-def test_every_law_and_element(law: str, kind: tuple[str, bool]) -> None:
+def test_hyper_reduction_works_for_every_law_and_element(law: str, kind: tuple[str, bool]) -> None:
     """All cells are plain POD; fewer cells predict the training loads nearly as well."""
     scene = scene_of(law, kind)
     train = solved(scene, 24)
@@ -125,7 +127,7 @@ def test_every_law_and_element(law: str, kind: tuple[str, bool]) -> None:
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 3.0, 100.0])
-def test_the_compiled_steps_end_as_the_shared_solve_does(tiny: Dataset, scale: float) -> None:
+def test_the_compiled_steps_end_where_the_shared_solve_ends(tiny: Dataset, scale: float) -> None:
     """Where they fail the shared solve takes over, so that both refuse the same loads."""
     method = HyperReducedPOD(8, 1e-2).fit(tiny.scene, tiny.train)
     problem, options, failed = method.problem_, NewtonOptions(1e-8), 0
@@ -169,14 +171,14 @@ def test_the_interpolated_force_is_projected_exactly_at_rest_and_has_its_tangent
     assert len(linear) > 0
 
 
-def test_deim_without_an_equilibrium_is_a_typed_error(tiny: Dataset) -> None:
+def test_deim_without_an_equilibrium_raises_a_typed_error(tiny: Dataset) -> None:
     method = InterpolatedPOD(6, 12).fit(tiny.scene, tiny.train)
     with pytest.raises(SolverError):
         method.predict(1e4 * tiny.test.forces[0])
 
 
 @pytest.mark.parametrize("kind", [("hexahedron", False), ("hexahedron", True)])
-def test_points_keep_the_reduced_force_of_training(kind: tuple[str, bool]) -> None:
+def test_points_preserve_the_reduced_force_of_the_training_samples(kind: tuple[str, bool]) -> None:
     """The force of the fitted model is that of all cells, over fewer points than cells have."""
     scene = scene_of("neo-hookean", kind)
     train = solved(scene, 40)
@@ -195,7 +197,7 @@ def test_points_keep_the_reduced_force_of_training(kind: tuple[str, bool]) -> No
     "method", [HyperReducedPOD(4, 1e-2), EmpiricalCubaturePOD(4, 1e-2), InterpolatedPOD(4, 6)]
 )
 @pytest.mark.parametrize("forged", [-1, 10**6, "twice", 0.5])
-def test_indices_of_a_file_are_checked(tiny: Dataset, method: Any, forged: Any) -> None:
+def test_invalid_indices_in_a_file_are_refused(tiny: Dataset, method: Any, forged: Any) -> None:
     """Kernels check no bounds."""
     state = method.fit(tiny.scene, tiny.train).arrays_
     name = "cells" if "cells" in state else "dofs"
@@ -207,7 +209,7 @@ def test_indices_of_a_file_are_checked(tiny: Dataset, method: Any, forged: Any) 
         )
 
 
-def test_snapshots_of_no_displacement_train_no_cubature(tiny: Dataset) -> None:
+def test_a_snapshot_without_displacement_does_not_train_the_cubature(tiny: Dataset) -> None:
     displacements = tiny.train.free_displacements[:10].copy()
     displacements[0] = 0.0
     train = replace(tiny.train[:10], free_displacements=displacements)
@@ -240,7 +242,7 @@ def wanted_at_the_tip(method: HyperReducedPOD) -> tuple[HyperReducedPOD, HyperRe
 
 
 @pytest.mark.slow
-def test_a_query_does_not_depend_on_the_mesh_where_few_outputs_are_wanted(cache: Path) -> None:
+def test_a_query_for_few_outputs_does_not_depend_on_the_mesh(cache: Path) -> None:
     """From forces to wanted displacements, the counted work is the same to the last product."""
     data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
     fitted = HyperReducedPOD(10, 1e-2, tolerance=1e-4, sampling="cells").fit(data.scene, data.train)
@@ -294,6 +296,6 @@ def test_compiled_steps_never_end_in_an_unstable_or_inverted_state() -> None:
     assert 1 + found.displacement[0] == pytest.approx(stable, abs=1e-9)
 
 
-def test_too_few_points_for_the_modes_are_a_typed_error(tiny: Dataset) -> None:
+def test_too_few_points_for_the_modes_raise_a_typed_error(tiny: Dataset) -> None:
     with pytest.raises(SolverError, match="too few cells or points"):
         HyperReducedPOD(20, 0.9).fit(tiny.scene, tiny.train)

@@ -61,7 +61,7 @@ def available(net: Any, backend: Any) -> Inference:
 @pytest.mark.parametrize("backend", list(EXACT))
 @pytest.mark.parametrize("activation", ["relu", "silu"])
 @torch.inference_mode()  # type: ignore[untyped-decorator]
-def test_a_back_end_answers_as_torch_and_a_batch_as_its_samples(
+def test_a_back_end_agrees_with_torch_and_a_batch_with_its_samples(
     backend: str, activation: Activation
 ) -> None:
     net = network(activation)
@@ -85,7 +85,7 @@ def test_a_back_end_answers_as_torch_and_a_batch_as_its_samples(
 
 
 @torch.inference_mode()  # type: ignore[untyped-decorator]
-def test_geometry_of_convolutions_is_kept() -> None:
+def test_back_ends_keep_the_geometry_of_convolutions() -> None:
     """Strides, dilations, groups, two dimensions, no bias; overlapping transposed kernels stay."""
     generator = torch.Generator().manual_seed(0)
     nn = torch.nn
@@ -123,7 +123,9 @@ def choose(
     return choose_inference(net, x, lambda function: function(x) - target)
 
 
-def test_the_choice_is_by_error_and_clear_gains(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_choice_depends_on_the_error_and_on_clear_gains(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     for backend in EXACT:
         available(network(), backend)
     times = {"eager": 10.0, "packed": 5.0, "onnx": 4.5, "packed-bfloat16": 2.0}
@@ -141,7 +143,7 @@ def test_the_choice_is_by_error_and_clear_gains(monkeypatch: pytest.MonkeyPatch)
     )
 
 
-def test_what_was_chosen_and_measured_is_saved_and_not_measured_again(
+def test_the_choice_and_its_measurements_are_saved_and_not_repeated(
     data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     method: Any = mor_bench.load_method("umesh", **{**TINY, "inference": "auto"}).fit(
@@ -163,7 +165,7 @@ def test_what_was_chosen_and_measured_is_saved_and_not_measured_again(
     )
 
 
-def test_another_machine_answers_by_torch_with_a_warning(
+def test_another_machine_uses_torch_with_a_warning(
     fitted: Surrogate, data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "model.safetensors"
@@ -189,7 +191,7 @@ def test_another_machine_answers_by_torch_with_a_warning(
 @pytest.mark.parametrize(
     "knobs", [{}, {"input": "linear-response", "zero_at_rest": True, "activation": "silu"}]
 )
-def test_an_onnx_file_answers_as_the_method(
+def test_an_onnx_file_predicts_the_same_as_the_method(
     data: Dataset, tmp_path: Path, knobs: dict[str, Any]
 ) -> None:
     onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
@@ -220,7 +222,7 @@ def test_an_onnx_file_answers_as_the_method(
         export_onnx(tmp_path / "model.safetensors", path)
 
 
-def test_what_cannot_be_written_as_onnx(
+def test_models_that_onnx_cannot_express_are_refused(
     data: Dataset, fitted: Surrogate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mor_bench.load_method("linear-fem").fit(data.scene, None).save(tmp_path / "linear.safetensors")

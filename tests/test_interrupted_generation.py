@@ -178,7 +178,7 @@ def long_undisturbed(
 
 @needs_signals
 @pytest.mark.slow
-def test_killed_fifty_times_and_resumed_is_bit_identical(
+def test_a_generation_killed_fifty_times_and_resumed_is_bit_identical(
     tmp_path: Path, generators: Generators, long_undisturbed: dict[str, bytes]
 ) -> None:
     """Every tenth time a pool of workers is killed. After its end a dataset is begun anew."""

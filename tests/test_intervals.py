@@ -95,7 +95,7 @@ def measure(
         *(pytest.param(n, most, marks=pytest.mark.slow) for n, most in ((2, 1.5), (5, 1.25))),
     ],
 )
-def test_the_median_of_a_repeated_measurement_falls_into_the_interval(
+def test_the_median_of_a_repeated_measurement_lies_in_the_interval(
     n_processes: int, widest: float
 ) -> None:
     generator = np.random.default_rng(4)
@@ -217,7 +217,7 @@ def test_resampling_regions_covers_the_truth_and_resampling_samples_does_not(k: 
     assert coverage(0.3, k, by_region=False) < 0.7
 
 
-def test_widening_is_that_of_student_and_stays_within_bounds() -> None:
+def test_widening_follows_student_and_stays_within_bounds() -> None:
     assert widening(13) == pytest.approx((13 / 12) ** 0.5 * 2.1788 / 1.95996, rel=1e-4)
     assert widening(10_000) == pytest.approx(1, abs=1e-3)
     draws = np.array([0.5, 1.0, 2.0, 0.0, np.inf])

@@ -32,7 +32,7 @@ def seen_by(row: Row) -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_method_finds_no_test_sample_and_no_result(
+def test_a_method_cannot_find_a_test_sample_or_a_result(
     tiny: Dataset, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
@@ -94,7 +94,7 @@ def test_no_method_can_change_what_another_learns_from(tmp_path: Path, cache: Pa
 
 
 @pytest.mark.slow
-def test_no_test_load_is_known_before_all_configurations_are_fitted(
+def test_no_method_sees_a_test_load_before_all_configurations_are_fitted(
     cache: Path, tmp_path: Path
 ) -> None:
     note = tmp_path / "forces.npy"
@@ -138,7 +138,7 @@ def test_the_first_failure_ends_a_run_that_fails_fast(cache: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_a_module_beside_its_file_competes(cache: Path, tmp_path: Path) -> None:
+def test_a_method_can_come_from_a_module_beside_its_file(cache: Path, tmp_path: Path) -> None:
     suite = tmp_path / "suite" / "methods"
     suite.mkdir(parents=True)
     code = "from tests.third_party import Zero\n\nclass Mine(Zero):\n    pass\n"
@@ -160,7 +160,7 @@ def test_a_module_beside_its_file_competes(cache: Path, tmp_path: Path) -> None:
         ("class Mine:\n    def __init__(self): pass", "unknown key `x`"),
     ],
 )
-def test_a_mistake_in_an_own_method_is_reported_before_anything_runs(
+def test_a_mistake_in_a_users_method_is_reported_before_anything_runs(
     content: str, words: str, cache: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "mistaken.py").write_text(content)

@@ -60,7 +60,9 @@ QUIET = timing([1.0, 1.01])
         ),
     ],
 )
-def test_a_timing_says_why_it_is_unstable(found: Timing, threads: int, reasons: list[str]) -> None:
+def test_a_timing_reports_why_it_is_unstable(
+    found: Timing, threads: int, reasons: list[str]
+) -> None:
     assert why_unstable(found, threads) == reasons
     summary = timing_summary(found, (0.9, 1.1), threads)["latency_ms"]
     assert (summary["stable"], summary["unstable_because"]) == (not reasons, reasons)
@@ -76,7 +78,7 @@ def test_a_summary_holds_the_percentiles_and_the_interval() -> None:
     assert summary["all_threads_ms"] == {"median": 2.0}
 
 
-def test_a_timing_comes_back_from_its_arrays() -> None:
+def test_a_timing_can_be_restored_from_its_arrays() -> None:
     kept = timing([1.0, 2.0])
     kept.throughput["512"] = None
     kept.checked = [(3, 0.1)]
@@ -87,7 +89,7 @@ def test_a_timing_comes_back_from_its_arrays() -> None:
     assert not again.holds(0.6)
 
 
-def test_the_probe_of_the_machine_takes_a_moment() -> None:
+def test_the_speed_probe_of_the_machine_is_short() -> None:
     assert 1e-5 < probe_s() < 5.0
 
 
@@ -146,7 +148,7 @@ def test_configurations_are_timed_in_turns_and_fail_alone(
 
 
 @pytest.mark.slow
-def test_answers_that_are_worse_while_timed_are_found(
+def test_predictions_that_are_worse_while_timed_are_found(
     tiny: Dataset, queries: Queries, tmp_path: Path
 ) -> None:
     methods = {

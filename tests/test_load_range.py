@@ -44,7 +44,7 @@ def nodal(snapshots: Snapshots) -> Snapshots:
     return replace(snapshots, loads=NodalLoads(snapshots.forces, snapshots.loads.patches))
 
 
-def test_the_named_test_sets_are_told_apart(pod: Surrogate, with_sets: Dataset) -> None:
+def test_the_range_flags_separate_the_named_test_sets(pod: Surrogate, with_sets: Dataset) -> None:
     assert not pod.out_of_range(with_sets.train.forces).any()
     assert pod.out_of_range(with_sets.test.forces).mean() < 0.02
     sets = with_sets.tests
@@ -58,7 +58,7 @@ def test_the_named_test_sets_are_told_apart(pod: Surrogate, with_sets: Dataset) 
         np.testing.assert_array_equal(pod.out_of_range(sets[name].forces), larger)
 
 
-def test_directions_across_those_of_training_are_flagged(tmp_path: Path) -> None:
+def test_unseen_directions_are_flagged(tmp_path: Path) -> None:
     spec = mor_bench.load_scene("beam-tiny").spec.model_dump(mode="json")
     pressed = {**spec, "loads": {**spec["loads"], "kind": "normal"}}
     data = mor_bench.load_dataset(
@@ -69,7 +69,7 @@ def test_directions_across_those_of_training_are_flagged(tmp_path: Path) -> None
     assert not method.out_of_range(data.tests["in-range"].forces).any()
 
 
-def test_the_strangeness_is_that_of_its_definition(tiny: Dataset) -> None:
+def test_the_strangeness_follows_its_definition(tiny: Dataset) -> None:
     forces = tiny.train.forces
     known = LoadRange.of(tiny.train)
     for load in (tiny.test.forces[3], np.random.default_rng(0).normal(size=forces.shape[1:])):
@@ -89,7 +89,7 @@ def test_the_strangeness_is_that_of_its_definition(tiny: Dataset) -> None:
         assert known.strangeness(load[None]) == pytest.approx([expected / total], rel=1e-12)
 
 
-def test_patches_and_nodal_forces_have_one_range_in_chunks_or_not(
+def test_patches_and_nodal_forces_have_the_same_range_with_or_without_chunks(
     tiny: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = LoadRange.of(tiny.train)
@@ -104,13 +104,15 @@ def test_patches_and_nodal_forces_have_one_range_in_chunks_or_not(
         np.testing.assert_allclose(found.moments, whole.moments, atol=1e-14)
 
 
-def test_the_nodal_forces_of_all_samples_are_never_made(tiny: Dataset) -> None:
+def test_the_nodal_forces_of_all_samples_are_never_stored_at_once(tiny: Dataset) -> None:
     fresh = replace(tiny.train)
     LoadRange.of(fresh)
     assert "forces" not in vars(fresh)
 
 
-def test_shapes_and_bad_input(pod: Surrogate, tiny: Dataset) -> None:
+def test_forces_of_any_valid_shape_are_accepted_and_bad_input_is_refused(
+    pod: Surrogate, tiny: Dataset
+) -> None:
     one, batch = tiny.test.forces[0], tiny.test.forces[:5]
     assert pod.out_of_range(one).shape == ()
     assert pod.out_of_range(batch).shape == (5,)
@@ -156,7 +158,7 @@ def test_the_range_survives_a_file(pod: Surrogate, with_sets: Dataset, tmp_path:
         )
 
 
-def test_a_file_without_a_range_is_read_and_says_so(
+def test_a_file_without_a_range_is_read_with_a_warning(
     pod: Surrogate, tiny: Dataset, tmp_path: Path
 ) -> None:
     path = tmp_path / "model.safetensors"

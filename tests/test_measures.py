@@ -41,7 +41,7 @@ def test_error_metrics_match_hand_computed_values() -> None:
     )
 
 
-def test_a_missing_prediction_is_an_infinite_error() -> None:
+def test_a_missing_prediction_has_an_infinite_error() -> None:
     reference = np.ones((30, 4, 3))
     predicted = reference.copy()
     predicted[7, 2, 1] = np.nan
@@ -101,7 +101,7 @@ def test_a_frontier_stays_between_its_points(
         assert front[-1].error * below <= at_time["error"] <= at_time["best"]["error"] * above
 
 
-def test_threads_are_pinned_and_given_back() -> None:
+def test_threads_are_pinned_and_then_restored() -> None:
     before = [pool["num_threads"] for pool in threadpool_info()]
     with pinned_threads(1):
         assert {pool["num_threads"] for pool in threadpool_info()} == {1}

@@ -305,7 +305,7 @@ def test_a_training_sized_to_seconds_is_repeated_by_its_number_of_iterations() -
 
 
 @pytest.mark.parametrize("each_s", [4e-4, 4e-3], ids=["many iterations", "few iterations"])
-def test_the_time_to_fill_includes_the_trial_and_the_validations(
+def test_the_given_time_includes_the_trial_and_the_validations(
     each_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By a clock that a loss advances in proportion to its samples."""

@@ -47,7 +47,7 @@ def test_a_new_method_is_valid_and_reproduces_its_training_data(
     np.testing.assert_allclose(predicted, reference, atol=1e-9 * np.abs(reference).max())
 
 
-def test_in_a_checkout_the_files_join_the_suite_and_keep_the_laws_of_the_tree(
+def test_in_a_checkout_the_new_files_join_the_suite_and_keep_the_laws_of_the_tree(
     tmp_path: Path,
 ) -> None:
     for folder in ("methods", "mor_bench/surrogates"):
@@ -83,7 +83,9 @@ def test_a_bad_name_is_refused_and_nothing_is_written(
 
 
 @pytest.mark.parametrize("existing", ["mine.toml", "mine.py"])
-def test_files_that_exist_are_kept_and_no_half_is_written(tmp_path: Path, existing: str) -> None:
+def test_existing_files_are_kept_and_nothing_is_written_in_part(
+    tmp_path: Path, existing: str
+) -> None:
     (tmp_path / existing).write_text("keep me", encoding="utf-8")
     with pytest.raises(SpecError, match=f"{existing}: the file exists"):
         write_method("mine", tmp_path)

@@ -48,7 +48,7 @@ def tiny_of(law: str) -> Scene:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_modal_derivatives_are_those_of_the_tangent(law: str) -> None:
+def test_modal_derivatives_follow_from_the_derivative_of_the_tangent(law: str) -> None:
     """K₀ ψᵢⱼ = -(∂K/∂qⱼ) φᵢ, by the central difference of the assembled tangent along a mode."""
     scene = tiny_of(law)
     model = FullOrderModel(scene)
@@ -72,7 +72,7 @@ def test_modal_derivatives_are_those_of_the_tangent(law: str) -> None:
         )
 
 
-def test_of_a_cubic_force_the_differences_are_exact_whatever_their_step(
+def test_differences_of_a_cubic_force_are_exact_for_any_step(
     tiny: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = FullOrderModel(tiny.scene)
@@ -165,7 +165,7 @@ def test_the_quadratic_manifold_is_exact_to_second_order(tiny: Dataset) -> None:
 
 @pytest.mark.parametrize(("name", "knobs"), NO_SNAPSHOTS)
 @pytest.mark.parametrize("law", LAWS)
-def test_without_snapshots_they_beat_linear_elasticity_for_every_law(
+def test_bases_without_snapshots_beat_linear_elasticity_for_every_law(
     name: str, knobs: dict[str, Any], law: str
 ) -> None:
     scene = tiny_of(law)
@@ -187,7 +187,7 @@ def test_without_snapshots_they_beat_linear_elasticity_for_every_law(
 
 @pytest.mark.parametrize("change", [{"integration": "selective"}, {"element": "tetrahedron"}])
 @pytest.mark.parametrize(("name", "knobs"), NO_SNAPSHOTS)
-def test_other_elements_and_integration(
+def test_nonlinear_bases_work_with_other_elements_and_integration(
     name: str, knobs: dict[str, Any], change: dict[str, str]
 ) -> None:
     content = load_generated_spec("beam-tiny").model_dump(mode="json")
@@ -202,7 +202,7 @@ def test_other_elements_and_integration(
     )
 
 
-def test_a_load_is_answered_from_the_basis_of_its_direction(tiny: Dataset) -> None:
+def test_a_load_uses_the_basis_of_its_direction(tiny: Dataset) -> None:
     """Scaling a load changes no cluster, and there are no more clusters than directions."""
     method = LocalPOD(n_clusters=4, n_modes=3).fit(tiny.scene, tiny.train)
     assert len(method.problems_) == 4
@@ -222,7 +222,7 @@ def test_a_load_is_answered_from_the_basis_of_its_direction(tiny: Dataset) -> No
     assert len(LocalPOD(n_clusters=500, n_modes=1).fit(tiny.scene, tiny.train[:6]).problems_) == 6
 
 
-def test_with_one_cluster_and_all_modes_local_pod_is_the_full_model_on_its_snapshots(
+def test_local_pod_with_one_cluster_and_all_modes_reproduces_its_snapshots(
     tiny: Dataset,
 ) -> None:
     method = LocalPOD(n_clusters=1, n_modes=10_000)
@@ -235,7 +235,7 @@ def test_with_one_cluster_and_all_modes_local_pod_is_the_full_model_on_its_snaps
 
 
 @pytest.mark.slow
-def test_of_clusters_of_like_loads_each_does_better_than_one_basis(cache: Path) -> None:
+def test_clusters_of_similar_loads_do_better_than_one_basis(cache: Path) -> None:
     """At five modes; at twenty the clusters gain little, see the method's limits."""
     data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
     medians = []
@@ -251,7 +251,7 @@ def test_of_clusters_of_like_loads_each_does_better_than_one_basis(cache: Path) 
 
 
 @pytest.mark.slow
-def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_answers(cache: Path) -> None:
+def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_predictions(cache: Path) -> None:
     """Small loads get the linear response even at a loose tolerance."""
     scene = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache).scene
     forces = draw_loads(scene, 0, 30).nodal_forces(scene.patch_weights)
@@ -273,7 +273,7 @@ def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_answers(cache: Pat
 
 
 @pytest.mark.slow
-def test_the_autoencoder_learns_what_linear_elasticity_lacks(cache: Path) -> None:
+def test_the_autoencoder_learns_the_difference_from_linear_elasticity(cache: Path) -> None:
     pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
     data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
     sizes, medians = np.linalg.norm(data.test.displacements, axis=(1, 2)), {}
@@ -304,7 +304,7 @@ def test_modes_of_a_damaged_model_are_refused(spoil: str, tiny: Dataset) -> None
 @pytest.mark.parametrize(
     ("name", "knobs"), [*NO_SNAPSHOTS, ("local-pod", {"n_clusters": 2, "n_modes": 4})]
 )
-def test_what_the_static_correction_inverts_is_refused(
+def test_a_body_that_the_static_correction_inverts_is_refused(
     name: str, knobs: dict[str, Any], tiny: Dataset
 ) -> None:
     method = mor_bench.load_method(name, **knobs).fit(tiny.scene, tiny.train)
@@ -331,9 +331,7 @@ def test_the_polynomial_is_used_where_it_pays(tiny: Dataset) -> None:
 
 
 @pytest.mark.slow
-def test_the_autoencoder_says_that_it_cannot_start_from_another(
-    tiny: Dataset, tmp_path: Path
-) -> None:
+def test_the_autoencoder_refuses_to_start_from_a_saved_model(tiny: Dataset, tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
     method = mor_bench.load_method("autoencoder", iterations=2).fit(tiny.scene, tiny.train)
     method.save(tmp_path / "model.safetensors")
@@ -343,7 +341,9 @@ def test_the_autoencoder_says_that_it_cannot_start_from_another(
 
 
 @pytest.mark.slow
-def test_no_load_in_a_batch_gives_exactly_no_displacement_of_the_autoencoder(tiny: Dataset) -> None:
+def test_the_autoencoder_gives_exactly_zero_displacement_for_a_zero_load_in_a_batch(
+    tiny: Dataset,
+) -> None:
     method = mor_bench.load_method("autoencoder", iterations=20).fit(tiny.scene, tiny.train)
     forces = tiny.test.forces[:5].copy()
     forces[[0, 3]] = 0.0

@@ -53,7 +53,7 @@ def relative_l2(predicted: np.ndarray, reference: np.ndarray) -> np.ndarray:
     return sample_errors(predicted, reference).relative_l2
 
 
-def test_gappy_pod_reproduces_what_its_modes_span(data: Dataset) -> None:
+def test_gappy_pod_reproduces_displacements_in_the_span_of_its_modes(data: Dataset) -> None:
     """Without regularisation, as many modes as samples reproduce each sample."""
     few = data.train[:12]
     method = mor_bench.load_method("gappy-pod", n_modes=12, regularisation=0.0).fit(data.scene, few)
@@ -64,7 +64,7 @@ def test_gappy_pod_reproduces_what_its_modes_span(data: Dataset) -> None:
     np.testing.assert_allclose(method.predict(given), mixed, atol=1e-8 * np.abs(mixed).max())
 
 
-def test_regularisation_keeps_noise_out_of_gappy_pod(data: Dataset) -> None:
+def test_regularisation_reduces_the_effect_of_noise_on_gappy_pod(data: Dataset) -> None:
     noise = (
         0.01
         * np.sqrt((data.test.displacements**2).mean())
@@ -85,7 +85,7 @@ def test_regularisation_keeps_noise_out_of_gappy_pod(data: Dataset) -> None:
 @pytest.mark.parametrize(
     "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in sorted(SPECS)]
 )
-def test_a_method_completes_what_is_observed_or_says_that_it_needs_forces(
+def test_a_method_completes_observed_displacements_or_says_that_it_needs_forces(
     name: str, data: Dataset
 ) -> None:
     method = cheap_method(name, observed=True)
@@ -107,7 +107,7 @@ def test_a_method_completes_what_is_observed_or_says_that_it_needs_forces(
     assert method.predict(given[:0]).shape == reference[:0].shape
 
 
-def test_most_methods_complete_what_is_observed() -> None:
+def test_most_methods_complete_observed_displacements() -> None:
     """So that the law above does not hold because every method refuses."""
     scene = scene_of({"region": "z-max"})
     for name in QUICK | (set(OBSERVATION_METHODS) - {"umesh"}):  # which needs torch
@@ -152,7 +152,7 @@ class Forgetful(Surrogate):
         return forces
 
 
-def test_a_method_that_does_not_say_that_it_can_is_not_given_displacements(
+def test_a_method_gets_displacements_only_if_it_declares_support(
     data: Dataset, tiny: Dataset
 ) -> None:
     with pytest.raises(UnsupportedSceneError, match=NO_FORCES):
@@ -160,7 +160,7 @@ def test_a_method_that_does_not_say_that_it_can_is_not_given_displacements(
     Forgetful().fit(tiny.scene, tiny.train)
 
 
-def test_forces_are_not_taken_for_displacements_nor_displacements_for_forces(
+def test_forces_and_displacements_are_never_confused(
     linear: Surrogate, data: Dataset, tiny: Dataset
 ) -> None:
     given = data.test.given
@@ -172,7 +172,7 @@ def test_forces_are_not_taken_for_displacements_nor_displacements_for_forces(
         linear.predict(ObservedDisplacements(given.values, np.arange(5)))
 
 
-def test_gappy_pod_needs_something_to_complete(tiny: Dataset) -> None:
+def test_gappy_pod_requires_observed_displacements(tiny: Dataset) -> None:
     with pytest.raises(UnsupportedSceneError, match="the scene gives forces"):
         mor_bench.load_method("gappy-pod").fit(tiny.scene, tiny.train)
 
@@ -187,7 +187,7 @@ def test_without_forces_no_error_is_indicated_and_no_range_is_known(
 
 
 @pytest.mark.slow
-def test_a_run_has_rows_of_those_that_can_and_reasons_of_the_others(
+def test_a_run_has_rows_of_supported_methods_and_reasons_for_the_others(
     data: Dataset, cache: Path, tmp_path: Path
 ) -> None:
     path, pod = written(tmp_path, TOP), tmp_path / "pod.toml"
@@ -220,7 +220,7 @@ def test_a_run_has_rows_of_those_that_can_and_reasons_of_the_others(
     assert comparison.datasets["beam-tiny-observed"]["observed"] == {"region": "z-max"}
 
 
-def test_the_fit_command_scores_answers_to_what_is_seen(
+def test_the_fit_command_scores_predictions_from_observed_displacements(
     data: Dataset, cache: Path, tmp_path: Path
 ) -> None:
     fitted = mor_bench.fit(
@@ -232,7 +232,7 @@ def test_the_fit_command_scores_answers_to_what_is_seen(
     )
 
 
-def test_a_model_of_other_observed_nodes_is_not_taken_from_the_cache(
+def test_the_cache_does_not_return_a_model_of_other_observed_nodes(
     data: Dataset, tiny: Dataset, tmp_path: Path
 ) -> None:
     corner = scene_of({"region": {"nearest_m": [[2.0, 1.0, 1.0], 20]}})
@@ -244,13 +244,13 @@ def test_a_model_of_other_observed_nodes_is_not_taken_from_the_cache(
 
 
 @pytest.mark.slow
-def test_by_default_the_methods_run_that_can(tmp_path: Path) -> None:
+def test_all_supported_methods_run_by_default(tmp_path: Path) -> None:
     path = written(tmp_path, TOP)
     chosen = [method.name for method in checked_specs([path], None, RunOptions())[1]]
     assert chosen == list(OBSERVATION_METHODS)
 
 
-def test_exported_answers_are_those_to_what_is_observed(
+def test_exported_predictions_use_the_observed_displacements(
     gappy: Surrogate, data: Dataset, tiny: Dataset, tmp_path: Path
 ) -> None:
     import meshio
@@ -266,9 +266,7 @@ def test_exported_answers_are_those_to_what_is_observed(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["umesh-small", "umesh-linear"])
-def test_an_onnx_file_does_not_look_at_what_is_not_seen(
-    name: str, data: Dataset, tmp_path: Path
-) -> None:
+def test_an_onnx_file_ignores_hidden_nodes(name: str, data: Dataset, tmp_path: Path) -> None:
     onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
     pytest.importorskip("torch")
     method = mor_bench.load_method(name, channels=2, steps=1, iterations=3).fit(

@@ -28,7 +28,7 @@ def data(tiny: Dataset, cache: Path, tmp_path_factory: pytest.TempPathFactory) -
     return mor_bench.load_dataset(written(tmp_path_factory.mktemp("observed"), TOP), cache=cache)
 
 
-def test_the_samples_are_those_of_the_scene_without_the_option(
+def test_the_samples_equal_those_of_the_scene_without_the_option(
     data: Dataset, tiny: Dataset, cache: Path
 ) -> None:
     assert data.scene.spec.digest() == tiny.scene.spec.digest()
@@ -49,7 +49,7 @@ def test_the_samples_are_those_of_the_scene_without_the_option(
     assert tiny.test.given.query is tiny.test.forces
 
 
-def test_the_manifest_of_shared_samples_stays_that_of_the_dataset_that_made_them(
+def test_shared_samples_keep_the_manifest_of_the_dataset_that_made_them(
     data: Dataset, tiny: Dataset, cache: Path
 ) -> None:
     assert isinstance(tiny.scene.spec, type(data.scene.generated))
@@ -99,7 +99,7 @@ def test_a_scene_with_nothing_hidden_is_refused() -> None:
 
 @pytest.mark.parametrize("region", ["z-max", "surface"])
 @pytest.mark.parametrize("solver", [None, "rotated-pcg", "cholesky", "jacobi-pcg"])
-def test_fem_finds_the_equilibrium_where_every_loaded_node_is_seen(
+def test_fem_finds_the_equilibrium_if_every_loaded_node_is_observed(
     region: str, solver: Any, tiny: Dataset
 ) -> None:
     scene = scene_of({"region": region})

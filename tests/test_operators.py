@@ -144,7 +144,7 @@ def test_message_passing_is_the_sum_over_edges_written_out(mesh: Mesh) -> None:
             torch.testing.assert_close(found_nodes[node], expected, rtol=1e-4, atol=1e-5)
 
 
-def test_gradients_through_the_graph_are_those_of_dense_matrices() -> None:
+def test_gradients_through_the_graph_equal_those_of_dense_matrices() -> None:
     mesh = tetrahedral()
     graph = Graph(mesh)
     senders, receivers = (
@@ -160,7 +160,7 @@ def test_gradients_through_the_graph_are_those_of_dense_matrices() -> None:
     torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-5)
 
 
-def test_a_graph_network_sees_as_many_edges_far_as_it_has_steps_and_no_numbers_or_places() -> None:
+def test_a_graph_network_sees_one_edge_per_step_and_ignores_numbering_and_position() -> None:
     mesh = box_mesh((6.0, 1.0, 1.0), (6, 1, 1))  # nodes are numbered along x first
     network = GraphNetwork(mesh, np.arange(4), 8, 2)
     initialise(network, torch.Generator().manual_seed(0))
@@ -212,7 +212,7 @@ def test_deeponet_is_the_branch_times_the_trunk(name: str, tiny: Dataset) -> Non
 
 @pytest.mark.parametrize("input", ["force", "linear-response"])
 @pytest.mark.parametrize("name", SMALL)
-def test_the_first_loss_is_that_of_the_network_less_its_answer_at_rest(
+def test_the_loss_subtracts_the_output_of_the_network_at_rest(
     name: str, input: str, tiny: Dataset
 ) -> None:
     """One step on all samples at a rate that changes nothing."""
@@ -230,7 +230,7 @@ def test_the_first_loss_is_that_of_the_network_less_its_answer_at_rest(
 
 @pytest.mark.parametrize("input", ["force", "linear-response"])
 @pytest.mark.parametrize("name", SMALL)
-def test_no_force_gives_no_displacement_alone_and_among_others(
+def test_zero_force_gives_zero_displacement_alone_and_in_a_batch(
     name: str, input: str, tiny: Dataset
 ) -> None:
     method = make(name, input=input).fit(tiny.scene, tiny.train[:60])
@@ -264,7 +264,7 @@ def test_a_second_fit_is_bit_identical_and_leaves_the_global_random_state_alone(
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_training_lowers_the_error_of_the_linear_response(name: str, tiny: Dataset) -> None:
+def test_training_gives_a_lower_error_than_the_linear_response(name: str, tiny: Dataset) -> None:
     """DeepONet on load regions that it never saw, the others on a mesh that lies in no grid."""
     train = test = tiny.train
     if "deeponet" in name:

@@ -105,7 +105,7 @@ def test_imported_samples_are_split_by_sample_direction_and_region(
         mor_bench.load_dataset(path)
 
 
-def test_imported_samples_are_split_as_the_file_says(arrays: Arrays, tmp_path: Path) -> None:
+def test_imported_samples_are_split_as_the_file_specifies(arrays: Arrays, tmp_path: Path) -> None:
     held = np.arange(len(arrays["forces"])) % 3 == 0
     for test in (held, held.astype(np.uint8)):
         path = written(tmp_path, {**arrays, "test": test}, BY_FILE.replace(".npz", ".h5"))
@@ -124,9 +124,7 @@ QUICK = {"fem", "pod", "gappy-pod", "pca-regression", "pca-regression-force"}
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in sorted(SPECS)]
 )
-def test_every_method_competes_or_gives_its_reason(
-    name: str, arrays: Arrays, tmp_path: Path
-) -> None:
+def test_every_method_runs_or_gives_its_reason(name: str, arrays: Arrays, tmp_path: Path) -> None:
     data = mor_bench.load_dataset(written(tmp_path, arrays))
     method = cheap_method(name)
     if hasattr(method, "iterations"):
@@ -157,12 +155,14 @@ def test_every_method_competes_or_gives_its_reason(
 @pytest.mark.parametrize(
     "none", [np.zeros(0), np.zeros(0, dtype=int), np.zeros(0, dtype=bool), np.zeros((0, 0))]
 )
-def test_no_node_need_be_fixed(none: NDArray[Any], arrays: Arrays, tmp_path: Path) -> None:
+def test_a_mesh_without_fixed_nodes_is_accepted(
+    none: NDArray[Any], arrays: Arrays, tmp_path: Path
+) -> None:
     scene = mor_bench.load_scene(written(tmp_path, {**arrays, "fixed_nodes": none}))
     assert scene.fixed_nodes.shape == (0,)
 
 
-def test_every_force_that_can_be_read_can_be_predicted() -> None:
+def test_every_force_that_can_be_read_has_a_prediction() -> None:
     assert MAX_SIZE["forces"] == MAX_FORCE_N
 
 
@@ -181,7 +181,7 @@ def test_a_linear_law_is_learned(tmp_path: Path, arrays: Arrays) -> None:
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(displacements).max())
 
 
-def test_there_is_no_full_order_model_of_it(arrays: Arrays, tmp_path: Path) -> None:
+def test_imported_snapshots_have_no_full_order_model(arrays: Arrays, tmp_path: Path) -> None:
     path = written(tmp_path, arrays)
     scene = mor_bench.load_scene(path)
     for call in (
@@ -198,7 +198,7 @@ def test_there_is_no_full_order_model_of_it(arrays: Arrays, tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_by_default_only_methods_run_that_learn_from_samples(
+def test_only_methods_that_learn_from_samples_run_by_default(
     arrays: Arrays, tmp_path: Path
 ) -> None:
     path = written(tmp_path, arrays)
@@ -359,7 +359,7 @@ def test_bad_files_are_refused_in_one_line(
         (h5py.ExternalLink("nowhere.h5", "/forces"), "`forces` cannot be read: .*"),
     ],
 )
-def test_entries_of_hdf5_that_are_no_arrays_are_named(
+def test_entries_of_hdf5_that_are_no_arrays_give_an_error_that_names_them(
     entry: Any, message: str, arrays: Arrays, tmp_path: Path
 ) -> None:
     path = written(tmp_path, without("forces")(arrays), TOML.replace(".npz", ".h5"))

@@ -27,7 +27,7 @@ def entries() -> list[Entry]:
     ]
 
 
-def test_the_paper_s_table_of_errors_has_its_networks_beside_ours(entries: list[Entry]) -> None:
+def test_the_error_table_of_the_paper_shows_its_networks_beside_ours(entries: list[Entry]) -> None:
     network = next(entry.row for entry in entries if entry.method == "umesh")
     size = {"channels": 128, "steps": 3}
     large = Entry(network.with_parts(label="large", parameters=size))

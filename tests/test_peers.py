@@ -18,7 +18,7 @@ from tests.benchmarks.peers import (
 
 
 @pytest.mark.parametrize("entry", PEERS, ids=lambda entry: entry.label)
-def test_peer_agrees(entry: Entry, tiny_scene: Scene) -> None:
+def test_every_peer_agrees_with_our_solution(entry: Entry, tiny_scene: Scene) -> None:
     if entry.missing:
         pytest.skip(f"not installed: {', '.join(entry.missing)}")
     _, forces = pick_loads(tiny_scene, 1)

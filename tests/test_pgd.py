@@ -46,7 +46,7 @@ def separable(x: Array) -> Array:
     return np.stack(products, axis=1) @ vectors
 
 
-def test_a_sum_of_products_is_found_and_holds_elsewhere() -> None:
+def test_a_sum_of_products_is_found_and_generalises() -> None:
     x, new = np.random.default_rng(0).uniform(-1, 1, (2, 400, 3))
     found = separate(separable(x), functions(x, "both"), 40, 0.0)
     assert found.residuals[-1] <= 1e-6
@@ -67,7 +67,7 @@ def test_one_product_takes_one_term() -> None:
     assert separate(target, functions(x, "both"), 4, 0.0).residuals[-1] <= 1e-4
 
 
-def test_the_residual_falls_with_every_term_and_is_the_true_one(tiny: Dataset) -> None:
+def test_the_reported_residual_is_the_true_one_and_falls_with_every_term(tiny: Dataset) -> None:
     x = np.random.default_rng(0).uniform(-1, 1, (200, 3))
     target = np.exp(x @ np.random.default_rng(2).normal(size=(3, 5))) * x[:, 2:] ** 2
     found = separate(target, functions(x, "both"), 12, 1e-12)
@@ -77,7 +77,7 @@ def test_the_residual_falls_with_every_term_and_is_the_true_one(tiny: Dataset) -
     assert found.residuals[-1] < 0.3 * found.residuals[0]
 
 
-def test_coordinates_are_the_patchs_own(tiny: Dataset) -> None:
+def test_coordinates_are_those_of_the_patch(tiny: Dataset) -> None:
     """The centroid of a patch's area, and the force that the plan has drawn."""
     scene, forces = tiny.scene, tiny.train.forces
     points, shares = scene.patch_points(np.arange(len(scene.patch_nodes)))
@@ -88,7 +88,9 @@ def test_coordinates_are_the_patchs_own(tiny: Dataset) -> None:
 
 
 @pytest.mark.parametrize("base", ["linear-response", "none"])
-def test_no_load_and_a_couple(base: str, tiny: Dataset) -> None:
+def test_zero_load_gives_zero_and_a_couple_gives_the_answer_of_the_base(
+    base: str, tiny: Dataset
+) -> None:
     method = SeparatedLoad(base, n_terms=10, position_degree=2).fit(tiny.scene, tiny.train)  # type: ignore[arg-type]
     force = np.zeros((tiny.scene.mesh.n_nodes, 3))
     assert not method.predict(force).any()
@@ -126,7 +128,7 @@ def test_a_separable_solution_of_patch_loads_is_found_in_unseen_regions(tiny: Da
     assert np.linalg.norm(found - exact) <= 2e-3 * np.linalg.norm(exact)
 
 
-def test_beside_the_linear_response_terms_are_of_second_degree_and_more(tiny: Dataset) -> None:
+def test_terms_added_to_the_linear_response_are_of_second_degree_and_more(tiny: Dataset) -> None:
     """Small loads get the linear response, even if the samples have another first degree."""
     samples = replace(tiny.train, free_displacements=1.5 * tiny.train.free_displacements)
     method = SeparatedLoad(n_terms=30).fit(tiny.scene, samples)
@@ -150,7 +152,7 @@ def test_on_unseen_load_regions_it_is_far_better_than_the_linear_response(tiny: 
     assert mine <= 0.4 * theirs
 
 
-def test_outside_the_positions_of_training_it_answers_as_at_their_edge(tiny: Dataset) -> None:
+def test_outside_the_training_positions_the_prediction_is_that_of_their_edge(tiny: Dataset) -> None:
     method = SeparatedLoad("none", n_terms=20, position_degree=2).fit(tiny.scene, tiny.train)
     functions = method.functions_
     assert functions.ends.shape == (2, 2)
@@ -165,7 +167,7 @@ def test_outside_the_positions_of_training_it_answers_as_at_their_edge(tiny: Dat
     np.testing.assert_allclose(position, there, atol=1e-9)
 
 
-def test_several_forces_are_named_as_the_reason() -> None:
+def test_several_forces_are_refused_with_this_reason() -> None:
     scene = mor_bench.load_scene("beam-coarse-3-forces")
     assert (
         SeparatedLoad().supports(scene) == "it handles one load patch, and here several act at once"

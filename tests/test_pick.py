@@ -74,7 +74,7 @@ DISQUALIFIED = {
 }
 
 
-def test_the_row_that_the_others_change_qualifies() -> None:
+def test_the_unchanged_row_qualifies() -> None:
     chosen = choose([a_row()], ASKED, "d")
     assert chosen.choice == a_row()
     assert (chosen.runner_up, chosen.relaxations, chosen.nearest) == (None, [], None)
@@ -93,7 +93,7 @@ def test_a_figure_without_a_limit_may_be_unknown() -> None:
     assert "unknown" in chosen.text()
 
 
-def test_the_cheapest_offline_wins_and_latency_decides_between_nearly_equal_ones() -> None:
+def test_the_lowest_offline_cost_wins_and_latency_breaks_near_ties() -> None:
     def winner(*rows: Row) -> str:
         choice = choose(rows, ASKED, "d").choice
         assert choice is not None
@@ -140,7 +140,7 @@ def synthetic(number: int, figures: tuple[Any, ...]) -> Row:
 
 
 @given(rows_of_figures, limits)
-def test_the_choice_meets_everything_and_nothing_cheaper_does(
+def test_the_choice_is_the_cheapest_row_that_meets_every_limit(
     figures: list[Any], limit: tuple[Any, ...]
 ) -> None:
     rows = [synthetic(number, row) for number, row in enumerate(figures)]
@@ -169,7 +169,9 @@ def test_the_choice_meets_everything_and_nothing_cheaper_does(
 
 
 @given(rows_of_figures, limits)
-def test_a_relaxation_is_enough_and_less_is_not(figures: list[Any], limit: tuple[Any, ...]) -> None:
+def test_a_suggested_relaxation_is_the_smallest_that_is_enough(
+    figures: list[Any], limit: tuple[Any, ...]
+) -> None:
     rows = [synthetic(number, row) for number, row in enumerate(figures)]
     requirements = Requirements(*limit)
 
@@ -194,7 +196,7 @@ def test_a_relaxation_is_enough_and_less_is_not(figures: list[Any], limit: tuple
             assert qualifies(error=shown * (1 + 1e-15))
 
 
-def test_without_a_choice_the_text_says_what_would_have_to_give() -> None:
+def test_without_a_choice_the_text_names_the_limits_to_relax() -> None:
     slow = a_row("exact", latency_ms={"median": 11.9, "high": 12.34}, error={"rel_l2_median": 1e-6})
     rough = a_row("rough", error={"rel_l2_median": 0.02})
     limits = Requirements(0.01, 3.0, 1e9)

@@ -25,7 +25,7 @@ def test_a_dry_run_computes_nothing_and_names_every_step(tmp_path: Path) -> None
     assert planned.seconds > planned.timing_s > 0
 
 
-def test_a_dry_run_knows_what_the_cache_has(small_run: Comparison, cache: Path) -> None:
+def test_a_dry_run_takes_the_cache_into_account(small_run: Comparison, cache: Path) -> None:
     planned = plan(["beam-tiny"], ["linear-fem", "pod"], cache=cache, limit=LIMIT)
     assert [step.done for step in planned.steps] == [True, True, *[False] * 7]
 
@@ -88,6 +88,6 @@ def test_a_digest_follows_the_modules_of_a_third_party(tmp_path: Path) -> None:
     assert code_digest("theirs.method:Mine", tmp_path) != before
 
 
-def test_every_shipped_method_says_how_long_a_fit_takes() -> None:
+def test_every_shipped_method_states_the_duration_of_a_fit() -> None:
     methods = [load_method_spec(path) for path in list_suite("methods").values()]
     assert all(method.fit_seconds(profile) for method in methods for profile in ("quick", "full"))

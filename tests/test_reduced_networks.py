@@ -36,7 +36,7 @@ def median_error(method: mor_bench.Surrogate, train: Snapshots, test: Snapshots)
 
 
 @pytest.mark.parametrize("of_force", [False, True])
-def test_sensitivities_are_finite_differences_of_full_order_solves(
+def test_sensitivities_match_finite_differences_of_full_order_solves(
     of_force: bool, tiny: Dataset
 ) -> None:
     model, few = FullOrderModel(tiny.scene), tiny.train[np.array([3, 40])]
@@ -120,7 +120,7 @@ def test_the_network_of_torch_and_of_numpy_agree_with_their_slopes() -> None:
 
 @pytest.mark.parametrize("derivatives", [False, True])
 @pytest.mark.parametrize("input", ["force", "linear-response"])
-def test_the_loss_of_the_training_is_that_of_the_predictions(
+def test_the_training_loss_equals_the_loss_of_the_predictions(
     input: str, derivatives: bool, tiny: Dataset, tmp_path: Path
 ) -> None:
     """One step on all samples, from a trained network: value and slope at rest are not zero."""
@@ -164,7 +164,7 @@ def test_the_loss_of_the_training_is_that_of_the_predictions(
 
 
 @pytest.mark.slow
-def test_derivatives_spare_samples(tiny: Dataset) -> None:
+def test_derivatives_lower_the_error_with_few_samples(tiny: Dataset) -> None:
     few = tiny.train[::6]
     without, with_them = (
         median_error(mor_bench.load_method("pod-nn", derivatives=d, **BRIEF), few, tiny.test)
@@ -178,7 +178,7 @@ def fitted(tiny: Dataset) -> mor_bench.Surrogate:
     return mor_bench.load_method("pod-nn", **BRIEF).fit(tiny.scene, tiny.train)
 
 
-def test_what_is_learned_is_of_second_order_in_the_load(
+def test_the_learned_part_is_of_second_order_in_the_load(
     fitted: mor_bench.Surrogate, tiny: Dataset
 ) -> None:
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
@@ -224,7 +224,7 @@ def test_damaged_arrays_are_refused(name: str, fitted: mor_bench.Surrogate, tiny
             other.restore(tiny.scene, {**fitted.arrays_, name: damaged})
 
 
-def test_axes_and_weights_scale_as_they_say() -> None:
+def test_input_axes_and_error_weights_have_their_documented_scale() -> None:
     samples = np.random.default_rng(0).normal(size=(50, 6)) * 10.0 ** -np.arange(6)
     for evenness in (0.0, 0.5, 1.0):
         sizes = np.sqrt(((samples @ input_axes(samples, 4, evenness)) ** 2).mean(axis=0))

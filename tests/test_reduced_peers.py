@@ -18,7 +18,7 @@ from tests.benchmarks.reduced_peers import (
 )
 
 
-def test_kratos_solves_our_reduced_equations(tiny: Dataset) -> None:
+def test_kratos_solves_the_same_reduced_equations(tiny: Dataset) -> None:
     missing = [name for name in KRATOS_ROM if not installed(name)]
     if missing:
         pytest.skip(f"not installed: {', '.join(missing)}")

@@ -23,7 +23,7 @@ def coarse(cache: Path) -> Dataset:
     return mor_bench.load_dataset("beam-coarse", limit=320, cache=cache)
 
 
-def test_projected_tangent_and_force(coarse: Dataset) -> None:
+def test_projected_force_and_tangent_match_the_full_order_model(coarse: Dataset) -> None:
     model = FullOrderModel(coarse.scene)
     modes = pod(coarse.train.free_displacements, 12).modes
     problem = GalerkinProblem(model.assembler, modes)
@@ -40,7 +40,9 @@ def test_projected_tangent_and_force(coarse: Dataset) -> None:
     )
 
 
-def test_galerkin_energy_never_lies_below_the_full_one_and_approaches_it(coarse: Dataset) -> None:
+def test_galerkin_energy_is_never_below_the_full_order_energy_and_approaches_it(
+    coarse: Dataset,
+) -> None:
     model = FullOrderModel(coarse.scene)
     forces, exact = coarse.test.free_forces[:20], coarse.test.free_displacements[:20]
     gaps = []
@@ -78,7 +80,7 @@ def test_ecsw_keeps_few_cells_and_stays_close_to_pod(coarse: Dataset) -> None:
     assert reduced.problem_.points.n_points == 8 * len(reduced.cells_)
 
 
-def test_the_compressed_training_system_is_the_whole_one(coarse: Dataset) -> None:
+def test_the_compressed_training_system_equals_the_whole_one(coarse: Dataset) -> None:
     model = FullOrderModel(coarse.scene)
     modes = pod(coarse.train.free_displacements, 4).modes
     q = coarse.train.free_displacements[:50] @ modes
@@ -98,7 +100,7 @@ def test_the_compressed_training_system_is_the_whole_one(coarse: Dataset) -> Non
     )
 
 
-def test_monomials_are_all_of_their_degree() -> None:
+def test_monomials_include_every_product_up_to_their_degree() -> None:
     z = np.random.default_rng(0).normal(size=(3, 4))
     values = Monomials(4, monomial_indices(4, 3))(z)
     assert values.shape == (3, 4 + 10 + 20)
@@ -115,7 +117,7 @@ def test_monomials_are_all_of_their_degree() -> None:
     assert {*np.round(values[0], 12)} == expected
 
 
-def test_pca_regression_answers_forces_outside_the_load_region(tiny: Dataset) -> None:
+def test_pca_regression_predicts_forces_outside_the_load_region(tiny: Dataset) -> None:
     method = mor_bench.load_method("pca-regression").fit(tiny.scene, tiny.train)
     forces = np.zeros((tiny.scene.mesh.n_nodes, 3))
     forces[tiny.scene.mesh.points[:, 2] == 0.0] = [0.0, 0.0, 1e-4]

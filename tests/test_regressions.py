@@ -122,7 +122,7 @@ EXPECTED = {
 }
 
 
-def test_predictions_are_those_of_scikit_learn(fitted: Any, tiny: Dataset) -> None:
+def test_predictions_match_scikit_learn(fitted: Any, tiny: Dataset) -> None:
     expected = EXPECTED[type(fitted).__name__](fitted, *coordinates(fitted, tiny))
     predicted = fitted.predict(tiny.test.forces)
     if fitted.input == "linear-response":
@@ -132,7 +132,7 @@ def test_predictions_are_those_of_scikit_learn(fitted: Any, tiny: Dataset) -> No
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
-def test_no_load_gives_no_displacement_alone_and_among_others(fitted: Any, tiny: Dataset) -> None:
+def test_zero_load_gives_zero_displacement_alone_and_in_a_batch(fitted: Any, tiny: Dataset) -> None:
     forces = tiny.test.forces[:3].copy()
     forces[1] = 0.0
     answers = fitted.predict(forces)
@@ -141,7 +141,9 @@ def test_no_load_gives_no_displacement_alone_and_among_others(fitted: Any, tiny:
     assert answers[[0, 2]].any(axis=(1, 2)).all()
 
 
-def test_a_gaussian_process_passes_near_its_points_and_moves_its_lengths(tiny: Dataset) -> None:
+def test_a_gaussian_process_passes_near_its_points_and_adapts_its_length_scales(
+    tiny: Dataset,
+) -> None:
     method: Any = mor_bench.load_method(
         "pca-gaussian-process", n_input_modes=6, n_output_modes=5, n_optimised=100
     ).fit(tiny.scene, tiny.train)
@@ -215,7 +217,7 @@ def test_arrays_that_would_mislead_a_kernel_are_refused(
         mor_bench.load_surrogate(path)
 
 
-def test_restoring_refuses_unknown_arrays_and_lengths_too_short_to_divide_by(
+def test_restoring_refuses_unknown_arrays_and_length_scales_too_short_to_divide_by(
     models: dict[str, Any], tiny: Dataset
 ) -> None:
     """With points near the origin, such lengths passed once, and gave NaN."""
@@ -228,7 +230,7 @@ def test_restoring_refuses_unknown_arrays_and_lengths_too_short_to_divide_by(
         kernel.restore(tiny.scene, model | short)
 
 
-def test_inputs_too_large_for_single_precision_find_a_leaf(
+def test_inputs_too_large_for_single_precision_still_reach_a_leaf(
     models: dict[str, Any], tiny: Dataset
 ) -> None:
     assert np.isfinite(models["pca-extra-trees"].predict(1e29 * tiny.test.forces[:2])).all()
@@ -236,9 +238,7 @@ def test_inputs_too_large_for_single_precision_find_a_leaf(
 
 @pytest.mark.parametrize("order", ["generated", "imported"])
 @pytest.mark.parametrize("name", ["pca-kernel-ridge", "pca-gaussian-process"])
-def test_the_samples_that_kernels_see_are_of_all_load_regions(
-    tiny: Dataset, name: str, order: str
-) -> None:
+def test_kernels_take_samples_from_all_load_regions(tiny: Dataset, name: str, order: str) -> None:
     """Imported snapshots may come region by region: the first hundred of these are of ten."""
     train = tiny.train
     if order == "imported":

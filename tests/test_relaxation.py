@@ -58,7 +58,7 @@ def loads(of: FullOrderModel, numbers: list[int], factor: float = 1.0) -> NDArra
         for element in ELEMENTS
     ],
 )
-def test_it_rests_where_the_full_order_solve_ends(law: str, element: str) -> None:
+def test_relaxation_ends_at_the_full_order_solution(law: str, element: str) -> None:
     full = model(law, element)
     relaxed = DynamicRelaxation(full)
     for load in loads(full, [14, 133], 3.0):
@@ -70,7 +70,7 @@ def test_it_rests_where_the_full_order_solve_ends(law: str, element: str) -> Non
         assert found.cuts == 0
 
 
-def test_mass_and_frequencies_at_rest() -> None:
+def test_mass_and_frequencies_at_rest_match_lapack() -> None:
     full = model()
     relaxed, pattern = DynamicRelaxation(full), full.assembler.pattern
     stiffness = pattern.symmetric(full.rest_tangent).toarray()
@@ -82,7 +82,7 @@ def test_mass_and_frequencies_at_rest() -> None:
     np.testing.assert_allclose(relaxed.mass[::3] / rows, relaxed.mass[0] / rows[0], rtol=1e-12)
 
 
-def test_steps_are_what_is_counted_and_a_cap_on_them_raises() -> None:
+def test_steps_are_counted_and_exceeding_their_limit_raises() -> None:
     full = model()
     relaxed, load = DynamicRelaxation(full), loads(full, [14])[0]
     with counted() as cost:
@@ -110,7 +110,7 @@ def test_an_inverted_body_is_never_an_answer() -> None:
     assert len(refused) < 12
 
 
-def test_a_body_that_rests_inverted_is_released_once_more() -> None:
+def test_a_body_that_comes_to_rest_inverted_is_released_again() -> None:
     full = model("mooney-rivlin")
     relaxed = DynamicRelaxation(full)
     for load in loads(full, [20, 27, 38], 20.0):
@@ -131,7 +131,7 @@ def test_a_step_beyond_the_limit_of_stability_is_made_shorter(
     assert np.linalg.norm(found.displacement - exact) <= 2e-6 * np.linalg.norm(exact)
 
 
-def test_a_linear_start_takes_the_same_load_to_the_same_rest(tiny_scene: mor_bench.Scene) -> None:
+def test_a_linear_start_leads_to_the_same_equilibrium(tiny_scene: mor_bench.Scene) -> None:
     drawn = draw_loads(tiny_scene, 14, 15).nodal_forces(tiny_scene.patch_weights)
     near, far = (
         ExplicitDynamics(1e-7, start).fit(tiny_scene, None) for start in ("linear-response", "rest")

@@ -150,7 +150,7 @@ def test_console_fits_its_width_without_squeezed_words(comparison: Comparison, w
     assert [line.split("]")[0] for line in meeting] == ["pod [n_modes=20"]
 
 
-def test_a_legacy_code_page_does_not_end_the_run(comparison: Comparison) -> None:
+def test_a_legacy_code_page_does_not_stop_the_run(comparison: Comparison) -> None:
     raw = io.BytesIO()
     stream = io.TextIOWrapper(raw, encoding="cp1252")
     print_tables(comparison, Console(file=stream, width=120))
@@ -177,7 +177,7 @@ def test_meeting_only_one_need_is_not_enough() -> None:
     assert re.search("No configuration meets .* Nearest is slow: .* 2 times the allowed lat", found)
 
 
-def test_targets_out_of_reach_are_named_so(comparison: Comparison) -> None:
+def test_targets_out_of_reach_are_labelled_as_such(comparison: Comparison) -> None:
     analysis = analyse(comparison, n_resamples=50)
     table = target_table(comparison, "beam-tiny", "time_at_error", analysis)
     rows = {method: cells for method, *cells in table.rows}
@@ -193,7 +193,7 @@ def test_targets_out_of_reach_are_named_so(comparison: Comparison) -> None:
     assert rows["pod"][-1].startswith("0.2")
 
 
-def test_the_page_escapes_and_needs_no_network(page: str, written: list[Path]) -> None:
+def test_the_page_escapes_html_and_needs_no_network(page: str, written: list[Path]) -> None:
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert not re.search(r"<(script|link|iframe|object)\b|url\(|@import|https?://", page)
     assert "<b>fast</b>" not in page
@@ -205,7 +205,7 @@ def test_the_page_escapes_and_needs_no_network(page: str, written: list[Path]) -
     assert not any("//" in link or ":" in link for link in links)
 
 
-def test_the_page_lists_every_configuration_once_and_nothing_unmeasured(
+def test_the_page_lists_every_configuration_once_and_omits_unmeasured_figures(
     comparison: Comparison, page: str
 ) -> None:
     table = page.split("<h3>Configurations</h3>")[1].split("</table>")[0]
@@ -219,7 +219,7 @@ def test_the_page_lists_every_configuration_once_and_nothing_unmeasured(
     assert not re.search(r"<tbody>\s*</tbody>", page)
 
 
-def test_figures_are_pictures(comparison: Comparison, written: list[Path]) -> None:
+def test_figures_are_png_files_with_content(comparison: Comparison, written: list[Path]) -> None:
     kinds = ["error-against-time", "error-against-deformation", "worst-samples", "singular-values"]
     assert [path.name for path in written] == [
         *(f"beam-tiny--{kind}.png" for kind in kinds),
@@ -236,7 +236,7 @@ def test_figures_are_pictures(comparison: Comparison, written: list[Path]) -> No
     assert not list(comparison.out.rglob("*.tmp"))
 
 
-def test_the_discretisation_error_is_stated_with_what_is_known() -> None:
+def test_the_discretisation_error_is_shown_with_its_evidence() -> None:
     rows = [a_row("pod"), a_row("pod", discretisation_error_m=0.0123)]
     rows.append(rows[1].with_parts(discretisation_rel_l2=0.205))
     unknown, alone, both = (discretisation_error([Entry(row)]) for row in rows)
@@ -270,13 +270,13 @@ def test_a_row_without_a_number_is_not_good(tmp_path: Path) -> None:
     assert "nan" in text
 
 
-def test_the_best_of_a_method_has_a_finite_error() -> None:
+def test_the_best_row_of_a_method_has_a_finite_error() -> None:
     errors = {5: 0.01, 20: float("inf")}
     rows = [a_row("pod", {"r": r}, error={"mean_dof_m": errors[r]}) for r in (20, 5)]
     assert [entry.row for entry in best_per_method([Entry(row) for row in rows])] == rows[1:]
 
 
-def test_numbers_are_short() -> None:
+def test_numbers_are_printed_with_few_digits() -> None:
     values = (None, float("inf"), 0.0, 0.00064, 0.843, 99.94, 99.96, 1234.4, 123456.0)
     texts = ["–", "inf", "0", "6.4e-04", "0.843", "99.9", "100", "1234", "1.2e+05"]
     assert [number(value) for value in values] == texts
@@ -295,9 +295,7 @@ def test_a_warning_of_many_configurations_is_shown_once() -> None:
 
 
 @pytest.mark.slow
-def test_the_page_has_a_section_for_all_that_was_measured(
-    rich: Comparison, analysis: Analysis
-) -> None:
+def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis: Analysis) -> None:
     page = render(rich, analysis)[-1].read_text(encoding="utf-8")
     titles = re.findall("<h3>(.*?)</h3>", page)
     assert [title for title in titles if not title.startswith("Who is faster")] == [
@@ -333,7 +331,7 @@ def test_the_page_has_a_section_for_all_that_was_measured(
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_the_console_shows_doubts_and_pairs(
+def test_the_console_shows_warnings_and_pairs(
     rich: Comparison, analysis: Analysis, width: int
 ) -> None:
     text = console_text(rich, width, analysis)
@@ -345,7 +343,7 @@ def test_the_console_shows_doubts_and_pairs(
     assert re.search(r"^\(1\) fem +· +\+[\d.]+ +-[\d.]+", text, re.MULTILINE)
 
 
-def test_the_matrix_of_pairs_carries_factors_and_intervals(
+def test_the_matrix_of_pairs_shows_factors_and_intervals(
     rich: Comparison, analysis: Analysis
 ) -> None:
     pairs = pairs_at(rich, "beam-coarse", 0.01, analysis)

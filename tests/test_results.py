@@ -34,7 +34,7 @@ def comparison(out: Path) -> Comparison:
     return made
 
 
-def test_the_committed_json_schema_is_the_one_of_the_code() -> None:
+def test_the_committed_json_schema_matches_the_code() -> None:
     assert SCHEMA_FILE.read_text(encoding="utf-8") == schema_text()
 
 
@@ -49,7 +49,7 @@ def test_results_read_back_as_they_were_written(tmp_path: Path) -> None:
     assert (tmp_path / "results.json").read_bytes() == before
 
 
-def test_a_row_without_swept_parameters_reads_as_one_that_sweeps_nothing(tmp_path: Path) -> None:
+def test_a_row_may_lack_the_swept_parameters(tmp_path: Path) -> None:
     comparison(tmp_path)
     path = tmp_path / "results.json"
     content = json.loads(path.read_text())

@@ -115,7 +115,9 @@ def least_gap(scene: Scene, loads: PatchLoads) -> float:
 
 
 @pytest.mark.parametrize("sampling", PLANS)
-def test_combinations_of_distant_patches_come_once_each_and_then_again(sampling: str) -> None:
+def test_every_combination_of_distant_patches_is_used_once_before_any_repeats(
+    sampling: str,
+) -> None:
     centres = several().patch_centres
     gap = np.linalg.norm(centres[:, None] - centres, axis=2)
     triples = [(a, b, c) for c in range(21) for b in range(c) for a in range(b)]
@@ -134,7 +136,7 @@ def test_combinations_of_distant_patches_come_once_each_and_then_again(sampling:
     np.testing.assert_allclose(nodal[:4], parts, rtol=0, atol=1e-15)
 
 
-def test_the_three_forces_of_the_paper() -> None:
+def test_the_plan_of_three_forces_is_that_of_the_paper() -> None:
     scene = load_scene("beam-coarse-3-forces")
     drawn = all_loads(scene)
     assert drawn.vectors.shape == (12_360, 3, 3)

@@ -68,7 +68,7 @@ def is_gone(pid: int, within_s: float = 20.0) -> bool:
         ("in-library", "Singular matrix (third_party.py, line "),
     ],
 )
-def test_a_failure_is_named_and_leaves_no_process(
+def test_a_failure_is_reported_and_leaves_no_process(
     how: str, words: str, server: ForkServer | None, tiny_scene: Scene, tmp_path: Path
 ) -> None:
     limit_s = 1.0 if how == "hang" else 60.0
@@ -81,7 +81,7 @@ def test_a_failure_is_named_and_leaves_no_process(
 
 
 @pytest.mark.parametrize("how", ["print", "fork"])
-def test_prints_and_forks_of_a_method_are_no_answers(
+def test_prints_and_forks_of_a_method_are_not_taken_for_results(
     how: str, server: ForkServer | None, tiny_scene: Scene, tmp_path: Path
 ) -> None:
     with SandboxedProcess(MethodSession, fork_server=server, scene=tiny_scene) as process:
@@ -95,7 +95,7 @@ def test_prints_and_forks_of_a_method_are_no_answers(
 
 @pytest.mark.slow
 @pytest.mark.skipif(not CAN_FORK, reason="fork servers are used on Linux only")
-def test_a_fork_server_that_a_method_ended_starts_again(tiny_scene: Scene, tmp_path: Path) -> None:
+def test_a_fork_server_restarts_after_a_method_ends_it(tiny_scene: Scene, tmp_path: Path) -> None:
     with closing(ForkServer(MethodSession)) as server:
         with (
             SandboxedProcess(MethodSession, fork_server=server, scene=tiny_scene) as process,
@@ -131,7 +131,7 @@ def test_a_sealed_folder_cannot_be_seen_in_any_way(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKILL")
-def test_a_process_ends_with_a_parent_that_is_killed() -> None:
+def test_a_process_ends_if_its_parent_is_killed() -> None:
     script = (
         "import time\n"
         "from mor_bench.measure.method_session import MethodSession\n"

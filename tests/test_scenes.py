@@ -81,7 +81,7 @@ def test_meshes_of_other_sizes_keep_the_body() -> None:
         ([5], r"`geometry.cut_cells\[1\]` is missing"),
     ],
 )
-def test_a_cut_that_leaves_no_l_is_refused(cut: list[int], message: str) -> None:
+def test_a_cut_that_leaves_no_l_shape_is_refused(cut: list[int], message: str) -> None:
     with pytest.raises(SpecError, match=message):
         load_scene(content(geometry={"cut_cells": cut}))
 
@@ -97,7 +97,7 @@ def liver() -> Scene:
     return load_scene("liver-hex")
 
 
-def test_forces_and_displacements_pass_between_the_livers_surface_and_its_grid(
+def test_forces_and_displacements_are_transferred_between_the_liver_and_its_grid(
     liver: Scene,
 ) -> None:
     points, shares = liver.patch_points(np.arange(200))
@@ -129,7 +129,7 @@ def test_the_liver_is_held_between_its_lobes_and_pressed_on_its_upper_half(liver
     assert ((liver.patch_normals * outwards).sum(axis=1) > 0).mean() > 0.9
 
 
-def test_the_two_livers_are_one_body(liver: Scene) -> None:
+def test_the_two_liver_meshes_describe_the_same_body(liver: Scene) -> None:
     other = load_scene("liver-tet")
     assert other.mesh.cells.shape[1] == 4
     points = liver.surface.points
@@ -151,7 +151,7 @@ def on_surface(surface: str, cells: list[int], unit_m: float = 1.0, **loads: Any
     return {**changed, "name": "body", "geometry": geometry}
 
 
-def test_a_users_surface_becomes_a_scene_wherever_its_file_lies(tmp_path: Path) -> None:
+def test_a_users_surface_becomes_a_scene_from_any_folder(tmp_path: Path) -> None:
     """A cube of 2 cm, in centimetres, with its lowest corner at (1, 0, 0)."""
     cube = box_mesh((2.0, 2.0, 2.0), (1, 1, 1))
     corners = triangles_of(np.add(cube.points, [1.0, 0, 0])[cube.boundary_facets])
@@ -182,7 +182,7 @@ QUICK = {*list_suite("datasets")} - SLOW - {"liver-hex-observed"}  # it has the 
 @pytest.mark.parametrize(
     "name", [*sorted(QUICK), *(pytest.param(n, marks=pytest.mark.slow) for n in sorted(SLOW))]
 )
-def test_every_load_patch_lies_on_the_surface_and_pushes_something_that_can_move(name: str) -> None:
+def test_every_load_patch_lies_on_the_surface_and_pushes_free_nodes(name: str) -> None:
     spec = load_generated_spec(name)
     for scene in map(load_scene, [spec, spec_of_set(spec, "unseen-regions")]):
         assert np.isin(scene.patch_nodes, scene.surface.facets).all()

@@ -47,7 +47,7 @@ def coarse(cache: Path) -> Dataset:
 
 
 @pytest.mark.slow
-def test_the_least_number_of_modes_that_meets_the_need_is_chosen(coarse: Dataset) -> None:
+def test_the_smallest_number_of_modes_that_meets_the_need_is_chosen(coarse: Dataset) -> None:
     scene = needing(coarse.scene, 0.05)
     fitted = PODGalerkin("auto", 1e-3).fit(scene, coarse.train)
     n_modes = fitted.sizes_["n_modes"]
@@ -69,7 +69,7 @@ def test_the_least_number_of_modes_that_meets_the_need_is_chosen(coarse: Dataset
 
 
 @pytest.mark.slow
-def test_the_score_is_that_of_models_which_never_saw_the_load_region(coarse: Dataset) -> None:
+def test_the_score_comes_from_models_that_never_saw_the_load_region(coarse: Dataset) -> None:
     trials = Trials(PODGalerkin("auto", 1e-3), coarse.scene, coarse.train)
     score = trials.score({"n_modes": 24})
     errors = []
@@ -116,7 +116,7 @@ def test_every_load_region_is_held_out_once(n_forces: int, coarse: Dataset) -> N
         )
 
 
-def test_samples_of_one_region_are_dealt_out(tiny: Dataset) -> None:
+def test_samples_of_a_single_region_are_divided_among_the_folds(tiny: Dataset) -> None:
     forces = tiny.train.forces[:11]
     imported = replace(tiny.train[:11], loads=NodalLoads(forces, np.zeros((11, 1), dtype=np.int64)))
     folds = validation_folds(imported)
@@ -173,7 +173,7 @@ def test_the_search_finds_the_least_work_with_few_trials(
     assert len(tried) < 0.15 * len(every)
 
 
-def test_knobs_that_are_given_are_left_alone(tiny: Dataset) -> None:
+def test_given_hyperparameters_are_not_changed(tiny: Dataset) -> None:
     method = PODGalerkin(7, 1e-3)
     assert choose_sizes(method, tiny.scene, tiny.train, {"n_modes": MODES}) == {}
     assert method.fit(tiny.scene, tiny.train).sizes_ == {}
@@ -182,7 +182,7 @@ def test_knobs_that_are_given_are_left_alone(tiny: Dataset) -> None:
     assert sized.fit(tiny.scene, tiny.train).sizes_ == {}
 
 
-def test_a_need_that_nothing_meets_gets_the_most_accurate_with_a_warning(tiny: Dataset) -> None:
+def test_an_unreachable_need_gives_the_most_accurate_model_with_a_warning(tiny: Dataset) -> None:
     with pytest.warns(
         UserWarning,
         match=r"relative l2 error of 1e-12. The most accurate .*, n_modes = \d+, reaches 0\.0",
@@ -198,7 +198,9 @@ def test_a_need_that_nothing_meets_gets_the_most_accurate_with_a_warning(tiny: D
     assert reached < 0.5 * trials.score({"n_modes": 5}).error
 
 
-def test_a_method_without_any_fit_says_so(tiny: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_says_that_no_size_could_be_fitted(
+    tiny: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def failing(*_: Any, **__: Any) -> None:
         raise InvalidInputError("nothing fits.")
 
@@ -210,7 +212,7 @@ def test_a_method_without_any_fit_says_so(tiny: Dataset, monkeypatch: pytest.Mon
 
 
 @pytest.mark.slow
-def test_hyper_reduction_is_sized_in_both_knobs(coarse: Dataset) -> None:
+def test_both_hyperparameters_of_hyper_reduction_are_chosen(coarse: Dataset) -> None:
     scene = needing(coarse.scene, 0.05)
     fitted = HyperReducedPOD("auto", "auto", n_cubature_snapshots=60, tolerance=1e-3).fit(
         scene, coarse.train
@@ -232,7 +234,7 @@ def test_hyper_reduction_is_sized_in_both_knobs(coarse: Dataset) -> None:
     np.testing.assert_array_equal(again.weights_, fitted.weights_)
 
 
-def test_what_was_chosen_is_saved_and_loaded(tiny: Dataset, tmp_path: Path) -> None:
+def test_chosen_sizes_are_saved_and_loaded(tiny: Dataset, tmp_path: Path) -> None:
     fitted = PODGalerkin("auto", "auto").fit(needing(tiny.scene, 0.2), tiny.train)
     path = tmp_path / "model.safetensors"
     fitted.save(path)
@@ -288,7 +290,7 @@ tolerance = 1e-3
 
 
 @pytest.mark.slow
-def test_the_record_of_a_fit_shows_what_was_chosen(tmp_path: Path, tiny: Dataset) -> None:
+def test_the_record_of_a_fit_shows_the_chosen_sizes(tmp_path: Path, tiny: Dataset) -> None:
     write_snapshots(tmp_path / "train", tiny.train)
     session = MethodSession(tiny.scene)
     surrogate = "mor_bench.surrogates.pod:PODGalerkin"
@@ -303,7 +305,9 @@ def test_the_record_of_a_fit_shows_what_was_chosen(tmp_path: Path, tiny: Dataset
     assert shown == [PODGalerkin("auto", 1e-3).fit(tiny.scene, tiny.train).sizes_, {}]
 
 
-def test_a_kept_fit_is_that_of_the_need(tmp_path: Path, tiny: Dataset) -> None:
+def test_a_cached_fit_depends_on_the_need_only_if_sizes_are_chosen(
+    tmp_path: Path, tiny: Dataset
+) -> None:
     (tmp_path / "sized.toml").write_text(SIZED)
     place: Any = SimpleNamespace(machine="here", fit_threads=1, cache=tmp_path)
 
@@ -338,7 +342,7 @@ def test_a_method_that_needs_no_equations_is_sized_on_imported_samples(
 
 
 @pytest.mark.slow
-def test_errors_of_the_wanted_nodes_decide(tiny: Dataset) -> None:
+def test_only_errors_of_the_requested_nodes_decide(tiny: Dataset) -> None:
     """Elsewhere a reduced method answers nothing, which is no error."""
     needs = tiny.scene.spec.needs.model_copy(update={"outputs": "x-max", "error": 0.1})
     scene = replace(tiny.scene, spec=tiny.scene.spec.model_copy(update={"needs": needs}))

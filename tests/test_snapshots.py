@@ -83,7 +83,7 @@ def test_a_dataset_holds_equilibria(tiny: Dataset) -> None:
 
 
 @pytest.mark.parametrize("by", ["sample", "region", "direction"])
-def test_refused_samples_are_in_no_part_and_all_others_keep_their_answers(
+def test_refused_samples_are_in_no_part_and_others_keep_their_displacements(
     by: Any, cache: Path
 ) -> None:
     spec = changed(samples_per_patch=3, magnitude_n=[0.0, 40.0])

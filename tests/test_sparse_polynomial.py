@@ -34,7 +34,7 @@ def median_error(method: mor_bench.Surrogate, samples: Snapshots) -> float:
     )
 
 
-def test_the_cheapest_terms_are_those_of_all() -> None:
+def test_the_cheapest_terms_match_an_exhaustive_list() -> None:
     costs = np.array([0.3137, 0.7741, 1.0059, 1.9347])
     every = [
         term
@@ -46,7 +46,7 @@ def test_the_cheapest_terms_are_those_of_all() -> None:
     assert len(cheapest_terms(costs, 10_000)) == len(every)
 
 
-def test_sparse_monomials_and_their_derivatives() -> None:
+def test_sparse_monomials_and_their_derivatives_match_direct_products() -> None:
     terms = cheapest_terms(np.array([0.4, 0.9, 1.3]), 25)
     levels, places = sparse_levels(terms, 4)
     generator = np.random.default_rng(0)
@@ -72,7 +72,9 @@ def test_a_high_degree_in_one_coordinate_is_found_from_few_samples() -> None:
     assert len(terms) < 60
 
 
-def test_sparse_terms_beat_the_full_cubic_and_derivatives_spare_samples(tiny: Dataset) -> None:
+def test_sparse_terms_beat_the_full_cubic_and_derivatives_help_with_few_samples(
+    tiny: Dataset,
+) -> None:
     few = tiny.train[::6]
     errors = [
         median_error(mor_bench.load_method(name, **knobs).fit(tiny.scene, few), tiny.test)
@@ -86,7 +88,7 @@ def test_sparse_terms_beat_the_full_cubic_and_derivatives_spare_samples(tiny: Da
     assert errors[2] <= 0.6 * errors[1]
 
 
-def test_training_loads_are_learned_from_either_input_and_no_load_gives_no_displacement(
+def test_training_loads_are_learned_from_either_input_and_zero_load_gives_zero(
     tiny: Dataset,
 ) -> None:
     for source in ("force", "linear-response"):
@@ -115,6 +117,6 @@ def test_damaged_terms_are_refused(spoil: Any) -> None:
         terms_from_array(np.array(spoil, dtype=np.int32), 3)
 
 
-def test_terms_come_back_as_they_were() -> None:
+def test_terms_can_be_restored_from_their_array() -> None:
     terms = cheapest_terms(np.array([0.4, 0.9, 1.3]), 25)
     assert terms_from_array(terms_to_array(terms), 3) == terms

@@ -202,12 +202,14 @@ def test_a_mistake_in_a_method_is_one_clear_line(tmp_path: Path, text: str, mess
         ("mor_bench.surrogates.pod:stiffness_at_rest", r"is not a class"),
     ],
 )
-def test_a_missing_class_is_named(tmp_path: Path, surrogate: str, message: str) -> None:
+def test_a_missing_class_gives_an_error_that_names_it(
+    tmp_path: Path, surrogate: str, message: str
+) -> None:
     with pytest.raises(MorBenchError, match=message):
         check_file(method_file(tmp_path, surrogate=surrogate))
 
 
-def test_an_unknown_name_gives_the_nearest_one() -> None:
+def test_an_unknown_name_gives_an_error_with_the_nearest_one() -> None:
     with pytest.raises(SpecError, match=r"unknown dataset 'beam-coarze'; did you mean 'beam-coars"):
         mor_bench.load_scene("beam-coarze")
     with pytest.raises(SpecError, match=r"unknown method 'pood'; did you mean 'pod'\?"):

@@ -42,7 +42,7 @@ CASES: dict[str, tuple[str, dict[str, Any], float]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_single_query(case: str, tiny: Dataset, benchmark: BenchmarkFixture) -> None:
+def test_a_single_query_is_accurate(case: str, tiny: Dataset, benchmark: BenchmarkFixture) -> None:
     """The test load that displaces most, in a load region that training has not seen."""
     name, parameters, bound = CASES[case]
     try:
@@ -125,7 +125,7 @@ def ratio_of_times(baseline: Surrogate, method: Surrogate, force: NDArray[np.flo
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "race"), RACES, ids=_race_id)
-def test_faster_than_the_baseline(
+def test_a_method_is_faster_than_the_baseline(
     name: str,
     race: Race,
     fitted: Callable[[str, str, dict[str, Any]], Surrogate],

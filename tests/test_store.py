@@ -91,7 +91,7 @@ def test_any_flipped_bit_is_noticed(content: bytes) -> None:
             parse_shard(bytes(flipped), "it")
 
 
-def test_a_file_truncated_anywhere_says_so(content: bytes) -> None:
+def test_a_truncated_file_is_reported_as_such(content: bytes) -> None:
     lengths = np.linspace(HEADER_BYTES, len(content) - 1, 100).astype(int)
     for length in [*range(0, HEADER_BYTES, 7), *lengths]:
         message = "truncated" if length >= HEADER_BYTES else "header|not a shard"
@@ -101,7 +101,7 @@ def test_a_file_truncated_anywhere_says_so(content: bytes) -> None:
         parse_shard(content + b"\0", "it")
 
 
-def test_no_other_digit_of_the_length_is_accepted(content: bytes) -> None:
+def test_a_changed_digit_of_the_length_is_refused(content: bytes) -> None:
     start = content.index(b'"bytes": ') + 9
     for place in range(start, content.index(b",", start)):
         for byte in {*range(256)} - {content[place]}:
@@ -139,7 +139,7 @@ DAMAGE: dict[str, tuple[Callable[[bytes], bytes], str]] = {
 
 
 @pytest.mark.parametrize("name", DAMAGE)
-def test_a_damaged_shard_alone_is_generated_again(tmp_path: Path, folder: Path, name: str) -> None:
+def test_only_a_damaged_shard_is_generated_again(tmp_path: Path, folder: Path, name: str) -> None:
     before, (damage, message) = files(folder), DAMAGE[name]
     path, other = shard_path(folder, 2), shard_path(folder, 0)
     path.write_bytes(damage(path.read_bytes()))
@@ -197,7 +197,7 @@ def test_newer_files_are_kept_and_refused(tmp_path: Path, folder: Path) -> None:
         path.write_bytes(sound)
 
 
-def test_a_folder_with_the_name_of_a_shard_is_an_error_of_the_store(tmp_path: Path) -> None:
+def test_a_folder_with_the_name_of_a_shard_raises_an_error_of_the_store(tmp_path: Path) -> None:
     path = shard_path(dataset_folder(SPEC, tmp_path), 0)
     path.mkdir(parents=True)
     with pytest.raises(StoreError, match="cannot be read"):
@@ -230,7 +230,7 @@ def test_a_limit_is_a_prefix_and_progress_counts_wanted_samples(
     assert shards(again) == shards(original)
 
 
-def test_no_more_tasks_are_in_memory_than_the_window() -> None:
+def test_the_window_limits_the_tasks_in_memory() -> None:
     drawn = finished = widest = 0
 
     def tasks() -> Iterator[int]:
@@ -249,7 +249,7 @@ def test_no_more_tasks_are_in_memory_than_the_window() -> None:
     assert widest <= 4
 
 
-def test_a_task_is_small_and_holds_nothing_derived() -> None:
+def test_a_task_is_small_and_holds_no_derived_data() -> None:
     scene = mor_bench.load_scene("beam-coarse")
     assert np.isfinite(scene.patch_normals).all()
     packed = pack(scene)
@@ -281,7 +281,7 @@ ADDRESS = "tcp://127.0.0.1:8786"
         ({"cluster": "http://127.0.0.1:8786"}, "tcp://host:port"),
     ],
 )
-def test_options_of_generation_are_checked_before_anything_is_done(
+def test_generation_options_are_checked_before_any_work(
     tmp_path: Path, options: dict[str, Any], message: str
 ) -> None:
     for function in (generate, mor_bench.load_dataset):
@@ -290,7 +290,7 @@ def test_options_of_generation_are_checked_before_anything_is_done(
     assert not list(tmp_path.iterdir())
 
 
-def test_without_the_extra_a_cluster_says_what_to_install(
+def test_without_the_extra_a_cluster_gives_the_package_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
@@ -325,7 +325,7 @@ def test_the_manifest_alone_is_enough_to_generate_the_same_again(
     ],
     ids=["truncated", "empty", "foreign", "changed", "older", "other format"],
 )
-def test_a_damaged_manifest_is_reported_and_written_again(
+def test_a_damaged_manifest_is_reported_and_rewritten(
     tmp_path: Path, folder: Path, damage: Callable[[bytes], bytes], message: str
 ) -> None:
     path, before = folder / "manifest.json", files(folder)
@@ -349,7 +349,9 @@ def test_every_environment_that_solved_is_in_the_manifest(
     assert read_manifest(folder).environments == (*here, {"machine": "another"})
 
 
-def test_a_dataset_of_a_users_file_can_be_generated_from_its_folder_alone(tmp_path: Path) -> None:
+def test_a_dataset_of_a_users_mesh_file_can_be_generated_from_its_folder_alone(
+    tmp_path: Path,
+) -> None:
     mesh, body = mor_bench.load_scene("beam-tiny").mesh, tmp_path / "body.vtu"
     meshio.Mesh(mesh.points, [("hexahedron", mesh.cells)]).write(body)
     geometry = {"shape": "file", "file": str(body)}

@@ -96,7 +96,7 @@ def pairs(*groups: dict[str, set[str]]) -> set[tuple[str, str]]:
     return {(name, part) for group in groups for name, parts in group.items() for part in parts}
 
 
-def test_every_hard_case_is_there() -> None:
+def test_every_documented_hard_case_exists() -> None:
     found = [(case.name, case.part) for case in CASES]
     assert sorted(found) == sorted(pairs(FULL_ORDER, LEARNERS, CUBATURE, ANY))
 
@@ -118,7 +118,7 @@ def test_a_method_meets_exactly_the_cases_that_concern_its_kind(scenes: Scenes) 
 
 
 @pytest.mark.slow
-def test_methods_fall_short_only_where_their_files_say_so(everything: StressResults) -> None:
+def test_methods_fall_short_only_as_their_files_declare(everything: StressResults) -> None:
     short = defaultdict(set)
     for row in everything.rows:
         if row.verdict == "fall short":
@@ -175,7 +175,9 @@ FLAWS: dict[str, set[tuple[str, str]]] = {
 
 
 @pytest.mark.parametrize("name", list(FLAWS))
-def test_a_method_falls_short_exactly_where_it_is_flawed(name: str, scenes: Scenes) -> None:
+def test_a_flawed_method_falls_short_exactly_in_the_cases_of_its_flaw(
+    name: str, scenes: Scenes
+) -> None:
     rows = tried(scenes, flawed(name))
     assert short_of(rows) == FLAWS[name]
     happened = {(row.case, row.part): row.happened for row in rows}
@@ -300,7 +302,7 @@ def sound() -> dict[tuple[str, str, str], str]:
         for name, plant in PLANTS.items()
     ],
 )
-def test_a_case_notices(
+def test_a_case_notices_its_planted_bug(
     name: str,
     scenes: Scenes,
     sound: dict[tuple[str, str, str], str],

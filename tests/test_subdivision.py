@@ -58,7 +58,7 @@ def test_subdivision_of_a_grid_gives_the_finer_grid(name: str) -> None:
     assert refined(scene).mesh.grid_shape == expected.mesh.grid_shape
 
 
-def test_answers_on_the_subdivided_mesh_are_those_on_the_finer_grid() -> None:
+def test_the_subdivided_mesh_and_the_finer_grid_have_the_same_solutions() -> None:
     scene = load_scene("beam-tiny")
     answers = []
     for finer in (refined(scene), off_grid(scene)):

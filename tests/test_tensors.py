@@ -53,7 +53,7 @@ def problems(scene: Scene, r: int = 6) -> tuple[GalerkinProblem, TensorProblem]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_energy_force_and_tangent_are_those_of_the_mesh(kind: str) -> None:
+def test_energy_force_and_tangent_equal_those_of_the_mesh(kind: str) -> None:
     galerkin, tensor = problems(scene_of(kind))
     # The general kernel has no energy of inverted states.
     for size in (0.01, 0.1, *([3.0] if kind == "H8" else [])):
@@ -81,7 +81,7 @@ def test_derivatives_are_symmetric_in_all_indices() -> None:
             )
 
 
-def test_leading_modes_have_the_leading_part_of_the_arrays() -> None:
+def test_the_leading_modes_have_the_leading_entries_of_the_arrays() -> None:
     large = problems(scene_of("H8"), 6)[1].tensors
     scene = scene_of("H8")
     model = FullOrderModel(scene)
@@ -98,7 +98,7 @@ def coarse(cache: Path) -> Dataset:
 
 
 @pytest.mark.parametrize("r", [1, 10, 30])
-def test_answers_are_those_of_plain_pod(coarse: Dataset, r: int) -> None:
+def test_predictions_equal_those_of_plain_pod(coarse: Dataset, r: int) -> None:
     plain, exact = (
         method(r, tolerance=1e-12).fit(coarse.scene, coarse.train).predict(coarse.test.forces[:10])
         for method in (PODGalerkin, TensorPOD)
@@ -106,7 +106,7 @@ def test_answers_are_those_of_plain_pod(coarse: Dataset, r: int) -> None:
     assert np.abs(exact - plain).max() <= 1e-10 * np.abs(plain).max()
 
 
-def test_the_watched_points_see_the_smallest_det_f_of_training_samples(coarse: Dataset) -> None:
+def test_the_monitored_points_find_the_smallest_det_f_of_training_samples(coarse: Dataset) -> None:
     method = TensorPOD(20).fit(coarse.scene, coarse.train)
     model = FullOrderModel(coarse.scene)
     chosen = np.unique(np.linspace(0, len(coarse.train) - 1, 300).astype(int))
@@ -137,7 +137,7 @@ def test_an_inverted_answer_is_refused(coarse: Dataset, r: int) -> None:
     assert refused > 0
 
 
-def test_a_query_does_not_see_the_mesh(coarse: Dataset) -> None:
+def test_the_cost_of_a_query_does_not_depend_on_the_mesh(coarse: Dataset) -> None:
     """Its counted work is the same on beam-fine, which has 18 times the unknowns."""
     counts = []
     fine = mor_bench.load_scene("beam-fine")

@@ -65,7 +65,7 @@ def training_of(row: Row) -> tuple[int | None, float | None]:
 
 
 @pytest.mark.slow
-def test_seconds_become_iterations_that_can_be_repeated(
+def test_given_seconds_become_a_repeatable_number_of_iterations(
     comparison: Comparison, own_cache: Path, tmp_path: Path
 ) -> None:
     row = comparison.rows[0]
@@ -106,7 +106,7 @@ def test_a_failed_seed_is_recorded_and_shown(comparison: Comparison, shown: list
     assert (comparison.out / "figures" / "beam-tiny--loss-curves.png").exists()
 
 
-def test_a_training_that_is_out_of_time_says_how_long_it_would_take(
+def test_a_training_out_of_time_reports_its_expected_duration(
     comparison: Comparison, shown: list[str]
 ) -> None:
     row = comparison.row("beam-tiny", "descent [channels=100]")
@@ -251,7 +251,9 @@ def test_a_fit_that_is_stopped_after_its_training_does_not_train_again(
     assert not list(tmp_path.glob("*/fits/*/training/*"))
 
 
-def test_only_the_folder_of_its_own_checkpoint_is_open_in_a_sealed_cache(tmp_path: Path) -> None:
+def test_a_training_can_open_only_its_own_checkpoint_folder_in_a_sealed_cache(
+    tmp_path: Path,
+) -> None:
     own = tmp_path / "fits" / "mine" / "training"
     own.mkdir(parents=True)
     (own.parent / "score.h5").write_text("errors")

@@ -64,7 +64,7 @@ def files(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
 
 @pytest.mark.filterwarnings("ignore:.* modes were requested")
 @pytest.mark.parametrize("name", ["deeponet", "pod-deeponet"])
-def test_the_branch_is_turned_into_the_bases_of_other_samples(
+def test_the_branch_is_transformed_to_the_bases_of_other_samples(
     name: str, tiny: Dataset, tmp_path: Path
 ) -> None:
     knobs = {"width": 32, "n_functions": 64, "n_input_modes": 200}
@@ -94,7 +94,7 @@ def test_a_training_on_the_same_scene_starts_from_the_same_weights(
             np.testing.assert_allclose(second.arrays_[key], array, rtol=1e-6, atol=1e-20)
 
 
-def test_all_that_train_name_their_architecture() -> None:
+def test_every_trained_method_names_its_architecture() -> None:
     classes = {load_method_spec(file).load_class() for file in list_suite("methods").values()}
     for surrogate in (item for item in classes if item.trains() and item is not Autoencoder):
         assert surrogate.architecture
@@ -152,13 +152,13 @@ def test_another_architecture_is_refused_before_anything_runs(
     assert not any(tmp_path.iterdir())
 
 
-def test_training_knobs_may_differ(files: dict[str, Path], tiny: Dataset) -> None:
+def test_training_hyperparameters_may_differ(files: dict[str, Path], tiny: Dataset) -> None:
     for name, path in files.items():
         started(make(name, iterations=2, seed=1), path, tiny.train[12:24])
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_on_another_mesh_weights_are_taken_where_they_have_the_same_meaning(
+def test_another_mesh_takes_only_weights_that_keep_their_meaning(
     name: str, files: dict[str, Path], tiny: Dataset, tmp_path: Path
 ) -> None:
     mesh = box_mesh((2.0, 1.0, 1.0), (3, 1, 1))
@@ -190,7 +190,7 @@ ARRAYS = {
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_weights_that_are_not_whole_are_refused(
+def test_missing_or_invalid_weights_are_refused(
     name: str, files: dict[str, Path], tiny: Dataset, tmp_path: Path
 ) -> None:
     method, path = mor_bench.load_surrogate(files[name]), tmp_path / "forged.safetensors"

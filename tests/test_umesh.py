@@ -96,7 +96,7 @@ def rms(values: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(("channels", "steps"), [(16, 2), (128, 3)])
-def test_the_number_of_weights_is_the_papers(channels: int, steps: int) -> None:
+def test_the_number_of_weights_is_that_of_the_paper(channels: int, steps: int) -> None:
     def convolution(c_in: int, c_out: int, size: int) -> int:
         return c_out * (c_in * size**3 + 1)
 
@@ -112,7 +112,7 @@ def test_the_number_of_weights_is_the_papers(channels: int, steps: int) -> None:
     assert sum(p.numel() for p in network.parameters()) == expected
 
 
-def test_the_network_is_the_papers_with_its_skips() -> None:
+def test_the_network_is_that_of_the_paper_with_skip_connections() -> None:
     """Written out: encoder, bottom, decoder that concatenates the encoder's features, head."""
     from torch.nn import functional
 
@@ -157,7 +157,7 @@ def test_nodes_go_to_the_padded_grid_and_back_unchanged() -> None:
     assert torch.equal(grid.displacements_to_grid(nodal), values)
 
 
-def test_nodes_of_a_part_of_a_box_in_any_order_go_to_their_places() -> None:
+def test_nodes_of_part_of_a_box_in_any_order_go_to_their_grid_points() -> None:
     whole = box_mesh((2.0, 1.0, 1.0), (6, 2, 2))
     kept = np.random.default_rng(0).permutation(whole.n_nodes)[:40]
     assert whole.grid_index is not None
@@ -171,7 +171,7 @@ def test_nodes_of_a_part_of_a_box_in_any_order_go_to_their_places() -> None:
 
 
 @pytest.mark.parametrize("regular", [True, False])
-def test_values_and_gradients_at_nodes_are_those_of_the_dense_matrix(regular: bool) -> None:
+def test_values_and_gradients_at_nodes_equal_those_of_the_dense_matrix(regular: bool) -> None:
     mesh = box_mesh((2.0, 1.0, 1.0), (6, 2, 2))
     if not regular:
         mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
@@ -224,7 +224,7 @@ def test_the_loss_is_the_mean_square_over_the_components_of_all_nodes(
     assert method.loss_curve_[0] == pytest.approx(expected, rel=1e-5)
 
 
-def test_normalisation_divides_by_what_it_says(data: Dataset) -> None:
+def test_normalisation_divides_by_the_named_scale(data: Dataset) -> None:
     samples = data.train[:20]
     forces, displacements = samples.forces, samples.displacements
     expected = {
@@ -292,14 +292,14 @@ def test_a_batch_of_more_than_one_chunk_agrees_with_single_queries(
         np.testing.assert_allclose(single, batch[row], rtol=0, atol=2e-6 * np.abs(batch).max())
 
 
-def test_the_linear_response_brings_most(improved: Any, fitted: Any, data: Dataset) -> None:
+def test_the_linear_response_helps_most(improved: Any, fitted: Any, data: Dataset) -> None:
     linear = mor_bench.load_method("linear-fem").fit(data.scene, None)
     errors = [mean_error(method, data.test) for method in (improved, linear, fitted)]
     assert errors[0] < 0.9 * errors[1]
     assert errors[0] < 0.2 * errors[2]
 
 
-def test_no_force_gives_exactly_no_displacement_if_that_is_asked_for(
+def test_zero_force_gives_exactly_zero_displacement_if_requested(
     improved: Any, fitted: Any, data: Dataset
 ) -> None:
     nothing = np.zeros((3, data.scene.mesh.n_nodes, 3))
@@ -374,7 +374,7 @@ def test_a_training_starts_from_a_network_of_another_scene(
 
 
 @pytest.mark.parametrize("shape", [(2, 1, 1), (2, 2, 4), (4, 2, 2)])
-def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding(
+def test_gradients_in_bfloat16_equal_those_of_float32_up_to_rounding(
     shape: tuple[int, int, int],
 ) -> None:
     generator = torch.Generator().manual_seed(0)
@@ -393,7 +393,7 @@ def test_gradients_in_bfloat16_are_those_of_float32_but_for_rounding(
     assert (found[1] - found[0]).norm() < 0.02 * found[0].norm()
 
 
-def test_losses_are_not_rounded_with_the_products(data: Dataset) -> None:
+def test_losses_are_not_rounded_to_bfloat16(data: Dataset) -> None:
     method = fit(data.train, iterations=2, precision="bfloat16", validation_fraction=0.2)
     losses = torch.from_numpy(method.validation_curve_)
     assert (losses.bfloat16().double() != losses).all()

@@ -54,7 +54,7 @@ def hard_matrix(kind: str) -> Array:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-8])
-def test_nnls_of_hard_columns_keeps_its_conditions(kind: str, tolerance: float) -> None:
+def test_nnls_of_hard_columns_meets_its_optimality_conditions(kind: str, tolerance: float) -> None:
     matrix = hard_matrix(kind)
     target = matrix @ np.random.default_rng(2).uniform(0.5, 1.5, 200)
     found = sparse_nnls(matrix, target, tolerance)
@@ -70,7 +70,7 @@ def test_nnls_of_hard_columns_keeps_its_conditions(kind: str, tolerance: float) 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_nnls_run_to_the_end_meets_all_conditions(kind: str) -> None:
+def test_converged_nnls_meets_all_optimality_conditions(kind: str) -> None:
     """On a target out of reach; scipy's solution has the same residual."""
     matrix, rng = hard_matrix(kind)[:, :40], np.random.default_rng(3)
     matrix[:, 30:] = matrix[:, :10] if kind == "duplicated columns" else matrix[:, 30:]
@@ -88,7 +88,7 @@ def test_nnls_run_to_the_end_meets_all_conditions(kind: str) -> None:
 
 
 @pytest.mark.parametrize("tolerance", [1e-3, 0.0])
-def test_nnls_with_too_few_iterations_fails_honestly(tolerance: float) -> None:
+def test_nnls_with_too_few_iterations_raises(tolerance: float) -> None:
     matrix = np.random.default_rng(0).random((30, 50))
     with pytest.raises(CubatureError, match="in 1 iterations"):
         sparse_nnls(matrix, matrix.sum(axis=1), tolerance, max_iterations=1)
@@ -112,7 +112,7 @@ def test_nnls_of_a_zero_target_has_zero_weights() -> None:
     assert not found.weights.any()
 
 
-def test_the_updated_factor_stays_that_of_its_columns() -> None:
+def test_the_updated_factor_remains_the_factor_of_its_columns() -> None:
     """600 changes to some of 300 nearly dependent columns."""
     rng = np.random.default_rng(0)
     matrix = rng.normal(size=(120, 60)) @ rng.normal(size=(60, 300)) + 1e-4 * rng.normal(
@@ -137,7 +137,7 @@ def test_the_updated_factor_stays_that_of_its_columns() -> None:
     assert updated <= 10 * off() <= 1e-8
 
 
-def test_blocks_of_rows_are_compressed_to_the_same_least_squares(tiny: Dataset) -> None:
+def test_compressing_blocks_of_rows_keeps_the_least_squares_problem(tiny: Dataset) -> None:
     model = FullOrderModel(tiny.scene)
     modes = pod(tiny.train.free_displacements, 4).modes
     q = tiny.train.free_displacements[:90] @ modes
@@ -153,7 +153,7 @@ def test_blocks_of_rows_are_compressed_to_the_same_least_squares(tiny: Dataset) 
             )
 
 
-def test_the_cell_basis_leaves_what_it_may_and_is_hardly_larger_than_the_smallest() -> None:
+def test_the_cell_basis_meets_its_tolerance_and_is_close_to_the_smallest() -> None:
     rng = np.random.default_rng(0)
     matrix = (
         rng.normal(size=(400, 150))
@@ -172,7 +172,9 @@ def test_the_cell_basis_leaves_what_it_may_and_is_hardly_larger_than_the_smalles
 
 
 @pytest.mark.parametrize("tolerance", [0.3, 1e-2, 1e-3])
-def test_empirical_cubature_integrates_its_basis_and_one(tiny: Dataset, tolerance: float) -> None:
+def test_empirical_cubature_integrates_its_basis_and_the_constant(
+    tiny: Dataset, tolerance: float
+) -> None:
     model = FullOrderModel(tiny.scene)
     modes = pod(tiny.train.free_displacements, 3).modes
     system = ecsw_system(
@@ -215,7 +217,7 @@ def test_interpolation_is_exact_in_the_basis_and_at_its_rows(selection: Selectio
     assert factor < 0.2 * min(scattered)
 
 
-def test_greedy_rows_of_a_small_basis_by_hand() -> None:
+def test_greedy_rows_of_a_small_basis_match_hand_computed_ones() -> None:
     basis = np.array([[1.0, 1.0], [2.0, 0.0], [0.0, -3.0]])
     # With row 1 alone, the interpolation of the second column is zero.
     assert interpolation_rows(basis, "greedy").tolist() == [1, 2]
@@ -224,7 +226,7 @@ def test_greedy_rows_of_a_small_basis_by_hand() -> None:
 
 
 @pytest.mark.parametrize("rank", [30, 100])
-def test_the_cell_basis_of_a_matrix_of_low_rank_is_whole_and_orthonormal(rank: int) -> None:
+def test_the_cell_basis_of_a_matrix_of_low_rank_is_complete_and_orthonormal(rank: int) -> None:
     rng = np.random.default_rng(0)
     matrix = rng.normal(size=(900, rank)) @ rng.normal(size=(rank, 300))
     basis = cell_basis(matrix, 1e-9)

@@ -35,7 +35,9 @@ def warped(element: str, cells: tuple[int, int, int] = (2, 2, 2)) -> Mesh:
 
 
 @pytest.mark.parametrize(("law", "kind"), EVERY)
-def test_taylor(law: str, kind: tuple[str, bool]) -> None:
+def test_taylor_remainders_of_energy_and_force_are_of_second_order(
+    law: str, kind: tuple[str, bool]
+) -> None:
     model = free_assembler(warped(kind[0]), LAWS[law], kind[1])
     worst = np.inf
     for seed in range(5):
@@ -71,7 +73,9 @@ def test_rest_is_stress_free_with_six_zero_modes_and_rotations_cost_nothing(
 
 
 @pytest.mark.parametrize(("law", "kind"), EVERY)
-def test_patch_of_warped_cells(law: str, kind: tuple[str, bool]) -> None:
+def test_a_patch_of_warped_cells_is_exact_for_linear_fields(
+    law: str, kind: tuple[str, bool]
+) -> None:
     assert patch_test_error(warped(kind[0], (3, 3, 3)), LAWS[law], kind[1]) <= 1e-12
 
 
@@ -90,7 +94,9 @@ def homogeneous(
 
 
 @pytest.mark.parametrize("kind", ELEMENTS)
-def test_homogeneous_states_of_saint_venant_kirchhoff(kind: tuple[str, bool]) -> None:
+def test_homogeneous_states_of_saint_venant_kirchhoff_match_hand_computed_values(
+    kind: tuple[str, bool],
+) -> None:
     law = SaintVenantKirchhoff(500.0, 0.4)
     p, energy = homogeneous(
         np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), law, *kind
@@ -116,7 +122,9 @@ STATES = {
 
 @pytest.mark.parametrize("state", list(STATES))
 @pytest.mark.parametrize(("law", "kind"), EVERY)
-def test_stress_of_homogeneous_states(law: str, kind: tuple[str, bool], state: str) -> None:
+def test_stress_of_homogeneous_states_matches_the_closed_forms(
+    law: str, kind: tuple[str, bool], state: str
+) -> None:
     p, energy = homogeneous(STATES[state], LAWS[law], *kind)
     np.testing.assert_allclose(p, piola(LAWS[law], STATES[state]), rtol=1e-10, atol=1e-9)
     # The energy is the stress's work on the straight way from rest.
@@ -127,7 +135,7 @@ def test_stress_of_homogeneous_states(law: str, kind: tuple[str, bool], state: s
 
 
 @pytest.mark.parametrize("law", list(LAWS))
-def test_tangent_where_two_stretches_are_equal(law: str) -> None:
+def test_the_tangent_is_exact_where_two_stretches_are_equal(law: str) -> None:
     """There the derivative of the principal stresses is a limit."""
     model = free_assembler(box_mesh((1.0, 1.0, 1.0), (2, 2, 2)), LAWS[law])
     points = box_mesh((1.0, 1.0, 1.0), (2, 2, 2)).points
@@ -141,7 +149,9 @@ def test_tangent_where_two_stretches_are_equal(law: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ELEMENTS)
-def test_hydrostatic_stress_of_saint_venant_kirchhoff(kind: tuple[str, bool]) -> None:
+def test_hydrostatic_stress_of_saint_venant_kirchhoff_matches_its_closed_form(
+    kind: tuple[str, bool],
+) -> None:
     law = SaintVenantKirchhoff(500.0, 0.4)
     for alpha in (0.7, 0.95, 1.3):
         expected = (3 * law.lame_lambda + 2 * law.lame_mu) / 2 * (alpha**3 - alpha)
@@ -202,7 +212,7 @@ def test_the_derivative_of_the_force_is_symmetric(law: str, kind: tuple[str, boo
 
 
 @pytest.mark.parametrize("law", list(LAWS))
-def test_small_strains_are_hookes(law: str) -> None:
+def test_every_law_is_hookes_at_small_strains(law: str) -> None:
     """At rest the tangent is that of linear elasticity with the law's Poisson ratio."""
     material = LAWS[law]
     tension = 1e-6
@@ -276,7 +286,7 @@ ELASTICA = {0.25: (0.082746, 0.004118), 1.0: (0.301721, 0.056433), 10.0: (0.8106
 @pytest.mark.parametrize(
     "load", slow_unless(lambda load: load == 1.0, [(load,) for load in ELASTICA])
 )
-def test_elastica(slender: FullOrderModel, load: float) -> None:
+def test_slender_beams_follow_the_elastica(slender: FullOrderModel, load: float) -> None:
     """Bisshopp and Drucker 1945: deflections of a cantilever over its length, by PL²/EI."""
     deflection = tip(slender, -load * 1000.0 / 20.0**2) / 20.0
     down, back = ELASTICA[load]
@@ -286,7 +296,7 @@ def test_elastica(slender: FullOrderModel, load: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("law", "kind"), [c for c in EVERY if c[1][0] == "hexahedron"])
-def test_elastica_of_every_law(law: str, kind: tuple[str, bool]) -> None:
+def test_every_law_follows_the_elastica(law: str, kind: tuple[str, bool]) -> None:
     """Strains of a slender beam are small, so PL²/EI = 1 bends all laws alike."""
     model = cantilever([20.0, 1.0, 1.0], [160, 1, 6], 0.0, "selective" if kind[1] else "full", law)
     deflection = tip(model, -1000.0 / 20.0**2) / 20.0

@@ -196,7 +196,7 @@ def test_multigrid_solves_as_the_banded_factor_does_and_accelerates(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("thickness", "may_fail"), [(0.1, False), (0.01, True)])
-def test_multigrid_bears_plates_or_says_why_not(
+def test_multigrid_solves_plates_or_gives_the_reason(
     thickness: float, may_fail: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The coarsest matrix of the thinner one is not definite in single precision."""

@@ -88,13 +88,13 @@ def compare(scene: Scene, n_loads: int) -> None:
 
 
 @pytest.mark.slow
-def test_agrees_with_felupe_on_twenty_random_loads() -> None:
+def test_solutions_agree_with_felupe_on_twenty_random_loads() -> None:
     compare(mor_bench.load_scene("beam-coarse"), 20)
 
 
 @pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
 @pytest.mark.parametrize("law", list(LAWS))
-def test_agrees_with_felupe_on_every_law_and_element(law: str, element: str) -> None:
+def test_solutions_agree_with_felupe_for_every_law_and_element(law: str, element: str) -> None:
     spec = mor_bench.load_scene("beam-tiny").spec.model_dump(mode="json")
     material = material_table(law, 500.0, 0.4)
     if law == "ogden":

@@ -24,7 +24,7 @@ from .scenes import relative_residual
 Array = NDArray[np.float64]
 
 
-def test_limit_of_confined_compression() -> None:
+def test_the_limit_of_confined_compression_matches_its_closed_form() -> None:
     """At stretch α the tangent is (3α² - 1)/2 of that at rest: it vanishes at α = 1/√3."""
     problem = confined_column()
     for alpha in (0.7, 0.9, 1.2):
@@ -38,7 +38,7 @@ def test_limit_of_confined_compression() -> None:
     assert 0 < limit.lowest_eigenvalue < 1e-3
 
 
-def test_asked_for_more_the_path_ends_in_an_error_that_names_the_limit() -> None:
+def test_a_load_beyond_the_limit_raises_an_error_that_names_the_limit() -> None:
     with pytest.raises(LimitPointError, match=r"ends at 0\.66666.*eigenvalue") as caught:
         solve_on_path(confined_column(), np.array([1.5 * LIMIT_PA]))
     assert caught.value.load_factor == pytest.approx(1 / 1.5, abs=1e-6)
@@ -50,7 +50,7 @@ def test_asked_for_more_the_path_ends_in_an_error_that_names_the_limit() -> None
     )
 
 
-def test_lowest_eigenvalue_of_a_large_tangent_is_that_of_the_dense_matrices() -> None:
+def test_the_lowest_eigenvalue_of_a_large_tangent_matches_dense_matrices() -> None:
     scene = mor_bench.load_scene("beam-coarse")
     model = FullOrderModel(scene)
     load = (scene.patch_weights[[62]].toarray()[0][:, None] * np.array([-2.0, 0.5, 1.0])).ravel()[
