@@ -14,27 +14,27 @@ Array = NDArray[np.float64]
 
 ACCELERATED_ITERATIONS = 40
 DIVERGED = 1e4
-"""A residual this many times the load ends the pass; the iteration does not recover from there."""
+"""Residual, as a multiple of the load, that ends the pass; the iteration would not recover."""
 TURNING = 1e-2
-"""Corrections larger than this, relative to the displacement, call for new nodal rotations."""
+"""Correction, relative to the displacement, above which nodal rotations are updated."""
 PROBE_FROM = 0.1
-"""Probing begins at this residual, relative to the load; the tangent hardly changes after that."""
+"""Residual, relative to the load, at which probing begins; the tangent hardly changes later."""
 PROBES = 3
 """Number of directions, soft ones first, that are probed for negative curvature."""
 PROBE_LENGTH = 1e-6
 """Length of the finite difference along a probe, relative to the body."""
 TOGETHER = 16
-"""Loads that are solved in step; on beam-fine a back-solve takes 2.4 ms alone, 0.7 ms among 16."""
+"""Loads solved together; a back-solve on beam-fine takes 2.4 ms alone, 0.7 ms in a group of 16."""
 
 Asked = list[tuple[Array, Array]]
 Correcting = Generator[Asked, list[Array], Attempt]
-"""A pass that repeatedly asks for the corrections of some residuals under some rotations."""
+"""A pass as a generator, which yields residuals with rotations and receives the corrections."""
 
 
 class _Probes:
     """A search for negative curvature along the iteration, with one more residual per step.
 
-    The first probe is the turned response to a random force, which soft modes dominate. Each next
+    The first probe is the rotated response to a random force, which soft modes dominate. Each next
     probe is P⁻¹K of the previous one, as in Lanczos' method. Products with K are differences of
     the internal force.
     """
@@ -58,7 +58,7 @@ class _Probes:
         return self._products[-1]
 
     def add(self, answer: Array, q: Array, force: Array) -> None:
-        """Take the next probe, at q with its internal force."""
+        """Add a probe from its correction, the state q and the internal force at q."""
         for probe in self._probes:
             answer = answer - float(probe @ answer) / float(probe @ probe) * probe
         length = PROBE_LENGTH * self._problem.extent / (float(np.abs(answer).max()) or 1.0)
@@ -79,7 +79,7 @@ class _Probes:
 def accelerated(
     problem: Problem, inverse: Turning, load: Array, start: Array | None, tolerance: float
 ) -> Correcting:
-    """Iterate with Anderson's acceleration; converged only where no negative curvature was seen."""
+    """Iterate with Anderson acceleration; reject a solution if negative curvature was seen."""
     load_norm = float(np.linalg.norm(load))
     memory, probes = Anderson(problem.n_unknowns), _Probes(problem)
     rotations = inverse.turned(start)

@@ -146,7 +146,7 @@ class Assembler:
     Raises
     ------
     InvalidInputError
-        If a cell is inverted or degenerate, or no element has as many nodes.
+        If a cell is inverted or degenerate, or no element has its number of nodes.
     """
 
     def __init__(
@@ -219,7 +219,7 @@ class Assembler:
         return state, values[:-1]
 
     def cell_forces(self, u: Array) -> Array:
-        """Return each cell's own internal force, (n_cells, 3 n_nodes), N; it trains cubatures."""
+        """Return each cell's own internal force, (n_cells, 3 n_nodes), N, to train cubatures."""
         local = np.arange(self._dofs.size, dtype=np.int32).reshape(self._dofs.shape)
         force = np.zeros(local.size + 1)
         self._sum(np.append(np.append(u, 0.0)[self._dofs].ravel(), 0.0), local, force, np.zeros(0))

@@ -17,7 +17,7 @@ from mor_bench.scene.dofs import dofs_of_nodes
 MANY, WIDE = 64, 256
 """Least number of right-hand sides, and least bandwidth, for solving by blocks of rows."""
 BLOCK = 96
-"""Rows of such a block."""
+"""Number of rows in a block."""
 
 
 @njit(inline="always")
@@ -102,9 +102,9 @@ def _backward(band, right_hand_sides, whole):
 def banded_solve(band, right_hand_sides):
     """Solve L Lᵀ x = x in place for every row x of (m, n).
 
-    ``band`` (n, bandwidth + 1) holds the columns of L with inverted diagonals. Four columns at
-    once load and store x once for four multiply-adds. They serve every right-hand side before the
-    next four columns are fetched.
+    ``band`` (n, bandwidth + 1) holds the columns of L with inverted diagonals. Processing
+    four columns at once loads and stores x once per four multiply-adds. They serve every right-hand
+    side before the next four columns are fetched.
     """
     n = len(band)
     whole = n - n % 4
@@ -188,7 +188,7 @@ class SingleBandedFactor:
     columns : (n, bandwidth + 1) float32
         Columns of L with inverted diagonals.
     place : (n,) int64
-        Place of each unknown in them.
+        Number of each unknown's column.
     """
 
     def __init__(self, columns: NDArray[np.float32], place: NDArray[np.int64]) -> None:

@@ -19,7 +19,7 @@ from mor_bench.scene.dofs import dofs_of_nodes
 Array = NDArray[np.float64]
 
 MAX_BYTES = 256 * 2**20
-"""Largest memory of the columns; if they need more, every response is a back-solve."""
+"""Memory limit for the columns, bytes; if they need more, every response is a back-solve."""
 
 _FIXED, _ELSEWHERE = -1, -2
 
@@ -94,9 +94,10 @@ def project(matrix: Array, loads: Array) -> Array:
 class Compliance:
     """K₀⁻¹ of a scene, with K₀ the stiffness at rest.
 
-    It keeps the columns of K₀⁻¹ at the nodes of the load patches. A back-solve answers loads
-    elsewhere, and loads on so many nodes that it takes fewer multiplications. It answers all loads
-    if the columns exceed `MAX_BYTES`, or if the solver is iterative. Both agree to round-off.
+    It keeps the columns of K₀⁻¹ at the nodes of the load patches. Loads on other nodes need a
+    back-solve. Loads on many nodes also use one, if it takes fewer multiplications. All loads use
+    back-solves if the columns exceed `MAX_BYTES`, or if the solver is iterative. Both ways agree
+    to round-off.
 
     Parameters
     ----------
@@ -158,7 +159,7 @@ class Compliance:
         return out
 
     def solve(self, rhs: Array) -> Array:
-        """Solve like a `Factor`: forces (n_free,) or (n_free, m), N, to displacements, m."""
+        """Map forces (n_free,) or (n_free, m), N, to displacements, m, like a `Factor`."""
         loads = np.zeros((rhs.size // len(self._free), len(self._place)))
         loads[:, self._free] = rhs.T
         return np.ascontiguousarray(self.respond(loads)[:, self._free].T).reshape(rhs.shape)
@@ -166,7 +167,7 @@ class Compliance:
     def to_coordinates(self, axes: Array) -> Array:
         """Return K₀⁻¹A on all dofs, zero at the supports.
 
-        `project` with it gives Aᵀ K₀⁻¹f without the response itself.
+        `project` with this matrix gives Aᵀ K₀⁻¹f without computing K₀⁻¹f.
 
         Parameters
         ----------

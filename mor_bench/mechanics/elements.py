@@ -53,7 +53,7 @@ def element_of(cells: NDArray[np.int64]) -> Element:
     Raises
     ------
     InvalidInputError
-        If there is none.
+        If no element has that number of nodes.
     """
     for element in (H8, T4):
         if cells.ndim == 2 and cells.shape[1] == element.n_nodes:

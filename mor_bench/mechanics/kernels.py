@@ -8,14 +8,14 @@ behind the last real one.
 
 Symbols: ``H`` = du/dX, ``F`` = I + H, ``E`` = (FᵀF - I)/2, ``S`` = λ tr(E) I + 2μE, ``P`` = FS,
 ``g_a`` = dN_a/dX, ``h_a`` = F g_a, ``w`` = Gauss weight times det J. The tangent block of nodes a
-and b is, with the isotropic elasticity tensor written out (Bonet & Wood, "Nonlinear Continuum
-Mechanics for FEA", sections 9.4-9.5, in material form),
+and b, with the isotropic elasticity tensor, is (Bonet & Wood, "Nonlinear Continuum Mechanics for
+FEA", sections 9.4-9.5, in material form)
 
     K_ab = w [ λ h_a ⊗ h_b + μ h_b ⊗ h_a + μ (g_a · g_b) F Fᵀ + (g_a · S g_b) I ].
 
 Saint Venant-Kirchhoff is also written out in `laws` and in `reduction.point_kernels`. They do not
-share it: numba's cache notices a change only in a function's own file, so after an edit of a shared
-file the other kernels would go on with old machine code.
+share code: numba's cache notices changes only in a function's own file. After an edit of a shared
+file, the other kernels would use old machine code.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ N_UPPER = 300
 """Entries in the upper triangle of a 24x24 element matrix."""
 
 FORCE_MULTIPLY_ADDS = 219
-"""Per Gauss point, for the force: H 72, E 24, S 8, energy 7, det F 9, P 27, f 72."""
+"""Multiply-adds per Gauss point for the force: H 72, E 24, S 8, energy 7, det F 9, P 27, f 72."""
 
 TANGENT_MULTIPLY_ADDS = 1200
-"""Per Gauss point, for the tangent: M 24, h and t 192, diagonal blocks 144, others 840."""
+"""Multiply-adds per Gauss point for the tangent: M 24, h and t 192, blocks 144 + 840."""
 
 
 @njit(inline="always")
@@ -241,7 +241,7 @@ def internal_force(u, dofs, gradients, w_lam, w_mu, force):
         Gauss weight times det J (and a cubature weight) times λ and times μ, J. With selective
         integration a point carries only one of the two.
     force : (n_dofs + 1,) float64
-        Receives the sum, N; the dummy entry receives that of the padding.
+        Receives the sum, N; the dummy entry receives the forces of the padding.
 
     Returns
     -------
@@ -271,8 +271,8 @@ def internal_force_and_tangent(u, dofs, gradients, w_lam, w_mu, slots, force, va
     Parameters
     ----------
     slots : (n_batches, 300, LANES) int32
-        Place in ``values`` of each upper entry of an element matrix. Entries of fixed dofs and of
-        padding are in its last, unused place.
+        Index in ``values`` of each upper entry of an element matrix. Fixed dofs and padding have
+        the index of its last, unused entry.
     values : (n_upper_nonzeros + 1,) float64
         Receives the sum, N/m.
     """
@@ -305,16 +305,16 @@ RUNNING, MET, DIVERGED = range(3)
 """Outcomes of a step of dynamic relaxation."""
 
 TARGET, STEP, LOWEST, LIMIT = range(4)
-"""Places in the control of `advance`, all squares.
+"""Indices into ``control`` of `advance`, whose entries are squares.
 
-They are the residual to reach, the step, the lowest frequency, and the residual of divergence.
+The entries are the residual to reach, the step, the lowest frequency, and the divergence residual.
 """
 
 ADVANCE_MULTIPLY_ADDS = 7
-"""Per unknown, for `advance`."""
+"""Multiply-adds of `advance` per unknown."""
 
 MOST_CURVATURE = 3.8
-"""Largest allowed Rayleigh quotient times the squared step; central differences need below 4."""
+"""Limit on the Rayleigh quotient times the squared step; above 4 the steps are unstable."""
 
 LEAST_LOWEST = 0.01
 """Least eigenvalue for the damping of a softened body, relative to the lowest at rest."""
@@ -340,9 +340,9 @@ def advance(u, v, force, before, load, mass, control):
     before : (n_dofs,) float64
         Internal force before the last step, N.
     load, mass : (n_dofs,) float64
-        N, and N/m; eigenvalues of M⁻¹K have no unit.
+        Load, N, and fictitious mass, N/m, so that eigenvalues of M⁻¹K have no unit.
     control : (4,) float64
-        The squared step may decrease.
+        Squared settings, see `TARGET`; the squared step is reduced in place.
 
     Returns `RUNNING`, `MET` or `DIVERGED`.
     """

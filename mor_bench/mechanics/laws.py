@@ -7,9 +7,8 @@ strains. To add a law, write the function, give it a number in `evaluate`, and w
 class in `mor_bench.scene.materials`.
 
 `general_force` takes one cell after the other: K_ab = w [ B_aᵀ D B_b + (g_a · S g_b) I ], with B_a
-the strain-displacement matrix at F (Bonet & Wood, section 9.4). It is in this file because numba
-recompiles a function only after a change in its own file. Saint Venant-Kirchhoff on H8 has its own,
-vectorised kernel.
+the strain-displacement matrix at F (Bonet & Wood, section 9.4). Saint Venant-Kirchhoff
+on H8 has its own, vectorised kernel.
 
 Longer than 400 lines because numba recompiles a function only after a change in its own file, so
 laws and the kernels that call them stay together.
@@ -30,7 +29,7 @@ _LAW_MULTIPLY_ADDS = {
     MOONEY_RIVLIN: 1563,
     OGDEN: 3313 + 122,
 }
-"""Per point, for stress and tangent; Ogden's eigenvectors count as 9/2 n³ = 122."""
+"""Multiply-adds per point for stress and tangent; Ogden's eigenvectors count as 9/2 n³ = 122."""
 
 _OGDEN_TERM_MULTIPLY_ADDS = 44
 
@@ -204,7 +203,7 @@ def _ogden(C, p, S, D):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def evaluate(law, C, parameters, S, D):
-    """Evaluate the law with a number; S and D are overwritten."""
+    """Evaluate the law with the given number; S and D are overwritten."""
     S[:] = 0.0
     D[:] = 0.0
     if law == SAINT_VENANT_KIRCHHOFF:
@@ -216,8 +215,8 @@ def evaluate(law, C, parameters, S, D):
     return _ogden(C, parameters, S, D)
 
 
-# Longer than 60 lines because it took 6 to 44 % longer when split into compiled functions, also
-# into inlined ones.
+# Longer than 60 lines because splitting it into compiled functions, even inlined ones, made it 6 to
+# 44 % slower.
 @njit(cache=True, nogil=True, error_model="numpy")
 def general_force(u, dofs, gradients, weights, law, parameters, slots, force, values):
     """Add the internal force to ``force`` and, if not empty, the tangent to ``values``.
@@ -233,7 +232,8 @@ def general_force(u, dofs, gradients, weights, law, parameters, slots, force, va
         Quadrature weight times det J, m³.
     law : int
     parameters : (n_points, n_parameters) float64
-        Of each quadrature point, which may carry only the volumetric part, or only the rest.
+        Law parameters of each quadrature point. A point may carry only the volumetric part, or
+        only the rest.
     slots : (n_cells, n_upper) int32
     force : (n_dofs + 1,) float64
     values : (n_upper_nonzeros + 1,) or (0,) float64
@@ -322,8 +322,8 @@ def general_force(u, dofs, gradients, weights, law, parameters, slots, force, va
     return energy, min_det
 
 
-# Longer than 60 lines because `general_force`, which has the same steps, took 6 to 44 % longer when
-# split into compiled functions.
+# Longer than 60 lines because splitting the similar `general_force` into compiled functions made it
+# 6 to 44 % slower.
 @njit(cache=True, nogil=True, error_model="numpy")
 def point_stresses(H, weights, law, parameters, P, A):
     """Write the weighted first Piola-Kirchhoff stress P and, if not empty, A = dP/dF.
@@ -335,7 +335,7 @@ def point_stresses(H, weights, law, parameters, P, A):
     weights : (n_batches, n_lanes) float64
     law : int
     parameters : (n_points, n_parameters) float64
-        Of each point; the last batch may have fewer points than lanes.
+        Law parameters of each point; the last batch may have fewer points than lanes.
     P : (n_batches, 9 * n_lanes) float64
     A : (n_batches, 81 * n_lanes) or (0, 81 * n_lanes) float64
         Component (i, J, k, L) at (9 (3i + J) + 3k + L) * n_lanes + l.
@@ -412,14 +412,14 @@ def point_stresses(H, weights, law, parameters, P, A):
 
 
 def point_multiply_adds(law: int, n_parameters: int) -> tuple[int, int]:
-    """Return the work of `point_stresses` at one point, without A, and what A adds."""
+    """Return multiply-adds of `point_stresses` per point: without A, and the addition for A."""
     terms = n_parameters // 2 if law == OGDEN else 0
     stress = 27 + 9 + 37 + _LAW_MULTIPLY_ADDS[law] + terms * _OGDEN_TERM_MULTIPLY_ADDS
     return stress, 9 * 6 * 4 + 81 * 3 + 27
 
 
 def general_multiply_adds(law: int, n_parameters: int, n_nodes: int) -> tuple[int, int]:
-    """Return the work of `general_force` at one point, for the force, and with the tangent."""
+    """Return multiply-adds of `general_force` per point: the force alone, and with tangent."""
     terms = n_parameters // 2 if law == OGDEN else 0
     force = 57 * n_nodes + 37 + _LAW_MULTIPLY_ADDS[law] + terms * _OGDEN_TERM_MULTIPLY_ADDS
     tangent = n_nodes * (216 + 39) + n_nodes * (n_nodes - 1) // 2 * 57

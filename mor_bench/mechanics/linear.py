@@ -89,9 +89,9 @@ class SparseLU:
 
     @cached_property
     def multiply_adds(self) -> tuple[int, int]:
-        """Multiply-adds of a factorisation, which does not use the symmetry, and of a solve.
+        """Multiply-adds of a factorisation and of a solve.
 
-        They follow from factors in which no entry cancels.
+        They assume that no entry of the factors cancels. The factorisation ignores the symmetry.
         """
         t = self._template
         counts = np.diff(t.indptr)
@@ -142,7 +142,7 @@ class Pardiso:
             self._phase(22, np.zeros(len(self._matrix.indptr) - 1))
         except self._error as error:
             raise NotPositiveDefiniteError from error
-        # MKL reports millions of operations. The least number for its entries has columns
+        # MKL reports whole millions of operations. The lower bound for its entries assumes columns
         # of equal length.
         least = self._entries**2 // (2 * self._matrix.shape[0])
         count(

@@ -41,14 +41,14 @@ from mor_bench.scene.scene import Scene
 from mor_bench.specs import NO_EQUATIONS, NO_FORCES, SolverName
 
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
-"""How equilibria are solved.
+"""Methods of solving equilibria.
 
 auto
     Anderson-accelerated iteration with the stiffness at rest, factorised once in single precision
-    and turned with the nodes. Where that fails, Newton's method as by `cholesky` on small meshes
-    and `rotated-pcg` on others.
+    and rotated with the nodes. If it fails, Newton's method follows, with `cholesky` on small
+    meshes and `rotated-pcg` on others.
 rotated-pcg
-    Newton's method. Conjugate gradients, preconditioned by the turned rest-state factor, find each
+    Newton's method. Conjugate gradients, preconditioned by the rotated rest-state factor, find each
     step.
 jacobi-pcg
     Newton's method. Conjugate gradients, preconditioned by the tangent's own 3x3 diagonal blocks,
@@ -61,14 +61,14 @@ Meshes whose band exceeds `MAX_BAND_ENTRIES` use multigrid instead of a rest-sta
 """
 
 MAX_BAND_ENTRIES = 1e8
-"""Largest number of entries of a banded rest-state factor (0.8 GB); multigrid serves the rest."""
+"""Largest number of entries of a banded rest-state factor (0.8 GB); larger meshes use multigrid."""
 
 PCG_FROM = 3000
-"""Unknowns from which conjugate gradients beat a fresh banded factor for each Newton step."""
+"""Number of unknowns above which conjugate gradients beat a banded factor per Newton step."""
 JACOBI_ITERATIONS = 20_000
 CERTIFY_TOLERANCE = 1e-2
 ILL_CONDITIONED = 1e10
-"""Condition number from which answers do not reach the default tolerance."""
+"""Condition number above which solutions miss the default tolerance."""
 
 RIGID_MODES = (
     "translation x",
@@ -128,7 +128,7 @@ def check_supports(scene: Scene) -> None:
 
 
 class FullOrderModel:
-    """Finite elements under dead loads, over the free dofs of a scene.
+    """Finite-element model of a scene under dead loads; its unknowns are the free dofs.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ class FullOrderModel:
 
     @property
     def turns(self) -> bool:
-        """Whether solves use the turned rest-state factor."""
+        """Whether solves use the rotated rest-state factor."""
         return self.solver in ("auto", "rotated-pcg")
 
     def force(self, q: NDArray[np.float64]) -> State:
@@ -301,6 +301,6 @@ class FullOrderModel:
     def solve_many(
         self, loads: NDArray[np.float64], options: NewtonOptions = NewtonOptions()
     ) -> list[Solution | SolverError]:
-        """Solve for loads (m, n_free), N; returns solutions, or the errors `solve` would raise."""
+        """Solve for loads (m, n_free), N; return solutions, or the errors `solve` would raise."""
         found = dict(solve_equilibria(self, list(loads), options=options))
         return [found[i] for i in range(len(loads))]

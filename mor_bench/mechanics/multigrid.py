@@ -47,7 +47,7 @@ class Multigrid:
 class MultigridFactor:
     """A multigrid hierarchy.
 
-    One V-cycle in float32 is a preconditioner. Conjugate gradients with it solve.
+    One V-cycle in float32 is the preconditioner. A solve uses conjugate gradients with it.
     """
 
     def __init__(
@@ -61,8 +61,8 @@ class MultigridFactor:
         motions[:, :, :3] = np.eye(3)
         for axis in range(3):
             motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], x / np.abs(x).max())
-        # The coarsest matrix of plates and other ill-conditioned bodies may not be definite in
-        # single precision, or not at all.
+        # The coarsest matrix of plates and other ill-conditioned bodies may be indefinite
+        # in single precision, or even in double precision.
         for dtype, coarse in (
             (np.float32, "cholesky"),
             (np.float64, "cholesky"),

@@ -31,9 +31,9 @@ Array = NDArray[np.float64]
 PLAIN_ITERATIONS = 25
 DAMPED_ITERATIONS = 60
 HOPELESS = 1e10
-"""A residual this many times the load ends the pass of full steps.
+"""Residual, as a multiple of the load, that ends the pass of full steps.
 
-Near incompressibility the residual rises 3,000-fold and still converges.
+Near incompressibility the residual may rise 3,000-fold before it converges.
 """
 ARMIJO = 1e-4
 DAMPED_FORCING = 1e-3
@@ -46,14 +46,14 @@ MAX_ITERATIONS = 300
 
 @dataclass(frozen=True)
 class NewtonOptions:
-    """Stopping and stepping.
+    """Tolerance and step control of the nonlinear solve.
 
     Parameters
     ----------
     tolerance : float
         Norm of the residual relative to that of the load, in (0, 1].
     max_cuts : int
-        How often an increment may be halved before the solve gives up.
+        Largest number of halvings of an increment before the solve gives up.
     """
 
     tolerance: float = 1e-8
@@ -236,9 +236,9 @@ def solve_equilibria(
 ) -> Iterator[tuple[int, Solution | SolverError]]:
     """Solve for many loads, which share the sweeps over the factor; see `solve_equilibrium`.
 
-    Yields the number of a load and its solution, or the error that `solve_equilibrium` would raise,
-    in the order in which they are found. A solution does not depend on the other loads, to the last
-    digit.
+    Yields the number of each load with its solution, or with the error that `solve_equilibrium`
+    would raise. Loads come in the order in which they finish. A solution does not depend on the
+    other loads, to the last digit.
     """
     loads = [_checked_load(load, number, problem) for number, load in enumerate(loads)]
     starts = [

@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 
 class _HiddenRest(RotatedRest):
-    """`RotatedRest` of the hidden nodes, which turn with the whole body.
+    """`RotatedRest` of the hidden nodes, which rotate with the whole body.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class _HiddenRest(RotatedRest):
         Factor of the hidden nodes' stiffness at rest.
     whole : FullOrderModel
     hidden : (n_hidden,) int64
-        Places of the hidden dofs among the free ones.
+        Indices of the hidden dofs among the free ones.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class ObservedModel:
         return out
 
     def respond(self, observed: Array) -> Array:
-        """As `linear_response`, for all dofs, (n, n_dofs), m; zero at the supports."""
+        """Return `linear_response` on all dofs, (n, n_dofs), m; zero at the supports."""
         out = np.zeros(observed.shape)
         out[:, self.scene.free_dofs] = self.linear_response(observed[:, self.scene.free_dofs])
         return out
@@ -189,8 +189,7 @@ class ObservedModel:
     def to_coordinates(self, axes: Array) -> Array:
         """Return Eᵀ A for all dofs, where E u_o is the linear extension of u_o.
 
-        Its product with observed displacements is that of A with their extension. It is zero where
-        nothing is observed.
+        The product (Eᵀ A)ᵀ u_o equals Aᵀ (E u_o). Rows of dofs that are not observed are zero.
 
         Parameters
         ----------
@@ -210,15 +209,17 @@ class ObservedModel:
     def solve_many(
         self, observed: Array, options: NewtonOptions = NewtonOptions()
     ) -> list[Solution | SolverError]:
-        """Solve for all free dofs under displacements of the observed ones; return errors, too.
+        """Solve for all free dofs, given the observed displacements.
+
+        Returns a solution or an error for each sample.
 
         Parameters
         ----------
         observed : (n, n_free) float64
             Displacements, m; those of hidden dofs are ignored.
         options : NewtonOptions
-            The tolerance bounds the residual on hidden dofs relative to the reactions on the
-            observed ones in the starting state, the linear response.
+            The tolerance bounds the residual on hidden dofs relative to the reactions on observed
+            dofs. These reactions belong to the starting state, the linear response.
         """
         return [self._solved(self.linear_response(row[None])[0], options) for row in observed]
 
@@ -259,21 +260,21 @@ class ObservedModel:
 
 
 class LinearResponse(Protocol):
-    """Linear elasticity under what methods are given: a `Compliance` or an `ObservedModel`."""
+    """Linear response to the input of methods: a `Compliance` or an `ObservedModel`."""
 
     def respond(self, loads: Array, /) -> Array: ...
     def to_coordinates(self, axes: Array) -> Array: ...
 
 
 def linear_response(scene: Scene) -> LinearResponse:
-    """Prepare the linear response to forces or, if these are given, to observed displacements."""
+    """Prepare the linear response to forces or, with observed nodes, to their displacements."""
     return (
         Compliance(FullOrderModel(scene)) if scene.observed_nodes is None else ObservedModel(scene)
     )
 
 
 def forward_model(scene: Scene, solver: SolverName | None = None) -> FullOrderModel | ObservedModel:
-    """Return a factorised model that solves for forces or, if given, for observed displacements."""
+    """Return a factorised model whose input is forces or, with observed nodes, displacements."""
     if scene.observed_nodes is not None:
         return ObservedModel(scene, solver)
     model = FullOrderModel(scene, solver)

@@ -47,7 +47,7 @@ class Pattern:
 def build_pattern(
     dof_of_node: NDArray[np.int64], cells: NDArray[np.int64], n_dofs: int
 ) -> tuple[Pattern, NDArray[np.int32]]:
-    """Return the pattern, and the places (n_cells, n_upper) of the cells' upper entries in it.
+    """Return the pattern, and the indices (n_cells, n_upper) of the cells' upper entries in it.
 
     Sorting pairs of nodes takes a ninth of the memory of sorting pairs of dofs. Nodes without a
     free dof are left out. Nodes with one or two free dofs are first treated as free.

@@ -1,4 +1,4 @@
-"""What the nonlinear solve needs of a model, and what its passes share."""
+"""Interfaces between the nonlinear solve and its models, and helpers that its passes share."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from mor_bench.mechanics.linear import Factor
 Array = NDArray[np.float64]
 
 ROUND_OFF = 1e-13
-"""A correction this small relative to the displacement is round-off.
+"""Size of a correction, relative to the displacement, that counts as round-off.
 
-Slender bodies never meet a force tolerance, so such a correction ends the solve. Once the residual
-falls no further, so does a correction this small relative to the body, because strains lose their
-digits to the 1 in F.
+Slender bodies may never meet a force tolerance, so such a correction ends the solve. Once the
+residual stagnates, a correction of this size relative to the body also ends it. Adding 1 in F then
+cancels the digits of the strain.
 """
 LINEAR = 1e-11
-"""Relative size, to the body, of displacements that the stiffness at rest gives to all digits."""
+"""Largest displacement, relative to the body, that the linear response gives to all digits."""
 
 
 class Turning(Protocol):
-    """An approximate inverse of all tangents, which turns with the body."""
+    """An approximate inverse of all tangents, which rotates with the body."""
 
     def turned(self, q: Array | None) -> Array:
         """Return the nodal rotations of the body at q; the identity for None."""
         ...
 
     def soft(self, rotations: Array) -> Array:
-        """Return the turned response at rest to a random force; soft modes dominate it."""
+        """Return the rotated response at rest to a random force; soft modes dominate it."""
         ...
 
     def solve_many(self, residuals: Sequence[Array], rotations: Sequence[Array]) -> Array:
@@ -70,14 +70,14 @@ class Problem(Protocol):
     def step(self, q: Array, tangent: Array, residual: Array, tolerance: float) -> Array:
         """Solve tangent · step = residual; iterative solvers stop at the relative tolerance.
 
-        Raises `NotPositiveDefiniteError` where the tangent proves not positive definite.
+        Raises `NotPositiveDefiniteError` if the tangent is found not positive definite.
         """
         ...
 
     def certify(self, q: Array) -> None:
-        """Look for negative curvature at a solution q, unless the steps to it excluded that.
+        """Look for negative curvature at a solution q, unless earlier steps excluded it.
 
-        Raises `NotPositiveDefiniteError` where there is some.
+        Raises `NotPositiveDefiniteError` if it finds any.
         """
         ...
 

@@ -27,7 +27,7 @@ MARGIN = 1.1
 POWER_ITERATIONS = 60
 
 GROWN = 1e6
-"""A residual this many times the load is divergence."""
+"""Residual, as a multiple of the load, that counts as divergence."""
 
 SECOND_STEP = 0.25
 """Squared step of the second attempt, relative to the first."""
@@ -61,7 +61,7 @@ class DynamicRelaxation:
         Mass of each free dof, equal for the dofs of a node, N/m. It is scaled such that the
         largest eigenvalue of M⁻¹K at rest is 1.
     lowest : float
-        The smallest eigenvalue.
+        Smallest eigenvalue of M⁻¹K at rest.
     """
 
     def __init__(self, model: FullOrderModel) -> None:
@@ -95,7 +95,7 @@ class DynamicRelaxation:
         tolerance : float
             Norm of the residual, relative to that of the load, at which the body is at rest.
         max_steps : int
-            Limit of each of the two attempts.
+            Largest number of steps in each of the two attempts.
         start : (n_unknowns,) float64, optional
             Start of the first attempt, m; undeformed by default.
 

@@ -1,6 +1,6 @@
-"""The rest-state stiffness, turned with the body, as an approximate inverse of any tangent.
+"""The rest-state stiffness, rotated with the body, as an approximate inverse of any tangent.
 
-To first order, a tangent is the rest-state stiffness turned with each node: K ≈ R K₀ Rᵀ, with R the
+To first order, a tangent is the rest-state stiffness rotated with each node: K ≈ R K₀ Rᵀ. R is the
 block-diagonal matrix of nodal rotations. These are the polar factors of the nodal mean deformation
 gradients. One single-precision factor of K₀ hence serves every iteration of every load.
 
@@ -26,19 +26,19 @@ from mor_bench.mechanics.pattern import Pattern
 Array = NDArray[np.float64]
 
 MAX_ITERATIONS = 400
-"""Limit for conjugate gradients with the turned factor.
+"""Iteration limit for conjugate gradients with the rotated factor.
 
-11-15 iterations are usual. A tangent that needs more than the limit is nearly singular.
+11 to 15 iterations are usual. A tangent that needs more than the limit is nearly singular.
 """
 
 
 class SingleFactor(Protocol):
-    """An exact or approximate factor in single precision, with an order of its own.
+    """An exact or approximate factor in single precision, in its own order of unknowns.
 
     Attributes
     ----------
     place : (n,) int64
-        Place of each unknown in that order.
+        Position of each unknown in that order.
     """
 
     place: NDArray[np.int64]
@@ -95,7 +95,7 @@ def _to_rotation(Q):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def nodal_rotations(u, cell_nodes, centre_gradients, volumes, rotations):
-    """Find each free node's rotation: that of the mean deformation gradient of its cells.
+    """Compute each free node's rotation from the mean deformation gradient of its cells.
 
     The mean is weighted by volume.
 
@@ -197,11 +197,11 @@ class RotatedRest:
     factor : SingleFactor
         Factor of the stiffness at rest, with the three dofs of a node as neighbours.
     cell_nodes : (n_cells, n_cell_nodes) int32
-        Number of each cell's nodes among the free ones; a fixed node has the number of free nodes.
+        Index of each cell's nodes among the free nodes; fixed nodes have the index n_free_nodes.
     centre_gradients : (n_cells, n_cell_nodes, 3) float64
         dN_a/dX at the cells' centres, 1/m.
     volumes : (n_cells,) float64
-        m³.
+        Volumes of the cells, m³.
     """
 
     def __init__(
@@ -259,7 +259,7 @@ class RotatedRest:
         return np.asarray(response[0] / np.abs(response).max())
 
     def soft(self, rotations: Array) -> Array:
-        """Return the turned response at rest to a random force, scaled to size one."""
+        """Return the rotated response at rest to a random force, scaled to size one."""
         count(multiply_adds=4 * len(self._soft))
         z = np.empty(len(self._soft))
         _turn(self._place, rotations, 1.0, self._soft, z)

@@ -24,7 +24,7 @@ DENSE_UP_TO = 300
 LEAP = 0.25
 """Largest distance of an increment from the mean of the linear predictions at its two ends.
 
-Relative to the increment's length; a larger distance is a leap to another path.
+It is relative to the increment's length. A larger distance is a jump to another path.
 """
 FIRST_INCREMENT = 1.0 / 16.0
 
@@ -98,7 +98,7 @@ def limit_load(
     ----------
     problem : AssembledProblem
     load : (n_unknowns,) float64
-        N.
+        Load, N.
     most : float
         Load factor at which to stop.
     tolerance : float
@@ -148,7 +148,8 @@ def solve_on_path(problem: AssembledProblem, load: Array) -> Array:
     Raises
     ------
     LimitPointError
-        If the path ends before. The message gives the limit's load factor and lowest eigenvalue.
+        If the path ends at a smaller load. The message gives the limit's load factor and lowest
+        eigenvalue.
     """
     limit = limit_load(problem, load)
     if limit is not None:
