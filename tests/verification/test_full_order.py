@@ -194,6 +194,17 @@ def test_multigrid_solves_as_the_banded_factor_does_and_accelerates(
     )
 
 
+def test_multigrid_out_of_cycles_returns_no_solution(
+    large: FullOrderModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mor_bench.mechanics.model.MAX_BAND_ENTRIES", 0)
+    factor = FullOrderModel(large.scene).rest_factor
+    assert isinstance(factor, MultigridFactor)
+    monkeypatch.setattr("mor_bench.mechanics.multigrid.MAX_CYCLES", 2)
+    with pytest.raises(SolverError, match="multigrid does not solve"):
+        factor.solve(np.ones(large.n_unknowns))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("thickness", "may_fail"), [(0.1, False), (0.01, True)])
 def test_multigrid_solves_plates_or_gives_the_reason(
