@@ -5,5 +5,5 @@ Start with `basis.pod` and `galerkin.GalerkinProblem`. Hyper-reduction begins at
 points. `tensors` evaluates Saint Venant-Kirchhoff as a polynomial, without a mesh.
 
 Methods do not belong here: a surrogate combines these tools in `mor_bench.surrogates`.
-Compiled kernels check no bounds: whoever calls them checks shapes.
+Compiled kernels check no bounds, so callers must check shapes.
 """

@@ -1,7 +1,7 @@
 """Reduced bases from snapshots: proper orthogonal decomposition by singular value decomposition.
 
-The eigenvalues of the Gram matrix are squared singular values. A basis from it loses orthonormality
-and is not used.
+The Gram matrix is not used. Its eigenvalues are squared singular values, so a basis from it loses
+orthonormality.
 
 Large matrices go through the randomised range finder of Halko, Martinsson and Tropp: Finding
 structure with randomness, SIAM Review 53 (2011), algorithm 4.4, which orthonormalises after every
@@ -33,7 +33,7 @@ OVERSAMPLING = 20
 POWER_ITERATIONS = 2
 """Subspace iterations; each brings the modes nearer to the exact ones."""
 FIRST_DIRECTIONS = 64
-"""First number of directions, which doubles, if the number of modes is not given."""
+"""Initial number of directions if the number of modes is not given; it doubles as needed."""
 LEAST_RANDOMISED_TOLERANCE = 1e-6
 """Least energy tolerance of a randomised decomposition; round-off hides smaller shares."""
 SEED = 0
@@ -65,8 +65,9 @@ def pod(
 ) -> Basis:
     """Return the leading right singular vectors of a snapshot matrix, without removing the mean.
 
-    With the mean removed, no load would give a displacement. Large matrices with few wanted modes
-    are decomposed by randomised subspace iteration, the same in every run; others exactly.
+    With the mean removed, zero load would cause a displacement. Large matrices with few wanted
+    modes use randomised subspace iteration, with the same result in every run. Other
+    decompositions are exact.
 
     Parameters
     ----------
@@ -74,8 +75,8 @@ def pod(
     n_modes : int, optional
         Capped at the rank of the snapshots with a warning; the rank by default.
     energy_tolerance : float, optional
-        Instead of `n_modes`: the fewest modes n with √(Σ_{j>n} sⱼ² / Σ sⱼ²) at most this, where s
-        are the singular values.
+        Take the fewest modes n with √(Σ_{j>n} sⱼ² / Σ sⱼ²) at most this, where s are the singular
+        values. It excludes `n_modes`.
     inner_product : (n, n) sparse array, optional
         Symmetric positive definite K: Φᵀ K Φ = I, and Φ is the best basis in the norm √(uᵀKu).
         Euclidean by default.
@@ -111,11 +112,11 @@ def _decomposed(
     energy_tolerance: float | None,
     inner_product: Any,
 ) -> tuple[_Decomposition, int | None]:
-    """Return a decomposition, and up to how many modes it is good for; None for all."""
+    """Return a decomposition and its number of usable modes; None stands for all."""
     small = min(snapshots.shape)
     most = small // RANDOMISED_SHARE if small >= RANDOMISED_FROM else 0
     if n_modes is not None and n_modes <= most:
-        # Where decompositions are remembered, more modes will be asked for.
+        # Later calls may want more modes of a remembered decomposition.
         reach = n_modes if _remembered is None else min(max(2 * n_modes, FIRST_DIRECTIONS), most)
         found = _randomised(snapshots, reach, None, inner_product, None)
         assert found is not None
@@ -225,7 +226,7 @@ class _Decomposition:
         return int((self.values > least).sum())
 
     def n_modes_of(self, energy_tolerance: float) -> int:
-        """Return the fewest modes that leave no larger share; one too many if none do."""
+        """Return the fewest modes that meet the tolerance; one more than exist if none do."""
         squares, rest = (self.values / self.values[0]) ** 2, 0.0
         if self._energy is not None:
             rest = max(self._energy / float(self.values[0]) ** 2 - float(squares.sum()), 0.0)
@@ -300,7 +301,7 @@ def _randomised(
 
 
 class _Remembered:
-    """Decompositions by the digest of their matrices, and up to how many modes each is good for."""
+    """Decompositions by the digest of their matrices, each with its number of usable modes."""
 
     def __init__(self) -> None:
         self._known: dict[str, tuple[_Decomposition, int | None]] = {}
@@ -325,7 +326,7 @@ _remembered: _Remembered | None = None
 
 @contextmanager
 def remembering() -> Iterator[None]:
-    """Let `pod` decompose equal snapshots once inside the block, for all numbers of modes."""
+    """Let `pod` decompose equal snapshots only once inside the block, for any number of modes."""
     global _remembered
     around, _remembered = _remembered, _Remembered()
     try:

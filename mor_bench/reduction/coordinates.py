@@ -40,7 +40,7 @@ def change_of_basis(old: Array, new: Array) -> Array:
 def error_weights(displacements: Array) -> Array:
     """Return weights (n_samples,) that make errors relative to displacements (n_samples, n).
 
-    Displacements below `SMALLEST` count as that large.
+    Displacements smaller than `SMALLEST` get the weight of that size.
     """
     sizes = np.linalg.norm(displacements, axis=1)
     typical = float(np.sqrt((sizes**2).mean()))

@@ -24,7 +24,7 @@ LEAST_GRADIENT = 1e-14
 DRIFT = 1e-12
 """Passive gradient, relative to target or scaled weights, that calls for a fresh factor."""
 MAX_ENTRIES = 2**26
-"""Entries of a training matrix (512 MB) from which QR compresses it."""
+"""Number of entries (512 MB) above which QR compresses a training matrix."""
 
 
 class CubatureError(MorBenchError):
@@ -57,7 +57,7 @@ class SparseWeights:
     dual_gradient : float
         Largest aⱼᵀ(b - A weights) / (‖aⱼ‖ ‖b‖) over the other columns, at least 0. If both
         gradients are zero, no non-negative weights are better (Karush, Kuhn and Tucker). A run
-        that stops at a tolerance stops earlier.
+        with a tolerance stops before that.
     iterations : int
     """
 
@@ -219,7 +219,7 @@ def sparse_nnls(
     tolerance : float
         Relative residual at which to stop; 0 runs to the optimum.
     max_iterations : int, optional
-        Most columns added or removed; 3 n by default.
+        Largest number of columns added or removed; 3 n by default.
 
     Raises
     ------
@@ -261,7 +261,7 @@ def sparse_nnls(
 def _appended(columns: ActiveColumns, entering: int) -> Array | None:
     """Append a column and return the coefficients; None if it cannot have a positive weight.
 
-    A dependent column, or one with a negative weight, would enter for ever.
+    A dependent column, or one with a negative weight, would be chosen again and again.
     """
     if not columns.append(entering):
         return None

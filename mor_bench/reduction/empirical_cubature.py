@@ -87,11 +87,11 @@ def empirical_cubature(
     tolerance : float
         Share of the matrix' Frobenius norm that the basis may lack.
     max_iterations : int, optional
-        Most columns added or removed; 3 n by default.
+        Largest number of columns added or removed; 3 n by default.
 
-    Returns non-negative weights with the residual, at most `EXACT`, of their equations. Raises
-    `InvalidInputError` if an entry is not finite, and `CubatureError` if the matrix is zero or the
-    equations are not solved within the iterations.
+    Returns non-negative weights and the residual of their equations, at most `EXACT`. Raises
+    `InvalidInputError` if an entry is not finite. Raises `CubatureError` if the matrix is zero or
+    the equations are not solved within the iterations.
     """
     equations = _equations(matrix, tolerance)
     target = equations.sum(axis=1)

@@ -24,11 +24,11 @@ from mor_bench.reduction.point_kernels import LANES, full_steps, gradients, inte
 Array = NDArray[np.float64]
 
 SVK_MULTIPLY_ADDS = 77, 162
-"""Per point, for Saint Venant-Kirchhoff: P, energy and det F from H; and A."""
+"""Multiply-adds per point for Saint Venant-Kirchhoff: P, energy and det F from H; and A."""
 
 
 def tangent_multiply_adds(r: int, symmetric: bool) -> int:
-    """Return the work per point for A : G_k of all modes and their products with test functions."""
+    """Return multiply-adds per point for A : G_k of all modes and products with test functions."""
     products = 0
     for k in range(0, r, 2):
         pair = 2 if k + 1 < r else 1
@@ -131,7 +131,7 @@ class ReducedPoints:
         return self._sum(q, tangent), tangent
 
     def point_forces(self, q: Array) -> Array:
-        """Return each point's part of the reduced force, (n_points, r); it trains cubatures."""
+        """Return each point's part of the reduced force, (n_points, r); to train cubatures."""
         H, P = np.empty((2, len(self.weights), 9 * LANES))
         gradients(self.trial, q, H)
         point_stresses(H, self.weights, self.law, self.parameters, P, np.empty((0, 81 * LANES)))
@@ -144,7 +144,7 @@ class ReducedPoints:
     ) -> Solution | None:
         """Take full Newton steps with Saint Venant-Kirchhoff; see `point_kernels.full_steps`.
 
-        Returns None for other laws, or without a stable end with det F > 0.
+        Returns None for other laws, or if the steps find no stable solution with det F > 0.
         """
         if self._lame is None:
             return None

@@ -57,7 +57,7 @@ def sensitivities(
     Returns
     -------
     Sensitivities
-        Zero, which fits any linear map, where K(u) is not positive definite; a warning says so.
+        Zero, with a warning, where K(u) is not positive definite; zeros fit any linear map.
 
     Raises
     ------

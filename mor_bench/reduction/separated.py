@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 Family = Sequence[Array]
 
 ITERATIONS = 8
-"""Most alternations for a term."""
+"""Largest number of alternations for a term."""
 
 STAGNANT = 1e-2
 """Relative change of a term's sampled function below which its alternation ends."""
@@ -78,7 +78,7 @@ def _solve(matrix: Array, rhs: Array, ridge: float) -> Array:
 def _orthonormal(values: Array) -> tuple[Array, Array]:
     """Return orthonormal combinations (n, r) of sampled functions, and their coefficients.
 
-    The coefficients, (n_functions, r), are those in the functions.
+    The coefficients are (n_functions, r).
     """
     scale = np.sqrt((values**2).mean(axis=0))
     scale[scale == 0] = 1.0
@@ -144,7 +144,7 @@ def separate(targets: Array, families: Sequence[Family], n_terms: int, ridge: fl
         For each family of terms, the functions of its factors, two or more, at the samples. Each
         term comes from the family that leaves the smallest residual.
     n_terms : int
-        Most terms; fewer if nothing is left.
+        Largest number of terms; fewer if the residual vanishes.
     ridge : float
         Tikhonov weight of every least-squares problem, relative to its matrix' mean diagonal.
     """

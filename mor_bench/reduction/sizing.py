@@ -1,4 +1,4 @@
-"""Choose hyperparameters set to "auto" from the scene's need, by cross-validation.
+"""Choose hyperparameters set to "auto" to meet the scene's need, by cross-validation.
 
 A method lists the values that such a hyperparameter may take in its class attribute ``sized``, and
 allows the word in the annotation: ``Annotated[int, Field(ge=1)] | Auto``. `mor_bench.Surrogate`
@@ -24,17 +24,17 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 
 Auto = Literal["auto"]
-"""Value of a hyperparameter that is to be chosen."""
+"""Value of a hyperparameter that requests an automatic choice."""
 
 N_FOLDS = 5
-"""Parts of the load regions, each held out once."""
+"""Number of folds: parts of the load regions, each held out once."""
 N_VALIDATION = 200
-"""Held-out samples in all folds together, about; spread evenly."""
+"""Approximate number of held-out samples in all folds together, spread evenly."""
 HOPELESS = 4.0
 """A trial ends if its error on the first folds exceeds this multiple of the need."""
 SEED = 0x512E
 STRIDE = 4
-"""Rungs skipped at once while climbing a ladder."""
+"""Step of the search through the values of a hyperparameter, from cheap to accurate."""
 
 MODES = tuple(sorted({round(1.12**k) for k in range(42)}))
 """Numbers of modes to choose from: 1 to 104, about 12 % apart."""
@@ -43,7 +43,7 @@ TOLERANCES = (1e-1, 3e-2, 1e-2, 1e-3, 1e-4)
 
 
 class Sizeable(Protocol):
-    """What the search needs of a `mor_bench.Surrogate`."""
+    """The part of `mor_bench.Surrogate` that the search uses."""
 
     @property
     def parameters(self) -> dict[str, Any]: ...
@@ -112,7 +112,7 @@ class Trials:
         self._folds = validation_folds(snapshots)
         self.scores: dict[tuple[tuple[str, Any], ...], Score] = {}
         self.refusal: MorBenchError | None = None
-        """Why the last candidate without a fit could not be fitted."""
+        """Reason why the last failed candidate could not be fitted."""
 
     def whole_score(self, knobs: Mapping[str, Any]) -> Score:
         """Score a configuration on all folds, however large its error is."""

@@ -1,7 +1,7 @@
 """Static correction: add the part of the linear response that a reduced basis lacks.
 
 A basis of few modes cannot represent the local dent under every load. At small strains, a
-back-solve with the stiffness at rest gives the rest. Linear dynamics knows this as static
+back-solve with the stiffness at rest gives the rest. In linear dynamics this is called static
 correction, residual flexibility or the mode acceleration method (MacNeal, Computers & Structures 1
 (1971) 581-601; Dickens, Nakagawa, Wittbrodt, ibid. 62 (1997) 985-998).
 """
@@ -26,11 +26,11 @@ def static_correction(
     modes: NDArray[np.float64],
     load: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return what a reduced model lacks of the linear response, (K₀⁻¹ - Φ (ΦᵀK₀Φ)⁻¹ Φᵀ) f.
+    """Return the linear response minus the reduced one, (K₀⁻¹ - Φ (ΦᵀK₀Φ)⁻¹ Φᵀ) f.
 
     Added to a reduced solution with the tangent space Φ at rest, it makes the answer to a small
-    load exact to first order. It does not turn with the body and may invert cells;
-    `refuse_inverted` checks that.
+    load exact to first order. It does not rotate with the body and may invert cells, which
+    `refuse_inverted` checks.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def static_correction(
     Returns
     -------
     (n_free,) float64
-        m.
+        Correction, m.
     """
     count(multiply_adds=2 * modes.size)
     return rest_factor.solve(load) - modes @ reduced_factor.solve(modes.T @ load)

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 def extent_of(scene: Scene) -> float:
-    """Return the size of orthonormal modes' coordinates for displacements of the body's size."""
+    """Return the size of coordinates of orthonormal modes at displacements of the body's size."""
     return float(np.ptp(scene.mesh.points, axis=0).max() * np.sqrt(len(scene.free_dofs)))
 
 

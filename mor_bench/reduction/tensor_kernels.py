@@ -1,7 +1,7 @@
 """Kernels of `mor_bench.reduction.tensors`: strains of pairs of modes, Newton's method.
 
-The Cholesky factorisation is a second one beside that of `point_kernels`. Each sums in an order of
-its own, so uniting them would change last digits, and numba's cache notices changes only in a
+The Cholesky factorisation does not share the code of `point_kernels`. Their orders of summation
+differ, so sharing code would change last digits. Numba's cache also notices changes only in a
 function's own file.
 """
 
@@ -126,7 +126,7 @@ def _back_solve(a, r, x):
 def equilibrium(quadratic, cubic, quartic, rest, load, tolerance, q):
     """Take full Newton steps from the linear response; the end has a positive definite Hessian.
 
-    ``rest`` is the factor at rest. Returns the number of Hessians, negative without an answer.
+    ``rest`` is the factor at rest. Returns the number of Hessians, negative if they fail.
     """
     r = len(load)
     products, force = np.empty(r * (r + 1) // 2), np.empty(r)

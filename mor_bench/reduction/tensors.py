@@ -40,16 +40,16 @@ from mor_bench.scene.scene import Scene
 Array = NDArray[np.float64]
 
 CHUNK_BYTES = 64e6
-"""Memory for strains of pairs of modes, which are summed a few cells at a time."""
+"""Memory for strains of pairs of modes, bytes; it limits the number of cells summed at a time."""
 
 MAX_SENTINELS = 64
 """Number of quadrature points at which det F is watched."""
 
 MOST_MODES = 100
-"""Most modes of a polynomial; more would take a gigabyte."""
+"""Largest number of modes of a polynomial; more would take a gigabyte."""
 
 MOST_BYTES = 5e8
-"""Memory for all polynomials of a method that has several."""
+"""Memory limit for all polynomials of a method that has several, bytes."""
 
 
 def n_pairs(r: int) -> int:

@@ -56,13 +56,13 @@ class RunEnvironment:
     sealed : tuple of Path
         Folders and files that no method may open.
     jobs : int
-        Fits at once, which share the cores.
+        Number of simultaneous fits, which share the cores.
     threads : int
-        Threads of a prediction.
+        Number of threads of a prediction.
     memory_limit_bytes : float
         Memory limit of a method's process.
     fork_server : ForkServer or None
-        Process that worker processes are forked from.
+        Process from which worker processes are forked.
     """
 
     cache: Path
@@ -74,7 +74,7 @@ class RunEnvironment:
 
     @cached_property
     def machine(self) -> str:
-        """Processor and cores, on which seconds of fitting depend."""
+        """Processor and number of cores, on which the time of a fit depends."""
         machine = describe_machine()
         return f"{machine['processor']} x {machine['cores']}"
 
@@ -85,7 +85,7 @@ class RunEnvironment:
 
 
 class FitRecord(BaseModel):
-    """The content of fit.json: what fitting took and gave.
+    """The content of fit.json: cost and results of a fit.
 
     Attributes
     ----------
@@ -126,17 +126,17 @@ class FitRecord(BaseModel):
 
     @property
     def iterations(self) -> int | None:
-        """Iterations of a training that was sized to seconds."""
+        """Number of iterations of a training with a time target."""
         return (self.training or {}).get("iterations")
 
 
 class CachedFit:
-    """A configuration, its folder in the cache and, for one that cannot be saved, its process.
+    """A configuration and its cache folder; also its process if the method cannot be saved.
 
     Attributes
     ----------
     taken_s : float
-        Seconds of a training in processes that were stopped.
+        Training time in earlier processes that were stopped, s.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class CachedFit:
             "machine": self.environment.machine,
             "threads": self.environment.fit_threads,
         }
-        if "auto" in parameters.values():  # such a size depends on what the scene needs
+        if "auto" in parameters.values():  # the choice depends on the scene's needs
             parts["needs"] = self.data.scene.spec.needs.error
         training = self.configuration.training
         if training is not None and training != TrainingOptions():
@@ -171,7 +171,7 @@ class CachedFit:
 
     @property
     def reproducible(self) -> Configuration:
-        """The configuration with the iterations that its seconds came to, once it is fitted."""
+        """The configuration with the fit's number of iterations instead of its time target."""
         configuration, record = self.configuration, self.record
         training = configuration.training
         if training is None or training.fit_seconds is None or record is None:
@@ -197,12 +197,12 @@ class CachedFit:
 
     @property
     def fitted(self) -> FitRecord:
-        """The record of a configuration that is known to be fitted."""
+        """The record of a fitted configuration."""
         assert self.record is not None
         return self.record
 
     def keep(self, record: FitRecord, model: Path | None) -> FitRecord:
-        """Keep a fit and its model; writing the record commits it."""
+        """Store a fit and its model; writing the record commits it."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if model is not None:
             partial = self.folder / f".{os.getpid()}.{self.key}.tmp"
@@ -215,7 +215,7 @@ class CachedFit:
         return record
 
     def arrays(self, name: str) -> dict[str, NDArray[Any]] | None:
-        """Read arrays that were kept; None if there are none or they are damaged."""
+        """Read stored arrays; None if there are none or they are damaged."""
         with suppress(OSError, KeyError, RuntimeError):
             arrays = read_arrays(self.folder / f"{name}.h5")
             if str(arrays.pop("digest").astype(str)) == digest_of_arrays(arrays):
@@ -223,12 +223,12 @@ class CachedFit:
         return None
 
     def keep_arrays(self, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Keep arrays."""
+        """Store arrays under a name."""
         digest = np.array(digest_of_arrays(arrays).encode())
         write_arrays(self.folder / f"{name}.h5", {**arrays, "digest": digest})
 
     def begin_training(self) -> None:
-        """Make room for a checkpoint; read the seconds that a stopped training took until it."""
+        """Create the folder of a checkpoint; read the training time up to an existing one."""
         record, taken = self.folder / "training.json", 0.0
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self.checkpoint.parent)
@@ -301,7 +301,7 @@ class CachedFit:
         self._held = worker
 
     def release(self) -> None:
-        """End the process that is held."""
+        """End the held process."""
         if self._held:
             self._held.end()
             self._held = None

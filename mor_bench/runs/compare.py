@@ -48,7 +48,7 @@ def run(
         on imported snapshots, or all methods of the suite with the profile "full". Methods of the
         option ``suite`` are added.
     profile : {"quick", "full"}
-        Which sweep and budget of the method files.
+        Profile of the method files, with its sweep and budget.
     out : path, optional
         Folder to write; ``reports/runs/TIME-DATASETS`` by default.
     listener : Listener

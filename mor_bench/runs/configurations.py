@@ -1,4 +1,4 @@
-"""Competitors of a run: the default methods, the configurations of each, and the tuning budget."""
+"""The configurations of a run: default methods, their sweeps, and the tuning budget."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ DATA_METHODS = ("pca-regression-force", "umesh")
 """Default methods on imported snapshots, whose equations are unknown."""
 
 OBSERVATION_METHODS = ("fem", "linear-fem", "gappy-pod", "pca-regression", "umesh")
-"""Default methods where displacements of a part of the surface are given instead of forces."""
+"""Default methods if displacements of a part of the surface are given instead of forces."""
 
 OWN = "mor_bench."
 """Prefix of the classes of this package; other classes are imported in a sandbox only."""
@@ -69,7 +69,7 @@ class Configuration:
     parameters : dict
         All given parameters.
     swept : dict
-        Those of them that the method's file varies.
+        The parameters that the method's file varies.
     training : TrainingOptions or None
         Device and seconds of a training; None for a method that does not train.
     """
@@ -102,12 +102,12 @@ def configurations_of(
 
 
 def may_train(method: MethodSpec) -> bool:
-    """Tell whether a method trains; a third party's class may until it is fitted."""
+    """Return whether a method trains; a third party's class is assumed to until it is fitted."""
     return _ask_class(method, lambda surrogate: bool(surrogate.trains()), of_others=True)
 
 
 def draws_randomly(configuration: Configuration) -> bool:
-    """Tell whether a fit draws random numbers.
+    """Return whether a fit draws random numbers.
 
     A third party's class is assumed to draw if its file has iterations or a seed.
     """
@@ -188,7 +188,7 @@ def _check_method(spec: MethodSpec, options: RunOptions) -> None:
     """Check parameters against the class.
 
     A third party's class is imported in a worker process, because its import may crash or hang.
-    A class that cannot be imported is no error here: it becomes a row with its reason.
+    A class that cannot be imported is not an error here: its row gives the reason.
     """
     if spec.surrogate.startswith(OWN):
         with suppress(MissingDependencyError):

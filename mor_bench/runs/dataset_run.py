@@ -54,7 +54,7 @@ from mor_bench.snapshots.test_sets import available_sets
 from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec
 
 SINGULAR_VALUES = 400
-"""Singular values of a large snapshot matrix that a figure shows; all would take minutes."""
+"""Number of singular values that a figure shows of a large snapshot matrix; all take minutes."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,11 @@ class RunPart:
     Attributes
     ----------
     number, n : int
-        Number of the dataset, and of all datasets.
+        Number of this dataset, and number of datasets.
     folder : Path
-        Folder for temporary files, to be made.
+        Folder for temporary files; the run creates it.
     fork_server : ForkServer or None
-        Process that worker processes are forked from.
+        Process from which worker processes are forked.
     """
 
     number: int
@@ -168,7 +168,7 @@ class DatasetRun:
         )
 
     def _fit_and_score_all(self) -> dict[str, CachedFit]:
-        """Write every row but for its latency; return the fits that can be timed, by label.
+        """Write every row without its latency; return the fits that can be timed, by label.
 
         All configurations of a method are fitted before any of them gets the test set.
         """
@@ -195,7 +195,7 @@ class DatasetRun:
         return fits
 
     def _fit(self, pool: Pool | None, number: int, configuration: Configuration) -> _Attempt:
-        """Fit a configuration, the number-th of its method, within the tuning budget."""
+        """Fit configuration ``number`` of its method within the tuning budget."""
         budget, method = self.context.budget, configuration.method.name
         self._announce(configuration)
         row = self._new_row(configuration)
@@ -228,7 +228,7 @@ class DatasetRun:
         self.context.listener.starting(self.spec.name, label, number, self.part.n * n)
 
     def _remote(self, pool: Pool | None, configuration: Configuration) -> RemoteFit | None:
-        """Return a fit on the cluster; a third party's class is not installed there."""
+        """Return a fit on the cluster; None for a third party's class, which it does not have."""
         if pool is None or configuration.method.folder is not None:
             return None
 

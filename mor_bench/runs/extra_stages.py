@@ -35,7 +35,7 @@ LEAST_TRAINING = 20
 
 @dataclass(frozen=True)
 class Stage:
-    """What every stage of a run on one dataset needs."""
+    """Shared inputs of the stages of a run on one dataset."""
 
     spec: AnyDatasetSpec
     data: Dataset
@@ -49,12 +49,12 @@ class Stage:
         return self.comparison.row(self.spec.name, label)
 
     def fit_and_score(self, cached: CachedFit) -> ScoredFit:
-        """Fit and score within the seconds of the tuning budget, which this does not use up."""
+        """Fit and score within the tuning budget's time limit, without using the budget up."""
         return fit_and_score(cached, self.context.budget.seconds)
 
 
 def train_other_seeds(stage: Stage, fits: Mapping[str, CachedFit]) -> None:
-    """Train methods that draw random numbers again, and record how their errors scatter."""
+    """Train randomised methods again with other seeds, and record how their errors scatter."""
     for label, cached in fits.items():
         if not isinstance(cached.fitted.parameters.get("seed"), int):
             continue
@@ -152,7 +152,7 @@ def _median_error(row: Row) -> float:
 
 
 def _learning_sizes(n_train: int) -> list[int]:
-    """Return all training samples and ever smaller parts of them, smallest first."""
+    """Return the numbers of training samples of a learning curve, smallest first."""
     sizes = [n_train]
     while sizes[-1] // LEARNING_STEP >= LEAST_TRAINING:
         sizes.append(sizes[-1] // LEARNING_STEP)

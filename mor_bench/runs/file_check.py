@@ -30,7 +30,7 @@ def check_file(path: Path) -> str:
     Raises
     ------
     SpecError, UnconstrainedBodyError
-        The first problem, in one line.
+        For the first problem, in one line.
     InvalidInputError
         If imported samples cannot be split, or the unseen region overlaps the load region.
     MissingDependencyError

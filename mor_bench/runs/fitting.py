@@ -21,7 +21,7 @@ from mor_bench.sandbox.process import MethodFailedError, Restrictions, Sandboxed
 from mor_bench.scene.scene import Scene
 
 RemoteFit = Callable[[CachedFit, float], tuple[dict[str, Any], bytes | None]]
-"""Fits elsewhere within a time limit, s; returns the worker's answer and the model's file."""
+"""A fit on another machine within a time limit, s; it returns the worker's answer and the model."""
 
 
 def fit_configuration(
@@ -35,14 +35,14 @@ def fit_configuration(
     limit_s : float
         Time limit of the fit, s.
     remote : callable, optional
-        Fits elsewhere.
+        Function that fits on another machine.
 
     Raises
     ------
     MethodFailedError
         If the method crashes, hangs, takes too much memory or changes the training samples.
     MorBenchError
-        Of the kind that the method raised.
+        With the type of the method's own error.
     """
     if cached.record is not None:
         return cached.record
@@ -68,7 +68,7 @@ def fit_configuration(
 def _fit_in_worker(
     cached: CachedFit, limit_s: float
 ) -> tuple[SandboxedProcess, dict[str, Any], Path]:
-    """Fit from a checkpoint if there is one, and again from the start if it was at fault."""
+    """Fit from a checkpoint if there is one; start again if the checkpoint caused a failure."""
     resumed = cached.checkpoint.exists()
     worker = _worker_for(cached)
     try:

@@ -30,15 +30,16 @@ def pick(
     listener: Listener = Listener(),
     **limits: float | None,
 ) -> Pick:
-    """Choose the cheapest configuration that meets what a scene needs.
+    """Choose the cheapest configuration that meets a scene's needs.
 
     Parameters
     ----------
     dataset : str, Path or dict
         A name in ``datasets/``, the path of a TOML, or its content.
     comparison : Comparison or path, optional
-        The evidence, or the folder of a run. By default the newest finished run of the dataset
-        under ``reports/runs``. If there is none, `mor_bench.run` compares the default methods.
+        Comparison to choose from, or the folder of a run. By default the newest finished run
+        of the dataset under ``reports/runs``. If there is none, `mor_bench.run` compares the
+        default methods.
     cache, suite : Path, optional
         Cache folder; folder with ``datasets/`` and ``methods/``.
     listener : Listener
@@ -106,7 +107,7 @@ def _with_upper_bounds(comparison: Comparison) -> list[Row]:
 
 
 def _holds(comparison: Comparison, spec: AnyDatasetSpec) -> bool:
-    """Tell whether a comparison holds this dataset, whatever its title and needs."""
+    """Return whether a comparison holds this dataset, whatever its title and needs."""
     held = comparison.datasets.get(spec.name)
     return held is not None and _decisive(held) == _decisive(spec.model_dump(mode="json"))
 

@@ -41,10 +41,10 @@ TRIAL_ITERATIONS = 100
 """Iterations after which a training that would take too long stops itself."""
 
 REFERENCE_DOFS, REFERENCE_TRAINING = 768, 5120
-"""Problem size of the `fit_s` of the method files: beam-coarse, on two cores."""
+"""Problem size for which method files state `fit_s`: beam-coarse, on two cores."""
 
 PROBED = 8
-"""Samples that are solved to measure how long one takes."""
+"""Number of samples that are solved to measure the time per sample."""
 
 LEARNING_POINTS = 4
 """Typical number of points of a learning curve, beside that of all samples."""
@@ -103,7 +103,7 @@ def plan(
     profile: str = "quick",
     **options: Any,
 ) -> Plan:
-    """Return what `mor_bench.run` would do with the same arguments, without doing any of it.
+    """Plan the steps of `mor_bench.run` for the same arguments, without taking them.
 
     The time of a fit follows from earlier fits of the method in the cache, or else from the
     method's file. Both are scaled by the numbers of unknowns and of training samples. The time of

@@ -69,7 +69,7 @@ def failed_set(n: int, seed: int) -> SetErrors:
 
 
 def training_record(record: FitRecord, options: TrainingOptions | None) -> TrainingRecord | None:
-    """Return what a row says about a training; None for a method without one."""
+    """Return the training record of a row; None for a method without training."""
     if not record.training:
         return None
     options = options or TrainingOptions()
@@ -91,7 +91,7 @@ def loss_curves(record: FitRecord) -> dict[str, NDArray[Any]]:
 
 
 def ignored_seconds(record: FitRecord, asked_s: float | None) -> list[str]:
-    """Return a warning if a method trained for its own number of iterations all the same."""
+    """Return a warning if a method ignored the requested training time."""
     iterations = record.parameters.get("iterations")
     if asked_s is None or iterations is None or record.iterations is not None:
         return []

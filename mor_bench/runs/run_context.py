@@ -1,4 +1,4 @@
-"""The checked options of a run, with everything that follows from them."""
+"""The checked options of a run, and the settings derived from them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mor_bench.training_options import TrainingOptions
 from mor_bench.version import __version__
 
 DEFAULT_SEEDS = {"quick": 1, "full": 3}
-"""Trainings of each configuration by default."""
+"""Default number of trainings of each configuration."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class RunContext:
 
     @property
     def seeds(self) -> int:
-        """Trainings of each configuration that has a seed."""
+        """Number of trainings of each configuration that has a seed."""
         return self.options.seeds or DEFAULT_SEEDS[self.options.profile]
 
     @property

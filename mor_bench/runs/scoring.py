@@ -1,4 +1,4 @@
-"""Scoring a fitted configuration on test sets; scores that the cache has are not computed again."""
+"""Score fitted configurations on test sets, reusing cached scores."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
 from mor_bench.snapshots.store import write_atomically
 
 N_COUNTED = 32
-"""Test loads over which the cost of a query is averaged."""
+"""Number of test loads over which the cost of a query is averaged."""
 
 SCORE_CHUNK = 256
-"""Samples that are predicted at once."""
+"""Number of samples in one request for predictions."""
 
 Score = dict[str, NDArray[Any]]
 """Per-sample errors on a test set, range flags if the method has them, and the worst sample."""
@@ -146,7 +146,7 @@ class _Worst:
     def look_at(
         self, start: int, errors: NDArray[np.float64], predicted: NDArray[np.float64]
     ) -> None:
-        """Look at the samples from number `start` on."""
+        """Update the worst sample from a chunk that begins at number `start`."""
         finite = np.where(np.isfinite(errors), errors, -1.0)
         if finite.max() > self.error:
             largest = int(finite.argmax())

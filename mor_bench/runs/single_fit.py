@@ -45,9 +45,9 @@ class Fit:
     seconds : float
         Time of the fit in this process, s; a resumed training counts from its checkpoint.
     iterations : int or None
-        Iterations of a training that was sized to seconds.
+        Number of iterations of a training with a time target.
     n_train, n_test : int
-        Samples.
+        Numbers of training and test samples.
     """
 
     method: Surrogate
@@ -100,7 +100,7 @@ def fit(
     StoreError
         If ``start_from`` or the checkpoint is damaged.
     MorBenchError
-        As the method's `fit`.
+        Any error of the method's `fit`.
     """
     chosen = FitOptions(**options)
     out = Path(out)
@@ -173,7 +173,7 @@ def _check_checkpoint(checkpoint: Path, out: Path) -> None:
 
 
 def _check_writable(name: str, path: Path) -> None:
-    """Check that a file can be written, before a fit of hours and not after it."""
+    """Check that a file can be written before a long fit begins."""
     if path.is_dir():
         raise InvalidInputError(f"`{name}`: {path} is a folder.")
     try:

@@ -24,7 +24,7 @@ from mor_bench.runs.extra_stages import Stage
 from mor_bench.sandbox.process import MethodFailedError
 
 MOST_QUERIES = 400
-"""Most loads of the test set that queries are drawn from."""
+"""Largest number of test loads from which queries are drawn."""
 
 
 class StopRunError(Exception):
@@ -32,7 +32,7 @@ class StopRunError(Exception):
 
 
 def time_configurations(stage: Stage, fits: Mapping[str, CachedFit]) -> None:
-    """Time all configurations without a timing from this machine at this speed; complete the rows.
+    """Time configurations that have no timing at this machine's present speed; complete the rows.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def _kept_timings(fits: Mapping[str, CachedFit], name: str, speed: float) -> dic
 
 
 def _measured(stage: Stage, fits: Mapping[str, CachedFit]) -> dict[str, Timing]:
-    """Time configurations in fresh processes; one that answers worse than when scored fails."""
+    """Time configurations in fresh processes; fail those with larger errors than when scored."""
     budget_s = stage.context.budget.seconds
     methods = {
         label: TimedMethod(partial(fit.open_worker, budget_s), fit.fitted.fit_memory_bytes)

@@ -42,7 +42,7 @@ class TestSet:
     nodes : (n_output_nodes,) int64
         Nodes where the error is measured.
     digest : str
-        SHA-256 of all of it.
+        SHA-256 of all arrays.
     """
 
     forces: NDArray[np.float64]
@@ -118,7 +118,7 @@ class TrainingData:
 
     @cached_property
     def indicator(self) -> ErrorIndicator | None:
-        """Error indicator; None without equations, forces or displacements everywhere."""
+        """Error indicator; None if equations, forces or some nodes' displacements are unknown."""
         known = self.scene.material is not None and self.scene.observed_nodes is None
         if not known or len(self.scene.output_nodes) < self.scene.mesh.n_nodes:
             return None
