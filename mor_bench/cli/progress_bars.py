@@ -24,7 +24,7 @@ from mor_bench.results.row import Row
 from mor_bench.runs.listener import Listener
 
 PRINT_EVERY_S = 10.0
-"""Seconds between lines about progress where there is no terminal to show a bar."""
+"""Interval between printed lines of progress if there is no terminal for a bar, s."""
 
 
 @contextmanager
@@ -106,7 +106,7 @@ class _Bars:
         self.progress.update(self.tasks[name], completed=done, **fields)
 
     def _is_due(self, name: str, now: float, last: bool = False) -> bool:
-        """Tell whether to print a line now, and note the time if so."""
+        """Return whether to print a line now; if so, record the time."""
         if self.progress.console.is_terminal:
             return False
         due = last or now - self.printed_at[name] >= PRINT_EVERY_S

@@ -1,4 +1,4 @@
-"""What a hard case is, its outcome, and the methods and datasets that it is tried on."""
+"""Hard cases, their outcomes, and the methods and datasets on which they are tried."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from mor_bench.surrogate import Surrogate
 Verdict = Literal["pass", "fall short", "not applicable"]
 
 LONGEST = {"quick": 300, "full": None}
-"""Most iterations of a training, by profile. Errors are published here, not compared."""
+"""Largest number of training iterations, by profile. Errors are published here, not compared."""
 
 LONGEST_S = 1800.0
-"""Seconds that a training may plan with; a method that predicts to exceed them says so."""
+"""Time limit that a training receives, s; a method that predicts a longer time reports it."""
 
 BRIEF = 20
 """Iterations of a training whose errors do not matter."""
@@ -67,7 +67,7 @@ class Scenes:
     Attributes
     ----------
     spec : DatasetSpec
-        That of beam-tiny.
+        Specification of beam-tiny.
     tiny : Dataset
         beam-tiny with its test sets.
     """
@@ -141,7 +141,7 @@ class Subject:
 
     @property
     def fitted(self) -> Surrogate:
-        """Return the method fitted on beam-tiny's training samples; raise what its fit raised."""
+        """Return the method fitted on beam-tiny's training samples, or raise its fit's error."""
         if isinstance(self._attempt, Exception):
             raise self._attempt
         return self._attempt
@@ -178,7 +178,7 @@ class Case:
 def hard_case(
     name: str, concerns: Callable[[Surrogate], bool], expected: str, part: str = ""
 ) -> Callable[[Callable[[Subject], Outcome]], Case]:
-    """Make a `Case` of the function that examines it, as a decorator."""
+    """Return a decorator that makes a `Case` from the function that examines it."""
     return lambda examine: Case(name, part, expected, concerns, examine)
 
 
@@ -204,7 +204,7 @@ def answers(method: Surrogate, forces: NDArray[np.float64]) -> NDArray[np.float6
 def wrongly_handled(
     attempts: Mapping[str, Callable[[], object]], by: type[Exception] = MorBenchError
 ) -> list[str]:
-    """Return what happened instead to attempts that do not raise an error of a kind."""
+    """Return the outcomes of attempts that do not raise an error of a given kind."""
     wrong = []
     for name, attempt in attempts.items():
         try:

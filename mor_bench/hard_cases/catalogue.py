@@ -27,7 +27,7 @@ class CaseResult:
     Attributes
     ----------
     case, part : str
-        The case, and which part of it, if it has several.
+        The case, and its part if it has several.
     method : str
     expected, happened : str
         The correct behaviour, and what was observed.
@@ -48,7 +48,7 @@ class CaseResult:
 
 
 def cases_for(subject: Subject, names: Sequence[str]) -> list[tuple[Case, str | None]]:
-    """Return the cases that concern a method, of those with some names.
+    """Return the named cases that concern a method.
 
     Each comes with the reason why it cannot be tried, or None.
     """

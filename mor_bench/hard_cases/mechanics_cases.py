@@ -51,19 +51,19 @@ from mor_bench.surrogates.fem import FullFEM
 Array = NDArray[np.float64]
 
 KINDS = {"H8": (False, False), "H8 selective": (False, True), "T4": (True, False)}
-"""Names of elements: whether they are tetrahedra, and whether they are integrated selectively."""
+"""Elements by name, with flags for tetrahedra and for selective integration."""
 
 SLENDER_EXACT = 0.19235
 """Tip deflection over length of the elastica at PL²/EI = 0.6 (Bisshopp and Drucker 1945)."""
 
 
 def full_order(method: Surrogate) -> bool:
-    """Whether a method is the full-order model, with any solver."""
+    """Return whether a method is the full-order model, with any solver."""
     return isinstance(method, FullFEM)
 
 
 def as_shipped(method: Surrogate) -> bool:
-    """Whether a method is the full-order model with its default solver.
+    """Return whether a method is the full-order model with its default solver.
 
     Cases that do not depend on the solver are tried once.
     """
@@ -237,7 +237,7 @@ def huge_step(subject: Subject) -> Outcome:
 
 
 def _cuts_beyond_the_limit(max_cuts: int) -> tuple[int | None, str]:
-    """Return the cut-backs that a refused solve reports, and what it says."""
+    """Return the cut-backs that a refused solve reports, and its message."""
     load, options = np.array([3 * LIMIT_PA]), NewtonOptions(max_cuts=max_cuts)
     try:
         solve_equilibrium(confined_column(), load, options=options)

@@ -35,22 +35,22 @@ from mor_bench.surrogates.fem import FullFEM
 Array = NDArray[np.float64]
 
 ZERO_FORCE = 1e-3
-"""Largest norm of the answer to no force, over the root mean square of the training samples."""
+"""Largest norm of the answer to zero force, over the root mean square of the training samples."""
 
 MIRRORED = 1e-12
 """Largest asymmetry of the full-order model, solved to 1e-13. Other methods only publish theirs."""
 
 ROUND_OFF = 2e-6
-"""Largest relative difference between a query alone and in a batch: that of float32."""
+"""Largest relative difference between a query alone and in a batch, from float32 round-off."""
 
 ADDED = 0.1
-"""Most error that low precision may add, relative to the method's own error."""
+"""Largest error that low precision may add, relative to the method's own error."""
 
 FLAGGED = 0.9
 """Share of the loads of an unseen kind that must be flagged."""
 
 LARGER = ("2x", "4x")
-"""Test sets of larger loads, of which only those larger than any in training are unlike."""
+"""Test sets of larger loads; only loads larger than all training loads are out of range."""
 
 FALSE_ALARMS = 0.02
 """Largest share of loads in range that may be flagged."""

@@ -32,7 +32,7 @@ def dense(assembler: Assembler, values: Array) -> Array:
 
 
 def free_assembler(mesh: Mesh, law: Material = LAW, selective: bool = False) -> Assembler:
-    """All dofs free, numbered as in the mesh."""
+    """Return an assembler of a mesh with all dofs free, numbered as in the mesh."""
     body = Discretisation(mesh.points, mesh.cells, law, selective)
     return Assembler(body, np.arange(mesh.n_dofs).reshape(-1, 3), mesh.n_dofs)
 
@@ -201,7 +201,7 @@ def make_bars(tetrahedra: bool = False, selective: bool = False, contrast: float
 
 
 def _numbered(mesh: Mesh, free: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
-    """Number the dofs of free nodes: (n_nodes, 3), and how many there are."""
+    """Return the numbers of the nodes' dofs, (n_nodes, 3), and the number of free dofs."""
     n = 3 * int(free.sum())
     dofs = np.full((mesh.n_nodes, 3), n)
     dofs[free] = np.arange(n).reshape(-1, 3)

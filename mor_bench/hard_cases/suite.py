@@ -49,7 +49,7 @@ class StressResults:
         return sum(row.verdict == verdict for row in self.rows)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all of it, as JSON can hold it."""
+        """Return the content for JSON."""
         return {
             "format": "mor-bench stress",
             "schema_version": 1,
@@ -77,16 +77,15 @@ def stress(
 ) -> StressResults:
     """Try the hard cases on methods. Each verdict is computed, and a crash costs only its own row.
 
-    Methods are tried on beam-tiny with the parameters of their files, none swept. A third party's
-    method runs in a process of its own, so that one that hangs or ends Python costs its own rows
-    only.
+    Methods are tried on beam-tiny with the parameters of their files, without sweeps. A third
+    party's method runs in its own process. If it hangs or ends Python, only its own rows fail.
 
     Parameters
     ----------
     methods : sequence of names or paths of TOML files, optional
         By default all of the suite.
     cases : sequence of str, optional
-        Of `CASE_NAMES`; by default all.
+        Names from `CASE_NAMES`; by default all.
     profile : {"quick", "full"}
         Which parameters of the method files to use; ``quick`` also cuts trainings to `LONGEST`
         iterations.
@@ -170,13 +169,13 @@ class _Trial:
         return attempt(case, self._subject, obstacle)
 
     def end(self) -> None:
-        """Nothing is held."""
+        """Do nothing, because there is no process to end."""
 
 
 class _SandboxedTrial:
     """A third party's method, tried in a process of its own.
 
-    After a case that ended it, the process is started again.
+    The process is restarted after a case that ended it.
     """
 
     def __init__(

@@ -33,18 +33,18 @@ from mor_bench.version import __version__
 FORMAT = "mor-bench discretisation error"
 SCHEMA_VERSION = 1
 PLAUSIBLE_ORDERS = (0.5, 3.0)
-"""Orders of convergence with which a limit is extrapolated.
+"""Range of orders of convergence that allows extrapolation of a limit.
 
 Linear elements have at most 2, and less at a clamped edge.
 """
 
 Progress = Callable[[int, int], None]
-"""Called with the finished solves and all solves."""
+"""Called with the numbers of finished solves and of all solves."""
 
 
 @dataclass(frozen=True)
 class RefinementPlan:
-    """What `refine` solves.
+    """Loads and meshes that `refine` solves.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ def chosen_samples(scene: Scene, n_loads: int) -> NDArray[np.int64]:
 def limit_of(
     displacements: list[NDArray[np.float64]],
 ) -> tuple[NDArray[np.float64], float | None, str]:
-    """Estimate the limit of displacements on meshes that are refined by two again and again.
+    """Estimate the limit of displacements on meshes whose cell size is halved repeatedly.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ class _Load:
     answers : list of (n_nodes, 3) float64
         Displacements at the scene's nodes, of every mesh.
     reason : str or None
-        Why a mesh has no equilibrium.
+        Reason why a mesh has no equilibrium.
     """
 
     sample: int
@@ -332,7 +332,7 @@ def measured(
 ) -> dict[str, Any] | None:
     """Read the record of `refine` for a dataset, from the cache or shipped as ``*.refine.json``.
 
-    A record belongs to a dataset if the digests of the physics agree. None if there is none.
+    A record belongs to a dataset if the digests of the physics agree. Returns None without one.
 
     Raises
     ------

@@ -71,8 +71,8 @@ def sample_errors(
 def summary(errors: SampleErrors) -> dict[str, float]:
     """Return the error figures of a results row.
 
-    `mean_dof_m` is the paper's ē, and `std_dof_m` its σ(e) with M - 1. `slope` is that of the
-    least-squares line through the origin of e over the sample's largest displacement.
+    `mean_dof_m` is the paper's ē, and `std_dof_m` its σ(e) with M - 1. `slope` belongs to
+    the least-squares line through the origin: e against the sample's largest displacement.
     """
     e, relative = errors.mean_dof_m, errors.relative_l2
     with np.errstate(invalid="ignore"):

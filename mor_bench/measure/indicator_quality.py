@@ -1,4 +1,4 @@
-"""How well errors that are estimated without the reference agree with measured errors."""
+"""Agreement of errors that are estimated without the reference with measured errors."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from scipy.stats import spearmanr
 from mor_bench.mechanics.indicator import ErrorIndicator
 
 N_INDICATED = 64
-"""Test samples whose errors are estimated, spread evenly over the test set."""
+"""Number of test samples whose errors are estimated, spread evenly over the test set."""
 
 LEAST_INDICATED = 10
 """Fewest usable samples for a summary."""
 
 EXACT = 1e-6
-"""Relative error below which no summary is made: the reference itself has such errors."""
+"""Relative error below which there is no summary, since the reference has such errors itself."""
 
 
 class Indicated:

@@ -2,7 +2,7 @@
 
 All configurations of a dataset are alive at once, each in a process of its own, and take turns. So
 whatever slows the machine for a while slows all of them. The measurement is repeated in fresh
-processes: where a process's memory happens to lie makes all its queries faster or slower.
+processes, because the memory layout of a process changes the latency of all its queries.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from mor_bench.sandbox.fork_server import CAN_FORK, ForkServer
 from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
 
 LEAST_QUERIES = 200
-"""Single queries of each configuration, over all processes and rounds, unless it is too slow."""
+"""Number of single queries of each configuration, over all processes; fewer if it is slow."""
 
 LEAST_TURN_S, MOST_TURN_S = 0.03, 1.0
-"""Shortest and longest turn of a configuration, s. A longer one leaves its other queries out."""
+"""Shortest and longest turn of a configuration, s. A turn at the limit skips its other queries."""
 
 BATCH_S, MOST_BATCH_S = 0.25, 5.0
-"""Seconds over which batches of one size are repeated, and the longest batch that is tried."""
+"""Time for repeating batches of one size, and time limit of one batch, s."""
 
 ANSWER_LIMIT_S = 300.0
-"""Time limit for a request that should take seconds, after which a hanging method is ended."""
+"""Time limit of a request that should take seconds, s; a hanging method is then ended."""
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """How a configuration is timed.
+    """Repetitions of a configuration's timing.
 
     Attributes
     ----------
     processes, rounds : int
-        Fresh processes, and turns of each.
+        Number of fresh processes, and number of turns of each.
     all_cores : bool
         Whether to time single queries and batches on all cores too.
     """
@@ -102,7 +102,7 @@ class TimedMethod:
 
 @dataclass(frozen=True)
 class Queries:
-    """What methods are asked while they are timed.
+    """Queries and references for timing methods.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ def measure_latencies(
     Returns
     -------
     dict of str to Timing
-        One that failed says why in `Timing.failed`.
+        `Timing.failed` holds the reason if a configuration failed.
     """
     timings = {label: Timing() for label in methods}
     order = np.random.default_rng(seed)
@@ -217,7 +217,7 @@ class _Turns:
     n_queries, threads : int
         Single queries in a turn, and their threads.
     number : int
-        Which replicate the process is.
+        Number of the replicate.
     """
 
     method: TimedMethod

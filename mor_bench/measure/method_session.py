@@ -32,19 +32,19 @@ from mor_bench.surrogate import Surrogate
 from mor_bench.training_options import TrainingOptions
 
 CURVES = ("loss_curve", "validation_curve")
-"""Attributes, with an underscore behind, in which a trained method keeps its losses."""
+"""Attributes, without the final underscore, in which a trained method keeps its losses."""
 
 SETTLE_QUERIES = 3
 """Untimed queries before each round; they fill the processor's caches with the method's data."""
 
 CHECKED_ANSWERS, CHECKED_SHARE = 4, 0.2
-"""Most answers that a round keeps for a check, and the probability that a query is one of them."""
+"""Largest number of answers kept per round for a check, and the probability of keeping one."""
 
 UNANSWERED = object()
-"""Stands for the answer to a query for which the method finds no equilibrium."""
+"""Placeholder for the answer to a query without an equilibrium."""
 
 WARM_UP_QUERIES, WARM_UP_S = 20, 2.0
-"""Most queries and, about, seconds of the warm-up."""
+"""Largest number of queries in the warm-up, and its approximate time limit, s."""
 
 PRELOADED = (
     "sklearn.linear_model",
@@ -72,9 +72,9 @@ class FitRequest:
         Where the fitted model is saved.
     threads : int
     limit_s : float
-        Seconds that the method may plan with.
+        Time limit that the method receives, s.
     training : TrainingOptions, optional
-        Of a method that may train.
+        Training options of a method that may train.
     """
 
     surrogate: str
@@ -194,7 +194,7 @@ class MethodSession(Session):
         return {"cost": cost_of(self.method, given_of(self.scene, forces))}
 
     def warm(self, forces: NDArray[np.float64], threads: int, seed: int) -> dict[str, Any]:
-        """Take the queries, (n, n_nodes, 3), N, and answer some of them."""
+        """Store the queries, (n, n_nodes, 3), N, and answer some of them untimed."""
         self.queries = forces
         self.generator = np.random.default_rng(seed)
         with pinned_threads(threads):
@@ -213,10 +213,9 @@ class MethodSession(Session):
         """Time at least ``n`` single queries, for at least ``floor_s`` and at most ``most_s``.
 
         Each load is one of the queries, drawn at random and scaled by a random factor, so that no
-        load comes twice. A few are not scaled; the answers to those are written to a file, to be
-        compared with the scored ones. The garbage collector runs as it would for a user, and its
-        time is recorded apart. A query that the method cannot answer counts with the time until the
-        method reports so.
+        load repeats. A few are not scaled. Their answers are written to a file, for comparison with
+        the scored ones. The garbage collector runs as it would for a user, and its time is recorded
+        separately. An unanswered query counts with the time until the method reports its failure.
 
         Returns
         -------
@@ -246,7 +245,7 @@ class MethodSession(Session):
         }
 
     def _query(self, values: NDArray[np.float64]) -> ArrayLike:
-        """Return what `predict` takes for forces, N, or displacements of observed nodes, m."""
+        """Convert forces, N, or displacements of observed nodes, m, to the input of `predict`."""
         return given_of(self.scene, values).query
 
     def _predict_if_possible(self, query: ArrayLike) -> Any:
@@ -308,7 +307,7 @@ class MethodSession(Session):
 def _training_record(method: Surrogate) -> dict[str, Any] | None:
     """Return the iterations and loss curves of a training.
 
-    None if the method did not train, or keeps something else than numbers there.
+    Returns None if the method did not train, or if its records are not numbers.
     """
     try:
         record: dict[str, Any] = {
@@ -323,7 +322,7 @@ def _training_record(method: Surrogate) -> dict[str, Any] | None:
 
 @dataclass
 class _Turn:
-    """What a turn of timed queries yields; ``kept`` maps a query's number to its checked answer."""
+    """Results of a turn of timed queries; ``kept`` maps a query's number to its checked answer."""
 
     latency_ms: list[float] = field(default_factory=list)
     gc_ms: list[float] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""Ask a method for predictions as the scoring needs them."""
+"""Collect a method's predictions for scoring."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def predict_all(method: Surrogate, given: Given) -> NDArray[np.float64]:
         If the method returns another shape or no floats.
     """
     try:
-        # Copies: what a method does to its input must not reach the scoring.
+        # Copies, because a method may change its input, which the scoring still needs.
         predicted = np.asarray(method.predict(_copied(given)))
     except SolverError:
         predicted = np.full(given.values.shape, np.nan)

@@ -1,4 +1,4 @@
-"""How well the flags of `Surrogate.out_of_range` find large errors."""
+"""Detection of large errors by the flags of `Surrogate.out_of_range`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Flags:
     usual_rel_l2 : float
         95th percentile of the relative l2 error; infinite if more than 5 % have no prediction.
     n, n_flagged : int
-        Samples there, and false alarms among them.
+        Samples of that test set, and false alarms among them.
     """
 
     in_range: str
@@ -36,7 +36,7 @@ class Flags:
     n_flagged: int
 
     def of(self, score: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-        """Count a test set's unusual errors and those flagged; `recall` is their share."""
+        """Count a test set's unusual errors, and how many are flagged; `recall` is their share."""
         unusual = score["relative_l2"] > self.usual_rel_l2
         n, found = int(unusual.sum()), int((unusual & score["flagged"]).sum())
         return {"n_unusual": n, "n_unusual_flagged": found, "recall": found / n if n else None}

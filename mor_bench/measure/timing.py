@@ -1,4 +1,4 @@
-"""The raw timing of one configuration, whether it can be relied on, and its summary."""
+"""The raw timing of one configuration, its reliability and its summary."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ The second number is the share of all cores; the larger of the two limits holds.
 """
 
 LEAST_CORES, MOST_CORES = 0.9, 1.2
-"""Cores that a process on one thread must have had at least, and may have used at most."""
+"""Lowest and highest number of cores that a single-threaded process may have used."""
 
 MOST_SPREAD = 0.1
 """Relative spread of the medians of rounds, or of processes, above which a timing is unstable."""
@@ -39,13 +39,13 @@ A solve that starts at the previous answer need not end where a single one does.
 
 @dataclass
 class Timing:
-    """What was measured of one configuration.
+    """Raw measurements of one configuration.
 
     Attributes
     ----------
     latency_ms, gc_ms : list of float
-        Of each query in the order of measurement: wall time, and the garbage collector's part of
-        it.
+        Wall time of each query, and the garbage collector's part of it, in the order of
+        measurement.
     process, round : list of int
         The replicate and the round in which each query was measured.
     all_threads_ms : list of float
@@ -55,13 +55,13 @@ class Timing:
     memory_bytes : int
         Peak resident memory with the model loaded and single queries answered.
     used : list of (3,) float
-        Of each turn: wall time, its own processor time, and that of all other processes, s.
+        Wall time of each turn, its own processor time, and that of all other processes, s.
     failed : str or None
-        Why there is no timing.
+        Reason why there is no timing.
     probe_s : float
         The machine's `probe_s` at the time of measurement.
     checked : list of (int, float)
-        Of the checked answers, the number of the query and the relative l2 error.
+        Number of the query and relative l2 error of each checked answer.
     """
 
     latency_ms: list[float] = field(default_factory=list)
@@ -88,7 +88,7 @@ class Timing:
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Everything that a cache keeps, as arrays; NaN stands for a batch that was too slow."""
+        """All cached data as arrays; NaN stands for a batch that was too slow."""
         rates = [self.throughput.get(str(size)) for size in BATCHES]
         return {
             **self.samples,
@@ -99,7 +99,7 @@ class Timing:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """Return the timing whose `arrays` were kept."""
+        """Restore a timing from its `arrays`."""
         names = ("latency_ms", "gc_ms", "process", "round", "all_threads_ms")
         return cls(
             **{name: arrays[name].tolist() for name in names},
@@ -140,7 +140,7 @@ def why_unstable(timing: Timing, threads: int) -> list[str]:
 def _relative_spread(medians: Sequence[float]) -> float:
     """Return half the interquartile range over the median.
 
-    Of fewer than four values: half the range over the mean.
+    For fewer than four values it is half the range over the mean.
     """
     if len(medians) < 4:
         return (max(medians) - min(medians)) / (2 * float(np.mean(medians)))

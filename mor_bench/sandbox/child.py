@@ -50,7 +50,7 @@ class _Child:
         return {}
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Return what a request yields, or the error that ended it, and its warnings."""
+        """Return the result of a request, or its error, and its warnings."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             try:
@@ -65,7 +65,7 @@ class _Child:
 
 
 def _crash(error: BaseException) -> str:
-    """Return what happened and where, as far as possible outside installed packages."""
+    """Describe an error and its location, if possible outside installed packages."""
     places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
     own = [place for place in places if not place[0].startswith(("<", *LIBRARIES))]
     file, line = (own or places)[-1]

@@ -33,7 +33,7 @@ CHILD_MODULE = "mor_bench.sandbox.child"
 
 
 def environment() -> dict[str, str]:
-    """Return this process's environment, in which ``-m`` finds this very package."""
+    """Return environment variables with which ``python -m`` finds this package."""
     package = str(Path(errors.__file__).parents[1])
     paths = [package, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}

@@ -36,7 +36,7 @@ MEMORY_SHARE = 0.75
 
 
 def default_memory_limit_bytes() -> float:
-    """Return the memory that a method may use where no limit is given."""
+    """Return the default memory limit of a method."""
     return MEMORY_SHARE * float(psutil.virtual_memory().total)
 
 
@@ -46,7 +46,7 @@ class MethodFailedError(MorBenchError):
 
 @dataclass(frozen=True)
 class Restrictions:
-    """What a sandboxed process may see and use.
+    """Access rights and limits of a sandboxed process.
 
     Attributes
     ----------
@@ -55,9 +55,9 @@ class Restrictions:
     exempt : Path, optional
         A folder within the sealed ones that stays accessible.
     import_from : Path, optional
-        A folder that imports search first: where a third party's module lies.
+        The first folder on the import path, which holds a third party's module.
     memory_bytes : float
-        Resident memory, of the process and its children, at which it is ended.
+        Limit on the resident memory of the process and its children; above it they are ended.
     """
 
     sealed: tuple[Path, ...] = ()
@@ -72,7 +72,7 @@ class SandboxedProcess:
     Parameters
     ----------
     session : type of Session
-        What the process does.
+        Class that answers the requests.
     restrictions : Restrictions
     fork_server : ForkServer, optional
         Fork the process from it; by default the process is a new interpreter.
@@ -127,7 +127,7 @@ class SandboxedProcess:
         self._answers.put(b"")
 
     def ask(self, do: str, within_s: float, /, **request: Any) -> dict[str, Any]:
-        """Make a request and wait for its answer.
+        """Send a request and wait for its answer.
 
         Parameters
         ----------
@@ -143,7 +143,7 @@ class SandboxedProcess:
         MethodFailedError
             If the session crashes, or its process dies or is ended.
         MorBenchError
-            Of the same type and text as one that the session raised.
+            If the session raised one, with the same type and text.
         """
         with suppress(OSError):  # a dead process is noticed while waiting
             pickle.dump({"do": do, **request}, self._process.requests)

@@ -1,4 +1,4 @@
-"""Keep a process out of folders that hold what a method must predict."""
+"""Block a process's access to folders with the displacements that a method must predict."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PROGRAM_EVENTS = (
     "os.spawn",
     "os.startfile",
 )
-"""Audit events of starting a program, which would not be under the seal."""
+"""Audit events of starting a program; the seal would not cover the program."""
 
 FILE_EVENTS = (
     "open",
@@ -34,7 +34,7 @@ FILE_EVENTS = (
 
 
 def seal(folders: Sequence[Path], exempt: Path | None = None) -> None:
-    """Make every access to some folders raise `PermissionError` in this process, for good.
+    """Make every access to some folders raise `PermissionError` for the rest of this process.
 
     The seal stops Python's usual ways to a file and the start of programs, so it catches mistakes.
     It does not stop a method that attacks the machine.

@@ -1,4 +1,4 @@
-"""The base class of what a sandboxed process does."""
+"""The base class of sessions, which define the work of sandboxed processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Table `[battery]` of a method file: what shared tests and benchmarks must know of the method.
+"""Table `[battery]` of a method file: settings of shared tests and benchmarks.
 
 No comparison reads this table. It lets a new method join every test and benchmark by itself.
 """

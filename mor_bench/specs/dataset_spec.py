@@ -23,7 +23,7 @@ Side = Annotated[int, Field(ge=2, le=1024)]
 
 
 class Needs(StrictModel):
-    """What the user of the scene needs.
+    """Requirements of the scene's user.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class CommonDatasetSpec(StrictModel):
     observed: Observed | None = Field(default=None, exclude_if=lambda value: value is None)
 
     def physics(self) -> dict[str, Any]:
-        """Return all that decides the samples: equal physics gives equal snapshots."""
+        """Return all settings that determine the samples: equal physics gives equal snapshots."""
         raise NotImplementedError
 
     def digest(self) -> str:

@@ -10,7 +10,7 @@ from mor_bench.specs.base import Count, Positive, StrictModel
 from mor_bench.specs.source_file import File, SourceFile, read_source_file
 
 MAX_CELLS = 10_000_000
-"""Most cells of a grid. More is a typing mistake: such a model does not fit into memory."""
+"""Largest number of cells of a grid; a larger model does not fit into memory."""
 
 
 def _fits_in_memory(value: tuple[int, int, int]) -> tuple[int, int, int]:

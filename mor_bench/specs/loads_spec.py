@@ -98,14 +98,14 @@ class Loads(StrictModel):
 
 
 class Split(StrictModel):
-    """Which samples are kept for the test; see `mor_bench.snapshots.split`."""
+    """Choice of the test samples; see `mor_bench.snapshots.split`."""
 
     test_fraction: Fraction = 0.2
     by: SplitBy = "region"
 
 
 class ImportedSplit(StrictModel):
-    """Which imported samples are kept for the test: as `Split`, or by the file's array `test`."""
+    """Choice of imported test samples: as `Split`, or by the file's array `test`."""
 
     test_fraction: Fraction = 0.2
     by: Literal["region", "sample", "direction", "file"] = "region"

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from mor_bench.specs.base import Finite, Positive, StrictModel
 
 SolverName = Literal["auto", "rotated-pcg", "jacobi-pcg", "cholesky", "superlu", "pardiso"]
-"""How equilibria are solved, see `mor_bench.mechanics.model`."""
+"""Methods of solving equilibria; see `mor_bench.mechanics.model`."""
 
 
 class Discretisation(StrictModel):

@@ -61,7 +61,7 @@ class MethodSpec(StrictModel):
     fit_s : float, optional
         Approximate time of a fit on beam-coarse with two cores, s.
     battery : Battery
-        What shared tests and benchmarks must know.
+        Settings of shared tests and benchmarks.
     """
 
     name: str

@@ -149,7 +149,7 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _is_discriminated(field: FieldInfo) -> bool:
-    """Tell whether a key or a part of the value chooses between the alternatives of a field."""
+    """Return whether a key or a part of the value chooses between the alternatives of a field."""
     return bool(field.discriminator) or any(
         isinstance(part, Discriminator) or (isinstance(part, FieldInfo) and part.discriminator)
         for part in (*field.metadata, *_parts(field.annotation))
@@ -157,7 +157,7 @@ def _is_discriminated(field: FieldInfo) -> bool:
 
 
 def _is_alternative(model: type[BaseModel], step: str) -> bool:
-    """Tell whether a step stands for a model: the key of a region, or a shape or material law."""
+    """Return whether a step stands for a model: the key of a region, or a shape or material law."""
     if step.removeprefix("by ") in model.model_fields:
         return True
     return any(

@@ -18,7 +18,7 @@ class SourceFile(StrictModel):
     Attributes
     ----------
     path : str
-        Absolute path. It is no part of a dataset's digest.
+        Absolute path. It is not part of a dataset's digest.
     sha256 : str
         SHA-256 of the content.
     """

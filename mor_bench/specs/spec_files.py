@@ -70,7 +70,7 @@ def load_generated_spec(
 
 
 def is_method_file(path: Path) -> bool:
-    """Tell whether a TOML describes a method, which names a `surrogate`, or a dataset."""
+    """Return whether a TOML describes a method, which names a `surrogate`, or a dataset."""
     return "surrogate" in read_toml(path) or path.resolve().parent.name == "methods"
 
 
