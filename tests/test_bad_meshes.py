@@ -116,7 +116,7 @@ BROKEN: list[tuple[str, str, str]] = [
     ("inp", "*NODE\n1, 0, 0, 0\n*NSET, NSET=a\n1\n*NSET, NSET=a\n1\n", "'a' is defined more than"),
     ("inp", TWO_BLOCKS, r"under one line \*NODE; there are 2"),
     ("msh", GMSH1.replace("2 3 4\n", "2 3 9\n"), "invalid Gmsh 1 file: it has no node, .* 9"),
-    ("msh", GMSH1.replace("1 4 1 1", "1 44 1 1"), "no element type, 44"),
+    ("msh", GMSH1.replace("1 4 1 1", "1 44 1 1"), "no element type, with the number 44"),
     ("msh", GMSH1.replace("$ELM\n1\n", "$ELM\n2\n"), r"first line of \$ELM must give the number"),
     ("msh", GMSH1.replace("$ENDELM", ""), r"\$ELM or \$ENDELM is missing"),
     ("msh", GMSH1.replace("4 0 0 1", "4 0 0 x"), "could not convert string to float"),

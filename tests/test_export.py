@@ -81,7 +81,7 @@ def test_an_impossible_export_is_refused_and_nothing_is_written(
     refused: list[tuple[Dataset, dict[str, Any], str]] = [
         (tiny, {"sample": 40}, r"`sample` must be an integer in \[0, 39\], the samples of part"),
         (tiny, {"part": "2x"}, "`part` must be train, test; got '2x'"),
-        (tiny, {"models": [pod, pod]}, "none be called 'reference'; got pod, pod"),
+        (tiny, {"models": [pod, pod]}, "none may be called 'reference'; got pod, pod"),
         (other, {"models": [pod]}, "pod.safetensors: the model was fitted to 'beam-tiny', not to"),
     ]
     for data, options, message in refused:

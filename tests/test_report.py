@@ -174,7 +174,9 @@ def test_meeting_only_one_need_is_not_enough() -> None:
         made.rows.append(a_row(name, **figures))
     assert not any(entry.meets_needs for entry in entries_of(made, "beam-tiny"))
     found = headline(made, "beam-tiny")
-    assert re.search("No configuration meets .* Nearest is slow: .* 2 times the allowed lat", found)
+    assert re.search(
+        "No configuration meets .* The nearest is slow: .* 2 times the allowed lat", found
+    )
 
 
 def test_targets_out_of_reach_are_labelled_as_such(comparison: Comparison) -> None:
