@@ -1,7 +1,7 @@
 """The laws of the source tree, each as a function that lists what breaks it.
 
-Every check takes the tree as a dict from path, relative to the root, to source text. So a test can
-plant a violation without touching a file.
+Every check takes the tree as a dict that maps each path, relative to the root, to its source text.
+So a test can plant a violation without touching a file.
 """
 
 from __future__ import annotations

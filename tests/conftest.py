@@ -44,7 +44,7 @@ def tiny_scene() -> Scene:
 
 @pytest.fixture(scope="session")
 def heard() -> Heard:
-    """What a listener was told of `small_run`."""
+    """The events that a listener received from `small_run`."""
     return Heard()
 
 

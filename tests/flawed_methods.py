@@ -1,4 +1,4 @@
-"""Third parties' methods with one flaw each, for the tests of the hard cases."""
+"""Methods of third parties with one flaw each, for the tests of the hard cases."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Good(PODGalerkin):
 
 
 class Bad(PODGalerkin):
-    """Answers no force with a displacement, never answers twice the same, and accepts NaN."""
+    """Moves without a force, never repeats a prediction, and accepts NaN."""
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         answer = super().predict(np.nan_to_num(np.asarray(forces)))
@@ -26,7 +26,7 @@ class Bad(PODGalerkin):
 
 
 class Crashing(PODGalerkin):
-    """Divides by zero where there is no force, as in some poor snapshots."""
+    """Divides by zero if there is no force, as in some poor snapshots."""
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         answer = super().predict(forces)
@@ -36,14 +36,14 @@ class Crashing(PODGalerkin):
 
 
 class Rounding(PODGalerkin):
-    """Loses a fifth of the answer in single precision."""
+    """Loses a fifth of the displacement in single precision."""
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         return super().predict(forces) * (0.8 if np.asarray(forces).dtype == np.float32 else 1.0)
 
 
 class Unchecked(PODGalerkin):
-    """Learns from any samples, and does not know its range."""
+    """Learns from any samples, and has no load range."""
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Self:
         assert snapshots is not None
@@ -60,7 +60,7 @@ class Unfit(PODGalerkin):
 
 
 class Ending(PODGalerkin):
-    """Ends Python where there is no force."""
+    """Ends Python if there is no force."""
 
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         if not np.asarray(forces).any():

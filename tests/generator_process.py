@@ -1,4 +1,4 @@
-"""Processes that generate a dataset and can be killed, forked from one with everything imported.
+"""Killable processes that generate a dataset, forked from one that has imported everything.
 
     python -m tests.generator_process SPEC SHARD_SIZE
 
@@ -59,7 +59,7 @@ class SlowFile:
 
 
 class Generators:
-    """The process that forks. Its children are the ones to kill."""
+    """The process that forks. Tests kill its children."""
 
     def __init__(self, spec_json: str, shard_size: int) -> None:
         root = Path(__file__).parents[1]

@@ -1,4 +1,4 @@
-"""Meshes that lie in no regular grid, made from boxes, and samples on one."""
+"""Irregular meshes made from boxes, and samples on one of them."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ TOP = '[observed]\nregion = "z-max"\n'
 
 
 def written(folder: Path, observed: str, name: str = "beam-tiny-observed") -> Path:
-    """beam-tiny with a table of what is observed."""
+    """Return beam-tiny with a table of observed displacements."""
     path = folder / f"{name}.toml"
     path.write_text(
         list_suite("datasets")["beam-tiny"].read_text(encoding="utf-8") + observed, encoding="utf-8"

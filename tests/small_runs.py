@@ -59,7 +59,7 @@ def wait_for(done: Callable[[], Any], process: Popen[str], within_s: float = 120
 
 @contextmanager
 def short_timing() -> Iterator[None]:
-    """Time with few queries, and reuse timings even if the machine is busy otherwise."""
+    """Time with few queries, and reuse timings even if the machine is busy."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(latency.PROTOCOLS, "quick", latency.Protocol(1, 3))
         patch.setattr(latency, "LEAST_QUERIES", 20)
@@ -78,7 +78,7 @@ def run_small(methods: list[str | Path], out: Path, cache: Path, **options: Any)
 
 
 class Heard:
-    """Notes what a listener is told."""
+    """Records the events that a listener receives."""
 
     def __init__(self) -> None:
         self.events: list[str] = []

@@ -1,4 +1,4 @@
-"""Comparisons without a run: rows and raw samples whose true figures are known."""
+"""Comparisons without a run: rows and raw samples with known true figures."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ REGIMES: dict[str, dict[str, Any]] = {
 
 
 def a_row(method: str, swept: Mapping[str, Any] | None = None, **fields: Any) -> Row:
-    """A row of a configuration that ran on beam-tiny; `fields` replace its fields."""
+    """Return a row of a configuration that ran on beam-tiny; `fields` replace its fields."""
     swept = dict(swept or {})
     row = {
         "dataset": "beam-tiny",
@@ -69,7 +69,7 @@ def a_row(method: str, swept: Mapping[str, Any] | None = None, **fields: Any) ->
 
 
 def changed(row: Row, **parts: Mapping[str, Any]) -> Row:
-    """A copy of a row; `parts` replace entries of its parts."""
+    """Return a copy of a row; `parts` replace entries of its parts."""
     content = row.as_dict()
     return Row.model_validate({**content, **{k: {**content[k], **v} for k, v in parts.items()}})
 
@@ -80,7 +80,7 @@ def region_errors(
     error: float,
     effects: NDArray[np.float64],
 ) -> SampleErrors:
-    """Errors of samples with a median near `error`; each region has the same effect everywhere."""
+    """Return errors with a median near `error`; a region affects every method equally."""
     noise = 0.5 * generator.normal(size=len(regions))
     relative = error * np.exp(effects[regions].sum(axis=1) + noise)
     amplitude = generator.uniform(0.02, 0.7, len(regions))
@@ -93,7 +93,7 @@ def timings(
     latency_ms: float,
     spread: float = 0.012,
 ) -> dict[str, NDArray[Any]]:
-    """Raw latencies on a machine whose log speed is given (n_processes, n_rounds)."""
+    """Return raw latencies for the given log speed of the machine (n_processes, n_rounds)."""
     process = spread * generator.normal(size=(len(speed), 1, 1))
     logs = process + speed[..., None] + 0.05 * generator.normal(size=(*speed.shape, N_QUERIES))
     logs += np.where(generator.random(logs.shape) < 0.03, generator.exponential(0.5, logs.shape), 0)
@@ -106,7 +106,7 @@ def timings(
 
 
 def measured_fields(errors: SampleErrors, times_ms: NDArray[np.float64]) -> dict[str, Any]:
-    """The fields of a row for which everything was measured."""
+    """Return the fields of a row with all measurements."""
     figures, median = summary(errors), float(np.median(times_ms))
     keys = ("mean_dof_m", "rel_l2_median", "rel_l2_p95", "rel_l2_max")
     return {
@@ -142,7 +142,7 @@ def measured_fields(errors: SampleErrors, times_ms: NDArray[np.float64]) -> dict
 def put_samples(
     comparison: Comparison, row: Row, errors: SampleErrors, timed: Mapping[str, NDArray[Any]]
 ) -> Row:
-    """Add a row and its raw samples; the worst sample is a bent beam that is predicted too long."""
+    """Add a row and its raw samples; the worst sample is a bent beam with too long a prediction."""
     generator = np.random.default_rng(len(comparison.rows))
     reference = 0.3 * MESH.points[:, [0]] ** 2 * np.array([0.01, 0.03, 0.1])
     forces = np.zeros_like(reference)
@@ -157,7 +157,7 @@ def put_samples(
 def add_configuration(
     comparison: Comparison, row: Row, errors: SampleErrors, timed: Mapping[str, NDArray[Any]]
 ) -> Row:
-    """Add a row, completed by everything that can be measured, and its raw samples."""
+    """Add a row with all measurements, and its raw samples."""
     measured = measured_fields(errors, timed["latency_ms"])
     full = Row.model_validate({**row.as_dict(), **measured})
     return put_samples(comparison, full, errors, timed)
@@ -166,7 +166,7 @@ def add_configuration(
 def synthetic_comparison(
     out: Path, dataset: str = "beam-coarse", n_regions: int = 13, per_region: int = 40
 ) -> Comparison:
-    """All of `METHODS` on a dataset of the suite, on a machine that drifts.
+    """Return a comparison of all `METHODS` on a dataset of the suite, on a machine that drifts.
 
     The timing of linear-fem is not stable, and the hidden test set disagrees with pca-regression.
     """

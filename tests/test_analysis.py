@@ -1,4 +1,4 @@
-"""Conclusions of a comparison, against numbers worked out by hand or simulated."""
+"""Conclusions of a comparison, against hand-computed or simulated numbers."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def analysis(comparison: Comparison) -> Record:
 
 
 def empty(out: Path) -> tuple[Comparison, NDArray[np.int64]]:
-    """A comparison without rows, and the load region of each of its test samples."""
+    """Return a comparison without rows, and the load region of each of its test samples."""
     made = Comparison(out, {})
     regions = np.repeat(np.arange(13), 20)[:, None]
     needs = {"needs": {"error": 0.02, "latency_ms": 1.0}}
@@ -64,14 +64,14 @@ def empty(out: Path) -> tuple[Comparison, NDArray[np.int64]]:
 
 
 def pair(analysis: Record, a: str, b: str, target: float) -> Record:
-    """The record of an ordered pair of methods at an error."""
+    """Return the record of an ordered pair of methods at an error."""
     wanted = (a, b, target)
     records = analysis["pairwise"]
     return next(r for r in records if (r["a"], r["b"], r["target_rel_l2_median"]) == wanted)
 
 
 def at_error(analysis: Record, method: str, target: float) -> Record:
-    """The record of the time of a method at an error."""
+    """Return the record of a method's time at an error."""
     records, wanted = analysis["time_at_error"], (method, target)
     return next(r for r in records if (r["method"], r["target_rel_l2_median"]) == wanted)
 
@@ -254,7 +254,7 @@ def test_rows_without_samples_or_figures_have_no_interval(tmp_path: Path) -> Non
 def scored(
     method: str, label: str, error: float, latency_ms: float, data: float | None = 30.0
 ) -> Row:
-    """A row with only the figures that by-hand checks need."""
+    """Return a row with only the figures that hand-computed checks need."""
     return a_row(
         method,
         label=label,

@@ -22,7 +22,7 @@ def hexes(cells: Any, points: Any = HEX.points) -> meshio.Mesh:
 
 
 def second_as(order: list[int]) -> meshio.Mesh:
-    """Two hexahedra, the second with its corners in another order."""
+    """Return two hexahedra, the second with its corners in another order."""
     return hexes(np.vstack([HEX.cells[:1], HEX.cells[1:, order]]))
 
 
@@ -38,7 +38,7 @@ def two_parts(shift: float) -> meshio.Mesh:
 
 
 def hinge(kind: str, at: str) -> meshio.Mesh:
-    """Two of the eight blocks of a cube, which share only an edge or a node."""
+    """Return two of the eight blocks of a cube, which share only an edge or a node."""
     cube = box_mesh((2.0, 2.0, 2.0), (2, 2, 2), kind == "tetra")
     centres = cube.points[cube.cells].mean(axis=1) > 1.0
     other = centres[:, :2].all(axis=1) & (centres[:, 2] == (at == "node"))
@@ -51,7 +51,7 @@ def three_on_one_face() -> meshio.Mesh:
 
 
 def on_one_side(kind: str) -> meshio.Mesh:
-    """A cell, and one twice as high on the same face; both are oriented outwards."""
+    """Return a cell, and one twice as high on the same face; both are oriented outwards."""
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1), kind == "tetra")
     cell = mesh.cells[0]
     higher = cell.copy()

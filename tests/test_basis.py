@@ -46,14 +46,14 @@ def off_identity(modes: Array, product: Any = None) -> float:
 
 
 def left_over(snapshots: Array, modes: Array, product: Any = None) -> float:
-    """Return the norm of what orthonormal modes leave of the snapshots."""
+    """Return the norm of the projection error of the snapshots on orthonormal modes."""
     product = sp.eye_array(snapshots.shape[1]) if product is None else product
     rest = snapshots - (product @ snapshots.T).T @ modes @ modes.T
     return float(np.sqrt(np.vdot(rest, (product @ rest.T).T)))
 
 
 def springs(n: int) -> Any:
-    """Return the stiffness of springs in a row that differ by eight decades: condition 2e11."""
+    """Return the stiffness of springs in series that differ by eight decades: condition 2e11."""
     sizes = sp.diags_array(10.0 ** np.random.default_rng(0).uniform(-4, 4, n + 1))
     ends = np.array([np.ones(n), -np.ones(n)])
     stretches = sp.diags_array(ends, offsets=[0, -1], shape=(n + 1, n))
@@ -79,7 +79,7 @@ def test_no_other_basis_has_a_smaller_projection_error(
 ) -> None:
     snapshots, product = tiny.train.free_displacements, stiffness if weighted else None
     found = pod(snapshots, 10, inner_product=product)
-    # In coordinates in which the inner product is Euclidean, the singular values are the same.
+    # The singular values are the same in coordinates that make the inner product Euclidean.
     root = np.linalg.cholesky(stiffness.toarray()) if weighted else np.eye(snapshots.shape[1])
     values = np.linalg.svd(snapshots @ root, compute_uv=False)
     accuracy = 1e-3 if route == "randomised" else 1e-9

@@ -1,4 +1,4 @@
-"""The linear response by columns: the same as by back-solves, where columns pay."""
+"""The linear response by stored columns: equal to that by back-solves."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def scene_with(element: str, integration: str) -> Scene:
 
 
 def patch_loads(scene: Scene, n: int) -> NDArray[np.float64]:
-    """(n, n_dofs) forces of random direction on some patches."""
+    """Return (n, n_dofs) forces of random direction on some patches."""
     rng = np.random.default_rng(0)
     weights = scene.patch_weights.toarray()
     chosen = weights[np.linspace(0, len(weights) - 1, n).astype(int)]
@@ -79,7 +79,7 @@ def test_columns_and_back_solves_give_the_same_response(case: str) -> None:
 def test_loads_without_stored_columns_are_solved_directly(
     tiny: Dataset, solver: SolverName
 ) -> None:
-    """On other nodes, on more than pays, and on supports, in one batch with those with columns."""
+    """Loads on other nodes, on too many nodes, and on supports share a batch with column loads."""
     if solver == "pardiso":
         pytest.importorskip("pypardiso")
     scene, model = tiny.scene, FullOrderModel(tiny.scene, solver)
@@ -130,7 +130,7 @@ def test_columns_that_do_not_pay_are_neither_used_nor_stored(
 def test_many_right_hand_sides_give_the_same_solutions_as_few(
     scene: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By blocks, in natural order and reordered, the last block shorter than the others."""
+    """Blocks are solved in natural order and reordered; the last block is shorter."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         model = FullOrderModel(load_scene(scene))
@@ -141,5 +141,5 @@ def test_many_right_hand_sides_give_the_same_solutions_as_few(
     monkeypatch.setattr(banded, "MANY", 100)
     few = factor.solve(rhs)
     assert n % banded.BLOCK
-    assert not np.array_equal(many, few)  # else both took one way
+    assert not np.array_equal(many, few)  # otherwise both took the same path
     np.testing.assert_allclose(many, few, rtol=0, atol=1e-11 * np.abs(few).max())

@@ -1,4 +1,4 @@
-"""What every method of the suite must do. A new method file joins by itself."""
+"""The requirements for every method of the suite. A new method file is tested automatically."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_a_loaded_model_predicts_the_same_bits(
 def test_wrong_arrays_with_a_valid_checksum_are_refused(
     fitted: Surrogate, tmp_path: Path, forgery: str
 ) -> None:
-    """Kernels check no bounds, so `prepare` must."""
+    """Kernels check no bounds, so `prepare` must check them."""
 
     def forge(arrays: dict[str, NDArray[Any]]) -> None:
         first = min(name for name, array in arrays.items() if array.dtype.kind == "f")
@@ -156,7 +156,7 @@ def test_fitting_again_forgets_the_first_fit_and_repeats_it(
 
 @pytest.mark.parametrize("name", sorted(SPECS))
 def test_every_method_inherits_checks_and_files_from_the_base_class(name: str) -> None:
-    """So that the laws below hold for all methods, though they are tested on one."""
+    """The tests below use one method, and hold for all because of this."""
     surrogate = type(cheap_method(name))
     for verb in ("fit", "predict", "restore", "save", "forget", "out_of_range", "indicate_error"):
         assert getattr(surrogate, verb) is getattr(Surrogate, verb), verb
@@ -235,7 +235,7 @@ def test_bad_snapshots_are_refused_and_leave_the_method_unfitted(tiny: Dataset) 
 
 @dataclass(eq=False)
 class Hoarder(Zero):
-    """Keeps things under many names, and fails or learns nonsense if asked to."""
+    """Keeps attributes under many names, and fails or learns nonsense on request."""
 
     how: str = "well"
 

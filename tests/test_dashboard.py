@@ -84,7 +84,7 @@ def git(folder: Path, *arguments: str) -> str:
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working folder: a checkout of something called mor-bench with two commits."""
+    """The working folder: a checkout of a project called mor-bench with two commits."""
     folder = tmp_path / "checkout"
     folder.mkdir()
     (folder / "pyproject.toml").write_text('[project]\nname = "mor-bench"\n')
@@ -99,7 +99,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def results(out: Path, commit: str) -> dict[str, dict[str, Any]]:
-    """The results of a commit: for each quantity asv's columns by name."""
+    """Return the results of a commit: for each quantity, asv's columns by name."""
     content = json.loads(next(out.glob(f"*/{commit[:8]}-*.json")).read_text())
     return {
         name.rpartition(".")[2]: dict(zip(content["result_columns"], values, strict=False))
@@ -206,7 +206,7 @@ def test_asv_follows_every_method_of_the_suite() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("dataset", FullOrder.params)
 def test_no_benchmark_of_the_full_order_model_raises(dataset: str) -> None:
-    """asv would silently skip it."""
+    """asv silently skips a benchmark that raises."""
     benchmark = FullOrder()
     benchmark.setup(dataset)
     found = [name for name in vars(FullOrder) if name.startswith(("time_", "peakmem_"))]
@@ -220,7 +220,7 @@ def test_no_benchmark_of_the_full_order_model_raises(dataset: str) -> None:
 
 @pytest.fixture
 def dashboard(checkout: Path) -> Iterator[str]:
-    """Address of a published dashboard with a comparison of two commits."""
+    """The address of a published dashboard with a comparison of two commits."""
     pytest.importorskip("asv")
     out = checkout / ".asv" / "results"
     pod = row("pod", 2e-3, label="pod [n_modes=10]")
@@ -239,7 +239,7 @@ def dashboard(checkout: Path) -> Iterator[str]:
 
 
 def page(address: str, profile: Path) -> str:
-    """Document of a page after its scripts have run in a headless browser."""
+    """Return the document of a page after its scripts have run in a headless browser."""
     quiet = "no-first-run disable-background-networking disable-component-update disable-sync"
     plain = f"headless no-sandbox disable-gpu disable-quic no-proxy-server dump-dom {quiet}"
     options = [
@@ -273,7 +273,7 @@ def test_the_dashboard_draws_without_the_internet(dashboard: str, tmp_path: Path
     for label in ("fem", "pod [n_modes=10]"):
         assert label in shown
     for found in (grid, graph):
-        assert "continental origin" not in found  # asv's page for scripts that failed
+        assert "continental origin" not in found  # asv's page for failed scripts
         assert "Download error" not in found
 
 

@@ -1,4 +1,4 @@
-"""Figures, tables and headlines show the rows: their artists and cells are compared with them."""
+"""Figures, tables and headlines agree with the rows of a comparison."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def made(tmp_path: Path) -> Comparison:
 
 
 def intervals(made: Comparison) -> dict[str, object]:
-    """An analysis that only has intervals."""
+    """Return an analysis that only has intervals."""
     rows = []
     for entry in entries_of(made, "beam"):
         values = {"rel_l2_median": entry.error, "latency_ms": entry.latency_ms, "mean_dof_m": 1e-3}

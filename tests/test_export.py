@@ -1,4 +1,4 @@
-"""Exported files hold what was computed, and can be read in again."""
+"""Exported files hold the computed fields, and can be read back."""
 
 from __future__ import annotations
 

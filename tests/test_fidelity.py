@@ -212,7 +212,7 @@ def test_extrapolation_finds_the_limit_of_a_series_of_known_order() -> None:
 
 
 def tip_deflection(scene: Scene, cells: tuple[int, int, int]) -> np.ndarray[Any, Any]:
-    """Mean deflection of the tip face, m, as an array of one, under 1 N spread evenly over it."""
+    """Return the tip face's mean deflection, m, shape (1,), under 1 N spread evenly over it."""
     mesh = with_cells(scene, cells)
     points = mesh.mesh.points
     tip = np.flatnonzero(points[:, 0] == points[:, 0].max())
@@ -265,7 +265,7 @@ def test_samples_are_those_of_the_dataset_and_spread_over_its_patches(tiny: Data
 
 @pytest.fixture(scope="module")
 def changed() -> DatasetSpec:
-    """beam-tiny with another stiffness: its physics has no shipped record."""
+    """beam-tiny with another stiffness, for which no record is shipped."""
     spec = load_generated_spec("beam-tiny")
     return spec.model_copy(
         update={"material": spec.material.model_copy(update={"young_pa": 600.0})}

@@ -26,12 +26,12 @@ def random_split(cache: Path, beam: Dataset) -> Dataset:
 
 
 def mean_error(name: str, data: Dataset, **parameters: object) -> float:
-    """The paper's ē, m."""
+    """Return the paper's ē, m."""
     return mean_error_of(mor_bench.load_method(name, **parameters), data)
 
 
 def mean_error_of(method: mor_bench.Surrogate, data: Dataset) -> float:
-    """The paper's ē of a method that is yet to be fitted, m."""
+    """Fit a method and return the paper's ē, m."""
     method.fit(data.scene, data.train)
     errors = sample_errors(method.predict(data.test.forces), data.test.displacements)
     return float(errors.mean_dof_m.mean())

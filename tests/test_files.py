@@ -95,7 +95,7 @@ def write_gmsh(version: str, binary: bool) -> Callable[[meshio.Mesh, Path], None
 
 
 def write_gmsh_reversed(raw: meshio.Mesh, path: Path) -> None:
-    """Gmsh gives a negative number to a surface that its group holds in reversed orientation."""
+    """Write a Gmsh file with a reversed surface in a group, marked by a negative number."""
     write_gmsh("4.1", False)(raw, path)
     lines = path.read_text().splitlines()
     first = lines.index("$Entities") + 2  # surface 1: number, box, number of groups, groups
@@ -106,7 +106,7 @@ def write_gmsh_reversed(raw: meshio.Mesh, path: Path) -> None:
 
 
 def write_gmsh1(raw: meshio.Mesh, path: Path) -> None:
-    """Write by hand, after the manual, with gaps between the numbers of nodes and elements."""
+    """Write the format of the manual, with gaps between the numbers of nodes and elements."""
     types = {"hexahedron": 5, "tetra": 4, "quad": 3, "triangle": 2}
     lines = ["$NOD", str(len(raw.points))]
     lines += [f"{3 * i + 5} {x:.17g} {y:.17g} {z:.17g}" for i, (x, y, z) in enumerate(raw.points)]
@@ -120,7 +120,7 @@ def write_gmsh1(raw: meshio.Mesh, path: Path) -> None:
 
 
 def write_abaqus(raw: meshio.Mesh, path: Path) -> None:
-    """Write by hand: a point set, and a set in the second of three ELEMENT lines only."""
+    """Write a point set, and a set that only the second of three ELEMENT lines names."""
     names = {"hexahedron": "C3D8", "tetra": "C3D4", "quad": "S4", "triangle": "S3"}
     lines = ["*HEADING", "*NODE"]
     lines += [f"{10 + i}, {x:.17g}, {y:.17g}, {z:.17g}" for i, (x, y, z) in enumerate(raw.points)]
@@ -172,7 +172,7 @@ def solve(scene: Scene) -> NDArray[np.float64]:
 
 @pytest.fixture(scope="module")
 def expected(beam: tuple[str, Mesh, meshio.Mesh]) -> NDArray[np.float64]:
-    """The displacements of the box."""
+    """The displacements of the original box."""
     return solve(mor_bench.load_scene(content(discretisation={"element": ELEMENTS[beam[0]]})))
 
 

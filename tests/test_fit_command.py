@@ -1,4 +1,4 @@
-"""`mor-bench fit`: resuming gives the same bytes; what cannot be done is refused first."""
+"""`mor-bench fit`: resuming gives the same bytes; impossible fits are refused first."""
 
 from __future__ import annotations
 
@@ -265,7 +265,7 @@ def test_a_fit_takes_the_first_swept_value_and_scores_on_the_test_part(
 
 
 class FixedLength(Descent):
-    """Trains for its own number of iterations, whatever the seconds."""
+    """Trains for its own number of iterations and ignores the given seconds."""
 
     def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> FixedLength:
         self.training = replace(self.training, fit_seconds=None)

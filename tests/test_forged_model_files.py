@@ -1,4 +1,4 @@
-"""A model file can do no harm: whatever is changed in it, loading gives one clear error."""
+"""A model file can do no harm: any change to it gives one clear error."""
 
 from __future__ import annotations
 

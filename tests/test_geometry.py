@@ -157,7 +157,7 @@ def test_points_are_inside_the_sphere_where_its_equation_says_so() -> None:
 
 
 def test_the_winding_number_is_an_integer_even_next_to_an_edge_or_a_corner() -> None:
-    """A ray through an edge, a diagonal of a face or a corner would be counted twice, or never."""
+    """A ray through an edge, a face diagonal or a corner would be counted twice, or never."""
     share = np.random.default_rng(0).random((200, 12, 1))
     on_edges = (share * CUBE_CORNERS[:, 0] + (1 - share) * CUBE_CORNERS[:, 1]).reshape(-1, 3)
     points = np.concatenate([on_edges, CUBE.points])
@@ -219,7 +219,7 @@ def test_a_body_made_of_whole_cells_has_these_cells_as_voxels(mesh: Mesh) -> Non
 
 
 def needle() -> Surface:
-    """A body along a diagonal, thinner than a cell, that contains no cell's centre."""
+    """Return a body along a diagonal that is thinner than a cell and contains no cell centre."""
     points = np.array([[0.0, 0, 0], [1, 1, 1], [0.5, 0.52, 0.5], [0.5, 0.5, 0.53]])
     found = Surface(points, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))
     return found if found.volume_m3 > 0 else Surface(points, found.triangles[:, ::-1])
@@ -305,7 +305,7 @@ def test_tetrahedra_of_a_sphere_are_well_shaped_and_have_its_surface(spacing_m: 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_tetrahedra_of_bumpy_bodies_are_well_shaped(seed: int) -> None:
-    """All stencils occur, with the surface at every angle."""
+    """The bodies contain all stencils, with the surface at every angle."""
     rng = np.random.default_rng(seed)
     waves, phases = rng.normal(size=(6, 3)) * 60, rng.uniform(0, 6, size=6)
 
@@ -329,7 +329,7 @@ def beside_the_lattice(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def quadrants(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A body in two opposite quadrants around a line of the lattice."""
+    """Return a body in two opposite quadrants around a line of the lattice."""
     return np.where(np.abs(x).max(axis=1) > 2.2, 1.0, -x[:, 0] * x[:, 1])
 
 

@@ -1,4 +1,4 @@
-"""A regular grid for any mesh keeps sums, moments and linear fields; a mesh's own grid is exact."""
+"""A regular grid keeps sums, moments and linear fields of any mesh; a mesh's own grid is exact."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_forces_keep_sum_moment_and_work_and_linear_displacements_stay_exact(
 
 
 def test_weights_are_products_of_three_linear_weights() -> None:
-    """For a node a quarter, a half and three quarters between two points: 8 weights by hand."""
+    """The 8 hand-computed weights of a node at 1/4, 1/2 and 3/4 between two points."""
     points = np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0], [0, 0, 1], [1.25, 0.5, 0.75]])
     mesh = Mesh(points, np.array([[0, 1, 2, 4], [0, 1, 4, 3], [0, 4, 2, 3], [1, 4, 3, 2]]))
     weights = grid_map(mesh, (5, 3, 2)).weights.toarray()[4].reshape(5, 3, 2)

@@ -1,4 +1,4 @@
-"""Comparisons from end to end: rows, errors, resuming, and what one method can do to another."""
+"""Comparisons from end to end: rows, errors, resuming, and isolation of methods."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_every_configuration_has_a_row_and_a_broken_one_gives_its_reason(
         "crashed with ZeroDivisionError: on purpose (third_party.py"
     )
     assert "must return floats of shape" in str(shape.reason)
-    assert sometimes.ok  # a load without an answer costs an infinite error, no more
+    assert sometimes.ok  # a load without a prediction only has an infinite error
     assert 0 < (sometimes.n_failed or 0) < sometimes.n_test
     assert sometimes.error is not None
     assert sometimes.error.mean_dof_m == sometimes.error.rel_l2_max == math.inf
@@ -250,7 +250,7 @@ def test_a_stopped_run_resumes_and_another_run_is_refused(tmp_path: Path) -> Non
 
 @pytest.fixture(scope="module")
 def tip_only(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """beam-tiny, of which only the tip's displacements are wanted."""
+    """beam-tiny with outputs at the tip only."""
     path = tmp_path_factory.mktemp("datasets") / "tip.toml"
     text = list_suite("datasets")["beam-tiny"].read_text()
     path.write_text(text.replace('outputs    = "all"', 'outputs = "x-max"'))

@@ -1,4 +1,4 @@
-"""Other methods' answers corrected by the full-order model, and indicated errors."""
+"""Predictions of other methods, corrected by the full-order model, and indicated errors."""
 
 from __future__ import annotations
 

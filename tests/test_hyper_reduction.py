@@ -50,7 +50,7 @@ def cubature_of(
 
 
 def whole_mesh(scene: Scene, weights: Array, modes: Array) -> GalerkinProblem:
-    """The same, assembled over the nodes; cells of weight zero add nothing."""
+    """Return the same model, assembled over the nodes; cells of weight zero add nothing."""
     number = np.full(scene.mesh.n_dofs, len(scene.free_dofs))
     number[scene.free_dofs] = np.arange(len(scene.free_dofs))
     dofs = number.reshape(-1, 3)
@@ -89,7 +89,7 @@ def test_sums_over_points_equal_the_assembled_force_and_tangent(
 
 
 def solved(scene: Scene, n: int) -> Snapshots:
-    """Samples of a scene that no dataset holds."""
+    """Return samples of a scene that no dataset holds."""
     loads = draw_loads(scene, 0, n)
     found = FullOrderModel(scene).solve_many(
         loads.nodal_forces(scene.patch_weights).reshape(n, -1)[:, scene.free_dofs]
@@ -103,7 +103,7 @@ def solved(scene: Scene, n: int) -> Snapshots:
 @pytest.mark.slow
 @pytest.mark.parametrize(("law", "kind"), EVERY)
 def test_hyper_reduction_works_for_every_law_and_element(law: str, kind: tuple[str, bool]) -> None:
-    """All cells are plain POD; fewer cells predict the training loads nearly as well."""
+    """With all cells it is plain POD; fewer cells predict the training loads nearly as well."""
     scene = scene_of(law, kind)
     train = solved(scene, 24)
     plain = PODGalerkin(5).fit(scene, train).predict(train.forces)
@@ -128,7 +128,7 @@ def test_hyper_reduction_works_for_every_law_and_element(law: str, kind: tuple[s
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 3.0, 100.0])
 def test_the_compiled_steps_end_where_the_shared_solve_ends(tiny: Dataset, scale: float) -> None:
-    """Where they fail the shared solve takes over, so that both refuse the same loads."""
+    """If they fail, the shared solve takes over. So both refuse the same loads."""
     method = HyperReducedPOD(8, 1e-2).fit(tiny.scene, tiny.train)
     problem, options, failed = method.problem_, NewtonOptions(1e-8), 0
     for load in tiny.test.free_forces[:25] @ method.modes_ * scale:
@@ -179,7 +179,7 @@ def test_deim_without_an_equilibrium_raises_a_typed_error(tiny: Dataset) -> None
 
 @pytest.mark.parametrize("kind", [("hexahedron", False), ("hexahedron", True)])
 def test_points_preserve_the_reduced_force_of_the_training_samples(kind: tuple[str, bool]) -> None:
-    """The force of the fitted model is that of all cells, over fewer points than cells have."""
+    """The fitted model uses fewer points but has the force of all cells."""
     scene = scene_of("neo-hookean", kind)
     train = solved(scene, 40)
     method = HyperReducedPOD(4, 1e-2).fit(scene, train)
@@ -218,7 +218,7 @@ def test_a_snapshot_without_displacement_does_not_train_the_cubature(tiny: Datas
 
 
 def wanted_at_the_tip(method: HyperReducedPOD) -> tuple[HyperReducedPOD, HyperReducedPOD]:
-    """Return the method, and its twin on twice the cells, with outputs at the loaded end only."""
+    """Return the method, and the same on twice the cells, with outputs at the loaded end only."""
     scene = method.scene_
     fine = with_cells(scene, (30, 3, 3))
     modes = interpolation_matrix(scene.mesh, fine.mesh.points) @ nodal(
@@ -243,7 +243,7 @@ def wanted_at_the_tip(method: HyperReducedPOD) -> tuple[HyperReducedPOD, HyperRe
 
 @pytest.mark.slow
 def test_a_query_for_few_outputs_does_not_depend_on_the_mesh(cache: Path) -> None:
-    """From forces to wanted displacements, the counted work is the same to the last product."""
+    """The counted work from forces to requested displacements is exactly the same."""
     data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
     fitted = HyperReducedPOD(10, 1e-2, tolerance=1e-4, sampling="cells").fit(data.scene, data.train)
     coarse, fine = wanted_at_the_tip(fitted)
@@ -275,7 +275,7 @@ def test_a_query_for_few_outputs_does_not_depend_on_the_mesh(cache: Path) -> Non
 
 
 def steps(cost: Cost, n_cells: int) -> tuple[int, float]:
-    """Tangents, and evaluations of all cells."""
+    """Return the numbers of tangents and of evaluations of all cells."""
     return cost.factorisations, cost.element_evaluations / n_cells
 
 

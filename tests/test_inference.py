@@ -1,4 +1,4 @@
-"""Back ends answer as torch does, the choice goes by error and time, and so do ONNX files."""
+"""Back ends and ONNX files agree with torch, and the choice depends on error and time."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def fitted(data: Dataset) -> Surrogate:
 
 
 def network(activation: Activation = "relu") -> UNet:
-    """With biases other than zero."""
+    """Return a network with non-zero biases."""
     generator = torch.Generator().manual_seed(1)
     made = new_network(4, 2, generator, activation).eval().requires_grad_(False)
     for parameter in made.parameters():
@@ -86,7 +86,7 @@ def test_a_back_end_agrees_with_torch_and_a_batch_with_its_samples(
 
 @torch.inference_mode()  # type: ignore[untyped-decorator]
 def test_back_ends_keep_the_geometry_of_convolutions() -> None:
-    """Strides, dilations, groups, two dimensions, no bias; overlapping transposed kernels stay."""
+    """Strides, dilations, groups, 2D, no bias; overlapping transposed kernels are not replaced."""
     generator = torch.Generator().manual_seed(0)
     nn = torch.nn
     layers = nn.Sequential(
@@ -109,7 +109,7 @@ def test_back_ends_keep_the_geometry_of_convolutions() -> None:
 def choose(
     monkeypatch: pytest.MonkeyPatch, times: dict[str, float], own_error: float
 ) -> inference.Choice:
-    """The choice for given times of queries and a given relative error of the network."""
+    """Return the choice for given query times and a given relative error of the network."""
     monkeypatch.setattr(
         inference, "fastest_ms", lambda able, inputs: {name: times[name] for name in able}
     )
@@ -130,7 +130,7 @@ def test_the_choice_depends_on_the_error_and_on_clear_gains(
         available(network(), backend)
     times = {"eager": 10.0, "packed": 5.0, "onnx": 4.5, "packed-bfloat16": 2.0}
     assert choose(monkeypatch, times, 1.0).inference.backend == "packed-bfloat16"
-    exact = choose(monkeypatch, times, 1e-3)  # bfloat16 alone errs more than this network
+    exact = choose(monkeypatch, times, 1e-3)  # bfloat16 has a larger error of its own
     assert exact.inference.backend == "packed"
     assert "own error" in exact.left_out["packed-bfloat16"]
     assert exact.milliseconds == {"eager": 10.0, "packed": 5.0, "onnx": 4.5}

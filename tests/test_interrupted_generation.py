@@ -55,7 +55,7 @@ def leftovers(folder: Path) -> list[Path]:
 
 
 class FullDisk:
-    """Stands in for `open`: files on a disk that takes a limited number of bytes in all."""
+    """Replaces `open`: files on a disk that takes a limited number of bytes in total."""
 
     def __init__(self, capacity: int) -> None:
         self.free = capacity
@@ -95,7 +95,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 def test_writes_may_fail_at_any_byte(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, bytes]
 ) -> None:
-    """Generate repeatedly on a full disk, with other room each time, until it succeeds."""
+    """Generate on a full disk, with different free space each time, until it succeeds."""
     monkeypatch.setattr(generate_module, "SHARD_SIZE", SMALL)
     rng, spec = np.random.default_rng(0), tiny_spec(20)
     folder = dataset_folder(spec, tmp_path)
@@ -181,7 +181,7 @@ def long_undisturbed(
 def test_a_generation_killed_fifty_times_and_resumed_is_bit_identical(
     tmp_path: Path, generators: Generators, long_undisturbed: dict[str, bytes]
 ) -> None:
-    """Every tenth time a pool of workers is killed. After its end a dataset is begun anew."""
+    """Every tenth kill hits a pool of workers. A finished dataset is generated again."""
     rng = np.random.default_rng(int(time.time()))
     kills = in_a_write = partial = attempt = 0
     while kills < 50:
@@ -287,7 +287,7 @@ def test_a_cluster_may_lose_a_worker(tmp_path: Path, many: dict[str, bytes]) -> 
             killed: list[str] = []
 
             def kill_one_at_work(done: int, total: int) -> None:
-                # A task in flight may be done when it is looked for: then after the next shard.
+                # A running task may finish before it is found; then try after the next shard.
                 if done >= total // 2 and not killed:
                     at_work = client.processing().items()
                     busy = [names[address] for address, tasks in at_work if tasks]

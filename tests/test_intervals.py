@@ -1,4 +1,4 @@
-"""Intervals hold what they promise, in simulated measurements whose truth is known."""
+"""Intervals have their nominal coverage in simulated measurements with a known truth."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from mor_bench.analysis.latency_intervals import (
 class Noise:
     """Disturbances of a timing, as relative standard deviations.
 
-    `process`: between fresh processes (Student's t with 3 degrees of freedom if `heavy`).
+    `process`: between new processes (Student's t with 3 degrees of freedom if `heavy`).
     `slow_processes`: share of processes that are slower by 5 to 10 %.
     `query`: between queries; the share `tails` of them has Pareto's tail.
     `drift`: slow change of the machine over all rounds.
@@ -56,7 +56,7 @@ NOISES = (
 def machine(
     generator: np.random.Generator, noise: Noise, n_processes: int = 5, n_rounds: int = 5
 ) -> NDArray[np.float64]:
-    """Log speed of the machine in each round: a wave of random length and phase."""
+    """Return the machine's log speed in each round: a wave of random length and phase."""
     time = np.linspace(0, 1, n_processes * n_rounds)
     wave = np.sin(2 * np.pi * (time / generator.uniform(0.3, 3) + generator.random()))
     return np.asarray(noise.drift * generator.random() * wave).reshape(n_processes, n_rounds)
@@ -68,7 +68,7 @@ def measure(
     speed: NDArray[np.float64],
     latency_ms: float = 1.0,
 ) -> dict[str, NDArray[np.float64]]:
-    """Raw samples of a configuration on a machine, 40 queries per round."""
+    """Return raw samples of a configuration on a machine, 40 queries per round."""
     n, rounds = speed.shape
     shape = np.asarray(
         generator.standard_t(3, n) / 3**0.5 if noise.heavy else generator.normal(size=n)
@@ -115,7 +115,7 @@ def test_the_median_of_a_repeated_measurement_lies_in_the_interval(
 
 
 def test_the_interval_of_a_latency_has_the_noise_of_two_measurements() -> None:
-    """One process on a machine without raw spread: only the typical spread and drift remain."""
+    """One process without spread in its samples: only the typical spread and drift remain."""
     low, high = latency_intervals({"a": {"latency_ms": np.ones(9)}})["a"]
     noise = (0.014**2 + 0.02**2) ** 0.5
     df = noise**4 / ((0.014**4 + 0.02**4) / 2)
@@ -192,7 +192,7 @@ def test_without_two_regions_each_sample_is_its_own_cluster() -> None:
 
 
 def coverage(effect: float, k: int, by_region: bool, n_regions: int = 13) -> float:
-    """Share of simulated test sets whose interval contains the median over all regions.
+    """Return the share of simulated test sets whose interval contains the median over all regions.
 
     Errors vary by region and by sample; each sample has k regions.
     """

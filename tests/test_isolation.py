@@ -1,4 +1,4 @@
-"""What a method can do to a comparison and to other methods: nothing but spoil its own row."""
+"""A method can spoil only its own row, not the comparison or other methods."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def test_a_method_cannot_find_a_test_sample_or_a_result(
 ) -> None:
     out = tmp_path / "out"
     folders = [str(cache / "datasets"), str(cache / "fits"), str(out / "samples")]
-    run_small(["linear-fem"], out, cache)  # so that there are results to look at
+    run_small(["linear-fem"], out, cache)  # creates results that the next run could find
     shards = [str(path) for path in cache.glob("datasets/*/shard-*.h5")]
     monkeypatch.setenv("MOR_BENCH_TEST_SHARDS", os.pathsep.join(shards))
     path = method_file(tmp_path, "peeker", "tests.third_party:Peeker", folders=folders)
     row = run_small(["linear-fem", path], out, cache).rows[1]
     assert row.ok, row.reason
     assert seen_by(row) == []
-    with pytest.warns(UserWarning, match="_open") as caught:  # it does look
+    with pytest.warns(UserWarning, match="_open") as caught:  # it does search
         Peeker(folders).fit(tiny.scene, tiny.train)
     assert caught
 

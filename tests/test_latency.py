@@ -1,4 +1,4 @@
-"""Latency: what a timing keeps, when it is unstable, and that configurations take turns."""
+"""Latency: the contents of a timing, its stability, and configurations timed in turns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The out-of-range flag: what it flags, what it does not, and how it is saved."""
+"""The out-of-range flag: flagged loads, accepted loads, and storage."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def pod(tiny: Dataset) -> Surrogate:
 
 
 def nodal(snapshots: Snapshots) -> Snapshots:
-    """The same samples as another program would give them."""
+    """Return the same samples in the form that another program would give."""
     return replace(snapshots, loads=NodalLoads(snapshots.forces, snapshots.loads.patches))
 
 

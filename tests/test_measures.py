@@ -1,4 +1,4 @@
-"""Error metrics, range flags and frontiers against numbers worked out by hand."""
+"""Error metrics, range flags and frontiers against hand-computed numbers."""
 
 from __future__ import annotations
 

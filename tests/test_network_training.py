@@ -38,7 +38,7 @@ EARLY = replace(PLAN, iterations=1000, schedule="constant", validation_fraction=
 
 @dataclass
 class Regression:
-    """A small regression whose loss also draws from the training's generator, as mirroring does."""
+    """A small regression whose loss draws random numbers from the training's generator."""
 
     noise: float = 0.0
     width: int = 16
@@ -83,7 +83,7 @@ class Regression:
         return train(problem, plan, TrainingOptions(**options), time_limit_s)
 
     def interrupted(self, after: int, checkpoint: Path) -> None:
-        """Train until the process "ends" in the step after some, each with a checkpoint."""
+        """Train with checkpoints, and "end" the process in the step after each of them."""
         steps = 0
 
         def dying(rows: Tensor) -> Tensor:
@@ -295,7 +295,7 @@ def test_early_stopping_keeps_the_best_validated_weights() -> None:
 def test_a_training_sized_to_seconds_is_repeated_by_its_number_of_iterations() -> None:
     filled, repeated = Regression(), Regression()
     plan = replace(PLAN, validation_fraction=0.0)
-    Regression().train(replace(plan, iterations=1))  # torch imports what its optimisers need
+    Regression().train(replace(plan, iterations=1))  # torch imports its optimisers
     start = perf_counter()
     done = filled.train(plan, fit_seconds=0.2)
     assert 0.02 < perf_counter() - start < 5.0
@@ -308,7 +308,7 @@ def test_a_training_sized_to_seconds_is_repeated_by_its_number_of_iterations() -
 def test_the_given_time_includes_the_trial_and_the_validations(
     each_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By a clock that a loss advances in proportion to its samples."""
+    """The loss advances a simulated clock in proportion to its samples."""
     problem, asked_s = Regression(), 0.0
 
     def slow(rows: Tensor) -> Tensor:
@@ -353,7 +353,7 @@ def test_divergence_is_an_error_and_writes_no_checkpoint(
         r"diverged .* the loss is (nan|inf), with a learning rate of 1e\+38 and products in "
         "float32; a lower rate may"
     )
-    for _ in range(2):  # the second resumes from what was finite, and ends as the first
+    for _ in range(2):  # the second resumes from the last finite state, and ends as the first
         with pytest.raises(MorBenchError, match=message):
             Regression().train(
                 replace(PLAN, learning_rate=1e38), checkpoint=tmp_path / "checkpoint"

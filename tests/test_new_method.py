@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def in_folder(folder: Path, *arguments: str) -> str:
-    """Run Python in a folder whose own `mor_bench` comes first, and return its output."""
+    """Run Python in a folder whose own `mor_bench` is imported, and return its output."""
     done = subprocess.run(
         [sys.executable, "-m", *arguments],
         cwd=folder,

@@ -128,7 +128,7 @@ def test_force_and_tangent_on_the_manifold_are_derivatives_of_its_energy(law: st
 def test_small_loads_get_the_linear_response(
     name: str, knobs: dict[str, Any], tiny: Dataset
 ) -> None:
-    """Under a load that no basis saw, the error falls with the square of the load."""
+    """Under a load unknown to the basis, the error falls with the square of the load."""
     method = mor_bench.load_method(name, **knobs).fit(
         tiny.scene, tiny.train if name == "local-pod" else None
     )
@@ -144,7 +144,7 @@ def test_small_loads_get_the_linear_response(
 
 
 def test_the_quadratic_manifold_is_exact_to_second_order(tiny: Dataset) -> None:
-    """If the linear response lies in Φ, the error is cubic in the load; on Φ alone quadratic."""
+    """If Φ contains the linear response, the error is cubic in the load; on Φ alone quadratic."""
     model = FullOrderModel(tiny.scene)
     modes = linear_modes(tiny.scene, model, 3).modes
     linear = GalerkinProblem(model.assembler, modes)
@@ -236,7 +236,7 @@ def test_local_pod_with_one_cluster_and_all_modes_reproduces_its_snapshots(
 
 @pytest.mark.slow
 def test_clusters_of_similar_loads_do_better_than_one_basis(cache: Path) -> None:
-    """At five modes; at twenty the clusters gain little, see the method's limits."""
+    """This holds for five modes; with twenty, clusters gain little (see the method's limits)."""
     data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
     medians = []
     for n_clusters in (1, 16):

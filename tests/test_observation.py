@@ -1,4 +1,4 @@
-"""Methods that are given displacements of a part of the surface instead of forces."""
+"""Methods with displacements of a part of the surface instead of forces as input."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_method_completes_observed_displacements_or_says_that_it_needs_forces(
 
 
 def test_most_methods_complete_observed_displacements() -> None:
-    """So that the law above does not hold because every method refuses."""
+    """The test above would also pass if every method refused."""
     scene = scene_of({"region": "z-max"})
     for name in QUICK | (set(OBSERVATION_METHODS) - {"umesh"}):  # which needs torch
         assert cheap_method(name, observed=True).supports(scene) is None
@@ -143,7 +143,7 @@ def test_a_loaded_model_knows_its_observed_nodes(
 
 
 class Forgetful(Surrogate):
-    """Written before there were such scenes: it says that it supports everything."""
+    """A method older than such scenes, which claims to support everything."""
 
     def supports(self, scene: Scene) -> str | None:
         return None

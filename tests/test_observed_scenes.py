@@ -121,7 +121,7 @@ def test_fem_finds_the_equilibrium_if_every_loaded_node_is_observed(
 
 
 def test_the_linear_extension_is_linear_elasticity(tiny: Dataset) -> None:
-    """Where all the force is seen, the extension of the linear response is the linear response."""
+    """If all loaded nodes are observed, the linear extension is the linear response."""
     scene = scene_of({"region": "z-max"})
     response = FullOrderModel(tiny.scene).rest_factor.solve(tiny.test.free_forces[:5].T).T
     model = ObservedModel(scene)
@@ -136,7 +136,7 @@ def test_the_linear_extension_is_linear_elasticity(tiny: Dataset) -> None:
 
 
 def test_large_displacements_are_reached_in_increments() -> None:
-    """A tip turned by half a circle: the linear response leads nowhere, increments do."""
+    """The tip turns by half a circle, too far for a start from the linear response."""
     scene = scene_of(
         {"region": "x-max"}, material={"law": "neo-hookean", "young_pa": 500.0, "poisson": 0.4}
     )

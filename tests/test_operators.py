@@ -1,4 +1,4 @@
-"""DeepONet, FNO and message passing: each network is what its equation says, written out slowly."""
+"""DeepONet, FNO and message passing agree with plain implementations of their equations."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def tetrahedral() -> Mesh:
 def test_the_spectral_convolution_is_a_circular_convolution_with_a_real_kernel(
     shape: tuple[int, int, int], modes: int
 ) -> None:
-    """The kernel by its sum over all wave numbers, the convolution as a sum over shifts."""
+    """The reference sums the kernel over all wave numbers, and the convolution over shifts."""
     layer = SpectralConvolution(shape, modes, 2)
     layer.initialise(torch.Generator().manual_seed(0))
     kept = [[k for k in np.fft.fftfreq(n, 1 / n).astype(int) if abs(k) < modes] for n in shape]
@@ -95,7 +95,7 @@ def test_forces_are_spread_over_the_grid_and_displacements_averaged() -> None:
 
 
 def test_the_padding_keeps_opposite_ends_apart() -> None:
-    """On a circle, a force at one end would act on the other as on its neighbour."""
+    """Without padding, a force at one end would act on the other end as on a neighbour."""
     network = FNO(padded_grid(grid_map(box_mesh((2.0, 1.0, 1.0), (7, 2, 2))), 0), True, 3, 9, 1)
     assert network.spectral[0].shape == (10, 4, 4)
     initialise(network, torch.Generator().manual_seed(0))
@@ -183,7 +183,7 @@ def test_a_graph_network_sees_one_edge_per_step_and_ignores_numbering_and_positi
 
 @pytest.mark.parametrize("name", ["deeponet", "pod-deeponet"])
 def test_deeponet_is_the_branch_times_the_trunk(name: str, tiny: Dataset) -> None:
-    """Written out for each node and component, from the force to the displacement."""
+    """The reference is computed for each node and component, from force to displacement."""
     method = make(name).fit(tiny.scene, tiny.train)
     force, network = tiny.test.forces[0], method.network_
     n_nodes = tiny.scene.mesh.n_nodes
@@ -215,7 +215,7 @@ def test_deeponet_is_the_branch_times_the_trunk(name: str, tiny: Dataset) -> Non
 def test_the_loss_subtracts_the_output_of_the_network_at_rest(
     name: str, input: str, tiny: Dataset
 ) -> None:
-    """One step on all samples at a rate that changes nothing."""
+    """The training is one step on all samples, too small to change the weights."""
     samples = tiny.train[:20]
     knobs = {"input": input, "iterations": 1, "batch_size": 20, "learning_rate": 1e-30}
     method = make(name, **knobs).fit(tiny.scene, samples)
@@ -265,7 +265,7 @@ def test_a_second_fit_is_bit_identical_and_leaves_the_global_random_state_alone(
 
 @pytest.mark.parametrize("name", SMALL)
 def test_training_gives_a_lower_error_than_the_linear_response(name: str, tiny: Dataset) -> None:
-    """DeepONet on load regions that it never saw, the others on a mesh that lies in no grid."""
+    """DeepONet is tested on unseen load regions, the others on an irregular mesh."""
     train = test = tiny.train
     if "deeponet" in name:
         test = tiny.test

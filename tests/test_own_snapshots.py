@@ -1,4 +1,4 @@
-"""Snapshots of other programs: which methods compete on them, and which files are refused."""
+"""Snapshots of other programs: supported methods and refused files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ IMPORTED = "its snapshots were imported, so its equations are not known"
 
 @pytest.fixture(scope="module")
 def arrays(tiny: Dataset) -> Arrays:
-    """The samples of beam-tiny as another program would write them."""
+    """The samples of beam-tiny in the form that another program would write."""
     found = snapshot_arrays(tiny)
     del found["test"]
     return found
@@ -167,7 +167,7 @@ def test_every_force_that_can_be_read_has_a_prediction() -> None:
 
 
 def test_a_linear_law_is_learned(tmp_path: Path, arrays: Arrays) -> None:
-    """On a mesh of free nodes the error is that of the ridge."""
+    """On a mesh of free nodes, only the ridge regularisation causes an error."""
     generator = np.random.default_rng(0)
     forces = np.zeros_like(arrays["forces"])
     forces[:, [4, 9]] = generator.normal(size=(len(forces), 2, 3))

@@ -33,7 +33,7 @@ def test_the_error_table_of_the_paper_shows_its_networks_beside_ours(entries: li
     large = Entry(network.with_parts(label="large", parameters=size))
     measures = error_measures("beam-coarse", [*entries, large])
     assert measures is not None
-    # Both of ours, and of the paper's eight all but the one that has the size of one of ours.
+    # Both of ours, and seven of the paper's eight: one has the size of one of ours.
     assert len(measures.rows) == 2 + 8 - 1
     assert measures.rows[0][1:4] == ["16", "2", "64"]
     assert measures.rows[1][:4] == ["large", "128", "3", "1024"]

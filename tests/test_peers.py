@@ -1,4 +1,4 @@
-"""Other codes solve our problem, and one that solves another is refused; times do not count."""
+"""Other codes solve the same problem, and one that solves another is refused."""
 
 from __future__ import annotations
 

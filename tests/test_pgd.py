@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 def functions(x: Array, kind: str) -> list[list[Array]]:
-    """Return two families of factors of x (n, 3): even and odd in the last coordinate."""
+    """Return two families of factors of x (n, 3), even and odd in the last coordinate."""
     first = np.stack([np.ones(len(x)), x[:, 0], x[:, 0] ** 2], axis=1)
     second = np.stack([np.ones(len(x)), x[:, 1], x[:, 1] ** 2, x[:, 1] ** 3], axis=1)
     even, odd = np.stack([x[:, 2] ** 2, x[:, 2] ** 4], axis=1), x[:, 2:] ** 3
@@ -36,7 +36,7 @@ def values(separation: Separation, families: list[list[Array]]) -> Array:
 
 
 def separable(x: Array) -> Array:
-    """(n, 6), a sum of three products, two even in the last coordinate and one odd."""
+    """Return (n, 6) sums of three products, two even in the last coordinate and one odd."""
     vectors = np.random.default_rng(1).normal(size=(3, 6))
     products = [
         (1 + x[:, 0]) * (x[:, 1] ** 2 - 0.3) * (x[:, 2] ** 2 - 0.5 * x[:, 2] ** 4),
@@ -63,7 +63,7 @@ def test_one_product_takes_one_term() -> None:
         :, None
     ] * np.arange(1.0, 5.0)
     assert separate(target, functions(x, "both"), 1, 0.0).residuals[0] <= 1e-2
-    # What a term leaves is what its alternation left.
+    # The residual of a term is that of its last alternating step.
     assert separate(target, functions(x, "both"), 4, 0.0).residuals[-1] <= 1e-4
 
 
@@ -78,7 +78,7 @@ def test_the_reported_residual_is_the_true_one_and_falls_with_every_term(tiny: D
 
 
 def test_coordinates_are_those_of_the_patch(tiny: Dataset) -> None:
-    """The centroid of a patch's area, and the force that the plan has drawn."""
+    """They are the centroid of the patch's area, and its force in the load plan."""
     scene, forces = tiny.scene, tiny.train.forces
     points, shares = scene.patch_points(np.arange(len(scene.patch_nodes)))
     centroids = shares @ points
@@ -105,7 +105,7 @@ def test_zero_load_gives_zero_and_a_couple_gives_the_answer_of_the_base(
 
 
 def test_a_separable_solution_of_patch_loads_is_found_in_unseen_regions(tiny: Dataset) -> None:
-    """Of degrees one to three in the force, with the patch positions in one factor."""
+    """It has degrees one to three in the force, and one factor for the patch position."""
     n_free = len(tiny.scene.free_dofs)
     vectors = np.random.default_rng(3).normal(size=(3, n_free))
 
@@ -129,7 +129,7 @@ def test_a_separable_solution_of_patch_loads_is_found_in_unseen_regions(tiny: Da
 
 
 def test_terms_added_to_the_linear_response_are_of_second_degree_and_more(tiny: Dataset) -> None:
-    """Small loads get the linear response, even if the samples have another first degree."""
+    """Small loads get the linear response, even if the linear part of the samples differs."""
     samples = replace(tiny.train, free_displacements=1.5 * tiny.train.free_displacements)
     method = SeparatedLoad(n_terms=30).fit(tiny.scene, samples)
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)

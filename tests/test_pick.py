@@ -1,4 +1,4 @@
-"""The choice among rows: what disqualifies, what is cheapest, and what would have to give."""
+"""The choice among rows: disqualification, cost, and suggested relaxations."""
 
 from __future__ import annotations
 

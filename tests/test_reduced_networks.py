@@ -123,7 +123,7 @@ def test_the_network_of_torch_and_of_numpy_agree_with_their_slopes() -> None:
 def test_the_training_loss_equals_the_loss_of_the_predictions(
     input: str, derivatives: bool, tiny: Dataset, tmp_path: Path
 ) -> None:
-    """One step on all samples, from a trained network: value and slope at rest are not zero."""
+    """Take one step on all samples from a trained network, which is not zero at rest."""
     few, scene = tiny.train[:20], tiny.scene
     sizes = {"n_input_modes": 8, "n_output_modes": 8, "n_hidden": 8}
     knobs = {**sizes, "input": input, "derivatives": derivatives}

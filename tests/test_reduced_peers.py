@@ -1,4 +1,4 @@
-"""Reduced models of other codes solve our equations, and one that solves others is refused."""
+"""Reduced models of other codes solve our equations; one with other equations is refused."""
 
 from __future__ import annotations
 

@@ -220,7 +220,7 @@ def test_arrays_that_would_mislead_a_kernel_are_refused(
 def test_restoring_refuses_unknown_arrays_and_length_scales_too_short_to_divide_by(
     models: dict[str, Any], tiny: Dataset
 ) -> None:
-    """With points near the origin, such lengths passed once, and gave NaN."""
+    """Near the origin, such length scales would give NaN."""
     ridge, kernel = (mor_bench.load_method(f"pca-{name}") for name in ("ridge", "kernel-ridge"))
     with pytest.raises(InvalidInputError, match="axes, modes, weights; got axes, modes, other, w"):
         ridge.restore(tiny.scene, {**models["pca-ridge"].arrays_, "other": np.zeros(3)})
@@ -239,7 +239,7 @@ def test_inputs_too_large_for_single_precision_still_reach_a_leaf(
 @pytest.mark.parametrize("order", ["generated", "imported"])
 @pytest.mark.parametrize("name", ["pca-kernel-ridge", "pca-gaussian-process"])
 def test_kernels_take_samples_from_all_load_regions(tiny: Dataset, name: str, order: str) -> None:
-    """Imported snapshots may come region by region: the first hundred of these are of ten."""
+    """Imported snapshots may be ordered by region; the first hundred here cover only ten."""
     train = tiny.train
     if order == "imported":
         train = train[np.argsort(train.regions, kind="stable")]

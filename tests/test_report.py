@@ -1,4 +1,4 @@
-"""The report of a comparison: what it must say, for good and bad results."""
+"""The report of a comparison, for good and bad results."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def add_row(
     latency_ms: float,
     **fields: Any,
 ) -> Row:
-    """Add a row with raw samples and this median relative L2 error; `n_failed` fails samples."""
+    """Add a row with raw samples and this median relative L2 error; `n_failed` samples fail."""
     relative = error * np.linspace(0.5, 1.5, N_TEST)
     relative[: fields.get("n_failed", 0)] = np.inf
     amplitude = np.linspace(0.01, 0.2, N_TEST)
@@ -93,7 +93,7 @@ def comparison(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
 
 @pytest.fixture(scope="module")
 def written(comparison: Comparison) -> list[Path]:
-    """All that `render` writes."""
+    """All files that `render` writes."""
     return render(comparison)
 
 
@@ -118,7 +118,7 @@ def text_of(page: str) -> str:
 
 
 def console_text(comparison: Comparison, width: int = 200, analysis: Analysis | None = None) -> str:
-    """Console output of a comparison."""
+    """Return the console output of a comparison."""
     stream = io.StringIO()
     print_tables(comparison, Console(file=stream, width=width), analysis)
     return stream.getvalue()

@@ -1,4 +1,4 @@
-"""A sandboxed process: what it cannot see, how its failures are reported, and that it ends."""
+"""A sandboxed process: hidden files, reports of failures, and its end."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def server() -> Iterator[ForkServer | None]:
 def ask_fit(
     process: SandboxedProcess, name: str, folder: Path, limit_s: float = 60.0, **parameters: Any
 ) -> dict[str, Any]:
-    """Let a process fit a class of `tests.third_party` that needs no samples."""
+    """Fit a class of `tests.third_party` that needs no samples in a process."""
     surrogate, model = f"tests.third_party:{name}", folder / "model.safetensors"
     request = FitRequest(surrogate, parameters, folder, model, 1, limit_s)
     return process.ask("fit", limit_s, request=request)
@@ -126,7 +126,7 @@ def test_a_sealed_folder_cannot_be_seen_in_any_way(
         warnings = ask_fit(process, "Peeker", tmp_path, folders=[str(cache)])["warnings"]
     (warning,) = (text for text in warnings if text.startswith("saw "))
     seen = {item.split()[0] for item in json.loads(warning.removeprefix("saw "))}
-    # Programs are never allowed: they would not be under the seal.
+    # Programs are never allowed, because the sandbox would not cover them.
     assert seen == (set() if sealed else {"_list", "_open", "_hdf5", "_load"})
 
 

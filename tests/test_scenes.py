@@ -152,7 +152,7 @@ def on_surface(surface: str, cells: list[int], unit_m: float = 1.0, **loads: Any
 
 
 def test_a_users_surface_becomes_a_scene_from_any_folder(tmp_path: Path) -> None:
-    """A cube of 2 cm, in centimetres, with its lowest corner at (1, 0, 0)."""
+    """The surface is a cube of 2 cm, in centimetres, with its lowest corner at (1, 0, 0)."""
     cube = box_mesh((2.0, 2.0, 2.0), (1, 1, 1))
     corners = triangles_of(np.add(cube.points, [1.0, 0, 0])[cube.boundary_facets])
     cubes, loads = [], {"patch_area_m2": 1e-4, "magnitude_n": [0.0, 1e-3], "region": "z-max"}

@@ -143,7 +143,7 @@ WORK: dict[str, Callable[[float], float]] = {
 def test_the_search_finds_the_least_work_with_few_trials(
     need: float, monkeypatch: pytest.MonkeyPatch, tiny: Dataset
 ) -> None:
-    """Where error and work are monotone in every knob, against trying all."""
+    """With monotone error and work, the choice equals that of an exhaustive search."""
     tried: list[Mapping[str, Any]] = []
 
     def score(knobs: Mapping[str, Any]) -> Score:
@@ -325,7 +325,7 @@ def test_a_cached_fit_depends_on_the_need_only_if_sizes_are_chosen(
 def test_a_method_that_needs_no_equations_is_sized_on_imported_samples(
     tiny: Dataset, cache: Path
 ) -> None:
-    """As other programs' samples come: forces on all nodes, maybe with regions, and no material."""
+    """Such samples have forces on all nodes and no material; load regions are optional."""
     imported = replace(tiny.train, loads=NodalLoads(tiny.train.forces, tiny.train.loads.patches))
     for (fitted, held), (same_fitted, same_held) in zip(
         validation_folds(imported), validation_folds(tiny.train), strict=True
@@ -343,7 +343,7 @@ def test_a_method_that_needs_no_equations_is_sized_on_imported_samples(
 
 @pytest.mark.slow
 def test_only_errors_of_the_requested_nodes_decide(tiny: Dataset) -> None:
-    """Elsewhere a reduced method answers nothing, which is no error."""
+    """A reduced method predicts nothing at other nodes, which is no error."""
     needs = tiny.scene.spec.needs.model_copy(update={"outputs": "x-max", "error": 0.1})
     scene = replace(tiny.scene, spec=tiny.scene.spec.model_copy(update={"needs": needs}))
     method = PODGalerkin("auto", 1e-4).fit(scene, replace(tiny.train, scene=scene))

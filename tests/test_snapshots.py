@@ -1,4 +1,4 @@
-"""Splits and named test sets: what is kept apart, and datasets as they are read."""
+"""Splits, named test sets, and the reading of datasets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Polynomials of high degree in few coordinates: their terms, and what choosing them gains."""
+"""Polynomials of high degree in few coordinates: their terms, and the gain from choosing them."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ CASES: dict[str, tuple[str, dict[str, Any], float]] = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_single_query_is_accurate(case: str, tiny: Dataset, benchmark: BenchmarkFixture) -> None:
-    """The test load that displaces most, in a load region that training has not seen."""
+    """The load is the test load with the largest displacement, in an unseen load region."""
     name, parameters, bound = CASES[case]
     try:
         method = mor_bench.load_method(name, **parameters)
@@ -115,7 +115,7 @@ def seconds_per_query(method: Surrogate, force: NDArray[np.float64]) -> float:
 
 
 def ratio_of_times(baseline: Surrogate, method: Surrogate, force: NDArray[np.float64]) -> float:
-    """Median seconds of the baseline over those of the method, which take turns."""
+    """Return the ratio of median times, baseline to method, timed in turns."""
     rounds = [
         (seconds_per_query(baseline, force), seconds_per_query(method, force))
         for _ in range(ROUNDS)
@@ -132,7 +132,7 @@ def test_a_method_is_faster_than_the_baseline(
     cache: Path,
     benchmark: BenchmarkFixture,
 ) -> None:
-    """At the median load of 64."""
+    """Both are timed at the median load of 64."""
     scene = mor_bench.load_scene(race.scene)
     drawn = draw_loads(scene, 0, 64)
     force = drawn.nodal_forces(scene.patch_weights)[

@@ -1,4 +1,4 @@
-"""The store: nothing lost, nothing doubled, no damage unnoticed, and no work done twice."""
+"""The store loses and repeats nothing, and notices all damage."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ SPEC = load_generated_spec("beam-tiny")
 
 @pytest.fixture(scope="module")
 def original(cache: Path, tiny: Dataset) -> Path:
-    """The folder of beam-tiny; not to be changed."""
+    """The folder of beam-tiny; tests must not change it."""
     return dataset_folder(SPEC, cache)
 
 

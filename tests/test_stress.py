@@ -1,4 +1,4 @@
-"""The hard cases: each method meets those that concern it, and each notices what goes wrong."""
+"""The hard cases: each method meets the relevant ones, and each case notices its errors."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def everything(cache: Path) -> StressResults:
 
 
 def tried(scenes: Scenes, spec: MethodSpec, names: Sequence[str] = ()) -> list[CaseResult]:
-    """The results of a method's cases, tried in this process."""
+    """Return the results of a method's cases, run in this process."""
     subject = Subject(spec, "quick", scenes)
     found = cases_for(subject, names or [case.name for case in CASES])
     return [attempt(case, subject, obstacle) for case, obstacle in found]
@@ -218,7 +218,7 @@ COLUMNS = "duplicated and badly scaled columns"
 
 @dataclass(frozen=True)
 class Plant:
-    """A bug: a method and a case that must notice that a name of a module has been replaced."""
+    """A bug: a replaced name of a module, and the method and case that must notice it."""
 
     method: str
     case: str

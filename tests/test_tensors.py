@@ -138,7 +138,7 @@ def test_an_inverted_answer_is_refused(coarse: Dataset, r: int) -> None:
 
 
 def test_the_cost_of_a_query_does_not_depend_on_the_mesh(coarse: Dataset) -> None:
-    """Its counted work is the same on beam-fine, which has 18 times the unknowns."""
+    """The counted work is the same on beam-fine, which has 18 times the unknowns."""
     counts = []
     fine = mor_bench.load_scene("beam-fine")
     for scene in (coarse.scene, fine):

@@ -1,4 +1,4 @@
-"""Trained methods in a comparison: seconds to fill, seeds, checkpoints and loss curves."""
+"""Trained methods in a comparison: given seconds, seeds, checkpoints and loss curves."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ OUT_OF_TIME = "OutOfTimeError: all iterations would take {} h; the limit is"
 
 @pytest.fixture(scope="module")
 def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A cache of this module alone, because kept fits are counted."""
+    """A cache of this module alone, because tests count cached fits."""
     return tmp_path_factory.mktemp("cache")
 
 
@@ -194,7 +194,7 @@ def test_a_damaged_checkpoint_is_dropped_and_the_time_before_a_stop_counts(
     with pytest.raises(MethodFailedError, match="the limit of 120 s; it was stopped after 130 s"):
         fit_configuration(stopped, 120.0)
     assert stopped.checkpoint.exists()
-    # The checkpoint is damaged, so the time that it had taken is lost with it.
+    # The checkpoint is damaged, so its training time is lost too.
     assert fit_configuration(stopped, 200.0).fit_s < 70.0
 
 

@@ -170,7 +170,7 @@ def test_another_mesh_takes_only_weights_that_keep_their_meaning(
     if name in ("mesh-graph-net", "umesh-small"):
         return
     knobs, path = {}, files[name]
-    if name == "fno":  # of a grid that has more wave numbers
+    if name == "fno":  # for a grid with more wave numbers
         knobs, path = {"modes": 4}, tmp_path / "fno.safetensors"
         make(name, **knobs).fit(tiny.scene, tiny.train[:12]).save(path)
     with pytest.raises(

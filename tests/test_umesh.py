@@ -47,13 +47,13 @@ IMPROVED: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def data(cache: Path) -> Dataset:
-    """beam-tiny, 7×3×3 nodes, whose axes one halving pads; split by sample, as in the paper."""
+    """beam-tiny, 7×3×3 nodes, which one halving pads; split by sample, as in the paper."""
     return mor_bench.load_dataset("beam-tiny", split="sample", cache=cache, workers=1)
 
 
 @pytest.fixture(scope="module")
 def irregular() -> tuple[Snapshots, Snapshots]:
-    """Training and test samples on a mesh that lies in no regular grid."""
+    """Training and test samples on an irregular mesh."""
     samples = irregular_samples(100)
     return samples[:80], samples[80:]
 
@@ -80,7 +80,7 @@ def fitted_irregular(irregular: tuple[Snapshots, Snapshots]) -> Any:
 
 
 def mean_error(method: Any, samples: Snapshots) -> float:
-    """Mean absolute error per dof, relative to that of predicting no displacement."""
+    """Return the mean absolute error per dof, relative to that of zero displacement."""
     errors = np.abs(method.predict(samples.forces) - samples.displacements)
     return float(errors.mean() / np.abs(samples.displacements).mean())
 
@@ -113,7 +113,7 @@ def test_the_number_of_weights_is_that_of_the_paper(channels: int, steps: int) -
 
 
 def test_the_network_is_that_of_the_paper_with_skip_connections() -> None:
-    """Written out: encoder, bottom, decoder that concatenates the encoder's features, head."""
+    """The reference has an encoder, a bottom, a decoder with the encoder's features, and a head."""
     from torch.nn import functional
 
     network = new_network(4, 2, torch.Generator().manual_seed(0))
@@ -190,7 +190,7 @@ def test_values_and_gradients_at_nodes_equal_those_of_the_dense_matrix(regular: 
 
 
 def test_displacements_on_the_grid_are_means_of_the_nodes_around() -> None:
-    """A constant field stays constant wherever there is body, and is zero beside it."""
+    """A constant field stays constant in the body, and is zero outside."""
     mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
     grid = padded_grid(grid_map(mesh), 1)
     values = grid.displacements_to_grid(torch.ones(2, mesh.n_nodes, 3))
@@ -206,7 +206,7 @@ def test_displacements_on_the_grid_are_means_of_the_nodes_around() -> None:
 def test_the_loss_is_the_mean_square_over_the_components_of_all_nodes(
     regular: bool, loss: str, data: Dataset, irregular: tuple[Snapshots, Snapshots]
 ) -> None:
-    """Before the first step, on one batch of all samples; padding does not enter."""
+    """The loss is that before the first step, of one batch of all samples, without padding."""
     samples = data.train[:20] if regular else irregular[0][:20]
     method = fit(samples, iterations=1, batch_size=20, loss=loss)
     grid = padded_grid(grid_map(samples.scene.mesh), 1)
@@ -311,7 +311,7 @@ def test_zero_force_gives_exactly_zero_displacement_if_requested(
 
 
 def test_a_mirrored_solution_is_a_solution(data: Dataset) -> None:
-    """beam-tiny is held at an end and loaded on its top: only left and right are alike."""
+    """beam-tiny is fixed at one end and loaded on top, so only left and right are symmetric."""
     (mirror,) = mirrors(data.scene)
     assert mirror.axis == 1
     np.testing.assert_array_equal(mirror.nodes[mirror.nodes], np.arange(data.scene.mesh.n_nodes))
@@ -326,7 +326,7 @@ def test_a_mirrored_solution_is_a_solution(data: Dataset) -> None:
 
 @pytest.mark.slow
 def test_mirror_images_teach_the_other_half(data: Dataset) -> None:
-    """Trained on loads of one half; without the images the mirrored half is predicted worse."""
+    """Training on one half without mirror images predicts the other half worse."""
     (mirror,) = mirrors(data.scene)
     y = data.scene.mesh.points[:, 1]
     left, right = (

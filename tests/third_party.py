@@ -1,4 +1,4 @@
-"""Third parties' methods: honest ones, broken ones, and ones that look for the test set."""
+"""Methods of third parties: honest ones, broken ones, and ones that search for the test set."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Zero(mor_bench.Surrogate):
 
 
 class Slowed(FullFEM):
-    """The full-order model, which then does nothing for a part of the time that it took."""
+    """The full-order model, followed by a pause in proportion to its time."""
 
     def __init__(self, tolerance: float = 1e-4, part: float = 0.0) -> None:
         super().__init__(tolerance)
@@ -57,7 +57,7 @@ class Slowed(FullFEM):
 
 
 class Recorder(mor_bench.Surrogate):
-    """Writes down what it is given, and then spoils it; overrides `fit` and `predict` only."""
+    """Records its inputs, then overwrites them; overrides `fit` and `predict` only."""
 
     def __init__(self, notes: str, spoil: str = "test") -> None:
         self.notes = notes
@@ -97,7 +97,7 @@ class Plain:
 
 
 class Broken(Zero):
-    """Fits, and then does not do what it should."""
+    """Fits, and then misbehaves in a chosen way."""
 
     def __init__(self, how: str = "crash") -> None:
         self.how = how
@@ -112,7 +112,7 @@ class Broken(Zero):
             os.kill(os.getpid(), signal.SIGSEGV)
         if self.how == "end":
             os._exit(7)
-        if self.how == "orphan":  # a child that would hold the pipe
+        if self.how == "orphan":  # a child that would keep the pipe open
             if os.fork() == 0:
                 time.sleep(60)
             os._exit(7)
@@ -150,7 +150,7 @@ class Broken(Zero):
 
 
 class Poison(Zero):
-    """Writes over the training samples where they lie."""
+    """Overwrites the training samples in place."""
 
     needs_snapshots = True
 
@@ -161,7 +161,7 @@ class Poison(Zero):
 
 
 class Leaky(Zero):
-    """Passes the forces that it is asked for on to its next configuration."""
+    """Passes the forces of its queries on to its next configuration."""
 
     def __init__(self, path: str, n: int = 1) -> None:
         self.path = path
@@ -179,7 +179,7 @@ class Leaky(Zero):
 
 
 class Peeker(Zero):
-    """Looks for the test set in memory and on disk while it is fitted; warns of what it finds."""
+    """Searches memory and disk for the test set during the fit; warns of every find."""
 
     def __init__(self, folders: list[str], dataset: str = "beam-tiny") -> None:
         self.folders = folders
@@ -244,7 +244,7 @@ class Peeker(Zero):
 
 
 def _known(folder: Path) -> list[str]:
-    """Names that someone who knows this package can guess, without listing the folder."""
+    """Return names that can be guessed from the source, without listing the folder."""
     return [
         line
         for line in os.environ.get("MOR_BENCH_TEST_SHARDS", "").split(os.pathsep)

@@ -1,4 +1,4 @@
-"""Methods without snapshots that are fitted in each process in which they are timed."""
+"""Methods without snapshots, fitted in each process that times them."""
 
 from __future__ import annotations
 

@@ -20,17 +20,17 @@ REFERENCE_TOLERANCE = 1e-11
 
 
 def median_load(scene: Any) -> Any:
-    """Forces on the free dofs, (n_free,) N."""
+    """Return the median load on the free dofs, (n_free,) N."""
     drawn = draw_loads(scene, 0, N_DRAWN)
     median = int(np.linalg.norm(drawn.vectors.reshape(N_DRAWN, -1), axis=1).argsort()[N_DRAWN // 2])
     return drawn.nodal_forces(scene.patch_weights)[median].ravel()[scene.free_dofs]
 
 
 class FullOrder:
-    """One call each, from rest, at the median load and the deformed state that it leads to.
+    """One call of each operation, at the median load or in its deformed state.
 
-    The scenes take different kernels: two sizes of Saint Venant-Kirchhoff in H8, neo-Hookean with
-    selective integration, T4.
+    The scenes use different kernels: two sizes of Saint Venant-Kirchhoff in H8, neo-Hookean with
+    selective integration, and T4.
     """
 
     params = ("beam-tiny", "beam-coarse", "beam-nearly-incompressible", "liver-tet")

@@ -45,7 +45,7 @@ def model_file(dataset: str, method: str) -> Path:
 
 
 def record_file(dataset: str, method: str) -> Path:
-    """What `measure` found, or why there is no model."""
+    """Return the path of the results of `measure`, or of the reason for a missing model."""
     return Path(f"{dataset}-{method}.json")
 
 
@@ -113,7 +113,7 @@ class Query(_Fitted):
 
 
 class NetworkQuery(_Fitted):
-    """U-Mesh's query by each of its back ends."""
+    """A query of U-Mesh with each of its back ends."""
 
     params = (tuple(LIMITS), ("eager", "packed", "packed-bfloat16", "onnx"))
     param_names = ("dataset", "backend")
@@ -140,7 +140,7 @@ class NetworkQuery(_Fitted):
 
 
 class Fit(_Fitted):
-    """Learning from the training part, and the size of what is learned."""
+    """Training time, and the size of the model."""
 
     rounds = 1
     number = 1

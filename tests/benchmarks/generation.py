@@ -3,10 +3,9 @@
     python -m tests.benchmarks.generation
     python -m tests.benchmarks.generation --samples 100 --samples 1000 --samples 33600
 
-Each size is generated in a process of its own, by so many workers of one thread. Seconds are the
-whole call's, with the scene and the start of the workers; "long run/s" is the rate beyond the first
-shard, which the parent solves alone. Peak memory is the largest resident set of the parent, which
-also solves the first shard, and of any one worker.
+A new process generates each size with single-threaded workers. Seconds include building the scene
+and starting the workers. The parent solves the first shard alone; "long run/s" is the rate after
+that shard. Peak memory is the largest resident set of the parent or of any worker.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ SIZES = (100, 300, 1000)
 
 
 def measure(dataset: str, samples: int, workers: int) -> dict[str, Any]:
-    """Seconds and peak memory of one generation, in this process and its workers."""
+    """Return seconds and peak memory of one generation, in this process and its workers."""
     from mor_bench.snapshots.generate import SHARD_SIZE, dataset_folder, generate
     from mor_bench.specs import load_generated_spec
 

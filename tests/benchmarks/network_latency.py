@@ -2,9 +2,9 @@
 
     python -m tests.benchmarks.network_latency --out network-latency.csv
 
-The networks have random weights, of which times do not depend. All back ends of one network take
-turns, so that what else the machine does slows all; each row has the median, the 95th percentile
-and the shortest of all queries, network only.
+The networks have random weights, because times do not depend on them. All back ends of a network
+take turns, so that other load on the machine affects all of them. Each row has the median, the 95th
+percentile and the minimum over all queries, for the network alone.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ COLUMNS = (
 def latencies(
     shape: tuple[int, int, int], channels: int, steps: int, threads: int, turns: int, queries: int
 ) -> dict[str, list[float]]:
-    """Milliseconds of single queries by each back end, in turns."""
+    """Return milliseconds of single queries with each back end, in turns."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
@@ -84,7 +84,7 @@ def table(
     turns: int,
     queries: int,
 ) -> Iterator[dict[str, Any]]:
-    """Rows of `COLUMNS`."""
+    """Return rows with the columns `COLUMNS`."""
     for scene in scenes:
         loaded = load_scene(load_dataset_spec(scene))
         grid = grid_map(loaded.mesh, loaded.spec.grid_nodes)

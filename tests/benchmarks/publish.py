@@ -3,9 +3,9 @@
     python -m tests.benchmarks.publish
     python -m http.server --directory .asv/html
 
-As `asv publish`, but its page loads jQuery, Flot and Bootstrap from copies in the folder instead of
-from the internet, and comparisons that `mor-bench export asv` wrote are shown even if `asv run` has
-rewritten its list of benchmarks since.
+Unlike with `asv publish`, the page loads jQuery, Flot and Bootstrap from copies in the folder. It
+shows comparisons from `mor-bench export asv` even if `asv run` has since rewritten its list of
+benchmarks.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ _TAG = re.compile(
 
 
 def make_offline(folder: Path) -> None:
-    """Make the page of a published folder load copies.
+    """Make the page of a published folder load local copies.
 
     Raises
     ------
     MorBenchError
-        If it loads something of which there is no copy, as a newer asv's may.
+        If the page loads a file without a local copy, which may happen with a newer asv.
     """
     page = folder / "index.html"
 
@@ -64,7 +64,7 @@ def make_offline(folder: Path) -> None:
 
 
 def publish(configuration: Path) -> Path:
-    """Publish what an asv.conf.json describes; returns the folder."""
+    """Publish the results of an asv.conf.json; return the folder."""
     from asv.commands.publish import Publish
     from asv.config import Config
 

@@ -2,9 +2,9 @@
 
     python -m tests.benchmarks.scaling
 
-Each size is a cantilever of the beams' proportions, material and loads, in a process of its own on
-one thread. Set-up is the mesh, the pattern and the rest-state factor, from the import on; a solve
-is the median over the loads.
+Each size is a cantilever like the shipped beams, in a process of its own on one thread. The set-up
+time covers imports, mesh, sparsity pattern and rest-state factor. The solve time is the median over
+the loads.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ N_LOADS = 5
 
 
 def measure(across: int) -> dict[str, Any]:
-    """Set-up, solve and peak memory of one size, in this process."""
+    """Return set-up time, solve time and peak memory of one size, in this process."""
     import mor_bench
     from mor_bench.mechanics.model import FullOrderModel
     from mor_bench.snapshots.sampling import draw_loads

@@ -1,4 +1,4 @@
-"""Laws and elements that the verification tests go through, and solutions of their own."""
+"""Laws and elements of the verification tests, and independent solutions."""
 
 from __future__ import annotations
 

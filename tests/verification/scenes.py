@@ -1,4 +1,4 @@
-"""Scenes with other laws and elements than shipped, loads on them, and checks of solutions."""
+"""Scenes with further laws and elements, loads on them, and checks of solutions."""
 
 from __future__ import annotations
 

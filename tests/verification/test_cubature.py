@@ -71,7 +71,7 @@ def test_nnls_of_hard_columns_meets_its_optimality_conditions(kind: str, toleran
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_converged_nnls_meets_all_optimality_conditions(kind: str) -> None:
-    """On a target out of reach; scipy's solution has the same residual."""
+    """The target cannot be reached; the solution of SciPy has the same residual."""
     matrix, rng = hard_matrix(kind)[:, :40], np.random.default_rng(3)
     matrix[:, 30:] = matrix[:, :10] if kind == "duplicated columns" else matrix[:, 30:]
     target = rng.normal(size=60)
@@ -113,7 +113,7 @@ def test_nnls_of_a_zero_target_has_zero_weights() -> None:
 
 
 def test_the_updated_factor_remains_the_factor_of_its_columns() -> None:
-    """600 changes to some of 300 nearly dependent columns."""
+    """The test makes 600 changes to some of 300 nearly dependent columns."""
     rng = np.random.default_rng(0)
     matrix = rng.normal(size=(120, 60)) @ rng.normal(size=(60, 300)) + 1e-4 * rng.normal(
         size=(120, 300)

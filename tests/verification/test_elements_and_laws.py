@@ -1,4 +1,4 @@
-"""Every law on every element: laws of mechanics and closed forms."""
+"""Every material law on every element, against laws of mechanics and closed forms."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_stress_of_homogeneous_states_matches_the_closed_forms(
 ) -> None:
     p, energy = homogeneous(STATES[state], LAWS[law], *kind)
     np.testing.assert_allclose(p, piola(LAWS[law], STATES[state]), rtol=1e-10, atol=1e-9)
-    # The energy is the stress's work on the straight way from rest.
+    # The energy is the work of the stress along a straight path from rest.
     places, weights = np.polynomial.legendre.leggauss(12)
     way = np.eye(3) + (0.5 + 0.5 * places[:, None, None]) * (STATES[state] - np.eye(3))
     work = 0.5 * weights @ np.einsum("nij,ij->n", piola(LAWS[law], way), STATES[state] - np.eye(3))
@@ -136,7 +136,7 @@ def test_stress_of_homogeneous_states_matches_the_closed_forms(
 
 @pytest.mark.parametrize("law", list(LAWS))
 def test_the_tangent_is_exact_where_two_stretches_are_equal(law: str) -> None:
-    """There the derivative of the principal stresses is a limit."""
+    """At equal stretches the derivative of the principal stresses is a limit."""
     model = free_assembler(box_mesh((1.0, 1.0, 1.0), (2, 2, 2)), LAWS[law])
     points = box_mesh((1.0, 1.0, 1.0), (2, 2, 2)).points
     u, direction = (
@@ -167,7 +167,7 @@ def test_hydrostatic_stress_of_saint_venant_kirchhoff_matches_its_closed_form(
 def test_stress_of_saint_venant_kirchhoff_is_least_at_one_over_root_three(
     kind: tuple[str, bool],
 ) -> None:
-    """In confined compression, uniaxial stress and hydrostatic compression alike."""
+    """This holds in confined compression, uniaxial stress and hydrostatic compression."""
     law, h = SaintVenantKirchhoff(500.0, 0.4), 1e-4
 
     def side(alpha: float) -> float:
@@ -232,7 +232,7 @@ def test_every_law_is_hookes_at_small_strains(law: str) -> None:
 
 def test_the_vectorised_kernel_is_the_general_one() -> None:
     class Renamed(NeoHookean):
-        """Saint Venant-Kirchhoff by its number, so that the general kernel evaluates it."""
+        """Saint Venant-Kirchhoff under another class, so that the general kernel evaluates it."""
 
         law = 0
 

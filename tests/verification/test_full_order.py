@@ -1,4 +1,4 @@
-"""Solvers of the full-order model: they agree, and notice what has no stable equilibrium."""
+"""Solvers of the full-order model agree, and notice loads without a stable equilibrium."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_every_solver_ends_at_the_same_equilibrium(
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_every_solver_notices_inversion_and_cuts_back(solver: SolverName) -> None:
-    """Three times the load that crushes the tip of the coarse beam."""
+    """The load is three times that which crushes the tip of the coarse beam."""
     if solver == "pardiso":
         pytest.importorskip("pypardiso", reason="MKL is an extra")
     scene = mor_bench.load_scene("beam-tiny")

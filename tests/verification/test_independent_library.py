@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 def felupe_law(scene: Scene) -> Any:
-    """The scene's law, its energy written in C."""
+    """Return the scene's law, with its energy as a function of C."""
     assert scene.material is not None
     models, p = tensortrax.models.hyperelastic, scene.material.parameters
     name = scene.generated.material.law
@@ -44,7 +44,7 @@ def felupe_law(scene: Scene) -> Any:
 
 
 def felupe_solution(scene: Scene, forces: Array) -> Array:
-    """Displacements, (n_nodes, 3) m."""
+    """Return displacements, (n_nodes, 3) m."""
     tetrahedra = scene.mesh.cells.shape[1] == 4
     mesh = felupe.Mesh(scene.mesh.points, scene.mesh.cells, "tetra" if tetrahedra else "hexahedron")
     field = felupe.FieldContainer(
@@ -68,7 +68,7 @@ def felupe_solution(scene: Scene, forces: Array) -> Array:
 
 
 def compare(scene: Scene, n_loads: int) -> None:
-    """Compare solutions for random loads on random patches; they agree to 1e-8."""
+    """Compare solutions for random loads on random patches, to 1e-8."""
     model, rng, weights = (
         FullOrderModel(scene),
         np.random.default_rng(7),

@@ -1,4 +1,4 @@
-"""Full-order models that warn of their scene, and inputs that they refuse."""
+"""Warnings of full-order models about their scene, and refused inputs."""
 
 from __future__ import annotations
 

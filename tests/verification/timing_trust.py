@@ -2,9 +2,9 @@
 
     python -m tests.verification.timing_trust [comparisons]
 
-It times identical code under two names, code that is slowed by a tenth, reruns against the stated
-intervals, and a method beside a busy process. It prints four shares and exits with 1 if one misses
-its target. A hundred comparisons take about a quarter of an hour.
+It times identical code under two names, code slowed by 10 %, reruns, and a method beside a busy
+process. It prints four shares and exits with 1 if one misses its target. A hundred comparisons take
+about a quarter of an hour.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def _matrix(timings: dict[str, Timing], folder: Path) -> dict[tuple[str, str], s
 def comparisons(n: int, scene: Scene, folder: Path) -> tuple[int, int]:
     """Count wrong and right verdicts of the report's matrix in n comparisons.
 
-    The first count is of identical code that is called different, the second of code slowed by a
-    tenth that is called slower.
+    The first count is of identical code called different. The second is of code slowed by 10 % and
+    called slower.
     """
     false, found = 0, 0
     for start in range(0, n, AT_ONCE):
@@ -113,7 +113,7 @@ def comparisons(n: int, scene: Scene, folder: Path) -> tuple[int, int]:
 
 
 def reruns(scene: Scene, folder: Path, protocol: str) -> float:
-    """The share of medians, measured again, in the interval that the measurement before states."""
+    """Return the share of repeated medians that lie in the interval of the previous measurement."""
     runs = [
         {
             name: timing.samples
@@ -132,7 +132,7 @@ def reruns(scene: Scene, folder: Path, protocol: str) -> float:
 
 
 def beside_a_busy_process(scene: Scene, folder: Path) -> bool:
-    """Whether a timing is called unstable beside a process that computes, and is not without it."""
+    """Return whether a timing is called unstable beside a busy process, and only then."""
     methods = {"fem": RERUN_METHODS["fem"]}
     quiet = why_unstable(_measured(scene, folder, methods, 0)["fem"], 1)
     busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
