@@ -7,6 +7,6 @@ comparison lives in `mor_bench.measure`.
 Start reading at `case` (the classes), then `method_cases` (for any method), `mechanics_cases` (for
 the full-order model) and `reduction_cases` (for the algebra behind reduced bases).
 
-To add a case, write a function from a `Subject` to an `Outcome`, decorate it with `hard_case`, and
-name it in the ``CASES`` of its file.
+To add a case, write a function from a `Subject` to an `Outcome` and decorate it with `hard_case`.
+Then name it in the ``CASES`` of its file.
 """

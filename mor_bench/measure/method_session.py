@@ -59,7 +59,7 @@ PRELOADED = (
 
 @dataclass(frozen=True)
 class FitRequest:
-    """What a session needs to fit a method.
+    """Inputs of a fit in a session.
 
     Attributes
     ----------

@@ -68,7 +68,7 @@ class _Probes:
 
     @property
     def convex(self) -> bool:
-        """Whether no combination of the probes has negative curvature."""
+        """True if no combination of the probes has negative curvature."""
         probes, products = np.array(self._probes), np.array(self._products)
         matrix = probes @ products.T
         scale = np.sqrt(np.abs(np.diag(matrix)))

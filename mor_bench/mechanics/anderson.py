@@ -71,7 +71,7 @@ class Anderson:
 
     @property
     def convex(self) -> bool:
-        """Whether the force rose along every kept step, so that no negative curvature was seen."""
+        """True if the force rose along every kept step: no negative curvature was seen."""
         return bool((self._curvatures > 0).all())
 
     def advance(self, q: Array, correction: Array, residual: Array) -> Array:

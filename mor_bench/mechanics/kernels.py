@@ -6,10 +6,10 @@ arrays: component ``i`` of lane ``l`` is at ``i * LANES + l``. With 2-D arrays, 
 aliasing and does not vectorise. Padding lanes have zero gradients and weights, and the dummy dof
 behind the last real one.
 
-Symbols: ``H`` = du/dX, ``F`` = I + H, ``E`` = (FᵀF - I)/2, ``S`` = λ tr(E) I + 2μE, ``P`` = FS,
-``g_a`` = dN_a/dX, ``h_a`` = F g_a, ``w`` = Gauss weight times det J. The tangent block of nodes a
-and b, with the isotropic elasticity tensor, is (Bonet & Wood, "Nonlinear Continuum Mechanics for
-FEA", sections 9.4-9.5, in material form)
+Strain: ``H`` = du/dX, ``F`` = I + H, ``E`` = (FᵀF - I)/2. Stress: ``S`` = λ tr(E) I + 2μE, ``P`` =
+FS. Gradients: ``g_a`` = dN_a/dX, ``h_a`` = F g_a. Weight: ``w`` = Gauss weight times det J. Source
+of the tangent block of nodes a and b, with the isotropic elasticity tensor: Bonet & Wood,
+"Nonlinear Continuum Mechanics for FEA", sections 9.4-9.5, in material form.
 
     K_ab = w [ λ h_a ⊗ h_b + μ h_b ⊗ h_a + μ (g_a · g_b) F Fᵀ + (g_a · S g_b) I ].
 
@@ -324,10 +324,10 @@ LEAST_LOWEST = 0.01
 def advance(u, v, force, before, load, mass, control):
     """Take one step of central differences in place, unless the residual is met.
 
-    v ← [(2 - c) v + 2h² M⁻¹ (f - f_int)] / (2 + c), u ← u + v, with v = h u̇ and c = 2h √λ, which
+    v ← [(2 - c) v + 2h² M⁻¹ (f - f_int)] / (2 + c), u ← u + v, with v = h u̇ and c = 2h √λ. This c
     damps the lowest mode critically. λ is the lowest eigenvalue at rest or, if smaller, the
-    Rayleigh quotient v·Δf_int / v·Mv of the last step (Joldes, Wittek, Miller, CMAME 200, 2011,
-    section 3). The step is shortened when the quotient nears the limit of stability.
+    Rayleigh quotient v·Δf_int / v·Mv of the last step. Source: Joldes, Wittek, Miller, CMAME 200,
+    2011, section 3. The step is shortened when the quotient nears the limit of stability.
 
     Parameters
     ----------

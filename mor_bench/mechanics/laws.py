@@ -1,17 +1,17 @@
 """Hyperelastic laws at a quadrature point, and kernels that sum them over cells of any element.
 
-A law is one function ``law(C, parameters, S, D) -> W``. From the right Cauchy-Green tensor C (3, 3)
-and the law's parameters it writes S = 2 dW/dC (3, 3) and D = dS/dE (6, 6), and returns the energy
-density W. S and D are zero on entry. D has the Voigt order 00 11 22 01 02 12 with engineering shear
-strains. To add a law, write the function, give it a number in `evaluate`, and write a parameter
-class in `mor_bench.scene.materials`.
+A law is one function ``law(C, parameters, S, D) -> W``. Its input is the right Cauchy-Green
+tensor C (3, 3) and the law's parameters. It writes S = 2 dW/dC (3, 3) and D = dS/dE (6, 6), and
+returns the energy density W. S and D are zero on entry. D has the Voigt order 00 11 22 01 02 12
+with engineering shear strains. To add a law, write the function, give it a number in `evaluate`,
+and write a parameter class in `mor_bench.scene.materials`.
 
 `general_force` takes one cell after the other: K_ab = w [ B_aᵀ D B_b + (g_a · S g_b) I ], with B_a
-the strain-displacement matrix at F (Bonet & Wood, section 9.4). Saint Venant-Kirchhoff
-on H8 has its own, vectorised kernel.
+the strain-displacement matrix at F (Bonet & Wood, section 9.4). Saint Venant-Kirchhoff on H8 has
+its own, vectorised kernel.
 
-Longer than 400 lines because numba recompiles a function only after a change in its own file, so
-laws and the kernels that call them stay together.
+Longer than 400 lines because numba recompiles a function only after a change in its own file. Laws
+and the kernels that call them hence stay together.
 """
 
 from __future__ import annotations

@@ -142,8 +142,8 @@ class Pardiso:
             self._phase(22, np.zeros(len(self._matrix.indptr) - 1))
         except self._error as error:
             raise NotPositiveDefiniteError from error
-        # MKL reports whole millions of operations. The lower bound for its entries assumes columns
-        # of equal length.
+        # MKL reports whole millions of operations. Columns of equal length give a lower bound for
+        # the number of entries.
         least = self._entries**2 // (2 * self._matrix.shape[0])
         count(
             factorisations=1,

@@ -14,7 +14,7 @@ class LoadSteps:
     increment : float
         Next increment of the load factor.
     reached : float
-        Largest load factor that was solved for.
+        Largest load factor with a solution.
     cuts : int
         Number of halvings.
     """
@@ -30,7 +30,7 @@ class LoadSteps:
 
     @property
     def complete(self) -> bool:
-        """Whether the whole load has been solved for."""
+        """True once the whole load has been solved for."""
         return self.reached == 1.0
 
     def accept(self) -> None:

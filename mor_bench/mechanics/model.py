@@ -222,7 +222,7 @@ class FullOrderModel:
 
     @property
     def turns(self) -> bool:
-        """Whether solves use the rotated rest-state factor."""
+        """True if solves use the rotated rest-state factor."""
         return self.solver in ("auto", "rotated-pcg")
 
     def force(self, q: NDArray[np.float64]) -> State:

@@ -4,7 +4,7 @@ The body is released under the whole load and moves by central differences, with
 and damping, until it rests. No stiffness is assembled or factorised for an answer, and a step costs
 one internal force (Miller, Joldes, Lance, Wittek, Commun. Numer. Meth. Engng 23, 2007; NiftySim:
 Johnsen et al., IJCARS 10, 2015). The mass of a node is a Gershgorin bound of its rows of the
-stiffness at rest, so that all parts of the mesh have the same critical step (Underwood 1983;
+stiffness at rest. All parts of the mesh then have the same critical step (Underwood 1983;
 Joldes, Wittek, Miller, CMAME 200, 2011).
 """
 

@@ -113,8 +113,8 @@ def _remove(q: Any, r: Any, c: Any, position: int, n: int) -> None:
 class ActiveColumns:
     """Least squares on a changing choice of a matrix's columns, with an updated QR factor.
 
-    Columns are scaled to unit norm. Appending one orthogonalises twice, and removing one rotates;
-    both cost O(m p) for p columns of length m.
+    Columns are scaled to unit norm. A new column is orthogonalised twice. Givens rotations remove
+    a column. Both cost O(m p) for p columns of length m.
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ def _appended(columns: ActiveColumns, entering: int) -> Array | None:
 
 
 def _positive(columns: ActiveColumns, x: Array, trial: Array) -> tuple[Array, int]:
-    """Remove columns, along the way from x to the trial, until all coefficients are positive.
+    """Remove columns between x and the trial until all coefficients are positive.
 
     Returns the least-squares coefficients on the remaining columns, and the number of removals.
     """
@@ -289,7 +289,7 @@ def _positive(columns: ActiveColumns, x: Array, trial: Array) -> tuple[Array, in
 
 
 def _check(found: SparseWeights, tolerance: float) -> None:
-    """Raise `CubatureError` if weights miss the tolerance or, on their columns, the optimum."""
+    """Raise `CubatureError` if weights miss the tolerance or the optimality conditions."""
     iterations = found.iterations
     if found.relative_residual > tolerance * (1 + 1e-9) > 0:
         raise CubatureError(
@@ -321,8 +321,8 @@ def ecsw_system(
     """Return the ECSW training matrix G, or a shorter one with the same least-squares problem.
 
     G[(s, i), e] = φ_iᵀ f_e(Φ q_s), (n_snapshots r, n_cells); the target is G·1. The triangle R of
-    G = QR has the same problem, because ‖Gξ - G1‖ = ‖Rξ - R1‖. QR pays from 4 rows per cell. If G
-    has more than ``max_entries``, blocks of rows are compressed as they come.
+    G = QR has the same problem, because ‖Gξ - G1‖ = ‖Rξ - R1‖. QR pays off above 4 rows per cell.
+    If G has more than ``max_entries``, blocks of rows are compressed as they come.
 
     Parameters
     ----------

@@ -96,8 +96,8 @@ def derivative_basis(
     """Return an orthonormal basis of linear modes and modal derivatives, (n_free, n_modes).
 
     The derivatives are those of the first n_linear modes. All enter one singular value
-    decomposition with their size in the second-order expansion of a response,
-    u = Σ qᵢφᵢ + ½ Σ qᵢqⱼψᵢⱼ, at the coordinates' root mean square.
+    decomposition, scaled as in the second-order expansion u = Σ qᵢφᵢ + ½ Σ qᵢqⱼψᵢⱼ. The coordinates
+    there have their root mean square.
     """
     linear = linear_modes(scene, model)
     n_linear = min(n_linear, linear.modes.shape[1])

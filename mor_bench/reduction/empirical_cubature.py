@@ -17,11 +17,13 @@ EXACT = 1e-8
 
 
 def cell_basis(matrix: Array, tolerance: float) -> Array:
-    """Return leading right singular vectors that leave at most ``tolerance`` of the Frobenius norm.
+    """Return leading right singular vectors; the others contribute at most ``tolerance``.
 
-    Random combinations of rows give the range block by block, with one step of subspace iteration
-    (Halko, Martinsson, Tropp, SIAM Review 53, 2011, algorithms 4.3 and 4.4), until the rest is
-    small enough. The singular vectors are then those of a small matrix.
+    The tolerance is relative to the matrix' Frobenius norm.
+
+    Random combinations of rows give the range block by block, with one step of subspace iteration,
+    until the rest is small enough. The singular vectors are then those of a small matrix. Source:
+    Halko, Martinsson, Tropp, SIAM Review 53, 2011, algorithms 4.3 and 4.4.
 
     Parameters
     ----------
@@ -72,7 +74,7 @@ def cell_basis(matrix: Array, tolerance: float) -> Array:
 def empirical_cubature(
     matrix: Array, tolerance: float, max_iterations: int | None = None
 ) -> SparseWeights:
-    """Find weights that integrate the training matrix' leading singular vectors, and 1, exactly.
+    """Find weights that exactly integrate 1 and the training matrix' leading singular vectors.
 
     Hernández, Caicedo, Ferrer: Dimensional hyper-reduction of nonlinear finite element models via
     empirical cubature, CMAME 313 (2017), section 3. The sum of the weights is constrained as in

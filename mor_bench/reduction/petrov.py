@@ -1,9 +1,9 @@
 """A reduced model with interpolated force, and Newton's method for its unsymmetric tangents.
 
 Such a model has no potential. There is no energy to descend on, and no Cholesky factor that
-identifies a stable equilibrium. A solution must have a small residual, det F > 0 at the integrated
-points, and a tangent whose determinant has the sign that it has at rest. A path that meets no
-singular tangent keeps that sign.
+identifies a stable equilibrium. A solution must have a small residual, and det F > 0 at the
+integrated points. The determinant of its tangent must have the same sign as at rest. A path that
+meets no singular tangent keeps that sign.
 """
 
 from __future__ import annotations

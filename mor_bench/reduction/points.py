@@ -5,8 +5,8 @@ F = I + H and the weights w, for any element,
 
     f_m = Σ w G_m : P(F),      K_mk = Σ w G_m : A(F) : G_k,      A = dP/dF.
 
-Work and memory depend only on the numbers of points and modes. Test functions that differ from the
-modes make the tangent unsymmetric; DEIM needs that.
+Work and memory depend only on the numbers of points and modes. DEIM needs test functions that
+differ from the modes; they make the tangent unsymmetric.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
 
 Alternating least squares find one term after the other, on the residual of the earlier ones. After
 each term, all vectors X_k are fitted again together. This is the progressive proper generalised
-decomposition with update (Nouy, CMAME 199, 2010, section 3), fitted to samples as in the sparse,
-non-intrusive one (Ibáñez et al., Complexity 2018, section 3).
+decomposition with update (Nouy, CMAME 199, 2010, section 3). It is fitted to samples as in the
+sparse, non-intrusive one (Ibáñez et al., Complexity 2018, section 3).
 """
 
 from __future__ import annotations

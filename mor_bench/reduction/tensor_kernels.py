@@ -124,7 +124,7 @@ def _back_solve(a, r, x):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def equilibrium(quadratic, cubic, quartic, rest, load, tolerance, q):
-    """Take full Newton steps from the linear response; the end has a positive definite Hessian.
+    """Take full Newton steps from the linear response; accept only a positive definite Hessian.
 
     ``rest`` is the factor at rest. Returns the number of Hessians, negative if they fail.
     """

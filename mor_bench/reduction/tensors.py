@@ -1,6 +1,6 @@
 """The reduced energy of Saint Venant-Kirchhoff as a quartic polynomial, evaluated without a mesh.
 
-With H = Σ qᵢ Hᵢ the displacement gradient of u = Φq, the Green-Lagrange strain is
+The displacement gradient of u = Φq is H = Σ qᵢ Hᵢ. The Green-Lagrange strain is
 E = Σ qᵢ eᵢ + ½ Σ qᵢ qⱼ s_ij, with eᵢ = sym(Hᵢ) and s_ij = sym(HᵢᵀHⱼ). The energy ½ ∫ E:C:E hence
 has degree four in q. Its coefficients are summed over the mesh once (Barbič and James: Real-time
 subspace integration for St. Venant-Kirchhoff deformable models, ACM Trans. Graph. 24, 2005). No

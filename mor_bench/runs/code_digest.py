@@ -55,8 +55,8 @@ def measuring_digest() -> str:
 
     It covers `mor_bench.measure` and the two modules of this package that call it.
 
-    It is part of the names of cached scores and timings, so a new metric or timing rule
-    invalidates them.
+    The names of cached scores and timings contain it, so a new metric or timing rule invalidates
+    them.
     """
     digest = hashlib.sha256()
     runs = [Path(__file__).with_name(name) for name in ("scoring.py", "timing_stage.py")]

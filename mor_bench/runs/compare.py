@@ -35,18 +35,18 @@ def run(
     """Compare methods on datasets.
 
     All specifications are checked first. Each configuration is fitted in a process of its own,
-    which gets the training samples only. Then all are timed beside each other in fresh processes.
-    The cache keeps fits, scores and timings, so a run that was stopped resumes, and another run
-    computes only what is new. A full comparison also scores named test sets, trains with other
+    which gets the training samples only. Then all are timed side by side in fresh processes.
+    The cache keeps fits, scores and timings. A run that was stopped resumes, and another run
+    computes only new results. A full comparison also scores named test sets, trains with other
     seeds and draws learning curves. Discretisation errors come from the records that
     `mor_bench.measure.discretisation_error.refine` left; they are not measured here.
 
     Parameters
     ----------
     datasets, methods : sequences of names or paths of TOML files
-        A dataset may also be a dict with the same keys. By default `CORE_METHODS`, `DATA_METHODS`
-        on imported snapshots, or all methods of the suite with the profile "full". Methods of the
-        option ``suite`` are added.
+        A dataset may also be a dict with the same keys. The default methods are `CORE_METHODS`, or
+        `DATA_METHODS` on imported snapshots. With the profile "full" they are all methods of the
+        suite. Methods of the option ``suite`` are added.
     profile : {"quick", "full"}
         Profile of the method files, with its sweep and budget.
     out : path, optional

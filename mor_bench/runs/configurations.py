@@ -102,7 +102,7 @@ def configurations_of(
 
 
 def may_train(method: MethodSpec) -> bool:
-    """Return whether a method trains; a third party's class is assumed to until it is fitted."""
+    """Return whether a method may train; True for any class of a third party."""
     return _ask_class(method, lambda surrogate: bool(surrogate.trains()), of_others=True)
 
 
@@ -119,7 +119,7 @@ def draws_randomly(configuration: Configuration) -> bool:
 
 
 def _ask_class(method: MethodSpec, question: Callable[[type[Any]], bool], of_others: bool) -> bool:
-    """Ask a class of this package; answer `of_others` for others, False without its extra."""
+    """Ask a class of this package; return `of_others` for others, False if its extra is missing."""
     if not method.surrogate.startswith(OWN):
         return of_others
     try:

@@ -54,7 +54,7 @@ from mor_bench.snapshots.test_sets import available_sets
 from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec
 
 SINGULAR_VALUES = 400
-"""Number of singular values that a figure shows of a large snapshot matrix; all take minutes."""
+"""Limit on the singular values in a figure; computing all of a large matrix takes minutes."""
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ class DatasetRun:
         self.context.listener.starting(self.spec.name, label, number, self.part.n * n)
 
     def _remote(self, pool: Pool | None, configuration: Configuration) -> RemoteFit | None:
-        """Return a fit on the cluster; None for a third party's class, which it does not have."""
+        """Return a fit on the cluster; None without a cluster or for a third party's class."""
         if pool is None or configuration.method.folder is not None:
             return None
 

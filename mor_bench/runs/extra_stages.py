@@ -183,7 +183,7 @@ def _learning_point(stage: Stage, cached: CachedFit, n: int, row: Row) -> Learni
 
 
 def score_fresh_test_set(stage: Stage, fits: Mapping[str, CachedFit], seed: int) -> None:
-    """Score on a test set that did not exist while anything was fitted."""
+    """Score on a test set that is drawn after all fits."""
     assert isinstance(stage.spec, DatasetSpec)
     by = stage.context.options.split or stage.spec.split.by
     fresh = fresh_test_set(stage.spec, stage.data.scene, by, seed, len(stage.data.test))

@@ -42,7 +42,7 @@ def fit_configuration(
     MethodFailedError
         If the method crashes, hangs, takes too much memory or changes the training samples.
     MorBenchError
-        With the type of the method's own error.
+        If the method raises an error. Its type is the same here.
     """
     if cached.record is not None:
         return cached.record

@@ -95,8 +95,9 @@ def fit(
     SpecError
         If the dataset, the method or a parameter is not valid.
     InvalidInputError
-        If an option is unknown or out of range, a training option is given to a method without
-        training, a file cannot be written, or the checkpoint or ``start_from`` is of another model.
+        If an option is unknown or out of range; if a training option is given to a method without
+        training; if a file cannot be written; if the checkpoint or ``start_from`` belongs to
+        another model.
     StoreError
         If ``start_from`` or the checkpoint is damaged.
     MorBenchError

@@ -1,4 +1,4 @@
-"""The timing stage: all configurations of a dataset timed beside each other."""
+"""The timing stage: time all configurations of a dataset side by side."""
 
 from __future__ import annotations
 

@@ -38,7 +38,8 @@ class TestSet:
     Attributes
     ----------
     forces, references : (n, n_nodes, 3) float64
-        N and m. In a scene with observed nodes `forces` holds the observed displacements, m.
+        Nodal forces, N, and reference displacements, m. In a scene with observed nodes, `forces`
+        holds the observed displacements, m.
     nodes : (n_output_nodes,) int64
         Nodes where the error is measured.
     digest : str

@@ -1,7 +1,7 @@
 """Run third-party code in separate processes, watched and limited.
 
-Here live: starting a process (new, or forked from a server), the seal that keeps it out of folders,
-limits on time and memory, and the hand-over of snapshots as files. A `Session`
+Here live: starting a process, the seal that keeps it out of folders, limits on time and memory, and
+the hand-over of snapshots as files. A `Session`
 class defines the work of a process; the parent names the class and the child imports it. Measuring
 methods lives in `mor_bench.measure`.
 

@@ -60,8 +60,8 @@ class CommonDatasetSpec(StrictModel):
     ----------
     needs : Needs
     grid_nodes : three ints, optional
-        Nodes per axis of the regular grid for methods that need one, if the mesh is not a part of
-        a regular grid.
+        Nodes per axis of the regular grid that some methods need. Only for meshes that are not
+        part of a regular grid.
     observed : Observed, optional
         If given, methods receive displacements of some nodes instead of forces. The samples
         stay the same.
