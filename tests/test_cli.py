@@ -70,7 +70,7 @@ def test_the_help_shows_every_option_with_its_description_and_default(
 
 
 @pytest.mark.slow
-def test_run_writes_everything_and_report_draws_it_again(tmp_path: Path, cache: Path) -> None:
+def test_run_writes_all_results_and_report_redraws_them(tmp_path: Path, cache: Path) -> None:
     # On Windows, the encodings of files and pipes lack letters such as ē.
     options = ["-m", "linear-fem", "--split", "sample", "--out", "out", "--json"]
     done = subprocess.run(

@@ -143,7 +143,7 @@ def test_wrong_arrays_with_a_valid_checksum_are_refused(
         mor_bench.load_surrogate(path)
 
 
-def test_fitting_again_forgets_the_first_fit_and_repeats_it(
+def test_fitting_again_discards_the_first_fit_and_is_repeatable(
     fitted: Surrogate, tiny: Dataset
 ) -> None:
     expected = fitted.predict(tiny.test.forces[:3])

@@ -137,7 +137,7 @@ def test_exported_figures_keep_their_values_and_units(checkout: Path) -> None:
     assert named["comparison.beam-tiny.latency"]["params"] == found["latency"]["params"]
 
 
-def test_exports_add_up_and_leave_the_files_of_asv_alone(checkout: Path) -> None:
+def test_exports_accumulate_and_keep_the_files_of_asv(checkout: Path) -> None:
     out = checkout / "results"
     benchmarks, machine_file = out / "benchmarks.json", out / platform.node() / "machine.json"
     machine_file.parent.mkdir(parents=True)

@@ -111,7 +111,7 @@ def test_forces_keep_their_sum_and_moment_on_the_coarse_mesh(element: str) -> No
     )
 
 
-def test_coarse_fem_is_the_coarse_model_where_the_meshes_share_nodes(tiny: Dataset) -> None:
+def test_coarse_fem_equals_the_coarse_model_at_shared_nodes(tiny: Dataset) -> None:
     method = mor_bench.load_method("fem-coarse", coarsening=2, tolerance=1e-10).fit(
         tiny.scene, None
     )
@@ -228,7 +228,7 @@ def tip_deflection(scene: Scene, cells: tuple[int, int, int]) -> np.ndarray[Any,
 
 
 @pytest.mark.slow
-def test_the_tip_of_the_coarse_beam_tends_to_its_independent_limit() -> None:
+def test_the_tip_deflection_converges_to_an_independent_limit() -> None:
     """An independent study gives 0.417 m on 8 x 2 x 2 cells and 0.518 m in the limit."""
     scene = load_scene("beam-coarse")
     assert tip_deflection(scene, (8, 2, 2))[0] == pytest.approx(0.417, rel=2e-3)
@@ -256,7 +256,7 @@ def test_every_mesh_carries_the_same_force_and_moment(changes: dict[str, str]) -
             )
 
 
-def test_samples_are_those_of_the_dataset_and_spread_over_its_patches(tiny: Dataset) -> None:
+def test_chosen_samples_come_from_the_dataset_and_spread_over_its_patches(tiny: Dataset) -> None:
     samples = chosen_samples(tiny.scene, 7)
     assert (samples % 21 // 3 == np.arange(7)).all()
     assert samples.max() < 210

@@ -50,7 +50,7 @@ def test_linear_methods_have_the_expected_errors_on_both_splits(
         assert mean_error("pca-regression", data, n_input_modes=20) <= 3e-5
 
 
-def test_pod_improves_with_its_rank_and_ecsw_stays_within_a_fifth(beam: Dataset) -> None:
+def test_pod_improves_with_its_rank_and_ecsw_is_within_a_fifth_of_pod(beam: Dataset) -> None:
     loosest = max(load_method_spec("hpod").sweep["cubature_tolerance"])
     plain = {r: mean_error("pod", beam, n_modes=r) for r in (3, 10, 40)}
     assert plain[40] < plain[10] < plain[3]

@@ -65,7 +65,7 @@ def sides(mesh: Mesh) -> list[NDArray[np.int64]]:
 
 @pytest.fixture(scope="module", params=["hexahedron", "tetra"])
 def beam(request: pytest.FixtureRequest) -> tuple[str, Mesh, meshio.Mesh]:
-    """The beam's mesh, and as meshio's with shuffled nodes, two unused nodes and two sides."""
+    """The beam's mesh, and its meshio mesh with shuffled nodes, two unused nodes and two sides."""
     kind = request.param
     mesh = box_mesh(SIZE, CELLS, kind == "tetra")
     order = np.random.default_rng(0).permutation(mesh.n_nodes)
@@ -197,7 +197,7 @@ def test_every_format_gives_the_solution_of_its_original_box(
     np.testing.assert_allclose(solve(scene), expected, rtol=0, atol=1e-7)
 
 
-def test_nodes_are_numbered_for_a_small_band_and_the_grid_is_found(
+def test_nodes_are_numbered_for_a_small_bandwidth_and_the_grid_is_found(
     beam: tuple[str, Mesh, meshio.Mesh], tmp_path: Path
 ) -> None:
     _, mesh, raw = beam
@@ -264,7 +264,7 @@ def test_inverted_cells_are_reoriented(beam: tuple[str, Mesh, meshio.Mesh], tmp_
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with the beam, and a plane just above it, in decimetres, as two files."""
+    """A folder with two files in decimetres: the beam, and a plane just above it."""
     mesh = box_mesh(SIZE, CELLS)
     top = (mesh.points[:, 2] > 0.39).astype(int)
     data = {"top": top, "temperature": mesh.points[:, 0]}
@@ -340,13 +340,13 @@ def test_empty_and_unknown_regions_give_an_error_that_names_them(
     assert "\n" not in str(caught.value)
 
 
-def test_the_element_must_be_that_of_the_file(folder: Path) -> None:
+def test_an_element_other_than_that_of_the_file_is_refused(folder: Path) -> None:
     message = "must be 'hexahedron', as in the mesh; got 'tetrahedron'"
     with pytest.raises(SpecError, match=message):
         mor_bench.load_scene(of_file(folder / "beam.vtu", element="tetrahedron"))
 
 
-def test_the_distance_from_a_triangle_is_that_of_its_nearest_sample() -> None:
+def test_the_distance_to_a_triangle_is_that_to_its_nearest_sample_point() -> None:
     """Sample random triangles densely. One of them is a needle without area."""
     generator = np.random.default_rng(1)
     corners = generator.normal(size=(4, 3, 3))
@@ -380,7 +380,7 @@ def test_a_missing_or_changed_file_gives_an_error_that_names_it(folder: Path) ->
         mor_bench.load_scene(spec)
 
 
-def test_half_a_binary_surface_is_refused_in_one_line(folder: Path) -> None:
+def test_a_truncated_binary_surface_is_refused_in_one_line(folder: Path) -> None:
     path, corners = folder / "half.stl", np.random.default_rng(0).random((60, 3))
     triangles = np.arange(60).reshape(20, 3)
     meshio.Mesh(corners, [("triangle", triangles)]).write(path, binary=True)

@@ -75,7 +75,7 @@ CUBE_CORNERS = CUBE_SURFACE.points[CUBE_SURFACE.triangles]
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_an_stl_has_its_volume_and_its_vertices_once_and_is_oriented(
+def test_an_stl_surface_is_oriented_and_has_its_volume_and_unique_vertices(
     tmp_path: Path, turned: bool
 ) -> None:
     corners = CUBE_CORNERS[:, ::-1] if turned else CUBE_CORNERS
@@ -95,7 +95,7 @@ def test_an_obj_may_have_polygons_and_unused_vertices(tmp_path: Path) -> None:
     assert (len(surface.points), len(surface.triangles)) == (8, 12)
 
 
-def test_the_volume_of_a_sphere_converges_with_second_order_and_is_the_same_far_away() -> None:
+def test_the_volume_of_a_sphere_converges_with_second_order_even_far_from_the_origin() -> None:
     exact = 4 / 3 * np.pi * RADIUS**3
     coarse, fine = (1 - sphere(h).volume_m3 / exact for h in (0.028, 0.014))
     assert 0 < fine < coarse / 3 < 0.03
@@ -147,7 +147,7 @@ def test_a_bad_surface_is_refused_in_one_line_that_names_the_file(
 # --- inside ---------------------------------------------------------------------------------------
 
 
-def test_points_are_inside_the_sphere_where_its_equation_says_so() -> None:
+def test_points_inside_a_sphere_match_its_equation() -> None:
     points = CENTRE + np.random.default_rng(0).uniform(-1.3 * RADIUS, 1.3 * RADIUS, size=(2000, 3))
     distance = np.linalg.norm(points - CENTRE, axis=1)
     clear = np.abs(distance - RADIUS) > 0.001
@@ -170,7 +170,7 @@ def test_the_winding_number_is_an_integer_even_next_to_an_edge_or_a_corner() -> 
     assert not inside(CUBE_SURFACE, in_plane).any()
 
 
-def test_a_cavity_is_outside() -> None:
+def test_points_in_a_cavity_are_outside() -> None:
     outer, inner = (boundary(box_mesh((a, a, a), (1, 1, 1))) for a in (3.0, 1.0))
     body = joined(outer, Surface(inner.points + 1, inner.triangles[:, ::-1]))
     assert body.volume_m3 == pytest.approx(26)

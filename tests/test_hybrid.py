@@ -119,7 +119,7 @@ def test_the_indicated_error_vanishes_at_an_equilibrium_and_is_infinite_without_
         fem.indicate_error(force, np.zeros((3, 3)))
 
 
-def test_moved_supports_are_errors_and_missing_nodes_are_refused(coarse: Dataset) -> None:
+def test_moved_supports_count_as_errors_and_missing_nodes_are_refused(coarse: Dataset) -> None:
     fem = mor_bench.load_method("fem").fit(coarse.scene, None)
     force = coarse.test.forces[:1]
     moved = fem.predict(force)
@@ -133,7 +133,7 @@ def test_moved_supports_are_errors_and_missing_nodes_are_refused(coarse: Dataset
 
 
 @pytest.mark.slow
-def test_inverted_answers_are_not_returned(coarse: Dataset) -> None:
+def test_inverted_predictions_are_never_returned(coarse: Dataset) -> None:
     """Under loads far beyond the range, det F is positive at all quadrature points."""
     method = Hybrid("linear-fem", steps=1).fit(coarse.scene, coarse.train)
     model, free, answered = FullOrderModel(coarse.scene), coarse.scene.free_dofs, 0

@@ -122,7 +122,7 @@ def test_a_hidden_test_set_depends_on_its_seed_only(cache: Path, tmp_path: Path)
     assert not list(cache.glob("**/*hidden*"))
 
 
-def test_two_runs_do_not_write_to_one_folder(cache: Path, tmp_path: Path) -> None:
+def test_two_runs_cannot_write_to_the_same_folder(cache: Path, tmp_path: Path) -> None:
     parent = psutil.Process(os.getppid())
     (tmp_path / ".running").write_text(f"{parent.pid} {parent.create_time()!r}")
     with pytest.raises(InvalidInputError, match=r"another run \(process"):

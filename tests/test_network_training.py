@@ -322,7 +322,7 @@ def test_the_given_time_includes_the_trial_and_the_validations(
     assert 0.8 < asked_s < 1.2
 
 
-def test_one_cycle_rises_for_a_tenth_and_falls_to_zero() -> None:
+def test_the_one_cycle_rate_rises_for_a_tenth_and_falls_to_zero() -> None:
     rates = np.array([rate_factor("one-cycle", i, 1000) for i in range(1000)])
     assert rates.argmax() == pytest.approx(100, abs=2)
     assert rates.max() == pytest.approx(1.0, abs=0.01)

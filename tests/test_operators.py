@@ -112,7 +112,7 @@ def test_the_padding_keeps_opposite_ends_apart() -> None:
 @pytest.mark.parametrize(
     "mesh", [box_mesh((2.0, 1.0, 1.0), (3, 2, 2)), tetrahedral()], ids=["hexahedra", "tetrahedra"]
 )
-def test_message_passing_is_the_sum_over_edges_written_out(mesh: Mesh) -> None:
+def test_message_passing_equals_an_explicit_sum_over_edges(mesh: Mesh) -> None:
     graph = Graph(mesh)
     pairs = {(int(s), int(r)) for s, r in zip(graph.senders, graph.receivers, strict=True)}
     assert len(pairs) == graph.n_edges

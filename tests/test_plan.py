@@ -64,7 +64,7 @@ def test_other_seeds_and_trainings_of_given_length_are_planned(tmp_path: Path) -
         ("mor_bench.surrogates.umesh.method:UMesh", True),
     ],
 )
-def test_a_digest_follows_what_a_method_imports(surrogate: str, has_network: bool) -> None:
+def test_a_digest_depends_on_the_imports_of_a_method(surrogate: str, has_network: bool) -> None:
     modules = imported_sources(surrogate.partition(":")[0]).keys()
     assert "mor_bench.surrogate" in modules
     assert ("mor_bench.surrogates.umesh.network" in modules) == has_network
@@ -73,7 +73,7 @@ def test_a_digest_follows_what_a_method_imports(surrogate: str, has_network: boo
     assert code_digest(surrogate) == code_digest(surrogate)
 
 
-def test_a_digest_follows_the_modules_of_a_third_party(tmp_path: Path) -> None:
+def test_a_digest_depends_on_the_modules_of_a_third_party(tmp_path: Path) -> None:
     package = tmp_path / "theirs"
     package.mkdir()
     (package / "__init__.py").write_text("")

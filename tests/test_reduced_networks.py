@@ -93,7 +93,7 @@ def test_samples_without_a_stable_tangent_are_left_out(tiny: Dataset) -> None:
         sensitivities(model, replace(few[1:2], free_displacements=squashed[1:2]), axes, axes)
 
 
-def test_the_network_of_torch_and_of_numpy_agree_with_their_slopes() -> None:
+def test_the_networks_of_torch_and_numpy_have_equal_values_and_derivatives() -> None:
     from mor_bench.learning.perceptron import Perceptron, evaluate, slope_at_rest
 
     network = Perceptron(3, 8, 2, torch.Generator().manual_seed(0)).double()
@@ -193,7 +193,7 @@ def test_the_learned_part_is_of_second_order_in_the_load(
     assert not fitted.predict(forces)[2].any()
 
 
-def test_from_the_force_alone_training_loads_are_learned(tiny: Dataset) -> None:
+def test_training_loads_are_learned_from_the_force_alone(tiny: Dataset) -> None:
     knobs = {**BRIEF, "input": "force", "n_input_modes": 40, "iterations": 600}
     method = mor_bench.load_method("pod-nn", **knobs)
     assert median_error(method, tiny.train, tiny.train) < 0.7

@@ -43,7 +43,7 @@ def test_kratos_solves_the_same_reduced_equations(tiny: Dataset) -> None:
     )  # cells for 1e-3
 
 
-def test_other_answers_are_refused(tiny: Dataset) -> None:
+def test_wrong_reduced_solutions_are_refused(tiny: Dataset) -> None:
     said: list[str] = []
     fitted = own_methods(tiny.scene, tiny.train, [*METHODS, "knn"], 3, said.append)
     assert {"pod", "hpod"} <= set(fitted) <= set(METHODS)

@@ -96,7 +96,7 @@ def test_steps_are_counted_and_exceeding_their_limit_raises() -> None:
         relaxed.solve(load, 1e-4, steps - 1)
 
 
-def test_an_inverted_body_is_never_an_answer() -> None:
+def test_an_inverted_body_is_never_returned() -> None:
     full = model()
     relaxed, refused = DynamicRelaxation(full), []
     for load in loads(full, list(range(0, 200, 17)), 20.0):
@@ -119,7 +119,7 @@ def test_a_body_that_comes_to_rest_inverted_is_released_again() -> None:
         assert np.linalg.norm(found.displacement - exact) <= 2e-5 * np.linalg.norm(exact)
 
 
-def test_a_step_beyond_the_limit_of_stability_is_made_shorter(
+def test_a_step_beyond_the_limit_of_stability_is_shortened(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     full = model()

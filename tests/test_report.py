@@ -157,7 +157,7 @@ def test_a_legacy_code_page_does_not_stop_the_run(comparison: Comparison) -> Non
     assert b"pod [n_modes=20]" in raw.getvalue()
 
 
-def test_needs_and_front_are_marked_where_they_belong(comparison: Comparison) -> None:
+def test_needs_and_frontier_are_marked_in_the_right_rows(comparison: Comparison) -> None:
     entries = entries_of(comparison, "beam-tiny")
     assert [entry.label for entry in entries if entry.meets_needs] == ["pod [n_modes=20]"]
     assert {entry.label for entry in entries if entry.on_front} == {
@@ -247,7 +247,7 @@ def test_the_discretisation_error_is_shown_with_its_evidence() -> None:
     assert both.startswith("1.2e-02 m, relative L2 (median) 20.5 %; an error")
 
 
-def test_a_report_without_a_row_that_ran_says_so(tmp_path: Path) -> None:
+def test_a_report_without_a_completed_row_says_so(tmp_path: Path) -> None:
     nothing = render(Comparison(tmp_path / "nothing", {}))[-1].read_text(encoding="utf-8")
     assert "nothing to report" in nothing
     made = tiny(tmp_path, "beam-tiny", "other")

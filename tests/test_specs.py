@@ -242,7 +242,7 @@ def test_a_profile_replaces_parameters_and_sweep(tmp_path: Path) -> None:
     ]
 
 
-def test_only_physics_decides_the_digest() -> None:
+def test_the_digest_depends_on_physics_only() -> None:
     spec = load_generated_spec("beam-tiny")
     split = spec.split.model_copy(update={"by": "sample"})
     assert spec.digest() == spec.model_copy(update={"title": "other", "split": split}).digest()

@@ -88,7 +88,7 @@ A method that is too slow loses every attempt.
 
 @pytest.fixture(scope="module")
 def fitted(cache: Path) -> Callable[[str, str, dict[str, Any]], Surrogate]:
-    """A method on a scene, fitted once for all races."""
+    """A method on a scene, fitted once for all timings."""
     known: dict[tuple[str, str], Surrogate] = {}
 
     def fit(scene: str, method: str, parameters: dict[str, Any]) -> Surrogate:
@@ -162,6 +162,6 @@ def test_a_method_is_faster_than_the_baseline(
     assert max(ratios) >= race.least_speedup, f"{name}: {[round(ratio, 2) for ratio in ratios]}"
 
 
-def test_every_method_has_a_race() -> None:
+def test_every_method_is_timed_against_the_baseline() -> None:
     raced = {name for method, race in RACES for name in (method, race.baseline)}
     assert raced == SPECS.keys()

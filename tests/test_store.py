@@ -217,7 +217,7 @@ def test_the_number_of_workers_changes_no_bit(tmp_path: Path, original: Path) ->
     assert generation_seconds(SPEC, tmp_path, 210) is not None
 
 
-def test_a_limit_is_a_prefix_and_progress_counts_wanted_samples(
+def test_a_limit_takes_the_first_samples_and_progress_counts_them(
     tmp_path: Path, original: Path
 ) -> None:
     counts: list[tuple[int, int]] = []

@@ -41,7 +41,7 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def comparison(tmp_path_factory: pytest.TempPathFactory, own_cache: Path) -> Comparison:
-    """Descents of 0.7 s, which are 70 iterations, with three seeds.
+    """Trainings of 0.7 s, or 70 iterations, with three seeds.
 
     Training with seed 1 fails. With 100 channels a training is out of time.
     """
@@ -154,7 +154,7 @@ def test_a_killed_comparison_resumes_in_the_middle_of_a_training(
     resumed = run_small([path], out, own_cache).rows[0]
     assert resumed.warnings[0].startswith("goes on from iteration ")
     assert resumed.offline_s is not None
-    assert resumed.offline_s.fit > 0.7  # with the time before the kill
+    assert resumed.offline_s.fit > 0.7  # includes the time before the kill
     assert not left.exists()
     model = tmp_path / "whole.safetensors"
     whole = mor_bench.fit("beam-tiny", path, out=model, cache=own_cache, limit=LIMIT, threads=1)

@@ -47,7 +47,7 @@ IMPROVED: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def data(cache: Path) -> Dataset:
-    """beam-tiny, 7×3×3 nodes, which one halving pads; split by sample, as in the paper."""
+    """beam-tiny, 7×3×3 nodes, padded for one halving; split by sample, as in the paper."""
     return mor_bench.load_dataset("beam-tiny", split="sample", cache=cache, workers=1)
 
 
@@ -189,7 +189,7 @@ def test_values_and_gradients_at_nodes_equal_those_of_the_dense_matrix(regular: 
     assert 0 < int((own != 0).sum()) < own.numel()
 
 
-def test_displacements_on_the_grid_are_means_of_the_nodes_around() -> None:
+def test_displacements_on_the_grid_are_means_of_neighbouring_nodes() -> None:
     """A constant field stays constant in the body, and is zero outside."""
     mesh = irregular_box((2.0, 1.0, 1.0), (6, 2, 2), tetrahedra=True)
     grid = padded_grid(grid_map(mesh), 1)
@@ -325,7 +325,7 @@ def test_a_mirrored_solution_is_a_solution(data: Dataset) -> None:
 
 
 @pytest.mark.slow
-def test_mirror_images_teach_the_other_half(data: Dataset) -> None:
+def test_mirror_images_lower_the_error_on_the_other_half(data: Dataset) -> None:
     """Training on one half without mirror images predicts the other half worse."""
     (mirror,) = mirrors(data.scene)
     y = data.scene.mesh.points[:, 1]
