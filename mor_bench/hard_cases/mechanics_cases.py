@@ -187,7 +187,7 @@ def near_incompressible(subject: Subject) -> Outcome:
 
 @hard_case("slender", full_order, "terminates; locking reported")
 def slender(subject: Subject) -> Outcome:
-    """Bend a beam of 100:1 and compare its locking with the discretisation error by refinement.
+    """Bend a 100:1 beam; compare its locking with the discretisation error from refinement.
 
     The reported discretisation error must not be much smaller than the actual error.
     """

@@ -98,7 +98,7 @@ class Arch:
     problem : GalerkinProblem
         On the basis of all free dofs.
     load : (n_free,) float64
-        N.
+        Nodal forces, N.
     crown : (2,) int64
         The free dofs that are loaded.
     """
@@ -230,9 +230,9 @@ def cantilever_spec(
     integration: str = "full",
     law: str = "saint-venant-kirchhoff",
 ) -> dict[str, Any]:
-    """Return a dataset of a beam along x of Y = 12 kPa, clamped at its start and loaded at its end.
+    """Return a dataset of a beam along x, clamped at its start and loaded at its end.
 
-    EI is 1000 N m² if the beam is 1 m wide and high.
+    Young's modulus is 12 kPa, so EI is 1000 N m² if the beam is 1 m wide and high.
     """
     return {
         "geometry": {"shape": "box", "size_m": size, "cells": cells},

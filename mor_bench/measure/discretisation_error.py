@@ -86,13 +86,13 @@ def limit_of(
     Parameters
     ----------
     displacements : list of (n_nodes, 3) float64
-        At the same nodes, m, coarsest mesh first; at least two.
+        Displacements at the same nodes, m, coarsest mesh first; at least two.
 
     Returns
     -------
     limit : (n_nodes, 3) float64
-        Richardson's extrapolation; or the last of the list, if there are fewer than three or their
-        order is not in `PLAUSIBLE_ORDERS`.
+        Richardson's extrapolation. With fewer than three meshes, or an order outside
+        `PLAUSIBLE_ORDERS`, it is the last of the list.
     order : float or None
         Order of convergence of the last three.
     kind : {"extrapolated", "finest"}
@@ -255,7 +255,7 @@ def refine(
         `meshes` and `left_out`: cells and degrees of freedom; `digest`, `version`, `command`;
         `loads`: each with `sample`, `patches`, `vectors_n`, `error_m`, `relative_l2`, `order` and
         `limit`, which is ``extrapolated``, ``finest``, or ``none`` with a `reason` if a mesh has no
-        equilibrium. Such a load counts in no mean.
+        equilibrium. The means leave out such a load.
 
     Raises
     ------

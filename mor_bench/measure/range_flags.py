@@ -36,7 +36,7 @@ class Flags:
     n_flagged: int
 
     def of(self, score: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-        """Count a test set's unusual errors, and how many are flagged; `recall` is their share."""
+        """Count a test set's unusual errors and the flagged ones; `recall` is the flagged share."""
         unusual = score["relative_l2"] > self.usual_rel_l2
         n, found = int(unusual.sum()), int((unusual & score["flagged"]).sum())
         return {"n_unusual": n, "n_unusual_flagged": found, "recall": found / n if n else None}

@@ -66,7 +66,7 @@ class ErrorIndicator:
         Raises
         ------
         InvalidInputError
-            On other shapes.
+            If a shape is wrong.
         """
         shape = (len(forces), self._scene.mesh.n_nodes, 3)
         if forces.shape != shape or displacements.shape != shape:

@@ -1,8 +1,8 @@
 """Equilibria of a body with known displacements at a part of the surface instead of forces.
 
 The observed nodes are held at their observed displacements and the supports at rest. All other
-nodes, the hidden ones, carry no force: f_int(u) = 0 there. That is exact if every loaded node is
-observed. Otherwise it is a modelling error, since hidden loads are neglected.
+nodes are hidden and carry no force: f_int(u) = 0 there. The model is exact if every loaded node is
+observed. Otherwise it neglects the hidden loads.
 """
 
 from __future__ import annotations

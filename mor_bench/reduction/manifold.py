@@ -35,7 +35,7 @@ class QuadraticManifold:
     Raises
     ------
     InvalidInputError
-        On other shapes, NaN or infinity.
+        If a shape is wrong, or an entry is NaN or infinite.
     """
 
     def __init__(self, modes: NDArray[np.float64], derivatives: NDArray[np.float64]) -> None:

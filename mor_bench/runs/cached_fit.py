@@ -47,7 +47,7 @@ LOAD_LIMIT_S = 300.0
 
 @dataclass(frozen=True)
 class RunEnvironment:
-    """Where methods run, and their limits.
+    """Run environment of methods, and their limits.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ class FitRecord(BaseModel):
 
     @property
     def iterations(self) -> int | None:
-        """Number of iterations of a training with a time target."""
+        """Number of iterations of a training with a time target; None for other trainings."""
         return (self.training or {}).get("iterations")
 
 
