@@ -41,7 +41,7 @@ DAMPED_FORCING = 1e-3
 MAX_HALVINGS = 14
 MAX_LOAD_N = 1e30
 MAX_ITERATIONS = 300
-"""Newton iterations over all increments before the solve gives up."""
+"""Largest number of Newton iterations, over all increments, before the solve gives up."""
 
 
 @dataclass(frozen=True)

@@ -28,13 +28,13 @@ def interpolation_rows(basis: NDArray[np.float64], selection: Selection) -> NDAr
     Parameters
     ----------
     basis : (n, k) float64
-        Of full rank.
+        Basis U of full rank.
     selection : {"greedy", "pivoted-qr"}
 
     Returns
     -------
     (k,) int64
-        In the order of choice.
+        Numbers of the chosen rows, in the order of choice.
     """
     n, k = basis.shape
     if k > n:

@@ -235,7 +235,7 @@ def integrate(q, trial, test, symmetric, weights, lame, force, tangent):
     symmetric : bool
         Whether both are the same.
     weights : (n_batches, LANES) float64
-        m³; zero for padding.
+        Quadrature weights, m³; zero for padding.
     lame : (n_batches, 2, LANES) float64
         λ and μ, Pa. With selective integration a point carries only one of them.
     force : (r,) float64

@@ -20,8 +20,8 @@ QUICK_ITERATIONS = 15
 def strains(gradients, shape_scale, volume_scale, rows):
     """Write scaled strains eᵢ, then s_ij, to rows (n, 6, r + n_pairs), from Hᵢ (n, 3, 3, r).
 
-    The six components, in an orthonormal basis of symmetric tensors, are five of the deviator and
-    the trace over √3.
+    The six components refer to an orthonormal basis of symmetric tensors. Five are those of the
+    deviator; the sixth is the trace over √3.
     """
     r = gradients.shape[3]
     trace, half, sixth = np.sqrt(1.0 / 3.0), np.sqrt(0.5), np.sqrt(1.0 / 6.0)

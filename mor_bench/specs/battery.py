@@ -48,7 +48,7 @@ class Battery(StrictModel):
     parameters : dict
         Hyperparameters for a cheap fit on beam-tiny.
     error : float
-        Upper bound on the mean training error over that of no prediction. Default: 0.2.
+        Upper bound on the mean training error, relative to that of zero displacement. Default: 0.2.
     observed_parameters : dict
         Hyperparameters for a cheap fit on scenes with observed nodes. Default: `parameters`.
     observed_error : float
