@@ -12,15 +12,15 @@ from mor_bench.surrogate import Surrogate
 
 
 def cost_of(method: Surrogate, given: Given) -> dict[str, float] | None:
-    """Return the mean work per query over some loads, each predicted on its own.
+    """Return the mean work per query over some loads, which are predicted one by one.
 
     Parameters
     ----------
     method : Surrogate
         Fitted.
     given : Forces or ObservedDisplacements
-        With values (n, n_nodes, 3). A load that the method cannot answer counts with the work until
-        its error.
+        With values (n, n_nodes, 3). If the method cannot answer a load, the work until its error
+        counts.
 
     Returns
     -------

@@ -103,8 +103,8 @@ def banded_solve(band, right_hand_sides):
     """Solve L Lᵀ x = x in place for every row x of (m, n).
 
     ``band`` (n, bandwidth + 1) holds the columns of L with inverted diagonals. Processing
-    four columns at once loads and stores x once per four multiply-adds. They serve every right-hand
-    side before the next four columns are fetched.
+    four columns at once loads and stores x once per four multiply-adds. All right-hand
+    sides use the four columns before the next four are fetched.
     """
     n = len(band)
     whole = n - n % 4

@@ -42,7 +42,7 @@ def seal(folders: Sequence[Path], exempt: Path | None = None) -> None:
     Parameters
     ----------
     folders : sequence of Path
-        Sealed with all that they contain.
+        Folders to seal, with all their contents.
     exempt : Path, optional
         A folder within them that stays accessible, such as the folder of a training's checkpoint.
     """

@@ -114,7 +114,7 @@ def _walk(
     Returns
     -------
     list of steps
-        The keys and indices, without the steps by which pydantic names the alternative of a union.
+        The keys and indices, without pydantic's names of the alternatives of a union.
     list of models
         The models that the table at the location may have.
     """
