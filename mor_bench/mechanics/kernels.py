@@ -342,7 +342,7 @@ def advance(u, v, force, before, load, mass, control):
     load, mass : (n_dofs,) float64
         Load, N, and fictitious mass, N/m, so that eigenvalues of M⁻¹K have no unit.
     control : (4,) float64
-        Squared settings, see `TARGET`; the squared step is reduced in place.
+        Squared settings, see `TARGET`; the squared step may be reduced in place.
 
     Returns `RUNNING`, `MET` or `DIVERGED`.
     """

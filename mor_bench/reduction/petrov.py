@@ -28,7 +28,7 @@ from mor_bench.reduction.points import ReducedPoints
 Array = NDArray[np.float64]
 
 MAX_HALVINGS = 8
-"""Halvings of a step that does not lower the residual."""
+"""Largest number of halvings of a step that does not lower the residual."""
 
 
 class InterpolatedProblem:

@@ -126,7 +126,7 @@ class FitRecord(BaseModel):
 
     @property
     def iterations(self) -> int | None:
-        """Number of iterations of a training with a time target; None for other trainings."""
+        """Number of iterations of a training with a time target; None if not recorded."""
         return (self.training or {}).get("iterations")
 
 
