@@ -298,10 +298,9 @@ def _by_newton(
         if steps.cuts > options.max_cuts or iterations > MAX_ITERATIONS:
             story = steps.story(iterations)
             if attempt.min_det_f <= 0 or (first.converged and first.min_det_f <= 0):
-                largest = min(attempt.min_det_f, first.min_det_f)
+                smallest = min(attempt.min_det_f, first.min_det_f)
                 raise InvertedElementError(
-                    f"elements invert: {story}; the largest det F among the inverted "
-                    f"states was {largest:.3g}.",
+                    f"elements invert: {story}; the smallest det F was {smallest:.3g}.",
                     cuts=steps.cuts,
                 )
             raise NoEquilibriumError(
