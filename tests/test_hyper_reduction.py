@@ -1,4 +1,4 @@
-"""Hyper-reduction: points, cubature and its optimality, interpolation, and independence of mesh."""
+"""Hyper-reduction: points, cubature and its optimality, interpolation, mesh independence."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_the_compiled_steps_end_where_the_shared_solve_ends(tiny: Dataset, scale
     assert (failed > 0) == (scale == 100.0)
 
 
-def test_the_interpolated_force_is_projected_exactly_at_rest_and_has_its_tangent(
+def test_the_interpolated_tangent_is_the_derivative_of_the_force_and_exact_at_rest(
     tiny: Dataset,
 ) -> None:
     method = InterpolatedPOD(6, 12).fit(tiny.scene, tiny.train)

@@ -92,7 +92,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_writes_may_fail_at_any_byte(
+def test_generation_survives_a_write_that_fails_at_any_byte(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: dict[str, bytes]
 ) -> None:
     """Generate on a full disk, with different free space each time, until it succeeds."""

@@ -119,7 +119,7 @@ def test_the_monitored_points_find_the_smallest_det_f_of_training_samples(coarse
 
 
 @pytest.mark.parametrize("r", [20, pytest.param(40, marks=pytest.mark.slow)])
-def test_an_inverted_answer_is_refused(coarse: Dataset, r: int) -> None:
+def test_an_inverted_prediction_is_refused(coarse: Dataset, r: int) -> None:
     """Loads far beyond the range invert cells, which the energy alone would accept."""
     method = TensorPOD(r, tolerance=1e-6).fit(coarse.scene, coarse.train)
     plain = PODGalerkin(r, tolerance=1e-6).fit(coarse.scene, coarse.train)
