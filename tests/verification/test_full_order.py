@@ -201,7 +201,7 @@ def test_multigrid_out_of_cycles_returns_no_solution(
     factor = FullOrderModel(large.scene).rest_factor
     assert isinstance(factor, MultigridFactor)
     monkeypatch.setattr("mor_bench.mechanics.multigrid.MAX_CYCLES", 2)
-    with pytest.raises(SolverError, match="multigrid does not solve"):
+    with pytest.raises(SolverError, match="multigrid does not converge"):
         factor.solve(np.ones(large.n_unknowns))
 
 
