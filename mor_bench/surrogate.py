@@ -26,7 +26,12 @@ from mor_bench.reduction.sizing import choose_sizes
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.checked_samples import checked_samples
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.snapshots.given import Given, ObservedDisplacements, checked_given
+from mor_bench.snapshots.given import (
+    Given,
+    ObservedDisplacements,
+    checked_forces,
+    checked_given,
+)
 from mor_bench.snapshots.load_range import LoadRange
 from mor_bench.specs import NO_FORCES, check_parameters
 from mor_bench.training_options import TrainingOptions
@@ -198,17 +203,18 @@ class Surrogate:
         SolverError
             If a method that solves equations finds no valid equilibrium.
         """
-        given = self._checked(forces)
-        found = (
-            self.answer_observed(given)
-            if isinstance(given, ObservedDisplacements)
-            else self.answer(given.values)
-        )
-        if found.shape != given.values.shape:
+        if isinstance(forces, ObservedDisplacements):
+            given = self._checked(forces)
+            assert isinstance(given, ObservedDisplacements)
+            found, shape = self.answer_observed(given), given.values.shape
+        else:
+            values = checked_forces(self._fitted_scene(), forces)
+            found, shape = self.answer(values), values.shape
+        if found.shape != shape:
             raise InvalidInputError(
-                f"`answer` must return an array of shape {given.values.shape}; got {found.shape}."
+                f"`answer` must return an array of shape {shape}; got {found.shape}."
             )
-        return found.reshape(np.shape(forces))
+        return found.reshape(forces.shape if isinstance(forces, np.ndarray) else np.shape(forces))
 
     @classmethod
     def trains(cls) -> bool:
@@ -345,6 +351,9 @@ class Surrogate:
         self.scene_, self.sizes_, self.timings_ms_ = scene, sizes, {}
 
     def _checked(self, forces: ArrayLike) -> Given:
+        return checked_given(self._fitted_scene(), forces)
+
+    def _fitted_scene(self) -> Scene:
         if not hasattr(self, "scene_"):
             raise NotFittedError(f"{type(self).__name__} must be fitted before it predicts.")
-        return checked_given(self.scene_, forces)
+        return self.scene_

@@ -87,34 +87,54 @@ def checked_given(scene: Scene, given: ArrayLike) -> Given:
         If forces are given instead of displacements or vice versa; for a wrong shape or dtype, NaN,
         infinity or a value beyond `MAX_FORCE_N`.
     """
-    observed, seen = scene.observed_nodes, isinstance(given, ObservedDisplacements)
-    if seen != (observed is not None):
+    if isinstance(given, ObservedDisplacements) and scene.observed_nodes is not None:
+        return _checked_displacements(scene.mesh.n_nodes, scene.observed_nodes, given)
+    return Forces(checked_forces(scene, given))
+
+
+def checked_forces(scene: Scene, forces: ArrayLike) -> NDArray[np.float64]:
+    """As `checked_given`, for forces alone; returns the plain array, which saves time per query."""
+    observed, seen = scene.observed_nodes, isinstance(forces, ObservedDisplacements)
+    if seen or observed is not None:
         wanted = "forces" if seen else "displacements of observed nodes, `ObservedDisplacements`"
         raise InvalidInputError(f"{scene.name}: a query must be {wanted}.")
-    name, unit = ("`values`", "m at the observed nodes") if seen else ("`forces`", "N")
+    n_nodes = scene.mesh.n_nodes
+    return _in_range(_real_numbers(n_nodes, forces, "`forces`"), "`forces`", "N")
+
+
+def _checked_displacements(
+    n_nodes: int, observed: NDArray[np.int64], given: ObservedDisplacements
+) -> ObservedDisplacements:
+    array = _real_numbers(n_nodes, given, "`values`")
+    if not np.array_equal(given.nodes, observed):
+        raise InvalidInputError(
+            "the displacements belong to other nodes than `Scene.observed_nodes`."
+        )
+    known = np.zeros(array.shape, dtype=array.dtype)
+    known[..., observed, :] = array[..., observed, :]
+    return ObservedDisplacements(_in_range(known, "`values`", "m at the observed nodes"), observed)
+
+
+def _real_numbers(n_nodes: int, given: ArrayLike, name: str) -> NDArray[Any]:
     try:
         array = np.asarray(given)
     except (ValueError, TypeError) as error:
         raise InvalidInputError(f"{name} must be an array of real numbers: {error}") from None
-    n_nodes = scene.mesh.n_nodes
     if array.dtype.kind not in "fiu":
         raise InvalidInputError(f"{name} must hold real numbers; got dtype {array.dtype}.")
     if array.ndim not in (2, 3) or array.shape[-2:] != (n_nodes, 3):
         raise InvalidInputError(
             f"{name} must have shape ({n_nodes}, 3) or (n, {n_nodes}, 3); got {array.shape}."
         )
-    if isinstance(given, ObservedDisplacements) and observed is not None:
-        if not np.array_equal(given.nodes, observed):
-            raise InvalidInputError(
-                f"{scene.name}: the displacements belong to other nodes than "
-                "`Scene.observed_nodes`."
-            )
-        known = np.zeros(array.shape, dtype=array.dtype)
-        known[..., observed, :] = array[..., observed, :]
-        array = known
-    if not (np.abs(array) <= MAX_FORCE_N).all():
+    return array
+
+
+def _in_range(array: NDArray[Any], name: str, unit: str) -> NDArray[np.float64]:
+    if array.size and not np.abs(array).max() <= MAX_FORCE_N:  # NaN compares as false
         raise InvalidInputError(
             f"{name} must be finite and at most {MAX_FORCE_N:g} {unit}; "
             f"got {np.abs(array).max():g}."
         )
-    return given_of(scene, array.astype(np.float64, copy=False).reshape(-1, n_nodes, 3))
+    if array.dtype != np.float64:
+        array = array.astype(np.float64)
+    return array[None] if array.ndim == 2 else array
