@@ -61,3 +61,13 @@ def small_run(tmp_path_factory: pytest.TempPathFactory, cache: Path, heard: Hear
     ]
     out = folder / "reports" / "runs" / "first"
     return run_small(["linear-fem", pod, *broken], out, cache, listener=heard.listener())
+
+
+@pytest.fixture(params=[1, 2])
+def threads(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Run a test of a network on one and on two threads."""
+    torch = pytest.importorskip("torch")
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield
+    torch.set_num_threads(before)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -241,14 +240,6 @@ def test_zero_force_gives_zero_displacement_alone_and_in_a_batch(
     assert not method.predict(forces[3]).any()
     assert answers[[0, 1, 2, 4]].any(axis=(1, 2)).all()
     assert np.abs(method.predict(1e-7 * forces[0])).max() < 1e-3 * np.abs(answers[0]).max()
-
-
-@pytest.fixture(params=[1, 2])
-def threads(request: pytest.FixtureRequest) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.usefixtures("threads")

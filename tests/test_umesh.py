@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -255,14 +254,6 @@ def test_a_mesh_without_a_grid_is_learned_saved_and_loaded(
     fitted_irregular.save(tmp_path / "umesh.safetensors")
     loaded = load_fitted(tmp_path / "umesh.safetensors", type(fitted_irregular), test.scene)
     np.testing.assert_array_equal(loaded.predict(test.forces), answer)
-
-
-@pytest.fixture(params=[1, 2])
-def threads(request: pytest.FixtureRequest) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.usefixtures("threads")
