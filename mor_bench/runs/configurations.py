@@ -35,7 +35,17 @@ from mor_bench.specs import (
 )
 from mor_bench.training_options import TrainingOptions
 
-CORE_METHODS = ("fem", "pod", "hpod", "pca-regression", "umesh")
+CORE_METHODS = (
+    "fem",
+    "linear-fem",
+    "pod",
+    "pod-tensor",
+    "hpod",
+    "pca-regression",
+    "pca-regression-force",
+    "umesh",
+    "umesh-linear",
+)
 """Default methods."""
 
 DATA_METHODS = ("pca-regression-force", "umesh")
