@@ -336,7 +336,7 @@ def test_tuning_reports_the_used_and_the_allowed_budget(tmp_path: Path) -> None:
         ({"min_iterations": 5}, "cpu", "0 of 5 iterations"),
         ({"split": "sample"}, "cpu", "split by region"),
         ({"gpu": True}, "cpu", "no graphics processor"),
-        ({"gpu": True}, "gpu", ""),
+        ({"gpu": True}, "cuda", "trained on a graphics processor, but queried on the CPU"),
     ],
 )
 def test_a_method_is_in_its_regime_only_if_all_its_conditions_hold(

@@ -11,6 +11,9 @@ from mor_bench.analysis.frontier import EXACT, median_error, number_or_inf
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 
+QUERIES_ON_CPU = "trained on a graphics processor, but queried on the CPU"
+"""Unmet condition of every row in a GPU regime: queries are timed on the CPU only."""
+
 HIDDEN_WORSE = 1.2
 """Largest ratio of hidden to shipped test error that is never called worse."""
 
@@ -91,8 +94,9 @@ def _missing(row: Row, regime: Mapping[str, Any], device: str) -> list[str]:
     ]
     if regime.get("split") and row.split != regime["split"]:
         missing.append(f"split by {row.split}")
-    if regime.get("gpu") and device == "cpu":
-        missing.append("no graphics processor")
+    if regime.get("gpu"):
+        trained_on = row.training.device if row.training else device
+        missing.append("no graphics processor" if trained_on == "cpu" else QUERIES_ON_CPU)
     return missing
 
 

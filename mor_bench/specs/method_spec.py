@@ -36,7 +36,8 @@ class Regime(StrictModel):
     split : str, optional
         How training and test samples are separated.
     gpu : bool
-        Whether the method needs a graphics processor.
+        Whether training and queries need a graphics processor. Queries are timed on the CPU only,
+        so no comparison tests such a method in its regime.
     """
 
     says: str
