@@ -349,6 +349,14 @@ def test_a_batch_costs_what_its_samples_cost_and_counting_changes_nothing(
     assert means == {field: total / len(loads) for field, total in asdict(batch).items()}
     assert means is not None
     assert means["multiply_adds"] > 1000
+    told = SPECS[name].told_with(SPECS[name].battery.parameters)
+    on_mesh = means["back_solves"] - means["reduced_back_solves"]
+    if told == "input":
+        assert on_mesh == 0  # only the linear response and the equations need the stiffness
+    if told == "equations":
+        assert means["element_evaluations"] + means["reduced_factorisations"] > 0
+    else:
+        assert means["element_evaluations"] == 0
 
 
 class Silent(Surrogate):

@@ -57,6 +57,22 @@ def test_every_shipped_method_is_valid_and_sweeps_different_configurations(name:
         assert len(set(configurations)) == len(configurations) > 0
 
 
+@pytest.mark.parametrize("name", list_suite("methods"))
+def test_every_shipped_method_states_what_it_is_told(name: str) -> None:
+    spec = load_method_spec(name)
+    of_input = {"force": "input", "linear-response": "linear-response"}
+    try:
+        default = getattr(spec.load_class(), "input", None)
+    except MissingDependencyError as error:
+        pytest.skip(str(error))
+    for profile in ("quick", "full"):
+        for parameters in spec.configurations(profile):
+            given = parameters.get("input", default)
+            assert spec.told_with(parameters) == of_input.get(given, spec.told)
+    assert spec.told is not None
+    assert not spec.reference or spec.told == "equations"
+
+
 BAD_DATASETS = """
 geometry.sise_m = [1.0] -> unknown key `geometry.sise_m`; did you mean 'size_m'?
 geometry.sise_m = 1 -> Allowed here: cells, shape, size_m.

@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, WithJsonSchema
 
+from mor_bench.specs.method_spec import Told
+
 Real = Annotated[
     float,
     WithJsonSchema({"anyOf": [{"type": "number"}, {"enum": ["nan", "inf", "-inf"]}]}),
@@ -255,6 +257,12 @@ class Row(Part):
         Names; the label lists the swept parameters.
     parameters, swept : dict
         All given parameters, and those that the sweep varies.
+    told : Told or None
+        What the method is told at query time; None if its file does not state it.
+    snapshots : bool or None
+        Whether the method learned from snapshots; None before its fit.
+    reference : bool
+        Whether the method solves the full equations on the dataset's own mesh, like the reference.
     sizes : dict
         Values chosen for parameters that were "auto".
     status, reason : str
@@ -295,6 +303,9 @@ class Row(Part):
     label: str
     parameters: dict[str, Any] = {}
     swept: dict[str, Any] = {}
+    told: Told | None = None
+    snapshots: bool | None = None
+    reference: bool = False
     sizes: dict[str, Any] = {}
     status: Status
     reason: str | None = None

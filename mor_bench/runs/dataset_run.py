@@ -259,6 +259,8 @@ class DatasetRun:
             label=configuration.label,
             parameters=configuration.parameters,
             swept=configuration.swept,
+            told=configuration.method.told_with(configuration.parameters),
+            reference=configuration.method.reference,
             status="ok",
             n_train=len(data.train),
             n_test=len(data.test),
@@ -281,6 +283,7 @@ class DatasetRun:
         indicator = indicator_summary(main)
         asked_s = self.context.options.fit_seconds
         row = row.with_parts(
+            snapshots=record.needs_snapshots,
             n_failed=failed,
             error=error_summary(main),
             offline_s=Offline(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +13,14 @@ from mor_bench.specs.base import Count, Positive, StrictModel
 from mor_bench.specs.battery import Battery
 from mor_bench.specs.loads_spec import SplitBy
 from mor_bench.specs.parameters import check_parameters, load_class
+
+Told = Literal["input", "linear-response", "equations"]
+"""What a method is told at query time: the input alone, also its linear response, the equations.
+
+The input is the forces; on scenes with observed displacements it is those.
+"""
+
+_TOLD_BY_INPUT: dict[str, Told] = {"force": "input", "linear-response": "linear-response"}
 
 
 class Profile(StrictModel):
@@ -55,6 +64,11 @@ class MethodSpec(StrictModel):
     ----------
     surrogate : str
         The class, ``package.module:Class``.
+    told : Told, optional
+        What the method is told at query time. A parameter `input` takes precedence.
+    reference : bool
+        Whether the method solves the full equations on the dataset's own mesh. Its error is then
+        that of its tolerance.
     limits : str
         Where the method fails, in plain words.
     folder : Path, optional
@@ -69,6 +83,8 @@ class MethodSpec(StrictModel):
     title: str
     surrogate: str
     source: str
+    told: Told | None = None
+    reference: bool = False
     limits: str = ""
     regime: Regime | None = None
     folder: Path | None = None
@@ -101,6 +117,10 @@ class MethodSpec(StrictModel):
     def parameters_of(self, profile: str) -> dict[str, Any]:
         """Return the parameters of the file, replaced by those of the profile, without sweeps."""
         return {**self.parameters, **self._profile(profile).parameters}
+
+    def told_with(self, parameters: Mapping[str, Any]) -> Told | None:
+        """Return what a configuration is told at query time; None if the file does not state it."""
+        return _TOLD_BY_INPUT.get(str(parameters.get("input")), self.told)
 
     def fit_seconds(self, profile: str) -> float | None:
         """Return the approximate time of a fit on beam-coarse, s, if the file has it."""
