@@ -63,8 +63,8 @@ def test_a_row_holds_every_figure(small_run: Comparison, cache: Path) -> None:
     assert (row.n_train + row.n_test, row.threads, row.split) == (LIMIT, 1, "region")
     assert row.swept == {"n_modes": 3}
     assert (row.told, row.snapshots, row.reference) == (None, True, False)
-    linear = row_of(small_run, "linear-fem")
-    assert (linear.told, linear.snapshots, linear.reference) == ("linear-response", False, False)
+    other = row_of(small_run, "linear-fem")
+    assert (other.told, other.snapshots, other.reference) == ("linear-response", False, False)
     assert row.error is not None
     assert row.error.model_fields_set == ErrorSummary.model_fields.keys() - {"rel_l2_median_high"}
     assert row.latency_ms is not None

@@ -60,7 +60,7 @@ def test_every_shipped_method_is_valid_and_sweeps_different_configurations(name:
 @pytest.mark.parametrize("name", list_suite("methods"))
 def test_every_shipped_method_states_what_it_is_told(name: str) -> None:
     spec = load_method_spec(name)
-    of_input = {"force": "input", "linear-response": "linear-response"}
+    of_input: dict[Any, Any] = {"force": "input", "linear-response": "linear-response"}
     try:
         default = getattr(spec.load_class(), "input", None)
     except MissingDependencyError as error:
