@@ -194,7 +194,11 @@ class RunOptions(TrainOptions):
     ] = 1
     jobs: Annotated[
         int,
-        Field(ge=1, le=CORES, description="Number of fits at the same time; they share the cores."),
+        Field(
+            ge=1,
+            le=CORES,
+            description="Number of fits at the same time; they share the cores and so take longer.",
+        ),
         CommandLine(metavar="N"),
     ] = 1
     cluster: Cluster = None

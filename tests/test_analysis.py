@@ -26,7 +26,7 @@ from mor_bench.analysis.frontier import (
 )
 from mor_bench.analysis.performance_profile import profile, share_within
 from mor_bench.results.comparison import Comparison
-from mor_bench.results.row import Row, SetErrors
+from mor_bench.results.row import Row, SetErrors, TrainingRecord
 from tests.synthetic import (
     METHODS,
     N_PROCESSES,
@@ -260,7 +260,7 @@ def scored(
         label=label,
         error={"rel_l2_median": error},
         latency_ms={"median": latency_ms},
-        offline_s={"data": data, "fit": 10.0},
+        offline_s={"data": data, "fit": 5.0, "fit_core_s": 10.0},
         n_dofs=600,
         n_train=1000,
         n_test=100,
@@ -279,15 +279,33 @@ def test_break_even_matches_hand_computed_values() -> None:
     records = compare(rows)["time_at_error"]
     records += compare([scored("far", "far", 0.5, 1.0)])["time_at_error"]
     at_one_percent = [r for r in records if r["target_rel_l2_median"] == 0.01]
+    rows += [
+        scored("quick", "other", 0.9, 0.1),
+        a_row("quick", label="failed", status="failed", tuning_s=15.0),
+        a_row("quick", label="skipped", status="skipped"),
+    ]
     found = {record["method"]: record for record in break_even(rows, at_one_percent)}
     assert "fem" not in found
-    assert found["quick"]["queries"] == 100_000  # 40 s over 0.4 ms
+    assert found["quick"]["queries"] == 100_000  # 40 core-seconds over 0.4 ms
+    # Data, two fits, and 15 s of a failed fit on two cores like the others: 80 core-seconds.
+    assert found["quick"]["queries_with_tuning"] == 200_000
     assert found["quick"]["fem_label"] == "loose"
     assert found["slow"]["verdict"] == "never"
     assert found["exact"]["verdict"] == "unknown"  # no full-order configuration is as accurate
     assert found["bought"]["fem_label"] == "tight"
     assert found["bought"]["verdict"] == "unknown"  # the cost of its data is unknown
     assert found["far"]["verdict"] == "not reached"
+
+
+def test_a_break_even_counts_all_threads_and_no_training_on_a_gpu() -> None:
+    rows = [scored("fem", "fem", 0.005, 1.0, 0.0), scored("quick", "quick", 0.008, 0.6)]
+    records = [r for r in compare(rows)["time_at_error"] if r["target_rel_l2_median"] == 0.01]
+    two = [row.with_parts(threads=2) for row in rows]
+    assert break_even(two, records)[0]["queries"] == 50_000
+    on_gpu = [rows[0], rows[1].with_parts(training=TrainingRecord(device="cuda"))]
+    found = break_even(on_gpu, records)[0]
+    assert (found["verdict"], found["queries"]) == ("unknown", None)
+    assert "its fit" in found["reason"]
 
 
 def test_the_performance_profile_matches_hand_computed_values() -> None:
@@ -319,7 +337,7 @@ def test_tuning_reports_the_used_and_the_allowed_budget(tmp_path: Path) -> None:
             "dataset": "beam-tiny",
             "method": "a",
             "configurations": 2,
-            "seconds": 20.0,
+            "seconds": 10.0,
             "seeds": 1,
             "configurations_allowed": 2,
             "seconds_allowed": 15.0,

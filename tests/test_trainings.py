@@ -155,6 +155,8 @@ def test_a_killed_comparison_resumes_in_the_middle_of_a_training(
     assert resumed.warnings[0].startswith("goes on from iteration ")
     assert resumed.offline_s is not None
     assert resumed.offline_s.fit > 0.7  # includes the time before the kill
+    assert resumed.offline_s.fit_core_s is not None
+    assert 0 < resumed.offline_s.fit_core_s < resumed.offline_s.fit  # the training naps
     assert not left.exists()
     model = tmp_path / "whole.safetensors"
     whole = mor_bench.fit("beam-tiny", path, out=model, cache=own_cache, limit=LIMIT, threads=1)

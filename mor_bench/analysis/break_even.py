@@ -1,4 +1,4 @@
-"""Break-even number of queries of each method against the full-order model."""
+"""Break-even number of queries of each method against the full-order model, in core-seconds."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ FULL_ORDER = "fem"
 
 
 def break_even(rows: Sequence[Row], at_error: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Count the queries after which the offline time of a method pays off, at each error.
+    """Count the queries after which the offline cost of a method pays off, at each error.
 
-    The count is the offline time (data and fit) divided by the time that a query saves. It compares
-    two configurations: the method's fastest at that error, and the fastest full-order one that is
-    at least as accurate.
+    The count is the offline cost (data and fit) divided by what a query saves, both in
+    core-seconds. A query uses its latency times its threads. The count compares two configurations:
+    the method's fastest at that error, and the fastest full-order one that is at least as accurate.
 
     Parameters
     ----------
@@ -29,35 +29,31 @@ def break_even(rows: Sequence[Row], at_error: Sequence[dict[str, Any]]) -> list[
     Returns
     -------
     list of dict
-        `queries`, or None with the `verdict` (``never``, ``not reached``, ``unknown``) and its
-        `reason`; and the figures from which the count is computed.
+        `queries` for the fit of this configuration alone, and `queries_with_tuning` for the fits of
+        all configurations of the method that were tried. Both are None with the `verdict`
+        (``never``, ``not reached``, ``unknown``) and its `reason`. The other figures are those from
+        which the counts are computed: `offline_core_s`, of data, fit and all fits.
     """
-    ran = [row for row in rows if row.status == "ok"]
-    return [_break_even(ran, record) for record in at_error if record["method"] != FULL_ORDER]
+    return [_break_even(rows, record) for record in at_error if record["method"] != FULL_ORDER]
 
 
-def _break_even(ran: Sequence[Row], record: dict[str, Any]) -> dict[str, Any]:
-    dataset, best = record["dataset"], record["best"]
+def _break_even(rows: Sequence[Row], record: dict[str, Any]) -> dict[str, Any]:
+    mine = [row for row in rows if row.dataset == record["dataset"]]
+    ran, best = [row for row in mine if row.ok], record["best"]
     out = {key: record[key] for key in ("dataset", "method", "target_rel_l2_median")}
-    out |= dict.fromkeys(
-        ("label", "latency_ms", "fem_label", "fem_latency_ms", "offline_s", "queries")
-    )
+    out |= dict.fromkeys(("label", "latency_ms", "fem_label", "fem_latency_ms", "offline_core_s"))
+    out |= {"queries": None, "queries_with_tuning": None}
     if best is None:
         return {**out, "verdict": "not reached", "reason": "no configuration is that accurate"}
-    row = next(row for row in ran if (row.dataset, row.label) == (dataset, best["label"]))
-    data, fit = (row.offline_s.data, row.offline_s.fit) if row.offline_s else (None, None)
-    latency = best["latency_ms"]
-    out |= {
-        "label": row.label,
-        "latency_ms": latency,
-        "offline_s": {"data": data, "fit": fit},
-    }
+    row = next(row for row in ran if row.label == best["label"])
+    latency, data = best["latency_ms"], row.offline_s.data if row.offline_s else None
+    fit, all_fits = row.fit_core_s, _all_fits_core_s(mine, row.method)
+    offline = {"data": data, "fit": fit, "all_fits": all_fits}
+    out |= {"label": row.label, "latency_ms": latency, "offline_core_s": offline}
     full_order = [
         other
         for other in ran
-        if (other.dataset, other.method) == (dataset, FULL_ORDER)
-        and other.latency_ms
-        and median_error(other) <= best["error"]
+        if other.method == FULL_ORDER and other.latency_ms and median_error(other) <= best["error"]
     ]
     if not full_order:
         reason = f"no configuration of {FULL_ORDER} is as accurate"
@@ -65,9 +61,28 @@ def _break_even(ran: Sequence[Row], record: dict[str, Any]) -> dict[str, Any]:
     fastest = min(full_order, key=median_latency_ms)
     full_order_ms = median_latency_ms(fastest)
     out |= {"fem_label": fastest.label, "fem_latency_ms": full_order_ms}
-    if latency >= full_order_ms:
+    saved_s = 1e-3 * (full_order_ms * fastest.threads - latency * row.threads)
+    if saved_s <= 0:
         return {**out, "verdict": "never", "reason": f"it is not faster than {FULL_ORDER}"}
     if data is None or fit is None:
-        return {**out, "verdict": "unknown", "reason": "the time that its data took is not known"}
-    queries = ceil((data + fit) / (1e-3 * (full_order_ms - latency)))
-    return {**out, "verdict": "pays off", "reason": "", "queries": queries}
+        missing = "its data" if data is None else "its fit"
+        return {**out, "verdict": "unknown", "reason": f"the cost of {missing} is not known"}
+    out |= {"verdict": "pays off", "reason": "", "queries": ceil((data + fit) / saved_s)}
+    if all_fits is not None:
+        out["queries_with_tuning"] = ceil((data + all_fits) / saved_s)
+    return out
+
+
+def _all_fits_core_s(rows: Sequence[Row], method: str) -> float | None:
+    """Core-seconds of all fits of a method; None if those of a fit are unknown.
+
+    A failed fit has only a wall time. It is taken to have used as many cores as the others.
+    """
+    tried = [row for row in rows if row.method == method and row.status != "skipped"]
+    fits = [(row.offline_s.fit, row.fit_core_s) for row in tried if row.offline_s]
+    known = [core_s for _, core_s in fits if core_s is not None]
+    if len(known) < len(fits) or not fits:
+        return None
+    wall_s, core_s = sum(wall for wall, _ in fits), sum(known)
+    failed_s = sum(row.tuning_s or 0.0 for row in tried if row.offline_s is None)
+    return core_s + failed_s * (core_s / wall_s if wall_s else 1.0)

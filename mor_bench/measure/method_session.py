@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mor_bench.errors import InvalidInputError, SolverError, UnknownRangeError
 from mor_bench.machine import peak_memory_bytes, pinned_threads
+from mor_bench.measure.fit_clock import fit_clock
 from mor_bench.measure.predictions import predict_all
 from mor_bench.measure.query_cost import cost_of
 from mor_bench.method_loading import load_fitted, make_surrogate
@@ -146,9 +147,8 @@ class MethodSession(Session):
             snapshots = (
                 read_snapshots(request.train, self.scene) if method.needs_snapshots else None
             )
-            start = perf_counter()
-            method.fit(self.scene, snapshots)
-            seconds = perf_counter() - start
+            with fit_clock() as cost:
+                method.fit(self.scene, snapshots)
         self.method = method
         saved = True
         try:
@@ -156,7 +156,8 @@ class MethodSession(Session):
         except Exception:  # a method that cannot be saved is fitted again where it is timed
             saved = False
         return {
-            "fit_s": seconds,
+            "fit_s": cost.wall_s,
+            "fit_core_s": cost.core_s,
             "fit_memory_bytes": peak_memory_bytes(),
             "model_bytes": request.model.stat().st_size if saved else None,
             "needs_snapshots": method.needs_snapshots,

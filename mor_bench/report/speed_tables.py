@@ -15,6 +15,7 @@ from mor_bench.report.number_format import (
     number,
     percent,
     short_swept,
+    whole,
 )
 from mor_bench.report.text_table import TextTable
 from mor_bench.results.comparison import Comparison
@@ -160,7 +161,8 @@ def break_even_table(
         if record["dataset"] != dataset or record["verdict"] == NOT_REACHED:
             continue
         entry = by_label[record["label"]]
-        queries = record["verdict"] if record["queries"] is None else f"{record['queries']:,}"
+        paid = record["queries"] is not None
+        queries = whole(record["queries"]) if paid else record["verdict"]
         why = f"\n{record['reason']}" if record["verdict"] == "unknown" else ""
         rows.append(
             [
@@ -168,19 +170,21 @@ def break_even_table(
                 f"{percent(record['target_rel_l2_median'])} %",
                 record["label"],
                 queries + why,
+                whole(record["queries_with_tuning"]),
                 number(record["latency_ms"]),
                 number(record["fem_latency_ms"]),
-                number(record["offline_s"]["data"]),
-                number(record["offline_s"]["fit"]),
+                *(number(record["offline_core_s"][part]) for part in ("data", "fit", "all_fits")),
                 bytes_text(entry.figure("memory_bytes", "fit")),
                 bytes_text(entry.row.model_bytes),
             ]
         )
-    headings = ["method", "error", "configuration", "break-even queries", "latency (ms)"]
-    headings += ["full-order (ms)", "data (s)", "fit (s)", "memory", "model"]
+    headings = ["method", "error", "configuration", "break-even queries", "with tuning"]
+    headings += ["latency (ms)", "full-order (ms)", "data (core-s)", "fit (core-s)"]
+    headings += ["all fits (core-s)", "memory", "model"]
     note = (
         "Each row is the fastest configuration of a method with at most this error. "
-        "Break-even queries: offline time (data and fit) divided by the time that a query saves. "
+        "Break-even queries: core-seconds of data and fit, divided by those that a query saves. "
+        "With tuning: all fits of the method count, failed ones too. "
         "The saving is against the fastest full-order configuration that is at least as accurate. "
         "Never: the full-order model is as fast. Errors that a method does not reach are left out."
     )

@@ -129,10 +129,21 @@ class AllThreadsLatency(Part):
 
 
 class Offline(Part):
-    """Offline cost: data generation, core-seconds (None if unknown), and fitting, s."""
+    """Offline cost.
+
+    Attributes
+    ----------
+    data : float or None
+        Core-seconds of generating the training samples; None if unknown.
+    fit : float
+        Wall time of the fit without compilation, s.
+    fit_core_s : float or None
+        Core-seconds of the fit without compilation; None in files of earlier versions.
+    """
 
     data: Real | None
     fit: Real
+    fit_core_s: Real | None = None
 
 
 class Memory(Part):
@@ -338,6 +349,20 @@ class Row(Part):
     def ok(self) -> bool:
         """True if the configuration ran to the end."""
         return self.status == "ok"
+
+    @property
+    def fit_core_s(self) -> float | None:
+        """Core-seconds of the fit; None for a training on a GPU. Old files have its wall time."""
+        if self.offline_s is None or (self.training and self.training.device == "cuda"):
+            return None
+        cores = self.offline_s.fit_core_s
+        return self.offline_s.fit if cores is None else cores
+
+    @property
+    def offline_core_s(self) -> float | None:
+        """Core-seconds of data and fit; None if one of them is unknown."""
+        data, fit = self.offline_s.data if self.offline_s else None, self.fit_core_s
+        return None if data is None or fit is None else data + fit
 
     def as_dict(self) -> dict[str, Any]:
         """Return the JSON content with all keys of a row."""

@@ -92,8 +92,8 @@ class FitRecord(BaseModel):
     method : str
     n_train, n_dofs : int
         Size of the problem.
-    fit_s : float
-        Seconds of fitting.
+    fit_s, fit_core_s : float
+        Wall time and core-seconds of fitting, without compilation.
     fit_memory_bytes : int
         Peak resident memory.
     model_bytes : int or None
@@ -115,6 +115,7 @@ class FitRecord(BaseModel):
     n_train: int
     n_dofs: int
     fit_s: float
+    fit_core_s: float
     fit_memory_bytes: int
     model_bytes: int | None
     needs_snapshots: bool

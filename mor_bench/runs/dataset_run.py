@@ -287,7 +287,9 @@ class DatasetRun:
             n_failed=failed,
             error=error_summary(main),
             offline_s=Offline(
-                data=self.data_s if record.needs_snapshots else 0.0, fit=record.fit_s
+                data=self.data_s if record.needs_snapshots else 0.0,
+                fit=record.fit_s,
+                fit_core_s=record.fit_core_s,
             ),
             memory_bytes=Memory(fit=record.fit_memory_bytes, predict=None),
             model_bytes=record.model_bytes,

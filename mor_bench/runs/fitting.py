@@ -50,7 +50,7 @@ def fit_configuration(
         return _keep_remote(cached, *remote(cached, limit_s))
     worker, answer, model = _fit_in_worker(cached, limit_s)
     try:
-        answer["fit_s"] += cached.taken_s
+        _add_earlier_processes(answer, cached.taken_s)
         saved = answer["model_bytes"] is not None
         record = cached.keep(_record(cached, answer), model if saved else None)
         shutil.rmtree(model.parent, ignore_errors=True)
@@ -63,6 +63,13 @@ def fit_configuration(
     else:
         cached.hold(worker)
     return record
+
+
+def _add_earlier_processes(answer: dict[str, Any], taken_s: float) -> None:
+    """Add a training's wall time before it was stopped; it is taken to have used as many cores."""
+    cores = answer["fit_core_s"] / answer["fit_s"] if answer["fit_s"] else 1.0
+    answer["fit_core_s"] += taken_s * cores
+    answer["fit_s"] += taken_s
 
 
 def _fit_in_worker(

@@ -84,6 +84,8 @@ class RunContext:
         }
         if options.fit_seconds is not None:
             settings["fit_seconds"] = options.fit_seconds
+        if options.jobs > 1:  # fits that share the cores take longer than alone
+            settings["jobs"] = options.jobs
         return settings
 
 

@@ -1,0 +1,73 @@
+"""The cost of a fit: core-seconds beside wall time, and no compilation."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from threading import Thread
+from time import sleep, thread_time
+
+import pytest
+from numba import njit
+
+from mor_bench.measure.fit_clock import fit_clock
+from tests.synthetic import a_row
+
+BUSY_S = 0.1
+
+
+def busy() -> None:
+    """Use one core for `BUSY_S` of processor time."""
+    until = thread_time() + BUSY_S
+    while thread_time() < until:
+        pass
+
+
+def test_core_seconds_count_threads_and_ended_children_but_no_waiting() -> None:
+    with fit_clock() as waiting:
+        sleep(BUSY_S)
+    assert waiting.core_s < 0.5 * waiting.wall_s
+    threads = [Thread(target=busy) for _ in range(2)]
+    with fit_clock() as threaded:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert threaded.core_s >= 2 * BUSY_S
+    loop = f"import time\nwhile time.process_time() < {2 * BUSY_S}: pass"
+    with fit_clock() as child:
+        subprocess.run([sys.executable, "-c", loop], check=True)
+    assert child.core_s >= 1.9 * BUSY_S  # the times of children have a resolution of 10 ms
+    assert threaded.compile_s == child.compile_s == 0.0
+
+
+def test_compilation_is_part_of_neither_time() -> None:
+    @njit(cache=False)
+    def summed(n: int) -> int:
+        total = 0
+        for i in range(n):
+            total += i * i
+        return total
+
+    with fit_clock() as cost:
+        assert summed(4) == 14
+    assert cost.compile_s > 0
+    assert max(cost.wall_s, cost.core_s) < 0.5 * cost.compile_s
+
+
+@pytest.mark.parametrize(
+    ("offline", "device", "known"),
+    [
+        ({"data": 3.0, "fit": 5.0, "fit_core_s": 9.0}, None, 12.0),
+        ({"data": 3.0, "fit": 5.0, "fit_core_s": 9.0}, "cpu", 12.0),
+        ({"data": 3.0, "fit": 5.0, "fit_core_s": 9.0}, "cuda", None),
+        ({"data": 3.0, "fit": 5.0}, None, 8.0),  # a file of an earlier version
+        ({"data": None, "fit": 5.0, "fit_core_s": 9.0}, None, None),
+        (None, None, None),
+    ],
+)
+def test_the_offline_cost_of_a_row_is_in_core_seconds(
+    offline: dict[str, float | None] | None, device: str | None, known: float | None
+) -> None:
+    training = {"device": device} if device else None
+    assert a_row("a", offline_s=offline, training=training).offline_core_s == known
