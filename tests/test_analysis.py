@@ -26,7 +26,8 @@ from mor_bench.analysis.frontier import (
 )
 from mor_bench.analysis.performance_profile import profile, share_within
 from mor_bench.results.comparison import Comparison
-from mor_bench.results.row import Row, SetErrors, TrainingRecord
+from mor_bench.results.parts import TrainingRecord
+from mor_bench.results.row import Row, SetErrors
 from tests.synthetic import (
     METHODS,
     N_PROCESSES,

@@ -8,27 +8,12 @@ from __future__ import annotations
 from math import nan
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, WithJsonSchema
+from pydantic import BeforeValidator, Field
 
+from mor_bench.results.parts import Part, Real, SeedSpread, TrainingRecord
 from mor_bench.specs.method_spec import Told
 
-Real = Annotated[
-    float,
-    WithJsonSchema({"anyOf": [{"type": "number"}, {"enum": ["nan", "inf", "-inf"]}]}),
-]
-"""A float. Files hold NaN and infinity as strings, because JSON lacks them."""
-
 Status = Literal["ok", "failed", "skipped"]
-
-
-class Part(BaseModel):
-    """A frozen group of figures."""
-
-    model_config = ConfigDict(frozen=True, ser_json_inf_nan="constants")
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the JSON content; fields that were not set are left out."""
-        return self.model_dump(exclude_unset=True)
 
 
 class ErrorSummary(Part):
@@ -119,7 +104,7 @@ class Latency(Part):
     n_queries: int = 0
     n_processes: int = 0
     stable: bool | None = None
-    unstable_because: list[str] = []
+    unstable_because: list[str] = Field(default=[])
 
 
 class AllThreadsLatency(Part):
@@ -209,56 +194,6 @@ class RangeFlags(Part):
     test: FlagCounts
 
 
-class TrainingRecord(Part):
-    """Device, time limit (s), iterations and last losses of a training; None where unknown."""
-
-    device: str
-    fit_seconds: Real | None = None
-    iterations: int | None = None
-    loss: Real | None = None
-    validation_loss: Real | None = None
-
-
-class Spread(Part):
-    """Scatter of one figure over the seeds of a training."""
-
-    median: Real
-    min: Real
-    max: Real
-    std: Real
-
-
-class SeedTraining(Part):
-    """One training: its seed, its fitting time (s), its errors, and the reason for a failure."""
-
-    seed: int
-    fit_s: Real | None
-    mean_dof_m: Real
-    rel_l2_median: Real
-    failed: str | None = None
-
-
-class SeedSpread(Part):
-    """Errors over the seeds of a training; a failed training has an infinite error.
-
-    Attributes
-    ----------
-    n, asked : int
-        Trainings that succeeded, and trainings that were started.
-    failed : list of str
-        Reasons of the failures.
-    mean_dof_m, rel_l2_median : Spread
-    trainings : list of SeedTraining
-    """
-
-    n: int
-    asked: int = 0
-    failed: list[str] = []
-    mean_dof_m: Spread | None = None
-    rel_l2_median: Spread | None = None
-    trainings: list[SeedTraining] = []
-
-
 class Row(Part):
     """One configuration of one method on one dataset.
 
@@ -312,12 +247,12 @@ class Row(Part):
     split: str
     method: str
     label: str
-    parameters: dict[str, Any] = {}
-    swept: dict[str, Any] = {}
+    parameters: dict[str, Any] = Field(default={})
+    swept: dict[str, Any] = Field(default={})
     told: Told | None = None
     snapshots: bool | None = None
     reference: bool = False
-    sizes: dict[str, Any] = {}
+    sizes: dict[str, Any] = Field(default={})
     status: Status
     reason: str | None = None
     n_train: int
@@ -335,14 +270,14 @@ class Row(Part):
     model_bytes: int | None = None
     cost: dict[str, Real] | None = None
     indicator: IndicatorQuality | None = None
-    sets: dict[str, SetErrors] = {}
+    sets: dict[str, SetErrors] = Field(default={})
     range: RangeFlags | None = None
     hidden: SetErrors | None = None
     training: TrainingRecord | None = None
     seeds: SeedSpread | None = None
     discretisation_error_m: Real | None = None
     discretisation_rel_l2: Real | None = None
-    warnings: list[str] = []
+    warnings: list[str] = Field(default=[])
     tuning_s: Real | None = None
 
     @property

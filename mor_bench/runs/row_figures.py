@@ -12,7 +12,8 @@ from mor_bench.errors import MissingDependencyError, MorBenchError, UnsupportedS
 from mor_bench.measure.error_metrics import ERRORS, SampleErrors, summary
 from mor_bench.measure.method_session import CURVES
 from mor_bench.measure.range_flags import Flags
-from mor_bench.results.row import ErrorSummary, Row, SetErrors, Status, TrainingRecord
+from mor_bench.results.parts import TrainingRecord
+from mor_bench.results.row import ErrorSummary, Row, SetErrors, Status
 from mor_bench.runs.cached_fit import FitRecord
 from mor_bench.sandbox.process import MethodFailedError
 from mor_bench.training_options import TrainingOptions

@@ -1,0 +1,73 @@
+"""The base of all typed parts of results.json, and the parts about trainings."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, WithJsonSchema
+
+Real = Annotated[
+    float,
+    WithJsonSchema({"anyOf": [{"type": "number"}, {"enum": ["nan", "inf", "-inf"]}]}),
+]
+"""A float. Files hold NaN and infinity as strings, because JSON lacks them."""
+
+
+class Part(BaseModel):
+    """A frozen group of figures."""
+
+    model_config = ConfigDict(frozen=True, ser_json_inf_nan="constants")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the JSON content; fields that were not set are left out."""
+        return self.model_dump(exclude_unset=True)
+
+
+class TrainingRecord(Part):
+    """Device, time limit (s), iterations and last losses of a training; None where unknown."""
+
+    device: str
+    fit_seconds: Real | None = None
+    iterations: int | None = None
+    loss: Real | None = None
+    validation_loss: Real | None = None
+
+
+class Spread(Part):
+    """Scatter of one figure over the seeds of a training."""
+
+    median: Real
+    min: Real
+    max: Real
+    std: Real
+
+
+class SeedTraining(Part):
+    """One training: its seed, its fitting time (s), its errors, and the reason for a failure."""
+
+    seed: int
+    fit_s: Real | None
+    mean_dof_m: Real
+    rel_l2_median: Real
+    failed: str | None = None
+
+
+class SeedSpread(Part):
+    """Errors over the seeds of a training; a failed training has an infinite error.
+
+    Attributes
+    ----------
+    n, asked : int
+        Trainings that succeeded, and trainings that were started.
+    failed : list of str
+        Reasons of the failures.
+    mean_dof_m, rel_l2_median : Spread
+    trainings : list of SeedTraining
+    """
+
+    n: int
+    asked: int = 0
+    failed: list[str] = []
+    mean_dof_m: Spread | None = None
+    rel_l2_median: Spread | None = None
+    trainings: list[SeedTraining] = []
