@@ -67,6 +67,9 @@ def main(
     ] = None,
     dataset: Annotated[str, typer.Option(help="Name or TOML file.")] = "beam-fine",
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    report: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures here.")
+    ] = None,
     one: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
     """Measure rate, cost per sample and memory of generating the first samples of a dataset."""
@@ -89,6 +92,7 @@ def main(
         "parent MB",
         "worker MB",
     )
+    rows = []
     for size in samples or SIZES:
         options = ["--one", "--samples", str(size), "--dataset", dataset, "--workers", str(workers)]
         command = [sys.executable, "-m", "tests.benchmarks.generation", *options]
@@ -97,6 +101,7 @@ def main(
                 command, check=True, stdout=subprocess.PIPE, text=True, env=pinned
             ).stdout
         )
+        rows.append(row)
         table.add_row(
             f"{row['samples']:,}",
             f"{row['seconds']:.1f}",
@@ -110,6 +115,9 @@ def main(
     console = Console(width=100)
     console.print(f"{dataset}, {workers} workers of one thread", highlight=False)
     console.print(table)
+    if report is not None:
+        found = {"dataset": dataset, "workers": workers, "sizes": rows}
+        report.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
 def _number(value: float | None, form: str) -> str:

@@ -1,6 +1,6 @@
 """Seconds and memory of the full-order solve against the size of the mesh, 1e3 to 3e5 unknowns.
 
-    python -m tests.benchmarks.scaling
+    python -m tests.benchmarks.scaling --json scaling.json
 
 Each size is a cantilever like the shipped beams, in a process of its own on one thread. The set-up
 time covers imports, mesh, sparsity pattern and rest-state factor. The solve time is the median over
@@ -13,6 +13,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
 
@@ -70,6 +71,9 @@ def main(
             min=2, help=f"Cells across; repeat for more. By default {SIZES}.", show_default=False
         ),
     ] = None,
+    report: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures here.")
+    ] = None,
     one: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
     """Measure seconds and memory of the full-order solve against the number of unknowns."""
@@ -103,13 +107,22 @@ def main(
         )
     console = Console()
     console.print(table)
-    if len(rows) > 1:
-        unknowns = np.log([row["unknowns"] for row in rows])
-        for key in ("solve_s", "set_up_s", "peak_mb"):
-            values = np.log([row[key] for row in rows])
-            if np.isfinite(values).all():
-                slope = np.polyfit(unknowns, values, 1)[0]
-                console.print(f"{key} grows as unknowns to the power {slope:.2f}", highlight=False)
+    powers = growth(rows) if len(rows) > 1 else {}
+    for key, power in powers.items():
+        console.print(f"{key} grows as unknowns to the power {power:.2f}", highlight=False)
+    if report is not None:
+        report.write_text(json.dumps({"sizes": rows, "powers": powers}, indent=1) + "\n")
+
+
+def growth(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Fit the power of the number of unknowns with which each known figure grows."""
+    unknowns = np.log([row["unknowns"] for row in rows])
+    logs = {key: np.log([row[key] for row in rows]) for key in ("solve_s", "set_up_s", "peak_mb")}
+    return {
+        key: float(np.polyfit(unknowns, values, 1)[0])
+        for key, values in logs.items()
+        if np.isfinite(values).all()
+    }
 
 
 if __name__ == "__main__":

@@ -11,7 +11,9 @@ fails if any answer is invalid.
 
 from __future__ import annotations
 
+import json
 from collections import Counter
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -34,6 +36,9 @@ def main(
     dataset: Annotated[str, typer.Argument(help="Name or TOML file.")],
     n_loads: Annotated[int, typer.Argument(min=1, help="Loads, drawn as the dataset draws them.")],
     times: Annotated[float, typer.Option(min=0, help="Factor on every load.")] = 1.0,
+    report: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Also write the counts here.")
+    ] = None,
 ) -> None:
     """Solve random loads and check every answer."""
     threadpool_limits(1)
@@ -72,6 +77,19 @@ def main(
         print(f"least det F {least:.3f}, largest residual {worst:.1e} of the load")
         middle, most = np.median(iterations), max(iterations)
         print(f"iterations: median {middle:.0f}, most {most}; cut-backs: {cuts}")
+    if report is not None:
+        found = {
+            "dataset": dataset,
+            "loads": n_loads,
+            "times": times,
+            "outcomes": dict(outcomes),
+            "least_det_f": least,
+            "largest_residual": worst,
+            "iterations_median": float(np.median(iterations)) if iterations else None,
+            "iterations_most": max(iterations, default=None),
+            "cut_backs": cuts,
+        }
+        report.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     if any(outcome.startswith("INVALID") for outcome in outcomes):
         raise typer.Exit(1)
 

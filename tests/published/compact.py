@@ -1,0 +1,96 @@
+"""A run in compact form: results, conclusions, and the errors of every test sample.
+
+FOLDER/results.json, FOLDER/comparison.json    as the run wrote them
+FOLDER/errors.h5                               per-sample errors in single precision
+
+Latencies of single queries, predictions and loss curves are left out.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.results.comparison import Comparison
+from mor_bench.snapshots.store import write_atomically
+
+ERRORS = "errors.h5"
+
+LEFT_OUT = (
+    "latency_ms",
+    "all_threads_ms",
+    "gc_ms",
+    "process",
+    "round",
+    "used",
+    "loss_curve",
+    "validation_curve",
+    "worst_prediction",
+    "worst_reference",
+    "worst_forces",
+)
+"""Arrays of a configuration that the compact form does not keep."""
+
+PACKED_BYTES = 8192
+"""Larger arrays are compressed; for smaller ones the description of the compression is larger."""
+
+KEPT_OF_DATASETS = ("test_regions", "validation_regions", "singular_values")
+
+
+def compact(run: Path, folder: Path) -> None:
+    """Write a finished run in compact form."""
+    comparison = Comparison.read(run)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("results.json", "comparison.json"):
+        content = json.loads((run / name).read_text(encoding="utf-8"))
+        text = json.dumps(content, indent=None, separators=(",", ":"), allow_nan=False)
+        write_atomically(folder / name, (text + "\n").encode())
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w", libver="latest") as file:
+        for name in comparison.datasets:
+            kept = comparison.dataset_arrays(name)
+            _write(file.create_group(name), {k: kept[k] for k in KEPT_OF_DATASETS if k in kept})
+        for row in comparison.rows:
+            if row.ok:
+                kept = comparison.samples(row)
+                _write(
+                    file.require_group(row.dataset).create_group(row.label),
+                    {k: v for k, v in kept.items() if k not in LEFT_OUT},
+                )
+    write_atomically(folder / ERRORS, buffer.getvalue())
+
+
+def _write(group: h5py.Group, arrays: Mapping[str, NDArray[Any]]) -> None:
+    for name, array in arrays.items():
+        stored = array.astype(np.float32) if array.dtype == np.float64 else array
+        packed = {"compression": "gzip", "shuffle": True} if stored.nbytes > PACKED_BYTES else {}
+        group.create_dataset(name, data=stored, track_times=False, **packed)
+
+
+def wrong_summaries(folder: Path) -> Iterator[str]:
+    """Compare the errors in results.json with those of the samples; yield each difference."""
+    comparison = Comparison.read(folder)
+    with h5py.File(folder / ERRORS, "r") as file:
+        for row in comparison.rows:
+            if not row.ok or row.error is None:
+                continue
+            samples = file[row.dataset][row.label]
+            relative = np.asarray(samples["relative_l2"][()], dtype=float)
+            computed = {
+                "rel_l2_median": float(np.median(relative)),
+                "rel_l2_max": float(np.max(relative)),
+                "mean_dof_m": float(np.mean(samples["mean_dof_m"][()], dtype=float)),
+            }
+            if len(relative) != row.n_test:
+                yield f"{row.label}: {len(relative)} samples of {row.n_test}"
+            for name, value in computed.items():
+                said = float(getattr(row.error, name))
+                if not np.isclose(value, said, rtol=1e-5, atol=1e-12, equal_nan=True):
+                    yield f"{row.dataset}, {row.label}: {name} is {value:g}, stated as {said:g}"

@@ -1,0 +1,223 @@
+"""Tables in Markdown of evidence other than runs; a table takes the path of a file or folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.report.number_format import DASH, number
+from tests.published.record import SOURCES, experiments, record_of
+from tests.published.run_tables import markdown
+from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of
+
+
+def _medians(row: Mapping[str, Any]) -> NDArray[np.float64]:
+    return np.asarray(np.median(np.array(row["times_ms"]), axis=1))
+
+
+def peers(source: str) -> str:
+    """Show the time of each code over that of the first, the median over loads."""
+    datasets = content_of(source)["datasets"]
+    columns = {
+        name: {row["name"]: _medians(row) for row in found["contenders"]}
+        for name, found in datasets.items()
+    }
+    names = list(dict.fromkeys(name for column in columns.values() for name in column))
+
+    def cell(column: Mapping[str, NDArray[np.float64]], name: str) -> str:
+        if name not in column:
+            return DASH
+        ratio = float(np.median(column[name] / next(iter(column.values()))))
+        return f"{number(ratio)} ({number(float(np.median(column[name])))} ms)"
+
+    body = [[name, *(cell(column, name) for column in columns.values())] for name in names]
+    return markdown(["", *columns], body)
+
+
+def reduced_peers(source: str) -> str:
+    """Show cells, time and speed-up over the faster POD of Kratos, for each number of modes."""
+    modes = content_of(source)["modes"]
+    headings, columns = [""], []
+    for n_modes, rows in modes.items():
+        headings += [f"r = {n_modes}: cells", "ms", "×"]
+        best = {row["name"]: np.min(np.array(row["times_ms"]), axis=1) for row in rows}
+        pods = [times for name, times in best.items() if name.startswith("Kratos POD")]
+        if not pods:
+            raise EvidenceError(f"{source}: Kratos' POD was not measured.")
+        base = np.min(pods, axis=0)
+        columns.append(
+            {
+                row["name"]: [
+                    DASH if row["n_cells"] is None else f"{row['n_cells']}",
+                    number(float(np.median(_medians(row)))),
+                    number(float(np.median(base / best[row["name"]]))),
+                ]
+                for row in rows
+            }
+        )
+    names = list(dict.fromkeys(name for column in columns for name in column))
+    body = [
+        [name, *(cell for column in columns for cell in column.get(name, [DASH] * 3))]
+        for name in names
+    ]
+    return markdown(headings, body)
+
+
+def scaling(source: str) -> str:
+    """Show the cost of a solve against the number of unknowns."""
+    headings = ["unknowns", "rest state", "set-up, s", "solve, ms", "iterations", "peak MB"]
+    return markdown(
+        headings,
+        [
+            [
+                f"{row['unknowns']:,}",
+                "banded" if "Banded" in row["rest_state"] else "multigrid",
+                f"{row['set_up_s']:.1f}",
+                number(1e3 * row["solve_s"]),
+                f"{row['iterations']:.0f}",
+                number(row["peak_mb"]),
+            ]
+            for row in content_of(source)["sizes"]
+        ],
+    )
+
+
+def generation(source: str) -> str:
+    """Show the cost of generating samples against their number."""
+    headings = ["samples", "seconds", "samples/s", "ms per sample", "disk, MB", "memory: parent"]
+    return markdown(
+        [*headings, "memory: worker"],
+        [
+            [
+                f"{row['samples']:,}",
+                f"{row['seconds']:.1f}",
+                number(row["rate"]),
+                number(1e3 / row["rate"]),
+                number(row["disk_mb"]),
+                f"{number(row['parent_mb'])} MB",
+                f"{number(row['worker_mb'])} MB" if row["worker_mb"] else DASH,
+            ]
+            for row in content_of(source)["sizes"]
+        ],
+    )
+
+
+def random_loads(source: str) -> str:
+    """Show how many answers to random loads passed the independent checks; SOURCE is FILE,…."""
+    body = []
+    for file in source.split(","):
+        found = content_of(file)
+        factor = "" if found["times"] == 1 else f", {number(found['times'])} times as large"
+        body.append(
+            [
+                f"{found['dataset']}, {found['loads']:,} loads as its dataset draws them{factor}",
+                ", ".join(f"{n:,} {outcome}" for outcome, n in found["outcomes"].items()),
+                f"{found['least_det_f']:.3f}",
+                f"{found['largest_residual']:.1e}",
+                f"{found['iterations_median']:.0f}, {found['iterations_most']}",
+            ]
+        )
+    headings = ["loads", "answers", "least det F", "largest residual", "iterations: median, most"]
+    return markdown(headings, body)
+
+
+def refinement(source: str) -> str:
+    """Show the discretisation error of every mesh; SOURCE is the folder of the datasets."""
+    body = []
+    for path in sorted((ROOT / source).glob("*.refine.json")):
+        found = content_of(path.relative_to(ROOT).as_posix())
+        meshes = found["meshes"]
+        body.append(
+            [
+                f"`{found['dataset']}`",
+                f"{meshes[0]['n_cells']:,}",
+                f"{meshes[-1]['n_cells']:,}",
+                f"{len(found['loads'])}",
+                f"{found['error_m']:.1e}",
+                f"{100 * found['relative_l2_median']:.2g}",
+            ]
+        )
+    headings = ["mesh", "cells", "cells of the finest mesh", "loads", "e, m", "median %"]
+    return markdown(headings, body)
+
+
+def _outcomes(source: str) -> list[dict[str, Any]]:
+    return [row for row in content_of(source)["rows"] if row["verdict"] != "not applicable"]
+
+
+def hard_cases(source: str) -> str:
+    """Show every hard case: expected behaviour, and which methods pass or fall short."""
+    cases: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in _outcomes(source):
+        cases.setdefault((row["case"], row["expected"]), []).append(row)
+    body = []
+    for (case, expected), rows in cases.items():
+        short = list(dict.fromkeys(r["method"] for r in rows if r["verdict"] == "fall short"))
+        methods = {row["method"] for row in rows}
+        if len(methods) == 1 and not short:
+            result = rows[0]["happened"]
+        else:
+            result = f"{len(methods) - len(short)} of {len(methods)} methods pass"
+            result += f"; short: {', '.join(f'`{m}`' for m in short)}" if short else ""
+        body.append([f"`{case}`", expected, result.replace("|", "/")])
+    return markdown(["case", "expected", "result"], body)
+
+
+def hard_loads(source: str) -> str:
+    """Show the errors of every method under loads unlike the training loads."""
+    rows = [row for row in _outcomes(source) if row["case"] == "out-of-distribution"]
+    parts = list(dict.fromkeys(row["part"] for row in rows))
+    cells = {(row["method"], row["part"]): _spread(row["measured"]) for row in rows}
+    methods = dict.fromkeys(row["method"] for row in rows)
+    headings = ["median / p95 / max, %", *parts]
+    body = [[f"`{m}`", *(cells.get((m, part), DASH) for part in parts)] for m in methods]
+    return markdown(headings, body)
+
+
+def _spread(measured: Mapping[str, Any]) -> str:
+    names = ("rel_l2_median", "rel_l2_p95", "rel_l2_max")
+    values: Sequence[float] = [float(measured[name]) for name in names]
+    return " / ".join(number(100 * x) if np.isfinite(x) else "none" for x in values)
+
+
+def evidence(source: str) -> str:
+    """List the experiments: evidence, command, commit, date, seconds, machine."""
+    if source != SOURCES:
+        raise EvidenceError(f"The table of the evidence is made from {SOURCES}.")
+    body = []
+    for name, entry in experiments().items():
+        path, key = record_of(name)
+        facts = content_of(path.relative_to(ROOT).as_posix()).get(key)
+        if facts is None:
+            raise EvidenceError(f"{name}: not recorded in {path.relative_to(ROOT)}.")
+        folder = (REPORTS / name).relative_to(REPORTS).as_posix()
+        body.append(
+            [
+                f"[{name}]({folder})",
+                f"`{facts['command']}`",
+                facts["commit"][:7],
+                facts["date"],
+                f"{facts['seconds']:,.0f}",
+                facts["machine"],
+            ]
+        )
+        if facts["command"] != entry["command"]:
+            raise EvidenceError(f"{name}: recorded with another command: {facts['command']}")
+    headings = ["evidence in `reports/`", "command", "commit", "date", "seconds", "machine"]
+    return markdown(headings, body)
+
+
+OTHER_TABLES: dict[str, Callable[..., str]] = {
+    "peers": peers,
+    "reduced-peers": reduced_peers,
+    "scaling": scaling,
+    "generation": generation,
+    "random-loads": random_loads,
+    "refinement": refinement,
+    "hard-cases": hard_cases,
+    "hard-loads": hard_loads,
+    "evidence": evidence,
+}

@@ -1,0 +1,96 @@
+"""Pictures in the pages that are drawn from the evidence.
+
+    <!-- drawn from: reports/quick-start error-against-time beam-coarse -->
+    ![…](docs/error-against-time.png)
+
+The PNG carries digests of its source files and of its own pixels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib import image
+from numpy.typing import NDArray
+from PIL import Image
+
+from mor_bench.report.canvas import DPI, styles_of
+from mor_bench.report.error_against_time import error_against_time
+from mor_bench.snapshots.store import write_atomically
+from tests.published.stored import ROOT, EvidenceError, run_of
+
+DRAWN = re.compile(
+    r"<!-- drawn from: (?P<source>\S+) (?P<kind>\S+) (?P<dataset>\S+) -->\n+"
+    r"!\[[^\]]*\]\((?P<path>[^)]+)\)"
+)
+PICTURE = re.compile(r"!\[[^\]]*\]\((?P<path>[^)]+\.png)\)")
+
+
+def drawn(source: str, kind: str, dataset: str) -> bytes:
+    """Draw a figure from a stored run; return the PNG with its digests."""
+    if kind != "error-against-time":
+        raise EvidenceError(f"{source}: there is no picture {kind!r}.")
+    run = run_of(source)
+    picture = error_against_time(run, dataset, styles_of(run), run.analysis or {})
+    if picture is None:
+        raise EvidenceError(f"{source}: no configuration of {dataset} can be drawn.")
+    buffer = io.BytesIO()
+    picture.figure.savefig(buffer, format="png", dpi=DPI)
+    digests = {
+        "Software": f"matplotlib {matplotlib.__version__}",
+        "Source": f"{source} {kind} {dataset} {source_digest(source)}",
+        "Comment": pixel_digest(buffer.getvalue()),
+    }
+    buffer = io.BytesIO()
+    picture.figure.savefig(buffer, format="png", dpi=DPI, metadata=digests)
+    return buffer.getvalue()
+
+
+def source_digest(source: str) -> str:
+    """Digest of the files that a picture of a run is drawn from."""
+    files = [(ROOT / source / name).read_bytes() for name in ("results.json", "comparison.json")]
+    return hashlib.sha256(b"\0".join(files)).hexdigest()
+
+
+def pixel_digest(png: bytes) -> str:
+    """Digest of the pixels of a PNG."""
+    return hashlib.sha256(pixels(png).tobytes()).hexdigest()
+
+
+def pixels(png: bytes) -> NDArray[np.float32]:
+    """Pixels (height, width, 4) of a PNG."""
+    return np.asarray(image.imread(io.BytesIO(png), format="png"))
+
+
+def stale_pictures(page: Path, text: str) -> Iterator[str]:
+    """Yield each picture of a page that is not drawn from the present evidence."""
+    known = set()
+    for match in DRAWN.finditer(text):
+        known.add(match["path"])
+        path = page.parent / match["path"]
+        if not path.is_file():
+            yield f"{page.name}: {match['path']} does not exist"
+            continue
+        with Image.open(path) as opened:
+            said = dict(opened.text)  # type: ignore[attr-defined]
+        source = " ".join((match["source"], match["kind"], match["dataset"]))
+        if said.get("Source") != f"{source} {source_digest(match['source'])}":
+            yield f"{page.name}: {match['path']} is not drawn from the present {match['source']}"
+        if said.get("Comment") != pixel_digest(path.read_bytes()):
+            yield f"{page.name}: {match['path']} was changed after it was drawn"
+    for match in PICTURE.finditer(text):
+        if match["path"] not in known:
+            yield f"{page.name}: {match['path']} has no line `<!-- drawn from: … -->` above it"
+
+
+def draw_pictures(page: Path, text: str) -> None:
+    """Draw the pictures of a page again."""
+    for match in DRAWN.finditer(text):
+        png = drawn(match["source"], match["kind"], match["dataset"])
+        write_atomically(page.parent / match["path"], png)

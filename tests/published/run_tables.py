@@ -1,0 +1,375 @@
+"""Tables in Markdown of stored runs. A table takes the run's folder and options of its block."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from math import inf, isfinite
+from typing import Any
+
+import h5py
+import numpy as np
+
+from mor_bench.analysis.frontier import median_error, median_latency_ms
+from mor_bench.report.number_format import DASH, number, percent, short_swept
+from mor_bench.report.paper_tables import PUBLISHED
+from mor_bench.results.comparison import Comparison
+from mor_bench.results.row import ErrorSummary, Row
+from tests.published.compact import ERRORS
+from tests.published.stored import ROOT, EvidenceError, run_of
+
+LEVELS = (0.03, 0.01, 0.003, 0.001)
+"""Median relative l2 errors of the columns of `fastest`."""
+
+
+def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Format a table in Markdown."""
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def _metres(value: float) -> str:
+    return f"{value:.1e}".replace("e-0", "e-") if isfinite(value) else "∞"
+
+
+def _percent(value: float) -> str:
+    return percent(value) if isfinite(value) else "∞"
+
+
+def _rows(run: Comparison, dataset: str, methods: str) -> list[Row]:
+    """Return the rows that ran, of one dataset and of the named methods in this order."""
+    name = dataset or next(iter(run.datasets))
+    rows = [row for row in run.rows if row.ok and row.dataset == name]
+    if not rows:
+        raise EvidenceError(f"{run.out}: no configuration ran on {name}.")
+    wanted = methods.split(",") if methods else list(dict.fromkeys(row.method for row in rows))
+    return [row for method in wanted for row in rows if row.method == method]
+
+
+def _by_method(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        found.setdefault(row.method, []).append(row)
+    return found
+
+
+def validated(row: Row) -> ErrorSummary:
+    """Return the errors that decide between configurations: on validation samples if there are any.
+
+    Methods without training have no validation samples; their test errors decide.
+    """
+    return getattr(row, "validation", None) or row.error or ErrorSummary()
+
+
+def chosen(rows: Sequence[Row]) -> Row:
+    """Return the configuration that the validation samples select: the smallest median error."""
+    return min(rows, key=lambda row: (validated(row).rel_l2_median, row.label))
+
+
+def _configuration(row: Row) -> str:
+    return short_swept(row.swept) or DASH
+
+
+def _figure(run: Comparison, row: Row, name: str) -> tuple[float | None, float | None]:
+    """Return the 95 % interval of a figure of a configuration."""
+    for record in (run.analysis or {})["rows"]:
+        if (record["dataset"], record["label"]) == (row.dataset, row.label):
+            return record[name]["low"], record[name]["high"]
+    return None, None
+
+
+def _with_interval(value: float, ends: tuple[float | None, float | None], scale: float) -> str:
+    text = number(scale * value) if isfinite(value) else "∞"
+    low, high = (None if end is None else scale * end for end in ends)
+    if low is None or value == 0:
+        return text
+    return f"{text} ({number(low)}–{'∞' if high is None else number(high)})"
+
+
+def _error(run: Comparison, row: Row) -> str:
+    return _with_interval(median_error(row), _figure(run, row, "rel_l2_median"), 100.0)
+
+
+def _latency(run: Comparison, row: Row) -> str:
+    if row.latency_ms is None:
+        return DASH
+    text = _with_interval(median_latency_ms(row), _figure(run, row, "latency_ms"), 1.0)
+    return text + (" *" if row.latency_ms.stable is False else "")
+
+
+def _offline(row: Row) -> str:
+    if row.offline_s is None:
+        return DASH
+    return f"{number(row.offline_s.data)} + {number(row.offline_s.fit)}"
+
+
+def _queries(run: Comparison, row: Row, target: float) -> str:
+    """Return the break-even number of queries of a row's method against `fem` at an error."""
+    for record in (run.analysis or {})["break_even"]:
+        key = (record["dataset"], record["method"], record["target_rel_l2_median"])
+        if key == (row.dataset, row.method, target):
+            return f"{record['queries']:,}" if record["queries"] is not None else record["verdict"]
+    return DASH
+
+
+def selected(source: str, dataset: str = "", methods: str = "") -> str:
+    """Show the configuration of each method that validation selected, scored on the test."""
+    run = run_of(source)
+    name = dataset or next(iter(run.datasets))
+    need = float((run.datasets[name].get("needs") or {}).get("error", 0.01))
+    rows = map(chosen, _by_method(_rows(run, dataset, methods)).values())
+    headings = [
+        "method",
+        "is given",
+        "selected",
+        "e, m",
+        "median %",
+        "p95 %",
+        "max %",
+        "ms",
+        "data + fit, s",
+        f"break-even at {need:.0%}",
+    ]
+    return markdown(
+        headings,
+        [
+            [
+                f"`{row.method}`",
+                row.told or DASH,
+                _configuration(row),
+                _metres(row.error.mean_dof_m),
+                _error(run, row),
+                _percent(row.error.rel_l2_p95),
+                _percent(row.error.rel_l2_max),
+                _latency(run, row),
+                _offline(row),
+                _queries(run, row, need),
+            ]
+            for row in rows
+            if row.error
+        ],
+    )
+
+
+def fastest(source: str, dataset: str = "", methods: str = "") -> str:
+    """Show the latency of the fastest configuration below each error, method by method."""
+    run = run_of(source)
+    headings = ["method", *(f"≤ {number(100 * level)} %" for level in LEVELS)]
+    body = []
+    for method, rows in _by_method(_rows(run, dataset, methods)).items():
+        cells = [f"`{method}`"]
+        for level in LEVELS:
+            within = [row for row in rows if median_error(row) <= level]
+            best = min(within, key=median_latency_ms, default=None)
+            cells.append(DASH if best is None else _latency(run, best))
+        least = min(rows, key=median_error)
+        largest = least.error.rel_l2_max if least.error else inf
+        cells.append(f"{_error(run, least)}; {_percent(largest)}")
+        body.append(cells)
+    return markdown([*headings, "smallest median %; its max %"], body)
+
+
+def configurations(source: str, dataset: str = "", methods: str = "") -> str:
+    """Show every configuration: errors, latency, offline cost."""
+    run = run_of(source)
+    headings = ["configuration", "e, m", "median %", "p95 %", "max %", "ms", "data + fit, s"]
+    return markdown(
+        headings,
+        [
+            [
+                row.label.replace("|", "/"),
+                _metres(row.error.mean_dof_m),
+                _error(run, row),
+                _percent(row.error.rel_l2_p95),
+                _percent(row.error.rel_l2_max),
+                _latency(run, row),
+                _offline(row),
+            ]
+            for row in _rows(run, dataset, methods)
+            if row.error
+        ],
+    )
+
+
+def verdicts(source: str, dataset: str = "", target: str = "0.01", methods: str = "") -> str:
+    """Show which method of each pair is faster at an error."""
+    run = run_of(source)
+    names = list(_by_method(_rows(run, dataset, methods)))
+    name = dataset or next(iter(run.datasets))
+    found = {
+        (record["a"], record["b"]): record["verdict"]
+        for record in (run.analysis or {})["pairwise"]
+        if record["dataset"] == name and record["target_rel_l2_median"] == float(target)
+    }
+    return markdown(
+        ["is → than ↓", *(f"`{a}`" for a in names)],
+        [
+            [f"`{b}`", *(DASH if a == b else found.get((a, b), "not reached") for a in names)]
+            for b in names
+        ],
+    )
+
+
+def splits(source: str, dataset: str = "", methods: str = "") -> str:
+    """Show the selected configuration of each method on two splits; SOURCE is FOLDER,FOLDER."""
+    runs = [run_of(folder) for folder in source.split(",")]
+    headings = ["method", "is given"]
+    columns: list[dict[str, Row]] = []
+    for run in runs:
+        rows = _rows(run, dataset, methods)
+        columns.append({m: chosen(own) for m, own in _by_method(rows).items()})
+        headings.append(f"split by {rows[0].split}: selected; e, m; median %; max %")
+    body = []
+    for method, first in columns[0].items():
+        cells = [f"`{method}`", first.told or DASH]
+        for run, column in zip(runs, columns, strict=True):
+            row = column.get(method)
+            if row is None or row.error is None:
+                cells.append(DASH)
+                continue
+            error = row.error
+            cells.append(
+                f"{_configuration(row)}; {_metres(error.mean_dof_m)}; {_error(run, row)}; "
+                f"{_percent(error.rel_l2_max)}"
+            )
+        body.append([*cells, _latency(runs[0], first)])
+    return markdown([*headings, "ms"], body)
+
+
+def seeds(source: str, dataset: str = "", methods: str = "") -> str:
+    """Show the scatter of errors over the seeds of the trained methods."""
+    run = run_of(source)
+    return markdown(
+        ["configuration", "seeds", "e, m: median (range)", "median %: median (range)"],
+        [
+            [
+                row.label,
+                str(row.seeds.n),
+                f"{_metres(e.median)} ({_metres(e.min)}–{_metres(e.max)})",
+                f"{_percent(r.median)} ({_percent(r.min)}–{_percent(r.max)})",
+            ]
+            for row in _rows(run, dataset, methods)
+            if row.seeds and (e := row.seeds.mean_dof_m) and (r := row.seeds.rel_l2_median)
+        ],
+    )
+
+
+def indicated(source: str, methods: str = "") -> str:
+    """Show how well errors are estimated without the reference; SOURCE is FOLDER,FOLDER,…."""
+    runs = [run_of(folder) for folder in source.split(",")]
+    names = [next(iter(run.datasets)) for run in runs]
+    columns = [
+        {m: chosen(own) for m, own in _by_method(_rows(run, "", methods)).items()} for run in runs
+    ]
+    body = []
+    for method in columns[0]:
+        cells = [f"`{method}`"]
+        for column in columns:
+            found = column[method].indicator if method in column else None
+            if found is None:
+                cells.append(DASH)
+                continue
+            ratios = ", ".join(
+                f"{x:.2f}" for x in (found.ratio_p5, found.ratio_median, found.ratio_p95)
+            )
+            plain = f"{found.residual_rank_correlation:.2f}".replace("-", "−")
+            cells.append(f"{ratios}; {found.rank_correlation:.3f} ({plain})")
+        body.append(cells)
+    return markdown(["", *names], body)
+
+
+def paper(source: str, methods: str = "umesh-small,umesh-linear") -> str:
+    """Show our networks beside the best of the paper by slope; SOURCE is FOLDER,FOLDER,….
+
+    The slope is that of the error e over the largest displacement of a sample.
+    """
+    body = []
+    for folder in source.split(","):
+        run = run_of(folder)
+        name = next(iter(run.datasets))
+        published = min(
+            (p for p in PUBLISHED if p.dataset == name), key=lambda p: p.slope or inf, default=None
+        )
+        if published is None:
+            raise EvidenceError(f"{folder}: the paper has no network on {name}.")
+        for row in map(chosen, _by_method(_rows(run, name, methods)).values()):
+            if row.error is None:
+                continue
+            body.append(
+                [
+                    name,
+                    f"`{row.method}`, split by {row.split}",
+                    _configuration(row),
+                    _metres(row.error.slope),
+                    _metres(published.slope) if published.slope else DASH,
+                    number(largest_displacement(folder, row)),
+                    _metres(row.error.mean_dof_m),
+                    _metres(published.mean_m),
+                    _error(run, row),
+                ]
+            )
+    headings = ["scene", "network", "size", "slope", "paper's slope", "largest displacement, m"]
+    return markdown([*headings, "e, m", "paper's e, m", "median %"], body)
+
+
+def largest_displacement(folder: str, row: Row) -> float:
+    """Return the largest displacement of the test samples, m."""
+    with h5py.File(ROOT / folder / ERRORS, "r") as file:
+        return float(np.max(file[row.dataset][row.label]["amplitude_m"][()]))
+
+
+def out_of_range(source: str, dataset: str = "", methods: str = "") -> str:
+    """Show errors on the named test sets: median and 95th percentile, and flagged loads."""
+    run = run_of(source)
+    rows = [chosen(own) for own in _by_method(_rows(run, dataset, methods)).values()]
+    names = list(dict.fromkeys(name for row in rows for name in row.sets))
+    if not names:
+        raise EvidenceError(f"{source}: no named test sets were scored.")
+
+    def cell(row: Row, name: str) -> str:
+        found = row.sets.get(name)
+        if found is None:
+            return DASH
+        flagged = "" if found.n_flagged is None else f"; {found.n_flagged / found.n:.0%} flagged"
+        return f"{_percent(found.rel_l2_median)} / {_percent(found.rel_l2_p95)}{flagged}"
+
+    return markdown(
+        ["median % / p95 %", "test", *names],
+        [
+            [
+                f"`{row.method}`",
+                f"{_percent(row.error.rel_l2_median)} / {_percent(row.error.rel_l2_p95)}",
+                *(cell(row, name) for name in names),
+            ]
+            for row in rows
+            if row.error
+        ],
+    )
+
+
+def facts(source: str, dataset: str = "") -> str:
+    """State the settings of a run in one line: machine, samples, commit of the code."""
+    run = run_of(source)
+    rows = _rows(run, dataset, "")
+    needs: dict[str, Any] = run.datasets[rows[0].dataset].get("needs") or {}
+    validation = getattr(rows[0], "n_validation", 0)
+    held = f", {validation:,} for validation" if validation else ""
+    return (
+        f"{rows[0].dataset}, split by {rows[0].split}: {rows[0].n_train:,} training samples"
+        f"{held} and {rows[0].n_test:,} test samples, {rows[0].n_dofs:,} degrees of freedom. "
+        f"Required: {number(100 * float(needs.get('error', inf)))} % and "
+        f"{number(float(needs.get('latency_ms', inf)))} ms."
+    )
+
+
+RUN_TABLES: dict[str, Callable[..., str]] = {
+    "selected": selected,
+    "fastest": fastest,
+    "configurations": configurations,
+    "verdicts": verdicts,
+    "splits": splits,
+    "seeds": seeds,
+    "indicated": indicated,
+    "paper": paper,
+    "out-of-range": out_of_range,
+    "facts": facts,
+}

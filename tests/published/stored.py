@@ -1,0 +1,79 @@
+"""Read the evidence of published numbers: JSON and TOML files, and runs in compact form."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from mor_bench.errors import MorBenchError
+from mor_bench.results.comparison import Comparison
+
+ROOT = Path(__file__).parents[2]
+"""The repository."""
+
+REPORTS = ROOT / "reports"
+
+
+class EvidenceError(MorBenchError):
+    """A published number has no evidence, or the evidence does not contain it."""
+
+
+@cache
+def content_of(name: str, root: Path = ROOT) -> Any:
+    """Read a JSON or TOML file, by its path in the repository.
+
+    Raises
+    ------
+    EvidenceError
+        If the file does not exist.
+    """
+    path = root / name
+    if not path.is_file():
+        raise EvidenceError(f"{name}: there is no such file; is the experiment recorded?")
+    text = path.read_text(encoding="utf-8")
+    return tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+
+
+def look_up(content: Any, key: str) -> Any:
+    """Follow a key such as ``rows/label=pod [n_modes=20]/error/rel_l2_median``.
+
+    A part is a name, the number of an item, or conditions ``name=value`` joined by ``&``. These
+    select the only item of a list that meets them.
+
+    Raises
+    ------
+    EvidenceError
+        If a part of the key leads nowhere, or to several items.
+    """
+    found = content
+    for part in key.split("/"):
+        if isinstance(found, dict) and part in found:
+            found = found[part]
+        elif isinstance(found, list) and part.isdecimal() and int(part) < len(found):
+            found = found[int(part)]
+        elif isinstance(found, list) and "=" in part:
+            wanted = [condition.partition("=")[::2] for condition in part.split("&")]
+            items = [
+                item
+                for item in found
+                if all(str(item.get(name)) == value for name, value in wanted)
+            ]
+            if len(items) != 1:
+                raise EvidenceError(f"{key}: {len(items)} items meet `{part}`.")
+            found = items[0]
+        else:
+            raise EvidenceError(f"{key}: there is no `{part}`.")
+    return found
+
+
+@cache
+def run_of(name: str, root: Path = ROOT) -> Comparison:
+    """Read a stored run with its conclusions, by the path of its folder in the repository."""
+    if not (root / name / "results.json").is_file():
+        raise EvidenceError(f"{name}: there is no stored run; is the experiment recorded?")
+    comparison = Comparison.read(root / name)
+    comparison.analysis = content_of(f"{name}/comparison.json", root)
+    return comparison

@@ -1,0 +1,35 @@
+"""Write the numbers of the evidence into the pages: tables, sentences and pictures.
+
+python -m tests.published.write
+"""
+
+from __future__ import annotations
+
+import sys
+
+from mor_bench.snapshots.store import write_atomically
+from tests.published.blocks import pages, with_blocks
+from tests.published.claims import statements, with_numbers, without_evidence, wrong_numbers
+from tests.published.pictures import draw_pictures
+from tests.published.stored import ROOT
+
+
+def main() -> int:
+    """Write every page; print what remains to be done by hand, and return 1 if there is any."""
+    known = statements()
+    left = []
+    for path in pages():
+        page = path.relative_to(ROOT).as_posix()
+        before = path.read_text(encoding="utf-8")
+        text = with_numbers(page, with_blocks(before), known)
+        if text != before:
+            write_atomically(path, text.encode())
+            print(f"{page}: written")
+        draw_pictures(path, text)
+        left += [*wrong_numbers(page, text, known), *without_evidence(page, text, known)]
+    print("\n".join(left))
+    return 1 if left else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,170 @@
+"""The tools of published numbers find a wrong number, an unlisted number and a stale picture."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from matplotlib import image
+
+from mor_bench.analysis.analyse import analyse
+from tests.published.blocks import with_blocks
+from tests.published.claims import (
+    MEASURED,
+    Statement,
+    prose,
+    with_numbers,
+    without_evidence,
+    wrong_numbers,
+)
+from tests.published.compact import ERRORS, compact, wrong_summaries
+from tests.published.pictures import draw_pictures, stale_pictures
+from tests.published.stored import EvidenceError, content_of, look_up, run_of
+from tests.synthetic import synthetic_comparison
+
+PAGE = "docs/page.md"
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A synthetic run in compact form."""
+    folder = tmp_path_factory.mktemp("published")
+    made = synthetic_comparison(folder / "run")
+    made.finish(analyse(made, n_resamples=50))
+    compact(folder / "run", folder / "stored")
+    return folder / "stored"
+
+
+def test_the_compact_form_keeps_the_errors_and_no_single_latencies(stored: Path) -> None:
+    assert list(wrong_summaries(stored)) == []
+    with h5py.File(stored / ERRORS, "r") as file:
+        arrays = file["beam-coarse"]["linear-fem"]
+        assert arrays["relative_l2"].dtype == np.float32
+        assert not {"latency_ms", "worst_prediction"} & set(arrays)
+
+
+def test_an_error_that_its_samples_do_not_give_is_found(stored: Path, tmp_path: Path) -> None:
+    shutil.copytree(stored, tmp_path / "copy")
+    path = tmp_path / "copy" / "results.json"
+    content = json.loads(path.read_text())
+    row = look_up(content, "rows/label=linear-fem")
+    row["error"]["rel_l2_median"] *= 1.001
+    path.write_text(json.dumps(content))
+    (found,) = wrong_summaries(tmp_path / "copy")
+    assert "linear-fem: rel_l2_median" in found
+
+
+@pytest.mark.parametrize("table", ["selected", "fastest", "configurations", "verdicts", "facts"])
+def test_a_table_that_was_edited_is_generated_again(stored: Path, table: str) -> None:
+    page = with_blocks(f"Text\n\n<!-- from: {stored} {table} -->\nold\n<!-- end -->\n\nMore\n")
+    assert "old" not in page
+    assert page.endswith("<!-- end -->\n\nMore\n")
+    assert with_blocks(page) == page
+    first = page.index("-->\n") + 4
+    assert with_blocks(page[:first] + "7" + page[first:]) == page
+
+
+def test_a_table_shows_the_numbers_of_the_run(stored: Path) -> None:
+    row = run_of(str(stored)).row("beam-coarse", "linear-fem")
+    assert row.error is not None
+    page = with_blocks(f"<!-- from: {stored} configurations -->\n<!-- end -->")
+    (line,) = [line for line in page.splitlines() if line.startswith("| linear-fem ")]
+    assert f"| {100 * row.error.rel_l2_median:.3g} (" in line
+    assert " * |" in line
+
+
+@pytest.mark.parametrize("spec", ["no-such-folder configurations", "{} no-such-table"])
+def test_a_table_without_evidence_is_refused(stored: Path, spec: str) -> None:
+    with pytest.raises(EvidenceError, match="there is no"):
+        with_blocks(f"<!-- from: {spec.format(stored)} -->\n<!-- end -->")
+
+
+@pytest.fixture
+def claim(tmp_path: Path) -> Statement:
+    """A statement with two numbers, 12.5 ms and a ratio of 4."""
+    path = tmp_path / "times.json"
+    path.write_text(
+        json.dumps({"codes": [{"name": "a", "ms": [12, 13]}, {"name": "b", "ms": [50]}]})
+    )
+    ours = {"file": str(path), "key": "codes/name=a/ms", "reduce": "median", "format": ".1f"}
+    ratio = {
+        "file": str(path),
+        "key": "codes/name=b/ms",
+        "over": "codes/name=a/ms",
+        "reduce": "median",
+        "format": ".0f",
+    }
+    return Statement(PAGE, "takes {} ms, and b {} times as long", [ours, ratio])
+
+
+def test_a_right_number_is_accepted_over_a_line_break(claim: Statement) -> None:
+    text = "It takes 12.5 ms,\nand b 4 times as long.\n"
+    assert list(wrong_numbers(PAGE, text, [claim])) == []
+    assert list(without_evidence(PAGE, text, [claim])) == []
+
+
+def test_a_wrong_number_is_found_and_corrected(claim: Statement) -> None:
+    text = "It takes 12.5 ms,\nand b 5 times as long.\n"
+    assert len(list(wrong_numbers(PAGE, text, [claim]))) == 1
+    assert with_numbers(PAGE, text, [claim]) == text.replace("5 times", "4 times")
+
+
+def test_a_number_that_no_entry_covers_is_found(claim: Statement) -> None:
+    text = "It takes 12.5 ms, and b 4 times as long.\n\nA query takes 3 µs.\n"
+    (found,) = without_evidence(PAGE, text, [claim])
+    assert found.startswith("docs/page.md:3: '3 µs'")
+
+
+def test_an_entry_whose_text_left_the_page_is_found(claim: Statement) -> None:
+    assert len(list(wrong_numbers(PAGE, "Nothing here.", [claim]))) == 1
+
+
+SEEN = (
+    "0.38 ms; 5 µs; 20 times; a factor of two; 1e-4 m; 18 of 25; 8,000 s; .037; 3×; 75 %; 22 MB; "
+    "five times; 10⁸; 33 core-minutes; two minutes; 1.6–1.8"
+)
+
+
+@pytest.mark.parametrize("text", SEEN.split("; "))
+def test_a_number_that_looks_like_a_measurement_is_seen(text: str) -> None:
+    assert MEASURED.search(f"It has {text} here.")
+
+
+@pytest.mark.parametrize("text", ["135 H8", "64 patches", "Section 3", "two methods", "T4 and H8"])
+def test_a_count_is_not_taken_for_a_measurement(text: str) -> None:
+    assert not MEASURED.search(f"It has {text} here.")
+
+
+def test_code_tables_and_links_are_no_prose() -> None:
+    text = "a `5 ms` [b](c-3.5.md)\n```\n5 ms\n```\n<!-- from: x y -->\n5 ms\n<!-- end -->\n6 ms\n"
+    assert len(prose(text)) == len(text)
+    assert MEASURED.findall(prose(text)) == ["6 ms"]
+
+
+def test_a_key_must_lead_to_one_item(claim: Statement) -> None:
+    content = content_of(claim.values[0]["file"])
+    assert look_up(content, "codes/1/ms/0") == 50
+    for key in ("codes/name=c", "codes/7", "nothing"):
+        with pytest.raises(EvidenceError, match=key.split("/")[0]):
+            look_up(content, key)
+
+
+@pytest.mark.slow
+def test_a_stale_or_edited_picture_is_found(stored: Path, tmp_path: Path) -> None:
+    shutil.copytree(stored, tmp_path / "copy")
+    page = tmp_path / "page.md"
+    text = f"<!-- drawn from: {tmp_path}/copy error-against-time beam-coarse -->\n![a](a.png)\n"
+    draw_pictures(page, text)
+    assert list(stale_pictures(page, text)) == []
+    assert len(list(stale_pictures(page, text.split("\n", 1)[1]))) == 1
+    results = tmp_path / "copy" / "results.json"
+    content = results.read_text()
+    results.write_text(content + "\n")
+    assert ["not drawn from" in found for found in stale_pictures(page, text)] == [True]
+    results.write_text(content)
+    image.imsave(tmp_path / "a.png", np.zeros((2, 2)))
+    assert len(list(stale_pictures(page, text))) == 2
