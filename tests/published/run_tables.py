@@ -99,7 +99,7 @@ def _latency(run: Comparison, row: Row) -> str:
 def _offline(row: Row) -> str:
     if row.offline_s is None:
         return DASH
-    return f"{number(row.offline_s.data)} + {number(row.offline_s.fit)}"
+    return f"{number(row.offline_s.data)} + {number(row.offline_s.fit_core_s)}"
 
 
 def _queries(run: Comparison, row: Row, target: float) -> str:
@@ -126,7 +126,7 @@ def selected(source: str, dataset: str = "", methods: str = "") -> str:
         "p95 %",
         "max %",
         "ms",
-        "data + fit, s",
+        "data + fit, core-s",
         f"break-even at {need:.0%}",
     ]
     return markdown(
@@ -171,7 +171,7 @@ def fastest(source: str, dataset: str = "", methods: str = "") -> str:
 def configurations(source: str, dataset: str = "", methods: str = "") -> str:
     """Show every configuration: errors, latency, offline cost."""
     run = run_of(source)
-    headings = ["configuration", "e, m", "median %", "p95 %", "max %", "ms", "data + fit, s"]
+    headings = ["configuration", "e, m", "median %", "p95 %", "max %", "ms", "data + fit, core-s"]
     return markdown(
         headings,
         [

@@ -78,7 +78,7 @@ def main(
         middle, most = np.median(iterations), max(iterations)
         print(f"iterations: median {middle:.0f}, most {most}; cut-backs: {cuts}")
     if report is not None:
-        found = {
+        content = {
             "dataset": dataset,
             "loads": n_loads,
             "times": times,
@@ -89,7 +89,7 @@ def main(
             "iterations_most": max(iterations, default=None),
             "cut_backs": cuts,
         }
-        report.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        report.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     if any(outcome.startswith("INVALID") for outcome in outcomes):
         raise typer.Exit(1)
 
