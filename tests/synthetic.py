@@ -74,6 +74,15 @@ def changed(row: Row, **parts: Mapping[str, Any]) -> Row:
     return Row.model_validate({**content, **{k: {**content[k], **v} for k, v in parts.items()}})
 
 
+def sample_errors_of(
+    relative: NDArray[np.float64], amplitude: NDArray[np.float64], share: float
+) -> SampleErrors:
+    """Return errors in proportion to the relative error; e is `share` of the largest nodal one."""
+    largest = relative * amplitude
+    e = share * largest
+    return SampleErrors(e, 16 / 15 * e, relative, largest, amplitude, 0.8 * largest, 0.8 * relative)
+
+
 def region_errors(
     generator: np.random.Generator,
     regions: NDArray[np.int64],
@@ -84,7 +93,7 @@ def region_errors(
     noise = 0.5 * generator.normal(size=len(regions))
     relative = error * np.exp(effects[regions].sum(axis=1) + noise)
     amplitude = generator.uniform(0.02, 0.7, len(regions))
-    return SampleErrors(0.15 * relative * amplitude, relative, relative * amplitude, amplitude)
+    return sample_errors_of(relative, amplitude, 0.15)
 
 
 def timings(

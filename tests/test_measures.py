@@ -22,23 +22,48 @@ def test_error_metrics_match_hand_computed_values() -> None:
     predicted = reference.copy()
     predicted[0, 1] += [0.0, 3.0, 4.0]
     predicted[1, 0] += [0.0, 0.0, -1.0]
-    errors = sample_errors(predicted, reference)
+    errors = sample_errors(predicted, reference, fixed_nodes=np.array([0]))
     np.testing.assert_allclose(errors.mean_dof_m, [7 / 6, 1 / 6])
+    np.testing.assert_allclose(errors.mean_free_dof_m, [7 / 3, 0.0])
     np.testing.assert_allclose(errors.relative_l2, [1.0, 0.1])
     np.testing.assert_allclose(errors.max_nodal_m, [5.0, 1.0])
     np.testing.assert_allclose(errors.amplitude_m, [5.0, 10.0])
+    np.testing.assert_allclose(errors.tip_m, [5.0, 0.0])
+    np.testing.assert_allclose(errors.tip_relative, [1.0, 0.0])
     assert summary(errors) == pytest.approx(
         {
             "mean_dof_m": 4 / 6,
             "std_dof_m": math.sqrt(2 * 0.5**2),
             "max_dof_m": 7 / 6,
+            "mean_free_dof_m": 7 / 6,
             "rel_l2_median": 0.55,
             "rel_l2_p95": 1.0,
             "rel_l2_max": 1.0,
             "max_nodal_m": 5.0,
             "slope": (5 * 7 / 6 + 10 / 6) / 125,
+            "amplitude_m": 10.0,
+            "tip_max_m": 5.0,
+            "tip_rel_median": 0.5,
+            "tip_rel_p95": 1.0,
+            "tip_rel_max": 1.0,
+            "tip_rel_at_max_e": 1.0,
+            "tip_rel_at_largest": 0.0,
         }
     )
+
+
+def test_the_tip_and_the_free_dofs_are_among_the_wanted_nodes() -> None:
+    """Node 2 moves most of all, node 1 most of the wanted ones, and node 0 is a support."""
+    reference, predicted = np.zeros((1, 3, 3)), np.zeros((1, 3, 3))
+    reference[0, :, 0] = 0.0, 2.0, 8.0
+    predicted[0, :, 0] = 0.3, 2.5, 9.0
+    supports, wanted = np.array([0]), np.array([0, 1])
+    errors = sample_errors(predicted, reference, wanted, supports)
+    assert (errors.amplitude_m[0], errors.tip_m[0]) == (2.0, 0.5)
+    assert errors.tip_relative[0] == 0.25
+    assert errors.mean_dof_m[0] == pytest.approx(0.8 / 6)
+    assert errors.mean_free_dof_m[0] == pytest.approx(0.5 / 3)
+    assert sample_errors(predicted, reference, None, supports).tip_m[0] == 1.0
 
 
 def test_a_missing_prediction_has_an_infinite_error() -> None:
@@ -48,6 +73,7 @@ def test_a_missing_prediction_has_an_infinite_error() -> None:
     found = summary(sample_errors(predicted, reference))
     infinite = {name for name, value in found.items() if value == math.inf}
     assert infinite >= {"mean_dof_m", "max_dof_m", "rel_l2_max", "std_dof_m"}
+    assert infinite >= {"mean_free_dof_m", "tip_max_m", "tip_rel_max", "tip_rel_at_max_e"}
     assert found["rel_l2_median"] == 0.0
 
 

@@ -15,7 +15,7 @@ from matplotlib.image import imread
 from rich.console import Console
 
 from mor_bench.analysis.analyse import analyse
-from mor_bench.measure.error_metrics import SampleErrors, summary
+from mor_bench.measure.error_metrics import summary
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.details import dataset_details
 from mor_bench.report.entries import Entry, best_per_method, entries_of
@@ -26,7 +26,7 @@ from mor_bench.report.summary import discretisation_error, headline, warnings_of
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import ErrorSummary, Row
 from mor_bench.specs import load_dataset_spec
-from tests.synthetic import MESH, a_row, put_samples, synthetic_comparison
+from tests.synthetic import MESH, a_row, put_samples, sample_errors_of, synthetic_comparison
 
 HOSTILE = "<script>alert(1)</script> & [bold]$x_1$"
 REASON = "OutOfMemoryError: 31 GiB <needed> & 24 GiB there"
@@ -49,7 +49,7 @@ def add_row(
     relative = error * np.linspace(0.5, 1.5, N_TEST)
     relative[: fields.get("n_failed", 0)] = np.inf
     amplitude = np.linspace(0.01, 0.2, N_TEST)
-    errors = SampleErrors(relative * amplitude / 4, relative, relative * amplitude, amplitude)
+    errors = sample_errors_of(relative, amplitude, 0.25)
     measured = {
         "n_test": N_TEST,
         "error": summary(errors),

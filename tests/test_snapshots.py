@@ -141,6 +141,19 @@ def test_named_sets_of_the_tiny_beam(with_sets: Dataset) -> None:
     assert repeated(loads) == 0
 
 
+def test_the_set_of_the_paper_s_amplitude_has_the_stated_forces() -> None:
+    spec = load_generated_spec("beam-tiny")
+    assert "`tests.paper_magnitude_n`" in str(why_not(spec, "paper-amplitude"))
+    tests = spec.tests.model_copy(update={"paper_magnitude_n": (0.0, 5.0)})
+    paper = spec.model_copy(update={"tests": tests})
+    assert "paper-amplitude" in available_sets(paper)
+    own, usual = (load_scene(spec_of_set(paper, name)) for name in ("paper-amplitude", "in-range"))
+    assert own.generated.loads.seed == usual.generated.loads.seed
+    larger, drawn = (draw_loads(scene, 0, n_samples_of(scene)) for scene in (own, usual))
+    np.testing.assert_allclose(larger.vectors, 5 / 4 * drawn.vectors, rtol=1e-12)
+    assert paper.digest() == spec.digest()
+
+
 def test_unseen_regions_share_no_facet_with_the_main_set(with_sets: Dataset) -> None:
     main, unseen = with_sets.scene, with_sets.tests["unseen-regions"]
     check_regions(main.generated)

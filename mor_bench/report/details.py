@@ -11,7 +11,7 @@ from mor_bench.report.caveat_tables import (
 )
 from mor_bench.report.entries import Analysis, entries_of
 from mor_bench.report.measurement_tables import indicated, resources, seeds, timing, training
-from mor_bench.report.paper_tables import error_measures, same_error_or_time
+from mor_bench.report.paper_tables import against_the_paper, error_measures, same_error_or_time
 from mor_bench.report.speed_tables import break_even_table, pairwise, profile_table
 from mor_bench.report.text_table import TextTable
 from mor_bench.results.comparison import Comparison
@@ -33,6 +33,7 @@ def dataset_details(comparison: Comparison, dataset: str, analysis: Analysis) ->
         hidden_table(dataset, entries, analysis),
         tuning_table(dataset, analysis),
         error_measures(dataset, entries),
+        against_the_paper(dataset, entries),
         *same_error_or_time(dataset, entries),
     ]
     return [table for table in tables if table is not None]

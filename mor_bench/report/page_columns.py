@@ -40,13 +40,25 @@ GROUPS: dict[str, dict[str, Cell]] = {
         INTERVAL: lambda e: span(e.intervals.get("mean_dof_m"), metres),
         "σ(e)": figure_cell("error", "std_dof_m", metres),
         "max e": figure_cell("error", "max_dof_m", metres),
+        "ē, free dofs": figure_cell("error", "mean_free_dof_m", metres),
     },
     "offline (s)": {
         "data": figure_cell("offline_s", "data"),
         "fit": figure_cell("offline_s", "fit"),
     },
-    "nodal (m)": {"max": figure_cell("error", "max_nodal_m", metres)},
-    "e over u": {"slope": figure_cell("error", "slope", metres)},
+    "nodal (m)": {
+        "max": figure_cell("error", "max_nodal_m", metres),
+        "max at the tip": figure_cell("error", "tip_max_m", metres),
+    },
+    "e over u": {
+        "slope": figure_cell("error", "slope", metres),
+        "largest u (m)": figure_cell("error", "amplitude_m"),
+    },
+    "tip (%)": {
+        "median": figure_cell("error", "tip_rel_median", percent),
+        "p95": figure_cell("error", "tip_rel_p95", percent),
+        "max": figure_cell("error", "tip_rel_max", percent),
+    },
 }
 """Groups of columns under a common heading."""
 

@@ -1,61 +1,24 @@
-"""The tables of the U-Mesh paper with our own figures beside the published ones.
-
-Source of the published figures: Mendizabal, Márquez-Neila, Cotin: Simulation of hyperelastic
-materials in real-time using deep learning, Medical Image Analysis 2020. The figures come from its
-tables of error measures (one per scene) and its two comparisons with POD. The slopes and maxima
-come from the captions. The paper's networks ran on a GeForce 1080 Ti, on a random split.
-"""
+"""The tables of the U-Mesh paper with our own figures beside the published ones."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from math import isfinite
 
-from mor_bench.report.entries import Entry
-from mor_bench.report.number_format import DASH, metres, number
-from mor_bench.report.text_table import TextTable
-
-
-@dataclass(frozen=True)
-class Published:
-    """A row of the paper's tables of error measures: c channels, k steps; lengths in m."""
-
-    dataset: str
-    channels: int
-    steps: int
-    mean_m: float
-    std_m: float
-    predict_ms: float
-    train_min: float
-    max_m: float | None = None
-    slope: float | None = None
-
-
-PUBLISHED = (
-    Published("beam-coarse", 64, 2, 0.0028, 0.0008, 2.0, 24),
-    Published("beam-coarse", 16, 4, 0.0012, 0.0009, 3.2, 40),
-    Published("beam-coarse", 32, 4, 0.0009, 0.0008, 3.2, 40),
-    Published("beam-coarse", 64, 3, 0.0007, 0.0007, 2.5, 80),
-    Published("beam-coarse", 64, 4, 0.0007, 0.0007, 3.3, 95),
-    Published("beam-coarse", 128, 3, 0.0007, 0.0006, 2.5, 35, slope=0.00352),
-    Published("beam-coarse", 64, 5, 0.0006, 0.0005, 4.0, 426),
-    Published("beam-coarse", 128, 4, 0.0006, 0.0005, 3.45, 320),
-    Published("beam-coarse-3-forces", 64, 4, 0.0007, 0.0003, 3.5, 100),
-    Published("beam-fine", 128, 3, 0.0019, 0.0018, 3.0, 210, max_m=0.0265, slope=0.0083),
-    Published("l-shape", 128, 3, 0.00648, 0.00493, 3.2, 97, max_m=0.0327, slope=0.002046),
-    Published("liver-hex", 128, 3, 2.89e-5, 3.41e-5, 3.0, 149, max_m=4.07e-4, slope=0.0021),
-    Published("liver-tet", 128, 3, 5.33e-5, 6.03e-5, 3.0, 149, max_m=4.9e-4),
+from mor_bench.report.entries import Entry, best_per_method
+from mor_bench.report.number_format import DASH, metres, number, percent
+from mor_bench.report.published_figures import (
+    COMPARED,
+    REMARKS,
+    SAME_ERROR,
+    SAME_TIME,
+    SCENES,
+    SELECTED_ON_TEST,
+    Published,
+    published_of,
+    scene_of,
 )
-
-SAME_ERROR = {"fem": (740.0, 0.0), "pod": (120.0, 0.006), "umesh": (3.0, 0.006)}
-"""Published figures of `COMPARED`, by method: prediction time in ms, e in m; POD has 3 modes."""
-
-SAME_TIME = {"fem": (740.0, 0.0), "hpod": (5.0, 0.084), "umesh": (3.0, 0.006)}
-"""Published figures of `COMPARED`, by method: time in ms, e in m; the POD has one mode."""
-
-COMPARED = "beam-fine"
-"""Dataset of the paper's two comparisons."""
+from mor_bench.report.text_table import TextTable
 
 Size = tuple[int, int]
 """Channels and steps of a network."""
@@ -78,7 +41,7 @@ def error_measures(dataset: str, entries: Sequence[Entry]) -> TextTable | None:
     ours = [(entry, size) for entry in entries if (size := _size(entry)) is not None]
     if not ours:
         return None
-    published = {(row.channels, row.steps): row for row in PUBLISHED if row.dataset == dataset}
+    published = {(row.channels, row.steps): row for row in published_of(dataset)}
     rows = [
         _measures(entry.label, size, _measured(entry), published.get(size)) for entry, size in ours
     ]
@@ -95,7 +58,8 @@ def error_measures(dataset: str, entries: Sequence[Entry]) -> TextTable | None:
     if published:
         note += (
             " The paper's networks were trained for 100,000 iterations, "
-            "timed on a GeForce 1080 Ti and tested on a random split."
+            "timed on a GeForce 1080 Ti and tested on a random split. Errors in m compare only "
+            "at equal deformations: see the next table."
         )
     else:
         headings, *rows = ([*row[:4], *row[4::2]] for row in (headings, *rows))
@@ -127,6 +91,70 @@ def _as_printed(value: float | None) -> str:
     return DASH if value is None else f"{value:g}"
 
 
+def against_the_paper(dataset: str, entries: Sequence[Entry]) -> TextTable | None:
+    """Build the comparison with the paper's network by slope and by relative error.
+
+    The first row is the paper's network; each method's most accurate configuration follows. None
+    if the dataset is none of the paper's scenes, or nothing ran.
+    """
+    scene, best = SCENES.get(scene_of(dataset)), best_per_method(entries)
+    if scene is None or not best:
+        return None
+    paper = scene.network
+    first = [
+        f"U-Mesh in the paper, c = {paper.channels}, k = {paper.steps}",
+        _as_printed(scene.amplitude_m),
+        _as_printed(paper.mean_m),
+        DASH,
+        percent(paper.mean_m / scene.amplitude_m),
+        DASH,
+        _as_printed(paper.slope),
+        DASH if paper.slope is None else "1",
+        _percent_as_printed(scene.tip_at_max_e),
+        _percent_as_printed(scene.tip_at_largest),
+    ]
+    note = (
+        "ē counts all degrees of freedom of the mesh, supports included, as the paper's formula "
+        "does; beside it over the free ones alone. Largest u: largest displacement of a node in "
+        "the test set. Slope: of the least-squares line through the origin, e over the sample's "
+        "largest displacement. Tip: relative error at the node that moves most, for the sample "
+        "with the largest e and for the one with the largest displacement. "
+    )
+    headings = ["configuration", "largest u (m)", "ē (m)", "ē, free dofs (m)"]
+    headings += ["ē / largest u (%)", "median rel. L2 (%)", "slope", "slope / paper's"]
+    headings += ["tip at largest e (%)", "tip at largest u (%)"]
+    note += " ".join([*REMARKS.get(scene_of(dataset), ()), SELECTED_ON_TEST])
+    rows = [first, *(_against(entry, paper.slope) for entry in best)]
+    return TextTable("Against the paper, by slope and relative error", note, headings, rows)
+
+
+def _against(entry: Entry, slope: float | None) -> list[str]:
+    own = entry.figure("error", "slope")
+    return [
+        entry.label,
+        number(entry.figure("error", "amplitude_m")),
+        metres(entry.figure("error", "mean_dof_m")),
+        metres(entry.figure("error", "mean_free_dof_m")),
+        percent(_relative(entry)),
+        percent(entry.figure("error", "rel_l2_median")),
+        metres(own),
+        DASH if slope is None or own is None else number(own / slope),
+        percent(entry.figure("error", "tip_rel_at_max_e")),
+        percent(entry.figure("error", "tip_rel_at_largest")),
+    ]
+
+
+def _relative(entry: Entry) -> float | None:
+    """Return ē over the largest displacement of the test set, as a fraction; None if unknown."""
+    mean = entry.figure("error", "mean_dof_m")
+    amplitude = entry.figure("error", "amplitude_m")
+    return None if mean is None or not amplitude else mean / amplitude
+
+
+def _percent_as_printed(fraction: float | None) -> str:
+    return DASH if fraction is None else f"{100 * fraction:g}"
+
+
 def same_error_or_time(dataset: str, entries: Sequence[Entry]) -> list[TextTable]:
     """Build the paper's two comparisons with its best network: at the same error and time.
 
@@ -146,14 +174,14 @@ def same_error_or_time(dataset: str, entries: Sequence[Entry]) -> list[TextTable
             f"The fastest configuration of each method with ē ≤ {error} m, the error of "
             f"{network.label}.",
             _least(methods, accurate, lambda e: e.latency_ms),
-            SAME_ERROR if dataset == COMPARED else {},
+            SAME_ERROR if scene_of(dataset) == COMPARED else {},
         ),
         _comparison(
             "Comparison at the same time",
             f"The most accurate configuration of each method within {time} ms, "
             f"the latency of {network.label}.",
             _least(methods, fast, lambda e: e.mean_error_m),
-            SAME_TIME if dataset == COMPARED else {},
+            SAME_TIME if scene_of(dataset) == COMPARED else {},
         ),
     ]
 
@@ -182,12 +210,17 @@ def _comparison(
 ) -> TextTable:
     rows = []
     for method, entry in chosen.items():
-        cells = [method, "not reached", DASH, DASH]
+        cells = [method, "not reached", DASH, DASH, DASH]
         if entry:
             cells = [method, entry.label, number(entry.latency_ms), metres(entry.mean_error_m)]
+            cells.append(percent(_relative(entry)))
         if published:
-            cells += map(_as_printed, published.get(method, (None, None)))
+            time, e = published.get(method, (None, None))
+            relative = None if e is None else e / SCENES[COMPARED].amplitude_m
+            cells += [_as_printed(time), _as_printed(e), percent(relative)]
         rows.append(cells)
-    headings = ["method", "configuration", "time (ms)", "ē (m)"]
-    headings += ["paper: time (ms)", "paper: e (m)"] if published else []
+    headings = ["method", "configuration", "time (ms)", "ē (m)", "ē / largest u (%)"]
+    if published:
+        headings += ["paper: time (ms)", "paper: e (m)", "paper: e / largest u (%)"]
+        note += f" {REMARKS[COMPARED][0]}"
     return TextTable(title, note, headings, rows)

@@ -23,12 +23,23 @@ class ErrorSummary(Part):
     ----------
     mean_dof_m, std_dof_m, max_dof_m : float
         Mean, standard deviation and maximum of the mean absolute error per degree of freedom, m.
+        The degrees of freedom of the supports count.
+    mean_free_dof_m : float
+        The mean over the free degrees of freedom alone, m.
     rel_l2_median, rel_l2_p95, rel_l2_max : float
         Relative L2 error, as a fraction: median, 95th percentile and maximum.
     max_nodal_m : float
         Largest nodal error, m.
     slope : float
         Slope of the error over the largest displacement, through the origin.
+    amplitude_m : float
+        Largest displacement of a node in the test set's reference, m.
+    tip_max_m : float
+        Largest error at the tip, the node that moves most in a sample, m.
+    tip_rel_median, tip_rel_p95, tip_rel_max : float
+        Error at the tip over its displacement, as a fraction: median, 95th percentile and maximum.
+    tip_rel_at_max_e, tip_rel_at_largest : float
+        The same of the sample with the largest e, and of the sample with the largest displacement.
     rel_l2_median_high : float or None
         Upper end of the 95 % interval of `rel_l2_median`; only in a pick, never in results.json.
     """
@@ -36,11 +47,19 @@ class ErrorSummary(Part):
     mean_dof_m: Real = nan
     std_dof_m: Real = nan
     max_dof_m: Real = nan
+    mean_free_dof_m: Real = nan
     rel_l2_median: Real = nan
     rel_l2_p95: Real = nan
     rel_l2_max: Real = nan
     max_nodal_m: Real = nan
     slope: Real = nan
+    amplitude_m: Real = nan
+    tip_max_m: Real = nan
+    tip_rel_median: Real = nan
+    tip_rel_p95: Real = nan
+    tip_rel_max: Real = nan
+    tip_rel_at_max_e: Real = nan
+    tip_rel_at_largest: Real = nan
     rel_l2_median_high: Real | None = None
 
 
@@ -53,7 +72,7 @@ class SetErrors(Part):
         Samples, and samples without a prediction.
     n_flagged : int or None
         Samples that the method flagged as out of range; None if the method has no flags.
-    mean_dof_m, rel_l2_median, rel_l2_p95, rel_l2_max : float
+    mean_dof_m, rel_l2_median, rel_l2_p95, rel_l2_max, slope, amplitude_m : float
         See `ErrorSummary`.
     n_unusual, n_unusual_flagged : int or None
         Samples with an unusually large error, and flagged samples among them.
@@ -71,6 +90,8 @@ class SetErrors(Part):
     rel_l2_median: Real = nan
     rel_l2_p95: Real = nan
     rel_l2_max: Real = nan
+    slope: Real = nan
+    amplitude_m: Real = nan
     n_unusual: int | None = None
     n_unusual_flagged: int | None = None
     recall: Real | None = None

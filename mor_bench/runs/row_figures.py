@@ -58,6 +58,8 @@ def set_errors(score: Score, flags: Flags | None = None, seed: int | None = None
         rel_l2_median=figures.rel_l2_median,
         rel_l2_p95=figures.rel_l2_p95,
         rel_l2_max=figures.rel_l2_max,
+        slope=figures.slope,
+        amplitude_m=figures.amplitude_m,
         **(flags.of(score) if flags else {}),
         **more,
     )

@@ -85,7 +85,8 @@ class _Scorer:
                 forces = test.forces[chunk]
                 left_s = max(1.0, until - monotonic())
                 predicted = self._predictions(forces, left_s, Path(folder) / "answers.npy")
-                errors.append(sample_errors(predicted, test.references[chunk], test.nodes))
+                references = test.references[chunk]
+                errors.append(sample_errors(predicted, references, test.nodes, test.fixed_nodes))
                 worst.look_at(start, errors[-1].mean_dof_m, predicted)
                 indicated.add(start, forces, predicted)
                 found = self.worker.ask("flag", LOAD_LIMIT_S, forces=forces)["flagged"]

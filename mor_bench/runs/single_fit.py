@@ -198,5 +198,6 @@ def _test_error(method: Surrogate, test: Snapshots) -> dict[str, float]:
         predict_all(method, test[start : start + SCORE_CHUNK].given)
         for start in range(0, len(test), SCORE_CHUNK)
     ]
-    nodes = test.scene.output_nodes
-    return summary(sample_errors(np.concatenate(predicted), test.displacements, nodes))
+    scene, answers = test.scene, np.concatenate(predicted)
+    errors = sample_errors(answers, test.displacements, scene.output_nodes, scene.fixed_nodes)
+    return summary(errors)

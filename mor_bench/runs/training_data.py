@@ -42,6 +42,8 @@ class TestSet:
         holds the observed displacements, m.
     nodes : (n_output_nodes,) int64
         Nodes where the error is measured.
+    fixed_nodes : (n_fixed,) int64
+        Nodes of the supports.
     digest : str
         SHA-256 of all arrays.
     """
@@ -49,19 +51,21 @@ class TestSet:
     forces: NDArray[np.float64]
     references: NDArray[np.float64]
     nodes: NDArray[np.int64]
+    fixed_nodes: NDArray[np.int64]
     digest: str
 
     @classmethod
     def of(cls, snapshots: Snapshots) -> TestSet:
         """Make a test set from snapshots."""
-        nodes = snapshots.scene.output_nodes
+        nodes, fixed_nodes = snapshots.scene.output_nodes, snapshots.scene.fixed_nodes
         arrays: dict[str, NDArray[Any]] = {
             "f": snapshots.given.values,
             "u": snapshots.displacements,
         }
         if len(nodes) < snapshots.scene.mesh.n_nodes:
             arrays["nodes"] = nodes
-        return cls(snapshots.given.values, snapshots.displacements, nodes, digest_of_arrays(arrays))
+        digest = digest_of_arrays(arrays)
+        return cls(snapshots.given.values, snapshots.displacements, nodes, fixed_nodes, digest)
 
 
 class TrainingData:

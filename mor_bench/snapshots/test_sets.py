@@ -4,6 +4,8 @@ in-range
     The main plan with other draws.
 2x, 4x
     The loads of `in-range`, two and four times as large.
+paper-amplitude
+    The loads of `in-range`, scaled so that the largest deformation is that of the paper's scene.
 unseen-regions
     Forces on a part of the surface where no load of the main set acts.
 unseen-directions
@@ -24,7 +26,15 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.specs import DatasetSpec
 
-SetName = Literal["in-range", "2x", "4x", "unseen-regions", "unseen-directions", "several-forces"]
+SetName = Literal[
+    "in-range",
+    "2x",
+    "4x",
+    "paper-amplitude",
+    "unseen-regions",
+    "unseen-directions",
+    "several-forces",
+]
 
 SET_NAMES: tuple[SetName, ...] = get_args(SetName)
 
@@ -43,6 +53,8 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
         return f"there is no such set; known: {', '.join(SET_NAMES)}"
     if name == "unseen-regions" and spec.tests.unseen_region is None:
         return "its file names no `tests.unseen_region`"
+    if name == "paper-amplitude" and spec.tests.paper_magnitude_n is None:
+        return "its file names no `tests.paper_magnitude_n`"
     if name == "unseen-directions" and spec.loads.kind == "force":
         return (
             "its directions are all over the sphere; "
@@ -83,6 +95,8 @@ def spec_of_set(spec: DatasetSpec, name: SetName) -> DatasetSpec:
     if name in ("2x", "4x"):
         times = int(name[0])
         changed["magnitude_n"] = times * low, times * high
+    elif name == "paper-amplitude":
+        changed["magnitude_n"] = spec.tests.paper_magnitude_n
     elif name == "unseen-regions":
         changed.update(region=spec.tests.unseen_region, n_patches=None)
     elif name == "unseen-directions":

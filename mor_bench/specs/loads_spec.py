@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from mor_bench.specs.base import Count, Positive, StrictModel
 from mor_bench.specs.region_spec import Region
@@ -13,6 +13,23 @@ LoadKind = Literal["force", "normal", "tangential"]
 Sampling = Literal["random", "latin-hypercube", "sobol"]
 SplitBy = Literal["region", "sample", "direction"]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise ValueError("the lower bound must not exceed the upper one")
+    return value
+
+
+Magnitude = Annotated[
+    tuple[
+        Annotated[float, Field(ge=0, allow_inf_nan=False)],
+        Annotated[float, Field(ge=1e-12, le=1e12)],
+    ],
+    Field(strict=False),
+    AfterValidator(_ordered),
+]
+"""Lower and upper end of a range of forces, N."""
 
 
 class Support(StrictModel):
@@ -59,22 +76,9 @@ class Loads(StrictModel):
     min_distance_m: Positive | None = None
     samples_per_patch: Count | None = None
     samples: Count | None = None
-    magnitude_n: Annotated[
-        tuple[
-            Annotated[float, Field(ge=0, allow_inf_nan=False)],
-            Annotated[float, Field(ge=1e-12, le=1e12)],
-        ],
-        Field(strict=False),
-    ]
+    magnitude_n: Magnitude
     sampling: Sampling = "random"
     seed: Annotated[int, Field(ge=0)] = 0
-
-    @field_validator("magnitude_n")
-    @classmethod
-    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
-        if value[0] > value[1]:
-            raise ValueError("the lower bound must not exceed the upper one")
-        return value
 
     @model_validator(mode="after")
     def _consistent(self) -> Loads:
@@ -120,7 +124,10 @@ class ExtraTests(StrictModel):
         Number of samples in each set.
     unseen_region : Region, optional
         A part of the surface where no load of the main set acts.
+    paper_magnitude_n : two floats, optional
+        Range of each force at which the set's largest deformation is that of the paper, N.
     """
 
     samples: Count = 200
     unseen_region: Region | None = None
+    paper_magnitude_n: Magnitude | None = None
