@@ -11,7 +11,7 @@ import numpy as np
 
 from mor_bench.analysis.frontier import median_error, median_latency_ms
 from mor_bench.report.number_format import DASH, number, percent, short_swept
-from mor_bench.report.paper_tables import PUBLISHED
+from mor_bench.report.published_figures import PUBLISHED
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import ErrorSummary, Row
 from tests.published.compact import ERRORS
