@@ -41,7 +41,12 @@ def show_progress(console: Console) -> Iterator[Listener]:
     with Progress(*columns, console=console, transient=True) as progress:
         bars = _Bars(progress)
         yield Listener(
-            bars.generating, bars.starting, bars.fitted, bars.timing, training=bars.training
+            compiling=bars.compiling,
+            generating=bars.generating,
+            starting=bars.starting,
+            fitted=bars.fitted,
+            timing=bars.timing,
+            training=bars.training,
         )
 
 
@@ -53,6 +58,16 @@ class _Bars:
     """Number done and time at the first call: earlier work does not count for the rate."""
 
     printed_at: dict[str, float] = field(default_factory=dict)
+
+    def compiling(self, method: str, done: int, total: int) -> None:
+        if "compiling" not in self.tasks:
+            self._print("Compiling numerical kernels. This happens once per machine and version.")
+        self._begin("compiling", "", 0, total)
+        self._update("compiling", done, description=f"compiling {escape(method)}")
+        if done < total and self._is_due("compiling", perf_counter()):
+            self._print(f"compiling {method} ({done + 1} of {total})")
+        if done == total:
+            self.progress.remove_task(self.tasks.pop("compiling"))
 
     def generating(self, dataset: str, done: int, total: int) -> None:
         now = perf_counter()

@@ -13,6 +13,7 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.measure.method_session import MethodSession
 from mor_bench.options import RunOptions
 from mor_bench.results.comparison import Comparison
+from mor_bench.runs.compilation import compile_kernels
 from mor_bench.runs.configurations import checked_specs, configurations_of
 from mor_bench.runs.dataset_run import DatasetRun, RunPart
 from mor_bench.runs.listener import Listener
@@ -34,7 +35,8 @@ def run(
 ) -> Comparison:
     """Compare methods on datasets.
 
-    All specifications are checked first. Each configuration is fitted in a process of its own,
+    All specifications are checked first. Kernels that this machine has not compiled yet are
+    compiled, which counts for no method. Each configuration is fitted in a process of its own,
     which gets the training samples only. Then all are timed side by side in fresh processes.
     The cache keeps fits, scores and timings. A run that was stopped resumes, and another run
     computes only new results. A full comparison also scores named test sets, trains with other
@@ -80,6 +82,7 @@ def run(
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mor-bench-")))
         stack.enter_context(suppress(StopRunError))
         for number, spec in enumerate(specs):
+            compile_kernels(spec, configurations, context, fork_server, scratch)
             part = RunPart(number, len(specs), scratch / f"{number}", fork_server)
             DatasetRun(spec, configurations, comparison, context, part).run()
     comparison.finish(analyse(comparison))

@@ -18,6 +18,8 @@ class Listener:
 
     Attributes
     ----------
+    compiling : callable
+        Called with (method, methods done, methods to compile) before and after each method.
     generating : callable
         Called with (dataset, samples done, samples wanted).
     starting : callable
@@ -32,6 +34,7 @@ class Listener:
         Called with (iterations done, all iterations, loss) during a single fit.
     """
 
+    compiling: Callable[[str, int, int], None] = _ignore
     generating: Callable[[str, int, int], None] = _ignore
     starting: Callable[[str, str, int, int], None] = _ignore
     fitted: Callable[[Row], None] = _ignore
