@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
@@ -16,7 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from llvmlite import binding
-from numba.core import config
 
 from mor_bench.errors import MorBenchError
 from mor_bench.measure.method_session import FitRequest, MethodSession
@@ -123,7 +123,8 @@ def _marker(spec: AnyDatasetSpec, configuration: Configuration) -> str:
     """Name a marker after all that the kernels of a configuration depend on."""
     method, parameters = configuration.method, configuration.parameters
     words = {name: value for name, value in parameters.items() if isinstance(value, str | bool)}
-    processor = [config.CPU_NAME or binding.get_host_cpu_name(), config.CPU_FEATURES]
+    settings = [os.environ.get(f"NUMBA_CPU_{name}") for name in ("NAME", "FEATURES")]
+    processor = [binding.get_host_cpu_name(), *settings]
     scene = [spec.digest(), spec.observed is not None]
     parts = [code_digest(method.surrogate), method.surrogate, words, processor, scene]
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
