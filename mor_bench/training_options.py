@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mor_bench.options import Device as Device
+
+if TYPE_CHECKING:
+    from mor_bench.snapshots.dataset import Snapshots
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,8 @@ class TrainingOptions:
         saved.
     start_from : Path or None
         A saved model of the same class and `Surrogate.architecture` with the initial weights.
+    validation : Snapshots or None
+        Samples that the training may use to stop early, and not to learn from.
     progress : callable or None
         Called regularly with the finished iterations, all iterations, and the loss.
     """
@@ -35,4 +41,5 @@ class TrainingOptions:
     fit_seconds: float | None = None
     checkpoint: Path | None = None
     start_from: Path | None = None
+    validation: Snapshots | None = None
     progress: Callable[[int, int, float], None] | None = None

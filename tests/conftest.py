@@ -13,6 +13,7 @@ import mor_bench
 from mor_bench.results.comparison import Comparison
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
+from mor_bench.specs import load_generated_spec
 from tests.small_runs import Heard, method_file, run_small
 
 
@@ -35,6 +36,17 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tiny(cache: Path) -> Dataset:
     """beam-tiny with its default split."""
     return mor_bench.load_dataset("beam-tiny", cache=cache, workers=1)
+
+
+@pytest.fixture(scope="session")
+def tiny_without_validation(cache: Path) -> Dataset:
+    """beam-tiny with all samples but those of the test for training."""
+    spec = load_generated_spec("beam-tiny")
+    split = spec.split.model_copy(update={"validation_fraction": 0.01})
+    whole = spec.model_copy(update={"split": split})
+    data = mor_bench.load_dataset(whole, cache=cache, workers=1)
+    assert len(data.validation) == 0
+    return data
 
 
 @pytest.fixture(scope="session")

@@ -169,7 +169,10 @@ def test_generate_prints_the_folder_of_the_dataset_and_of_its_test_sets(tmp_path
             "generate beam-tiny --cluster host --cache .",
             "must be the address of a Dask scheduler, tcp://host:port; got 'host'",
         ),
-        ("export vtu beam-tiny --sample 0 --out . --part no", "`--part` must be train, test"),
+        (
+            "export vtu beam-tiny --sample 0 --out . --part no",
+            "`--part` must be train, validation, test",
+        ),
         ("new-method Bad", "the name of a method must hold lower-case letters"),
     ],
 )

@@ -80,7 +80,7 @@ def test_an_impossible_export_is_refused_and_nothing_is_written(
     other = replace(tiny, scene=replace(tiny.scene, spec=spec))
     refused: list[tuple[Dataset, dict[str, Any], str]] = [
         (tiny, {"sample": 40}, r"`sample` must be an integer in \[0, 39\], the samples of part"),
-        (tiny, {"part": "2x"}, "`part` must be train, test; got '2x'"),
+        (tiny, {"part": "2x"}, "`part` must be train, validation, test; got '2x'"),
         (tiny, {"models": [pod, pod]}, "none may be called 'reference'; got pod, pod"),
         (other, {"models": [pod]}, "pod.safetensors: the model was fitted to 'beam-tiny', not to"),
     ]
@@ -100,14 +100,15 @@ def test_exported_arrays_read_back_with_the_same_parts(
     data = mor_bench.load_dataset("beam-tiny", split=split, cache=cache)  # type: ignore[arg-type]
     npz, toml = export_numpy(data, tmp_path / "new" / "tiny.npz")
     again = mor_bench.load_dataset(toml)
-    for before, after in ((data.train, again.train), (data.test, again.test)):
+    for part in ("train", "validation", "test"):
+        before, after = getattr(data, part), getattr(again, part)
         for name in ("forces", "displacements", "free_displacements", "regions"):
             np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
     np.testing.assert_array_equal(again.scene.mesh.cells, data.scene.mesh.cells)
     assert again.scene.mesh.grid_shape == data.scene.mesh.grid_shape == again.scene.spec.grid_nodes
     assert again.scene.spec.needs == data.scene.spec.needs
     assert again.scene.spec.title == data.scene.spec.title
-    for first in (20, 60):  # the first samples of the file hold both parts in proportion
+    for first in (20, 60):  # the first samples of the file hold all parts in proportion
         n_test = len(mor_bench.load_dataset(toml, first).test)
         assert abs(n_test - len(data.test) / 210 * first) <= 1
     twice = export_numpy(again, tmp_path / "again.npz")[0]
@@ -157,7 +158,10 @@ def test_the_export_commands_print_the_files_they_write(
     assert len(written) == 2
     refused = command("export", "vtu", *sample, "--part", "trian", cwd=tmp_path)
     assert refused.returncode == 2
-    assert "`--part` must be train, test, in-range, 2x, 4x, unseen-regions" in refused.stderr
+    assert (
+        "`--part` must be train, validation, test, in-range, 2x, 4x, unseen-regions"
+        in refused.stderr
+    )
 
 
 @pytest.mark.parametrize("there", ["body.toml", "body.npz"])

@@ -261,7 +261,8 @@ def test_a_fit_takes_the_first_swept_value_and_scores_on_the_test_part(
     test = load_dataset("beam-tiny", LIMIT, cache=cache).test
     off = np.abs(again.predict(test.forces) - test.displacements).mean(axis=(1, 2))
     assert fitted.error["mean_dof_m"] == pytest.approx(off.mean())
-    assert (fitted.n_train + fitted.n_test, fitted.iterations) == (LIMIT, None)
+    assert fitted.n_train + fitted.n_validation + fitted.n_test == LIMIT
+    assert fitted.iterations is None
 
 
 class FixedLength(Descent):

@@ -60,7 +60,8 @@ def test_every_configuration_has_a_row_and_a_broken_one_gives_its_reason(
 
 def test_a_row_holds_every_figure(small_run: Comparison, cache: Path) -> None:
     row = row_of(small_run, "pod-swept [n_modes=3]")
-    assert (row.n_train + row.n_test, row.threads, row.split) == (LIMIT, 1, "region")
+    assert row.n_train + row.n_validation + row.n_test == LIMIT
+    assert (row.threads, row.split) == (1, "region")
     assert row.swept == {"n_modes": 3}
     assert (row.told, row.snapshots, row.reference) == (None, True, False)
     other = row_of(small_run, "linear-fem")
@@ -82,7 +83,7 @@ def test_a_row_holds_every_figure(small_run: Comparison, cache: Path) -> None:
     assert row.offline_s.fit > 0
     assert (row.model_bytes or 0) > 8 * 3 * 162
     assert row.offline_s.data == generation_seconds(
-        load_generated_spec("beam-tiny"), cache, row.n_train
+        load_generated_spec("beam-tiny"), cache, row.n_train + row.n_validation
     )
     linear = row_of(small_run, "linear-fem").offline_s
     assert linear is not None
@@ -96,6 +97,13 @@ def test_the_figures_of_a_row_follow_from_its_raw_samples(small_run: Comparison)
     assert len(samples["latency_ms"]) == len(samples["process"]) == len(samples["round"])
     assert set(samples["round"]) == {0, 1, 2}
     assert samples["mean_dof_m"].mean() == pytest.approx(row.error.mean_dof_m)
+    assert row.validation is not None
+    held = samples["validation_relative_l2"]
+    assert len(held) == row.n_validation > 0
+    assert np.median(held) == pytest.approx(row.validation.rel_l2_median)
+    arrays = small_run.dataset_arrays("beam-tiny")
+    assert len(arrays["validation_regions"]) == row.n_validation
+    assert not set(arrays["validation_regions"].ravel()) & set(arrays["test_regions"].ravel())
     worst = np.abs(samples["worst_prediction"] - samples["worst_reference"]).mean()
     assert worst == pytest.approx(row.error.max_dof_m)
 

@@ -292,6 +292,24 @@ def test_early_stopping_keeps_the_best_validated_weights() -> None:
     assert loss == pytest.approx(done.validation_curve[best], rel=1e-5)
 
 
+def test_given_validation_samples_decide_instead_of_training_samples() -> None:
+    """The samples after the training samples are validated, and are never in a batch."""
+    problem = Regression(**NOISY)
+    seen: set[int] = set()
+
+    def loss(rows: Tensor) -> Tensor:
+        if problem.network.training:
+            seen.update(rows.tolist())
+        return problem.loss(rows)
+
+    learning = LearningProblem(problem.network, loss, 40, problem.generator, n_validation=20)
+    done = train(learning, EARLY, TrainingOptions())
+    assert seen == set(range(40))
+    with torch.no_grad():
+        left = float(problem.loss(torch.arange(40, 60)))
+    assert left == pytest.approx(done.validation_curve.min(), rel=1e-5)
+
+
 def test_a_training_sized_to_seconds_is_repeated_by_its_number_of_iterations() -> None:
     filled, repeated = Regression(), Regression()
     plan = replace(PLAN, validation_fraction=0.0)

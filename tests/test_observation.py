@@ -237,7 +237,7 @@ def test_the_cache_does_not_return_a_model_of_other_observed_nodes(
 ) -> None:
     corner = scene_of({"region": {"nearest_m": [[2.0, 1.0, 1.0], 20]}})
     digests = {
-        TrainingData(scene, tiny.train, {}, tmp_path).digest
+        TrainingData(scene, tiny.train, tiny.validation, {}, tmp_path).digest
         for scene in (tiny.scene, data.scene, corner)
     }
     assert len(digests) == 3

@@ -20,15 +20,13 @@ from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.options import RunOptions
 from mor_bench.runs.configurations import CORE_METHODS, DATA_METHODS, checked_specs
 from mor_bench.runs.file_check import check_file
-from mor_bench.scene.mesh import box_mesh
 from mor_bench.scene.snapshot_file import MAX_SIZE
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.given import MAX_FORCE_N
 from mor_bench.specs import ImportedDatasetSpec, load_generated_spec
 from tests.commands import mor_bench_command as command
+from tests.spoiled_arrays import Arrays, doubled, first, hinged, put, with_, without
 from tests.suite_methods import SPECS, cheap_method
-
-Arrays = dict[str, NDArray[Any]]
 
 TOML = """title = "Mine"
 source = "SOFA"
@@ -46,7 +44,7 @@ IMPORTED = "its snapshots were imported, so its equations are not known"
 def arrays(tiny: Dataset) -> Arrays:
     """The samples of beam-tiny in the form that another program would write."""
     found = snapshot_arrays(tiny)
-    del found["test"]
+    del found["test"], found["validation"]
     return found
 
 
@@ -73,13 +71,15 @@ def test_the_arrays_are_read_as_they_were_written(
     np.testing.assert_array_equal(scene.mesh.cells, original.mesh.cells)
     np.testing.assert_array_equal(scene.fixed_nodes, original.fixed_nodes)
     assert scene.material is None
-    assert len(data.train) + len(data.test) == len(arrays["forces"])
+    parts = (data.train, data.validation, data.test)
+    assert sum(map(len, parts)) == len(arrays["forces"])
     pairs = zip(arrays["forces"], arrays["displacements"], strict=True)
     answers = {force.tobytes(): u for force, u in pairs}
-    for part in (data.train, data.test):
+    for part in parts:
         for force, u in zip(part.forces, part.displacements, strict=True):
             np.testing.assert_array_equal(u, answers[force.tobytes()])
     assert not set(data.train.regions) & set(data.test.regions)
+    assert not set(data.train.regions) & set(data.validation.regions)
     with pytest.raises(ValueError, match="read-only"):
         data.train.forces[0] = 0
 
@@ -222,7 +222,9 @@ def test_a_run_ends_with_tables_and_a_report(arrays: Arrays, tmp_path: Path) -> 
     assert rows[2].discretisation_error_m is None
     assert "mine.npz" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     checked = command("check", "mine.toml", cwd=tmp_path).stdout
-    counts = "24 cells, 63 nodes, 9 of them fixed, 170 samples to train and 40 to test"
+    counts = (
+        "24 cells, 63 nodes, 9 of them fixed, 140 samples to train, 30 to validate and 40 to test"
+    )
     assert f"dataset of imported snapshots, {counts}" in checked
     for verb in ("generate", "refine"):
         refused = command(verb, "mine.toml", cwd=tmp_path)
@@ -230,43 +232,7 @@ def test_a_run_ends_with_tables_and_a_report(arrays: Arrays, tmp_path: Path) -> 
         assert refused.stderr == f"mor-bench: mine: {IMPORTED}.\n"
 
 
-def without(*names: str) -> Callable[[Arrays], Arrays]:
-    return lambda arrays: {name: array for name, array in arrays.items() if name not in names}
-
-
-def with_(**changed: Callable[[NDArray[Any]], Any]) -> Callable[[Arrays], Arrays]:
-    return lambda arrays: {
-        **arrays,
-        **{name: np.asarray(change(arrays[name].copy())) for name, change in changed.items()},
-    }
-
-
-def put(*index: Any, value: float) -> Callable[[NDArray[Any]], NDArray[Any]]:
-    def change(array: NDArray[Any]) -> NDArray[Any]:
-        array[index] = value
-        return array
-
-    return change
-
-
-def first(n: int) -> Callable[[Arrays], Arrays]:
-    """Keep the first samples only."""
-    by_sample = ("forces", "displacements", "regions")
-    return lambda arrays: {k: v[:n] if k in by_sample else v for k, v in arrays.items()}
-
-
-def hinged(arrays: Arrays) -> Arrays:
-    """Use two blocks of a cube that share only an edge."""
-    cube = box_mesh((2.0, 2.0, 1.0), (2, 2, 1))
-    used, cells = np.unique(cube.cells[[0, 3]], return_inverse=True)
-    shared = {name: arrays[name][:, : len(used)] for name in ("forces", "displacements")}
-    return {"points": cube.points[used], "cells": cells.reshape(2, 8), **shared}
-
-
-def doubled(rows: NDArray[Any]) -> NDArray[Any]:
-    return np.concatenate([rows[:1], rows[:1], rows[2:]])
-
-
+BOTH = "`test` and `validation` must exclude each other; 210 samples are both"
 TEST = "`test` must hold booleans, or 0 and 1 as integers; "
 RANGE = r"must be in \[-1e\+30, 1e\+30\] "
 ZERO = "must differ from zero somewhere, and be at most .* {}; got zeros only"
@@ -305,6 +271,7 @@ BAD: list[tuple[Callable[[Arrays], Arrays], str]] = [
     (with_(regions=lambda r: r * 0), "210 samples cannot be split by region"),
     (lambda a: {**a, "test": np.arange(210) % 3}, TEST + "got 0 to 2"),
     (lambda a: {**a, "test": np.zeros(210)}, TEST + "got dtype float64"),
+    (lambda a: {**a, **dict.fromkeys(("test", "validation"), np.ones(210, dtype=bool))}, BOTH),
     (with_(forces=put(7, 30, 1, value=-1e31)), RANGE + r"N; entry \[7, 30, 1\] is -1e\+31"),
     (with_(displacements=put(2, 30, 0, value=1e99)), RANGE + r"m; entry \[2, 30, 0\] is 1e\+99"),
     (with_(forces=lambda f: 0 * f), "`forces` " + ZERO.format("N")),

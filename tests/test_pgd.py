@@ -104,8 +104,11 @@ def test_zero_load_gives_zero_and_a_couple_gives_the_answer_of_the_base(
     )
 
 
-def test_a_separable_solution_of_patch_loads_is_found_in_unseen_regions(tiny: Dataset) -> None:
+def test_a_separable_solution_of_patch_loads_is_found_in_unseen_regions(
+    tiny_without_validation: Dataset,
+) -> None:
     """It has degrees one to three in the force, and one factor for the patch position."""
+    tiny = tiny_without_validation
     n_free = len(tiny.scene.free_dofs)
     vectors = np.random.default_rng(3).normal(size=(3, n_free))
 
@@ -142,7 +145,10 @@ def test_terms_added_to_the_linear_response_are_of_second_degree_and_more(tiny: 
     assert 0.9e-4 * small <= smaller <= 1.1e-4 * small
 
 
-def test_on_unseen_load_regions_it_is_far_better_than_the_linear_response(tiny: Dataset) -> None:
+def test_on_unseen_load_regions_it_is_far_better_than_the_linear_response(
+    tiny_without_validation: Dataset,
+) -> None:
+    tiny = tiny_without_validation
     method = SeparatedLoad(n_terms=20, position_degree=2).fit(tiny.scene, tiny.train)
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
     mine, theirs = (

@@ -315,7 +315,7 @@ def test_a_cached_fit_depends_on_the_need_only_if_sizes_are_chosen(
         job: Any = SimpleNamespace(
             method=load_method_spec(tmp_path / "sized.toml"), parameters=knobs, training=None
         )
-        data = TrainingData(needing(tiny.scene, need), tiny.train, {}, tmp_path)
+        data = TrainingData(needing(tiny.scene, need), tiny.train, tiny.validation, {}, tmp_path)
         return CachedFit(job, data, place).key
 
     assert key(0.1, n_modes="auto") != key(0.2, n_modes="auto")

@@ -32,13 +32,19 @@ def test_splits_keep_their_parts_apart(by: Any, k: int) -> None:
     spec = changed(samples_per_patch=200) if k == 1 else "beam-coarse-3-forces"
     scene = load_scene(spec)
     drawn = draw_loads(scene, 0, n_samples_of(scene))
-    train, test = split_samples(drawn, len(scene.patch_nodes), Split(test_fraction=0.2, by=by), 0)
-    assert not set(train) & set(test)
-    assert 0.1 < len(test) / (len(train) + len(test)) < 0.35
+    parts = split_samples(drawn, len(scene.patch_nodes), Split(test_fraction=0.2, by=by), 0)
+    train, validation, test = parts
+    n_used = sum(map(len, parts))
+    assert len(set(train) | set(validation) | set(test)) == n_used
+    assert 0.1 < len(test) / n_used < 0.35
+    assert 0.08 < len(validation) / n_used < 0.25
     if k == 1 or by == "sample":
-        assert len(train) + len(test) == len(drawn)
+        assert n_used == len(drawn)
     if by == "region":
-        assert not set(drawn.patches[train].ravel()) & set(drawn.patches[test].ravel())
+        learned, chosen, tested = (set(drawn.patches[part].ravel().tolist()) for part in parts)
+        assert not (learned | chosen) & tested
+        touched = [set(row.tolist()) - learned for row in drawn.patches[validation]]
+        assert all(touched)  # every validation sample has a force where no training sample has one
     if by == "direction":
         directions = drawn.vectors / np.linalg.norm(drawn.vectors, axis=2, keepdims=True)
         axis = directions[test].reshape(-1, 3).mean(axis=0)
@@ -47,6 +53,8 @@ def test_splits_keep_their_parts_apart(by: Any, k: int) -> None:
         assert (directions[test] @ axis).min() > (directions[train] @ axis).max() - 0.1
         held = {tuple(row) for row in directions[test].reshape(-1, 3)}
         assert not held & {tuple(row) for row in directions[train].reshape(-1, 3)}
+        nearest = (directions[validation] @ axis).max(axis=1).min()
+        assert nearest > (directions[train] @ axis).max() - 0.1
 
 
 def test_the_sample_split_of_the_paper_has_its_counts() -> None:
@@ -59,25 +67,27 @@ def test_the_sample_split_of_the_paper_has_its_counts() -> None:
         scene = load_scene(name)
         n, k = n_samples_of(scene), scene.generated.loads.simultaneous
         loads = PatchLoads(np.zeros((n, k), dtype=np.int64), np.zeros((n, k, 3)))
-        train, test = split_samples(loads, len(scene.patch_nodes), Split(by="sample"), 0)
-        assert (len(train), len(test)) == expected
+        train, validation, test = split_samples(
+            loads, len(scene.patch_nodes), Split(by="sample"), 0
+        )
+        assert (len(train) + len(validation), len(test)) == expected
 
 
 def test_test_regions_do_not_depend_on_the_limit() -> None:
     regions = np.arange(640) % 64
     loads = PatchLoads(regions[:, None], np.zeros((640, 1, 3)))
-    test = [set(regions[split_samples(loads[:n], 64, Split(), 0)[1]]) for n in (128, 640)]
+    test = [set(regions[split_samples(loads[:n], 64, Split(), 0).test]) for n in (128, 640)]
     assert test[0] == test[1]
 
 
 def test_a_dataset_holds_equilibria(tiny: Dataset) -> None:
     model = FullOrderModel(tiny.scene)
-    for part in (tiny.train, tiny.test):
+    for part in (tiny.train, tiny.validation, tiny.test):
         assert part.forces.shape == part.displacements.shape == (len(part), 63, 3)
         assert part.min_det_f.min() > 0
         for u, f in zip(part.free_displacements[:20], part.free_forces[:20], strict=True):
             assert np.linalg.norm(f - model.force(u).force) <= 1e-8 * np.linalg.norm(f)
-    assert len(tiny.train) + len(tiny.test) + tiny.n_refused == 210
+    assert sum(map(len, (tiny.train, tiny.validation, tiny.test))) + tiny.n_refused == 210
     assert not set(tiny.train.regions) & set(tiny.test.regions)
     assert len(set(tiny.test.regions)) == 4
 
@@ -93,10 +103,11 @@ def test_refused_samples_are_in_no_part_and_others_keep_their_displacements(
     assert data.n_refused == 63 - len(valid) > 0
     answers = {vector.tobytes(): shard.displacements[i] for i, vector in enumerate(shard.vectors)}
     expected = {shard.vectors[i].tobytes() for i in valid}
-    found = [v.tobytes() for part in (data.train, data.test) for v in part.loads.vectors]
+    parts = (data.train, data.validation, data.test)
+    found = [v.tobytes() for part in parts for v in part.loads.vectors]
     assert len(found) == len(expected)
     assert set(found) == expected
-    for part in (data.train, data.test):
+    for part in parts:
         for vector, u in zip(part.loads.vectors, part.free_displacements, strict=True):
             np.testing.assert_array_equal(u, answers[vector.tobytes()])
         assert part.min_det_f.min() > 0
@@ -104,10 +115,10 @@ def test_refused_samples_are_in_no_part_and_others_keep_their_displacements(
 
 def test_other_splits_reach_load_dataset(cache: Path) -> None:
     data = mor_bench.load_dataset("beam-tiny", split="sample", cache=cache)
-    assert (len(data.train), len(data.test)) == (168, 42)
+    assert (len(data.train), len(data.validation), len(data.test)) == (136, 32, 42)
     data = mor_bench.load_dataset("beam-tiny", split="direction", cache=cache)
     assert 20 <= len(data.test) <= 70
-    assert len(data.train) + len(data.test) + data.n_refused == 210
+    assert sum(map(len, (data.train, data.validation, data.test))) + data.n_refused == 210
 
 
 def test_wrong_options_are_refused(cache: Path) -> None:

@@ -168,7 +168,9 @@ def test_a_killed_comparison_resumes_in_the_middle_of_a_training(
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> TrainingData:
     tiny = mor_bench.load_dataset("beam-tiny", LIMIT, cache=cache)
-    return TrainingData(tiny.scene, tiny.train, {}, tmp_path_factory.mktemp("data"))
+    return TrainingData(
+        tiny.scene, tiny.train, tiny.validation, {}, tmp_path_factory.mktemp("data")
+    )
 
 
 @pytest.mark.slow

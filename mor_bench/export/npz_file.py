@@ -37,11 +37,11 @@ def export_numpy(data: Dataset, out: str | Path) -> list[Path]:
 
 
 def snapshot_arrays(data: Dataset) -> dict[str, NDArray[Any]]:
-    """Return training and test samples in the schema of `mor_bench.scene.snapshot_file`.
+    """Return all samples in the schema of `mor_bench.scene.snapshot_file`.
 
-    Training and test samples alternate, so the first n samples hold both in about their proportion.
+    The parts alternate, so the first n samples hold each in about its proportion.
     """
-    parts = (data.train, data.test)
+    parts = (data.train, data.validation, data.test)
     places = np.concatenate([(np.arange(len(part)) + 0.5) / len(part) for part in parts])
     order = np.argsort(places, kind="stable")
     arrays: dict[str, NDArray[Any]] = {
@@ -53,7 +53,9 @@ def snapshot_arrays(data: Dataset) -> dict[str, NDArray[Any]]:
         arrays[name] = np.concatenate([getattr(part, name) for part in parts])[order]
     if isinstance(data.train.loads, NodalLoads) and not arrays["regions"].any():
         del arrays["regions"]  # the imported file had none
-    arrays["test"] = (np.arange(len(order)) >= len(data.train))[order]
+    part = np.repeat(["train", "validation", "test"], [len(samples) for samples in parts])[order]
+    for name in ("validation", "test"):
+        arrays[name] = part == name
     return arrays
 
 

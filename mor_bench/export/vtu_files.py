@@ -17,9 +17,9 @@ from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.test_sets import SET_NAMES, SetName
 from mor_bench.surrogate import Surrogate
 
-Part = Literal["train", "test"] | SetName
+Part = Literal["train", "validation", "test"] | SetName
 
-PARTS: tuple[Part, ...] = ("train", "test", *SET_NAMES)
+PARTS: tuple[Part, ...] = ("train", "validation", "test", *SET_NAMES)
 
 
 def export_vtu(
@@ -86,7 +86,11 @@ def export_vtu(
 
 
 def _samples_of(data: Dataset, part: Part) -> Snapshots:
-    parts: dict[str, Snapshots] = {"train": data.train, "test": data.test}
+    parts: dict[str, Snapshots] = {
+        "train": data.train,
+        "validation": data.validation,
+        "test": data.test,
+    }
     parts.update({str(name): samples for name, samples in data.tests.items()})
     if part not in parts:
         raise InvalidInputError(f"`part` must be {', '.join(parts)}; got {part!r}.")

@@ -40,7 +40,8 @@ class TrainingLoop:
     total, n_summed
         Sum and number of the losses since the last point of the curve.
     rows, held, order : (n,) int64
-        Indices of the training samples, of the held-out samples, and of those left in this epoch.
+        Indices of the training samples, of the validation samples (held out by the caller or
+        here), and of those left in this epoch.
     best : dict of Tensor
         Weights with the lowest validation loss.
     """
@@ -72,9 +73,11 @@ class TrainingLoop:
 
     @property
     def n_held(self) -> int:
-        """Number of held-out samples."""
+        """Number of training samples to hold out."""
         fraction, n = self.plan.validation_fraction, self.problem.n_samples
-        return max(1, round(fraction * n)) if fraction > 0 and n > 1 else 0
+        if fraction == 0 or n == 1 or self.problem.n_validation:
+            return 0
+        return max(1, round(fraction * n))
 
     @property
     def validation_interval(self) -> int:
@@ -89,8 +92,10 @@ class TrainingLoop:
         return len(self.validated) - 1 - int(np.argmin(self.validated)) >= PATIENCE
 
     def begin(self) -> None:
-        """Draw the held-out samples and set the number of iterations."""
-        if self.n_held:
+        """Choose the samples that decide on early stopping, and set the number of iterations."""
+        if self.plan.validation_fraction > 0 and self.problem.n_validation:
+            self.held = self.problem.n_samples + torch.arange(self.problem.n_validation)
+        elif self.n_held:
             order = torch.randperm(self.problem.n_samples, generator=self.generator)
             self.held = order[: self.n_held].sort().values
             self.rows = order[self.n_held :].sort().values

@@ -37,8 +37,8 @@ class TrainingPlan:
         Precision of the products in the forward and backward pass. Weights and their updates are
         float32.
     validation_fraction : float
-        Fraction of the training samples, chosen at random, that is held out for early stopping; 0
-        for none.
+        Fraction of the training samples, chosen at random, that is held out for early stopping if
+        the problem has no validation samples; 0 for no early stopping.
     """
 
     iterations: int
@@ -68,6 +68,8 @@ class LearningProblem:
         Constants of the loss. They identify a training: a checkpoint with other arrays is refused.
     knobs : mapping
         Hyperparameters of the method as JSON values; they identify a training too.
+    n_validation : int
+        Number of validation samples; their indices follow those of the training samples.
     """
 
     network: nn.Module
@@ -76,6 +78,7 @@ class LearningProblem:
     generator: torch.Generator
     arrays: Mapping[str, Tensor] = field(default_factory=dict)
     knobs: Mapping[str, object] = field(default_factory=dict)
+    n_validation: int = 0
 
 
 def rate_factor(schedule: Schedule, iteration: int, iterations: int) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from time import perf_counter, process_time
@@ -76,6 +76,8 @@ class FitRequest:
         Time limit that the method receives, s.
     training : TrainingOptions, optional
         Training options of a method that may train.
+    validation : Path, optional
+        Folder of the validation snapshots, for a method that may train.
     """
 
     surrogate: str
@@ -85,6 +87,7 @@ class FitRequest:
     threads: int
     limit_s: float
     training: TrainingOptions | None = None
+    validation: Path | None = None
 
 
 class MethodSession(Session):
@@ -142,7 +145,8 @@ class MethodSession(Session):
         method = make_surrogate(load_class(request.surrogate), request.parameters)
         method.time_limit_s = request.limit_s
         if request.training is not None:
-            method.training = request.training
+            held = request.validation and read_snapshots(request.validation, self.scene)
+            method.training = replace(request.training, validation=held or None)
         with pinned_threads(request.threads):
             snapshots = (
                 read_snapshots(request.train, self.scene) if method.needs_snapshots else None

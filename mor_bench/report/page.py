@@ -133,8 +133,9 @@ def _facts(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> li
     unused = _values(row.n_unused for row in rows)
     split = f"by {_values(row.split for row in rows)}; "
     split += f"training samples: {_values(row.n_train for row in rows)}; "
+    split += f"validation samples: {_values(row.n_validation for row in rows)}; "
     split += f"test samples: {_values(row.n_test for row in rows)}"
-    split += f"; in neither part: {unused}" if any(row.n_unused for row in rows) else ""
+    split += f"; in no part: {unused}" if any(row.n_unused for row in rows) else ""
     counts = (
         f"{sum(r.status == status for r in rows)} {status}" for status in ("failed", "skipped")
     )

@@ -108,6 +108,7 @@ class Comparison:
 
         `latency_ms`, `process`, `round` (n_queries,): latency, fresh process and interleaved round.
         `mean_dof_m`, `relative_l2`, `max_nodal_m`, `amplitude_m` (n_test,): errors.
+        `validation_relative_l2` (n_validation,): errors on the validation samples.
         `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3): the sample with the
         largest finite error.
         `loss_curve`, `validation_curve` (n_intervals,): losses, evenly spread over the training.
@@ -117,7 +118,8 @@ class Comparison:
     def dataset_arrays(self, name: str) -> dict[str, NDArray[Any]]:
         """Read a dataset's arrays.
 
-        `singular_values`, `points` (n_nodes, 3), `cells` (n_cells, 8), `test_regions` (n_test, k).
+        `singular_values`, `points` (n_nodes, 3), `cells` (n_cells, 8), `test_regions` (n_test, k),
+        `validation_regions` (n_validation, k).
         """
         return read_arrays(self._samples_path(name))
 

@@ -234,12 +234,14 @@ class Row(Part):
         Values chosen for parameters that were "auto".
     status, reason : str
         "ok", "failed" or "skipped", and the reason.
-    n_train, n_test, n_unused, n_failed : int
+    n_train, n_validation, n_test, n_unused, n_failed : int
         Samples; `n_failed` test samples have no prediction.
     n_dofs, threads : int
         Degrees of freedom of the mesh, and threads of a prediction.
     error : ErrorSummary or None
         Errors on the main test set.
+    validation : ErrorSummary or None
+        Errors on the validation samples, which decide between configurations.
     latency_ms, all_threads_ms : Latency, AllThreadsLatency or None
     throughput : dict or None
         Queries per second by batch size.
@@ -277,12 +279,14 @@ class Row(Part):
     status: Status
     reason: str | None = None
     n_train: int
+    n_validation: int = 0
     n_test: int
     n_unused: int = 0
     n_failed: int | None = None
     n_dofs: int = 0
     threads: int = 1
     error: ErrorSummary | None = None
+    validation: ErrorSummary | None = None
     latency_ms: Latency | None = None
     all_threads_ms: AllThreadsLatency | None = None
     throughput: dict[Annotated[str, BeforeValidator(str)], Real | None] | None = None

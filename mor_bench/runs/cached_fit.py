@@ -168,6 +168,8 @@ class CachedFit:
         if training is not None and training != TrainingOptions():
             device = gpu_name() if training.device == "cuda" else training.device
             parts["training"] = {"device": device, "fit_seconds": training.fit_seconds}
+        if training is not None:
+            parts["validation"] = self.data.validation_digest
         return parts
 
     @property
@@ -272,6 +274,7 @@ class CachedFit:
             threads=self.environment.fit_threads,
             limit_s=limit_s,
             training=training and replace(training, checkpoint=checkpoint),
+            validation=self.data.validation_folder if training else None,
         )
         answer = worker.ask("fit", limit_s, request=request)
         if answer["needs_snapshots"]:

@@ -44,7 +44,7 @@ from mor_bench.runs.row_figures import (
 from mor_bench.runs.run_context import RunContext
 from mor_bench.runs.scoring import Score, ScoredFit, score_fit
 from mor_bench.runs.timing_stage import StopRunError, time_configurations
-from mor_bench.runs.training_data import TestSet, TrainingData
+from mor_bench.runs.training_data import TrainingData
 from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.handover import arrays_of
 from mor_bench.snapshots.dataset import Dataset, load_dataset
@@ -101,9 +101,7 @@ class DatasetRun:
         self.data = self._load()
         record_dataset(comparison, spec, self.data)
         part.folder.mkdir()
-        sets = {"test": self.data.test, **self.data.tests}
-        tests = {name: TestSet.of(snapshots) for name, snapshots in sets.items()}
-        self.training_data = TrainingData(self.data.scene, self.data.train, tests, part.folder)
+        self.training_data = TrainingData.of(self.data, part.folder)
         self.environment = self._environment()
         self.data_s = self._data_seconds()
         self.discretisation = _discretisation(spec, context)
@@ -148,10 +146,11 @@ class DatasetRun:
         )
 
     def _data_seconds(self) -> float | None:
-        """Return the core-seconds of generating the training samples; None if unknown."""
+        """Return the core-seconds of the training and validation samples; None if unknown."""
         if not isinstance(self.spec, DatasetSpec):
             return None
-        return generation_seconds(self.spec, self.context.cache, len(self.data.train))
+        n = len(self.data.train) + len(self.data.validation)
+        return generation_seconds(self.spec, self.context.cache, n)
 
     def _environment(self) -> RunEnvironment:
         context = self.context
@@ -234,8 +233,8 @@ class DatasetRun:
 
         def remote(cached: CachedFit, limit_s: float) -> tuple[dict[str, Any], bytes | None]:
             memory = self.environment.memory_limit_bytes
-            arrays = arrays_of(self.data.train)
-            task = ClusterFit(self.data.scene, arrays, configuration, limit_s, memory)
+            samples = arrays_of(self.data.train), arrays_of(self.data.validation)
+            task = ClusterFit(self.data.scene, *samples, configuration, limit_s, memory)
             return pool.executor.submit(fit_on_cluster, task).result()
 
         return remote
@@ -263,6 +262,7 @@ class DatasetRun:
             reference=configuration.method.reference,
             status="ok",
             n_train=len(data.train),
+            n_validation=len(data.validation),
             n_test=len(data.test),
             n_unused=data.n_unused,
             n_dofs=data.scene.mesh.n_dofs,
@@ -276,7 +276,7 @@ class DatasetRun:
         """Add a fit's figures and scores to a row; return the raw samples as well."""
         record, others = scored.record, dict(scored.scores)
         flags = flags_of(scored.scores) if record.needs_snapshots else None
-        main = others.pop("test")
+        main, held = others.pop("test"), others.pop("validation", None)
         failed = n_failed(main)
         if failed == len(main["mean_dof_m"]):
             raise SolverError(f"no valid prediction on any of {failed} test samples")
@@ -286,6 +286,7 @@ class DatasetRun:
             snapshots=record.needs_snapshots,
             n_failed=failed,
             error=error_summary(main),
+            validation=None if held is None else error_summary(held),
             offline_s=Offline(
                 data=self.data_s if record.needs_snapshots else 0.0,
                 fit=record.fit_s,
@@ -301,7 +302,12 @@ class DatasetRun:
             training=training_record(record, configuration.training),
             warnings=[*record.warnings, *ignored_seconds(record, asked_s)],
         )
-        return row, {**main, **loss_curves(record)}
+        return row, {**main, **_validation_samples(held), **loss_curves(record)}
+
+
+def _validation_samples(score: Score | None) -> Score:
+    """Return the raw samples that a row keeps of its validation errors."""
+    return {} if score is None else {"validation_relative_l2": score["relative_l2"]}
 
 
 def _discretisation(spec: AnyDatasetSpec, context: RunContext) -> dict[str, float | None]:
@@ -324,5 +330,6 @@ def record_dataset(comparison: Comparison, spec: AnyDatasetSpec, data: Dataset) 
         "points": data.scene.mesh.points,
         "cells": data.scene.mesh.cells,
         "test_regions": data.test.loads.patches,
+        "validation_regions": data.validation.loads.patches,
     }
     comparison.add_dataset(spec.name, spec.model_dump(mode="json"), arrays)

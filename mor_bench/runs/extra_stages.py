@@ -122,7 +122,7 @@ def _spread(errors: Sequence[float]) -> Spread:
 def draw_learning_curves(stage: Stage, fits: Mapping[str, CachedFit]) -> None:
     """Measure errors over the number of training samples.
 
-    Each method that learns is measured in its most accurate configuration.
+    Each method that learns is measured in its configuration with the least validation error.
     """
     comparison, name = stage.comparison, stage.spec.name
     comparison.learning = [point for point in comparison.learning if point.dataset != name]
@@ -135,14 +135,16 @@ def draw_learning_curves(stage: Stage, fits: Mapping[str, CachedFit]) -> None:
         ]
         if not mine:
             continue
-        best, cached = min(mine, key=lambda pair: _median_error(pair[0]))
+        best, cached = min(mine, key=lambda pair: _deciding_error(pair[0]))
         for n in _learning_sizes(stage.training_data.n_train):
             comparison.learning.append(_learning_point(stage, cached, n, best))
             comparison.write()
 
 
-def _median_error(row: Row) -> float:
-    return np.inf if row.error is None else row.error.rel_l2_median
+def _deciding_error(row: Row) -> float:
+    """Median error on the validation samples; on the test samples if there are no others."""
+    decides = row.validation or row.error
+    return np.inf if decides is None else decides.rel_l2_median
 
 
 def _learning_sizes(n_train: int) -> list[int]:

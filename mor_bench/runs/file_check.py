@@ -69,5 +69,6 @@ def _imported(spec: ImportedDatasetSpec) -> str:
     mesh, n_fixed = data.scene.mesh, len(data.scene.fixed_nodes)
     return (
         f"dataset of imported snapshots, {mesh.n_cells} cells, {mesh.n_nodes} nodes, "
-        f"{n_fixed} of them fixed, {len(data.train)} samples to train and {len(data.test)} to test"
+        f"{n_fixed} of them fixed, {len(data.train)} samples to train, "
+        f"{len(data.validation)} to validate and {len(data.test)} to test"
     )

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, StoreError
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.runs.cached_fit import CachedFit, FitRecord
 from mor_bench.runs.configurations import Configuration
+from mor_bench.sandbox.handover import write_arrays
 from mor_bench.sandbox.process import MethodFailedError, Restrictions, SandboxedProcess
 from mor_bench.scene.scene import Scene
 
@@ -133,19 +133,20 @@ def _keep_remote(cached: CachedFit, answer: dict[str, Any], content: bytes | Non
 
 @dataclass(frozen=True)
 class ClusterFit:
-    """A fit to do on another machine: scene, training samples, configuration and limits.
+    """A fit to do on another machine: scene, samples, configuration and limits.
 
     Attributes
     ----------
     scene : Scene
-    arrays : dict
-        The training samples, see `mor_bench.sandbox.handover`.
+    train, validation : dict
+        Arrays of the samples, see `mor_bench.sandbox.handover`.
     configuration : Configuration
     limit_s, memory_limit_bytes : float
     """
 
     scene: Scene
-    arrays: dict[str, NDArray[Any]]
+    train: dict[str, NDArray[Any]]
+    validation: dict[str, NDArray[Any]]
     configuration: Configuration
     limit_s: float
     memory_limit_bytes: float
@@ -154,10 +155,10 @@ class ClusterFit:
 def fit_on_cluster(task: ClusterFit) -> tuple[dict[str, Any], bytes | None]:
     """Fit on this machine in a worker process; return its answer and the model's file."""
     with tempfile.TemporaryDirectory() as name:
-        train, model = Path(name) / "train", Path(name) / "model.safetensors"
-        train.mkdir()
-        for key, array in task.arrays.items():
-            np.save(train / f"{key}.npy", array, allow_pickle=False)
+        train, validation = Path(name) / "train", Path(name) / "validation"
+        model = Path(name) / "model.safetensors"
+        write_arrays(train, task.train)
+        write_arrays(validation, task.validation)
         request = FitRequest(
             surrogate=task.configuration.method.surrogate,
             parameters=task.configuration.parameters,
@@ -166,6 +167,7 @@ def fit_on_cluster(task: ClusterFit) -> tuple[dict[str, Any], bytes | None]:
             threads=os.cpu_count() or 1,
             limit_s=task.limit_s,
             training=task.configuration.training,
+            validation=validation,
         )
         restrictions = Restrictions(memory_bytes=task.memory_limit_bytes)
         with SandboxedProcess(MethodSession, restrictions, scene=task.scene) as worker:

@@ -199,7 +199,8 @@ def _problem_size(spec: AnyDatasetSpec, context: RunContext) -> tuple[int, int]:
         n = n_samples_to_generate(spec, limit)
     else:
         n = len(load_dataset(spec, limit).train)
-    return load_scene(spec).mesh.n_dofs, max(1, round((1 - spec.split.test_fraction) * n))
+    held_out = spec.split.test_fraction + spec.split.validation_fraction
+    return load_scene(spec).mesh.n_dofs, max(1, round((1 - held_out) * n))
 
 
 def _data_step(spec: AnyDatasetSpec, context: RunContext) -> Step:
@@ -239,7 +240,7 @@ def _cached_labels(
     data = load_dataset(spec, options.limit, split=options.split, cache=context.cache)
     environment = RunEnvironment(context.cache, jobs=options.jobs, threads=options.threads)
     with TemporaryDirectory(prefix="mor-bench-") as scratch:
-        training_data = TrainingData(data.scene, data.train, {}, Path(scratch))
+        training_data = TrainingData.of(data, Path(scratch))
         return {
             item.label
             for item in configurations

@@ -46,8 +46,8 @@ class Fit:
         Time of the fit in this process, s; a resumed training counts from its checkpoint.
     iterations : int or None
         Number of iterations of a training with a time target.
-    n_train, n_test : int
-        Numbers of training and test samples.
+    n_train, n_validation, n_test : int
+        Numbers of samples. A training uses the validation samples to stop early.
     """
 
     method: Surrogate
@@ -56,6 +56,7 @@ class Fit:
     seconds: float
     iterations: int | None
     n_train: int
+    n_validation: int
     n_test: int
 
 
@@ -133,7 +134,8 @@ def fit(
                 stacklevel=2,
             )
         error = _test_error(unfitted, data.test)
-    return Fit(unfitted, out, error, seconds, iterations, len(data.train), len(data.test))
+    sizes = map(len, (data.train, data.validation, data.test))
+    return Fit(unfitted, out, error, seconds, iterations, *sizes)
 
 
 def _unfitted(source: str | Path, parameters: Mapping[str, Any], options: FitOptions) -> Surrogate:
@@ -187,6 +189,8 @@ def _check_writable(name: str, path: Path) -> None:
 def _fit_and_save(unfitted: Surrogate, data: Dataset, out: Path) -> float:
     """Fit and save a method; return the seconds of the fit."""
     start = perf_counter()
+    if unfitted.trains():
+        unfitted.training = replace(unfitted.training, validation=data.validation)
     unfitted.fit(data.scene, data.train if unfitted.needs_snapshots else None)
     seconds = perf_counter() - start
     unfitted.save(out)

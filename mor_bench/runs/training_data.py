@@ -1,4 +1,4 @@
-"""Training samples in files for the methods' processes, and test sets in memory."""
+"""Training and validation samples in files for the methods' processes, and test sets in memory."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mor_bench.mechanics.indicator import ErrorIndicator
 from mor_bench.sandbox.handover import arrays_of, write_snapshots
 from mor_bench.sandbox.process import MethodFailedError
 from mor_bench.scene.scene import Scene
-from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.dataset import Dataset, Snapshots
 
 
 def digest_of_file(path: Path) -> str:
@@ -69,26 +69,45 @@ class TestSet:
 
 
 class TrainingData:
-    """Training samples as files for the methods' processes, and the test sets to score on.
+    """Samples to learn from, as files for the methods' processes, and the test sets to score on.
 
     Parameters
     ----------
     scene : Scene
-    train : Snapshots
+    train, validation : Snapshots
+        Only trainings get the validation samples, to stop early.
     sets : dict of str to TestSet
-        The main test set is ``test``.
+        The main test set is ``test``. If there are validation samples, ``validation`` holds them.
     scratch : Path
         An existing folder that every method's process may write to.
     """
 
     def __init__(
-        self, scene: Scene, train: Snapshots, sets: Mapping[str, TestSet], scratch: Path
+        self,
+        scene: Scene,
+        train: Snapshots,
+        validation: Snapshots,
+        sets: Mapping[str, TestSet],
+        scratch: Path,
     ) -> None:
         self.scene, self.scratch, self.sets = scene, scratch, dict(sets)
-        self.train = train
-        self.folder = Path(tempfile.mkdtemp(dir=scratch)) / "train"
-        write_snapshots(self.folder, train)
+        self.train, self.validation = train, validation
+        folder = Path(tempfile.mkdtemp(dir=scratch))
+        self.folder, self.validation_folder = folder / "train", folder / "validation"
+        self._write()
         self._written = self._file_digests()
+
+    @classmethod
+    def of(cls, data: Dataset, scratch: Path) -> TrainingData:
+        """Take the samples of a dataset, with all its test sets."""
+        held = {"validation": data.validation} if len(data.validation) else {}
+        sets = {"test": data.test, **held, **data.tests}
+        tests = {name: TestSet.of(snapshots) for name, snapshots in sets.items()}
+        return cls(data.scene, data.train, data.validation, tests, scratch)
+
+    def _write(self) -> None:
+        write_snapshots(self.folder, self.train)
+        write_snapshots(self.validation_folder, self.validation)
 
     @property
     def n_train(self) -> int:
@@ -96,17 +115,19 @@ class TrainingData:
         return len(self.train)
 
     def _file_digests(self) -> dict[str, str]:
-        return {path.name: digest_of_file(path) for path in sorted(self.folder.iterdir())}
+        folders = (self.folder, self.validation_folder)
+        return {str(path): digest_of_file(path) for folder in folders for path in folder.iterdir()}
 
     def check_unchanged(self) -> None:
-        """Raise `MethodFailedError` and restore the training samples if a method changed them."""
+        """Raise `MethodFailedError` and restore the samples if a method changed them."""
         try:
             unchanged = self._file_digests() == self._written
         except OSError:
             unchanged = False
         if not unchanged:
-            shutil.rmtree(self.folder, ignore_errors=True)
-            write_snapshots(self.folder, self.train)
+            for folder in (self.folder, self.validation_folder):
+                shutil.rmtree(folder, ignore_errors=True)
+            self._write()
             raise MethodFailedError("the method overwrote the training samples")
 
     @cached_property
@@ -122,6 +143,11 @@ class TrainingData:
         return digest_of_arrays(arrays_of(self.train)) + hashlib.sha256(scene.encode()).hexdigest()
 
     @cached_property
+    def validation_digest(self) -> str:
+        """SHA-256 of the validation samples."""
+        return digest_of_arrays(arrays_of(self.validation))
+
+    @cached_property
     def indicator(self) -> ErrorIndicator | None:
         """Error indicator; None if equations, forces or some nodes' displacements are unknown."""
         known = self.scene.material is not None and self.scene.observed_nodes is None
@@ -134,7 +160,7 @@ class TrainingData:
     def first(self, n: int) -> TrainingData:
         """Return the same data with only the first training samples and the main test set."""
         sets = {"test": self.sets["test"]}
-        return TrainingData(self.scene, self.train[:n], sets, self.scratch)
+        return TrainingData(self.scene, self.train[:n], self.validation, sets, self.scratch)
 
     def with_sets(self, sets: Mapping[str, TestSet]) -> TrainingData:
         """Return the same training samples with other test sets."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +30,13 @@ def arrays_of(snapshots: Snapshots) -> dict[str, NDArray[np.generic]]:
 
 def write_snapshots(folder: Path, snapshots: Snapshots) -> None:
     """Write the arrays of snapshots to a new folder."""
+    write_arrays(folder, arrays_of(snapshots))
+
+
+def write_arrays(folder: Path, arrays: Mapping[str, NDArray[np.generic]]) -> None:
+    """Write arrays to a new folder, one file each."""
     folder.mkdir()
-    for name, array in arrays_of(snapshots).items():
+    for name, array in arrays.items():
         np.save(folder / f"{name}.npy", array, allow_pickle=False)
 
 

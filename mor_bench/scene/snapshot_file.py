@@ -2,7 +2,8 @@
 
 Required: `points` (n_nodes, 3), m; `cells` (n_cells, 8 or 4) in VTK order, counted from 0; `forces`
 and `displacements` (n, n_nodes, 3), N and m. Optional: `fixed_nodes` (n_fixed,); `regions` (n,), or
-(n, k) with k forces at once, load-region ids from 0; `test` (n,), true or 1 for test samples.
+(n, k) with k forces at once, load-region ids from 0; `test` and `validation` (n,), true or 1 for
+test and validation samples.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ MAX_SIZE = {"forces": 1e30, "displacements": 1e30}
 """Largest allowed values, N and m. Their squares and products do not overflow."""
 
 REQUIRED = ("points", "cells", "forces", "displacements")
-OPTIONAL = ("fixed_nodes", "regions", "test")
-_KINDS = {"cells": "iu", "fixed_nodes": "iu", "regions": "iu", "test": "biu"}
+OPTIONAL = ("fixed_nodes", "regions", "test", "validation")
+_KINDS = {"cells": "iu", "fixed_nodes": "iu", "regions": "iu", "test": "biu", "validation": "biu"}
 _WORDS = {"iu": "integers", "biu": "booleans, or 0 and 1 as integers", "fiu": "real numbers"}
 _UNREADABLE = (
     OSError,
@@ -61,7 +62,7 @@ class ImportedArrays:
         Sorted.
     regions : (n, k) int64 or None
         Load-region ids.
-    test : (n,) bool or None
+    test, validation : (n,) bool or None
     """
 
     mesh: Mesh
@@ -70,6 +71,7 @@ class ImportedArrays:
     fixed_nodes: NDArray[np.int64]
     regions: NDArray[np.int64] | None
     test: NDArray[np.bool_] | None
+    validation: NDArray[np.bool_] | None
 
 
 def read_arrays(file: SourceFile) -> ImportedArrays:
@@ -142,7 +144,7 @@ def _checked(arrays: Mapping[str, NDArray[Any]]) -> ImportedArrays:
     n, n_nodes = forces.shape[:2]
     if n == 0:
         raise SpecError("there must be samples; got none.")
-    regions, test = arrays.get("regions"), arrays.get("test")
+    regions = arrays.get("regions")
     check_numbers(points, cells)
     if (unused := n_nodes - len(np.unique(cells))) > 0:
         raise SpecError(f"every node must belong to a cell; {unused} of {n_nodes} do not.")
@@ -156,11 +158,20 @@ def _checked(arrays: Mapping[str, NDArray[Any]]) -> ImportedArrays:
     seen = {hashlib.sha256((force + 0.0).tobytes()).digest() for force in forces}
     if len(seen) < n:
         raise SpecError(f"`forces`: {n - len(seen)} samples have the same forces as others.")
-    if test is not None:
-        if not np.isin(test, [0, 1]).all():
-            raise SpecError(f"`test` must hold {_WORDS['biu']}; got {test.min()} to {test.max()}.")
-        test = test.astype(np.bool_)
-    return ImportedArrays(in_grid(mesh), forces, displacements, fixed, regions, test)
+    test, validation = (_truth_values(name, arrays.get(name)) for name in ("test", "validation"))
+    if test is not None and validation is not None and (both := int((test & validation).sum())):
+        raise SpecError(
+            f"`test` and `validation` must exclude each other; {both} samples are both."
+        )
+    return ImportedArrays(in_grid(mesh), forces, displacements, fixed, regions, test, validation)
+
+
+def _truth_values(name: str, array: NDArray[Any] | None) -> NDArray[np.bool_] | None:
+    if array is None:
+        return None
+    if not np.isin(array, [0, 1]).all():
+        raise SpecError(f"`{name}` must hold {_WORDS['biu']}; got {array.min()} to {array.max()}.")
+    return array.astype(np.bool_)
 
 
 def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -174,6 +185,7 @@ def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
         "fixed_nodes": ((None,),),
         "regions": ((n,), (n, None)),
         "test": ((n,),),
+        "validation": ((n,),),
     }
     for name in (*REQUIRED, *OPTIONAL):
         array = arrays.get(name)

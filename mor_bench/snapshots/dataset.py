@@ -20,7 +20,7 @@ from mor_bench.snapshots.imported_dataset import NodalLoads, nodal_loads, read_s
 from mor_bench.snapshots.sampling import PatchLoads, n_samples_of, repeated
 from mor_bench.snapshots.split import split_imported, split_samples
 from mor_bench.snapshots.test_sets import SetName, check_regions, spec_of_set
-from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, Split, SplitBy
+from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, SplitBy
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
@@ -106,20 +106,25 @@ class Snapshots:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A scene with its training and test snapshots.
+    """A scene with its training, validation and test snapshots.
 
     Attributes
     ----------
+    train, validation, test : Snapshots
+        Methods learn from `train`. Choices between configurations use `validation`, so that errors
+        on `test` are those of methods that were not chosen for it. See
+        `mor_bench.snapshots.split`.
     n_refused : int
         Samples without a valid equilibrium. They are stored with the reason and are in no part.
     n_unused : int
-        Valid samples in neither part, because only some of their forces are held out.
+        Valid samples in no part, because only some of their forces are held out for the test.
     tests : dict of str to Snapshots
         The requested named test sets, see `mor_bench.snapshots.test_sets`.
     """
 
     scene: Scene = field(repr=False)
     train: Snapshots
+    validation: Snapshots
     test: Snapshots
     n_refused: int
     n_unused: int = 0
@@ -188,12 +193,12 @@ def _split(
             f"{spec.name}: {n} samples repeat others; check `seed` and `magnitude_n`."
         )
     valid, n_patches = main.valid, len(main.scene.patch_nodes)
-    chosen = Split(test_fraction=spec.split.test_fraction, by=by)
+    chosen = spec.split.model_copy(update={"by": by})
     parts = split_samples(main.loads[valid], n_patches, chosen, spec.loads.seed)
-    train, test = main.snapshots([valid[part] for part in parts])
+    train, validation, test = main.snapshots([valid[part] for part in parts])
     sets: dict[str, Snapshots] = {n: s.snapshots([s.valid])[0] for n, s in others.items()}
-    n_unused = len(valid) - len(train) - len(test)
-    return Dataset(main.scene, train, test, len(main.status) - len(valid), n_unused, sets)
+    n_refused, n_unused = len(main.status) - len(valid), len(valid) - sum(map(len, parts))
+    return Dataset(main.scene, train, validation, test, n_refused, n_unused, sets)
 
 
 def _imported(
@@ -206,11 +211,12 @@ def _imported(
     arrays = read_samples(spec, limit)
     scene, loads = imported_scene(spec, arrays), nodal_loads(arrays)
     displacements = arrays.displacements.reshape(len(loads), -1)[:, scene.free_dofs]
-    train, test = (
+    parts = split_imported(spec, arrays, by)
+    train, validation, test = (
         Snapshots(scene, loads[part], displacements[part], np.full(len(part), np.nan))[:]
-        for part in split_imported(spec, arrays, by)
+        for part in parts
     )
-    return Dataset(scene, train, test, 0, len(loads) - len(train) - len(test))
+    return Dataset(scene, train, validation, test, 0, len(loads) - sum(map(len, parts)))
 
 
 class _Store:

@@ -11,7 +11,7 @@ from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.sampling import draw_loads, n_samples_of
 from mor_bench.snapshots.split import split_samples
-from mor_bench.specs import DatasetSpec, Split, SplitBy
+from mor_bench.specs import DatasetSpec, SplitBy
 
 MAX_FRESH = 400
 """Largest number of samples. One process solves them while the run waits."""
@@ -41,8 +41,8 @@ def fresh_test_set(spec: DatasetSpec, scene: Scene, by: SplitBy, seed: int, n: i
     """
     other = spec.model_copy(update={"loads": spec.loads.model_copy(update={"seed": seed})})
     drawn = draw_loads(load_scene(other), 0, n_samples_of(scene))
-    split = Split(test_fraction=spec.split.test_fraction, by=by)
-    held = drawn[split_samples(drawn, len(scene.patch_nodes), split, spec.loads.seed)[1]]
+    split = spec.split.model_copy(update={"by": by})
+    held = drawn[split_samples(drawn, len(scene.patch_nodes), split, spec.loads.seed).test]
     held = held[: min(n, MAX_FRESH)]
     forces = held.nodal_forces(scene.patch_weights).reshape(len(held), -1)[:, scene.free_dofs]
     found = FullOrderModel(scene).solve_many(forces)

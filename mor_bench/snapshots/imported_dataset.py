@@ -41,13 +41,13 @@ class NodalLoads:
 def read_samples(spec: ImportedDatasetSpec, limit: int | None = None) -> ImportedArrays:
     """Read the first or all samples of an imported dataset; errors as in `read_arrays`."""
     arrays = read_arrays(spec.snapshots.file)
-    first = slice(limit)
+    by_sample = {
+        name: getattr(arrays, name)
+        for name in ("forces", "displacements", "regions", "test", "validation")
+    }
     return replace(
         arrays,
-        forces=arrays.forces[first],
-        displacements=arrays.displacements[first],
-        regions=None if arrays.regions is None else arrays.regions[first],
-        test=None if arrays.test is None else arrays.test[first],
+        **{name: array[:limit] for name, array in by_sample.items() if array is not None},
     )
 
 

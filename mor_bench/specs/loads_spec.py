@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -102,17 +102,40 @@ class Loads(StrictModel):
 
 
 class Split(StrictModel):
-    """Choice of the test samples; see `mor_bench.snapshots.split`."""
+    """Choice of the validation and test samples; see `mor_bench.snapshots.split`."""
 
     test_fraction: Fraction = 0.2
+    validation_fraction: Fraction = 0.15
     by: SplitBy = "region"
+
+    @model_validator(mode="after")
+    def _some_left(self) -> Split:
+        return _checked_fractions(self)
 
 
 class ImportedSplit(StrictModel):
-    """Choice of imported test samples: as `Split`, or by the file's array `test`."""
+    """Choice of imported validation and test samples: as `Split`, or by the arrays of the file."""
 
     test_fraction: Fraction = 0.2
+    validation_fraction: Fraction = 0.15
     by: Literal["region", "sample", "direction", "file"] = "region"
+
+    @model_validator(mode="after")
+    def _some_left(self) -> ImportedSplit:
+        return _checked_fractions(self)
+
+
+AnySplit = TypeVar("AnySplit", Split, ImportedSplit)
+
+
+def _checked_fractions(split: AnySplit) -> AnySplit:
+    held_out = split.test_fraction + split.validation_fraction
+    if held_out >= 1:
+        raise ValueError(
+            "`test_fraction` and `validation_fraction` must leave samples for training: "
+            f"their sum must be less than 1; got {held_out:g}"
+        )
+    return split
 
 
 class ExtraTests(StrictModel):

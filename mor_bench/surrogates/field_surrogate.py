@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -147,9 +147,7 @@ class FieldSurrogate(Surrogate, ABC):
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         self.set_up(scene)
-        given, wanted = self._network_input(samples.given.values), samples.displacements
-        if self.input == "linear-response":
-            wanted = wanted - given
+        given, wanted = self._pairs(samples)
         scales = np.array([self.scale(given), self.scale(wanted)])
         inputs, targets = given / scales[0], wanted / scales[1]
         constants = self.constants(inputs, targets)
@@ -159,7 +157,11 @@ class FieldSurrogate(Surrogate, ABC):
         network = self.initialise(self.build_network(constants), generator)
         if self.training.start_from is not None:
             self._start_from(network, self.training.start_from, model)
-        done = self._train(network, _single(inputs), _single(targets), generator)
+        known = [(_single(inputs), _single(targets))]
+        if self.plan().validation_fraction > 0 and self.training.validation is not None:
+            held = self._pairs(self.training.validation)
+            known.append((_single(held[0] / scales[0]), _single(held[1] / scales[1])))
+        done = self._train(network, known, generator)
         self.network_ = network.cpu()
         self.finish(_single(inputs), _single(targets))
         weights = self.network_.state_dict()
@@ -168,14 +170,28 @@ class FieldSurrogate(Surrogate, ABC):
         model["iterations"] = np.array([done.iterations])
         return model
 
+    def _pairs(self, samples: Snapshots) -> tuple[Array, Array]:
+        """Return what the network is given and what it learns, (n, n_nodes, 3) both."""
+        given, wanted = self._network_input(samples.given.values), samples.displacements
+        return given, wanted - given if self.input == "linear-response" else wanted
+
     def _train(
-        self, network: nn.Module, inputs: Tensor, targets: Tensor, generator: torch.Generator
+        self,
+        network: nn.Module,
+        known: Sequence[tuple[Tensor, Tensor]],
+        generator: torch.Generator,
     ) -> Training:
+        """Train on inputs and targets: those to learn from, and perhaps those to validate on."""
         device = device_of(self.training)
+        inputs, targets = (torch.cat(parts) for parts in zip(*known, strict=True))
         data = self.training_data(network, inputs, targets)
         data = {name: value.to(device) for name, value in data.items()}
         loss = self.loss_function(network.to(device), data, generator)
-        problem = LearningProblem(network, loss, len(inputs), generator, data, self.parameters)
+        n_train = len(known[0][0])
+        n_validation = len(inputs) - n_train
+        problem = LearningProblem(
+            network, loss, n_train, generator, data, self.parameters, n_validation
+        )
         return train(problem, self.plan(), self.training, self.time_limit_s)
 
     def _start_from(self, network: nn.Module, path: Path, model: Arrays) -> None:

@@ -81,8 +81,9 @@ class UMesh(FieldSurrogate):
     precision : {"float32", "bfloat16"}
         Precision of the products in training.
     validation_fraction : float
-        Fraction of the training samples, in [0, 0.5], that is held out for early stopping. The best
-        weights on them are kept.
+        0 for no early stopping. Otherwise the weights with the lowest loss on the validation
+        samples of `training` are kept. Without such samples, this fraction of the training samples,
+        in [0, 0.5], is held out at random instead.
     inference : str
         Back end of the predictions, see `mor_bench.learning.inference`. "packed" differs from
         "eager" by rounding only. "auto" chooses the fastest that is accurate enough, timed at the
