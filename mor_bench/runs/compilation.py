@@ -24,7 +24,7 @@ from mor_bench.mechanics.kernels import internal_force
 from mor_bench.runs.code_digest import code_digest
 from mor_bench.runs.configurations import OWN, Configuration, may_train
 from mor_bench.runs.run_context import RunContext
-from mor_bench.runs.training_data import TestSet, TrainingData
+from mor_bench.runs.training_data import TrainingData
 from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.process import Restrictions, SandboxedProcess
 from mor_bench.snapshots.dataset import load_dataset
@@ -143,7 +143,7 @@ def _small_problem(spec: AnyDatasetSpec, context: RunContext, folder: Path) -> T
     """Generate a few samples of a dataset in this process, which compiles the solver too."""
     limit = min(N_SAMPLES, context.options.limit or N_SAMPLES)
     data = load_dataset(spec, limit, split=context.options.split, workers=1, cache=folder)
-    return TrainingData(data.scene, data.train, {"test": TestSet.of(data.test)}, folder)
+    return TrainingData.of(data, folder)
 
 
 def _fit_and_query(
