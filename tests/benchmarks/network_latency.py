@@ -1,6 +1,6 @@
 """Latency of single queries of the U-Net, by back end, network size and grid.
 
-    python -m tests.benchmarks.network_latency --out network-latency.csv
+    python -m tests.benchmarks.network_latency --out network-latency.json
 
 The networks have random weights, because times do not depend on them. All back ends of a network
 take turns, so that other load on the machine affects all of them. Each row has the median, the 95th
@@ -10,7 +10,7 @@ percentile and the minimum over all queries, for the network alone.
 from __future__ import annotations
 
 import argparse
-import csv
+import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -102,7 +102,7 @@ def table(
                             k,
                             n_threads,
                             backend,
-                            *(f"{v:.3f}" for v in (median, late, min(each))),
+                            *(round(float(v), 3) for v in (median, late, min(each))),
                             len(each),
                         )
                         yield dict(zip(COLUMNS, values, strict=True))
@@ -123,7 +123,7 @@ def main() -> None:
     parser.add_argument(
         "--quick", action="store_true", help="small networks, one thread, three turns"
     )
-    parser.add_argument("--out", type=Path, help="CSV file to write")
+    parser.add_argument("--out", type=Path, help="JSON file to write")
     options = parser.parse_args()
     if options.quick:
         options.channels, options.steps, options.threads, options.turns = [8, 16], [2, 3], [1], 3
@@ -139,10 +139,7 @@ def main() -> None:
         rows.append(row)
         print("  ".join(f"{row[column]!s:>15}" for column in COLUMNS), flush=True)
     if options.out is not None:
-        with options.out.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            writer.writeheader()
-            writer.writerows(rows)
+        options.out.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

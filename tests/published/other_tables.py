@@ -124,6 +124,42 @@ def random_loads(source: str) -> str:
     return markdown(headings, body)
 
 
+def network_latency(source: str) -> str:
+    """Show the latency of the network alone, by back end; cells hold one and two threads."""
+    found: dict[tuple[str, int, int], dict[str, dict[int, float]]] = {}
+    for row in content_of(source)["rows"]:
+        size = (row["scene"], row["channels"], row["steps"])
+        by_threads = found.setdefault(size, {}).setdefault(row["backend"], {})
+        by_threads[row["threads"]] = row["median_ms"]
+    backends = list(dict.fromkeys(name for cells in found.values() for name in cells))
+    body = [
+        [scene, str(c), str(k)]
+        + [" / ".join(number(ms) for _, ms in sorted(cells.get(b, {}).items())) for b in backends]
+        for (scene, c, k), cells in found.items()
+    ]
+    return markdown(["grid", "c", "k", *(f"{b}, ms" for b in backends)], body)
+
+
+def umesh_choices(source: str, group: str = "open") -> str:
+    """Show errors of U-Mesh's variants on validation and test samples."""
+    body = []
+    for row in content_of(source)["rows"]:
+        if row["group"] != group:
+            continue
+        cells = [f"{row['choice']} {row['value']}".strip()]
+        for part in ("validation", "test"):
+            errors = [training[part] for training in row["trainings"]]
+            e = float(np.median([error["mean_dof_m"] for error in errors]))
+            median, p95 = (
+                100 * float(np.median([error[name] for error in errors]))
+                for name in ("rel_l2_median", "rel_l2_p95")
+            )
+            cells.append(f"{e:.2e}; {number(median)}; {number(p95)}".replace("e-0", "e-"))
+        body.append(cells)
+    headings = ["", "validation: e, m; median %; p95 %", "test: e, m; median %; p95 %"]
+    return markdown(headings, body)
+
+
 def refinement(source: str) -> str:
     """Show the discretisation error of every mesh; SOURCE is the folder of the datasets."""
     body = []
@@ -216,6 +252,8 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "scaling": scaling,
     "generation": generation,
     "random-loads": random_loads,
+    "network-latency": network_latency,
+    "umesh-choices": umesh_choices,
     "refinement": refinement,
     "hard-cases": hard_cases,
     "hard-loads": hard_loads,
