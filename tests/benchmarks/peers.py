@@ -635,7 +635,11 @@ def compare_on(
     with ends_at_disagreement(console):
         rows = compare(scene, forces, [entry.make(scene) for entry in entries], options.rounds)
     print_rows(console, rows)
-    return {"samples": samples, "load_norms_n": norms, "contenders": [vars(row) for row in rows]}
+    contenders = [
+        {**vars(row), "times_as_long": float(np.median(row.medians_ms / rows[0].medians_ms))}
+        for row in rows
+    ]
+    return {"samples": samples, "load_norms_n": norms, "contenders": contenders}
 
 
 @with_options

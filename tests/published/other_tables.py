@@ -20,20 +20,16 @@ def _medians(row: Mapping[str, Any]) -> NDArray[np.float64]:
 
 def peers(source: str) -> str:
     """Show the time of each code over that of the first, the median over loads."""
-    datasets = content_of(source)["datasets"]
     columns = {
-        name: {row["name"]: _medians(row) for row in found["contenders"]}
-        for name, found in datasets.items()
+        dataset: {
+            row["name"]: f"{number(row['times_as_long'])} "
+            f"({number(float(np.median(_medians(row))))} ms)"
+            for row in found["contenders"]
+        }
+        for dataset, found in content_of(source)["datasets"].items()
     }
     names = list(dict.fromkeys(name for column in columns.values() for name in column))
-
-    def cell(column: Mapping[str, NDArray[np.float64]], name: str) -> str:
-        if name not in column:
-            return DASH
-        ratio = float(np.median(column[name] / next(iter(column.values()))))
-        return f"{number(ratio)} ({number(float(np.median(column[name])))} ms)"
-
-    body = [[name, *(cell(column, name) for column in columns.values())] for name in names]
+    body = [[name, *(column.get(name, DASH) for column in columns.values())] for name in names]
     return markdown(["", *columns], body)
 
 

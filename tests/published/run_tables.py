@@ -6,16 +6,13 @@ from collections.abc import Callable, Iterable, Sequence
 from math import inf, isfinite
 from typing import Any
 
-import h5py
-import numpy as np
-
 from mor_bench.analysis.frontier import median_error, median_latency_ms
+from mor_bench.report.entries import entries_of
 from mor_bench.report.number_format import DASH, number, percent, short_swept
-from mor_bench.report.published_figures import PUBLISHED
+from mor_bench.report.paper_tables import against_the_paper
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import ErrorSummary, Row
-from tests.published.compact import ERRORS
-from tests.published.stored import ROOT, EvidenceError, run_of
+from tests.published.stored import EvidenceError, run_of
 
 LEVELS = (0.03, 0.01, 0.003, 0.001)
 """Median relative l2 errors of the columns of `fastest`."""
@@ -277,44 +274,24 @@ def indicated(source: str, methods: str = "") -> str:
     return markdown(["", *names], body)
 
 
-def paper(source: str, methods: str = "umesh-small,umesh-linear") -> str:
-    """Show our networks beside the best of the paper by slope; SOURCE is FOLDER,FOLDER,….
+def paper(source: str, methods: str = "") -> str:
+    """Show our networks beside the paper's by slope and relative error; SOURCE is FOLDER,….
 
     The slope is that of the error e over the largest displacement of a sample.
     """
+    headings: Sequence[str] = ()
     body = []
     for folder in source.split(","):
         run = run_of(folder)
         name = next(iter(run.datasets))
-        published = min(
-            (p for p in PUBLISHED if p.dataset == name), key=lambda p: p.slope or inf, default=None
-        )
-        if published is None:
-            raise EvidenceError(f"{folder}: the paper has no network on {name}.")
-        for row in map(chosen, _by_method(_rows(run, name, methods)).values()):
-            if row.error is None:
-                continue
-            body.append(
-                [
-                    name,
-                    f"`{row.method}`, split by {row.split}",
-                    _configuration(row),
-                    _metres(row.error.slope),
-                    _metres(published.slope) if published.slope else DASH,
-                    number(largest_displacement(folder, row)),
-                    _metres(row.error.mean_dof_m),
-                    _metres(published.mean_m),
-                    _error(run, row),
-                ]
-            )
-    headings = ["scene", "network", "size", "slope", "paper's slope", "largest displacement, m"]
-    return markdown([*headings, "e, m", "paper's e, m", "median %"], body)
-
-
-def largest_displacement(folder: str, row: Row) -> float:
-    """Return the largest displacement of the test samples, m."""
-    with h5py.File(ROOT / folder / ERRORS, "r") as file:
-        return float(np.max(file[row.dataset][row.label]["amplitude_m"][()]))
+        wanted = methods.split(",") if methods else [row.method for row in run.rows]
+        entries = [e for e in entries_of(run, name) if e.method in wanted]
+        table = against_the_paper(name, entries)
+        if table is None:
+            raise EvidenceError(f"{folder}: {name} is no scene of the paper, or nothing ran.")
+        headings = table.headings
+        body += [[name, *row] for row in table.rows]
+    return markdown(["scene", *headings], body)
 
 
 def out_of_range(source: str, dataset: str = "", methods: str = "") -> str:
