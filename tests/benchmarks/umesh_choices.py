@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 import mor_bench
+from mor_bench.machine import pinned_threads
 from mor_bench.measure.error_metrics import sample_errors, summary
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 
@@ -59,7 +60,8 @@ def trained(data: Dataset, parameters: Parameters, seed: int) -> dict[str, Any]:
     """Train one variant, and score it on the validation and the test samples."""
     method = mor_bench.load_method("umesh-small", **parameters, seed=seed)
     begun = process_time()
-    method.fit(data.scene, data.train)
+    with pinned_threads(1):
+        method.fit(data.scene, data.train)
     return {
         "seed": seed,
         "core_s": process_time() - begun,
@@ -71,7 +73,7 @@ def trained(data: Dataset, parameters: Parameters, seed: int) -> dict[str, Any]:
 def main(
     dataset: Annotated[str, typer.Option(help="Name or TOML file.")] = "beam-coarse",
     channels: Annotated[int, typer.Option(min=1, help="Channels of the first level.")] = 8,
-    iterations: Annotated[int, typer.Option(min=1, help="Iterations of every training.")] = 1500,
+    iterations: Annotated[int, typer.Option(min=1, help="Iterations of every training.")] = 1000,
     seeds: Annotated[int, typer.Option(min=1, help="Trainings of every variant.")] = 1,
     report: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write the errors here.")

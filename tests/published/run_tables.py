@@ -54,7 +54,7 @@ def validated(row: Row) -> ErrorSummary:
 
     Methods without training have no validation samples; their test errors decide.
     """
-    return getattr(row, "validation", None) or row.error or ErrorSummary()
+    return row.validation or row.error or ErrorSummary()
 
 
 def chosen(rows: Sequence[Row]) -> Row:
@@ -328,7 +328,7 @@ def facts(source: str, dataset: str = "") -> str:
     run = run_of(source)
     rows = _rows(run, dataset, "")
     needs: dict[str, Any] = run.datasets[rows[0].dataset].get("needs") or {}
-    validation = getattr(rows[0], "n_validation", 0)
+    validation = rows[0].n_validation
     held = f", {validation:,} for validation" if validation else ""
     return (
         f"{rows[0].dataset}, split by {rows[0].split}: {rows[0].n_train:,} training samples"
