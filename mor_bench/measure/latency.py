@@ -107,7 +107,7 @@ class Queries:
     Attributes
     ----------
     forces, references : (n, n_nodes, 3) float64
-        Loads, N, and the reference displacements, m, which stay in this process.
+        Loads, N, sorted by the size of the reference displacements, m, which stay in this process.
     nodes : (n_output_nodes,) int64
         The nodes where answers count.
     scratch : Path

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -23,6 +23,7 @@ from mor_bench.machine import peak_memory_bytes, pinned_threads
 from mor_bench.measure.fit_clock import fit_clock
 from mor_bench.measure.predictions import predict_all
 from mor_bench.measure.query_cost import cost_of
+from mor_bench.measure.timed_loads import TimedLoads
 from mor_bench.method_loading import load_fitted, make_surrogate
 from mor_bench.sandbox.handover import read_snapshots
 from mor_bench.sandbox.session import Session
@@ -115,8 +116,7 @@ class MethodSession(Session):
         if scene is not None:
             self.scene = scene
         self.method: Surrogate
-        self.queries: NDArray[np.float64]
-        self.generator: np.random.Generator
+        self.loads: TimedLoads
 
     @classmethod
     def preload(cls) -> None:
@@ -199,15 +199,12 @@ class MethodSession(Session):
         return {"cost": cost_of(self.method, given_of(self.scene, forces))}
 
     def warm(self, forces: NDArray[np.float64], threads: int, seed: int) -> dict[str, Any]:
-        """Store the queries, (n, n_nodes, 3), N, and answer some of them untimed."""
-        self.queries = forces
-        self.generator = np.random.default_rng(seed)
+        """Store the loads of the queries, see `TimedLoads`, and answer some of them untimed."""
+        self.loads = TimedLoads(forces, seed)
         with pinned_threads(threads):
             start = perf_counter()
-            for i in range(WARM_UP_QUERIES):
-                with suppress(SolverError):
-                    load = self.queries[-1 - i % len(self.queries)].copy()
-                    self.method.predict(self._query(load))
+            for _ in range(WARM_UP_QUERIES):
+                self._answer_untimed()
                 if perf_counter() - start > WARM_UP_S:
                     break
         return {"memory_bytes": peak_memory_bytes()}
@@ -217,10 +214,10 @@ class MethodSession(Session):
     ) -> dict[str, Any]:
         """Time at least ``n`` single queries, for at least ``floor_s`` and at most ``most_s``.
 
-        Each load is one of the queries, drawn at random and scaled by a random factor, so that no
-        load repeats. A few are not scaled. Their answers are written to a file, for comparison with
-        the scored ones. The garbage collector runs as it would for a user, and its time is recorded
-        separately. An unanswered query counts with the time until the method reports its failure.
+        The loads are those of the test set, see `TimedLoads`. The answers to a few unchanged ones
+        are written to a file, for comparison with the scored ones. The garbage collector runs as it
+        would for a user, and its time is recorded separately. An unanswered query counts with the
+        time until the method reports its failure.
 
         Returns
         -------
@@ -229,11 +226,10 @@ class MethodSession(Session):
             `cpu_all_s` of the whole request; `checked`, the numbers of the queries whose answers
             were kept.
         """
-        begun, shape = process_time(), self.queries.shape[1:]
+        begun, shape = process_time(), self.loads.values.shape[1:]
         with pinned_threads(threads):
             for _ in range(SETTLE_QUERIES):
-                load = self.queries[self.generator.integers(len(self.queries))]
-                self._predict_if_possible(self._query(load * self.generator.uniform(0.5, 1.0)))
+                self._answer_untimed()
             turn = self._timed_queries(n, floor_s, most_s)
         if {answer.shape for answer in turn.kept.values()} - {shape}:
             raise InvalidInputError(
@@ -253,6 +249,9 @@ class MethodSession(Session):
         """Convert forces, N, or displacements of observed nodes, m, to the input of `predict`."""
         return given_of(self.scene, values).query
 
+    def _answer_untimed(self) -> None:
+        self._predict_if_possible(self._query(self.loads.changed(self.loads.next())))
+
     def _predict_if_possible(self, query: ArrayLike) -> Any:
         try:
             return self.method.predict(query)
@@ -260,14 +259,12 @@ class MethodSession(Session):
             return UNANSWERED
 
     def _timed_queries(self, n: int, floor_s: float, most_s: float) -> _Turn:
-        turn, queries, draw = _Turn(), self.queries, self.generator
+        turn, loads = _Turn(), self.loads
         with _collector_clock() as clock:
             while True:
-                number, check = (
-                    int(draw.integers(len(queries))),
-                    len(turn.kept) < CHECKED_ANSWERS and draw.random() < CHECKED_SHARE,
-                )
-                query = self._query(queries[number] * (1.0 if check else draw.uniform(0.5, 1.0)))
+                number, few = loads.next(), len(turn.kept) < CHECKED_ANSWERS
+                checked = loads.unchanged(number, CHECKED_SHARE) if few else None
+                query = self._query(loads.changed(number) if checked is None else checked)
                 clock.seconds, busy = 0.0, process_time()
                 before = perf_counter()
                 answer = self._predict_if_possible(query)
@@ -276,7 +273,7 @@ class MethodSession(Session):
                 turn.wall_s += after - before
                 turn.latency_ms.append(1e3 * (after - before))
                 turn.gc_ms.append(1e3 * clock.seconds)
-                if check and answer is not UNANSWERED:
+                if checked is not None and answer is not UNANSWERED:
                     turn.kept[number] = np.array(answer, dtype=float)
                 if turn.wall_s > most_s or (len(turn.latency_ms) >= n and turn.wall_s > floor_s):
                     return turn
@@ -290,21 +287,23 @@ class MethodSession(Session):
         """
         rates: dict[str, float | None] = {}
         expected = 0.0
+        numbers = np.arange(max(sizes)) % len(self.loads.values)
         with pinned_threads(threads):
             for size in sizes:
-                batch = self._query(self.queries[np.arange(size) % len(self.queries)])
                 if expected * size > most_s:
                     rates[str(size)] = None
                     continue
-                start, n = perf_counter(), 0
+                seconds, n = 0.0, 0
                 try:
-                    while n == 0 or perf_counter() - start < floor_s:
+                    while n == 0 or seconds < floor_s:
+                        batch = self._query(self.loads.changed(numbers[:size]))
+                        start = perf_counter()
                         self.method.predict(batch)
-                        n += size
+                        seconds, n = seconds + perf_counter() - start, n + size
                 except SolverError:
                     rates[str(size)] = None
                     continue
-                expected = (perf_counter() - start) / n
+                expected = seconds / n
                 rates[str(size)] = 1 / expected
         return {"throughput": rates}
 

@@ -23,8 +23,8 @@ from mor_bench.runs.code_digest import measuring_digest
 from mor_bench.runs.extra_stages import Stage
 from mor_bench.sandbox.process import MethodFailedError
 
-MOST_QUERIES = 400
-"""Largest number of test loads from which queries are drawn."""
+MOST_QUERY_BYTES, LEAST_LOADS = 2**26, 200
+"""Most memory of the test loads that are timed, bytes, and the number that is always timed."""
 
 
 class StopRunError(Exception):
@@ -84,8 +84,7 @@ def _measured(stage: Stage, fits: Mapping[str, CachedFit]) -> dict[str, Timing]:
         for label, fit in fits.items()
     }
     test = stage.training_data.sets["test"]
-    n = len(test.forces)
-    chosen: NDArray[np.int64] = np.linspace(0, n - 1, min(MOST_QUERIES, n)).astype(int)
+    chosen = timed_numbers(test.references)
     queries = Queries(
         test.forces[chosen], test.references[chosen], test.nodes, stage.training_data.scratch
     )
@@ -103,6 +102,23 @@ def _measured(stage: Stage, fits: Mapping[str, CachedFit]) -> dict[str, Timing]:
         except MethodFailedError as error:
             timing.failed = timing.failed or str(error)
     return timings
+
+
+def timed_numbers(references: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the numbers of the test loads that are timed, in the order of their displacements.
+
+    If the loads take too much memory, the numbers are spread evenly over the sizes of the
+    displacements, on which the work of a query depends.
+
+    Parameters
+    ----------
+    references : (n, n_nodes, 3) float64
+        Reference displacements, m.
+    """
+    n, bytes_of_one = len(references), references[0].nbytes
+    wanted = min(n, max(LEAST_LOADS, MOST_QUERY_BYTES // bytes_of_one))
+    by_size = np.argsort(np.linalg.norm(references, axis=(1, 2)))
+    return np.asarray(by_size[np.linspace(0, n - 1, wanted).round().astype(int)])
 
 
 def _timed_row(row: Row, timing: Timing, interval: tuple[float, float]) -> Row:
