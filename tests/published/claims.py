@@ -28,6 +28,8 @@ from tests.published.stored import ROOT, EvidenceError, content_of, look_up
 
 CLAIMS = "reports/claims.toml"
 
+EVERY_PAGE = "*"
+
 REDUCE: dict[str, Callable[[Any], float]] = {
     "median": np.median,
     "min": np.min,
@@ -56,12 +58,13 @@ MEASURED = re.compile(
     rf"|[-−]?\d*\.\d+(?:e[-+]?\d+)?|[-−]?\d+e[-+]?\d+|10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+"
     rf"|\d[\d,]* of (?:the )?\d[\d,]*"
     rf"|(?:{_WORDS})(?: \w+)? (?:times|seconds|minutes|hours|per cent)\b"
-    rf"|(?:factor of|twice|thrice)(?: \w+)?)"
+    rf"|factor of (?:about )?(?:{_WORDS}|\d+))"
 )
 """A number that looks like a measurement."""
 
 _NOT_PROSE = (
     re.compile(r"^ *```.*?^ *```", re.DOTALL | re.MULTILINE),
+    re.compile(r"^ {4}.*$", re.MULTILINE),
     BLOCK,
     re.compile(r"<!--.*?-->", re.DOTALL),
     re.compile(r"`[^`\n]+`"),
@@ -72,7 +75,10 @@ _NOT_PROSE = (
 
 @dataclass(frozen=True)
 class Statement:
-    """An entry of claims.toml: the texts of a page with numbers, and where these come from."""
+    """An entry of claims.toml: a text with numbers, where these come from, and its page.
+
+    The page `EVERY_PAGE` stands for any page, for terms such as "95 % interval".
+    """
 
     page: str
     text: str
@@ -132,7 +138,7 @@ def without_evidence(page: str, text: str, known: Sequence[Statement]) -> Iterat
     """Yield each number of a page that no statement covers."""
     covered = np.zeros(len(text), dtype=bool)
     for statement in known:
-        if statement.page == page:
+        if statement.page in (page, EVERY_PAGE):
             for match in statement.pattern().finditer(text):
                 covered[match.start() : match.end()] = True
     plain = prose(text)

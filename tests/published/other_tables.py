@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mor_bench.report.number_format import DASH, number
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
-from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of
+from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of, look_up
 
 
 def _medians(row: Mapping[str, Any]) -> NDArray[np.float64]:
@@ -156,6 +156,20 @@ def umesh_choices(source: str, group: str = "open") -> str:
     return markdown(headings, body)
 
 
+def records(source: str, key: str, columns: str = "") -> str:
+    """Show a list of flat records; `columns` names the shown fields, by default all."""
+    found = look_up(content_of(source), key)
+    names = columns.split(",") if columns else list(found[0])
+    return markdown(
+        [name.replace("_", " ") for name in names],
+        [[_shown(record.get(name)) for name in names] for record in found],
+    )
+
+
+def _shown(value: Any) -> str:
+    return number(value) if isinstance(value, float) else DASH if value is None else str(value)
+
+
 def refinement(source: str) -> str:
     """Show the discretisation error of every mesh; SOURCE is the folder of the datasets."""
     body = []
@@ -250,6 +264,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "random-loads": random_loads,
     "network-latency": network_latency,
     "umesh-choices": umesh_choices,
+    "records": records,
     "refinement": refinement,
     "hard-cases": hard_cases,
     "hard-loads": hard_loads,
