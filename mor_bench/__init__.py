@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mor_bench.method_loading import load_surrogate as load_surrogate
     from mor_bench.results.comparison import Comparison as Comparison
     from mor_bench.runs.compare import run as run
-    from mor_bench.runs.pick import Pick as Pick
+    from mor_bench.runs.pick import Verdict as Verdict
     from mor_bench.runs.pick import pick as pick
     from mor_bench.runs.single_fit import Fit as Fit
     from mor_bench.runs.single_fit import fit as fit
@@ -43,10 +43,10 @@ _HOMES = {
     "Comparison": "mor_bench.results.comparison",
     "Fit": "mor_bench.runs.single_fit",
     "MorBenchError": "mor_bench.errors",
-    "Pick": "mor_bench.runs.pick",
     "Scene": "mor_bench.scene.scene",
     "Snapshots": "mor_bench.snapshots.dataset",
     "Surrogate": "mor_bench.surrogate",
+    "Verdict": "mor_bench.runs.pick",
     "fit": "mor_bench.runs.single_fit",
     "load_dataset": "mor_bench.snapshots.dataset",
     "load_method": "mor_bench.method_loading",

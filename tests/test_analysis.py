@@ -82,7 +82,7 @@ def test_frontier_draws_are_the_frontier_points_of_each_resample(n_configuration
     generator = np.random.default_rng(n_configurations)
     shape = (n_configurations, 60)
     latencies = generator.normal(0, 1.5, shape).round(1)  # rounded, so that there are ties
-    errors = generator.normal(-4, 2, shape).round(1)
+    errors = generator.normal(-3, 3, shape).round(1)  # some are worse than answering zero
     errors[generator.random(shape) < 0.1] = np.inf
     errors[generator.random(shape) < 0.05] = np.log(EXACT)
     found_times, found_errors = frontier_draws(latencies, errors, TARGET_ERRORS, TARGET_TIMES_MS)
@@ -143,7 +143,7 @@ def test_target_intervals_contain_their_value_or_report_a_target_out_of_reach(
     analysis: Record,
 ) -> None:
     for record in analysis["time_at_error"]:
-        assert record["exists"] == (record["best"] is not None)
+        assert (record["latency_ms"] is None) == (record["best"] is None)  # both by the test errors
         assert (record["high"] is None) == (record["not_reached"] > 0.025)
         if record["latency_ms"] is not None:
             assert record["low"] <= record["latency_ms"] <= (record["high"] or np.inf)

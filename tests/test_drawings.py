@@ -15,7 +15,6 @@ from mor_bench.report.entries import entries_of
 from mor_bench.report.error_against_time import error_against_time
 from mor_bench.report.singular_values import SIGMA, TAIL, singular_values
 from mor_bench.report.speed_tables import pairs_at
-from mor_bench.report.summary import headline
 from mor_bench.results.comparison import Comparison
 from tests.synthetic import a_row
 
@@ -87,10 +86,6 @@ def test_each_label_of_the_legend_belongs_to_its_curve(made: Comparison) -> None
     assert np.column_stack(ranks.get_data()) == pytest.approx(
         np.column_stack([[2, 3], left_out[1:]])
     )
-
-
-def test_the_worst_sample_of_a_headline_is_the_maximum(made: Comparison) -> None:
-    assert "1 ms (p95 – ms) at 1 % (worst sample 7 %)" in headline(made, "beam")
 
 
 @pytest.mark.parametrize(

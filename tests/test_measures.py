@@ -90,7 +90,8 @@ def test_a_frontier_interpolates_in_log_log_and_never_extrapolates() -> None:
     assert [point.label for point in non_dominated(POINTS)] == ["a", "b", "c"]
     middle = time_at_error(POINTS, math.sqrt(0.1 * 0.01))
     assert middle["latency_ms"] == pytest.approx(math.sqrt(10.0))
-    assert middle["best"] == {"label": "b", "latency_ms": 10.0, "error": 0.01}
+    best = {"label": "b", "latency_ms": 10.0, "error": 0.01, "validation": None}
+    assert middle["best"] == best
     assert time_at_error(POINTS, 0.5)["latency_ms"] == 1.0
     assert time_at_error(POINTS, 0.0005) == {"latency_ms": None, "best": None}
     assert error_at_time(POINTS, 0.7) == {"error": None, "best": None}
@@ -100,9 +101,35 @@ def test_a_frontier_interpolates_in_log_log_and_never_extrapolates() -> None:
     assert error_at_time(POINTS, 1e6)["error"] == 0.001
 
 
+def test_answers_worse_than_zero_are_on_no_front() -> None:
+    useless = [Point(0.1, 1.0, "zero"), Point(0.2, 40.0, "wild")]
+    assert non_dominated([*useless, *POINTS]) == non_dominated(POINTS)
+    assert time_at_error(useless, 100.0) == {"latency_ms": None, "best": None}
+    assert error_at_time(useless, 1.0) == {"error": None, "best": None}
+
+
+def test_validation_selects_and_the_whole_sweep_stays_that_of_the_test() -> None:
+    points = [
+        Point(1.0, 0.009, "lucky on the test", 0.02),
+        Point(2.0, 0.012, "selected", 0.008),
+        Point(3.0, 0.004, "slow", 0.009),
+    ]
+    found = time_at_error(points, 0.01)
+    assert found["latency_ms"] == 1.0
+    assert found["best"] == {
+        "label": "selected",
+        "latency_ms": 2.0,
+        "error": 0.012,
+        "validation": 0.008,
+    }
+    within = error_at_time(points, 5.0)
+    assert (within["error"], within["best"]["error"]) == (0.004, 0.012)
+    assert time_at_error([points[1]], 0.01)["latency_ms"] is None
+
+
 @example([(1.0, 1.0000000000000002e-06), (2.0, 1e-06)], 1e-06, 1.0)
 @given(
-    st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-6, 1.0)), min_size=1, max_size=12),
+    st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(1e-6, 0.99)), min_size=1, max_size=12),
     st.floats(1e-6, 1.0),
     st.floats(1e-3, 1e3),
 )

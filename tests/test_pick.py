@@ -1,28 +1,35 @@
-"""The choice among rows: disqualification, cost, and suggested relaxations."""
+"""The verdict on rows: qualification, the winner and those beside it, suggested relaxations."""
 
 from __future__ import annotations
 
 import json
 import os
+import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from math import inf, nan
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
 import mor_bench
-from mor_bench.analysis.selection import Requirements, choose, figure, offline_rank
+from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.draws import draws_of
+from mor_bench.analysis.selection import decide
+from mor_bench.analysis.selection_text import retime_command
+from mor_bench.analysis.verdict import RULE, Requirements, Verdict, offline_rank, speed_rank
 from mor_bench.cli.app import app
 from mor_bench.errors import InvalidInputError
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 from mor_bench.runs.pick import newest_run
 from mor_bench.specs import load_dataset_spec
-from tests.small_runs import short_timing
+from tests.small_runs import LIMIT, short_timing
 
 ASKED = Requirements(0.01, 3.0, 2e8, 100.0)
 
@@ -51,13 +58,21 @@ def a_row(label: str = "a", **changes: Any) -> Row:
     return Row.model_validate(content)
 
 
+def choose(rows: Sequence[Row], requirements: Requirements, dataset: str = "d") -> Verdict:
+    """Decide from rows alone."""
+    made = Comparison(Path("nowhere"), {"processor": "p"}, list(rows))
+    draws = draws_of(made, dataset, 200, np.random.default_rng(0))
+    return decide(made, dataset, requirements, draws)
+
+
 def fresh(median: float, largest: float) -> dict[str, Any]:
     return {"n": 20, "seed": 1, "rel_l2_median": median, "rel_l2_max": largest}
 
 
 DISQUALIFIED = {
     "error": a_row(error={"rel_l2_median": 0.011}),
-    "upper end of the error": a_row(error={"rel_l2_median_high": 0.011}),
+    "error on the validation part": a_row(validation={"rel_l2_median": 0.011}),
+    "no answer on a validation load": a_row(validation={"rel_l2_median": 0.005, "rel_l2_max": inf}),
     "error on fresh loads": a_row(hidden=fresh(0.011, 0.03)),
     "no answer on a fresh load": a_row(hidden=fresh(0.005, inf)),
     "error that is not a number": a_row(error={"rel_l2_median": nan}),
@@ -77,7 +92,8 @@ DISQUALIFIED = {
 def test_the_unchanged_row_qualifies() -> None:
     chosen = choose([a_row()], ASKED, "d")
     assert chosen.choice == a_row()
-    assert (chosen.runner_up, chosen.relaxations, chosen.nearest) == (None, [], None)
+    assert (chosen.runner_up, chosen.relaxations, chosen.nearest) == (None, (), None)
+    assert RULE in chosen.text()
 
 
 @pytest.mark.parametrize("row", DISQUALIFIED.values(), ids=DISQUALIFIED)
@@ -93,24 +109,66 @@ def test_a_figure_without_a_limit_may_be_unknown() -> None:
     assert "unknown" in chosen.text()
 
 
-def test_the_lowest_offline_cost_wins_and_latency_breaks_near_ties() -> None:
-    def winner(*rows: Row) -> str:
-        choice = choose(rows, ASKED, "d").choice
-        assert choice is not None
-        return choice.label
+def test_the_fastest_wins_and_the_cheapest_offline_stands_beside_it() -> None:
+    quick = a_row("quick", latency_ms={"median": 0.5}, offline_s={"fit": 30.0})
+    cheap = a_row("cheap", offline_s={"data": 0.0, "fit": 0.4}, told="equations", reference=True)
+    again = a_row("again", latency_ms={"median": 0.7}, method="quick", offline_s={"data": None})
+    chosen = choose([cheap, again, quick], Requirements(0.01, 3.0))
+    assert [row.label for row in chosen.qualified] == ["quick", "again", "cheap"]
+    assert (chosen.choice, chosen.runner_up, chosen.cheapest) == (quick, cheap, cheap)
+    assert chosen.best_told == {"equations": cheap, None: quick}
+    assert "Cheapest offline: cheap (reference), 1 ms at 0.5 %, 0.4 core-seconds" in chosen.text()
+    assert choose([quick, again], Requirements(0.01)).runner_up is None
+    costs = [{"data": 0.0, "fit": 0.4}, {"data": 0.0, "fit": 0.01}]
+    rows = [
+        a_row(n, latency_ms={"median": m}, offline_s=c)
+        for n, m, c in zip("ab", (1, 2), costs, strict=True)
+    ]
+    assert choose(rows, ASKED).cheapest == rows[0]  # a tie to the second goes to the faster
 
-    assert winner(a_row("b", offline_s={"data": 0.0, "fit": 30.0}), a_row("a")) == "b"
-    for fit in (0.6, 1.4):
-        slower = a_row("slower", latency_ms={"high": 2.0}, offline_s={"fit": fit})
-        assert winner(slower, a_row("fast")) == "fast"
-    slower = a_row("slower", latency_ms={"high": 2.0}, offline_s={"data": 0.0, "fit": 0.01})
-    fast = a_row("fast", offline_s={"data": 0.0, "fit": 0.4})
-    chosen = choose([slower, fast], ASKED, "d")
-    assert (chosen.choice, chosen.runner_up) == (fast, slower)
-    same = [row.with_parts(method="same") for row in (slower, fast)]
-    assert choose(same, ASKED, "d").runner_up is None
-    unknown = offline_rank(a_row(offline_s={"data": None, "fit": 0.1}))
-    assert unknown > offline_rank(a_row(offline_s={"data": 1e6, "fit": 0.1}))
+
+def test_validation_selects_and_the_test_set_confirms() -> None:
+    lucky = a_row("lucky", validation={"rel_l2_median": 0.02}, latency_ms={"median": 0.1})
+    unlucky = a_row("unlucky", validation={"rel_l2_median": 0.004}, error={"rel_l2_median": 0.013})
+    chosen = choose([lucky, unlucky], ASKED)
+    assert chosen.choice == unlucky
+    assert "1.3 %: it does NOT meet the limit of 1 % there" in chosen.headline
+    honest = unlucky.with_parts(error=lucky.error)
+    assert "0.5 %: it meets the limit of 1 % there." in choose([honest], ASKED).headline
+    without = honest.with_parts(validation=None)
+    assert "selected on the test set: optimistic" in choose([without], ASKED).headline
+
+
+def test_close_latencies_are_listed_as_undecided() -> None:
+    rows = [a_row(str(ms), latency_ms={"median": ms}) for ms in (1.0, 1.01, 2.0)]
+    chosen = choose(rows, ASKED)
+    assert [row.label for row in chosen.undecided] == ["1.01"]
+    assert "Cannot be told apart from the winner in latency: 1.01." in chosen.beside
+
+
+def test_each_class_of_information_has_its_best() -> None:
+    rows = [
+        a_row("force", told="input", error={"rel_l2_median": 0.5}),
+        a_row("derived", told="linear-response", snapshots=True),
+    ]
+    chosen = choose(rows, ASKED)
+    assert chosen.best_told == {"input": None, "linear-response": rows[1]}
+    assert "Best when told force only: none qualifies." in chosen.beside
+    assert "  derived (force and linear response, snapshots)" in chosen.evidence
+
+
+def test_the_command_that_times_again_has_the_options_of_the_run(small_run: Comparison) -> None:
+    chosen = mor_bench.pick("beam-tiny", error=10.0, comparison=small_run)
+    doubt = chosen.rows[0].latency_ms
+    assert doubt is not None
+    unstable = chosen.rows[0].with_parts(latency_ms=doubt.model_copy(update={"stable": False}))
+    words = shlex.split(retime_command(replace(chosen, rows=[unstable])))
+    assert words[:3] == ["mor-bench", "run", "beam-tiny"]
+    assert words[-3:] == ["--out", str(small_run.out), "--retime"]
+    assert words[words.index("--limit") + 1] == str(LIMIT)
+    assert words[words.index("--time-limit") + 1] == "1200"
+    known = words[1 : words.index("-m")] + words[words.index("--time-limit") :]
+    assert CliRunner().invoke(app, [*known, "-m", "linear-fem", "--dry-run"]).exit_code == 0
 
 
 positive = st.floats(1e-3, 1e3)
@@ -140,32 +198,26 @@ def synthetic(number: int, figures: tuple[Any, ...]) -> Row:
 
 
 @given(rows_of_figures, limits)
-def test_the_choice_is_the_cheapest_row_that_meets_every_limit(
+def test_the_choice_is_the_fastest_row_that_meets_every_limit(
     figures: list[Any], limit: tuple[Any, ...]
 ) -> None:
     rows = [synthetic(number, row) for number, row in enumerate(figures)]
     requirements = Requirements(*limit)
 
     def meets(row: Row) -> bool:
-        asked = requirements.asked.items()
-        return row.n_failed == 0 and all(figure(row, name) <= value for name, value in asked)
-
-    def cost(row: Row) -> tuple[Any, ...]:
-        return (*offline_rank(row), figure(row, "latency_ms"))
+        bounds, asked = chosen.figures[row.label], requirements.asked.items()
+        return row.n_failed == 0 and all(bounds[name] <= value for name, value in asked)
 
     chosen = choose(rows, requirements, "d")
-    meeting = sorted((row for row in rows if meets(row)), key=cost)
-    assert chosen.n_meeting == len(meeting)
+    meeting = sorted((row for row in rows if meets(row)), key=speed_rank)
+    assert list(chosen.qualified) == meeting
     assert (chosen.choice is None) == (not meeting)
     assert chosen.text()
     json.dumps(chosen.as_json(), allow_nan=False)
     if chosen.choice is not None:
-        assert meets(chosen.choice)
-        assert cost(chosen.choice) == cost(meeting[0])
-        assert (chosen.relaxations, chosen.nearest) == ([], None)
-        if len(meeting) > 1:
-            assert chosen.runner_up is not None  # every row is a method of its own
-            assert cost(chosen.runner_up) == cost(meeting[1])
+        assert (chosen.relaxations, chosen.nearest) == ((), None)
+        assert chosen.runner_up == (meeting[1] if len(meeting) > 1 else None)
+        assert chosen.cheapest == min(meeting, key=offline_rank)
 
 
 @given(rows_of_figures, limits)
@@ -204,11 +256,12 @@ def test_without_a_choice_the_text_names_the_limits_to_relax() -> None:
     assert chosen.nearest == rough
     for line in (
         "d needs error <= 1 % (relative l2, median), latency <= 3 ms (median), memory <= 1000 MB.",
-        "None of 3 configurations meets all; 1 of them failed, were skipped or left loads without",
+        "No configuration qualifies among 3 configurations.",
+        "1 of 3 configurations failed, were skipped or left loads without an answer.",
         "Enough alone: error <= 2 % (relative l2, median), by rough",
         "Enough alone: latency <= 12.4 ms (median), by exact",
         "Not enough alone: memory, whatever the limit",
-        "Nearest, with error 2 times the limit:",
+        "The nearest is rough, 1 ms at 2 %, with error 2 times the limit.",
     ):
         assert line in chosen.text()
     without = [row.with_parts(memory_bytes=None) for row in (slow, rough)]
@@ -224,7 +277,7 @@ def test_a_choice_comes_with_its_evidence() -> None:
     )
     chosen = choose([row], ASKED, "d")
     for line in (
-        "Cheapest by offline cost",
+        "hpod [n_modes=20] wins: the only one that qualifies among 1 configurations",
         "hpod [n_modes=20]",
         "0.5 % median, 2 % p95, 3 % max on 20 test loads",
         "on 20 freshly drawn loads",
@@ -232,8 +285,9 @@ def test_a_choice_comes_with_its_evidence() -> None:
         "150 MB to predict",
         "data 50 s of 80 samples, fit 1 s",
         "4 % median, inf % p95, inf % max on 60 loads, 3 without an answer",
-        "5 % median: the discretisation error; no method can be more accurate",
-        "No other method meets all.",
+        "The discretisation error of the mesh is 5 % (median).",
+        "No other method qualifies.",
+        "1 of 1 timings were not stable, the winner among them. Time again: mor-bench run d",
     ):
         assert line in chosen.text()
     content = json.loads(json.dumps(chosen.as_json(), allow_nan=False))
@@ -254,14 +308,16 @@ def test_a_real_comparison_gives_a_choice(small_run: Comparison) -> None:
 
     rough = pick(10.0, 1e4)
     meeting = small_run.rows[:3]
-    assert rough.n_meeting == len(meeting)
-    assert offline_rank(rough.choice) == min(map(offline_rank, meeting))
+    assert sorted(rough.qualified, key=speed_rank) == sorted(meeting, key=speed_rank)
+    assert rough.choice == min(meeting, key=speed_rank)
     assert {rough.choice.method, rough.runner_up.method} == {"linear-fem", "pod-swept"}
     assert rough.run == small_run.out
-    assert rough.choice.error.rel_l2_median_high > rough.choice.error.rel_l2_median
+    assert rough.figures[rough.choice.label]["error"] > rough.choice.error.rel_l2_median
     impossible = pick(1e-7, 1e-4)
     assert impossible.choice is None
     assert impossible.relaxations == []
+    equal = analyse(small_run)["verdicts"][0]
+    assert equal == mor_bench.pick("beam-tiny", comparison=small_run).summary()
     assert impossible.nearest is not None
     with pytest.raises(InvalidInputError, match="unknown limit `memory`"):
         mor_bench.pick("beam-tiny", memory=1.0, comparison=small_run)

@@ -13,10 +13,16 @@ from mor_bench.analysis.draws import draws_of, headlines
 from mor_bench.analysis.frontier import compare
 from mor_bench.analysis.pairs import add_intervals
 from mor_bench.analysis.performance_profile import profile
+from mor_bench.analysis.selection import decide
+from mor_bench.analysis.verdict import Requirements, Verdict
 from mor_bench.results.comparison import Comparison
 
+N_RESAMPLES = 2000
 
-def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -> dict[str, Any]:
+
+def analyse(
+    comparison: Comparison, *, n_resamples: int = N_RESAMPLES, seed: int = 0
+) -> dict[str, Any]:
     """Draw all conclusions from the rows and raw samples of a comparison.
 
     All intervals have a level of 95 %. Errors are resampled by a bootstrap over the load regions of
@@ -34,10 +40,11 @@ def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -
     Returns
     -------
     dict
+        `verdicts`: `mor_bench.analysis.verdict.Verdict.summary` of each dataset.
         `rows`: value, low and high of the main figures of each configuration.
         `time_at_error`, `error_at_time`: records of `mor_bench.analysis.frontier.compare` with
-        three additions. `exists`: whether a real configuration meets the target. `low`, `high`:
-        None where not reached. `not_reached`: share of resamples that do not reach the target.
+        two additions. `low`, `high`: None where not reached. `not_reached`: share of resamples that
+        do not reach the target.
         `pairwise`: for each ordered pair of methods and error, the ratio of their times and the
         verdict on the first.
         `break_even`, `profile`, `hidden`, `regimes`, `tuning`: see the functions of these names.
@@ -49,6 +56,7 @@ def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -
         "settings": {"n_resamples": n_resamples, "seed": seed, "level": LEVEL},
         **compare(comparison.rows),
         **{name: [] for name in ("rows", "pairwise", "break_even", "hidden", "clusters", "timing")},
+        "verdicts": [],
     }
     for dataset in dict.fromkeys(row.dataset for row in comparison.rows):
         draws = draws_of(comparison, dataset, n_resamples, np.random.default_rng(seed))
@@ -61,7 +69,9 @@ def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -
             for row in comparison.rows
             if row.dataset == dataset and row.status == "ok"
         ]
-        analysis["pairwise"] += add_intervals(targets, draws, needed_error(comparison, dataset))
+        requirements = needs_of(comparison, dataset)
+        analysis["verdicts"].append(decide(comparison, dataset, requirements, draws).summary())
+        analysis["pairwise"] += add_intervals(targets, draws, requirements.error)
         analysis["break_even"] += break_even(comparison.rows, targets["time_at_error"])
         analysis["hidden"] += hidden(comparison.rows, dataset, draws.intervals)
         for name, facts in (("clusters", draws.clusters), ("timing", draws.timing)):
@@ -72,7 +82,13 @@ def analyse(comparison: Comparison, *, n_resamples: int = 2000, seed: int = 0) -
     return analysis
 
 
-def needed_error(comparison: Comparison, dataset: str) -> float | None:
-    """Relative L2 error that a dataset's file requires, as a fraction; None if it requires none."""
-    value = (comparison.datasets.get(dataset, {}).get("needs") or {}).get("error")
-    return None if value is None else float(value)
+def needs_of(comparison: Comparison, dataset: str) -> Requirements:
+    """Return the limits that a dataset's file states."""
+    stated = comparison.datasets.get(dataset, {}).get("needs") or {}
+    return Requirements(stated.get("error"), stated.get("latency_ms"))
+
+
+def verdict_on(comparison: Comparison, dataset: str, requirements: Requirements) -> Verdict:
+    """Reach the verdict on one dataset, with the resamples of `analyse`."""
+    draws = draws_of(comparison, dataset, N_RESAMPLES, np.random.default_rng(0))
+    return decide(comparison, dataset, requirements, draws)

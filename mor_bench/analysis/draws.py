@@ -25,6 +25,7 @@ from mor_bench.analysis.frontier import (
     median_error,
     median_latency_ms,
     number_or_inf,
+    selecting_error,
 )
 from mor_bench.analysis.latency_intervals import (
     latency_draws,
@@ -34,6 +35,9 @@ from mor_bench.analysis.latency_intervals import (
 )
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
+
+VALIDATION = "validation_rel_l2_median"
+"""Name of the median relative L2 error on the validation part, and of its interval."""
 
 Interval = tuple[float, float]
 Samples = dict[str, NDArray[Any]]
@@ -50,8 +54,8 @@ class Draws:
     log_latencies, log_errors : (n_rows, n) float64
         Natural logarithms. Resample i uses the same load regions and processes in all rows.
     intervals : dict
-        By label: the intervals of `rel_l2_median`, `mean_dof_m` and `latency_ms`, where there are
-        raw samples.
+        By label: the intervals of `rel_l2_median`, `mean_dof_m`, `latency_ms` and `VALIDATION`,
+        where there are raw samples.
     clusters, timing : dict
         The resampled units, and the spread between processes; empty without raw samples.
     """
@@ -68,7 +72,10 @@ def draws_of(comparison: Comparison, dataset: str, n: int, generator: np.random.
     """Resample a dataset n times: its load regions for the errors, its processes for latencies."""
     ran = [row for row in comparison.rows if row.dataset == dataset and row.status == "ok"]
     raw = {row.label: _raw_samples(comparison, row) for row in ran}
-    resampler = _Resampler(_test_regions(comparison, dataset), n, generator)
+    resampler, held_out = (
+        _Resampler(_regions(comparison, dataset, part), n, generator)
+        for part in ("test", "validation")
+    )
     intervals: dict[str, dict[str, Interval]] = {row.label: {} for row in ran}
     errors: dict[str, NDArray[np.float64]] = {}
     for label, samples in raw.items():
@@ -78,6 +85,9 @@ def draws_of(comparison: Comparison, dataset: str, n: int, generator: np.random.
         intervals[label]["rel_l2_median"] = central_interval(errors[label])
         if "mean_dof_m" in samples:
             intervals[label]["mean_dof_m"] = resampler.mean_interval(samples["mean_dof_m"])
+        if len(samples.get("validation_relative_l2", ())) > 1:
+            validation = held_out.median_errors({"relative_l2": samples["validation_relative_l2"]})
+            intervals[label][VALIDATION] = central_interval(validation)
     for label, interval in latency_intervals(raw).items():
         intervals[label]["latency_ms"] = interval
     usable = [row for row in ran if is_point(row)]
@@ -101,9 +111,9 @@ def _raw_samples(comparison: Comparison, row: Row) -> Samples:
         return {}
 
 
-def _test_regions(comparison: Comparison, dataset: str) -> NDArray[Any] | None:
+def _regions(comparison: Comparison, dataset: str, part: str) -> NDArray[Any] | None:
     try:
-        return comparison.dataset_arrays(dataset).get("test_regions")
+        return comparison.dataset_arrays(dataset).get(f"{part}_regions")
     except OSError:
         return None
 
@@ -180,6 +190,7 @@ def finite_or_none(value: float) -> float | None:
 def headlines(row: Row, draws: Draws) -> dict[str, Any]:
     """Value, low and high of the median error, the mean error and the median latency of a row.
 
+    The median error on the validation part is added if there is one.
     A latency interval that was stored with the row takes precedence.
     """
     error, latency = row.error, row.latency_ms
@@ -189,6 +200,8 @@ def headlines(row: Row, draws: Draws) -> dict[str, Any]:
         "mean_dof_m": number_or_inf(error.mean_dof_m if error else None),
         "latency_ms": median_latency_ms(row),
     }
+    if row.validation:
+        values[VALIDATION] = selecting_error(row)
     found: dict[str, Any] = {"dataset": row.dataset, "label": row.label}
     for name, value in values.items():
         low, high = intervals.get(name, (inf, inf))

@@ -1,21 +1,24 @@
 """Time at error and error at time, from the swept configurations of each method.
 
-Between two adjacent non-dominated configurations the frontier is a straight line in log-log.
-Nothing is extrapolated beyond them. Each interpolated figure comes with the best real configuration
-that meets the target.
+The frontier is that of the whole sweep on the test set. Between two adjacent non-dominated
+configurations it is a straight line in log-log. Nothing is extrapolated beyond them. Each
+interpolated figure comes with the real configuration that the validation errors select.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, inf, isfinite, isnan, log
+from math import exp, inf, isnan, log
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.results.row import Row
+
+USELESS = 1.0
+"""Relative error of answering zero. Configurations that are no better are in no Pareto front."""
 
 TARGET_ERRORS = (0.10, 0.03, 0.01, 0.003, 0.001)
 """Median relative L2 errors over the test set, as fractions."""
@@ -29,18 +32,26 @@ EXACT = 1e-16
 
 @dataclass(frozen=True)
 class Point:
-    """A configuration on the plane of latency and error."""
+    """A configuration on the plane of latency and test error.
+
+    `validation` is the error that selects configurations; without one, the test error does.
+    """
 
     latency_ms: float
     error: float
     label: str
+    validation: float | None = None
+
+    @property
+    def selecting(self) -> float:
+        return self.error if self.validation is None else self.validation
 
 
 def non_dominated(points: Sequence[Point]) -> list[Point]:
     """Return the Pareto front of latency and error, fastest first."""
     front: list[Point] = []
     for point in sorted(points, key=lambda p: (p.latency_ms, p.error)):
-        if isfinite(point.error) and (not front or point.error < front[-1].error):
+        if point.error < USELESS and (not front or point.error < front[-1].error):
             front.append(point)
     return front
 
@@ -54,14 +65,17 @@ def _interpolate(x: float, x0: float, y0: float, x1: float, y1: float) -> float:
 
 
 def time_at_error(points: Sequence[Point], target: float) -> dict[str, Any]:
-    """Return the interpolated latency at an error, and the fastest real configuration there.
+    """Return the interpolated latency at an error, and the configuration to select for it.
 
-    If the fastest configuration of all meets the target, both are its latency. None: not reached.
+    Selected is the fastest one whose validation error meets the target. The interpolated latency is
+    that of the whole sweep on the test set. None: not reached.
     """
+    able = [p for p in points if p.selecting <= target and p.selecting < USELESS]
+    best = _selected(min(able, key=lambda p: (p.latency_ms, p.selecting), default=None))
     front = non_dominated(points)
     real = next((p for p in front if p.error <= target), None)
     if real is None:
-        return {"latency_ms": None, "best": None}
+        return {"latency_ms": None, "best": best}
     before = front.index(real) - 1
     latency = real.latency_ms
     if before >= 0:
@@ -69,18 +83,33 @@ def time_at_error(points: Sequence[Point], target: float) -> dict[str, Any]:
         latency = _interpolate(
             target, p.error, p.latency_ms, max(real.error, EXACT), real.latency_ms
         )
+    return {"latency_ms": latency, "best": best}
+
+
+def _selected(point: Point | None) -> dict[str, Any] | None:
+    """Return the figures of a selected configuration; `error` is that of the test set."""
+    if point is None:
+        return None
     return {
-        "latency_ms": latency,
-        "best": {"label": real.label, "latency_ms": real.latency_ms, "error": real.error},
+        "label": point.label,
+        "latency_ms": point.latency_ms,
+        "error": point.error,
+        "validation": point.validation,
     }
 
 
 def error_at_time(points: Sequence[Point], target_ms: float) -> dict[str, Any]:
-    """Return the interpolated error at a latency, and the most accurate configuration within it."""
+    """Return the interpolated error at a latency, and the configuration to select within it.
+
+    Selected is the one with the least validation error. The interpolated error is that of the whole
+    sweep on the test set. None: not reached.
+    """
+    able = [p for p in points if p.latency_ms <= target_ms and p.selecting < USELESS]
+    best = _selected(min(able, key=lambda p: (p.selecting, p.latency_ms), default=None))
     front = non_dominated(points)
     within = [p for p in front if p.latency_ms <= target_ms]
     if not within:
-        return {"error": None, "best": None}
+        return {"error": None, "best": best}
     real = within[-1]
     error = real.error
     if len(within) < len(front):
@@ -88,10 +117,7 @@ def error_at_time(points: Sequence[Point], target_ms: float) -> dict[str, Any]:
         error = _interpolate(
             target_ms, real.latency_ms, max(real.error, EXACT), p.latency_ms, max(p.error, EXACT)
         )
-    return {
-        "error": error,
-        "best": {"label": real.label, "latency_ms": real.latency_ms, "error": real.error},
-    }
+    return {"error": error, "best": best}
 
 
 def frontier_draws(
@@ -116,6 +142,7 @@ def frontier_draws(
     (n_times, n) float64
         Logarithms of the errors at the latencies; infinite where not reached.
     """
+    log_errors = np.where(log_errors < log(USELESS), log_errors, inf)
     order = np.lexsort((log_errors, log_latencies), axis=0)
     latency, error = (
         np.take_along_axis(log_latencies, order, 0),
@@ -166,6 +193,11 @@ def median_error(row: Row) -> float:
     return number_or_inf(row.error.rel_l2_median if row.error else None)
 
 
+def selecting_error(row: Row) -> float:
+    """Median relative L2 error that selects a row: on the validation part, or else on the test."""
+    return number_or_inf(row.validation.rel_l2_median) if row.validation else median_error(row)
+
+
 def median_latency_ms(row: Row) -> float:
     """Median latency of a row, ms; infinite if there is none."""
     return number_or_inf(row.latency_ms.median if row.latency_ms else None)
@@ -184,7 +216,12 @@ def compare(rows: Sequence[Row]) -> dict[str, Any]:
     at_error, at_time = [], []
     for dataset, method in dict.fromkeys((row.dataset, row.method) for row in rows):
         points = [
-            Point(median_latency_ms(row), median_error(row), row.label)
+            Point(
+                median_latency_ms(row),
+                median_error(row),
+                row.label,
+                selecting_error(row) if row.validation else None,
+            )
             for row in rows
             if (row.dataset, row.method) == (dataset, method) and is_point(row)
         ]

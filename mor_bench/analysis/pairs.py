@@ -89,9 +89,7 @@ def _add_interval(record: Record, key: str, draws: NDArray[np.float64]) -> None:
         low, high = min(low, value), max(high, value)
     if key == "error":  # draws of an error of zero equal the round-off
         low, high = (0.0 if end <= EXACT else end for end in (low, high))
-    record.update(
-        exists=record["best"] is not None, low=finite_or_none(low), high=finite_or_none(high)
-    )
+    record.update(low=finite_or_none(low), high=finite_or_none(high))
     record["not_reached"] = float(np.mean(~np.isfinite(draws)))
 
 

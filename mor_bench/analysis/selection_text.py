@@ -1,9 +1,17 @@
-"""Lines of text about limits and about the figures of a configuration."""
+"""The verdict in words: one headline, what stands beside it, and the figures of the winner."""
 
 from __future__ import annotations
 
-from math import ceil, floor, inf, log10
+import shlex
+from collections.abc import Mapping
+from dataclasses import replace
+from math import ceil, floor, inf, isfinite, log10
+from typing import Any
 
+from mor_bench.analysis.frontier import median_error, median_latency_ms
+from mor_bench.analysis.told import class_text, told_text
+from mor_bench.analysis.verdict import RULE, Verdict
+from mor_bench.options import RunOptions, command_line
 from mor_bench.results.row import ErrorSummary, Row, SetErrors
 
 FIGURE_NAMES = {
@@ -18,7 +26,7 @@ _UNITS = {
     "error": (100.0, " % (relative l2, median)"),
     "latency_ms": (1.0, " ms (median)"),
     "memory_bytes": (1e-6, " MB"),
-    "offline_s": (1.0, " s"),
+    "offline_s": (1.0, " core-seconds"),
 }
 
 
@@ -37,12 +45,196 @@ def _rounded_up(value: float, digits: int = 3) -> str:
     return text if float(text) >= value else f"{value:.17g}"
 
 
-def evidence(row: Row) -> list[str]:
+def worded(verdict: Verdict) -> Verdict:
+    """Return the verdict with its sentences."""
+    shown = verdict.choice or verdict.nearest
+    source = filter(None, [str(verdict.run or ""), kind(verdict), timed_on(verdict)])
+    return replace(
+        verdict,
+        headline=f"{needs(verdict)} {headline(verdict)}",
+        beside=[*beside(verdict), f"Evidence: {', '.join(source)}."],
+        evidence=evidence(verdict, shown) if shown else [],
+    )
+
+
+def needs(verdict: Verdict) -> str:
+    """State the limits."""
+    limits = [limit_text(name, limit) for name, limit in verdict.requirements.asked.items()]
+    return f"{verdict.dataset} needs {', '.join(limits) or 'nothing in particular'}."
+
+
+def headline(verdict: Verdict) -> str:
+    """Name the winner and its error on the test set, or the nearest without a winner."""
+    tried = f"{len(verdict.rows)} configurations"
+    row = verdict.choice
+    if row is None:
+        usable = [
+            r for r in verdict.rows if r.ok and isfinite(median_error(r) + median_latency_ms(r))
+        ]
+        if not usable:
+            return (
+                f"No configuration gave a usable result: {len(verdict.rows)} tried, none has both "
+                "a finite median error and a latency."
+            )
+        found = f"No configuration qualifies among {tried}."
+        if verdict.nearest is None:
+            return found
+        return f"{found} The nearest is {_short(verdict.nearest)}, with {_misses(verdict)}."
+    rank = "the only one that qualifies"
+    if len(verdict.qualified) > 1:
+        rank = f"the fastest of {len(verdict.qualified)} that qualify"
+    return (
+        f"{_named(row)} wins: {rank} among {tried}, with a latency of "
+        f"{median_latency_ms(row):.3g} ms. {_confirmation(verdict, row)}"
+    )
+
+
+def _confirmation(verdict: Verdict, row: Row) -> str:
+    """State the winner's median error on the test set, and whether it meets the limit there."""
+    error, limit = median_error(row), verdict.requirements.error
+    interval = verdict.intervals.get(row.label, {}).get("rel_l2_median")
+    high = error if interval is None else max(interval[1], error)
+    shown = f"Its median error on the test set is {100 * error:.3g} %"
+    if interval is not None:
+        shown += f" [{100 * min(interval[0], error):.3g}, {100 * high:.3g}]"
+    if row.validation is None:
+        return f"{shown}; it was selected on the test set: optimistic."
+    if limit is None:
+        return f"{shown}."
+    if error > limit:
+        return f"{shown}: it does NOT meet the limit of {100 * limit:g} % there."
+    doubt = "" if high <= limit else ", but its interval does not exclude a larger error"
+    return f"{shown}: it meets the limit of {100 * limit:g} % there{doubt}."
+
+
+def beside(verdict: Verdict) -> list[str]:
+    """List what stands beside the headline, one sentence or two for each."""
+    lines = [RULE]
+    if verdict.choice is None:
+        lines += _relaxation_lines(verdict)
+    else:
+        lines += _alternatives(verdict, verdict.choice)
+    if verdict.n_without_answers:
+        lines.append(
+            f"{verdict.n_without_answers} of {len(verdict.rows)} configurations failed, were "
+            "skipped or left loads without an answer."
+        )
+    return [*lines, *_mesh(verdict), *_stability(verdict)]
+
+
+def _alternatives(verdict: Verdict, choice: Row) -> list[str]:
+    other, cheapest = verdict.runner_up, verdict.cheapest
+    undecided = ", ".join(_named(row) for row in verdict.undecided)
+    lines = [f"Runner-up: {_short(other)}." if other else "No other method qualifies."]
+    if undecided:
+        lines.append(f"Cannot be told apart from the winner in latency: {undecided}.")
+    if cheapest is not None:
+        name = "the winner itself" if cheapest == choice else _short(cheapest)
+        lines.append(f"Cheapest offline: {name}, {_core_seconds(cheapest.offline_core_s)}.")
+    for told, best in verdict.best_told.items():
+        name = "none qualifies" if best is None else _short(best)
+        lines.append(f"Best when told {told_text(told, verdict.observed)}: {name}.")
+    return lines
+
+
+def _relaxation_lines(verdict: Verdict) -> list[str]:
+    lines = []
+    relaxed = {item.name: item for item in verdict.relaxations}
+    for name in verdict.requirements.asked:
+        if name in verdict.unknown:
+            lines.append(f"Not known of any configuration: {FIGURE_NAMES[name]}")
+        elif name in relaxed:
+            needed = limit_text(name, relaxed[name].needed, round_up=True)
+            lines.append(f"Enough alone: {needed}, by {relaxed[name].row.label}")
+        else:
+            lines.append(f"Not enough alone: {FIGURE_NAMES[name]}, whatever the limit")
+    return lines
+
+
+def _misses(verdict: Verdict) -> str:
+    assert verdict.nearest is not None
+    bounds = verdict.figures[verdict.nearest.label]
+    factors = {name: bounds[name] / limit for name, limit in verdict.requirements.asked.items()}
+    return ", ".join(
+        f"{FIGURE_NAMES[name]} {factor:.3g} times the limit"
+        for name, factor in factors.items()
+        if factor > 1
+    )
+
+
+def _mesh(verdict: Verdict) -> list[str]:
+    found = (row.discretisation_rel_l2 for row in verdict.rows)
+    mesh = next((value for value in found if value is not None), None)
+    if mesh is None:
+        return ["The discretisation error of the mesh was not measured."]
+    return [
+        f"The discretisation error of the mesh is {100 * mesh:.3g} % (median). Differences below "
+        "it say nothing about the real body."
+    ]
+
+
+def _stability(verdict: Verdict) -> list[str]:
+    timed = [row for row in verdict.rows if row.latency_ms and row.latency_ms.stable is not None]
+    unstable = [row for row in timed if row.latency_ms and not row.latency_ms.stable]
+    if not timed:
+        return ["The stability of the timings was not checked."]
+    if not unstable:
+        return ["All timings were stable."]
+    winners = ", the winner among them" if verdict.choice in unstable else ""
+    return [
+        f"{len(unstable)} of {len(timed)} timings were not stable{winners}. "
+        f"Time again: {retime_command(verdict)}"
+    ]
+
+
+def retime_command(verdict: Verdict) -> str:
+    """Return the command that repeats the timings of the verdict's run."""
+    settings = dict(verdict.settings)
+    budget = settings.pop("budget", None) or {}
+    given = {**settings, "time_limit_s": budget.get("seconds")}
+    words = ["mor-bench", "run", verdict.dataset]
+    words += [word for name in settings.get("methods", ()) for word in ("-m", name)]
+    for name, field, line in command_line(RunOptions):
+        value = given.get(name)
+        if value is not None and value != field.default:
+            words += [line.flag, f"{value:g}" if isinstance(value, float) else str(value)]
+    return shlex.join([*words, "--out", str(verdict.run), "--retime"])
+
+
+def kind(verdict: Verdict) -> str:
+    """Return profile, split and number of samples of the run."""
+    settings: Mapping[str, Any] = verdict.settings
+    parts = [f"profile {settings.get('profile')}"]
+    if settings.get("split"):
+        parts.append(f"split by {settings['split']}")
+    if settings.get("limit"):
+        parts.append(f"first {settings['limit']:,} samples")
+    return ", ".join(parts)
+
+
+def timed_on(verdict: Verdict) -> str:
+    """Return the processor of the timings in words; empty if unknown."""
+    processor = verdict.machine.get("processor")
+    return f"timed on {processor}" if processor else ""
+
+
+def _named(row: Row) -> str:
+    return f"{row.label} (reference)" if row.reference else row.label
+
+
+def _short(row: Row) -> str:
+    return f"{_named(row)}, {median_latency_ms(row):.3g} ms at {100 * median_error(row):.3g} %"
+
+
+def evidence(verdict: Verdict, row: Row) -> list[str]:
     """Return the figures of a configuration, one per indented line."""
     lines = [
-        f"  {row.label}",
+        f"  {row.label} ({class_text(row, verdict.observed)})",
         f"    error    {_errors(row.error)} on {row.n_test} test loads",
     ]
+    if row.validation:
+        n = row.n_validation
+        lines.append(f"    selected {_errors(row.validation)} on {n} validation loads")
     if row.hidden:
         lines.append(f"    fresh    {_errors(row.hidden)} on {row.hidden.n} freshly drawn loads")
     predict = row.memory_bytes.predict if row.memory_bytes else None
@@ -54,13 +246,11 @@ def evidence(row: Row) -> list[str]:
     for name, found in row.sets.items():
         missing = f", {found.n_failed} without an answer" if found.n_failed else ""
         lines.append(f"    {name:<8} {_errors(found)} on {found.n} loads{missing}")
-    mesh = row.discretisation_rel_l2
-    if mesh is not None:
-        lines.append(
-            f"    mesh     {100 * mesh:.3g} % median: the discretisation error; "
-            "no method can be more accurate"
-        )
     return lines
+
+
+def _core_seconds(value: float | None) -> str:
+    return "offline cost unknown" if value is None else f"{value:.3g} core-seconds of data and fit"
 
 
 def _errors(found: ErrorSummary | SetErrors | None) -> str:

@@ -11,14 +11,19 @@ from pydantic import Field
 
 import mor_bench
 from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.told import told_at_most
 from mor_bench.cli.console import make_console
 from mor_bench.cli.option_groups import DatasetName, with_options
 from mor_bench.cli.progress_bars import show_progress
 from mor_bench.options import CommandLine, FolderOptions
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.page import render
+from mor_bench.specs.method_spec import Told
 
 app = typer.Typer(rich_markup_mode=None)
+
+
+TOLD_HELP = "The most that a method may be told at query time; others are left out."
 
 
 class PickOptions(FolderOptions):
@@ -41,10 +46,13 @@ class PickOptions(FolderOptions):
     ] = None
     offline_s: Annotated[
         float | None,
-        Field(
-            description="Upper limit of the offline time in seconds: data (core-seconds) plus fit."
-        ),
+        Field(description="Upper limit of the offline cost (data and fit), in core-seconds."),
         CommandLine("--offline", metavar="SECONDS", default="any"),
+    ] = None
+    told: Annotated[
+        Told | None,
+        Field(description=TOLD_HELP),
+        CommandLine(default="equations"),
     ] = None
     comparison: Annotated[
         Path | None,
@@ -56,9 +64,15 @@ class PickOptions(FolderOptions):
 @app.command()
 def report(
     out: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="Folder of a run.")],
+    told: Annotated[
+        Told | None, typer.Option(help=f"{TOLD_HELP} Then only the tables are printed.")
+    ] = None,
 ) -> None:
     """Print the tables of a finished run, and draw its figures and report again."""
     comparison = mor_bench.Comparison.read(out)
+    if told is not None:
+        print_tables(told_at_most(comparison, told), make_console())
+        return
     analysis = analyse(comparison)
     comparison.finish(analysis)
     print_tables(comparison, make_console(), analysis)
@@ -76,7 +90,7 @@ def pick(
         bool, typer.Option("--json", help="Print the choice to standard output as JSON.")
     ] = False,
 ) -> None:
-    """Name the cheapest configuration that meets a dataset's needs, with the evidence.
+    """Name the fastest configuration that meets a dataset's needs, with the evidence.
 
     If there is none, the exit code is 1 and the output says how far the needs must be relaxed.
     """

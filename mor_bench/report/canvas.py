@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from mor_bench.results.comparison import Comparison
 from mor_bench.snapshots.store import write_atomically
+from mor_bench.specs.method_spec import Told
 
 DPI = 150
 WIDTH_IN = 9.4
@@ -32,7 +33,13 @@ WIDTH_IN = 9.4
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 """Okabe and Ito's palette for colour-blind readers, with brown instead of its pale yellow."""
 
-MARKERS = ("o", "s", "^", "D", "P", "X", "v", "*", "<", ">", "h")
+MARKERS: dict[Told | None, tuple[str, ...]] = {
+    "input": ("o", "h", "8"),
+    "linear-response": ("s", "D", "d"),
+    "equations": ("^", ">", "<"),
+    None: ("P", "X", "*"),
+}
+"""Markers by what a method is told: round ones for the force only, squares, triangles."""
 
 INK, GREY, LIGHT = "#222222", "#8a8a8a", "#d9d9d9"
 
@@ -70,11 +77,15 @@ class Style:
 
 
 def styles_of(comparison: Comparison) -> dict[str, Style]:
-    """Choose a colour and a marker for each method, in the order in which they ran."""
-    methods = dict.fromkeys(row.method for row in comparison.rows)
+    """Choose a colour for each method, in the order of the run, and a marker by its class."""
+    told: dict[str, Told | None] = {}
+    for row in comparison.rows:
+        told.setdefault(row.method, row.told)
     return {
-        method: Style(COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)])
-        for i, method in enumerate(methods)
+        method: Style(
+            COLOURS[i % len(COLOURS)], MARKERS[told[method]][i // len(COLOURS) % len(MARKERS[None])]
+        )
+        for i, method in enumerate(told)
     }
 
 

@@ -9,7 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
-from mor_bench.report.entries import Entry
+from mor_bench.report.entries import Entry, by_group
 from mor_bench.report.number_format import DASH, metres, number, percent, span
 from mor_bench.report.text_table import Cell, figure_cell
 
@@ -42,10 +42,10 @@ def _scaled(factor: float) -> Callable[[float | None], str]:
     return lambda value: number(None if value is None else value / factor)
 
 
-def _needs_mark(entry: Entry) -> str:
+def _qualified_mark(entry: Entry) -> str:
     if not entry.ran:
         return entry.row.status
-    return "yes" if entry.meets_needs else "no"
+    return "yes" if entry.qualified else "no"
 
 
 def _latency(entry: Entry) -> str:
@@ -81,8 +81,8 @@ COLUMNS = (
     Column("mem\nMB", figure_cell("memory_bytes", "predict", _scaled(1e6)), 3),
     Column("size\nkB", lambda e: _scaled(1000)(e.row.model_bytes), 4),
     Column("\nthr", lambda e: str(e.row.threads or DASH), 4),
-    Column("Pa-\nreto", lambda e: "*" if e.on_front else "", REQUIRED),
-    Column("meets\nneeds", _needs_mark, REQUIRED),
+    Column("Pa-\nreto", lambda e: e.pareto_mark, REQUIRED),
+    Column("quali-\nfies", _qualified_mark, REQUIRED),
 )
 
 
@@ -103,15 +103,21 @@ def _columns_for(entries: Sequence[Entry], width: int) -> tuple[list[Column], in
 
 
 def configuration_table(entries: Sequence[Entry], width: int) -> Table:
-    """Build the table of configurations, one per row, within a width in characters."""
+    """Build the table of configurations, one per row, within a width in characters.
+
+    The rows are grouped by what the methods are told.
+    """
     columns, room = _columns_for(entries, width)
     table = Table(box=SIMPLE_HEAD, padding=0, show_edge=False)
     table.add_column("configuration", overflow="fold", max_width=room)
     for column in columns:
         table.add_column(column.heading, justify="right", no_wrap=True)
-    for entry in entries:
-        style = "green" if entry.meets_needs else "" if entry.ran else "red"
-        failed = f" ({entry.n_failed} failed)" if entry.ran and entry.n_failed else ""
-        label = Text.assemble((entry.label, "bold" if entry.on_front else ""), (failed, "red"))
-        table.add_row(label, *(Text(column.cell(entry)) for column in columns), style=style)
+    for group, members in by_group(entries).items():
+        table.add_row(Text(f"– {group} –", style="dim italic"))
+        for entry in members:
+            style = "green" if entry.qualified else "" if entry.ran else "red"
+            failed = f" ({entry.n_failed} failed)" if entry.ran and entry.n_failed else ""
+            look = "bold" if entry.pareto_mark == "*" else ""
+            label = Text.assemble((entry.label, look), (failed, "red"))
+            table.add_row(label, *(Text(column.cell(entry)) for column in columns), style=style)
     return table

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.told import LEGEND
 from mor_bench.report.caveat_tables import out_of_range
 from mor_bench.report.console_columns import configuration_table
 from mor_bench.report.entries import (
@@ -21,12 +22,18 @@ from mor_bench.report.entries import (
     dataset_names,
     entries_of,
     needs_of,
+    verdict_of,
 )
 from mor_bench.report.number_format import explain_short_names, metres, number, percent
-from mor_bench.report.speed_tables import NOT_REACHED, PAIRWISE_LEGEND, pairs_at, target_table
+from mor_bench.report.speed_tables import (
+    NOT_REACHED,
+    PAIRWISE_LEGEND,
+    TARGETS_NOTE,
+    pairs_at,
+    target_table,
+)
 from mor_bench.report.summary import (
     discretisation_error,
-    headline,
     interval_basis,
     needs_text,
     notes_of,
@@ -56,7 +63,7 @@ def _target_parts(shown: TextTable, width: int) -> list[RenderableType]:
     for method, *cells in shown.rows:
         texts = (Text(cell, style="dim" if cell == NOT_REACHED else "") for cell in cells)
         table.add_row(Text(method), *texts)
-    return _titled(f"{shown.title} (in brackets: the best real configuration)", table)
+    return _titled(f"{shown.title} ", table, Text(TARGETS_NOTE, style="dim"))
 
 
 def _pairwise_parts(
@@ -114,7 +121,10 @@ def _notes(
 def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: Analysis) -> Group:
     entries = entries_of(comparison, dataset, analysis)
     title = str(comparison.datasets.get(dataset, {}).get("title", ""))
-    marks = "Pareto *: no other configuration is both faster and more accurate (medians)."
+    marks = (
+        "Pareto *: no other configuration is both faster and more accurate (medians). "
+        "ref: a full-order solve on the dataset's mesh, which competes for no rank of errors."
+    )
     if any(entry.unstable for entry in entries):
         marks += " Latency ~: not stable, see below."
     parts: list[RenderableType] = [
@@ -124,6 +134,7 @@ def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: A
         Text(""),
         configuration_table(entries, width),
         Text(marks, style="dim"),
+        Text(LEGEND, style="dim"),
         *_notes(comparison, dataset, entries, analysis),
     ]
     for kind in ("time_at_error", "error_at_time"):
@@ -133,8 +144,12 @@ def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: A
     parts.append(Text("  ".join(filter(None, basis)), style="dim"))
     parts += _pairwise_parts(comparison, dataset, analysis)
     parts += _out_of_range_parts(entries)
-    parts += [Text(""), Text(headline(comparison, dataset), style="bold"), Text("")]
-    return Group(*parts)
+    return Group(*parts, *_verdict_parts(verdict_of(analysis, dataset)))
+
+
+def _verdict_parts(verdict: Mapping[str, Any]) -> list[RenderableType]:
+    lines = [*verdict["evidence"], *verdict["beside"]]
+    return [Text(""), Text(verdict["headline"], style="bold"), *map(Text, lines), Text("")]
 
 
 def print_tables(

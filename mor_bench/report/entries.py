@@ -1,19 +1,21 @@
-"""Rows with conclusions about each: whether it meets the needs, is on the front, and intervals."""
+"""Rows with conclusions about each: whether it qualifies, is on the front, and intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import inf, isfinite
+from math import inf
 from typing import Any
 
 from mor_bench.analysis.frontier import (
     Point,
+    is_point,
     median_error,
     median_latency_ms,
     non_dominated,
     number_or_inf,
 )
+from mor_bench.analysis.told import CLASSES, class_text, is_observed
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 
@@ -46,17 +48,21 @@ class Entry:
     Attributes
     ----------
     row : Row
-    meets_needs : bool
-        It ran, and its median error and median latency are within the dataset's needs.
+    qualified : bool
+        The verdict's rule qualifies it.
     on_front : bool
-        No other configuration of the dataset is both faster and more accurate.
+        No other configuration of the dataset is both faster and more accurate, and it is more
+        accurate than answering zero.
+    group : str
+        What it is told at query time, and whether it learned from snapshots, in words.
     intervals : dict
         95 % intervals, as far as known, of `rel_l2_median`, `mean_dof_m` and `latency_ms`.
     """
 
     row: Row
-    meets_needs: bool = False
+    qualified: bool = False
     on_front: bool = False
+    group: str = ""
     intervals: Mapping[str, Interval] = field(default_factory=dict)
 
     @property
@@ -74,6 +80,11 @@ class Entry:
     @property
     def ran(self) -> bool:
         return self.row.ok
+
+    @property
+    def pareto_mark(self) -> str:
+        """A star on the Pareto front; a reference is marked as such and competes for no star."""
+        return "ref" if self.row.reference else "*" if self.on_front else ""
 
     @property
     def n_failed(self) -> int:
@@ -105,6 +116,12 @@ class Entry:
     def mean_error_m(self) -> float:
         """Mean error per degree of freedom, ē, m; infinite if there is none."""
         return number_or_inf(self.figure("error", "mean_dof_m"))
+
+    @property
+    def selecting_error_m(self) -> float:
+        """Mean error per degree of freedom that selects: on the validation part, or the test."""
+        validation = self.row.validation
+        return number_or_inf(validation.mean_dof_m) if validation else self.mean_error_m
 
     @property
     def unstable(self) -> Sequence[str]:
@@ -145,30 +162,66 @@ def entries_of(
 ) -> list[Entry]:
     """List all configurations of a dataset in the order in which they ran.
 
-    The intervals come from the analysis and are missing without it.
+    The intervals and the qualified ones come from the analysis and are missing without it.
     """
-    needs = needs_of(comparison, dataset)
     rows = [row for row in comparison.rows if row.dataset == dataset]
     points = [
-        Point(median_latency_ms(row), median_error(row), row.label)
-        for row in rows
-        if row.ok and isfinite(median_latency_ms(row))
+        Point(median_latency_ms(row), median_error(row), row.label) for row in rows if is_point(row)
     ]
     front = {point.label for point in non_dominated(points)}
+    qualified = verdict_of(analysis or {}, dataset).get("qualified", ())
+    groups = _groups(rows, is_observed(comparison, dataset))
     records = (analysis or {}).get("rows", ())
     intervals = {r["label"]: _intervals(r) for r in records if r["dataset"] == dataset}
     return [
         Entry(
             row,
-            row.ok
-            and isfinite(median_error(row))
-            and median_error(row) <= needs.error
-            and median_latency_ms(row) <= needs.latency_ms,
+            row.label in qualified,
             row.label in front,
+            groups[row.label],
             intervals.get(row.label, {}),
         )
         for row in rows
     ]
+
+
+def verdict_of(analysis: Analysis, dataset: str) -> Mapping[str, Any]:
+    """Return the summary of a dataset's verdict; empty if there is none."""
+    found = (record for record in analysis.get("verdicts", ()) if record["dataset"] == dataset)
+    return next(found, {})
+
+
+def _groups(rows: Sequence[Row], observed: bool) -> dict[str, str]:
+    """Describe each row's information; a row without a fit has the snapshots of its method."""
+    known = {row.method: row.snapshots for row in rows if row.snapshots is not None}
+    return {
+        row.label: class_text(
+            row.with_parts(snapshots=known.get(row.method, row.snapshots)), observed
+        )
+        for row in rows
+    }
+
+
+def by_group(entries: Sequence[Entry]) -> dict[str, list[Entry]]:
+    """Group entries by what they are told, the least information first, unknown classes last."""
+
+    def rank(entry: Entry) -> tuple[int, bool, str]:
+        told = entry.row.told
+        return (CLASSES.index(told) if told else len(CLASSES)), entry.row.reference, entry.group
+
+    groups: dict[str, list[Entry]] = {}
+    for entry in sorted(entries, key=rank):
+        groups.setdefault(entry.group, []).append(entry)
+    return groups
+
+
+def told_by_method(entries: Sequence[Entry]) -> dict[str, str]:
+    """Describe the information of each method whose file states it."""
+    found: dict[str, dict[str, None]] = {}
+    for entry in entries:
+        if entry.row.told:
+            found.setdefault(entry.method, {})[entry.group] = None
+    return {method: "; ".join(groups) for method, groups in found.items()}
 
 
 def _intervals(record: Mapping[str, Any]) -> dict[str, Interval]:
@@ -182,10 +235,13 @@ def _intervals(record: Mapping[str, Any]) -> dict[str, Interval]:
 
 
 def best_per_method(entries: Sequence[Entry]) -> list[Entry]:
-    """Return the configuration with the smallest ē of each method that ran."""
+    """Return the configuration of each method that ran with the smallest ē, as validation sees it.
+
+    Without validation errors, the test errors select.
+    """
     ran = [entry for entry in entries if entry.ran]
     methods = dict.fromkeys(entry.method for entry in ran)
     return [
-        min((e for e in ran if e.method == method), key=lambda e: (e.mean_error_m, e.error))
+        min((e for e in ran if e.method == method), key=lambda e: (e.selecting_error_m, e.error))
         for method in methods
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from math import isfinite
 
@@ -24,7 +25,7 @@ from mor_bench.report.canvas import (
     plain,
     shortened,
 )
-from mor_bench.report.entries import Analysis, Entry, Needs, entries_of, needs_of
+from mor_bench.report.entries import Analysis, Entry, Needs, by_group, entries_of, needs_of
 from mor_bench.report.number_format import explain_short_names, number, short_swept
 from mor_bench.results.comparison import Comparison
 
@@ -59,7 +60,7 @@ def error_against_time(
     figure.legend(handles=[*handles, front], loc="outside right upper", fontsize=9, frameon=False)
     notes = [
         Note(*_place(e), short_swept(e.swept).split(", ")[0], styles[e.method].colour)
-        for e in sorted(shown, key=lambda e: not e.on_front)
+        for e in sorted(shown, key=lambda e: e.pareto_mark != "*")
         if e.swept
     ]
     annotate(axes, notes, lines, [box_label] if box_label else [])
@@ -85,8 +86,11 @@ def _caption(entries: Sequence[Entry], shown: Sequence[Entry]) -> str:
             e.intervals for e in shown
         ),
         "The dashed steps through the ringed points are the Pareto front: "
-        "no other configuration is both faster and more accurate. "
-        "In the shaded box the dataset's needs are met.": True,
+        "no other configuration is both faster and more accurate. Full-order solves on the "
+        "dataset's mesh are references and not ringed. "
+        "In the shaded box the medians meet the dataset's needs. The shape of a marker shows what "
+        "a method is told: round, the force only; square, also its linear response; triangle, the "
+        "equations.": True,
         "Where a method has two swept parameters, labels give the first one and the legend "
         "the second.": any(len(e.swept) > 1 for e in shown),
         f"Labels: {names}.": bool(names),
@@ -134,7 +138,7 @@ def _draw_needs(axes: Axes, needs: Needs) -> Artist | None:
     look = {"facecolor": "#eef6ea", "edgecolor": "#6a9a55", "linewidth": 1, "alpha": 0.8}
     axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, zorder=1.5, **look))  # type: ignore[arg-type]
     return axes.annotate(
-        f"meets the needs: ≤ {number(x1)} ms, ≤ {number(y1)} %",
+        f"the needs: ≤ {number(x1)} ms, ≤ {number(y1)} %",
         (x0, y0),
         xytext=(6, 6),
         textcoords="offset points",
@@ -147,18 +151,21 @@ def _draw_needs(axes: Axes, needs: Needs) -> Artist | None:
 def _draw_methods(
     axes: Axes, shown: Sequence[Entry], styles: dict[str, Style]
 ) -> tuple[list[NDArray[np.float64]], list[Line2D]]:
-    """Draw all points; return the joining lines, and handles for the legend.
+    """Draw all points; return the joining lines, and handles for the legend, grouped by class.
 
     The configurations of a method that differ in their first swept parameter are joined.
     """
     lines, handles = [], []
-    for method in dict.fromkeys(e.method for e in shown):
-        style = styles[method]
-        series: dict[str, list[Entry]] = {}
-        for entry in (e for e in shown if e.method == method):
-            series.setdefault(short_swept(dict(list(entry.swept.items())[1:])), []).append(entry)
-        for rank, (others, members) in enumerate(series.items()):
-            hollow = rank % 2 == 1
+    for group, mine in by_group(shown).items():
+        handles.append(Line2D([], [], linestyle="none", label=plain(f"{group}:")))
+        series: dict[tuple[str, str], list[Entry]] = {}
+        for entry in mine:
+            others = short_swept(dict(list(entry.swept.items())[1:]))
+            series.setdefault((entry.method, others), []).append(entry)
+        ranks = Counter[str]()
+        for (method, others), members in series.items():
+            style, hollow = styles[method], ranks[method] % 2 == 1
+            ranks[method] += 1
             lines.append(_draw_series(axes, members, style, hollow))
             handle = Line2D([], [], color=style.colour, linewidth=1, marker=style.marker)
             handle.set_markerfacecolor("white" if hollow else style.colour)
@@ -192,10 +199,11 @@ def _draw_series(
 
 
 def _draw_front(axes: Axes, front: Sequence[Entry]) -> NDArray[np.float64]:
-    """Draw the Pareto front as steps with ringed points; return the steps (n, 2)."""
-    xy = np.array(sorted(_place(e) for e in front))
+    """Draw the Pareto front as steps, and rings around contestants; return the steps (n, 2)."""
+    xy = np.array(sorted(_place(e) for e in front)).reshape(-1, 2)
     steps = np.stack([np.repeat(xy[:, 0], 2)[1:], np.repeat(xy[:, 1], 2)[:-1]], axis=1)
     axes.plot(*steps.T, color=INK, linewidth=1.2, linestyle=FRONT_LINE, zorder=3)
-    (rings,) = axes.plot(*xy.T, "o", markersize=11, markerfacecolor="none", zorder=5)
+    contestants = np.array([_place(e) for e in front if e.pareto_mark == "*"]).reshape(-1, 2)
+    (rings,) = axes.plot(*contestants.T, "o", markersize=11, markerfacecolor="none", zorder=5)
     rings.set(mec=INK, mew=1.2)
     return steps

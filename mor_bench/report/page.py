@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,16 +11,23 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.told import LEGEND, classes_of, told_text
 from mor_bench.report.canvas import Drawn
 from mor_bench.report.details import dataset_details, overall
-from mor_bench.report.entries import Analysis, Entry, dataset_names, entries_of, needs_of
+from mor_bench.report.entries import (
+    Analysis,
+    Entry,
+    dataset_names,
+    entries_of,
+    needs_of,
+    verdict_of,
+)
 from mor_bench.report.figures import write_figures
 from mor_bench.report.number_format import explain_short_names
 from mor_bench.report.page_columns import ConfigurationTable, configuration_columns
 from mor_bench.report.speed_tables import target_table
 from mor_bench.report.summary import (
     discretisation_error,
-    headline,
     interval_basis,
     needs_text,
     notes_of,
@@ -44,13 +51,16 @@ class Event:
 class Section:
     """Content of the page about one dataset.
 
-    `facts` describe the run. `basis` and `short_names` are sentences under the tables. `targets`
-    are time at error and error at time; `details` are the tables after the figures.
+    `verdict` is the summary of the verdict. `classes` maps labels and methods to what they are
+    told, for the filter. `facts` describe the run. `basis` and `short_names` are sentences under
+    the tables. `targets` are time at error and error at time; `details` are the tables after the
+    figures.
     """
 
     name: str
     title: str
-    headline: str
+    verdict: Mapping[str, Any]
+    classes: Mapping[str, str]
     facts: list[tuple[str, str]]
     configurations: ConfigurationTable
     basis: str
@@ -85,6 +95,8 @@ def render(comparison: Comparison, analysis: Analysis | None = None) -> list[Pat
         overall=overall(analysis),
         overall_figures=[figure for figure in drawn if figure.dataset not in names],
         machine=list(_flat(comparison.machine)),
+        told={told or "": told_text(told) for told in classes_of(comparison.rows)},
+        legend=LEGEND,
     )
     path = comparison.out / "report.html"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -103,7 +115,8 @@ def _section(
     return Section(
         name=dataset,
         title=str(comparison.datasets.get(dataset, {}).get("title") or ""),
-        headline=headline(comparison, dataset),
+        verdict=verdict_of(analysis, dataset),
+        classes={name: e.row.told or "" for e in entries for name in (e.method, e.label)},
         facts=_facts(comparison, dataset, entries),
         configurations=configuration_columns(entries),
         basis=interval_basis(dataset, analysis),

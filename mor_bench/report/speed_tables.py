@@ -9,7 +9,7 @@ from typing import Any
 
 from mor_bench.analysis.frontier import TARGET_ERRORS
 from mor_bench.analysis.performance_profile import share_within
-from mor_bench.report.entries import Analysis, Entry, needs_of
+from mor_bench.report.entries import Analysis, Entry, entries_of, needs_of, told_by_method
 from mor_bench.report.number_format import (
     bytes_text,
     number,
@@ -27,6 +27,11 @@ PAIRWISE_LEGEND = (
     "?1.1: 1.1 times faster, but the 95 % interval of the ratio contains 1."
 )
 
+TARGETS_NOTE = (
+    "Interpolated in the whole sweep, on the test set. In brackets: the configuration that the "
+    "validation part selects (without one: the test set), with its figure on the test set."
+)
+
 FACTORS = (1.0, 1.5, 2.0, 5.0, 10.0, 100.0)
 """Columns of the performance profile's table."""
 
@@ -34,9 +39,10 @@ FACTORS = (1.0, 1.5, 2.0, 5.0, 10.0, 100.0)
 def target_table(comparison: Comparison, dataset: str, kind: str, analysis: Analysis) -> TextTable:
     """Build the table of time at error or error at time, a row per method.
 
-    A cell has the interpolated value, the best real configuration and the 95 % interval. `kind` is
-    "time_at_error" or "error_at_time".
+    A cell has the value of the whole sweep on the test set, the configuration that validation
+    selects, and the 95 % interval. `kind` is "time_at_error" or "error_at_time".
     """
+    told = told_by_method(entries_of(comparison, dataset))
     swept = {row.label: short_swept(row.swept) for row in comparison.rows if row.dataset == dataset}
     of_time = kind == "time_at_error"
     key, shown, unit = ("latency_ms", number, "ms") if of_time else ("error", percent, "%")
@@ -46,10 +52,12 @@ def target_table(comparison: Comparison, dataset: str, kind: str, analysis: Anal
         if record["dataset"] != dataset:
             continue
         best, cell = record["best"], NOT_REACHED
-        if best is not None:
-            value = f"{shown(record[key])} {unit} ({shown(best[key])})"
-            lines = (value, swept[best["label"]], _target_interval(record, shown))
-            cell = "\n".join(filter(None, lines))
+        if best is not None or record[key] is not None:
+            value = NOT_REACHED if record[key] is None else f"{shown(record[key])} {unit}"
+            lines = [f"{value} ({shown(best and best[key])})", best and swept[best["label"]]]
+            if of_time and best and best["error"] > record["target_rel_l2_median"]:
+                lines.append(f"test error {percent(best['error'])} %")
+            cell = "\n".join(filter(None, [*lines, _target_interval(record, shown)]))
         headings[_target_heading(record)] = None
         rows.setdefault(record["method"], []).append(cell)
     title = (
@@ -57,8 +65,9 @@ def target_table(comparison: Comparison, dataset: str, kind: str, analysis: Anal
         if of_time
         else "Error at time: median relative L2 error within a median latency"
     )
-    note = "In brackets: the best real configuration."
-    return TextTable(title, note, list(headings), [[name, *row] for name, row in rows.items()])
+    named = ["\n".join(filter(None, (name, told.get(name, "")))) for name in rows]
+    cells = [[name, *row] for name, row in zip(named, rows.values(), strict=True)]
+    return TextTable(title, TARGETS_NOTE, list(headings), cells)
 
 
 def _target_heading(record: Mapping[str, Any]) -> str:

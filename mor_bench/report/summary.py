@@ -1,11 +1,10 @@
-"""Sentences for console and page: headline, warnings, notes, and the basis of the intervals."""
+"""Sentences for console and page: warnings, notes, and the basis of the intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite
 
-from mor_bench.report.entries import Analysis, Entry, Needs, entries_of, needs_of
+from mor_bench.report.entries import Analysis, Entry, Needs, entries_of
 from mor_bench.report.number_format import metres, number, percent
 from mor_bench.results.comparison import Comparison
 
@@ -92,48 +91,3 @@ def needs_text(needs: Needs) -> str:
     """State the needs, such as ``median relative L2 error ≤ 1 %, median latency ≤ 3 ms``."""
     error, latency = percent(needs.error), number(needs.latency_ms)
     return f"median relative L2 error ≤ {error} %, median latency ≤ {latency} ms"
-
-
-def headline(comparison: Comparison, dataset: str) -> str:
-    """Name the fastest configuration that meets the needs, or the one nearest to meeting them."""
-    entries, needs = entries_of(comparison, dataset), needs_of(comparison, dataset)
-    usable = [e for e in entries if e.ran and isfinite(e.error) and isfinite(e.latency_ms)]
-    if not usable:
-        return (
-            "No configuration gave a usable result: "
-            f"{len(entries)} tried, none has both a finite median error and a latency."
-        )
-    wanted = needs_text(needs)
-    meeting = [entry for entry in usable if entry.meets_needs]
-    if meeting:
-        best = min(meeting, key=lambda e: (e.latency_ms, e.error))
-        role = (
-            "the only configuration that meets"
-            if len(meeting) == 1
-            else f"the fastest of {len(meeting)} configurations that meet"
-        )
-        return f"{best.label} is {role} the needs ({wanted}): {_figures(best)}."
-
-    def excess(entry: Entry) -> tuple[float, float]:
-        return entry.error / needs.error, entry.latency_ms / needs.latency_ms
-
-    nearest = min(usable, key=lambda e: max(excess(e)))
-    over = [
-        f"{number(factor)} times the allowed {name}"
-        for name, factor in zip(("error", "latency"), excess(nearest), strict=True)
-        if factor > 1
-    ]
-    return (
-        f"No configuration meets the needs ({wanted}). The nearest is {nearest.label}: "
-        f"{_figures(nearest)}, {' and '.join(over)}."
-    )
-
-
-def _figures(entry: Entry) -> str:
-    latency = f"{number(entry.latency_ms)} ms (p95 {number(entry.figure('latency_ms', 'p95'))} ms)"
-    worst = (
-        f"{entry.n_failed} without a prediction"
-        if entry.n_failed
-        else f"worst sample {percent(entry.figure('error', 'rel_l2_max'))} %"
-    )
-    return f"{latency} at {percent(entry.error)} % ({worst})"

@@ -40,8 +40,6 @@ class ErrorSummary(Part):
         Error at the tip over its displacement, as a fraction: median, 95th percentile and maximum.
     tip_rel_at_max_e, tip_rel_at_largest : float
         The same of the sample with the largest e, and of the sample with the largest displacement.
-    rel_l2_median_high : float or None
-        Upper end of the 95 % interval of `rel_l2_median`; only in a pick, never in results.json.
     """
 
     mean_dof_m: Real = nan
@@ -60,7 +58,6 @@ class ErrorSummary(Part):
     tip_rel_max: Real = nan
     tip_rel_at_max_e: Real = nan
     tip_rel_at_largest: Real = nan
-    rel_l2_median_high: Real | None = None
 
 
 class SetErrors(Part):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mor_bench.analysis.frontier import selecting_error
 from mor_bench.errors import MorBenchError
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.parts import SeedSpread, SeedTraining, Spread
@@ -135,16 +136,10 @@ def draw_learning_curves(stage: Stage, fits: Mapping[str, CachedFit]) -> None:
         ]
         if not mine:
             continue
-        best, cached = min(mine, key=lambda pair: _deciding_error(pair[0]))
+        best, cached = min(mine, key=lambda pair: selecting_error(pair[0]))
         for n in _learning_sizes(stage.training_data.n_train):
             comparison.learning.append(_learning_point(stage, cached, n, best))
             comparison.write()
-
-
-def _deciding_error(row: Row) -> float:
-    """Median error on the validation samples; on the test samples if there are no others."""
-    decides = row.validation or row.error
-    return np.inf if decides is None else decides.rel_l2_median
 
 
 def _learning_sizes(n_train: int) -> list[int]:

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mor_bench.analysis.analyse import analyse
-from mor_bench.analysis.selection import Pick, Requirements, choose
+from mor_bench.analysis.analyse import verdict_on
+from mor_bench.analysis.told import told_at_most
+from mor_bench.analysis.verdict import Requirements, Verdict
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.results.comparison import Comparison
-from mor_bench.results.row import Row
 from mor_bench.runs.compare import run
 from mor_bench.runs.listener import Listener
 from mor_bench.specs import AnyDatasetSpec, load_dataset_spec
+from mor_bench.specs.method_spec import Told
 
-__all__ = ["Pick", "newest_run", "pick"]
+__all__ = ["Verdict", "newest_run", "pick"]
 
 RUNS = Path("reports") / "runs"
 
@@ -28,9 +28,10 @@ def pick(
     cache: Path | None = None,
     suite: Path | None = None,
     listener: Listener = Listener(),
+    told: Told | None = None,
     **limits: float | None,
-) -> Pick:
-    """Choose the cheapest configuration that meets a scene's needs.
+) -> Verdict:
+    """Choose the fastest configuration that meets a scene's needs, by the rule of every report.
 
     Parameters
     ----------
@@ -44,8 +45,10 @@ def pick(
         Cache folder; folder with ``datasets/`` and ``methods/``.
     listener : Listener
         Callbacks for progress, if a comparison must be run.
+    told : Told, optional
+        The most that a method may be told at query time. By default all methods take part.
     **limits
-        Upper limits, see `mor_bench.analysis.selection.Requirements`: error and latency_ms, by
+        Upper limits, see `mor_bench.analysis.verdict.Requirements`: error and latency_ms, by
         default those of the dataset's ``[needs]``; memory_bytes and offline_s, by default none.
 
     Raises
@@ -73,37 +76,7 @@ def pick(
             "`comparison` must be a Comparison or the folder of a run; "
             f"got {type(comparison).__name__}."
         )
-    return replace(
-        choose(_with_upper_bounds(evidence), requirements, spec.name),
-        run=evidence.out,
-        processor=str(evidence.machine.get("processor", "")),
-        kind=_kind(evidence.settings),
-    )
-
-
-def _kind(settings: Mapping[str, Any]) -> str:
-    parts = [f"profile {settings.get('profile')}"]
-    if settings.get("split"):
-        parts.append(f"split by {settings['split']}")
-    if settings.get("limit"):
-        parts.append(f"first {settings['limit']:,} samples")
-    return ", ".join(parts)
-
-
-def _with_upper_bounds(comparison: Comparison) -> list[Row]:
-    """Return the rows with the upper bound of each median error."""
-    highs = {
-        (record["dataset"], record["label"]): record["rel_l2_median"]["high"]
-        for record in analyse(comparison)["rows"]
-    }
-
-    def with_bound(row: Row) -> Row:
-        high = highs.get((row.dataset, row.label))
-        if high is None or row.error is None:
-            return row
-        return row.with_parts(error=row.error.model_copy(update={"rel_l2_median_high": high}))
-
-    return [with_bound(row) for row in comparison.rows]
+    return verdict_on(told_at_most(evidence, told), spec.name, requirements)
 
 
 def _holds(comparison: Comparison, spec: AnyDatasetSpec) -> bool:

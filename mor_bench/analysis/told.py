@@ -1,0 +1,55 @@
+"""Classes of methods by what they are told at query time, in words, and a filter by class."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import get_args
+
+from mor_bench.results.comparison import Comparison
+from mor_bench.results.row import Row
+from mor_bench.specs.method_spec import Told
+
+CLASSES: tuple[Told, ...] = get_args(Told)
+"""All classes, the one with the least information first."""
+
+LEGEND = (
+    "What a method is told at query time: the force only; also its linear response, which needs "
+    "the equations once; or the equations. Snapshots: whether it learned from samples."
+)
+
+
+def told_text(told: Told | None, observed: bool = False) -> str:
+    """Name a class, such as "force and linear response".
+
+    `observed` holds for scenes that give observed displacements instead of forces.
+    """
+    given = "observed displacements" if observed else "force"
+    names = {"input": f"{given} only", "linear-response": f"{given} and linear response"}
+    return names.get(told or "", told or "not stated")
+
+
+def class_text(row: Row, observed: bool = False) -> str:
+    """Describe a row's information, such as "equations, snapshots, reference"."""
+    learned = {True: "snapshots", False: "no snapshots", None: ""}[row.snapshots]
+    parts = (told_text(row.told, observed), learned, "reference" if row.reference else "")
+    return ", ".join(filter(None, parts))
+
+
+def is_observed(comparison: Comparison, dataset: str) -> bool:
+    """Return whether a dataset gives observed displacements instead of forces."""
+    return bool(comparison.datasets.get(dataset, {}).get("observed"))
+
+
+def classes_of(rows: Iterable[Row]) -> list[Told | None]:
+    """List the classes of rows, the least information first and unknown ones last."""
+    found = {row.told for row in rows}
+    return [told for told in (*CLASSES, None) if told in found]
+
+
+def told_at_most(comparison: Comparison, told: Told | None) -> Comparison:
+    """Keep the rows that are told no more than a class; None keeps all."""
+    if told is None:
+        return comparison
+    allowed = CLASSES[: CLASSES.index(told) + 1]
+    return replace(comparison, rows=[row for row in comparison.rows if row.told in allowed])
