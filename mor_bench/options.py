@@ -235,6 +235,15 @@ class RunOptions(TrainOptions):
         Field(ge=1e8, description="Memory limit of a method's process, in GB."),
         CommandLine("--memory-limit", metavar="GB", default="3/4 of the memory", scale=1e9),
     ] = None
+    train: Annotated[
+        bool,
+        Field(
+            description=(
+                "Train networks here instead of using the suite's trained weights. The full "
+                "profile always does."
+            )
+        ),
+    ] = False
     retime: Annotated[
         bool, Field(description="Repeat timings instead of reading them from the cache.")
     ] = False

@@ -91,7 +91,7 @@ class _Bars:
             text = (
                 f"ē {row.error.mean_dof_m:.2e} m   rel. l2 {row.error.rel_l2_median:.3%}   "
                 f"fit {row.offline_s.fit:.3g} s"
-            )
+            ) + (" (trained elsewhere)" if row.trained_elsewhere else "")
         label = f"[bold]{escape(row.label):<46}[/bold]"
         self.progress.console.print(f"{label} {escape(text)}", highlight=False)
 

@@ -118,6 +118,7 @@ def configuration_table(entries: Sequence[Entry], width: int) -> Table:
             style = "green" if entry.qualified else "" if entry.ran else "red"
             failed = f" ({entry.n_failed} failed)" if entry.ran and entry.n_failed else ""
             look = "bold" if entry.pareto_mark == "*" else ""
-            label = Text.assemble((entry.label, look), (failed, "red"))
+            origin = " (trained elsewhere)" if entry.row.trained_elsewhere else ""
+            label = Text.assemble((entry.label, look), (origin, "dim"), (failed, "red"))
             table.add_row(label, *(Text(column.cell(entry)) for column in columns), style=style)
     return table

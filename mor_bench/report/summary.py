@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from mor_bench.report.entries import Analysis, Entry, Needs, entries_of
 from mor_bench.report.number_format import metres, number, percent
 from mor_bench.results.comparison import Comparison
+from mor_bench.results.parts import TrainedElsewhere
 
 MESH_NOTE = "an error below it is not evidence about the real body"
 
@@ -23,7 +24,8 @@ def warnings_of(entries: Sequence[Entry]) -> list[tuple[str, str]]:
 def notes_of(comparison: Comparison, dataset: str, analysis: Analysis) -> list[tuple[str, str]]:
     """List doubts, each after the name of its configuration or method.
 
-    Doubts are unstable timings, a hidden test set that disagrees, and untested regimes.
+    Doubts are unstable timings, networks trained elsewhere, a hidden test set that disagrees, and
+    untested regimes.
     """
     entries = entries_of(comparison, dataset)
     unstable: dict[str, list[str]] = {}
@@ -32,6 +34,11 @@ def notes_of(comparison: Comparison, dataset: str, analysis: Analysis) -> list[t
             unstable.setdefault(reason, []).append(entry.label)
     notes = [
         (_first_of(labels), f"timing not stable: {reason}") for reason, labels in unstable.items()
+    ]
+    notes += [
+        (entry.label, _origin(entry.row.trained_elsewhere))
+        for entry in entries
+        if entry.row.trained_elsewhere
     ]
     for record in analysis["hidden"]:
         if record["dataset"] == dataset and record["worse"]:
@@ -45,6 +52,14 @@ def notes_of(comparison: Comparison, dataset: str, analysis: Analysis) -> list[t
         if record["method"] in methods and record["in_regime"] is False
     ]
     return notes
+
+
+def _origin(training: TrainedElsewhere) -> str:
+    return (
+        f"trained elsewhere: {training.iterations:,} iterations with seed {training.seed}, "
+        f"{number(training.core_s)} core-seconds on {training.machine} cores, {training.date}, "
+        f"commit {training.commit[:7]}; `--train` trains here"
+    )
 
 
 def _first_of(labels: Sequence[str]) -> str:

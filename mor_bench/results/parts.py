@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, WithJsonSchema
+from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
 Real = Annotated[
     float,
@@ -31,6 +31,33 @@ class TrainingRecord(Part):
     iterations: int | None = None
     loss: Real | None = None
     validation_loss: Real | None = None
+
+
+class TrainedElsewhere(Part):
+    """Where and how the suite's own weights were trained; the offline cost of the row is theirs.
+
+    Attributes
+    ----------
+    machine : str
+        Processor and number of cores.
+    core_s, wall_s : float
+        Core-seconds and wall time of the training, s.
+    threads, iterations, seed : int
+    commit, date : str
+        Commit of the code, and day of the training (UTC).
+    versions : dict of str to str
+        Versions of the libraries that results depend on.
+    """
+
+    machine: str
+    core_s: Real
+    wall_s: Real
+    threads: int
+    iterations: int
+    seed: int
+    commit: str
+    date: str
+    versions: dict[str, str] = Field(default={})
 
 
 class Spread(Part):

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from mor_bench.results.parts import Part, Real, SeedSpread, TrainingRecord
+from mor_bench.results.parts import Part, Real, SeedSpread, TrainedElsewhere, TrainingRecord
 from mor_bench.specs.method_spec import Told
 
 Status = Literal["ok", "failed", "skipped"]
@@ -255,6 +255,8 @@ class Row(Part):
     hidden : SetErrors or None
         A test set drawn after all fits.
     training : TrainingRecord or None
+    trained_elsewhere : TrainedElsewhere or None
+        Set if the weights are the suite's own, and were not trained in this run.
     seeds : SeedSpread or None
     discretisation_error_m, discretisation_rel_l2 : float or None
         Error of the dataset's mesh against the limit of fine meshes: mean, m; relative median.
@@ -296,6 +298,7 @@ class Row(Part):
     range: RangeFlags | None = None
     hidden: SetErrors | None = None
     training: TrainingRecord | None = None
+    trained_elsewhere: TrainedElsewhere | None = None
     seeds: SeedSpread | None = None
     discretisation_error_m: Real | None = None
     discretisation_rel_l2: Real | None = None

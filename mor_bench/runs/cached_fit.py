@@ -32,6 +32,7 @@ from mor_bench.digests import digest_of_arrays
 from mor_bench.machine import describe_machine, gpu_name
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.results.arrays import read_arrays, write_arrays
+from mor_bench.results.parts import TrainedElsewhere
 from mor_bench.runs.code_digest import code_digest
 from mor_bench.runs.configurations import Configuration
 from mor_bench.runs.training_data import TrainingData, digest_of_file
@@ -107,6 +108,8 @@ class FitRecord(BaseModel):
     warnings : list of str
     model_sha256 : str or None
         Checksum of the saved model.
+    trained_elsewhere : TrainedElsewhere or None
+        Origin of weights that the suite ships.
     """
 
     model_config = ConfigDict(frozen=True, ser_json_inf_nan="constants")
@@ -124,6 +127,7 @@ class FitRecord(BaseModel):
     training: dict[str, Any] | None = None
     warnings: list[str]
     model_sha256: str | None = None
+    trained_elsewhere: TrainedElsewhere | None = None
 
     @property
     def iterations(self) -> int | None:
@@ -168,6 +172,8 @@ class CachedFit:
         if training is not None and training != TrainingOptions():
             device = gpu_name() if training.device == "cuda" else training.device
             parts["training"] = {"device": device, "fit_seconds": training.fit_seconds}
+        if self.configuration.shipped is not None:
+            parts["shipped"] = self.configuration.shipped
         if training is not None:
             parts["validation"] = self.data.validation_digest
         return parts

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import io
 import platform
+import tokenize
 from collections.abc import Iterator
 from functools import cache
 from importlib.machinery import PathFinder
@@ -24,6 +26,9 @@ LIBRARIES = (
     "pypardiso",
     "safetensors",
 )
+
+LEARNING_ROOMS = ("mor_bench.surrogates.", "mor_bench.learning.", "mor_bench.scene.grid")
+"""Beginnings of the names of modules that define a network, its inputs and its training."""
 
 DATA_ONLY = frozenset(
     f"mor_bench.snapshots.{name}"
@@ -75,6 +80,33 @@ def library_versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+def learning_digest(surrogate: str) -> str:
+    """Return the SHA-256 of the code that gives a trained model its meaning.
+
+    It covers the sources in `LEARNING_ROOMS` that the class imports, without comments, docstrings
+    and blank lines. So it changes with the network and its training, and with little else.
+    """
+    digest = hashlib.sha256()
+    for name, path in sorted(imported_sources(surrogate.partition(":")[0]).items()):
+        if name.startswith(LEARNING_ROOMS) and not name.endswith(("onnx_model", "onnx_graph")):
+            digest.update(f"{name}\n{bare_code(path.read_text(encoding='utf-8'))}\n".encode())
+    return digest.hexdigest()
+
+
+def bare_code(source: str) -> str:
+    """Return a source without comments, docstrings and blank lines."""
+    lines = source.splitlines()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            row, column = token.start
+            lines[row - 1] = lines[row - 1][:column]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            for row in range(node.lineno, (node.end_lineno or node.lineno) + 1):
+                lines[row - 1] = ""
+    return "\n".join(line.rstrip() for line in lines if line.strip())
 
 
 def imported_sources(module: str, folder: Path | None = None) -> dict[str, Path]:

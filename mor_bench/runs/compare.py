@@ -57,8 +57,8 @@ def run(
         Callbacks for progress.
     **options
         See `mor_bench.options.RunOptions`: limit, split, threads, workers, jobs, cluster,
-        test_seed, device, fit_seconds, seeds, time_limit_s, memory_limit_bytes, retime, fail_fast,
-        cache and suite.
+        test_seed, device, fit_seconds, seeds, time_limit_s, memory_limit_bytes, train, retime,
+        fail_fast, cache and suite.
 
     Raises
     ------

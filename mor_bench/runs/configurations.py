@@ -82,12 +82,15 @@ class Configuration:
         The parameters that the method's file varies.
     training : TrainingOptions or None
         Device and seconds of a training; None for a method that does not train.
+    shipped : str or None
+        Checksum of weights that the suite ships and this configuration uses.
     """
 
     method: MethodSpec
     parameters: dict[str, Any]
     swept: dict[str, Any] = field(default_factory=dict)
     training: TrainingOptions | None = None
+    shipped: str | None = None
 
     @property
     def label(self) -> str:

@@ -43,6 +43,7 @@ from mor_bench.runs.row_figures import (
 )
 from mor_bench.runs.run_context import RunContext
 from mor_bench.runs.scoring import Score, ScoredFit, score_fit
+from mor_bench.runs.shipped_models import adopt, find_shipped
 from mor_bench.runs.timing_stage import StopRunError, time_configurations
 from mor_bench.runs.training_data import TrainingData
 from mor_bench.sandbox.fork_server import ForkServer
@@ -209,7 +210,8 @@ class DatasetRun:
             reason = f"beyond the tuning budget of {limit}"
             return _Attempt(row.with_parts(status="skipped", reason=reason))
         began = monotonic()
-        cached = CachedFit(configuration, self.training_data, self.environment)
+        cached, warnings = self._cached_fit(configuration)
+        row = row.with_parts(parameters=cached.configuration.parameters, warnings=warnings)
         try:
             spent = fit_configuration(cached, left, self._remote(pool, configuration)).fit_s
         except MorBenchError as error:
@@ -219,6 +221,19 @@ class DatasetRun:
             with self._lock:
                 self._spent[method] = self._spent.get(method, 0.0) + spent
         return _Attempt(row.with_parts(tuning_s=spent), cached)
+
+    def _cached_fit(self, configuration: Configuration) -> tuple[CachedFit, list[str]]:
+        """Return a configuration's fit, with shipped weights if there are any; and warnings."""
+        own = CachedFit(configuration, self.training_data, self.environment)
+        if configuration.training is None or not self.context.uses_shipped_weights:
+            return own, []
+        try:
+            found = find_shipped(configuration, self.spec, self.context.options.split)
+            if found is None or not found[1].agrees_with(self.training_data):
+                return own, []
+            return adopt(*found, configuration, self.training_data, self.environment), []
+        except MorBenchError as error:
+            return own, [f"{error} So the network was trained here."]
 
     def _announce(self, configuration: Configuration) -> None:
         n = len(self.configurations)
@@ -300,7 +315,8 @@ class DatasetRun:
             sets={name: set_errors(score, flags) for name, score in others.items()},
             range=RangeFlags.model_validate(flags.as_dict(main)) if flags else None,
             training=training_record(record, configuration.training),
-            warnings=[*record.warnings, *ignored_seconds(record, asked_s)],
+            trained_elsewhere=record.trained_elsewhere,
+            warnings=[*row.warnings, *record.warnings, *ignored_seconds(record, asked_s)],
         )
         return row, {**main, **_validation_samples(held), **loss_curves(record)}
 

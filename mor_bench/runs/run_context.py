@@ -59,6 +59,13 @@ class RunContext:
         return self.options.seeds or DEFAULT_SEEDS[self.options.profile]
 
     @property
+    def uses_shipped_weights(self) -> bool:
+        """Whether configurations may use weights that the suite ships instead of a training."""
+        options = self.options
+        may = options.profile == "quick" and not options.train and self.seeds == 1
+        return may and options.limit is None and self.training == TrainingOptions()
+
+    @property
     def cache(self) -> Path:
         """Cache folder."""
         return Path(self.options.cache or default_cache())
@@ -84,6 +91,8 @@ class RunContext:
         }
         if options.fit_seconds is not None:
             settings["fit_seconds"] = options.fit_seconds
+        if options.train:
+            settings["train"] = True
         if options.jobs > 1:  # fits that share the cores take longer than alone
             settings["jobs"] = options.jobs
         return settings
