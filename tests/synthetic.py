@@ -193,6 +193,7 @@ def synthetic_comparison(
         "cells": MESH.cells,
         "singular_values": 0.8 ** np.arange(90.0),
         "test_regions": 5 * regions,
+        "patch_centres": MESH.points[MESH.points[:, 2] == 1.0],
     }
     made.add_dataset(dataset, load_dataset_spec(dataset).model_dump(mode="json"), arrays)
     speed = 0.02 * np.sin(np.arange(N_PROCESSES * N_ROUNDS) / 3).reshape(N_PROCESSES, N_ROUNDS)

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.lines import AxLine
 from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
 
 from mor_bench.report.canvas import Picture, styles_of
 from mor_bench.report.entries import entries_of
+from mor_bench.report.error_against_deformation import error_against_deformation
 from mor_bench.report.error_against_time import error_against_time
+from mor_bench.report.error_over_position import error_over_position, median_per_patch
 from mor_bench.report.singular_values import SIGMA, TAIL, singular_values
 from mor_bench.report.speed_tables import pairs_at
 from mor_bench.results.comparison import Comparison
-from tests.synthetic import a_row
+from tests.synthetic import MESH, a_row
 
 LOW, HIGH = 0.8, 1.5
 """Ends of all intervals, relative to the value."""
@@ -86,6 +91,57 @@ def test_each_label_of_the_legend_belongs_to_its_curve(made: Comparison) -> None
     assert np.column_stack(ranks.get_data()) == pytest.approx(
         np.column_stack([[2, 3], left_out[1:]])
     )
+
+
+def test_the_median_per_patch_counts_a_sample_at_each_of_its_patches() -> None:
+    regions = np.array([[0, 2], [2, 4], [0, 4], [2, 4]])
+    found = median_per_patch(np.array([1.0, 2.0, 3.0, np.inf]), regions, 6)
+    np.testing.assert_array_equal(found, [2.0, np.nan, 2.0, np.nan, 3.0, np.nan])
+
+
+def test_the_map_of_the_error_has_a_panel_for_the_best_of_each_class(tmp_path: Path) -> None:
+    made = Comparison(tmp_path, {})
+    centres = MESH.points[MESH.points[:, 2] == 1.0][:6]
+    regions = np.array([[0], [0], [3], [4]])
+    arrays = {"points": MESH.points, "cells": MESH.cells, "patch_centres": centres}
+    made.add_dataset("beam", {}, {**arrays, "test_regions": regions})
+    for method, told, e in (("a", "input", 0.2), ("b", "input", 0.1), ("c", "equations", 0.3)):
+        row = a_row(method, dataset="beam", told=told, error={"mean_dof_m": e})
+        made.put(row, {"relative_l2": 0.1 * e * np.array([1.0, 3.0, 20.0, np.inf])})
+    full = a_row("fem", dataset="beam", told="equations", reference=True, error={"mean_dof_m": 0.0})
+    made.put(full, {"relative_l2": np.full(4, 1e-9)})
+    picture = error_over_position(made, "beam")
+    assert picture is not None
+    assert picture.caption.startswith("b: 2 to 20 %, a factor of 10; most where the load acts")
+    panels = [axes for axes in picture.figure.axes if axes.get_title(loc="left")]
+    assert [axes.get_title(loc="left").split("\n")[0] for axes in panels] == ["b", "c"]
+    dots, scales = zip(*(_dots(axes) for axes in panels), strict=True)
+    assert dots[0] == pytest.approx(np.array([2.0, 20.0]))
+    assert dots[1] == pytest.approx(np.array([6.0, 60.0]))
+    assert scales[0] == scales[1] == pytest.approx((2.0, 60.0))
+    made.add_dataset("beam", {}, {"test_regions": regions})
+    assert error_over_position(made, "beam") is None
+
+
+def _dots(axes: Axes) -> tuple[NDArray[np.float64], tuple[Any, Any]]:
+    """Return the values of a panel's coloured dots in percent, and the ends of their scale."""
+    (dots,) = (found for found in axes.collections if isinstance(found, PathCollection))
+    return np.asarray(dots.get_array()), (dots.norm.vmin, dots.norm.vmax)
+
+
+@pytest.mark.parametrize(("dataset", "n_lines"), [("beam-coarse-paper", 2), ("beam-tiny", 1)])
+def test_the_slope_of_the_paper_is_drawn_on_its_scenes_only(
+    tmp_path: Path, dataset: str, n_lines: int
+) -> None:
+    made = Comparison(tmp_path, {})
+    row = a_row("pod", dataset=dataset, error={"mean_dof_m": 0.002})
+    made.put(row, {"amplitude_m": np.array([0.1, 0.3]), "mean_dof_m": np.array([0.001, 0.003])})
+    picture = error_against_deformation(made, dataset, styles_of(made))
+    assert picture is not None
+    (axes,) = picture.figure.axes
+    slopes = [line.get_slope() for line in axes.lines if isinstance(line, AxLine)]
+    assert slopes == pytest.approx([0.01, 0.00352][:n_lines])
+    assert ("up to 0.724 m" in picture.caption) == (n_lines == 2)
 
 
 @pytest.mark.parametrize(

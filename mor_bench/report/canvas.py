@@ -49,23 +49,26 @@ class Picture:
     """A figure that is drawn but not saved.
 
     `kind` is a part of its file name, such as ``learning-curves``. `title` and `caption` describe
-    the figure and explain how to read it.
+    the figure and explain how to read it. `finding` says what it shows, for readers who cannot see
+    it.
     """
 
     kind: str
     title: str
     caption: str
     figure: Figure
+    finding: str = ""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure on disk: its dataset, PNG file, title, and a caption that explains it."""
+    """A figure on disk: its dataset, PNG file, title, a caption that explains it, and a finding."""
 
     dataset: str
     path: Path
     title: str
     caption: str
+    finding: str = ""
 
 
 @dataclass(frozen=True)
@@ -124,7 +127,7 @@ def save(picture: Picture, comparison: Comparison, dataset: str) -> Drawn:
     buffer = io.BytesIO()
     picture.figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
     write_atomically(path, buffer.getvalue())
-    return Drawn(dataset, path, picture.title, picture.caption)
+    return Drawn(dataset, path, picture.title, picture.caption, picture.finding)
 
 
 def plain(text: str) -> str:

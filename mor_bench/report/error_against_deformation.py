@@ -21,7 +21,8 @@ from mor_bench.report.canvas import (
     shortened,
 )
 from mor_bench.report.entries import Entry, best_per_method, entries_of
-from mor_bench.report.number_format import short_swept
+from mor_bench.report.number_format import number, short_swept
+from mor_bench.report.published_figures import SCENES, scene_of
 from mor_bench.results.comparison import Comparison
 
 CAPTION = (
@@ -51,7 +52,15 @@ def error_against_deformation(
             continue
     if not panels:
         return None
-    title = "Error against deformation"
+    title, scene = "Error against deformation", SCENES.get(scene_of(dataset))
+    caption, slope = CAPTION, scene.network.slope if scene else None
+    if scene:
+        largest = max(float(amplitude.max()) for _, amplitude, _ in panels)
+        line = f"; the dashed line has its slope, {slope:g}" if slope else ", without a slope"
+        caption += (
+            f" The paper's U-Mesh is on this scene with deformations of up to "
+            f"{scene.amplitude_m:g} m{line}. The largest here is {number(largest)} m."
+        )
     columns = min(3, len(panels))
     rows = ceil(len(panels) / columns)
     figure = new_figure(0.6 + 2.7 * rows, f"{title} – {dataset}")
@@ -59,16 +68,20 @@ def error_against_deformation(
     for axes in grid.ravel()[len(panels) :]:
         axes.set_visible(False)
     for axes, (entry, amplitude, e) in zip(grid.ravel(), panels, strict=False):
-        _panel(axes, entry, (amplitude, e), styles[entry.method])
+        _panel(axes, entry, (amplitude, e), styles[entry.method], slope)
     figure.supxlabel("largest nodal displacement of the reference (m)", fontsize=10)
     figure.supylabel("mean error per dof, e (m)", fontsize=10)
-    return Picture("error-against-deformation", title, CAPTION, figure)
+    return Picture("error-against-deformation", title, caption, figure)
 
 
 def _panel(
-    axes: Axes, entry: Entry, samples: tuple[NDArray[np.float64], NDArray[np.float64]], style: Style
+    axes: Axes,
+    entry: Entry,
+    samples: tuple[NDArray[np.float64], NDArray[np.float64]],
+    style: Style,
+    published: float | None,
 ) -> None:
-    """Draw the samples (largest displacement, e) of one configuration, m."""
+    """Draw the samples (largest displacement, e) of one configuration, m, and the paper's slope."""
     amplitude, e = samples
     finite = np.isfinite(e) & np.isfinite(amplitude)
     x, y = amplitude[finite], e[finite]
@@ -83,6 +96,9 @@ def _panel(
         axes.axline((0, 0), slope=slope, color=INK, linewidth=1.3)
         axes.set_xlim(0, 1.05 * float(x.max()))
         remarks.append(f"slope {slope:.1e}" if y.max() > 0 else "e = 0 on every sample")
+        if published is not None and y.max() > 0:
+            axes.axline((0, 0), slope=published, color=INK, linewidth=1.3, linestyle=(0, (4, 3)))
+            remarks.append(f"paper's U-Mesh {published:.1e}")
     if len(y) and y.max() > 0:
         axes.set_ylim(0, 1.05 * float(y.max()))
     else:

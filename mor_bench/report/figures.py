@@ -6,6 +6,7 @@ from mor_bench.report.canvas import Drawn, save, styles_of
 from mor_bench.report.entries import Analysis, dataset_names
 from mor_bench.report.error_against_deformation import error_against_deformation
 from mor_bench.report.error_against_time import error_against_time
+from mor_bench.report.error_over_position import error_over_position
 from mor_bench.report.profile_figure import performance_profile
 from mor_bench.report.singular_values import singular_values
 from mor_bench.report.training_curves import learning_curves, loss_curves
@@ -26,6 +27,7 @@ def write_figures(comparison: Comparison, analysis: Analysis) -> list[Drawn]:
             learning_curves(comparison, dataset, styles),
             loss_curves(comparison, dataset, styles),
             error_against_deformation(comparison, dataset, styles),
+            error_over_position(comparison, dataset),
             worst_samples(comparison, dataset, styles),
             singular_values(comparison, dataset, styles),
         ):

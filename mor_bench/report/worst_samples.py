@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
@@ -25,14 +24,15 @@ from mor_bench.report.canvas import (
 )
 from mor_bench.report.entries import Entry, best_per_method, entries_of
 from mor_bench.report.number_format import metres, percent, short_swept
+from mor_bench.report.projection import View, normals
 from mor_bench.results.comparison import Comparison
 from mor_bench.scene.mesh import Mesh
 
 REFERENCE, REFERENCE_EDGE = "#7fb2d6", "#33607f"
 REST, PREDICTION, FORCE = "#c4c4c4", "#D55E00", "#222222"
 
-AZIMUTH, ELEVATION = np.deg2rad(-68.0), np.deg2rad(20.0)
-"""View direction: x points right, z points up; the faces y-min and z-max are visible."""
+VIEW = View(azimuth=-68.0, elevation=20.0)
+"""x points right, z points up; the faces y-min and z-max are visible."""
 
 CAPTION = (
     "Each panel shows a method's configuration with the smallest ē, on its test sample "
@@ -120,14 +120,6 @@ def _read(comparison: Comparison, entry: Entry) -> WorstSample | None:
     return WorstSample(entry, prediction, reference, forces, *figures)
 
 
-def _project(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotate points into screen coordinates (n, 2), m, and nearness to the viewer (n,), m."""
-    ca, sa, ce, se = np.cos(AZIMUTH), np.sin(AZIMUTH), np.cos(ELEVATION), np.sin(ELEVATION)
-    towards = np.array([ce * ca, ce * sa, se])
-    right = np.array([-sa, ca, 0.0])
-    return points @ np.stack([right, np.cross(towards, right)]).T, points @ towards
-
-
 def _limits(
     mesh: Mesh, samples: list[WorstSample], arrows: list[NDArray[np.float64] | None]
 ) -> NDArray[np.float64]:
@@ -143,7 +135,7 @@ def _limits(
         shapes.append(
             (mesh.points + np.clip(sample.prediction, -0.5 * span, 0.5 * span))[predicted]
         )
-    screen = np.concatenate([_project(shape)[0] for shape in shapes])
+    screen = np.concatenate([VIEW.project(shape)[0] for shape in shapes])
     margin = 0.06 * float(np.ptp(screen[:, 0]))
     return np.array([screen.min(axis=0) - margin, screen.max(axis=0) + margin])
 
@@ -163,7 +155,7 @@ def _arrow(mesh: Mesh, sample: WorstSample) -> NDArray[np.float64] | None:
     loaded = mesh.boundary_facets[
         np.isin(mesh.boundary_facets, np.flatnonzero(size > 0)).any(axis=1)
     ]
-    pushes = _normals(points, loaded).sum(axis=0) @ total < 0
+    pushes = normals(points, loaded).sum(axis=0) @ total < 0
     return np.stack([place - arrow, place] if pushes else [place, place + arrow])
 
 
@@ -171,63 +163,23 @@ def _draw_sample(
     axes: Axes, mesh: Mesh, sample: WorstSample, arrow: NDArray[np.float64] | None
 ) -> None:
     facets = mesh.boundary_facets
-    _draw_edges(axes, mesh.points, facets, {"colors": REST, "linewidths": 0.5, "zorder": 1})
-    _draw_surface(axes, mesh.points + sample.reference, facets)
+    VIEW.draw_edges(axes, mesh.points, facets, {"colors": REST, "linewidths": 0.5, "zorder": 1})
+    VIEW.draw_surface(axes, mesh.points + sample.reference, facets, (REFERENCE, REFERENCE_EDGE))
     predicted = np.asarray(np.isfinite(sample.prediction).all(axis=1))
     figures = "no prediction: the method failed on it"
     if predicted.any():
         points = mesh.points + sample.prediction
         whole = facets[predicted[facets].all(axis=1)]
         look = {"colors": PREDICTION, "linewidths": 0.9, "zorder": 4}
-        _draw_edges(axes, points, whole[_facing(points, whole)], look)
+        VIEW.draw_edges(axes, points, whole[VIEW.facing(points, whole)], look)
         figures = f"e = {metres(sample.error_m)} m, relative L2 = {percent(sample.relative_l2)} %"
         if sample.entry.n_failed:
             figures += f"; {sample.entry.n_failed} failed"
     if arrow is not None:
-        start, end = _project(arrow)[0]
+        start, end = VIEW.project(arrow)[0]
         _draw_force(axes, start, end, float(np.linalg.norm(sample.forces.sum(axis=0))))
     name = shortened(f"{sample.entry.method}  {short_swept(sample.entry.swept)}".rstrip(), 44)
     axes.set_title(plain(f"{name}\n{figures}"), fontsize=9.5, loc="left", color=INK)
-
-
-def _draw_edges(
-    axes: Axes, points: NDArray[np.float64], facets: NDArray[np.int64], look: dict[str, Any]
-) -> None:
-    pairs = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
-    edges = np.unique(np.sort(pairs, axis=1), axis=0)
-    axes.add_collection(LineCollection(list(_project(points)[0][edges]), **look))
-
-
-def _normals(points: NDArray[np.float64], facets: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Outward normals (n_facets, 3); their length is twice the facet's area."""
-    corners = points[facets]
-    return np.asarray(np.cross(corners[:, 2] - corners[:, 0], corners[:, -1] - corners[:, 1]))
-
-
-def _facing(points: NDArray[np.float64], facets: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mark the facets with a visible outer side."""
-    return np.asarray(_project(_normals(points, facets))[1] > 0)
-
-
-def _draw_surface(axes: Axes, points: NDArray[np.float64], facets: NDArray[np.int64]) -> None:
-    """Draw visible facets from far to near; facets that face upwards are brighter."""
-    seen = facets[_facing(points, facets)]
-    screen, nearness = _project(points)
-    order = np.argsort(nearness[seen].mean(axis=1))
-    normals = _normals(points, seen)
-    up = normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), np.finfo(float).tiny)
-    base = np.array([int(REFERENCE[i : i + 2], 16) / 255 for i in (1, 3, 5)])
-    shade = 1.0 - 0.75 * (0.35 + 0.3 * np.clip(up, -1, 1))[:, None]
-    colours = 1.0 - (1.0 - base) * np.clip(shade, 0.3, 1.0)
-    axes.add_collection(
-        PolyCollection(
-            list(screen[seen[order]]),
-            facecolors=colours[order],
-            edgecolors=REFERENCE_EDGE,
-            linewidths=0.4,
-            zorder=3,
-        )
-    )
 
 
 def _draw_force(

@@ -119,7 +119,8 @@ class Comparison:
         """Read a dataset's arrays.
 
         `singular_values`, `points` (n_nodes, 3), `cells` (n_cells, 8), `test_regions` (n_test, k),
-        `validation_regions` (n_validation, k).
+        `validation_regions` (n_validation, k); `patch_centres` (n_patches, 3), m, of generated
+        samples.
         """
         return read_arrays(self._samples_path(name))
 

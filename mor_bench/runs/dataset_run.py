@@ -341,11 +341,13 @@ def record_dataset(comparison: Comparison, spec: AnyDatasetSpec, data: Dataset) 
     """Record the arrays of a dataset that figures need."""
     displacements = data.train.free_displacements
     few = min(displacements.shape) <= SINGULAR_VALUES * 5
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "singular_values": pod(displacements, None if few else SINGULAR_VALUES).singular_values,
         "points": data.scene.mesh.points,
         "cells": data.scene.mesh.cells,
         "test_regions": data.test.loads.patches,
         "validation_regions": data.validation.loads.patches,
     }
+    if isinstance(spec, DatasetSpec):
+        arrays["patch_centres"] = data.scene.patch_centres
     comparison.add_dataset(spec.name, spec.model_dump(mode="json"), arrays)
