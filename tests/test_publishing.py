@@ -58,10 +58,10 @@ def test_an_error_that_its_samples_do_not_give_is_found(stored: Path, tmp_path: 
     assert "linear-fem: rel_l2_median" in found
 
 
-@pytest.mark.parametrize("table", ["selected", "fastest", "configurations", "verdicts", "facts"])
+@pytest.mark.parametrize("table", ["selected", "verdict", "fastest", "configurations", "facts"])
 def test_a_table_that_was_edited_is_generated_again(stored: Path, table: str) -> None:
-    page = with_blocks(f"Text\n\n<!-- from: {stored} {table} -->\nold\n<!-- end -->\n\nMore\n")
-    assert "old" not in page
+    page = with_blocks(f"Text\n\n<!-- from: {stored} {table} -->\nstale\n<!-- end -->\n\nMore\n")
+    assert "stale" not in page
     assert page.endswith("<!-- end -->\n\nMore\n")
     assert with_blocks(page) == page
     first = page.index("-->\n") + 4

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -170,6 +170,24 @@ def _shown(value: Any) -> str:
     return number(value) if isinstance(value, float) else DASH if value is None else str(value)
 
 
+def leaves(source: str, key: str = "") -> str:
+    """Show every number and text of a nested file, with its key."""
+    content = content_of(source)
+    found = _leaves(look_up(content, key) if key else content)
+    return markdown(["", "value"], [[" · ".join(path), value] for path, value in found])
+
+
+def _leaves(content: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield from _leaves(value, (*path, key.replace("_", " ")))
+    elif isinstance(content, list):
+        for i, value in enumerate(content, 1):
+            yield from _leaves(value, (*path, str(i)))
+    else:
+        yield path, _shown(content)
+
+
 def refinement(source: str) -> str:
     """Show the discretisation error of every mesh; SOURCE is the folder of the datasets."""
     body = []
@@ -265,6 +283,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "network-latency": network_latency,
     "umesh-choices": umesh_choices,
     "records": records,
+    "leaves": leaves,
     "refinement": refinement,
     "hard-cases": hard_cases,
     "hard-loads": hard_loads,

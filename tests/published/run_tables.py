@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from math import inf, isfinite
+from math import inf, isfinite, isnan
 from typing import Any
 
-from mor_bench.analysis.frontier import median_error, median_latency_ms
+from mor_bench.analysis.frontier import median_error, median_latency_ms, selecting_error
+from mor_bench.analysis.told import class_text, is_observed
 from mor_bench.report.entries import entries_of
 from mor_bench.report.number_format import DASH, number, percent, short_swept
 from mor_bench.report.paper_tables import against_the_paper
@@ -26,6 +27,12 @@ def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def _metres(value: float) -> str:
     return f"{value:.1e}" if isfinite(value) else "∞"
+
+
+def _mean_error(error: ErrorSummary) -> str:
+    """Return e over all degrees of freedom, and over the free ones in brackets if it is known."""
+    free = error.mean_free_dof_m
+    return _metres(error.mean_dof_m) + ("" if isnan(free) else f" ({_metres(free)})")
 
 
 def _percent(value: float) -> str:
@@ -49,17 +56,9 @@ def _by_method(rows: Iterable[Row]) -> dict[str, list[Row]]:
     return found
 
 
-def validated(row: Row) -> ErrorSummary:
-    """Return the errors that decide between configurations: on validation samples if there are any.
-
-    Methods without training have no validation samples; their test errors decide.
-    """
-    return row.validation or row.error or ErrorSummary()
-
-
 def chosen(rows: Sequence[Row]) -> Row:
     """Return the configuration that the validation samples select: the smallest median error."""
-    return min(rows, key=lambda row: (validated(row).rel_l2_median, row.label))
+    return min(rows, key=lambda row: (selecting_error(row), row.label))
 
 
 def _configuration(row: Row) -> str:
@@ -84,6 +83,16 @@ def _with_interval(value: float, ends: tuple[float | None, float | None], scale:
 
 def _error(run: Comparison, row: Row) -> str:
     return _with_interval(median_error(row), _figure(run, row, "rel_l2_median"), 100.0)
+
+
+ERRORS_SHOWN = ("e (free dofs), m", "median %", "p95 %", "max %")
+
+
+def _errors(run: Comparison, row: Row) -> list[str]:
+    """Return the cells of `ERRORS_SHOWN`."""
+    error = row.error or ErrorSummary()
+    ends = (_percent(error.rel_l2_p95), _percent(error.rel_l2_max))
+    return [_mean_error(error), _error(run, row), *ends]
 
 
 def _latency(run: Comparison, row: Row) -> str:
@@ -113,7 +122,7 @@ def sufficient(rows: Sequence[Row], need: float) -> Row:
 
     If there is none, return the most accurate one.
     """
-    within = [row for row in rows if validated(row).rel_l2_median <= need]
+    within = [row for row in rows if selecting_error(row) <= need]
     return min(within, key=median_latency_ms) if within else chosen(rows)
 
 
@@ -130,41 +139,42 @@ def selected(source: str, dataset: str = "", methods: str = "", by: str = "need"
         sufficient(own, need) if by == "need" else chosen(own)
         for own in _by_method(_rows(run, dataset, methods)).values()
     ]
-    headings = ["method", "is given", "selected", "e, m", "median %", "p95 %", "max %", "ms"]
+    headings = ["method", "is given", "selected", *ERRORS_SHOWN, "fresh test: median %", "ms"]
     headings += ["data + fit, core-s", f"break-even at {100 * need:g} %, queries"]
     return markdown(
         headings,
         [
             [
                 f"`{row.method}`",
-                row.told or DASH,
+                class_text(row, is_observed(run, name)),
                 _configuration(row),
-                _metres(row.error.mean_dof_m),
-                _error(run, row),
-                _percent(row.error.rel_l2_p95),
-                _percent(row.error.rel_l2_max),
+                *_errors(run, row),
+                _percent(row.hidden.rel_l2_median) if row.hidden else DASH,
                 _latency(run, row),
                 _offline(row),
                 _queries(run, row, need),
             ]
             for row in rows
-            if row.error
         ],
     )
 
 
 def fastest(source: str, dataset: str = "", methods: str = "") -> str:
-    """Show the latency of the fastest configuration below each error, method by method."""
+    """Show the latency of the fastest configuration below each error, method by method.
+
+    The errors on the validation samples decide. A dagger marks a larger error on the test samples.
+    """
     run = run_of(source)
     headings = ["method", *(f"≤ {number(100 * level)} %" for level in LEVELS)]
     body = []
     for method, rows in _by_method(_rows(run, dataset, methods)).items():
         cells = [f"`{method}`"]
         for level in LEVELS:
-            within = [row for row in rows if median_error(row) <= level]
+            within = [row for row in rows if selecting_error(row) <= level]
             best = min(within, key=median_latency_ms, default=None)
-            cells.append(DASH if best is None else _latency(run, best))
-        least = min(rows, key=median_error)
+            missed = best is not None and median_error(best) > level
+            cells.append((DASH if best is None else _latency(run, best)) + " †" * missed)
+        least = chosen(rows)
         largest = least.error.rel_l2_max if least.error else inf
         cells.append(f"{_error(run, least)}; {_percent(largest)}")
         body.append(cells)
@@ -174,23 +184,23 @@ def fastest(source: str, dataset: str = "", methods: str = "") -> str:
 def configurations(source: str, dataset: str = "", methods: str = "") -> str:
     """Show every configuration: errors, latency, offline cost."""
     run = run_of(source)
-    headings = ["configuration", "e, m", "median %", "p95 %", "max %", "ms", "data + fit, core-s"]
     return markdown(
-        headings,
+        ["configuration", *ERRORS_SHOWN, "ms", "data + fit, core-s"],
         [
-            [
-                row.label.replace("|", "/"),
-                _metres(row.error.mean_dof_m),
-                _error(run, row),
-                _percent(row.error.rel_l2_p95),
-                _percent(row.error.rel_l2_max),
-                _latency(run, row),
-                _offline(row),
-            ]
+            [row.label.replace("|", "/"), *_errors(run, row), _latency(run, row), _offline(row)]
             for row in _rows(run, dataset, methods)
-            if row.error
         ],
     )
+
+
+def verdict(source: str, dataset: str = "") -> str:
+    """State the verdict on a dataset in the words of the report."""
+    run = run_of(source)
+    name = dataset or next(iter(run.datasets))
+    (found,) = [v for v in (run.analysis or {})["verdicts"] if v["dataset"] == name]
+    beside = [line for line in found["beside"] if not line.startswith("Evidence:")]
+    beside = [line.partition(" Time again:")[0] for line in beside]
+    return "\n".join([found["headline"], *(f"- {line}" for line in beside)])
 
 
 def verdicts(source: str, dataset: str = "", target: str = "0.01", methods: str = "") -> str:
@@ -220,10 +230,10 @@ def splits(source: str, dataset: str = "", methods: str = "") -> str:
     for run in runs:
         rows = _rows(run, dataset, methods)
         columns.append({m: chosen(own) for m, own in _by_method(rows).items()})
-        headings.append(f"split by {rows[0].split}: selected; e, m; median %; max %")
+        headings.append(f"split by {rows[0].split}: selected; e (free dofs), m; median %; max %")
     body = []
     for method, first in columns[0].items():
-        cells = [f"`{method}`", first.told or DASH]
+        cells = [f"`{method}`", class_text(first)]
         for run, column in zip(runs, columns, strict=True):
             row = column.get(method)
             if row is None or row.error is None:
@@ -231,7 +241,7 @@ def splits(source: str, dataset: str = "", methods: str = "") -> str:
                 continue
             error = row.error
             cells.append(
-                f"{_configuration(row)}; {_metres(error.mean_dof_m)}; {_error(run, row)}; "
+                f"{_configuration(row)}; {_mean_error(error)}; {_error(run, row)}; "
                 f"{_percent(error.rel_l2_max)}"
             )
         body.append([*cells, _latency(runs[0], first)])
@@ -290,8 +300,9 @@ def paper(source: str, methods: str = "") -> str:
     for folder in source.split(","):
         run = run_of(folder)
         name = next(iter(run.datasets))
-        wanted = methods.split(",") if methods else [row.method for row in run.rows]
-        entries = [e for e in entries_of(run, name) if e.method in wanted]
+        entries = [
+            e for e in entries_of(run, name) if not methods or e.method in methods.split(",")
+        ]
         table = against_the_paper(name, entries)
         if table is None:
             raise EvidenceError(f"{folder}: {name} is no scene of the paper, or nothing ran.")
@@ -348,6 +359,7 @@ RUN_TABLES: dict[str, Callable[..., str]] = {
     "selected": selected,
     "fastest": fastest,
     "configurations": configurations,
+    "verdict": verdict,
     "verdicts": verdicts,
     "splits": splits,
     "seeds": seeds,
