@@ -84,7 +84,7 @@ def record(name: str, allow_changes: bool = False) -> None:
         raise EvidenceError("The code has uncommitted changes; commit them first.")
     path, key = record_of(name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    machine = describe_machine()
+    machine, commit = describe_machine(), _git("rev-parse", "HEAD")
     begun, date = perf_counter(), datetime.now(UTC)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / ("out" + (REPORTS / name).suffix)
@@ -98,7 +98,7 @@ def record(name: str, allow_changes: bool = False) -> None:
     known = content_of(path.relative_to(ROOT).as_posix()) if path.is_file() else {}
     facts = {
         "command": command,
-        "commit": _git("rev-parse", "HEAD"),
+        "commit": commit,
         "date": f"{date:%Y-%m-%d %H:%M} UTC",
         "seconds": round(seconds, 1),
         "machine": f"{machine['processor']}, {machine['cores']} cores, "
