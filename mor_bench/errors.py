@@ -11,6 +11,15 @@ class MorBenchError(Exception):
     """Base class of the errors of mor-bench."""
 
 
+def printable(text: str, most: int = 2000) -> str:
+    """Return a text that is safe to print: control characters escaped, and not endless."""
+    shown = text if len(text) <= most else f"{text[:most]}…"
+    return "".join(
+        letter if letter.isprintable() or letter in "\n\t" else ascii(letter)[1:-1]
+        for letter in shown
+    )
+
+
 class SpecError(MorBenchError, ValueError):
     """A dataset, method or hyperparameter is not valid.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
@@ -10,12 +9,19 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mor_bench.checked_files import parse_json
 from mor_bench.errors import MorBenchError, NotFittedError, StoreError, UnsupportedSceneError
 from mor_bench.model_file import StoredModel, class_path, read_model
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.load_range import LoadRange
-from mor_bench.specs import check_parameters, list_suite, load_class, load_method_spec
+from mor_bench.specs import (
+    check_parameters,
+    list_suite,
+    load_class,
+    load_method_spec,
+    load_recorded_spec,
+)
 from mor_bench.surrogate import Surrogate
 
 
@@ -144,8 +150,8 @@ def _fitted(
 ) -> Surrogate:
     """Make the method from a file's content. Without a scene, build the scene in its header."""
     try:
-        method = make_surrogate(surrogate, json.loads(model.parameters))
-        scene = scene or load_scene(json.loads(model.scene))
+        method = make_surrogate(surrogate, parse_json(model.parameters, "parameters"))
+        scene = scene or load_scene(load_recorded_spec(parse_json(model.scene, "scene"), "scene"))
         method.restore(scene, model.arrays, model.sizes)
         method.timings_ms_.update(model.timings_ms)
         if model.load_range:

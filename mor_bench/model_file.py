@@ -11,6 +11,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.array_files import check_safetensors
+from mor_bench.checked_files import parse_json
 from mor_bench.digests import digest_of_arrays
 from mor_bench.errors import InvalidInputError, MorBenchError, StoreError
 from mor_bench.snapshots.store import write_atomically
@@ -121,6 +123,10 @@ def read_header_and_arrays(path: str | Path) -> tuple[dict[str, str], Arrays]:
     from safetensors import SafetensorError, safe_open
 
     try:
+        check_safetensors(Path(path))
+    except FileNotFoundError:
+        raise StoreError(f"{path}: no such file.") from None
+    try:
         with safe_open(str(path), framework="numpy") as file:
             header = file.metadata() or {}
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
@@ -181,7 +187,7 @@ def weights_to_start_from(path: str | Path, method: Startable) -> Arrays:
             f"got one of {header.get('surrogate')!r}."
         )
     try:
-        saved = check_parameters(surrogate, json.loads(header["parameters"]))
+        saved = check_parameters(surrogate, parse_json(header["parameters"], "parameters"))
     except (MorBenchError, KeyError, ValueError, TypeError, RecursionError) as error:
         raise StoreError(
             f"{path}: its parameters do not match the class {surrogate.__qualname__}: {error}"

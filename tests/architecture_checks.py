@@ -18,7 +18,7 @@ from pathlib import Path
 Tree = dict[str, str]
 
 FLOORS = (
-    ("errors", "counting", "digests", "machine", "version"),
+    ("errors", "counting", "digests", "machine", "version", "checked_files", "array_files"),
     ("specs", "options"),
     ("scene",),
     ("mechanics",),

@@ -81,10 +81,14 @@ geometry.cells = - -> key `geometry.cells` is missing.
 geometry.cells = [6, 2] -> key `geometry.cells[2]` is missing.
 geometry.cells = [6, 2, 0] -> `geometry.cells[2]` must be greater than or equal to 1; got 0.
 geometry.cells = [6, 2, 2.5] -> `geometry.cells[2]` must be a valid integer; got 2.5.
-geometry.cells = [2000000, 2000, 2000] -> there must be at most 10,000,000 cells in all
+geometry.cells = [2000000, 2000, 2000] -> there must be at most 1,000,000 cells in all
 geometry.size_m = [1.0, -1.0, 1.0] -> `geometry.size_m[1]` must be greater than 0; got -1.0.
 geometry = { shape = "file", file = 3 } -> `geometry.file`: it must be the path of a file; got 3.
 geometry = { shape = "file", file = "none.vtu" } -> `geometry.file`: … no such file
+grid_nodes = [1000, 1000, 1000] -> there must be at most 1,000,000 nodes in all
+geometry.size_m = [1e200, 1.0, 1.0] -> `geometry.size_m[0]`: it must be in [1e-09, 1e+09] m
+name = "../../x" -> `name` must consist of lower-case letters, digits and hyphens; got '../../x'.
+title = "\\u001b[31m" -> `title`: it must not hold control characters
 extra = 1 -> unknown key `extra`
 supports.0.regoin = "x-min" -> unknown key `supports[0].regoin`; did you mean 'region'?
 supports.0.region = "x-mim" -> `supports[0].region` must be 'x-min', … got 'x-mim'.
@@ -102,6 +106,9 @@ material.poisson = "0.4" -> `material.poisson` must be a valid number; got '0.4'
 material.young_pa = 0.0 -> `material.young_pa` must be greater than 0; got 0.0.
 material.young_pa = nan -> `material.young_pa` must be
 material.young_pa = inf -> `material.young_pa` must be a finite number; got inf.
+material.young_pa = 1e308 -> `material.young_pa`: it must be in [1e-06, 1e+15] Pa, the range in
+material.young_pa = 5e-324 -> `material.young_pa`: it must be in [1e-06, 1e+15] Pa, the range in
+material.poisson = 0.4999999999 -> `material.poisson`: it must be in [-0.999999, 0.499999], the
 material = { law = "mooney-rivlin", c10_pa = 1.0, c01_pa = 0.1 } -> `material.bulk_pa` is missing
 material = { law = "mooney-rivlin", c10_pa = -1.0, c01_pa = 0.1, bulk_pa = 9.0 } -> than 0; got -1
 material = { law = "ogden", mu_pa = [1.0], alpha = [2.0, 3.0], bulk_pa = 9.0 } -> equal lengths
@@ -117,6 +124,7 @@ loads.patch_area_m2 = 0.0 -> `loads.patch_area_m2` must be greater than 0; got 0
 loads.magnitude_n = [2.0, 1.0] -> `loads.magnitude_n`: the lower bound must not exceed the upper
 loads.magnitude_n = [-1.0, 1.0] -> `loads.magnitude_n[0]` must be greater than or equal to 0
 loads.magnitude_n = [0.0, 1e-300] -> `loads.magnitude_n[1]` must be greater than or equal to 0.0
+loads.samples_per_patch = 1000000000000000000 -> must be less than or equal to 10000000
 loads.samples_per_patch = 0 -> `loads.samples_per_patch` must be greater than or equal to 1
 loads.seed = -1 -> `loads.seed` must be greater than or equal to 0; got -1.
 loads.kind = "moment" -> `loads.kind` must be 'force', 'normal' or 'tangential'; got 'moment'.

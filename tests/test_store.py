@@ -316,8 +316,8 @@ def test_the_manifest_alone_is_enough_to_generate_the_same_again(
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda content: content[:-20], "not a manifest"),
-        (lambda content: b"", "not a manifest"),
+        (lambda content: content[:-20], "not valid JSON"),
+        (lambda content: b"", "not valid JSON"),
         (lambda content: b"[1]", "not a manifest"),
         (lambda content: content.replace(b"500.0", b"600.0"), "checksum"),
         (lambda content: of_schema(content, 1), "version 1.*generate the dataset again"),

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import typer
 
-from mor_bench.errors import MorBenchError
+from mor_bench.errors import MorBenchError, printable
 
 STOPPED = (
     "stopped; finished samples and rows are kept. "
@@ -24,11 +24,12 @@ def clear_errors() -> Iterator[None]:
     except MorBenchError as error:
         _exit(str(error), "red", 2)
     except OSError as error:
-        _exit(f"{error.filename or ''}: {error.strerror or error}", "red", 2)
+        place = f"{error.filename}: " if error.filename else ""
+        _exit(f"{place}{error.strerror or error}", "red", 2)
     except KeyboardInterrupt:
         _exit(STOPPED, "yellow", 130)
 
 
 def _exit(message: str, colour: str, code: int) -> None:
-    typer.secho(f"mor-bench: {message}", fg=colour, err=True)
+    typer.secho(f"mor-bench: {printable(message)}", fg=colour, err=True)
     raise typer.Exit(code) from None

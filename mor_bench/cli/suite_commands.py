@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from mor_bench.errors import MissingDependencyError, MorBenchError
+from mor_bench.errors import MissingDependencyError, MorBenchError, printable
 from mor_bench.specs import list_suite, load_dataset_spec, load_method_spec
 
 app = typer.Typer(rich_markup_mode=None)
@@ -73,6 +73,6 @@ def check(
             problems += 1
             message = str(error)
             line = message if message.startswith(str(path)) else f"{path}: {message}"
-            typer.secho(line, fg="red", err=True)
+            typer.secho(printable(line), fg="red", err=True)
     if problems:
         raise typer.Exit(2)

@@ -9,12 +9,12 @@ import os
 import platform
 import re
 import subprocess
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mor_bench.checked_files import read_json, read_toml
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.machine import describe_machine
 from mor_bench.snapshots.store import write_atomically
@@ -76,11 +76,11 @@ def read_file(path: Path, kind: str) -> dict[str, Any] | None:
         If the file is not asv's, or has another version.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         version = content.pop("version")
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise StoreError(f"{path}: not an asv file: {error!r}") from None
     if version != VERSION[kind]:
         raise StoreError(
@@ -152,8 +152,8 @@ def commit_and_date(commit: str | None) -> tuple[str, int]:
     """
     top = _git("rev-parse", "--show-toplevel")
     project = Path(top) / "pyproject.toml" if top else None
-    text = project.read_text(encoding="utf-8") if project and project.is_file() else ""
-    if tomllib.loads(text).get("project", {}).get("name") != "mor-bench":
+    content = read_toml(project) if project and project.is_file() else {}
+    if content.get("project", {}).get("name") != "mor-bench":
         raise InvalidInputError(
             f"{Path().resolve()} is not in a git checkout of mor-bench; use the checkout "
             "with the commit that ran the comparison."

@@ -11,6 +11,8 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
+from mor_bench.array_files import check_safetensors
+from mor_bench.checked_files import parse_json
 from mor_bench.digests import digest_of_arrays
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.learning.training_loop import LOSS_INTERVAL, TrainingLoop
@@ -67,7 +69,9 @@ def resume(loop: TrainingLoop, path: Path, fingerprint: str) -> bool:
     """
     from safetensors import SafetensorError, safe_open
 
-    if not path.exists():
+    try:
+        check_safetensors(path)
+    except FileNotFoundError:
         return False
     try:
         with safe_open(str(path), framework="pt") as file:
@@ -85,8 +89,8 @@ def resume(loop: TrainingLoop, path: Path, fingerprint: str) -> bool:
     try:
         if header.pop("sha256") != fingerprint_of(header, tensors):
             raise ValueError("the checksum does not match")
-        _restore(loop, _Numbers.model_validate(json.loads(header["numbers"])), tensors)
-    except (KeyError, ValueError, TypeError, RuntimeError) as error:
+        _restore(loop, _Numbers.model_validate(parse_json(header["numbers"], "numbers")), tensors)
+    except (KeyError, ValueError, TypeError, RuntimeError, StoreError) as error:
         first = error.errors()[0] if isinstance(error, ValidationError) else None
         reason = f"`{'.'.join(map(str, first['loc']))}`: {first['msg']}" if first else error
         raise StoreError(

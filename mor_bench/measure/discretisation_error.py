@@ -19,6 +19,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from mor_bench.checked_files import read_json
 from mor_bench.errors import InvalidInputError, SolverError, SpecError, StoreError
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
@@ -352,13 +353,13 @@ def measured(
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        record: dict[str, Any] = read_json(path)
         sound = (record["format"], record["schema_version"]) == (FORMAT, SCHEMA_VERSION)
         sound = sound and isinstance(record["digest"], str)
         sound = sound and all(
             0 <= float(record[key]) < inf for key in ("error_m", "relative_l2_median")
         )
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, StoreError, ValueError, KeyError, TypeError):
         sound = False
     if not sound:
         raise StoreError(

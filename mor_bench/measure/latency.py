@@ -21,7 +21,8 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from mor_bench.errors import MorBenchError
+from mor_bench.array_files import read_npy
+from mor_bench.errors import MorBenchError, StoreError
 from mor_bench.machine import pinned_threads
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.measure.method_session import MethodSession
@@ -286,10 +287,10 @@ class _Turns:
             limits = {"floor_s": LEAST_TURN_S, "most_s": MOST_TURN_S}
             found = self._ask("time", out=out, n=n, threads=threads, **limits)
             try:
-                answers = np.load(out, allow_pickle=False)
+                answers = read_npy(out)
                 references = self.queries.references[found["checked"]]
                 errors = sample_errors(answers, references, self.queries.nodes).relative_l2
-            except (OSError, ValueError, IndexError, KeyError, TypeError) as error:
+            except (OSError, StoreError, ValueError, IndexError, KeyError, TypeError) as error:
                 raise MethodFailedError(f"the method's answers cannot be read: {error}") from None
         self.timing.checked += list(zip(found["checked"], errors.tolist(), strict=True))
         return found

@@ -8,16 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.snapshots.store import write_atomically
-
-
-def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Read named arrays from an HDF5 file."""
-    with h5py.File(path, "r") as file:
-        return {key: np.asarray(file[key][()]) for key in file}
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -19,8 +19,10 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from mor_bench.array_files import read_hdf5
+from mor_bench.checked_files import read_json
 from mor_bench.errors import StoreError
-from mor_bench.results.arrays import read_arrays, write_arrays
+from mor_bench.results.arrays import write_arrays
 from mor_bench.results.json_file import write_json
 from mor_bench.results.row import LearningPoint, ResultsFile, Row
 from mor_bench.snapshots.store import write_atomically
@@ -113,7 +115,7 @@ class Comparison:
         largest finite error.
         `loss_curve`, `validation_curve` (n_intervals,): losses, evenly spread over the training.
         """
-        return read_arrays(self.samples_path(row))
+        return read_hdf5(self.samples_path(row))
 
     def dataset_arrays(self, name: str) -> dict[str, NDArray[Any]]:
         """Read a dataset's arrays.
@@ -122,7 +124,7 @@ class Comparison:
         `validation_regions` (n_validation, k); `patch_centres` (n_patches, 3), m, of generated
         samples.
         """
-        return read_arrays(self._samples_path(name))
+        return read_hdf5(self._samples_path(name))
 
     def samples_path(self, row: Row) -> Path:
         """Return the file of a row's raw samples."""
@@ -163,7 +165,7 @@ class Comparison:
         """
         path = Path(out) / "results.json"
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = read_json(path)
             version = content["schema_version"]
             if version != SCHEMA_VERSION:
                 raise StoreError(

@@ -28,10 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from mor_bench.array_files import read_hdf5
+from mor_bench.checked_files import read_json
 from mor_bench.digests import digest_of_arrays
+from mor_bench.errors import StoreError
 from mor_bench.machine import describe_machine, gpu_name
 from mor_bench.measure.method_session import FitRequest, MethodSession
-from mor_bench.results.arrays import read_arrays, write_arrays
+from mor_bench.results.arrays import write_arrays
 from mor_bench.results.parts import TrainedElsewhere
 from mor_bench.runs.code_digest import code_digest
 from mor_bench.runs.configurations import Configuration
@@ -197,10 +200,10 @@ class CachedFit:
     def record(self) -> FitRecord | None:
         """The record of the fit; None if there is none or it is damaged."""
         try:
-            record = FitRecord.model_validate_json((self.folder / "fit.json").read_bytes())
+            record = FitRecord.model_validate(read_json(self.folder / "fit.json"))
             checksum = record.model_sha256
             damaged = checksum is not None and checksum != digest_of_file(self.model)
-        except (OSError, ValidationError):
+        except (OSError, StoreError, ValidationError):
             return None
         return None if damaged else record
 
@@ -225,8 +228,8 @@ class CachedFit:
 
     def arrays(self, name: str) -> dict[str, NDArray[Any]] | None:
         """Read stored arrays; None if there are none or they are damaged."""
-        with suppress(OSError, KeyError, RuntimeError):
-            arrays = read_arrays(self.folder / f"{name}.h5")
+        with suppress(OSError, KeyError, StoreError):
+            arrays = read_hdf5(self.folder / f"{name}.h5")
             if str(arrays.pop("digest").astype(str)) == digest_of_arrays(arrays):
                 return arrays
         return None
@@ -241,8 +244,8 @@ class CachedFit:
         record, taken = self.folder / "training.json", 0.0
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self.checkpoint.parent)
-        with suppress(OSError, ValueError, KeyError, TypeError):
-            kept, written = json.loads(record.read_bytes()), self.checkpoint.stat().st_mtime
+        with suppress(OSError, StoreError, ValueError, KeyError, TypeError):
+            kept, written = read_json(record), self.checkpoint.stat().st_mtime
             taken = float(kept["taken_s"]) + max(0.0, written - float(kept["began"]))
         write_atomically(record, json.dumps({"taken_s": taken, "began": time()}).encode())
         self.taken_s = taken

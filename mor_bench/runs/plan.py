@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -13,10 +12,14 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
+from pydantic import ValidationError
+
+from mor_bench.checked_files import read_json
+from mor_bench.errors import StoreError
 from mor_bench.measure.latency import PROTOCOLS
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.options import RunOptions
-from mor_bench.runs.cached_fit import CachedFit, RunEnvironment
+from mor_bench.runs.cached_fit import CachedFit, FitRecord, RunEnvironment
 from mor_bench.runs.configurations import (
     Configuration,
     checked_specs,
@@ -248,14 +251,14 @@ def _cached_labels(
         }
 
 
-def _earlier_fits(cache: Path, configuration: Configuration) -> list[dict[str, Any]]:
+def _earlier_fits(cache: Path, configuration: Configuration) -> list[FitRecord]:
     """Return records of earlier fits of a method, with the same parameters if there are any."""
     records = []
     for path in (cache / "fits").glob(f"{configuration.method.name}-*/fit.json"):
-        with suppress(OSError, ValueError):
-            records.append(json.loads(path.read_bytes()))
+        with suppress(OSError, StoreError, ValidationError):
+            records.append(FitRecord.model_validate(read_json(path)))
     wanted = configuration.parameters.items()
-    same = [record for record in records if record.get("parameters", {}).items() >= wanted]
+    same = [record for record in records if record.parameters.items() >= wanted]
     return same or records
 
 
@@ -273,10 +276,10 @@ def _fit_seconds(
         return training.fit_seconds
     times: list[float] = []
     for record in _earlier_fits(context.cache, configuration):
-        with suppress(KeyError, TypeError, ZeroDivisionError):
-            grows = record["needs_snapshots"] and not iterates
-            samples = n_train / record["n_train"] if grows else 1.0
-            times.append(record["fit_s"] * n_dofs / record["n_dofs"] * samples)
+        with suppress(ZeroDivisionError):
+            grows = record.needs_snapshots and not iterates
+            samples = n_train / record.n_train if grows else 1.0
+            times.append(record.fit_s * n_dofs / record.n_dofs * samples)
     if times:
         return median(times)
     shipped = configuration.method.fit_seconds(context.options.profile)

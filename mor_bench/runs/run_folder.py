@@ -43,6 +43,7 @@ def open_run(
                 "choose another folder or remove it."
             )
     else:
+        _check_no_foreign(folder)
         gpu = {"gpu": gpu_name()} if context.training.device == "cuda" else {}
         comparison = Comparison(folder, {**describe_machine(), **gpu}, settings=settings)
     comparison.methods |= {
@@ -53,6 +54,16 @@ def open_run(
     except OSError as error:
         raise InvalidInputError(f"`out`: {folder} cannot be written: {error.strerror}.") from None
     return comparison
+
+
+def _check_no_foreign(folder: Path) -> None:
+    """Raise `InvalidInputError` if a folder without a run has files that a run would overwrite."""
+    names = ("results.csv", "comparison.json", "report.html", "samples", "figures")
+    if found := [name for name in names if os.path.lexists(folder / name)]:
+        raise InvalidInputError(
+            f"`out`: {folder} is not the folder of a run, but has a {found[0]!r}, which would be "
+            "overwritten; choose another folder."
+        )
 
 
 def _default_folder(names: Sequence[str]) -> Path:

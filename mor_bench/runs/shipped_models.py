@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from mor_bench.checked_files import read_json
 from mor_bench.digests import digest_of_arrays
 from mor_bench.errors import StoreError
 from mor_bench.runs.cached_fit import LOAD_LIMIT_S, CachedFit, FitRecord, RunEnvironment
@@ -165,9 +166,10 @@ def shipped_models(folder: Path | None = None) -> dict[Path, ShippedModel]:
     found = {}
     for path in sorted(folder.glob("*.json")):
         try:
-            record = ShippedModel.model_validate_json(path.read_bytes())
+            record = ShippedModel.model_validate(read_json(path))
         except (OSError, ValidationError) as error:
-            raise StoreError(f"{path}: not a valid record of trained weights: {error}") from None
+            reason = " ".join(str(error).split())
+            raise StoreError(f"{path}: not a valid record of trained weights: {reason}") from None
         found[path.with_suffix(".safetensors")] = record
     return found
 

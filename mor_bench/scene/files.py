@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
@@ -11,11 +12,21 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.array_files import is_hdf5, open_hdf5
+from mor_bench.checked_files import check_file, limited_memory, read_bytes
 from mor_bench.errors import SpecError
 from mor_bench.scene.gmsh1 import is_gmsh1, read_gmsh1
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.point_sets import PointSets, check_abaqus, named_point_sets
-from mor_bench.scene.soundness import tidied
+from mor_bench.scene.soundness import FARTHEST_M, tidied
+
+_XDMF = rb"""(?i)Format\s*=\s*["'](?!XML)[^"']*["']|xi:include[^>]*"""
+_REFERENCES = {
+    ".xdmf": _XDMF,
+    ".xmf": _XDMF,
+    ".inp": rb"(?im)^\*INCLUDE[^\r\n]*",
+}
+"""What a file of each format holds where it refers to another file."""
 
 CELLS = ("hexahedron", "tetra")
 """Supported volume cells, by meshio's names."""
@@ -99,12 +110,15 @@ def read_triangles(path: Path, unit_m: float) -> NDArray[np.float64]:
     corners: NDArray[np.float64] = points[numbers]
     if not np.isfinite(corners).all():
         raise SpecError(f"{path}: positions must be finite.")
+    if np.abs(corners).max() > FARTHEST_M:
+        raise SpecError(f"{path}: positions must be in [-{FARTHEST_M:g}, {FARTHEST_M:g}] m.")
     return corners
 
 
 def _positions(raw: meshio.Mesh, unit_m: float) -> NDArray[np.float64]:
     points = np.asarray(raw.points, dtype=np.float64)
-    return (points if points.size else points.reshape(0, 3)) * unit_m
+    with np.errstate(over="ignore"):  # the range is checked later
+        return (points if points.size else points.reshape(0, 3)) * unit_m
 
 
 def read_with_meshio(path: Path) -> meshio.Mesh:
@@ -116,15 +130,43 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
         If the file is missing or unreadable, or its positions are not three-dimensional.
     """
     try:
+        check_file(path, error=SpecError)
         with path.open("rb") as file:
             head = file.read(64)
     except FileNotFoundError:
         raise SpecError(f"{path}: no such file.") from None
     except OSError as error:
         raise SpecError(f"{path}: cannot be read: {error.strerror}.") from None
+    _check_alone(path)
+    with limited_memory(path, SpecError):
+        raw = read_gmsh1(path) if is_gmsh1(head) else _read_by_suffix(path, head)
+    if raw.points.size and (raw.points.ndim != 2 or raw.points.shape[1] != 3):
+        shape = raw.points.shape
+        raise SpecError(
+            f"{path}: positions must have three coordinates; got an array of shape {shape}."
+        )
+    return raw
+
+
+def _check_alone(path: Path) -> None:
+    """Refuse a mesh that other files or links continue: a dataset's checksum covers one file."""
     suffix = path.suffix.lower()
-    if is_gmsh1(head):
-        return read_gmsh1(path)
+    if suffix in (".node", ".ele", ".xml", ".gz"):
+        raise SpecError(f"{path}: a mesh must be one file, not packed; convert it to .vtu or .msh.")
+    pattern = _REFERENCES.get(suffix)
+    if pattern and (found := re.search(pattern, read_bytes(path, error=SpecError))):
+        words = " ".join(found[0].decode(errors="replace").split())
+        raise SpecError(
+            f"{path}: refers to another file ({words[:80]!r}); a mesh must be one file. "
+            "Convert it to .vtu or .msh."
+        )
+    if is_hdf5(path):
+        with open_hdf5(path, SpecError):
+            pass
+
+
+def _read_by_suffix(path: Path, head: bytes) -> meshio.Mesh:
+    suffix = path.suffix.lower()
     if suffix == ".inp":
         check_abaqus(path)
     # Ansys and Gmsh both write .msh. With a given format, meshio's message explains the error in
@@ -134,16 +176,12 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
     try:
         with redirect_stdout(printed), redirect_stderr(printed), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            raw = meshio.read(path, file_format)
+            return meshio.read(path, file_format)
+    except MemoryError:
+        raise
     except (Exception, SystemExit) as error:
         text = printed.getvalue() if isinstance(error, SystemExit) else str(error)
         raise SpecError(f"{path}: {_reason(error, text, suffix)}.") from None
-    if raw.points.size and (raw.points.ndim != 2 or raw.points.shape[1] != 3):
-        shape = raw.points.shape
-        raise SpecError(
-            f"{path}: positions must have three coordinates; got an array of shape {shape}."
-        )
-    return raw
 
 
 def _reason(error: BaseException, text: str, suffix: str) -> str:

@@ -10,17 +10,16 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.array_files import open_hdf5, read_npz
 from mor_bench.errors import SpecError
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.soundness import check_numbers, in_grid, sound_cells
@@ -36,16 +35,6 @@ REQUIRED = ("points", "cells", "forces", "displacements")
 OPTIONAL = ("fixed_nodes", "regions", "test", "validation")
 _KINDS = {"cells": "iu", "fixed_nodes": "iu", "regions": "iu", "test": "biu", "validation": "biu"}
 _WORDS = {"iu": "integers", "biu": "booleans, or 0 and 1 as integers", "fiu": "real numbers"}
-_UNREADABLE = (
-    OSError,
-    ValueError,
-    EOFError,
-    TypeError,
-    KeyError,
-    AttributeError,
-    zipfile.BadZipFile,
-    UnpicklingError,
-)
 
 
 @dataclass(frozen=True)
@@ -86,30 +75,21 @@ def read_arrays(file: SourceFile) -> ImportedArrays:
     try:
         return _checked(_read(path))
     except SpecError as error:
-        raise SpecError(f"{path}: {error}") from None
+        named = str(error).startswith(f"{path}: ")
+        raise SpecError(str(error) if named else f"{path}: {error}") from None
 
 
 def _read(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a file. Pickled objects are refused."""
+    """Return the arrays of a file, see `mor_bench.array_files`."""
     suffix = path.suffix.lower()
-    try:
-        if suffix == ".npz":
-            with zipfile.ZipFile(
-                path
-            ):  # numpy also reads other files, but these hold no named arrays
-                pass
-            with np.load(path, allow_pickle=False) as content:
-                _check_names(content.files)
-                return {name: content[name] for name in content.files}
-        if suffix in (".h5", ".hdf5"):
-            with h5py.File(path, "r") as content:
-                _check_names(list(content))
-                return {name: _entry(content, name) for name in content}
-    except SpecError:
-        raise
-    except _UNREADABLE as error:
-        reason = " ".join(str(error).split())
-        raise SpecError(f"not a readable {suffix} file of arrays: {reason}") from None
+    if suffix == ".npz":
+        arrays = read_npz(path, SpecError)
+        _check_names(list(arrays))
+        return arrays
+    if suffix in (".h5", ".hdf5"):
+        with open_hdf5(path, SpecError) as content:
+            _check_names(list(content))
+            return {name: _entry(content, name) for name in content}
     raise SpecError(f"snapshots must be in an .npz, .h5 or .hdf5 file; got {suffix!r}.")
 
 

@@ -20,6 +20,12 @@ SAME_PLACE = 1e-9
 IN_GRID = 1e-6
 """Tolerance of grid points as a fraction of the diagonal; files have single precision."""
 
+MAX_LISTED = 1_000_000
+"""Largest number of coinciding pairs that are listed; n equal nodes have about n² pairs."""
+
+FARTHEST_M, SMALLEST_M = 1e9, 1e-9
+"""Largest coordinate and smallest size of a body, m, for which double precision suffices."""
+
 FLAT = 1e-12
 """det J / |J|³ below which a cell is flat: the round-off of an exact zero."""
 
@@ -90,6 +96,11 @@ def check_numbers(points: NDArray[np.float64], cells: NDArray[np.int64]) -> None
     if not np.isfinite(points).all():
         first = int(np.argwhere(~np.isfinite(points))[0, 0])
         raise SpecError(f"positions must be finite; point {first} (counted from 0) is not.")
+    if np.abs(points).max() > FARTHEST_M or np.ptp(points, axis=0).max() < SMALLEST_M:
+        raise SpecError(
+            f"positions must be in [-{FARTHEST_M:g}, {FARTHEST_M:g}] m and at least "
+            f"{SMALLEST_M:g} m apart; got {points.min():g} to {points.max():g} m."
+        )
     if cells.min() < 0 or cells.max() >= len(points):
         raise SpecError(
             f"cells must have nodes in [0, {len(points) - 1}]; got {cells.min()} to {cells.max()}."
@@ -106,8 +117,11 @@ def sound_cells(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArra
         two cells lie on the same side of a face; or some cells are not connected through faces.
     """
     near = SAME_PLACE * float(np.linalg.norm(np.ptp(points, axis=0)))
-    pairs = cKDTree(points).query_pairs(near, output_type="ndarray")
-    if len(pairs):
+    tree = cKDTree(points)
+    if (n_near := int(tree.count_neighbors(tree, near)) - len(points)) > MAX_LISTED:
+        raise SpecError(f"{n_near:,} pairs of nodes coincide; merge them.")
+    if n_near:
+        pairs = tree.query_pairs(near, output_type="ndarray")
         raise SpecError(
             f"{len(np.unique(pairs[:, 1]))} nodes coincide with others, as at "
             f"{points[pairs[:, 0].min()].tolist()} m; merge them."

@@ -9,13 +9,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
+from mor_bench.checked_files import read_bytes, read_json
 from mor_bench.errors import NewerSchemaError, StoreError
 from mor_bench.snapshots.store import SCHEMA_VERSION, check_version, write_atomically
-from mor_bench.specs import DatasetSpec, SourceFile
+from mor_bench.specs import RECORDED, DatasetSpec, SourceFile
 from mor_bench.version import __version__
 
 FORMAT = "mor-bench dataset"
@@ -60,6 +61,15 @@ class Manifest:
         return (json.dumps(checked, indent=1, sort_keys=True) + "\n").encode()
 
 
+class _Rest(BaseModel):
+    """The fields of a manifest beside its specification."""
+
+    generator_version: int
+    n_samples: Annotated[int, Field(ge=0)]
+    shard_size: Annotated[int, Field(ge=1)]
+    environments: list[dict[str, str]]
+
+
 def _digest(content: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -83,22 +93,21 @@ def read_manifest(folder: Path) -> Manifest:
     """
     path = folder / NAME
     try:
-        content = json.loads(path.read_bytes())
+        content = read_json(path)
         if content["format"] != FORMAT:
             raise StoreError(f"{path}: not the manifest of a dataset of mor-bench.")
         check_version(content["schema_version"], str(path))
         if content.pop("sha256") != _digest(content):
             raise StoreError(f"{path}: damaged: the checksum does not match.")
-        spec = DatasetSpec.model_validate_json(json.dumps(_with_kept(content["spec"], folder)))
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        spec = DatasetSpec.model_validate_json(
+            json.dumps(_with_kept(content["spec"], folder)), context=RECORDED
+        )
+        rest = _Rest.model_validate({name: content[name] for name in _Rest.model_fields})
+    except (ValueError, KeyError, TypeError) as error:
         reason = "damaged" if not isinstance(error, ValidationError) else "its `spec` is not valid"
         raise StoreError(f"{path}: not a manifest of mor-bench, or {reason}.") from None
     return Manifest(
-        spec,
-        content["generator_version"],
-        content["n_samples"],
-        content["shard_size"],
-        tuple(content["environments"]),
+        spec, rest.generator_version, rest.n_samples, rest.shard_size, tuple(rest.environments)
     )
 
 
@@ -107,7 +116,7 @@ def keep_sources(folder: Path, spec: DatasetSpec) -> None:
     for file in _sources(spec.model_dump(mode="json")):
         kept = _kept(folder, file)
         if not kept.is_file():
-            write_atomically(kept, SourceFile(**file).checked().read_bytes())
+            write_atomically(kept, read_bytes(SourceFile(**file).checked()))
 
 
 def _kept(folder: Path, file: dict[str, str]) -> Path:

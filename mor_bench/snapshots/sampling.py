@@ -29,10 +29,13 @@ from scipy.spatial.distance import cdist
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.scene import Scene
-from mor_bench.specs import Loads, Sampling
+from mor_bench.specs import MAX_COUNT, Loads, Sampling
 
 MAX_COMBINATIONS = 5_000_000
 """Largest number of listed combinations of patches. With three patches each, they need 120 MB."""
+
+MAX_PAIRED = 10_000
+"""Largest number of patches whose distances from each other are computed."""
 
 MAX_DRAWS = 1000
 """Tries per sample to draw patches that are far apart."""
@@ -71,11 +74,23 @@ class PatchLoads:
 
 
 def n_samples_of(scene: Scene, limit: int | None = None) -> int:
-    """Return the number of samples of a scene's plan, or the limit if that is less."""
+    """Return the number of samples of a scene's plan, or the limit if that is less.
+
+    Raises
+    ------
+    SpecError
+        If the plan has more than `MAX_COUNT` samples.
+    """
     loads = scene.generated.loads
     whole = loads.samples or 0
     if loads.samples_per_patch:
         whole = len(scene.patch_nodes) * loads.samples_per_patch
+    if whole > MAX_COUNT:
+        raise SpecError(
+            f"`samples_per_patch`: {len(scene.patch_nodes):,} patches with "
+            f"{loads.samples_per_patch:,} samples each are {whole:,} samples; at most "
+            f"{MAX_COUNT:,} are allowed."
+        )
     return whole if limit is None else min(limit, whole)
 
 
@@ -142,6 +157,11 @@ def far_apart(centres: bytes, k: int, distance: float) -> NDArray[np.int64] | No
         If there is no such set.
     """
     points = np.frombuffer(centres).reshape(-1, 3)
+    if k > 1 and len(points) > MAX_PAIRED:
+        raise SpecError(
+            f"with `simultaneous` > 1 there must be at most {MAX_PAIRED:,} patches; "
+            f"got {len(points):,}."
+        )
     # Allow for round-off in the distance.
     apart = cdist(points, points) >= distance * (1 - 1e-9)
     apart &= np.triu(np.ones_like(apart), 1)

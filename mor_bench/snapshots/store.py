@@ -24,6 +24,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.checked_files import parse_json, read_bytes
 from mor_bench.errors import NewerSchemaError, StoreError
 
 SCHEMA_VERSION = 3
@@ -155,22 +156,16 @@ def read_shard(path: Path) -> Shard:
     FileNotFoundError
         If it does not exist.
     """
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be read: {error.strerror}.") from None
-    return parse_shard(content, str(path))
+    return parse_shard(read_bytes(path), str(path))
 
 
 def parse_shard(content: bytes, where: str) -> Shard:
     """Return the shard in a file's content; messages of `StoreError` begin with ``where``."""
     head, body = content[:HEADER_BYTES], memoryview(content)[HEADER_BYTES:]
     try:
-        header = json.loads(head)
+        header = parse_json(head, where)
         format_, version = header["format"], header["schema_version"]
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (StoreError, KeyError, TypeError):
         raise StoreError(f"{where}: not a shard of mor-bench, or its header is damaged.") from None
     if format_ != FORMAT:
         raise StoreError(f"{where}: not a shard of mor-bench (format {format_!r}).")

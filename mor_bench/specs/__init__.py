@@ -7,6 +7,7 @@ the hyperparameters of a method against its class.
 Start reading with `dataset_spec.py` and `method_spec.py`; `spec_files.py` reads the files.
 """
 
+from mor_bench.specs.base import MAX_COUNT
 from mor_bench.specs.battery import Battery, Race
 from mor_bench.specs.dataset_spec import (
     NO_EQUATIONS,
@@ -40,18 +41,21 @@ from mor_bench.specs.region_spec import (
     Region,
     SphereRegion,
 )
-from mor_bench.specs.source_file import SourceFile
+from mor_bench.specs.source_file import RECORDED, SourceFile
 from mor_bench.specs.spec_files import (
     is_method_file,
     load_dataset_spec,
     load_generated_spec,
     load_method_spec,
+    load_recorded_spec,
 )
 from mor_bench.specs.suite_folder import find_suite, list_suite
 
 __all__ = [
+    "MAX_COUNT",
     "NO_EQUATIONS",
     "NO_FORCES",
+    "RECORDED",
     "AnyDatasetSpec",
     "Battery",
     "BoxGeometry",
@@ -88,4 +92,5 @@ __all__ = [
     "load_dataset_spec",
     "load_generated_spec",
     "load_method_spec",
+    "load_recorded_spec",
 ]

@@ -1,15 +1,46 @@
-"""The strict base of every specification, and the numbers that they share."""
+"""The strict base of every specification, and the numbers and words that they share."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+MAX_COUNT = 10_000_000
+"""Largest count that a file may ask for. Ten million samples take days to generate."""
+
+
+def in_range(low: float, high: float, unit: str) -> AfterValidator:
+    """Return a check of a number against the range in which double precision can answer."""
+
+    def check(value: float) -> float:
+        if not low <= value <= high:
+            raise ValueError(
+                f"it must be in [{low:.9g}, {high:.9g}]{unit and f' {unit}'}, "
+                "the range in which double precision suffices"
+            )
+        return value
+
+    return AfterValidator(check)
+
+
+def _printable(text: str) -> str:
+    if not all(letter.isprintable() or letter in "\n\t" for letter in text):
+        raise ValueError("it must not hold control characters")
+    return text
+
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
-Triple = Annotated[tuple[Finite, Finite, Finite], Field(strict=False)]
+Count = Annotated[int, Field(ge=1, le=MAX_COUNT)]
+Length = Annotated[Positive, in_range(1e-9, 1e9, "m")]
+Area = Annotated[Positive, in_range(1e-18, 1e18, "m²")]
+Modulus = Annotated[Positive, in_range(1e-6, 1e15, "Pa")]
+Coordinate = Annotated[Finite, in_range(-1e9, 1e9, "m")]
+Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
+Text = Annotated[str, Field(max_length=10_000), AfterValidator(_printable)]
+Name = Annotated[str, Field(pattern=r"^[a-z0-9-]+$", max_length=100)]
+"""A name that is safe in the names of folders."""
 
 
 class StrictModel(BaseModel):

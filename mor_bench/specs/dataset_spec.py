@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+from math import prod
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from mor_bench.errors import UnsupportedSceneError
-from mor_bench.specs.base import Positive, StrictModel
-from mor_bench.specs.geometry_spec import Geometry
+from mor_bench.specs.base import Name, Positive, StrictModel, Text
+from mor_bench.specs.geometry_spec import MAX_CELLS, Geometry
 from mor_bench.specs.loads_spec import ExtraTests, ImportedSplit, Loads, Split, Support
 from mor_bench.specs.material_spec import Discretisation, MaterialSpec, SolverName
 from mor_bench.specs.region_spec import Outputs, Region
@@ -20,6 +21,15 @@ NO_EQUATIONS = "its snapshots were imported, so its equations are not known"
 NO_FORCES = "its forces are not known, only the displacements of a part of its surface"
 
 Side = Annotated[int, Field(ge=2, le=1024)]
+
+
+def _few_enough(value: tuple[int, int, int]) -> tuple[int, int, int]:
+    if prod(value) > MAX_CELLS:
+        raise ValueError(f"there must be at most {MAX_CELLS:,} nodes in all")
+    return value
+
+
+GridNodes = Annotated[tuple[Side, Side, Side], Field(strict=False), AfterValidator(_few_enough)]
 
 
 class Needs(StrictModel):
@@ -67,11 +77,11 @@ class CommonDatasetSpec(StrictModel):
         stay the same.
     """
 
-    name: str
-    title: str
-    source: str
+    name: Name
+    title: Text
+    source: Text
     needs: Needs
-    grid_nodes: Annotated[tuple[Side, Side, Side], Field(strict=False)] | None = None
+    grid_nodes: GridNodes | None = None
     observed: Observed | None = Field(default=None, exclude_if=lambda value: value is None)
 
     def physics(self) -> dict[str, Any]:

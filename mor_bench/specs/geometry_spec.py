@@ -6,11 +6,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
 
-from mor_bench.specs.base import Count, Positive, StrictModel
+from mor_bench.specs.base import Count, Length, StrictModel
 from mor_bench.specs.source_file import File, SourceFile, read_source_file
 
-MAX_CELLS = 10_000_000
-"""Largest number of cells of a grid; a larger model does not fit into memory."""
+MAX_CELLS = 1_000_000
+"""Largest number of cells of a grid. A larger model takes minutes to build."""
 
 
 def _fits_in_memory(value: tuple[int, int, int]) -> tuple[int, int, int]:
@@ -20,7 +20,7 @@ def _fits_in_memory(value: tuple[int, int, int]) -> tuple[int, int, int]:
 
 
 Cells = Annotated[tuple[Count, Count, Count], Field(strict=False), AfterValidator(_fits_in_memory)]
-Size = Annotated[tuple[Positive, Positive, Positive], Field(strict=False)]
+Size = Annotated[tuple[Length, Length, Length], Field(strict=False)]
 
 
 class BoxGeometry(StrictModel):
@@ -67,7 +67,7 @@ class VoxelsGeometry(StrictModel):
     shape: Literal["voxels"]
     surface: Annotated[Literal["liver"] | SourceFile, BeforeValidator(_surface)]
     cells: Cells
-    unit_m: Positive = 1.0
+    unit_m: Length = 1.0
 
 
 class TetrahedraGeometry(StrictModel):
@@ -89,7 +89,7 @@ class FileGeometry(StrictModel):
 
     shape: Literal["file"]
     file: File
-    unit_m: Positive = 1.0
+    unit_m: Length = 1.0
 
 
 Geometry = Annotated[

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, model_validator
 
-from mor_bench.specs.base import Count, Positive, StrictModel
+from mor_bench.specs.base import Area, Count, Length, StrictModel
 from mor_bench.specs.region_spec import Region
 
 LoadKind = Literal["force", "normal", "tangential"]
@@ -70,15 +70,15 @@ class Loads(StrictModel):
 
     region: Region
     kind: LoadKind
-    patch_area_m2: Positive
+    patch_area_m2: Area
     n_patches: Count | None = None
     simultaneous: Annotated[int, Field(ge=1, le=8)] = 1
-    min_distance_m: Positive | None = None
+    min_distance_m: Length | None = None
     samples_per_patch: Count | None = None
     samples: Count | None = None
     magnitude_n: Magnitude
     sampling: Sampling = "random"
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**64)] = 0
 
     @model_validator(mode="after")
     def _consistent(self) -> Loads:

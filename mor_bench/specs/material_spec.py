@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from mor_bench.specs.base import Finite, Positive, StrictModel
+from mor_bench.specs.base import Finite, Modulus, StrictModel, in_range
 
 SolverName = Literal["auto", "rotated-pcg", "jacobi-pcg", "cholesky", "superlu", "pardiso"]
 """Methods of solving equilibria; see `mor_bench.mechanics.model`."""
@@ -35,26 +35,30 @@ class TwoLameMaterial(StrictModel):
     """Saint Venant-Kirchhoff or neo-Hookean, from Young's modulus and Poisson's ratio."""
 
     law: Literal["saint-venant-kirchhoff", "neo-hookean"]
-    young_pa: Positive
-    poisson: Annotated[float, Field(gt=-1, lt=0.5)]
+    young_pa: Modulus
+    poisson: Annotated[float, Field(gt=-1, lt=0.5), in_range(-0.999999, 0.499999, "")]
 
 
 class MooneyRivlinMaterial(StrictModel):
     """Mooney-Rivlin with a quadratic volumetric energy."""
 
     law: Literal["mooney-rivlin"]
-    c10_pa: Positive
-    c01_pa: Annotated[float, Field(ge=0, allow_inf_nan=False)]
-    bulk_pa: Positive
+    c10_pa: Modulus
+    c01_pa: Annotated[float, Field(ge=0, le=1e15)]
+    bulk_pa: Modulus
+
+
+_Shear = Annotated[Finite, in_range(-1e15, 1e15, "Pa")]
+_Exponent = Annotated[Finite, in_range(-100, 100, "")]
 
 
 class OgdenMaterial(StrictModel):
     """Ogden with a quadratic volumetric energy; every term needs mu_p alpha_p > 0."""
 
     law: Literal["ogden"]
-    mu_pa: Annotated[tuple[Finite, ...], Field(strict=False, min_length=1)]
-    alpha: Annotated[tuple[Finite, ...], Field(strict=False, min_length=1)]
-    bulk_pa: Positive
+    mu_pa: Annotated[tuple[_Shear, ...], Field(strict=False, min_length=1, max_length=20)]
+    alpha: Annotated[tuple[_Exponent, ...], Field(strict=False, min_length=1, max_length=20)]
+    bulk_pa: Modulus
 
     @model_validator(mode="after")
     def _stable_terms(self) -> OgdenMaterial:

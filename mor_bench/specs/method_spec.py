@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
+from math import prod
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from mor_bench.specs.base import Count, Positive, StrictModel
+from mor_bench.specs.base import Count, Positive, StrictModel, Text
 from mor_bench.specs.battery import Battery
 from mor_bench.specs.loads_spec import SplitBy
 from mor_bench.specs.parameters import check_parameters, load_class
@@ -21,6 +22,9 @@ The input is the forces; on scenes with observed displacements it is those.
 """
 
 _TOLD_BY_INPUT: dict[str, Told] = {"force": "input", "linear-response": "linear-response"}
+
+
+MAX_CONFIGURATIONS = 1000
 
 
 class Profile(StrictModel):
@@ -49,7 +53,7 @@ class Regime(StrictModel):
         so no comparison tests such a method in its regime.
     """
 
-    says: str
+    says: Text
     min_dofs: Count | None = None
     min_train: Count | None = None
     min_iterations: Count | None = None
@@ -79,13 +83,13 @@ class MethodSpec(StrictModel):
         Settings of shared tests and benchmarks.
     """
 
-    name: str
-    title: str
-    surrogate: str
-    source: str
+    name: Text
+    title: Text
+    surrogate: Text
+    source: Text
     told: Told | None = None
     reference: bool = False
-    limits: str = ""
+    limits: Text = ""
     regime: Regime | None = None
     folder: Path | None = None
     fit_s: Positive | None = None
@@ -108,6 +112,10 @@ class MethodSpec(StrictModel):
             for key, values in sweep.items():
                 if not values:
                     raise ValueError(f"the sweep of `{key}` is empty")
+            if (n := prod(map(len, sweep.values()))) > MAX_CONFIGURATIONS:
+                raise ValueError(
+                    f"a sweep must make at most {MAX_CONFIGURATIONS:,} configurations; got {n:,}"
+                )
         return self
 
     def load_class(self) -> type[Any]:

@@ -17,11 +17,14 @@ from mor_bench.specs.region_spec import REGIONS
 
 _M = TypeVar("_M", bound=BaseModel)
 
+MAX_SHOWN = 300
+"""Most characters of a wrong value that a message quotes."""
+
 _EXPECTED = "Input should be "
 
 
 def validated(
-    model: type[_M], content: Mapping[str, Any], where: str, folder: Path | None = None
+    model: type[_M], content: Mapping[str, Any], where: str, folder: Path | str | None = None
 ) -> _M:
     """Make a model of a table, or raise an error of one line.
 
@@ -31,8 +34,8 @@ def validated(
     content : mapping
     where : str
         Beginning of the message: the file or the class.
-    folder : Path, optional
-        Folder that relative paths of files start from.
+    folder : Path or str, optional
+        Folder that relative paths of files start from, or `RECORDED` for a stored specification.
 
     Raises
     ------
@@ -70,6 +73,9 @@ def _message(problems: Sequence[ErrorDetails], model: type[BaseModel]) -> str:
                 f"`{key}.{_discriminator(problem)}` must be {', '.join(others)} or {last}; "
                 f"got {problem['ctx']['tag']!r}."
             )
+        case "string_pattern_mismatch":
+            letters = "must consist of lower-case letters, digits and hyphens"
+            return f"`{key}` {letters}; got {_shown(problem)}."
         case _:
             return _bad_value(key, problem, problems, model)
 
@@ -101,9 +107,17 @@ def _bad_value(
         ]
         if len(expected) > 1:
             key, message = str(location[0]), " or ".join(expected)
-    given = "" if problem["type"] == "value_error" and not key else f"; got {problem['input']!r}"
+    given = "" if problem["type"] == "value_error" and not key else f"; got {_shown(problem)}"
     verb = " must be" if problem["msg"].startswith("Input should") else ":"
     return f"`{key}`{verb} {message}{given}."
+
+
+def _shown(problem: ErrorDetails) -> str:
+    try:
+        text = repr(problem["input"])
+    except ValueError:  # an integer of thousands of digits
+        return "a number of thousands of digits"
+    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"
 
 
 def _walk(

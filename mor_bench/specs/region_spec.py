@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Discriminator, Field, Tag
 
-from mor_bench.specs.base import Count, Positive, StrictModel, Triple
+from mor_bench.specs.base import Count, Length, StrictModel, Text, Triple
 from mor_bench.specs.source_file import File
 
 
@@ -20,7 +20,7 @@ class BoxRegion(StrictModel):
 class SphereRegion(StrictModel):
     """The nodes inside a sphere: centre and radius, m."""
 
-    sphere_m: Annotated[tuple[Triple, Positive], Field(strict=False)]
+    sphere_m: Annotated[tuple[Triple, Length], Field(strict=False)]
 
 
 class NearestRegion(StrictModel):
@@ -32,15 +32,15 @@ class NearestRegion(StrictModel):
 class PointSetRegion(StrictModel):
     """A named set of nodes of the mesh file."""
 
-    point_set: str
+    point_set: Text
 
 
 class NearSurfaceRegion(StrictModel):
     """The surface nodes near another surface, open or closed, of an STL or OBJ file."""
 
     near_surface: File
-    within_m: Positive
-    unit_m: Positive = 1.0
+    within_m: Length
+    unit_m: Length = 1.0
 
 
 NamedRegion = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max", "surface"]

@@ -8,8 +8,12 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ValidationInfo
 
+from mor_bench.checked_files import read_bytes
 from mor_bench.errors import SpecError
 from mor_bench.specs.base import StrictModel
+
+RECORDED = "recorded"
+"""Validation context of a specification in a stored file, where each file needs a checksum."""
 
 
 class SourceFile(StrictModel):
@@ -41,14 +45,9 @@ class SourceFile(StrictModel):
 
 def _sha256(path: Path) -> str:
     try:
-        # Reading from a device or pipe might never end.
-        if path.exists() and not path.is_file() and not path.is_dir():
-            raise SpecError(f"{path}: a device or pipe, not a file.")
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        return hashlib.sha256(read_bytes(path, error=SpecError)).hexdigest()
     except FileNotFoundError:
         raise SpecError(f"{path}: no such file.") from None
-    except OSError as error:
-        raise SpecError(f"{path}: cannot be read: {error.strerror}.") from None
 
 
 def read_source_file(value: Any, info: ValidationInfo) -> Any:
@@ -57,7 +56,12 @@ def read_source_file(value: Any, info: ValidationInfo) -> Any:
         return value
     if not isinstance(value, str):
         raise ValueError("it must be the path of a file")
-    path = (Path(info.context or ".") / value).resolve()
+    if info.context is RECORDED:
+        raise ValueError("it must be a table of `path` and `sha256`")
+    try:
+        path = (Path(info.context or ".") / value).resolve()
+    except (ValueError, OSError, RuntimeError) as error:  # a NUL, or a circle of links
+        raise ValueError(f"it cannot be a path: {error}") from None
     return {"path": str(path), "sha256": _sha256(path)}
 
 

@@ -15,6 +15,7 @@ from mor_bench.specs.dataset_spec import (
 )
 from mor_bench.specs.method_spec import MethodSpec
 from mor_bench.specs.one_line_errors import validated
+from mor_bench.specs.source_file import RECORDED
 from mor_bench.specs.suite_folder import find_file, read_toml
 
 
@@ -46,8 +47,21 @@ def load_dataset_spec(
     return _validated_dataset({**read_toml(path), "name": path.stem}, str(path), path.parent)
 
 
+def load_recorded_spec(content: Any, where: str) -> AnyDatasetSpec:
+    """Validate a dataset that a stored file holds. Each file that it names needs its checksum.
+
+    Raises
+    ------
+    SpecError
+        If it is not valid; the message begins with `where`.
+    """
+    if not isinstance(content, dict):
+        raise SpecError(f"{where}: a dataset must be a table; got {type(content).__name__}.")
+    return _validated_dataset(content, where, RECORDED)
+
+
 def _validated_dataset(
-    content: Mapping[str, Any], where: str, folder: Path | None = None
+    content: Mapping[str, Any], where: str, folder: Path | str | None = None
 ) -> AnyDatasetSpec:
     if "snapshots" in content:
         return validated(ImportedDatasetSpec, content, where, folder)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
+from mor_bench import checked_files
 from mor_bench.errors import SpecError
 from mor_bench.specs.one_line_errors import nearest_name
 
@@ -71,10 +71,6 @@ def read_toml(path: Path) -> dict[str, Any]:
         If the file cannot be read or is not valid TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return checked_files.read_toml(path, SpecError)
     except FileNotFoundError:
         raise SpecError(f"{path}: no such file.") from None
-    except OSError as error:
-        raise SpecError(f"{path}: cannot be read: {error.strerror}.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SpecError(f"{path}: not valid TOML: {error}") from None
