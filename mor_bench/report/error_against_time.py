@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from math import isfinite
+from textwrap import fill
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -157,7 +158,7 @@ def _draw_methods(
     """
     lines, handles = [], []
     for group, mine in by_group(shown).items():
-        handles.append(Line2D([], [], linestyle="none", label=plain(f"{group}:")))
+        handles.append(Line2D([], [], linestyle="none", label=fill(plain(f"{group}:"), 28)))
         series: dict[tuple[str, str], list[Entry]] = {}
         for entry in mine:
             others = short_swept(dict(list(entry.swept.items())[1:]))
