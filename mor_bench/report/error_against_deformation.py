@@ -26,7 +26,8 @@ from mor_bench.report.published_figures import SCENES, scene_of
 from mor_bench.results.comparison import Comparison
 
 CAPTION = (
-    "Each dot is a test sample. Each panel shows a method's configuration with the smallest ē. "
+    "Each dot is a test sample. Each panel shows a method's configuration "
+    "with the smallest ē, of the validation part if there is one. "
     "The line is the least-squares line through the origin. "
     "Its slope (m of error per m of deformation) compares methods at a glance. "
     "Every panel has its own vertical scale. "

@@ -35,7 +35,8 @@ VIEW = View(azimuth=-68.0, elevation=20.0)
 """x points right, z points up; the faces y-min and z-max are visible."""
 
 CAPTION = (
-    "Each panel shows a method's configuration with the smallest ē, on its test sample "
+    "Each panel shows a method's configuration with the smallest ē (of the "
+    "validation part if there is one), on its test sample "
     "with the largest e. A mean hides such samples. Samples without a prediction cannot "
     "be drawn; the title gives their number. Filled: the reference. Lines: the "
     "prediction. Grey: the body at rest. Deformations are not magnified, and all panels "
