@@ -19,7 +19,7 @@ from typer.testing import CliRunner, Result
 
 import mor_bench
 from mor_bench.analysis.analyse import analyse
-from mor_bench.analysis.draws import draws_of
+from mor_bench.analysis.draws import VALIDATION, draws_of
 from mor_bench.analysis.selection import decide
 from mor_bench.analysis.selection_text import retime_command
 from mor_bench.analysis.verdict import RULE, Requirements, Verdict, offline_rank, speed_rank
@@ -137,6 +137,22 @@ def test_validation_selects_and_the_test_set_confirms() -> None:
     assert "0.5 %: it meets the limit of 1 % there." in choose([honest], ASKED).headline
     without = honest.with_parts(validation=None)
     assert "selected on the test set: optimistic" in choose([without], ASKED).headline
+
+
+def test_the_upper_bound_of_the_validation_errors_qualifies(tmp_path: Path) -> None:
+    regions = np.repeat(np.arange(13), 20)
+    errors = 0.009 * np.exp(np.random.default_rng(0).normal(0, 0.3, 13))[regions]
+    made = Comparison(tmp_path, {})
+    made.add_dataset(
+        "d", {}, {"test_regions": regions[:, None], "validation_regions": regions[:, None]}
+    )
+    row = a_row(validation={"rel_l2_median": float(np.median(errors))})
+    made.put(row, {"relative_l2": np.full(260, 0.001), "validation_relative_l2": errors})
+    draws = draws_of(made, "d", 500, np.random.default_rng(0))
+    high = draws.intervals["a"][VALIDATION][1]
+    assert 1.05 < high / np.median(errors) < 2.0
+    for limit, qualified in ((0.999 * high, 0), (1.001 * high, 1)):
+        assert len(decide(made, "d", Requirements(limit), draws).qualified) == qualified
 
 
 def test_close_latencies_are_listed_as_undecided() -> None:
