@@ -213,5 +213,9 @@ def print_plan(plan: Plan, console: Console) -> None:
         table.add_row(step.dataset, Text(step.label), "in the cache" if step.done else estimate)
     console.print(table, highlight=False)
     unknown = f", and {plan.n_unknown} steps of unknown duration" if plan.n_unknown else ""
-    total = f"about {plan.seconds / 60:.1f} min, {plan.timing_s / 60:.1f} of them timing"
+    stages = {"compilation, once per machine": plan.compilation_s, "scores": plan.scoring_s}
+    stages |= {"timing": plan.timing_s, "report": plan.report_s}
+    parts = ", ".join(f"{name} {number(seconds)} s" for name, seconds in stages.items() if seconds)
+    console.print(Text(f"beside these steps: {parts}"))
+    total = f"about {plan.seconds / 60:.1f} min"
     console.print(Text(total + unknown, style="bold"))

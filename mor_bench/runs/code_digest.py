@@ -30,6 +30,9 @@ LIBRARIES = (
 LEARNING_ROOMS = ("mor_bench.surrogates.", "mor_bench.learning.", "mor_bench.scene.grid")
 """Beginnings of the names of modules that define a network, its inputs and its training."""
 
+NOT_LEARNING = (".onnx_model", ".onnx_graph", ".checkpoint")
+"""Ends of the names of modules in these rooms that do not change what is learned."""
+
 DATA_ONLY = frozenset(
     f"mor_bench.snapshots.{name}"
     for name in ("executors", "generate", "manifest", "solve", "store", "test_sets")
@@ -90,7 +93,7 @@ def learning_digest(surrogate: str) -> str:
     """
     digest = hashlib.sha256()
     for name, path in sorted(imported_sources(surrogate.partition(":")[0]).items()):
-        if name.startswith(LEARNING_ROOMS) and not name.endswith(("onnx_model", "onnx_graph")):
+        if name.startswith(LEARNING_ROOMS) and not name.endswith(NOT_LEARNING):
             digest.update(f"{name}\n{bare_code(path.read_text(encoding='utf-8'))}\n".encode())
     return digest.hexdigest()
 

@@ -4,30 +4,32 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import median
 from tempfile import TemporaryDirectory
-from time import perf_counter
 from typing import Any
 
-from pydantic import ValidationError
-
-from mor_bench.checked_files import read_json
-from mor_bench.errors import StoreError
-from mor_bench.measure.latency import PROTOCOLS
-from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.options import RunOptions
-from mor_bench.runs.cached_fit import CachedFit, FitRecord, RunEnvironment
+from mor_bench.runs.cached_fit import CachedFit, RunEnvironment
 from mor_bench.runs.configurations import (
     Configuration,
     checked_specs,
     configurations_of,
     draws_randomly,
 )
+from mor_bench.runs.durations import (
+    REPORT_S,
+    Pace,
+    compile_seconds,
+    fit_seconds,
+    query_seconds,
+    sample_seconds,
+    scoring_seconds,
+    timing_seconds,
+)
 from mor_bench.runs.extra_stages import LEARNING_STEP
 from mor_bench.runs.run_context import RunContext
+from mor_bench.runs.shipped_models import find_shipped
 from mor_bench.runs.training_data import TrainingData
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import load_dataset
@@ -37,26 +39,13 @@ from mor_bench.snapshots.generate import (
     n_samples_to_generate,
     shard_path,
 )
-from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import AnyDatasetSpec, DatasetSpec
 
 TRIAL_ITERATIONS = 100
 """Iterations after which a training that would take too long stops itself."""
 
-REFERENCE_DOFS, REFERENCE_TRAINING = 768, 5120
-"""Problem size for which method files state `fit_s`: beam-coarse, on two cores."""
-
-PROBED = 8
-"""Number of samples that are solved to measure the time per sample."""
-
 LEARNING_POINTS = 4
 """Typical number of points of a learning curve, beside that of all samples."""
-
-TURN_S = 0.1
-"""Typical time of a turn of timed queries, s."""
-
-START_S = 2.0
-"""Typical time to start the processes of a timing, s."""
 
 
 @dataclass(frozen=True)
@@ -80,15 +69,30 @@ class Step:
 
 @dataclass(frozen=True)
 class Plan:
-    """The steps of a run, and the seconds of timing everything."""
+    """The steps of a run, and the seconds of the stages that treat all steps.
+
+    Attributes
+    ----------
+    steps : list of Step
+    compilation_s : float
+        To compile kernels, once per machine.
+    scoring_s, timing_s : float
+        To score and to time all configurations.
+    report_s : float
+        To start, and to write tables, figures and report.
+    """
 
     steps: list[Step]
+    compilation_s: float
+    scoring_s: float
     timing_s: float
+    report_s: float
 
     @property
     def seconds(self) -> float:
         """Seconds of everything that is known and not done."""
-        return self.timing_s + sum(step.seconds or 0.0 for step in self.steps if not step.done)
+        stages = self.compilation_s + self.scoring_s + self.timing_s + self.report_s
+        return stages + sum(step.seconds or 0.0 for step in self.steps if not step.done)
 
     @property
     def n_unknown(self) -> int:
@@ -109,8 +113,8 @@ def plan(
     """Plan the steps of `mor_bench.run` for the same arguments, without taking them.
 
     The time of a fit follows from earlier fits of the method in the cache, or else from the
-    method's file. Both are scaled by the numbers of unknowns and of training samples. The time of
-    generating data follows from a few samples that are solved here.
+    method's file, scaled by this machine's speed. Both are scaled by the numbers of unknowns and of
+    training samples. The time of generating data follows from a few samples that are solved here.
 
     Raises
     ------
@@ -126,16 +130,33 @@ def plan(
             : context.budget.configurations
         ]
     ]
-    steps = [step for spec in specs for step in _steps(spec, configurations, context)]
-    protocol = PROTOCOLS[context.options.profile]
-    turns = protocol.processes * (protocol.rounds + 2) * len(configurations) * len(specs)
-    return Plan(steps, turns * TURN_S + protocol.processes * START_S * len(specs))
+    pace = Pace.measured()
+    steps: list[Step] = []
+    compilation_s = scoring_s = timing_s = 0.0
+    for spec in specs:
+        own = _steps(spec, configurations, context, pace)
+        n_dofs, n_train = _problem_size(spec, context)
+        query_s = query_seconds(n_dofs, pace)
+        held = spec.split.test_fraction + spec.split.validation_fraction
+        n_scored = round(n_train * held / (1 - held))
+        undone = [
+            item for item, step in zip(configurations, own[1:], strict=False) if not step.done
+        ]
+        compilation_s += compile_seconds(spec, configurations, pace)
+        scoring_s += sum(scoring_seconds(item, n_scored, query_s, pace) for item in undone)
+        timing_s += timing_seconds(configurations, context, query_s, pace)
+        steps += own
+    report_s = REPORT_S * pace.interpreter * len(specs)
+    return Plan(steps, compilation_s, scoring_s, timing_s, report_s)
 
 
 def _steps(
-    spec: AnyDatasetSpec, configurations: Sequence[Configuration], context: RunContext
+    spec: AnyDatasetSpec,
+    configurations: Sequence[Configuration],
+    context: RunContext,
+    pace: Pace,
 ) -> list[Step]:
-    """Return the steps on one dataset."""
+    """Return the steps on one dataset: data, configurations, and extra stages."""
     data = _data_step(spec, context)
     done = _cached_labels(spec, configurations, context) if data.done else set()
     size = _problem_size(spec, context)
@@ -143,12 +164,21 @@ def _steps(
     fits = []
     for configuration in configurations:
         method, label = configuration.method.name, configuration.label
-        expected = _fit_seconds(configuration, context, size)
+        if _is_shipped(configuration, spec, context):
+            fits.append(Step(spec.name, f"{label} (trained elsewhere)", False, 0.0))
+            continue
+        expected = fit_seconds(configuration, context, size, pace)
         seconds = _within_budget(expected, left_s[method], configuration)
         left_s[method] -= seconds or 0.0
         shared = None if seconds is None else seconds / context.options.jobs
         fits.append(Step(spec.name, label, label in done, shared))
     return [data, *fits, *_extra_steps(spec.name, configurations, fits, context)]
+
+
+def _is_shipped(configuration: Configuration, spec: AnyDatasetSpec, context: RunContext) -> bool:
+    if configuration.training is None or not context.uses_shipped_weights:
+        return False
+    return find_shipped(configuration, spec, context.options.split) is not None
 
 
 def _within_budget(
@@ -219,20 +249,8 @@ def _data_step(spec: AnyDatasetSpec, context: RunContext) -> Step:
     if not missing:
         return Step(spec.name, f"{n:,} samples", True, 0.0)
     workers = context.options.workers or os.cpu_count() or 1
-    seconds = missing * _sample_seconds(spec) / workers
+    seconds = missing * sample_seconds(spec) / workers
     return Step(spec.name, f"{missing:,} of {n:,} samples", False, seconds)
-
-
-def _sample_seconds(spec: DatasetSpec) -> float:
-    """Measure the seconds of one full-order solution among several."""
-    scene = load_scene(spec)
-    model = FullOrderModel(scene)
-    forces = draw_loads(scene, 0, PROBED).nodal_forces(scene.patch_weights)
-    free_forces = forces.reshape(PROBED, -1)[:, scene.free_dofs]
-    model.solve_many(free_forces[:1])
-    start = perf_counter()
-    model.solve_many(free_forces)
-    return (perf_counter() - start) / PROBED
 
 
 def _cached_labels(
@@ -249,41 +267,3 @@ def _cached_labels(
             for item in configurations
             if CachedFit(item, training_data, environment).record is not None
         }
-
-
-def _earlier_fits(cache: Path, configuration: Configuration) -> list[FitRecord]:
-    """Return records of earlier fits of a method, with the same parameters if there are any."""
-    records = []
-    for path in (cache / "fits").glob(f"{configuration.method.name}-*/fit.json"):
-        with suppress(OSError, StoreError, ValidationError):
-            records.append(FitRecord.model_validate(read_json(path)))
-    wanted = configuration.parameters.items()
-    same = [record for record in records if record.parameters.items() >= wanted]
-    return same or records
-
-
-def _fit_seconds(
-    configuration: Configuration, context: RunContext, size: tuple[int, int]
-) -> float | None:
-    """Scale the time of a fit from earlier fits or the method's file.
-
-    The time of an iteration is assumed not to depend on the number of training samples.
-    """
-    n_dofs, n_train = size
-    iterates = "iterations" in configuration.parameters
-    training = configuration.training
-    if iterates and training and training.fit_seconds:
-        return training.fit_seconds
-    times: list[float] = []
-    for record in _earlier_fits(context.cache, configuration):
-        with suppress(ZeroDivisionError):
-            grows = record.needs_snapshots and not iterates
-            samples = n_train / record.n_train if grows else 1.0
-            times.append(record.fit_s * n_dofs / record.n_dofs * samples)
-    if times:
-        return median(times)
-    shipped = configuration.method.fit_seconds(context.options.profile)
-    if shipped is None:
-        return None
-    samples = 1.0 if iterates else n_train / REFERENCE_TRAINING
-    return shipped * n_dofs / REFERENCE_DOFS * samples

@@ -79,6 +79,8 @@ class MethodSpec(StrictModel):
         Folder of the file, which may also hold the module. None for the suite's own methods.
     fit_s : float, optional
         Approximate time of a fit on beam-coarse with two cores, s.
+    compile_s : float, optional
+        Approximate time to compile the method's kernels, beside those of the full-order model, s.
     battery : Battery
         Settings of shared tests and benchmarks.
     """
@@ -93,6 +95,7 @@ class MethodSpec(StrictModel):
     regime: Regime | None = None
     folder: Path | None = None
     fit_s: Positive | None = None
+    compile_s: Positive | None = None
     parameters: dict[str, Any] = Field(default_factory=dict)
     sweep: dict[str, list[Any]] = Field(default_factory=dict)
     profiles: dict[Literal["quick", "full"], Profile] = Field(default_factory=dict)

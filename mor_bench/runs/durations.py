@@ -1,0 +1,186 @@
+"""Expected durations of the parts of a run, from stated times and this machine's measured speed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from math import sqrt
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+
+from pydantic import ValidationError
+
+from mor_bench.checked_files import read_json
+from mor_bench.errors import StoreError
+from mor_bench.measure.latency import (
+    BATCH_S,
+    LEAST_TURN_S,
+    MOST_BATCH_S,
+    MOST_TURN_S,
+    PROTOCOLS,
+)
+from mor_bench.measure.machine_speed import MachineSpeed, recorded_machines
+from mor_bench.measure.method_session import SETTLE_QUERIES
+from mor_bench.measure.timing import BATCHES
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.runs.cached_fit import FitRecord
+from mor_bench.runs.compilation import uncompiled
+from mor_bench.runs.configurations import OWN, Configuration, may_train
+from mor_bench.runs.run_context import RunContext
+from mor_bench.scene.scene import load_scene
+from mor_bench.snapshots.sampling import draw_loads
+from mor_bench.specs import AnyDatasetSpec, DatasetSpec
+
+REFERENCE_DOFS, REFERENCE_TRAINING = 768, 5120
+"""Problem size for which method files state `fit_s`: beam-coarse, with its former training part."""
+
+QUERY_S = 3e-4
+"""Typical time of a query on the reference machine and problem, s."""
+
+START_S, TORCH_S, SERVER_S, REPORT_S = 0.3, 2.0, 3.0, 8.0
+"""Times on the reference machine: to start a process, to import PyTorch, to start a fork server,
+and to write tables, figures and report, s."""
+
+KERNELS_S, METHOD_S = 15.0, 1.0
+"""Times to compile the full-order model, and a method that states no `compile_s`, s."""
+
+PROBED = 8
+"""Number of samples that are solved to measure the time per sample."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Times on this machine over times on the reference machine.
+
+    Attributes
+    ----------
+    interpreter : float
+        Of Python code and of compilation.
+    solver : float
+        Of residuals and back-solves.
+    training : float
+        Of trainings, which use all cores.
+    """
+
+    interpreter: float
+    solver: float
+    training: float
+
+    @classmethod
+    def measured(cls) -> Pace:
+        """Measure this machine."""
+        reference = recorded_machines()[0]
+        here, there = MachineSpeed.measure(), reference.speed
+        training = 1.0
+        if here.convolution_ms and there.convolution_ms:
+            cores = reference.cores / (os.cpu_count() or 1)
+            training = here.convolution_ms / there.convolution_ms * cores
+        return cls(
+            here.interpreter_ms / there.interpreter_ms,
+            sqrt(
+                (here.residual_us * here.back_solve_us) / (there.residual_us * there.back_solve_us)
+            ),
+            training,
+        )
+
+    def of(self, configuration: Configuration) -> float:
+        """Return the factor for a fit."""
+        return self.training if may_train(configuration.method) else self.solver
+
+
+def sample_seconds(spec: DatasetSpec) -> float:
+    """Measure the seconds of one full-order solution among several."""
+    scene = load_scene(spec)
+    model = FullOrderModel(scene)
+    forces = draw_loads(scene, 0, PROBED).nodal_forces(scene.patch_weights)
+    free_forces = forces.reshape(PROBED, -1)[:, scene.free_dofs]
+    model.solve_many(free_forces[:1])
+    start = perf_counter()
+    model.solve_many(free_forces)
+    return (perf_counter() - start) / PROBED
+
+
+def compile_seconds(
+    spec: AnyDatasetSpec, configurations: Sequence[Configuration], pace: Pace
+) -> float:
+    """Estimate the seconds of compiling what is not compiled yet."""
+    waiting = uncompiled(spec, configurations)
+    each = [
+        (group.configurations[0].method.compile_s or METHOD_S)
+        + (TORCH_S if may_train(group.configurations[0].method) else START_S)
+        for group in waiting
+    ]
+    return pace.interpreter * (sum(each) + (KERNELS_S if waiting else 0.0))
+
+
+def fit_seconds(
+    configuration: Configuration, context: RunContext, size: tuple[int, int], pace: Pace
+) -> float | None:
+    """Scale the time of a fit from earlier fits here, or from the method's file.
+
+    The time of an iteration is assumed not to depend on the number of training samples.
+    """
+    n_dofs, n_train = size
+    iterates = "iterations" in configuration.parameters
+    training = configuration.training
+    if iterates and training and training.fit_seconds:
+        return training.fit_seconds
+    times: list[float] = []
+    for record in _earlier_fits(context.cache, configuration):
+        with suppress(ZeroDivisionError):
+            grows = record.needs_snapshots and not iterates
+            samples = n_train / record.n_train if grows else 1.0
+            times.append(record.fit_s * n_dofs / record.n_dofs * samples)
+    if times:
+        return median(times)
+    stated = configuration.method.fit_seconds(context.options.profile)
+    if stated is None:
+        return None
+    samples = 1.0 if iterates else n_train / REFERENCE_TRAINING
+    return stated * pace.of(configuration) * n_dofs / REFERENCE_DOFS * samples
+
+
+def _earlier_fits(cache: Path, configuration: Configuration) -> list[FitRecord]:
+    """Return records of earlier fits of a method, with the same parameters if there are any."""
+    records = []
+    for path in (cache / "fits").glob(f"{configuration.method.name}-*/fit.json"):
+        with suppress(OSError, StoreError, ValidationError):
+            record = FitRecord.model_validate(read_json(path))
+            if record.trained_elsewhere is None:
+                records.append(record)
+    wanted = configuration.parameters.items()
+    same = [record for record in records if record.parameters.items() >= wanted]
+    return same or records
+
+
+def scoring_seconds(
+    configuration: Configuration, n_scored: int, query_s: float, pace: Pace
+) -> float:
+    """Estimate the seconds of scoring a configuration, with its processes' starts."""
+    start = 2 * START_S + (2 * TORCH_S if _needs_torch(configuration) else 0.0)
+    return pace.interpreter * start + n_scored * query_s
+
+
+def timing_seconds(
+    configurations: Sequence[Configuration], context: RunContext, query_s: float, pace: Pace
+) -> float:
+    """Estimate the seconds of timing configurations, each as fast as a typical query."""
+    protocol, cores = PROTOCOLS[context.options.profile], os.cpu_count() or 1
+    turn = min(MOST_TURN_S, max(LEAST_TURN_S, (protocol.queries + SETTLE_QUERIES) * query_s))
+    batches = [max(BATCH_S, n * query_s) for n in BATCHES if n * query_s <= MOST_BATCH_S]
+    turns = protocol.processes * (protocol.rounds + 1) * turn + sum(batches)
+    starts = [START_S + (TORCH_S if _needs_torch(item) else 0.0) for item in configurations]
+    opened = protocol.processes * (SERVER_S + sum(starts) / cores)
+    return len(configurations) * turns + pace.interpreter * opened
+
+
+def query_seconds(n_dofs: int, pace: Pace) -> float:
+    """Return the time of a typical query on a mesh, s."""
+    return QUERY_S * pace.solver * n_dofs / REFERENCE_DOFS
+
+
+def _needs_torch(configuration: Configuration) -> bool:
+    return configuration.method.surrogate.startswith(OWN) and may_train(configuration.method)
