@@ -1,4 +1,4 @@
-"""Checked reading of arrays from NPZ, NPY, HDF5 and safetensors files.
+"""Checked reading of arrays from NPZ, NPY and HDF5 files.
 
 Before an array is allocated, its declared size is compared with the size of the file. Objects,
 which would need pickle, and data in other files are refused.
@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.checked_files import MOST_JSON_BYTES, check_file, limited_memory
+from mor_bench.checked_files import check_file, limited_memory
 from mor_bench.errors import MorBenchError, StoreError
 
 Arrays = dict[str, NDArray[Any]]
@@ -170,18 +170,6 @@ def read_hdf5(path: Path, error: type[MorBenchError] = StoreError) -> Arrays:
     if unlike := [name for name, array in arrays.items() if array.dtype.hasobject]:
         raise error(f"{path}: `{unlike[0]}` must be an array of numbers.")
     return arrays
-
-
-def check_safetensors(path: Path, error: type[MorBenchError] = StoreError) -> None:
-    """Check size and length of the header of a safetensors file; errors as in `read_npz`."""
-    check_file(path, error=error)
-    with path.open("rb") as file:
-        length = int.from_bytes(file.read(8), "little")
-    if length > MOST_JSON_BYTES:
-        raise error(
-            f"{path}: not a readable safetensors file: its header has {length:,} bytes; at most "
-            f"{MOST_JSON_BYTES:,} are allowed."
-        )
 
 
 def is_hdf5(path: Path) -> bool:

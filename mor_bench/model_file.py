@@ -11,8 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.array_files import check_safetensors
-from mor_bench.checked_files import parse_json
+from mor_bench.checked_files import check_file, parse_json
 from mor_bench.digests import digest_of_arrays
 from mor_bench.errors import InvalidInputError, MorBenchError, StoreError
 from mor_bench.snapshots.store import write_atomically
@@ -123,7 +122,7 @@ def read_header_and_arrays(path: str | Path) -> tuple[dict[str, str], Arrays]:
     from safetensors import SafetensorError, safe_open
 
     try:
-        check_safetensors(Path(path))
+        check_file(Path(path))
     except FileNotFoundError:
         raise StoreError(f"{path}: no such file.") from None
     try:

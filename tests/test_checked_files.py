@@ -225,7 +225,7 @@ def test_odd_hdf5_files_are_refused(write: Callable[[h5py.File], None], tmp_path
 def test_the_header_of_a_model_file_is_limited(tmp_path: Path) -> None:
     path = tmp_path / "a.safetensors"
     path.write_bytes(struct.pack("<Q", 2**40) + b"{}")
-    refused(mor_bench.load_surrogate, path, "its header has 1,099,511,627,776 bytes")
+    refused(mor_bench.load_surrogate, path, "not a readable safetensors file: .*[Hh]eader")
 
 
 def body(path: Path) -> meshio.Mesh:

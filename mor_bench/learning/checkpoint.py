@@ -11,8 +11,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
-from mor_bench.array_files import check_safetensors
-from mor_bench.checked_files import parse_json
+from mor_bench.checked_files import check_file, parse_json
 from mor_bench.digests import digest_of_arrays
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.learning.training_loop import LOSS_INTERVAL, TrainingLoop
@@ -70,7 +69,7 @@ def resume(loop: TrainingLoop, path: Path, fingerprint: str) -> bool:
     from safetensors import SafetensorError, safe_open
 
     try:
-        check_safetensors(path)
+        check_file(path)
     except FileNotFoundError:
         return False
     try:
