@@ -95,7 +95,9 @@ def test_a_failed_seed_is_recorded_and_shown(comparison: Comparison, shown: list
     assert spread is not None
     assert spread.median == max(errors[0], errors[2])
     assert (spread.min, spread.max, spread.std) == (min(errors), inf, inf)
-    assert len(comparison.samples(row)["seeds_relative_l2"]) == 1
+    samples = comparison.samples(row)
+    assert samples["seeds_relative_l2"].shape == (1, row.n_test)
+    assert samples["seeds_validation_relative_l2"].shape == (1, row.n_validation)
     assert comparison.rows[-1].seeds is None  # a method without a seed
     assert Comparison.read(comparison.out).rows == comparison.rows
     assert comparison.table.loc[0, "seeds.mean_dof_m.max"] == inf

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from mor_bench.analysis.draws import VALIDATION, draws_of
 from mor_bench.analysis.selection import decide
+from mor_bench.analysis.selection_text import retime_command
 from mor_bench.analysis.verdict import RULE, Requirements, Verdict, offline_rank, speed_rank
 from mor_bench.errors import InvalidInputError
 from mor_bench.results.comparison import Comparison
@@ -143,6 +144,9 @@ def test_the_upper_bound_of_the_validation_errors_qualifies(tmp_path: Path) -> N
     assert 1.05 < high / np.median(errors) < 2.0
     for limit, qualified in ((0.999 * high, 0), (1.001 * high, 1)):
         assert len(decide(made, "d", Requirements(limit), draws).qualified) == qualified
+    made.add_samples(row, {"seeds_validation_relative_l2": np.array([3 * errors, errors / 3])})
+    wider = draws_of(made, "d", 500, np.random.default_rng(0)).intervals["a"][VALIDATION][1]
+    assert wider > 2 * high
 
 
 def test_close_latencies_are_listed_as_undecided() -> None:
@@ -150,6 +154,20 @@ def test_close_latencies_are_listed_as_undecided() -> None:
     chosen = choose(rows, ASKED)
     assert [row.label for row in chosen.undecided] == ["1.01"]
     assert "Cannot be told apart from the winner in latency: 1.01." in chosen.beside
+
+
+def test_the_command_that_times_again_repeats_what_was_recorded() -> None:
+    settings = {"profile": "full", "train": True, "seeds": 3, "limit": None, "device": "cpu"}
+    settings |= {"budget": {"configurations": 16, "seconds": 1800.0}, "version": "0"}
+    made = Comparison(Path("a run"), {}, [a_row(dataset="e")], settings=settings)
+    made.datasets |= {"d": {}, "e": {}}
+    made.methods["pod"] = {}
+    draws = draws_of(made, "e", 20, np.random.default_rng(0))
+    command = retime_command(decide(made, "e", Requirements(), draws))
+    options = "--profile full --train --seeds 3 --time-limit 1800"
+    assert sorted(command.split()) == sorted(
+        f"mor-bench run d e -m pod {options} --out 'a run' --retime".split()
+    )
 
 
 def test_each_class_of_information_has_its_best() -> None:

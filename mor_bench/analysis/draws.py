@@ -85,9 +85,9 @@ def draws_of(comparison: Comparison, dataset: str, n: int, generator: np.random.
         intervals[label]["rel_l2_median"] = central_interval(errors[label])
         if "mean_dof_m" in samples:
             intervals[label]["mean_dof_m"] = resampler.mean_interval(samples["mean_dof_m"])
-        if len(samples.get("validation_relative_l2", ())) > 1:
-            validation = held_out.median_errors({"relative_l2": samples["validation_relative_l2"]})
-            intervals[label][VALIDATION] = central_interval(validation)
+        validation = _of_validation(samples)
+        if len(validation.get("relative_l2", ())) > 1:
+            intervals[label][VALIDATION] = central_interval(held_out.median_errors(validation))
     for label, interval in latency_intervals(raw).items():
         intervals[label]["latency_ms"] = interval
     usable = [row for row in ran if is_point(row)]
@@ -109,6 +109,15 @@ def _raw_samples(comparison: Comparison, row: Row) -> Samples:
         return comparison.samples(row)
     except (OSError, KeyError):
         return {}
+
+
+def _of_validation(samples: Samples) -> Samples:
+    """Return the raw errors on the validation part under the names of those on the test set."""
+    names = {
+        "relative_l2": "validation_relative_l2",
+        "seeds_relative_l2": "seeds_validation_relative_l2",
+    }
+    return {plain: samples[name] for plain, name in names.items() if name in samples}
 
 
 def _regions(comparison: Comparison, dataset: str, part: str) -> NDArray[Any] | None:

@@ -58,7 +58,11 @@ def decide(
         observed=is_observed(comparison, dataset),
         run=comparison.out,
         machine=comparison.machine,
-        settings={**comparison.settings, "methods": list(comparison.methods)},
+        settings={
+            **comparison.settings,
+            "datasets": list(comparison.datasets) or [dataset],
+            "methods": list(comparison.methods),
+        },
     )
     if qualified:
         return worded(verdict)

@@ -192,12 +192,13 @@ def retime_command(verdict: Verdict) -> str:
     settings = dict(verdict.settings)
     budget = settings.pop("budget", None) or {}
     given = {**settings, "time_limit_s": budget.get("seconds")}
-    words = ["mor-bench", "run", verdict.dataset]
+    words = ["mor-bench", "run", *settings.get("datasets", [verdict.dataset])]
     words += [word for name in settings.get("methods", ()) for word in ("-m", name)]
     for name, field, line in command_line(RunOptions):
         value = given.get(name)
         if value is not None and value != field.default:
-            words += [line.flag, f"{value:g}" if isinstance(value, float) else str(value)]
+            shown = f"{value:.15g}" if isinstance(value, float) else str(value)
+            words += [line.flag] if value is True else [line.flag, shown]
     return shlex.join([*words, "--out", str(verdict.run), "--retime"])
 
 

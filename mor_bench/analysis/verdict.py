@@ -114,7 +114,7 @@ class Verdict:
     run : Path or None
         Folder of the comparison.
     machine, settings : dict
-        Those of the comparison.
+        Those of the comparison, with the names of its datasets and methods.
     headline : str
         The winner and its error on the test set.
     beside : list of str

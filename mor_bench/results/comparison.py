@@ -111,6 +111,7 @@ class Comparison:
         `latency_ms`, `process`, `round` (n_queries,): latency, fresh process and interleaved round.
         `mean_dof_m`, `relative_l2`, `max_nodal_m`, `amplitude_m` (n_test,): errors.
         `validation_relative_l2` (n_validation,): errors on the validation samples.
+        `seeds_relative_l2`, `seeds_validation_relative_l2` (n_seeds - 1, n): of other seeds.
         `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3): the sample with the
         largest finite error.
         `loss_curve`, `validation_curve` (n_intervals,): losses, evenly spread over the training.

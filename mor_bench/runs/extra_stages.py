@@ -15,7 +15,7 @@ from mor_bench.results.row import ErrorSummary, LearningPoint, Row
 from mor_bench.runs.cached_fit import CachedFit, RunEnvironment
 from mor_bench.runs.row_figures import error_summary, failed_set, failure, set_errors
 from mor_bench.runs.run_context import RunContext
-from mor_bench.runs.scoring import ScoredFit, fit_and_score
+from mor_bench.runs.scoring import Score, ScoredFit, fit_and_score
 from mor_bench.runs.training_data import TestSet, TrainingData
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.fresh import fresh_test_set
@@ -26,6 +26,10 @@ LEARNING_STEP = 4
 
 LEAST_TRAINING = 20
 """Fewest training samples of a learning curve."""
+
+
+SEED_SAMPLES = {"test": "seeds_relative_l2", "validation": "seeds_validation_relative_l2"}
+"""Names of the raw samples of other seeds, by set of samples."""
 
 
 @dataclass(frozen=True)
@@ -58,18 +62,23 @@ def train_other_seeds(stage: Stage, fits: Mapping[str, CachedFit]) -> None:
         row = stage.row(label)
         stage.comparison.put(row.with_parts(seeds=seeds, warnings=[*row.warnings, *seeds.failed]))
         if errors:
-            stage.comparison.add_samples(row, {"seeds_relative_l2": np.array(errors)})
+            samples = {name: np.array([found[name] for found in errors]) for name in errors[0]}
+            stage.comparison.add_samples(row, samples)
 
 
-def _trainings(
-    stage: Stage, cached: CachedFit, row: Row
-) -> tuple[list[SeedTraining], list[np.ndarray]]:
-    """Train with other seeds; a failed training has an infinite error."""
+def _trainings(stage: Stage, cached: CachedFit, row: Row) -> tuple[list[SeedTraining], list[Score]]:
+    """Train with other seeds; a failed training has an infinite error.
+
+    The second list holds the raw samples of each training that succeeded.
+    """
     seed, first = cached.fitted.parameters["seed"], cached.reproducible
-    main = stage.training_data.with_sets({"test": stage.training_data.sets["test"]})
+    sets = stage.training_data.sets
+    main = stage.training_data.with_sets(
+        {name: sets[name] for name in SEED_SAMPLES if name in sets}
+    )
     assert row.error is not None
     trainings = [_training(seed, cached.fitted.fit_s, row.error)]
-    errors = []
+    errors: list[Score] = []
     for other in range(seed + 1, seed + stage.context.seeds):
         configuration = replace(first, parameters={**first.parameters, "seed": other})
         try:
@@ -79,7 +88,7 @@ def _trainings(
             trainings.append(_training(other, None, infinite, failure(error)[1]))
             continue
         test = scored.scores["test"]
-        errors.append(test["relative_l2"])
+        errors.append({SEED_SAMPLES[n]: s["relative_l2"] for n, s in scored.scores.items()})
         trainings.append(_training(other, scored.record.fit_s, error_summary(test)))
     return trainings, errors
 
