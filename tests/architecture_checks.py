@@ -18,7 +18,17 @@ from pathlib import Path
 Tree = dict[str, str]
 
 FLOORS = (
-    ("errors", "counting", "digests", "machine", "version", "checked_files", "array_files"),
+    (
+        "errors",
+        "counting",
+        "digests",
+        "machine",
+        "parent_death",
+        "scratch",
+        "version",
+        "checked_files",
+        "array_files",
+    ),
     ("specs", "options"),
     ("scene",),
     ("mechanics",),

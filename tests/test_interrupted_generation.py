@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from mor_bench.errors import StoreError, WorkerError
+from mor_bench.scratch import host_name
 from mor_bench.snapshots import generate as generate_module
 from mor_bench.snapshots import store
 from mor_bench.snapshots.dataset import Dataset
@@ -144,7 +145,7 @@ def test_leftovers_of_dead_processes_are_removed_and_files_of_live_ones_are_kept
 ) -> None:
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    host, living = store.host_name(), os.getppid()
+    host, living = host_name(), os.getppid()
     stale = f".d.h5.{host}.{living}.01.tmp"
     kept = {
         f".b.h5.{host}.{living}.00.tmp",

@@ -14,6 +14,7 @@ from mor_bench.options import RunOptions
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 from mor_bench.runs.configurations import CORE_METHODS, checked_specs
+from mor_bench.scratch import identity
 from mor_bench.snapshots.dataset import Dataset
 from tests.small_runs import method_file, run_small
 from tests.third_party import Peeker
@@ -123,15 +124,14 @@ def test_a_hidden_test_set_depends_on_its_seed_only(cache: Path, tmp_path: Path)
 
 
 def test_two_runs_cannot_write_to_the_same_folder(cache: Path, tmp_path: Path) -> None:
-    parent = psutil.Process(os.getppid())
-    (tmp_path / ".running").write_text(f"{parent.pid} {parent.create_time()!r}")
+    (tmp_path / ".running").write_text(str(identity(os.getppid())))
     with pytest.raises(InvalidInputError, match=r"another run \(process"):
         run_small(["linear-fem"], tmp_path, cache)
 
 
 @pytest.mark.slow
 def test_the_first_failure_ends_a_run_that_fails_fast(cache: Path, tmp_path: Path) -> None:
-    (tmp_path / ".running").write_text("1234567 1.0")  # of a run that has ended
+    (tmp_path / ".running").write_text("1234567-1")  # of a run that has ended
     methods: list[str | Path] = [broken_file(tmp_path, "end"), "linear-fem"]
     found = run_small(methods, tmp_path, cache, fail_fast=True)
     assert [row.status for row in found.rows] == ["failed"]

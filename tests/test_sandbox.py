@@ -13,16 +13,20 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import psutil
 import pytest
 
 from mor_bench.errors import SpecError
 from mor_bench.measure.method_session import FitRequest, MethodSession
+from mor_bench.sandbox import landlock
 from mor_bench.sandbox.fork_server import CAN_FORK, ForkServer
-from mor_bench.sandbox.process import MethodFailedError, Restrictions, SandboxedProcess
+from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
+from mor_bench.sandbox.seal import Restrictions
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
+from tests.intruder import WAYS
 
 
 @pytest.fixture(scope="module")
@@ -148,3 +152,43 @@ def test_a_process_ends_if_its_parent_is_killed() -> None:
     parent.send_signal(signal.SIGKILL)
     parent.wait()
     assert is_gone(pid)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(landlock.version() < 6, reason="needs a kernel with Landlock")
+@pytest.mark.parametrize("sealed", [True, False])
+@pytest.mark.parametrize("way", WAYS)
+def test_the_kernel_keeps_a_method_out_of_sealed_folders(
+    way: str, sealed: bool, server: ForkServer | None, tiny_scene: Scene, tmp_path: Path
+) -> None:
+    if way == "as_a_tensor":
+        pytest.importorskip("torch")
+    secret, own = tmp_path / "cache" / "datasets" / "x" / "secret", tmp_path / "own"
+    secret.parent.mkdir(parents=True)
+    own.mkdir()
+    secret.write_bytes(b"0123456789")
+    with h5py.File(secret.with_suffix(".h5"), "w") as file:
+        file["secret"] = np.frombuffer(b"0123456789", np.uint8)
+    closed = (secret.parents[1], tmp_path / "not-yet" / "there") if sealed else ()
+    restrictions = Restrictions(closed, scratch=own)
+    arguments = {"way": way, "secret": str(secret), "folder": str(own)}
+    with SandboxedProcess(MethodSession, restrictions, server, scene=tiny_scene) as process:
+        request = FitRequest("tests.intruder:Intruder", arguments, own, own / "m", 1, 60.0)
+        (said,) = process.ask("fit", 60.0, request=request)["warnings"]
+    never = way == "by_a_process_of_the_fork_server"
+    assert said.startswith("refused" if sealed or never else "saw "), said
+    assert not sealed or secret.read_bytes() == b"0123456789"
+
+
+def test_a_sealed_process_works_beside_the_sealed_folders(
+    server: ForkServer | None, tiny_scene: Scene, tmp_path: Path
+) -> None:
+    closed, own = tmp_path / "cache", tmp_path / "own"
+    own.mkdir()
+    (tmp_path / "loop").symlink_to(tmp_path)
+    restrictions = Restrictions((closed,), exempt=closed / "mine", scratch=own)
+    (closed / "mine").mkdir(parents=True)
+    with SandboxedProcess(MethodSession, restrictions, server, scene=tiny_scene) as process:
+        for folder in (own, closed / "mine"):
+            answer = ask_fit(process, "Zero", folder)
+            assert answer["model_bytes"] == (folder / "model.safetensors").stat().st_size

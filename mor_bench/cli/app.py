@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
-from io import TextIOWrapper
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from mor_bench.cli.clear_errors import clear_errors
+from mor_bench.cli.clear_errors import clear_errors, open_streams
 
 COMMANDS = {
     "run": ("run_command", "Fit, score and time methods on datasets, and write a report."),
@@ -45,8 +43,13 @@ class LazyCommands(TyperGroup):
         with formatter.section("Commands"):
             formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
 
-    def invoke(self, ctx: Any) -> Any:
+    def main(self, *args: Any, **extra: Any) -> Any:
+        open_streams()
         with clear_errors():
+            return super().main(*args, **extra)
+
+    def invoke(self, ctx: Any) -> Any:
+        with clear_errors():  # before Typer catches interrupts
             return super().invoke(ctx)
 
 
@@ -67,10 +70,6 @@ def main(
 
     A comparison gives the error at equal time and the time at equal error.
     """
-    for stream in (sys.stdout, sys.stderr):
-        # On Windows, the encodings of files and pipes lack letters such as ē.
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="replace")
     if version:
         from mor_bench.version import __version__
 

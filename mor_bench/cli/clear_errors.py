@@ -1,35 +1,114 @@
-"""One line on standard error, and an exit code, for every error that is raised on purpose."""
+"""One line on standard error, and an exit code, for errors, signals and closed streams."""
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from threading import current_thread, main_thread
+from types import FrameType
 
 import typer
 
 from mor_bench.errors import MorBenchError, printable
 
 STOPPED = (
-    "stopped; finished samples and rows are kept. "
+    "stopped{}; finished samples and rows are kept. "
     "Repeat the command with the same --out to continue a run. "
     "A training resumes from its last checkpoint."
 )
 
+ENDING = ("SIGTERM", "SIGHUP")
+"""Signals that stop a command as an interrupt does."""
+
+
+class StoppedBySignal(KeyboardInterrupt):
+    """A signal asks this process to end; ``number`` names the signal."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
 
 @contextmanager
 def clear_errors() -> Iterator[None]:
-    """Exit with code 2 after an error of mor-bench or a file, and with 130 after an interrupt."""
+    """Exit with code 2 after an error of mor-bench or a file, and with 128 + n after signal n."""
     try:
-        yield
+        with _signals_as_interrupts():
+            yield
+            sys.stdout.flush()
     except MorBenchError as error:
         _exit(str(error), "red", 2)
+    except BrokenPipeError:
+        _forget_output()
+        raise SystemExit(128 + 13) from None  # as a program that SIGPIPE ends
     except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        _exit(f"{place}{error.strerror or error}", "red", 2)
+        where = error.filename
+        if not where:  # mor-bench names the files that it writes
+            _forget_output()
+            where = "standard output or a temporary file"
+        _exit(f"{where}: {error.strerror or error}", "red", 2)
+    except StoppedBySignal as stop:
+        by = f" by {signal.Signals(stop.number).name}"
+        _exit(STOPPED.format(by), "yellow", 128 + stop.number)
     except KeyboardInterrupt:
-        _exit(STOPPED, "yellow", 130)
+        _exit(STOPPED.format(""), "yellow", 130)
+
+
+@contextmanager
+def _signals_as_interrupts() -> Iterator[None]:
+    """Raise `StoppedBySignal` at the first signal; ignored signals, as under nohup, stay so."""
+
+    def stop(number: int, _: FrameType | None) -> None:
+        for other in caught:
+            signal.signal(other, signal.SIG_IGN)  # the clean-up takes a moment
+        raise StoppedBySignal(number)
+
+    present = [getattr(signal, name) for name in ENDING if hasattr(signal, name)]
+    caught = [number for number in present if signal.getsignal(number) == signal.SIG_DFL]
+    if current_thread() is not main_thread():
+        caught = []
+    for number in caught:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in caught:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def open_streams() -> None:
+    """Connect closed standard streams to nothing, and let odd letters never raise.
+
+    A file that is opened later would otherwise become standard output.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            with suppress(OSError):
+                os.fstat(number)
+                continue
+            nothing = os.open(os.devnull, os.O_RDWR)
+            if nothing != number:
+                os.dup2(nothing, number)
+                os.close(nothing)
+            setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8"))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        # On Windows, the encodings of files and pipes lack letters such as ē.
+        if reconfigure := getattr(stream, "reconfigure", None):
+            reconfigure(errors="replace")
+
+
+def _forget_output() -> None:
+    """Drop what could not be written, so that Python does not try again when it ends."""
+    with suppress(OSError, ValueError):
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, sys.stdout.fileno())
+        os.close(nothing)
 
 
 def _exit(message: str, colour: str, code: int) -> None:
-    typer.secho(f"mor-bench: {printable(message)}", fg=colour, err=True)
-    raise typer.Exit(code) from None
+    with suppress(OSError):  # the terminal may be gone
+        typer.secho(f"mor-bench: {printable(message)}", fg=colour, err=True)
+    raise SystemExit(code) from None

@@ -63,8 +63,9 @@ def run(
             names, method or None, out=out, listener=listener, **options.model_dump()
         )
     analysis = comparison.analysis
+    written = render(comparison, analysis)  # first, since the tables may meet a closed pipe
     print_tables(comparison, console, analysis)
-    for path in render(comparison, analysis):
+    for path in written:
         console.print(str(path), highlight=False, soft_wrap=True)
     if as_json:
         print((comparison.out / "results.json").read_text(encoding="utf-8"))

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import sys
-import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +25,7 @@ from mor_bench.hard_cases.case import (
     wrongly_handled,
 )
 from mor_bench.measure.error_metrics import sample_errors
+from mor_bench.scratch import scratch_folder
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.surrogate import Surrogate
@@ -133,8 +132,8 @@ def bad_snapshots(subject: Subject) -> Outcome:
     )
     prediction = partial(method.predict, data.test.forces[0])
     wrong += wrongly_handled({"a prediction after a refused fit": prediction}, NotFittedError)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.safetensors"
+    with scratch_folder() as folder:
+        path = folder / "model.safetensors"
         wrong += wrongly_handled({"saving after a refused fit": partial(method.save, path)})
         if path.exists():
             wrong.append("a file was left")

@@ -17,10 +17,10 @@ from mor_bench.hard_cases.case_session import CaseSession
 from mor_bench.hard_cases.catalogue import CASE_NAMES, CASES, CaseResult, attempt, cases_for
 from mor_bench.machine import describe_machine
 from mor_bench.sandbox.process import (
-    Restrictions,
     SandboxedProcess,
     default_memory_limit_bytes,
 )
+from mor_bench.sandbox.seal import Restrictions
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import MethodSpec, list_suite, load_method_spec
 from mor_bench.version import __version__

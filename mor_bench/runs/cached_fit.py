@@ -40,8 +40,9 @@ from mor_bench.runs.code_digest import code_digest
 from mor_bench.runs.configurations import Configuration
 from mor_bench.runs.training_data import TrainingData, digest_of_file
 from mor_bench.sandbox.fork_server import ForkServer
-from mor_bench.sandbox.process import Restrictions, SandboxedProcess
-from mor_bench.snapshots.store import remove_leftovers, write_atomically
+from mor_bench.sandbox.process import SandboxedProcess
+from mor_bench.sandbox.seal import Restrictions
+from mor_bench.snapshots.store import remove_leftovers, temporary_beside, write_atomically
 from mor_bench.specs import list_suite, load_method_spec
 from mor_bench.training_options import TrainingOptions
 
@@ -217,7 +218,8 @@ class CachedFit:
         """Store a fit and its model; writing the record commits it."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if model is not None:
-            partial = self.folder / f".{os.getpid()}.{self.key}.tmp"
+            remove_leftovers(self.folder)
+            partial = temporary_beside(self.model)
             shutil.copyfile(model, partial)
             os.replace(partial, self.model)
             checksum = {"model_sha256": digest_of_file(self.model)}
@@ -263,6 +265,7 @@ class CachedFit:
             self.environment.sealed,
             exempt,
             self.configuration.method.folder,
+            self.data.scratch,
             self.environment.memory_limit_bytes,
         )
         server = fork_server or self.environment.fork_server
@@ -297,9 +300,10 @@ class CachedFit:
         if self._held and fork_server is None:
             worker, self._held = self._held, None
             return worker
-        worker = self.worker(fork_server)
+        saved = self.record is not None and self.record.model_sha256 is not None
+        worker = self.worker(fork_server, exempt=self.model if saved else None)
         try:
-            if self.record is not None and self.record.model_sha256 is not None:
+            if saved:
                 surrogate = self.configuration.method.surrogate
                 worker.ask("load", LOAD_LIMIT_S, surrogate=surrogate, model=self.model)
             else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
@@ -21,6 +20,7 @@ from mor_bench.runs.run_context import RunContext
 from mor_bench.runs.run_folder import only_run_in, open_run
 from mor_bench.runs.timing_stage import StopRunError
 from mor_bench.sandbox.fork_server import CAN_FORK, ForkServer
+from mor_bench.scratch import scratch_folder
 from mor_bench.specs import AnyDatasetSpec, ImportedDatasetSpec
 
 
@@ -79,7 +79,7 @@ def run(
         fork_server = None
         if CAN_FORK:
             fork_server = stack.enter_context(closing(ForkServer(MethodSession, passive_wait=True)))
-        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mor-bench-")))
+        scratch = stack.enter_context(scratch_folder())
         stack.enter_context(suppress(StopRunError))
         for number, spec in enumerate(specs):
             compile_kernels(spec, configurations, context, fork_server, scratch)

@@ -26,7 +26,8 @@ from mor_bench.runs.configurations import OWN, Configuration, may_train
 from mor_bench.runs.run_context import RunContext
 from mor_bench.runs.training_data import TrainingData
 from mor_bench.sandbox.fork_server import ForkServer
-from mor_bench.sandbox.process import Restrictions, SandboxedProcess
+from mor_bench.sandbox.process import SandboxedProcess
+from mor_bench.sandbox.seal import Restrictions
 from mor_bench.snapshots.dataset import load_dataset
 from mor_bench.specs import AnyDatasetSpec
 

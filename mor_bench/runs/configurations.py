@@ -17,10 +17,10 @@ from mor_bench.results.row import label_of
 from mor_bench.sandbox.process import (
     START_LIMIT_S,
     MethodFailedError,
-    Restrictions,
     SandboxedProcess,
     default_memory_limit_bytes,
 )
+from mor_bench.sandbox.seal import Restrictions
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.generate import default_cache
 from mor_bench.specs import (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -48,6 +47,7 @@ from mor_bench.runs.timing_stage import StopRunError, time_configurations
 from mor_bench.runs.training_data import TrainingData
 from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.handover import arrays_of
+from mor_bench.sandbox.process import stoppable_threads
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.executors import Pool, cluster_pool
 from mor_bench.snapshots.generate import generation_seconds
@@ -177,7 +177,7 @@ class DatasetRun:
         with ExitStack() as stack:
             pool = stack.enter_context(cluster_pool(cluster)) if cluster else None
             n_threads = pool.window() if pool else self.context.options.jobs
-            executor = stack.enter_context(ThreadPoolExecutor(n_threads))
+            executor = stack.enter_context(stoppable_threads(n_threads))
             for _, group in groupby(self.configurations, key=lambda item: item.method.name):
                 mine = list(group)
                 attempts = list(executor.map(partial(self._fit, pool), range(len(mine)), mine))

@@ -17,8 +17,10 @@ from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.runs.cached_fit import CachedFit, FitRecord
 from mor_bench.runs.configurations import Configuration
 from mor_bench.sandbox.handover import write_arrays
-from mor_bench.sandbox.process import MethodFailedError, Restrictions, SandboxedProcess
+from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
+from mor_bench.sandbox.seal import Restrictions
 from mor_bench.scene.scene import Scene
+from mor_bench.scratch import scratch_folder
 
 RemoteFit = Callable[[CachedFit, float], tuple[dict[str, Any], bytes | None]]
 """A fit on another machine within a time limit, s; it returns the worker's answer and the model."""
@@ -154,9 +156,9 @@ class ClusterFit:
 
 def fit_on_cluster(task: ClusterFit) -> tuple[dict[str, Any], bytes | None]:
     """Fit on this machine in a worker process; return its answer and the model's file."""
-    with tempfile.TemporaryDirectory() as name:
-        train, validation = Path(name) / "train", Path(name) / "validation"
-        model = Path(name) / "model.safetensors"
+    with scratch_folder() as folder:
+        train, validation = folder / "train", folder / "validation"
+        model = folder / "model.safetensors"
         write_arrays(train, task.train)
         write_arrays(validation, task.validation)
         request = FitRequest(

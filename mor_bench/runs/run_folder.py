@@ -8,12 +8,12 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-import psutil
-
 from mor_bench.errors import InvalidInputError
 from mor_bench.machine import describe_machine, gpu_name
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.run_context import RunContext
+from mor_bench.scratch import identity, is_running
+from mor_bench.snapshots.store import remove_leftovers
 from mor_bench.specs import AnyDatasetSpec, MethodSpec
 
 
@@ -79,17 +79,17 @@ def only_run_in(folder: Path) -> Iterator[None]:
     InvalidInputError
         If another run writes there.
     """
-    lock = folder / ".running"
-    other = None
-    with suppress(OSError, ValueError, psutil.Error):
-        number, created = map(float, lock.read_text().split())
-        other = int(number) if psutil.Process(int(number)).create_time() == created else None
-    if other not in (None, os.getpid()):
+    lock, mine, other = folder / ".running", str(identity(os.getpid())), ""
+    with suppress(OSError, ValueError):
+        other = lock.read_text(encoding="ascii")
+    if other != mine and is_running(other):
         raise InvalidInputError(
-            f"{folder}: another run (process {other}) writes to this folder; wait for it "
-            "or choose another folder."
+            f"{folder}: another run (process {other.partition('-')[0]}) writes to this folder; "
+            "wait for it or choose another folder."
         )
-    lock.write_text(f"{os.getpid()} {psutil.Process().create_time()!r}")
+    for part in (folder, folder / "samples", folder / "figures"):
+        remove_leftovers(part)
+    lock.write_text(mine, encoding="ascii")
     try:
         yield
     finally:

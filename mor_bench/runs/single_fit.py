@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from time import perf_counter
 from typing import Any
 
@@ -25,7 +24,7 @@ from mor_bench.runs.listener import Listener
 from mor_bench.runs.run_context import training_options
 from mor_bench.runs.scoring import SCORE_CHUNK
 from mor_bench.snapshots.dataset import Dataset, Snapshots, load_dataset
-from mor_bench.snapshots.store import remove_leftovers
+from mor_bench.snapshots.store import remove_leftovers, temporary_beside
 from mor_bench.specs import check_parameters, load_dataset_spec, load_method_spec
 from mor_bench.surrogate import Surrogate
 from mor_bench.training_options import TrainingOptions
@@ -172,16 +171,17 @@ def _check_checkpoint(checkpoint: Path, out: Path) -> None:
         raise InvalidInputError(
             f"`checkpoint` and `out` must be different files; got {checkpoint} for both."
         )
-    remove_leftovers(checkpoint.parent, checkpoint.name)
 
 
 def _check_writable(name: str, path: Path) -> None:
     """Check that a file can be written before a long fit begins."""
     if path.is_dir():
         raise InvalidInputError(f"`{name}`: {path} is a folder.")
+    remove_leftovers(path.parent, path.name)
+    temporary = temporary_beside(path)
     try:
-        with NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}."):
-            pass
+        temporary.touch(exist_ok=False)
+        temporary.unlink()
     except OSError as error:
         raise InvalidInputError(f"`{name}`: {path} cannot be written: {error.strerror}.") from None
 

@@ -10,8 +10,10 @@ import json
 import os
 import pickle
 import signal
+import socket
 import sys
 import sysconfig
+import tempfile
 import warnings
 from pathlib import Path
 from queue import SimpleQueue
@@ -20,7 +22,7 @@ from traceback import walk_tb
 from typing import Any, BinaryIO
 
 from mor_bench.errors import MorBenchError
-from mor_bench.sandbox.seal import seal
+from mor_bench.sandbox.seal import Restrictions, seal
 from mor_bench.sandbox.session import Session, session_class
 
 LIBRARIES = tuple(
@@ -39,12 +41,13 @@ class _Child:
         session: str,
         arguments: dict[str, Any],
         import_path: list[str],
-        sealed: list[Path],
-        exempt: Path | None,
+        restrictions: Restrictions,
     ) -> dict[str, Any]:
         """Import the session class, seal the process, and make the session."""
         made_by = session_class(session)
-        seal(sealed, exempt)
+        seal(restrictions.sealed, restrictions.exempt)
+        if restrictions.scratch is not None:
+            os.environ["TMPDIR"] = tempfile.tempdir = str(restrictions.scratch)
         sys.path[:] = import_path
         self.session = made_by(**arguments)
         return {}
@@ -79,12 +82,17 @@ def _printable(error: object) -> str:
 
 
 def _read(requests: BinaryIO, queue: SimpleQueue[dict[str, Any]]) -> None:
-    """Pass requests on. End the process at once when the parent is gone, whatever runs in it."""
     while True:
-        try:
-            queue.put(pickle.load(requests))
-        except (EOFError, OSError):
-            os._exit(1)
+        queue.put(_next(requests))
+
+
+def _next(requests: BinaryIO) -> dict[str, Any]:
+    """Return the next request. End the process at once when the parent is gone."""
+    try:
+        request: dict[str, Any] = pickle.load(requests)
+    except (EOFError, OSError):
+        os._exit(1)
+    return request
 
 
 def answer_requests(requests: BinaryIO, answers: BinaryIO) -> None:
@@ -95,25 +103,31 @@ def answer_requests(requests: BinaryIO, answers: BinaryIO) -> None:
     with open(os.devnull, "rb") as nothing:
         os.dup2(nothing.fileno(), 0)
     queue: SimpleQueue[dict[str, Any]] = SimpleQueue()
-    Thread(target=_read, args=(requests, queue), daemon=True).start()
+    reader = Thread(target=_read, args=(requests, queue), daemon=True)
     child, process = _Child(), os.getpid()
+    # The first request seals this thread. Only then may another start, which the seal covers too.
+    request = _next(requests)
     while True:
-        answer = child.answer(queue.get())
+        answer = child.answer(request)
         if os.getpid() != process:  # foreign code has forked, and this is the copy
             os._exit(0)
         answers.write(json.dumps(answer).encode() + b"\n")
         answers.flush()
+        if reader.ident is None:
+            reader.start()
+        request = queue.get()
 
 
 def main() -> None:
     """Answer requests on standard input.
 
-    With a socket's path and a session class as arguments, serve forks instead.
+    With a socket's descriptor and a session class as arguments, serve forks instead.
     """
     if len(sys.argv) == 3:
         from mor_bench.sandbox.fork_server import serve
 
-        serve(sys.argv[1], session_class(sys.argv[2]).preload, answer_requests)
+        control = socket.socket(fileno=int(sys.argv[1]))
+        serve(control, session_class(sys.argv[2]).preload, answer_requests)
     else:
         answer_requests(os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb"))
 

@@ -13,15 +13,19 @@ import signal
 import socket
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from threading import Condition, Lock, Thread
-from time import monotonic, sleep
 from typing import Any, BinaryIO
 
 from mor_bench import errors
+from mor_bench.parent_death import (
+    adopt_orphans,
+    end_descendants,
+    end_with_parent,
+    wait_for_end,
+)
 from mor_bench.sandbox.session import Session
 
 CAN_FORK = sys.platform == "linux"
@@ -53,8 +57,6 @@ class ForkServer:
 
     def __init__(self, session: type[Session], passive_wait: bool = False) -> None:
         self._session = session
-        self._folder = tempfile.TemporaryDirectory(prefix="mor-bench-")
-        self._path = os.path.join(self._folder.name, "s")
         self._exit_codes: dict[int, int] = {}
         self._child_ended = Condition()
         self._restarting = Lock()
@@ -63,13 +65,17 @@ class ForkServer:
         self._start()
 
     def _start(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", CHILD_MODULE, self._path, self._session.path()],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=self._environment,
-            start_new_session=True,
-        )
+        # A pair of sockets has no path by which a method could ask the server for a process.
+        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", CHILD_MODULE, str(theirs.fileno()), self._session.path()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                env=self._environment,
+                start_new_session=True,
+                pass_fds=[theirs.fileno()],
+            )
         Thread(target=self._record_exits, args=(self._process.stdout,), daemon=True).start()
 
     def _record_exits(self, reports: BinaryIO) -> None:
@@ -79,8 +85,8 @@ class ForkServer:
                 self._exit_codes[pid] = os.waitstatus_to_exitcode(status)
                 self._child_ended.notify_all()
 
-    def fork(self, stderr_path: str) -> tuple[socket.socket, int]:
-        """Fork a process whose standard error goes to a file.
+    def fork(self, stderr: BinaryIO) -> tuple[socket.socket, int]:
+        """Fork a process whose standard error goes to an open file.
 
         Returns
         -------
@@ -95,24 +101,21 @@ class ForkServer:
         """
         with self._restarting:
             if self._process.poll() is not None:  # foreign code has ended it
-                Path(self._path).unlink(missing_ok=True)
+                self._control.close()
                 self._start()
-        until = monotonic() + START_S
-        connection = socket.socket(socket.AF_UNIX)
-        while True:
-            try:
-                connection.connect(self._path)
-                break
-            except (FileNotFoundError, ConnectionRefusedError):
-                if monotonic() > until or self._process.poll() is not None:
-                    raise errors.MorBenchError(
-                        "the fork server of the methods' processes does not start."
-                    ) from None
-                sleep(0.02)
-        connection.sendall(stderr_path.encode() + b"\n")
-        pid = connection.recv(8, socket.MSG_WAITALL)
+        connection, theirs = socket.socketpair()
+        connection.settimeout(START_S)
+        pid = b""
+        with suppress(OSError), theirs:
+            socket.send_fds(self._control, [b"fork"], [theirs.fileno(), stderr.fileno()])
+        with suppress(OSError):
+            pid = connection.recv(8, socket.MSG_WAITALL)
         if len(pid) < 8:
-            raise errors.MorBenchError("the fork server of the methods' processes has died.")
+            connection.close()
+            raise errors.MorBenchError(
+                "the fork server of the methods' processes does not start, or has died."
+            )
+        connection.settimeout(None)
         return connection, int.from_bytes(pid, "little")
 
     def exit_code(self, pid: int, within_s: float = 5.0) -> int:
@@ -122,55 +125,57 @@ class ForkServer:
             return self._exit_codes.get(pid, 1)
 
     def close(self) -> None:
-        """End the server; forked processes end with their connections."""
-        assert self._process.stdin
-        with suppress(OSError):
-            self._process.stdin.close()
+        """End the server and all forked processes."""
+        self._control.close()
         self._process.wait()
-        self._folder.cleanup()
 
 
 def serve(
-    path: str,
+    control: socket.socket,
     preload: Callable[[], None],
     answer_requests: Callable[[BinaryIO, BinaryIO], Any],
 ) -> None:
-    """Preload, then fork a process for every connection to a socket, until standard input closes.
+    """Preload, then fork a process for every message on a socket, until the other end closes.
 
+    A message carries two descriptors: the process's connection and its standard error.
     Standard output carries a line ``pid status`` for each forked process that has ended.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    preload()
+    adopt_orphans()
+    with wait_for_end(control):
+        preload()
     reports = os.dup(1)
     woken, wake = os.pipe()
     os.set_blocking(wake, False)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
-    listener = socket.socket(socket.AF_UNIX)
-    listener.bind(path)
-    listener.listen(64)
     while True:
-        ready = select.select([listener.fileno(), 0, woken], [], [])[0]
+        ready = select.select([control.fileno(), woken], [], [])[0]
         if woken in ready:
             os.read(woken, 4096)
             _report_ended(reports)
-        if 0 in ready and not os.read(0, 1):
+        if control.fileno() not in ready:
+            continue
+        message, descriptors, _, _ = socket.recv_fds(control, 16, 2)
+        if not message:
+            end_descendants()
             os._exit(0)
-        if listener.fileno() in ready:
-            connection, _ = listener.accept()
-            stderr_path = b""
-            while not stderr_path.endswith(b"\n") and (part := connection.recv(4096)):
-                stderr_path += part
-            if stderr_path.endswith(b"\n") and os.fork() == 0:
-                os.setsid()  # a signal to the child's process group must not reach the server
-                signal.set_wakeup_fd(-1)
-                signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-                for descriptor in (listener.fileno(), reports, woken, wake):
-                    os.close(descriptor)
-                os.dup2(os.open(stderr_path.strip(), os.O_WRONLY), 2)
-                connection.sendall(os.getpid().to_bytes(8, "little"))
-                answer_requests(connection.makefile("rb"), connection.makefile("wb"))
-            connection.close()
+        server = os.getpid()
+        if os.fork() == 0:
+            end_with_parent(server)
+            os.setsid()  # a signal to the child's process group must not reach the server
+            signal.set_wakeup_fd(-1)
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            control.close()
+            for descriptor in (reports, woken, wake):
+                os.close(descriptor)
+            os.dup2(descriptors[1], 2)
+            os.close(descriptors[1])
+            connection = socket.socket(fileno=descriptors[0])
+            connection.sendall(os.getpid().to_bytes(8, "little"))
+            answer_requests(connection.makefile("rb"), connection.makefile("wb"))
+        for descriptor in descriptors:
+            os.close(descriptor)
 
 
 def _report_ended(reports: int) -> None:
@@ -181,4 +186,5 @@ def _report_ended(reports: int) -> None:
             return
         if pid == 0:
             return
-        os.write(reports, f"{pid} {status}\n".encode())
+        with suppress(OSError):
+            os.write(reports, f"{pid} {status}\n".encode())

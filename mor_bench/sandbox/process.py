@@ -10,19 +10,20 @@ import socket
 import subprocess
 import sys
 import tempfile
-from contextlib import suppress
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from queue import Empty, SimpleQueue
-from threading import Thread
+from threading import Event, Thread, get_ident
 from time import monotonic
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import psutil
 
 from mor_bench import errors
 from mor_bench.errors import MorBenchError
 from mor_bench.sandbox.fork_server import CHILD_MODULE, ForkServer, environment
+from mor_bench.sandbox.seal import Restrictions
 from mor_bench.sandbox.session import Session
 
 MEMORY_CHECK_S = 0.2
@@ -40,30 +41,38 @@ def default_memory_limit_bytes() -> float:
     return MEMORY_SHARE * float(psutil.virtual_memory().total)
 
 
+_ALIVE: set[SandboxedProcess] = set()
+
+
+@contextmanager
+def stoppable_threads(n: int) -> Iterator[ThreadPoolExecutor]:
+    """Open a pool of threads that wait for processes which they start.
+
+    After an error in the body, such as an interrupt, these processes are ended, because a fit may
+    last an hour and the pool waits for its threads.
+    """
+    own: set[int] = set()
+    executor = ThreadPoolExecutor(n, initializer=lambda: own.add(get_ident()))
+    left = Event()
+
+    def end_processes() -> None:
+        while not left.wait(0.05):
+            for process in [item for item in tuple(_ALIVE) if item.thread in own]:
+                process.end()
+
+    try:
+        yield executor
+    except BaseException:
+        Thread(target=end_processes, daemon=True).start()
+        executor.shutdown(cancel_futures=True)
+        raise
+    finally:
+        executor.shutdown()
+        left.set()
+
+
 class MethodFailedError(MorBenchError):
     """A method crashed, its process died, or it exceeded its limit of time or memory."""
-
-
-@dataclass(frozen=True)
-class Restrictions:
-    """Access rights and limits of a sandboxed process.
-
-    Attributes
-    ----------
-    sealed : tuple of Path
-        Folders that it must not access.
-    exempt : Path, optional
-        A folder within the sealed ones that stays accessible.
-    import_from : Path, optional
-        The first folder on the import path, which holds a third party's module.
-    memory_bytes : float
-        Limit on the resident memory of the process and its children; above it they are ended.
-    """
-
-    sealed: tuple[Path, ...] = ()
-    exempt: Path | None = None
-    import_from: Path | None = None
-    memory_bytes: float = float("inf")
 
 
 class SandboxedProcess:
@@ -93,11 +102,13 @@ class SandboxedProcess:
         **arguments: Any,
     ) -> None:
         self._session, self._memory_limit = session, restrictions.memory_bytes
-        self._stderr = tempfile.NamedTemporaryFile()  # noqa: SIM115 - closed by `end`
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `end`
         self._process = (
-            _Forked(fork_server, self._stderr.name) if fork_server else _Spawned(self._stderr)
+            _Forked(fork_server, self._stderr) if fork_server else _Spawned(self._stderr)
         )
         self._watched = psutil.Process(self._process.pid)
+        self.thread = get_ident()
+        _ALIVE.add(self)
         self._answers: SimpleQueue[bytes] = SimpleQueue()
         Thread(target=self._read_answers, daemon=True).start()
         folder = restrictions.import_from
@@ -108,8 +119,7 @@ class SandboxedProcess:
                 session=session.path(),
                 arguments=arguments,
                 import_path=[*([str(folder)] if folder else []), *sys.path],
-                sealed=list(restrictions.sealed),
-                exempt=restrictions.exempt,
+                restrictions=restrictions,
             )
         except BaseException:
             self.end()
@@ -210,6 +220,7 @@ class SandboxedProcess:
 
     def end(self) -> None:
         """End the process and all that it started."""
+        _ALIVE.discard(self)
         with suppress(psutil.Error):
             for process in self._watched.children(recursive=True):
                 with suppress(psutil.Error):
@@ -232,7 +243,7 @@ class SandboxedProcess:
 class _Spawned:
     """A new interpreter."""
 
-    def __init__(self, stderr: Any) -> None:
+    def __init__(self, stderr: BinaryIO) -> None:
         self._process = subprocess.Popen(
             [sys.executable, "-m", CHILD_MODULE],
             stdin=subprocess.PIPE,
@@ -259,9 +270,9 @@ class _Spawned:
 class _Forked:
     """A process forked from a server."""
 
-    def __init__(self, fork_server: ForkServer, stderr_path: str) -> None:
+    def __init__(self, fork_server: ForkServer, stderr: BinaryIO) -> None:
         self._fork_server = fork_server
-        self._connection, self.pid = fork_server.fork(stderr_path)
+        self._connection, self.pid = fork_server.fork(stderr)
         self.requests = self._connection.makefile("wb")
         self.answers = self._connection.makefile("rb")
 

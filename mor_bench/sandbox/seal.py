@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from mor_bench.sandbox import landlock
 
 PROGRAM_EVENTS = (
     "subprocess.Popen",
@@ -33,18 +36,45 @@ FILE_EVENTS = (
 )
 
 
-def seal(folders: Sequence[Path], exempt: Path | None = None) -> None:
-    """Make every access to some folders raise `PermissionError` for the rest of this process.
+@dataclass(frozen=True)
+class Restrictions:
+    """Access rights and limits of a sandboxed process.
 
-    The seal stops Python's usual ways to a file and the start of programs, so it catches mistakes.
-    It does not stop a method that attacks the machine.
+    Attributes
+    ----------
+    sealed : tuple of Path
+        Folders that it must not access.
+    exempt : Path, optional
+        A folder within the sealed ones that stays accessible, or a file that it may read.
+    import_from : Path, optional
+        The first folder on the import path, which holds a third party's module.
+    scratch : Path, optional
+        Folder for its temporary files.
+    memory_bytes : float
+        Limit on the resident memory of the process and its children; above it they are ended.
+    """
+
+    sealed: tuple[Path, ...] = ()
+    exempt: Path | None = None
+    import_from: Path | None = None
+    scratch: Path | None = None
+    memory_bytes: float = float("inf")
+
+
+def seal(folders: Sequence[Path], exempt: Path | None = None) -> None:
+    """Close some folders to this process for the rest of its life.
+
+    Where the kernel has Landlock, it refuses every access to their contents, also to libraries in
+    other languages and to processes that this one starts. Everywhere, Python's usual ways to a file
+    and the start of programs raise `PermissionError`; there alone, that catches mistakes only.
 
     Parameters
     ----------
     folders : sequence of Path
         Folders to seal, with all their contents.
     exempt : Path, optional
-        A folder within them that stays accessible, such as the folder of a training's checkpoint.
+        A folder within them that stays accessible, such as the folder of a training's checkpoint,
+        or a file that may be read.
     """
     exempt_prefix = None if exempt is None else _prefix(exempt)
     prefixes = tuple(_prefix(folder) for folder in folders)
@@ -62,11 +92,12 @@ def seal(folders: Sequence[Path], exempt: Path | None = None) -> None:
 
     def refuse(event: str, arguments: tuple[Any, ...]) -> None:
         if event in FILE_EVENTS:
-            for argument in arguments[:2]:
+            for argument in arguments[: 1 if event == "open" else 2]:  # then comes the mode
                 check(argument)
         elif event in PROGRAM_EVENTS:
             raise PermissionError(f"{event}: a method must not start programs during a comparison.")
 
+    landlock.close_folders(folders, exempt)
     sys.addaudithook(refuse)
     _guard_hdf5(check)
 

@@ -24,6 +24,7 @@ from time import sleep
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from mor_bench.errors import InvalidInputError, MissingDependencyError, WorkerError
+from mor_bench.parent_death import end_with_parent
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -36,6 +37,9 @@ IN_FLIGHT = 2
 
 CONNECT_S = 10
 """Timeout for a cluster's scheduler, and for its first worker, s."""
+
+PARENT_CHECK_S = 0.2
+"""Interval at which a worker looks for its parent, s."""
 
 KEPT = "Finished shards are kept; run the same command again to continue."
 
@@ -114,6 +118,7 @@ class _InThisProcess(Executor):
 
 def _end_with(parent: int) -> None:
     """Make this worker exit after its parent was killed. Otherwise it would wait for ever."""
+    end_with_parent(parent)  # on Linux at once, even in the middle of a solve
 
     def watch() -> None:
         _wait_for_end_of_parent(parent)
@@ -131,7 +136,7 @@ def _wait_for_end_of_parent(parent: int) -> None:
         kernel.WaitForSingleObject(kernel.OpenProcess(synchronize, False, parent), infinite)
     else:
         while os.getppid() == parent:
-            sleep(1.0)
+            sleep(PARENT_CHECK_S)
 
 
 @contextmanager

@@ -11,7 +11,6 @@ import hashlib
 import io
 import json
 import os
-import platform
 import re
 import secrets
 import sys
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 
 from mor_bench.checked_files import parse_json, read_bytes
 from mor_bench.errors import NewerSchemaError, StoreError
+from mor_bench.scratch import host_name
 
 SCHEMA_VERSION = 3
 FORMAT = "mor-bench snapshots"
@@ -78,22 +78,26 @@ _FIELDS = {
 }
 
 
-def host_name() -> str:
-    """Return this machine's name in the form used in names of temporary files."""
-    return re.sub(r"[^0-9A-Za-z-]", "-", platform.node())
+def temporary_beside(path: Path) -> Path:
+    """Return the name of a temporary file that `remove_leftovers` removes if its writer is killed.
+
+    The name identifies the writer, even if several machines share the folder.
+    """
+    return path.with_name(f".{path.name}.{host_name()}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
 
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file so that it is complete or absent, even if the process is killed."""
-    # The name identifies the writer, even if several machines share the folder.
-    writer = f"{host_name()}.{os.getpid()}.{secrets.token_hex(4)}"
-    temporary = path.with_name(f".{path.name}.{writer}.tmp")
+    temporary = temporary_beside(path)
     try:
         with open(temporary, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
+    except OSError as error:
+        error.filename = error.filename or str(path)  # a full disk has no name
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
