@@ -170,6 +170,21 @@ def _shown(value: Any) -> str:
     return number(value) if isinstance(value, float) else DASH if value is None else str(value)
 
 
+def optimism(source: str) -> str:
+    """Show, by way of selection, how often a selected configuration misses its target."""
+    ways = ("test", "validation", "bound")
+    body = []
+    for record in content_of(source)["methods"]:
+        for way in ways:
+            found = record.get(way) or {"n": 0}
+            if found["n"]:
+                figures = (100 * found["missed"], found["ratio"], found["ratio_p90"])
+                cells = [f"`{record['method']}`", way, str(found["n"])]
+                body.append([*cells, *map(number, figures)])
+    headings = ["method", "selected by", "selections", "missed %", "error ratio: mean", "p90"]
+    return markdown(headings, body)
+
+
 def leaves(source: str, key: str = "") -> str:
     """Show every number and text of a nested file, with its key."""
     content = content_of(source)
@@ -283,6 +298,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "network-latency": network_latency,
     "umesh-choices": umesh_choices,
     "records": records,
+    "optimism": optimism,
     "leaves": leaves,
     "refinement": refinement,
     "hard-cases": hard_cases,
