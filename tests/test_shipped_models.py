@@ -14,15 +14,33 @@ import mor_bench
 from mor_bench.results.row import Row
 from mor_bench.runs.cached_fit import RunEnvironment
 from mor_bench.runs.code_digest import bare_code
-from mor_bench.runs.shipped_models import (
-    SampleSketch,
-)
-from mor_bench.runs.training_data import digest_of_file
+from mor_bench.runs.configurations import configurations_of
+from mor_bench.runs.shipped_models import Binding, SampleSketch, shipped_models
+from mor_bench.runs.training_data import TrainingData, digest_of_file
 from mor_bench.snapshots.dataset import Snapshots, load_dataset
-from tests.benchmarks.train_shipped import ship
+from mor_bench.specs import DatasetSpec, load_dataset_spec, load_method_spec
+from tests.benchmarks.train_shipped import DATASET, ITERATIONS, ship
 from tests.small_runs import short_timing
 
 RETRAIN = "run `python -m tests.benchmarks.train_shipped` and commit the folder `trained`"
+
+
+def test_shipped_weights_agree_with_the_code_the_parameters_and_the_split() -> None:
+    models = shipped_models()
+    spec = load_dataset_spec(DATASET)
+    assert isinstance(spec, DatasetSpec)
+    assert {path.stem for path in models} == {f"{method}-{DATASET}" for method in ITERATIONS}
+    for weights, model in models.items():
+        configuration = configurations_of([load_method_spec(model.fit.method)], "quick")[0]
+        assert Binding.of(configuration, spec) == model.binding, RETRAIN
+        assert digest_of_file(weights) == model.fit.model_sha256
+        assert weights.stat().st_size < 1.5e6
+
+
+@pytest.mark.slow
+def test_shipped_weights_agree_with_the_samples(cache: Path, tmp_path: Path) -> None:
+    data = TrainingData.of(load_dataset(DATASET, cache=cache), tmp_path)
+    assert all(model.agrees_with(data) for model in shipped_models().values()), RETRAIN
 
 
 def test_comments_docstrings_and_blank_lines_are_no_code() -> None:
@@ -115,3 +133,13 @@ def test_damaged_and_forged_weights_are_refused_with_a_warning(
     record.write_text("{}")
     [warning] = _row(tmp_path, "broken").warnings
     assert "not a valid record" in warning
+
+
+def test_a_record_is_written_and_read_unchanged(tmp_path: Path) -> None:
+    shipped = shipped_models()
+    for weights, model in shipped.items():
+        model.write(weights, tmp_path / weights.stem)
+    again = shipped_models(tmp_path)
+    assert {path.name: model for path, model in again.items()} == {
+        path.name: model for path, model in shipped.items()
+    }

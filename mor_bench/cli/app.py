@@ -18,6 +18,7 @@ COMMANDS = {
     "list": ("suite_commands", "List the datasets and methods of the suite."),
     "check": ("suite_commands", "Check dataset and method files for errors."),
     "new-method": ("new_method", "Write the files of a new method from a template."),
+    "doctor": ("doctor_command", "Show what is installed, and the speed of this machine."),
     "generate": ("data_commands", "Generate the snapshots of a dataset."),
     "refine": ("data_commands", "Measure the discretisation error of a dataset's mesh."),
     "stress": ("stress_command", "Try the hard cases on the full-order model and on methods."),
