@@ -25,6 +25,8 @@ from mor_bench.analysis.latency_intervals import (
     latency_intervals,
     spreads_of,
 )
+from mor_bench.analysis.seeds import error_draws, seed_interval
+from tests.verification.interval_coverage import Setting, coverage, coverage_of_seeds
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,7 @@ def test_without_two_regions_each_sample_is_its_own_cluster() -> None:
         assert cluster_numbers(regions, 5).tolist() == [[0], [1], [2], [3], [4]]
 
 
-def coverage(effect: float, k: int, by_region: bool, n_regions: int = 13) -> float:
+def coverage_of_regions(effect: float, k: int, by_region: bool, n_regions: int = 13) -> float:
     """Return the share of simulated test sets whose interval contains the median over all regions.
 
     Errors vary by region and by sample; each sample has k regions.
@@ -213,8 +215,44 @@ def coverage(effect: float, k: int, by_region: bool, n_regions: int = 13) -> flo
 
 @pytest.mark.parametrize("k", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_resampling_regions_covers_the_truth_and_resampling_samples_does_not(k: int) -> None:
-    assert coverage(0.3, k, by_region=True) >= 0.9
-    assert coverage(0.3, k, by_region=False) < 0.7
+    assert coverage_of_regions(0.3, k, by_region=True) >= 0.9
+    assert coverage_of_regions(0.3, k, by_region=False) < 0.7
+
+
+def test_the_interval_of_a_seed_is_a_t_interval_on_the_logarithm() -> None:
+    low, high = seed_interval([1.0, np.e, np.e**2])
+    half = 4.302653 * (1 + 1 / 3) ** 0.5  # t with two degrees of freedom; deviation 1 about 1
+    assert (log(low), log(high)) == pytest.approx((1 - half, 1 + half))
+    assert seed_interval([1.0, np.e, np.e**2, np.inf]) == pytest.approx((low, np.inf))
+    assert seed_interval([1.0]) == seed_interval([1.0, np.inf]) == (0.0, np.inf)
+    assert coverage_of_seeds(3, 0.2, 2000, np.random.default_rng(0)) == pytest.approx(
+        0.95, abs=0.015
+    )
+
+
+@pytest.mark.parametrize(
+    "setting", [Setting(3, 13, 0.05, samples=100), Setting(10, 40, 0.3, samples=100)]
+)
+def test_the_interval_of_a_trained_method_covers_another_training(setting: Setting) -> None:
+    assert coverage(setting, 100, 200, np.random.default_rng(0)) >= 0.93
+
+
+def test_draws_of_errors_hold_trainings_and_regions() -> None:
+    generator = np.random.default_rng(0)
+    errors = np.exp(0.1 * generator.normal(size=(3, 200)))
+    weights = resample_weights(cluster_numbers(None, 200), 4000, generator)
+
+    def ends(trainings: NDArray[np.float64]) -> tuple[float, float]:
+        draws = error_draws(trainings, weights, 1.0, weighted_medians, generator)
+        return central_interval(draws)
+
+    same = errors[[0, 0, 0]]  # seeds without scatter: only the regions vary
+    assert ends(same) == pytest.approx(ends(errors[:1]))
+    apart = ends(errors[[0, 0, 0]] * np.array([0.5, 1.0, 2.0])[:, None])
+    assert apart == pytest.approx(seed_interval([0.5, 1.0, 2.0]), rel=0.15)
+    lost = np.full((1, 200), np.inf)
+    assert ends(np.concatenate([errors, lost]))[1] == np.inf
+    assert ends(lost) == (np.inf, np.inf)
 
 
 def test_widening_follows_student_and_stays_within_bounds() -> None:

@@ -16,7 +16,6 @@ from mor_bench.analysis.bootstrap import (
     resample_weights,
     weighted_means,
     weighted_medians,
-    widen,
     widening,
 )
 from mor_bench.analysis.frontier import (
@@ -33,6 +32,7 @@ from mor_bench.analysis.latency_intervals import (
     n_processes_of,
     spreads_of,
 )
+from mor_bench.analysis.seeds import error_draws
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 
@@ -72,6 +72,7 @@ def draws_of(comparison: Comparison, dataset: str, n: int, generator: np.random.
     """Resample a dataset n times: its load regions for the errors, its processes for latencies."""
     ran = [row for row in comparison.rows if row.dataset == dataset and row.status == "ok"]
     raw = {row.label: _raw_samples(comparison, row) for row in ran}
+    failed_seeds = {row.label: len(row.seeds.failed) if row.seeds else 0 for row in ran}
     resampler, held_out = (
         _Resampler(_regions(comparison, dataset, part), n, generator)
         for part in ("test", "validation")
@@ -81,13 +82,15 @@ def draws_of(comparison: Comparison, dataset: str, n: int, generator: np.random.
     for label, samples in raw.items():
         if len(samples.get("relative_l2", ())) < 2:
             continue
-        errors[label] = resampler.median_errors(samples)
+        failed = failed_seeds[label]
+        errors[label] = resampler.draws(samples, "relative_l2", failed)
         intervals[label]["rel_l2_median"] = central_interval(errors[label])
         if "mean_dof_m" in samples:
-            intervals[label]["mean_dof_m"] = resampler.mean_interval(samples["mean_dof_m"])
-        validation = _of_validation(samples)
-        if len(validation.get("relative_l2", ())) > 1:
-            intervals[label][VALIDATION] = central_interval(held_out.median_errors(validation))
+            means = resampler.draws(samples, "mean_dof_m", failed)
+            intervals[label]["mean_dof_m"] = central_interval(means)
+        if len(samples.get("validation_relative_l2", ())) > 1:
+            validation = held_out.draws(samples, "validation_relative_l2", failed)
+            intervals[label][VALIDATION] = central_interval(validation)
     for label, interval in latency_intervals(raw).items():
         intervals[label]["latency_ms"] = interval
     usable = [row for row in ran if is_point(row)]
@@ -109,15 +112,6 @@ def _raw_samples(comparison: Comparison, row: Row) -> Samples:
         return comparison.samples(row)
     except (OSError, KeyError):
         return {}
-
-
-def _of_validation(samples: Samples) -> Samples:
-    """Return the raw errors on the validation part under the names of those on the test set."""
-    names = {
-        "relative_l2": "validation_relative_l2",
-        "seeds_relative_l2": "seeds_validation_relative_l2",
-    }
-    return {plain: samples[name] for plain, name in names.items() if name in samples}
 
 
 def _regions(comparison: Comparison, dataset: str, part: str) -> NDArray[Any] | None:
@@ -162,33 +156,25 @@ class _Resampler:
             self.resampled = self.resampled or found
         return self._weights[n_samples]
 
-    def median_errors(self, samples: Samples) -> NDArray[np.float64]:
-        """Draw median relative L2 errors over load regions and, if there are several, over seeds.
+    def draws(self, samples: Samples, name: str, failed: int) -> NDArray[np.float64]:
+        """Draw the error of a test set over load regions and, if there are several, over seeds.
 
-        Drawing another training seed multiplies the error by the ratio of that seed's median to the
-        geometric mean of all seeds' medians.
+        Parameters
+        ----------
+        samples : dict
+            Raw samples of a configuration; those of other seeds are named ``seeds_NAME``.
+        name : str
+            Name of the samples. The mean of ``mean_dof_m`` is drawn, the median of the others.
+        failed : int
+            Number of seeds whose training failed.
         """
-        values = np.asarray(samples["relative_l2"], dtype=float)
-        weights, factor = self._resamples(len(values))
-        bounds = float(values.min()), float(values.max())
-        draws = widen(weighted_medians(values, weights), float(np.median(values)), factor, bounds)
-        no_seeds = np.zeros((0, len(values)))
-        others = np.asarray(samples.get("seeds_relative_l2", no_seeds), dtype=float)
-        if not len(others):
-            return draws
-        medians = np.median(np.concatenate([values[None], others]), axis=1)
-        if not (np.isfinite(medians) & (medians > 0)).all():
-            return draws
-        few = np.sqrt(len(medians) / (len(medians) - 1))
-        ratios = np.exp(np.log(medians) - np.log(medians).mean()) ** few
-        return np.asarray(draws * self.generator.choice(ratios, draws.size))
-
-    def mean_interval(self, mean_dof_m: NDArray[Any]) -> Interval:
-        """Interval of the mean of the samples' errors over the test set, m."""
-        e = np.asarray(mean_dof_m, dtype=float)
-        weights, factor = self._resamples(len(e))
-        bounds = float(e.min()), float(e.max())
-        return central_interval(widen(weighted_means(e, weights), float(e.mean()), factor, bounds))
+        first = np.asarray(samples[name], dtype=float)[None]
+        others = np.asarray(samples.get(f"seeds_{name}", first[:0]), dtype=float)
+        lost = np.full((failed, first.shape[1]), inf)
+        trainings = np.concatenate([first, others.reshape(-1, first.shape[1]), lost])
+        weights, factor = self._resamples(first.shape[1])
+        statistic = weighted_means if name == "mean_dof_m" else weighted_medians
+        return error_draws(trainings, weights, factor, statistic, self.generator)
 
 
 def finite_or_none(value: float) -> float | None:

@@ -54,12 +54,12 @@ def _latency(entry: Entry) -> str:
 
 def _seeds_error(entry: Entry) -> str:
     spread = entry.row.seeds and entry.row.seeds.rel_l2_median
-    return span((spread.min, spread.max), percent) if spread else DASH
+    return span(spread.interval, percent) if spread else DASH
 
 
 def _seeds_mean(entry: Entry) -> str:
     spread = entry.row.seeds and entry.row.seeds.mean_dof_m
-    return span((spread.min, spread.max), metres) if spread else DASH
+    return span(spread.interval, metres) if spread else DASH
 
 
 COLUMNS = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mor_bench.report.entries import Entry
-from mor_bench.report.number_format import DASH, bytes_text, metres, number, percent, whole
+from mor_bench.report.number_format import DASH, bytes_text, metres, number, percent, span, whole
 from mor_bench.report.text_table import Cell, TextTable, figure_cell, table_of
 
 
@@ -122,15 +122,16 @@ def seeds(entries: Sequence[Entry]) -> TextTable | None:
                 figures += [DASH] * 3
                 continue
             ends = f"{shown(spread.min)}–{shown(spread.max)}"
-            figures += [shown(spread.median), ends, shown(spread.std)]
+            figures += [shown(spread.median), ends, span(spread.interval, shown)]
         failed = "\n".join(found.failed) or DASH
         rows.append([entry.label, f"{found.n} of {found.asked}", *figures, failed])
-    statistics = ("median", "min–max", "st. dev.")
+    statistics = ("median", "min–max", "another training")
     named = [f"{name}: {what}" for name in ("rel. L2 (%)", "ē (m)") for what in statistics]
     note = (
         "The same configuration trained with other seeds; all other tables show the first "
         "seed. The figures describe the median relative L2 error and ē of these "
-        "trainings. A failed training has an infinite error."
+        "trainings. A failed training has an infinite error. Another training: its 95 % "
+        "prediction interval on the same test set, from Student's t on the logarithms."
     )
     headings = ["configuration", "trained", *named, "failed"]
     return TextTable("Training seeds", note, headings, rows) if rows else None

@@ -61,12 +61,27 @@ class TrainedElsewhere(Part):
 
 
 class Spread(Part):
-    """Scatter of one figure over the seeds of a training."""
+    """Scatter of one figure over the seeds of a training.
+
+    Attributes
+    ----------
+    median, min, max, std : float
+    low, high : float or None
+        95 % prediction interval for the figure of another training on the same test set, from
+        Student's t on the logarithms; None in files of earlier versions.
+    """
 
     median: Real
     min: Real
     max: Real
     std: Real
+    low: Real | None = None
+    high: Real | None = None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """The prediction interval; None where the file lacks it."""
+        return None if self.low is None or self.high is None else (self.low, self.high)
 
 
 class SeedTraining(Part):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mor_bench.analysis.frontier import selecting_error
+from mor_bench.analysis.seeds import seed_interval
 from mor_bench.errors import MorBenchError
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.parts import SeedSpread, SeedTraining, Spread
@@ -89,6 +90,7 @@ def _trainings(stage: Stage, cached: CachedFit, row: Row) -> tuple[list[SeedTrai
             continue
         test = scored.scores["test"]
         errors.append({SEED_SAMPLES[n]: s["relative_l2"] for n, s in scored.scores.items()})
+        errors[-1]["seeds_mean_dof_m"] = test["mean_dof_m"]
         trainings.append(_training(other, scored.record.fit_s, error_summary(test)))
     return trainings, errors
 
@@ -121,11 +123,14 @@ def seed_spread(trainings: Sequence[SeedTraining]) -> SeedSpread:
 def _spread(errors: Sequence[float]) -> Spread:
     values = np.array(errors)
     known = len(values) > 1 and np.isfinite(values).all()
+    low, high = seed_interval(errors)
     return Spread(
         median=float(np.median(values)),
         min=float(values.min()),
         max=float(values.max()),
         std=float(values.std(ddof=1)) if known else np.inf,
+        low=low,
+        high=high,
     )
 
 
