@@ -15,6 +15,7 @@ import argparse
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +62,7 @@ class Setting:
     sample_sd: float = 0.3
     own_sd: float = 0.1
 
-    def trainings(self, generator: np.random.Generator) -> tuple[NDArray[np.float64], NDArray]:
+    def trainings(self, generator: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[Any]]:
         """Return errors (seeds, samples), and the region of each sample."""
         k, regions = self.seeds, np.arange(self.samples) % self.regions
         shared = self.region_sd * generator.normal(size=self.regions)[regions]
