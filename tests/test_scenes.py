@@ -175,7 +175,7 @@ def test_a_users_surface_becomes_a_scene_from_any_folder(tmp_path: Path) -> None
         load_scene(first.spec)
 
 
-SLOW = {"beam-fine", "liver-hex", "liver-tet"}
+SLOW = {"beam-fine", "beam-fine-paper", "liver-hex", "liver-tet"}
 QUICK = {*list_suite("datasets")} - SLOW - {"liver-hex-observed"}  # it has the loads of liver-hex
 
 

@@ -1,16 +1,20 @@
 """Largest deformation and share of refused loads of a dataset, over the size of its loads.
 
+    python -m tests.benchmarks.paper_amplitude --json paper-amplitude.json
     python -m tests.benchmarks.paper_amplitude beam-coarse --force 1 --force 1.4
-    python -m tests.benchmarks.paper_amplitude beam-coarse --force 1.4 --main --samples 2000
+    python -m tests.benchmarks.paper_amplitude beam-coarse --force 1.4 --main --samples 1280
 
-The loads are those of the named test sets, the main plan with other draws. With ``--main`` they
-are the test part of the main plan, split by sample as in the paper. ``--force`` is the upper end
-of `magnitude_n`. A refused load has no valid equilibrium. The loads of
-`datasets/*-paper.toml` and `paper_magnitude_n` in `datasets/*.toml` come from this table.
+The loads of the part `set` are those of the named test sets, the main plan with other draws. Those
+of the part `test` (``--main``) are the test part of the main plan, split by sample as in the
+paper. ``--force`` is the upper end of `magnitude_n`. A refused load has no valid equilibrium. The
+loads of `datasets/*-paper.toml` and `paper_magnitude_n` in `datasets/*.toml` come from this table.
 """
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -23,13 +27,19 @@ from threadpoolctl import threadpool_limits
 from mor_bench.errors import InvertedElementError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import Solution
+from mor_bench.report.published_figures import SAME_AMPLITUDE, SCENES, scene_of
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of
 from mor_bench.snapshots.split import split_samples
 from mor_bench.snapshots.test_sets import spec_of_set
-from mor_bench.specs import DatasetSpec, Split, load_generated_spec
+from mor_bench.specs import DatasetSpec, Split, list_suite, load_generated_spec
 
 CHUNK = 100
+WHOLE = 10**9
+"""No limit on the number of loads."""
+
+FURTHER = {"liver-tet": (0.6, 0.8, 1.0, 1.3)}
+"""Largest forces of a scene whose loads are refused before it deforms as in the paper, N."""
 
 
 def loads_of(spec: DatasetSpec, upper: float, samples: int, *, main: bool) -> PatchLoads:
@@ -40,7 +50,7 @@ def loads_of(spec: DatasetSpec, upper: float, samples: int, *, main: bool) -> Pa
     loads = draw_loads(scene, 0, n_samples_of(scene) if main else samples)
     if main:
         split = Split(test_fraction=spec.split.test_fraction, by="sample")
-        loads = loads[split_samples(loads, len(scene.patch_nodes), split, spec.loads.seed)[1]]
+        loads = loads[split_samples(loads, len(scene.patch_nodes), split, spec.loads.seed).test]
     return loads[:samples]
 
 
@@ -65,30 +75,60 @@ def measured(spec: DatasetSpec, upper: float, samples: int, *, main: bool) -> di
     with threadpool_limits(1):
         amplitudes, n_inverted = solve(load_scene(spec), loads)
     valid = amplitudes[np.isfinite(amplitudes)]
-    refused = len(loads) - len(valid)
     return {
-        "largest force, N": f"{upper:g}",
+        "dataset": spec.name,
+        "part": "test" if main else "set",
+        "force_n": upper,
         "loads": len(loads),
-        "refused": refused,
-        "share": f"{100 * refused / len(loads):.2g} %",
+        "refused": len(loads) - len(valid),
         "inverted": n_inverted,
-        "largest deformation, m": f"{valid.max():.4g}" if len(valid) else "–",
+        "largest_m": float(valid.max()),
     }
 
 
+def published(datasets: list[str]) -> Iterator[dict[str, Any]]:
+    """Measure the paper's scenes with their own loads and with those at the paper's deformation."""
+    for name in datasets:
+        spec = load_generated_spec(name)
+        own, paper = spec.loads.magnitude_n[1], spec.tests.paper_magnitude_n
+        yield measured(spec, own, WHOLE, main=True)
+        if paper is not None:
+            yield measured(spec, paper[1], spec.tests.samples, main=False)
+        if name + SAME_AMPLITUDE in list_suite("datasets"):
+            larger = load_generated_spec(name + SAME_AMPLITUDE)
+            yield measured(larger, larger.loads.magnitude_n[1], WHOLE, main=True)
+        for force in FURTHER.get(name, ()):
+            yield measured(spec, force, WHOLE, main=True)
+
+
 def run(
-    dataset: Annotated[str, typer.Argument(help="Name or TOML file.")],
-    force: Annotated[list[float], typer.Option(help="Largest force, N. Repeat for more.")],
+    dataset: Annotated[
+        list[str] | None, typer.Argument(help="Names or files. Default: the paper's scenes.")
+    ] = None,
+    force: Annotated[list[float] | None, typer.Option(help="Largest force, N; repeat.")] = None,
     samples: Annotated[int, typer.Option(min=1, help="Largest number of loads.")] = 200,
     main: Annotated[bool, typer.Option("--main", help="Test part of the main plan.")] = False,
+    report: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Also write the figures here.")
+    ] = None,
 ) -> None:
     """Print the largest valid deformation and the refused loads for each size of the loads."""
-    spec = load_generated_spec(dataset)
-    rows = [measured(spec, upper, samples, main=main) for upper in force]
-    table = Table(*rows[0], title=dataset)
+    names = dataset or list(SCENES)
+    if force:
+        specs = [load_generated_spec(name) for name in names]
+        rows = [measured(spec, f, samples, main=main) for spec in specs for f in force]
+    else:
+        rows = list(published(names))
+    table = Table("dataset", "part", "N", "loads", "refused", "inverted", "largest, m", "paper, m")
     for row in rows:
-        table.add_row(*map(str, row.values()))
-    Console(width=100).print(table)
+        scene = SCENES.get(scene_of(row["dataset"]))
+        row["paper_m"] = scene and scene.amplitude_m
+        share = f"{row['refused']} ({100 * row['refused'] / row['loads']:.2g} %)"
+        shown = {**row, "refused": share, "largest_m": f"{row['largest_m']:.4g}"}
+        table.add_row(*map(str, shown.values()))
+    Console(width=110).print(table)
+    if report is not None:
+        report.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -62,6 +62,25 @@ def reduced_peers(source: str) -> str:
     return markdown(headings, body)
 
 
+def paper_amplitude(source: str) -> str:
+    """Show the largest deformation of the paper's scenes over the size of the loads."""
+    parts = {"test": "test part, split by sample", "set": "test set `paper-amplitude`"}
+    body = [
+        [
+            f"`{row['dataset']}`",
+            parts[row["part"]],
+            f"{row['force_n']:g}",
+            f"{row['loads']:,}",
+            f"{100 * row['refused'] / row['loads']:.2g} %",
+            number(row["largest_m"]),
+            f"{row['paper_m']:g}",
+        ]
+        for row in content_of(source)["rows"]
+    ]
+    headings = ["dataset", "loads", "up to, N", "number", "refused", "largest u, m", "paper, m"]
+    return markdown(headings, body)
+
+
 def scaling(source: str) -> str:
     """Show the cost of a solve against the number of unknowns."""
     headings = ["unknowns", "rest state", "set-up, s", "solve, ms", "iterations", "peak MB"]
@@ -297,6 +316,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "random-loads": random_loads,
     "network-latency": network_latency,
     "umesh-choices": umesh_choices,
+    "paper-amplitude": paper_amplitude,
     "records": records,
     "optimism": optimism,
     "leaves": leaves,
