@@ -83,7 +83,8 @@ def compile_kernels(
                     ) as worker:
                         _fit_and_query(configuration, problem, worker)
                 _leave_marker(group)
-            context.listener.compiling(group.method, number + 1, len(waiting))
+        if waiting:
+            context.listener.compiling(waiting[-1].method, len(waiting), len(waiting))
 
 
 def uncompiled(spec: AnyDatasetSpec, configurations: Sequence[Configuration]) -> list[Uncompiled]:

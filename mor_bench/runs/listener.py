@@ -19,7 +19,7 @@ class Listener:
     Attributes
     ----------
     compiling : callable
-        Called with (method, methods done, methods to compile) before and after each method.
+        Called with (method, methods done, methods to compile) before each method, and at the end.
     generating : callable
         Called with (dataset, samples done, samples wanted).
     starting : callable
