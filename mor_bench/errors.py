@@ -27,6 +27,10 @@ class SpecError(MorBenchError, ValueError):
     """
 
 
+class UnusableClassError(SpecError):
+    """A method's class cannot be imported, is abstract, or lacks the methods of a method."""
+
+
 class InvalidInputError(MorBenchError, ValueError):
     """An argument is out of range, or an array has a wrong shape or dtype or is not finite."""
 

@@ -19,9 +19,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, Self, get_args, get_origin
 
-from annotated_types import Ge, Gt, Le
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -34,6 +33,7 @@ from pydantic.fields import FieldInfo
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.specs.loads_spec import SplitBy
+from mor_bench.specs.parameters import python_number
 
 Device = Literal["auto", "cpu", "cuda"]
 Profile = Literal["quick", "full"]
@@ -70,6 +70,14 @@ Cluster = Annotated[
 ]
 
 
+class InvalidOptionError(InvalidInputError):
+    """The value of an option is out of range, or there is no such option; ``option`` names it."""
+
+    def __init__(self, message: str, option: str) -> None:
+        super().__init__(message)
+        self.option = option
+
+
 class Options(BaseModel):
     """A frozen group of options, checked at construction."""
 
@@ -81,14 +89,34 @@ class Options(BaseModel):
         is_flag = cls.model_fields[str(info.field_name)].annotation is bool
         if value is not None and isinstance(value, bool) != is_flag:
             raise ValueError("true and false are the values of flags, and of nothing else")
-        return value
+        return python_number(value)
 
     def __init__(self, **values: Any) -> None:
         try:
             super().__init__(**values)
         except ValidationError as error:
             problem = error.errors(include_url=False)[0]
-            raise InvalidInputError(self._message(str(problem["loc"][0]), values)) from None
+            name = str(problem["loc"][0])
+            raise InvalidOptionError(self._message(name, values), name) from None
+
+    @classmethod
+    def from_command_line(cls, given: dict[str, Any]) -> Self:
+        """Make the options from values in the units of the command line; errors name flags."""
+        shown = {name: line for name, _, line in command_line(cls)}
+        scaled = {name: line.scale for name, line in shown.items() if line.scale != 1}
+        values = {
+            name: value * scaled[name] if name in scaled and value is not None else value
+            for name, value in given.items()
+        }
+        try:
+            return cls(**values)
+        except InvalidOptionError as error:
+            line = shown[error.option]
+            allowed = allowed_values(cls.model_fields[error.option], line.scale)
+            unit = f" {line.metavar}" if line.scale != 1 else ""
+            raise InvalidOptionError(
+                f"`{line.flag}` must be {allowed}{unit}; got {given[error.option]!r}.", error.option
+            ) from None
 
     @classmethod
     def _message(cls, name: str, values: dict[str, Any]) -> str:
@@ -262,30 +290,38 @@ def _with_flag(shown: CommandLine, name: str) -> CommandLine:
     return CommandLine(f"--{name.replace('_', '-')}", shown.metavar, shown.default, shown.scale)
 
 
-def allowed_values(field: FieldInfo) -> str:
-    """Describe the values that an option may have, such as "an integer in [1, 100]"."""
-    return " or ".join(_described(field.annotation, field.metadata))
+def allowed_values(field: FieldInfo, scale: float = 1.0) -> str:
+    """Describe the values that an option may have, such as "an integer in [1, 100]".
+
+    Bounds are divided by the scale of the command line.
+    """
+    return " or ".join(_described(field.annotation, field.metadata, scale))
 
 
-def _described(annotation: Any, metadata: list[Any]) -> Iterator[str]:
+def _described(annotation: Any, metadata: list[Any], scale: float) -> Iterator[str]:
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Literal:
         yield " or ".join(map(repr, parts))
     elif origin is Annotated:
         inner = [item for extra in parts[1:] for item in getattr(extra, "metadata", [])]
-        yield from _described(parts[0], inner)
+        yield from _described(parts[0], inner, scale)
     elif parts:
         for part in parts:
-            yield from _described(part, metadata)
+            yield from _described(part, metadata, scale)
     elif annotation is not NoneType:
         names = {int: "an integer", float: "a number", bool: "true or false", Path: "a path"}
-        yield names.get(annotation, "a text") + _bounds(metadata)
+        yield names.get(annotation, "a text") + _bounds(metadata, scale)
 
 
-def _bounds(metadata: list[Any]) -> str:
-    least = next((item.ge for item in metadata if isinstance(item, Ge)), None)
-    above = next((item.gt for item in metadata if isinstance(item, Gt)), None)
-    most = next((item.le for item in metadata if isinstance(item, Le)), None)
-    if least is not None:
-        return f" of at least {least:g}" if most is None else f" in [{least}, {most}]"
-    return "" if above is None else f" above {above:g}"
+def _bounds(metadata: list[Any], scale: float) -> str:
+    bounds: dict[str, float] = {}
+    for item in metadata:
+        bounds |= {name: getattr(item, name) for name in ("ge", "gt", "le") if hasattr(item, name)}
+    if "ge" in bounds:
+        least = bounds["ge"]
+        return (
+            f" in [{least}, {bounds['le']}]"
+            if "le" in bounds
+            else f" of at least {least / scale:g}"
+        )
+    return f" above {bounds['gt'] / scale:g}" if "gt" in bounds else ""

@@ -8,10 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+import mor_bench as mor_bench_package
 from mor_bench.cli.app import COMMANDS, app
+from mor_bench.errors import InvalidInputError
 from mor_bench.options import FitOptions, Options, RunOptions, command_line
 from mor_bench.specs import list_suite
 
@@ -185,3 +188,30 @@ def test_an_error_is_one_line_and_nothing_is_written(
     assert message in done.stderr
     assert "\n" not in done.stderr.strip()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("--time-limit=-1", "`--time-limit` must be a number above 0; got -1.0."),
+        ("--memory-limit=0.01", "`--memory-limit` must be a number of at least 0.1 GB; got 0.01."),
+        ("--seeds=0", "`--seeds` must be an integer in [1, 100]; got 0."),
+    ],
+)
+def test_errors_name_an_option_as_the_command_line_does(option: str, words: str) -> None:
+    found = mor_bench("run", option)
+    assert (found.exit_code, found.stderr) == (2, f"mor-bench: {words}\n")
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    assert RunOptions(limit=np.int64(3), time_limit_s=np.float32(2.0)).limit == 3
+    assert mor_bench_package.load_method("pod", n_modes=np.int64(3)).parameters["n_modes"] == 3
+    with pytest.raises(InvalidInputError, match="must be an integer"):
+        RunOptions(limit=np.True_)
+
+
+def test_a_single_name_is_refused_with_the_list_that_is_meant() -> None:
+    with pytest.raises(
+        InvalidInputError, match=r"`methods` must be a list .* \['pod'\]; got 'pod'"
+    ):
+        mor_bench_package.run(methods="pod")

@@ -14,8 +14,10 @@ from mor_bench.options import RunOptions
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 from mor_bench.runs.configurations import CORE_METHODS, checked_specs
+from mor_bench.runs.plan import plan
 from mor_bench.scratch import identity
 from mor_bench.snapshots.dataset import Dataset
+from tests.commands import mor_bench_command
 from tests.small_runs import method_file, run_small
 from tests.third_party import Peeker
 
@@ -214,3 +216,55 @@ def test_a_damaged_fit_is_made_again(tmp_path: Path) -> None:
     for content in (b"null", b"{}", b'{"model_sha256": null}'):
         next(cache.glob(f"fits/{FORCES}-*/fit.json")).write_bytes(content)
         assert run_small([FORCES], tmp_path / "b", cache).rows[0].error == first.error
+
+
+BROKEN_MODULES = {
+    "syntax": ("class Mine(:\n", "SyntaxError"),
+    "null": ("x = 1\0\n", "null bytes"),
+    "name": ("\nclass Mine(Nothing): pass\n", "NameError: name 'Nothing' is not defined"),
+    "exit": ("import sys\nsys.exit(0)\n", "SystemExit: 0"),
+    "no-method": ("class Mine:\n    pass\n", "has no methods `fit` and `predict`"),
+    "abstract": (
+        "from abc import ABC, abstractmethod\nfrom tests.third_party import Zero\n\n"
+        "class Mine(Zero, ABC):\n    @abstractmethod\n    def more(self): ...\n",
+        "is abstract: it lacks `more`",
+    ),
+    "silent": (
+        "import mor_bench\n\nclass Mine(mor_bench.Surrogate):\n    pass\n",
+        "neither `answer` nor `predict`",
+    ),
+}
+"""Code of a method's module, and words of the one line that reports it."""
+
+
+def broken_module(folder: Path, how: str) -> Path:
+    (folder / f"module_{how.replace('-', '_')}.py").write_text(BROKEN_MODULES[how][0])
+    return method_file(folder, how, f"module_{how.replace('-', '_')}:Mine")
+
+
+@pytest.mark.slow
+def test_a_module_that_cannot_be_imported_costs_its_own_row(cache: Path, tmp_path: Path) -> None:
+    methods = [broken_module(tmp_path, how) for how in BROKEN_MODULES]
+    rows = run_small([*methods, "linear-fem"], tmp_path / "out", cache).rows
+    assert rows[-1].ok
+    for row, (_, words) in zip(rows[:-1], BROKEN_MODULES.values(), strict=True):
+        assert row.status == "failed"
+        assert words in str(row.reason), row.reason
+    steps = plan(["beam-tiny"], [*methods, "linear-fem"], cache=cache).steps
+    assert {*BROKEN_MODULES, "linear-fem"} <= {step.label for step in steps}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", BROKEN_MODULES)
+@pytest.mark.parametrize("command", ["check", "fit"])
+def test_a_module_that_cannot_be_imported_is_one_line_of_check_and_fit(
+    how: str, command: str, cache: Path, tmp_path: Path
+) -> None:
+    file = str(broken_module(tmp_path, how))
+    fit = ["beam-tiny", "-m", file, "--out", "m.safetensors", "--cache", str(cache), "--limit=60"]
+    done = mor_bench_command(command, *([file] if command == "check" else fit), cwd=tmp_path)
+    assert done.returncode == 2, done
+    assert BROKEN_MODULES[how][1] in done.stderr
+    assert "Traceback" not in done.stderr
+    assert len([line for line in done.stderr.splitlines() if "%" not in line]) == 1, done.stderr
+    assert not list(tmp_path.glob("*m.safetensors*"))

@@ -111,7 +111,7 @@ def test_the_command_prints_a_choice_and_its_exit_code(small_run: Comparison) ->
     def command(*options: str) -> Result:
         return CliRunner().invoke(app, ["pick", "beam-tiny", f"--run={small_run.out}", *options])
 
-    limits = ["--error=10", "--latency=10000", "--offline=1000", "--memory=1e6", "--json"]
+    limits = ["--error=10", "--latency=10000", "--offline=1000", "--memory=1e3", "--json"]
     done = command(*limits)
     assert done.exit_code == 0, done.stderr
     asked = {"error": 10.0, "latency_ms": 1e4, "memory_bytes": 1e12, "offline_s": 1e3}

@@ -57,6 +57,11 @@ def fit(
         )
     error = fitted.error
     iterations = "" if fitted.iterations is None else f", {fitted.iterations:,} iterations"
+    for name, values in fitted.first_of.items():
+        print(
+            f"{name} = {values[0]!r}, the first of {len(values)} values in the method's file; "
+            f"choose another one with --set {name}=VALUE"
+        )
     print(f"fit: {fitted.seconds:.3g} s{iterations}, {fitted.n_train:,} training samples")
     relative = ", ".join(
         f"{name} {error[f'rel_l2_{name}']:.3%}" for name in ("median", "p95", "max")

@@ -45,10 +45,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     @wraps(command)
     def expanded(**given: Any) -> None:
         values = {name: given.pop(name) for name in shown}
-        for name, (_, line) in shown.items():
-            if line.scale != 1 and values[name] is not None:
-                values[name] *= line.scale
-        command(**given, options=model(**values))
+        command(**given, options=model.from_command_line(values))
 
     # Positional order does not matter to Typer, which passes every value by name.
     keywords = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters]

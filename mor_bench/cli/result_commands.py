@@ -41,8 +41,8 @@ class PickOptions(FolderOptions):
     ] = None
     memory_bytes: Annotated[
         float | None,
-        Field(description="Upper limit of the resident memory of the predicting process, in MB."),
-        CommandLine("--memory", metavar="MB", default="any", scale=1e6),
+        Field(description="Upper limit of the resident memory of the predicting process, in GB."),
+        CommandLine("--memory", metavar="GB", default="any", scale=1e9),
     ] = None
     offline_s: Annotated[
         float | None,

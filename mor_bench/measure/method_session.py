@@ -18,7 +18,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mor_bench.errors import InvalidInputError, SolverError, UnknownRangeError
+from mor_bench.errors import (
+    InvalidInputError,
+    SolverError,
+    UnknownRangeError,
+    UnusableClassError,
+)
 from mor_bench.machine import peak_memory_bytes, pinned_threads
 from mor_bench.measure.fit_clock import fit_clock
 from mor_bench.measure.predictions import predict_all
@@ -134,8 +139,11 @@ class MethodSession(Session):
     def check(
         self, surrogate: str, configurations: list[dict[str, Any]], where: str
     ) -> dict[str, Any]:
-        """Import a class and check parameters against it."""
+        """Import a class, and check that it predicts and takes the parameters."""
         loaded = load_class(surrogate)
+        own = (getattr(loaded, verb, None) for verb in ("predict", "answer", "answer_observed"))
+        if all(function in vars(Surrogate).values() for function in own):
+            raise UnusableClassError(f"surrogate {surrogate!r} has neither `answer` nor `predict`.")
         for configuration in configurations:
             check_parameters(loaded, configuration, where)
         return {}

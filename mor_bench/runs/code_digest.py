@@ -167,7 +167,11 @@ def _source_digest(path: Path, changed: int) -> bytes:
 def _imports_of(path: Path, changed: int, package: str) -> tuple[str, ...]:
     """Return the names that a source file imports; ``from a import b`` gives a and a.b."""
     names: list[str] = []
-    for node in _nodes(ast.parse(path.read_bytes())):
+    try:
+        tree = ast.parse(path.read_bytes())
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return ()  # nothing can import it either, and the method's row says so
+    for node in _nodes(tree):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from inspect import signature
 from pathlib import Path
 from typing import Any
 
-from mor_bench.errors import InvalidInputError, MissingDependencyError
+from mor_bench.errors import InvalidInputError, MissingDependencyError, UnusableClassError
 from mor_bench.measure.method_session import MethodSession
 from mor_bench.mechanics.model import check_supports
 from mor_bench.options import RunOptions
@@ -22,12 +22,14 @@ from mor_bench.sandbox.process import (
 )
 from mor_bench.sandbox.seal import Restrictions
 from mor_bench.scene.scene import load_scene
+from mor_bench.scratch import scratch_folder
 from mor_bench.snapshots.generate import default_cache
 from mor_bench.specs import (
     AnyDatasetSpec,
     DatasetSpec,
     ImportedDatasetSpec,
     MethodSpec,
+    all_configurations,
     check_method,
     list_suite,
     load_dataset_spec,
@@ -158,7 +160,10 @@ def checked_specs(
     """
     for name, given in (("datasets", datasets), ("methods", methods)):
         if isinstance(given, str | Path | Mapping):
-            raise InvalidInputError(f"`{name}` must be a list of names; got {given!r}.")
+            shown = "beam-coarse" if isinstance(given, Mapping) else str(given)
+            raise InvalidInputError(
+                f"`{name}` must be a list of names, such as [{shown!r}]; got {given!r}."
+            )
     if not datasets or (methods is not None and not methods):
         raise InvalidInputError("`datasets` and `methods` must each hold at least one name.")
     specs = [load_dataset_spec(dataset, options.suite) for dataset in datasets]
@@ -207,22 +212,36 @@ def _check_method(spec: MethodSpec, options: RunOptions) -> None:
         with suppress(MissingDependencyError):
             check_method(spec)
         return
-    restrictions = Restrictions(
-        sealed=tuple(sealed_folders(options.cache or default_cache())),
-        import_from=spec.folder,
-        memory_bytes=options.memory_limit_bytes or default_memory_limit_bytes(),
-    )
-    with (
-        suppress(MethodFailedError, MissingDependencyError),
-        SandboxedProcess(MethodSession, restrictions) as worker,
-    ):
-        for profile in ("quick", "full"):
+    memory_bytes = options.memory_limit_bytes or default_memory_limit_bytes()
+    with suppress(MethodFailedError, MissingDependencyError, UnusableClassError):
+        check_foreign_method(spec, options.cache or default_cache(), memory_bytes)
+
+
+def check_foreign_method(spec: MethodSpec, cache: Path, memory_bytes: float) -> None:
+    """Import a third party's class in a sandbox, and check its method file against it.
+
+    Raises
+    ------
+    SpecError, MissingDependencyError
+        As `mor_bench.specs.check_method`.
+    MethodFailedError
+        If the import ends the process or takes too much time or memory.
+    """
+    with ExitStack() as stack:
+        restrictions = Restrictions(
+            sealed=tuple(sealed_folders(cache)),
+            import_from=spec.folder,
+            scratch=stack.enter_context(scratch_folder()),
+            memory_bytes=memory_bytes,
+        )
+        worker = stack.enter_context(SandboxedProcess(MethodSession, restrictions))
+        for where, configurations in all_configurations(spec).items():
             worker.ask(
                 "check",
                 START_LIMIT_S,
                 surrogate=spec.surrogate,
-                configurations=spec.configurations(profile),
-                where=f"method {spec.name} ({profile})",
+                configurations=configurations,
+                where=where,
             )
 
 

@@ -7,8 +7,11 @@ from pathlib import Path
 from mor_bench.errors import MissingDependencyError
 from mor_bench.mechanics.locking import locking_risk
 from mor_bench.mechanics.model import check_supports, missing_library
+from mor_bench.runs.configurations import OWN, check_foreign_method
+from mor_bench.sandbox.process import default_memory_limit_bytes
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import load_dataset
+from mor_bench.snapshots.generate import default_cache
 from mor_bench.snapshots.sampling import draw_loads, n_samples_of
 from mor_bench.snapshots.test_sets import check_regions
 from mor_bench.specs import (
@@ -29,7 +32,7 @@ def check_file(path: Path) -> str:
 
     Raises
     ------
-    SpecError, UnconstrainedBodyError
+    SpecError, MethodFailedError, UnconstrainedBodyError
         For the first problem, in one line.
     InvalidInputError
         If imported samples cannot be split, or the unseen region overlaps the load region.
@@ -38,7 +41,10 @@ def check_file(path: Path) -> str:
     """
     if is_method_file(path):
         method = load_method_spec(path)
-        check_method(method)
+        if method.surrogate.startswith(OWN):
+            check_method(method)
+        else:
+            check_foreign_method(method, default_cache(), default_memory_limit_bytes())
         quick, full = (len(method.configurations(profile)) for profile in ("quick", "full"))
         return f"method, {quick} quick and {full} full configurations"
     spec = load_dataset_spec(path)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.machine import describe_machine, gpu_name
@@ -35,12 +36,13 @@ def open_run(
     settings = context.recorded()
     if (folder / "results.json").exists():
         comparison = Comparison.read(folder)
-        if comparison.settings != settings or any(
-            datasets.get(name) != spec for name, spec in comparison.datasets.items()
-        ):
+        if found := [
+            *_differences(comparison.settings, settings),
+            *_other_datasets(comparison.datasets, datasets),
+        ]:
             raise InvalidInputError(
-                f"{folder} holds a run with other settings or datasets; "
-                "choose another folder or remove it."
+                f"{folder} holds another run, with {'; '.join(found)}. "
+                "Choose another folder or remove it."
             )
     else:
         _check_no_foreign(folder)
@@ -54,6 +56,24 @@ def open_run(
     except OSError as error:
         raise InvalidInputError(f"`out`: {folder} cannot be written: {error.strerror}.") from None
     return comparison
+
+
+def _differences(kept: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
+    """Describe the settings that differ."""
+    return [
+        f"`{name}` = {kept.get(name)!r} instead of {wanted.get(name)!r}"
+        for name in dict.fromkeys([*kept, *wanted])
+        if kept.get(name) != wanted.get(name)
+    ]
+
+
+def _other_datasets(kept: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
+    """Describe the datasets of a run that are missing now, or have changed."""
+    return [
+        f"the dataset {name!r}" if name not in wanted else f"another version of {name!r}"
+        for name, spec in kept.items()
+        if wanted.get(name) != spec
+    ]
 
 
 def _check_no_foreign(folder: Path) -> None:

@@ -25,7 +25,7 @@ from mor_bench.runs.run_context import training_options
 from mor_bench.runs.scoring import SCORE_CHUNK
 from mor_bench.snapshots.dataset import Dataset, Snapshots, load_dataset
 from mor_bench.snapshots.store import remove_leftovers, temporary_beside
-from mor_bench.specs import check_parameters, load_dataset_spec, load_method_spec
+from mor_bench.specs import MethodSpec, check_parameters, load_dataset_spec, load_method_spec
 from mor_bench.surrogate import Surrogate
 from mor_bench.training_options import TrainingOptions
 
@@ -47,6 +47,8 @@ class Fit:
         Number of iterations of a training with a time target.
     n_train, n_validation, n_test : int
         Numbers of samples. A training uses the validation samples to stop early.
+    first_of : dict of str to list
+        Swept parameters that were not given, and the values in the file; the first one was used.
     """
 
     method: Surrogate
@@ -57,6 +59,7 @@ class Fit:
     n_train: int
     n_validation: int
     n_test: int
+    first_of: dict[str, list[Any]]
 
 
 def fit(
@@ -106,7 +109,8 @@ def fit(
     chosen = FitOptions(**options)
     out = Path(out)
     spec = load_dataset_spec(dataset, chosen.suite)
-    unfitted = _unfitted(method, parameters or {}, chosen)
+    method_spec = load_method_spec(method, chosen.suite)
+    unfitted = _unfitted(method_spec, parameters or {})
     checkpoint = chosen.checkpoint or out.parent / f".{out.name}.checkpoint"
     training = _training(unfitted, chosen)
     _check_writable("out", out)
@@ -133,12 +137,13 @@ def fit(
                 stacklevel=2,
             )
         error = _test_error(unfitted, data.test)
-    sizes = map(len, (data.train, data.validation, data.test))
-    return Fit(unfitted, out, error, seconds, iterations, *sizes)
+    n_train, n_validation, n_test = map(len, (data.train, data.validation, data.test))
+    swept = method_spec.sweep_of("full")
+    first_of = {name: values for name, values in swept.items() if name not in (parameters or {})}
+    return Fit(unfitted, out, error, seconds, iterations, n_train, n_validation, n_test, first_of)
 
 
-def _unfitted(source: str | Path, parameters: Mapping[str, Any], options: FitOptions) -> Surrogate:
-    spec = load_method_spec(source, options.suite)
+def _unfitted(spec: MethodSpec, parameters: Mapping[str, Any]) -> Surrogate:
     surrogate = spec.load_class()
     chosen = {**spec.configurations("full")[0], **parameters}
     check_parameters(surrogate, chosen, f"method {spec.name}")

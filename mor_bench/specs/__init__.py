@@ -31,7 +31,7 @@ from mor_bench.specs.material_spec import (
     SolverName,
     TwoLameMaterial,
 )
-from mor_bench.specs.method_spec import MethodSpec, check_method
+from mor_bench.specs.method_spec import MethodSpec, all_configurations, check_method
 from mor_bench.specs.parameters import check_parameters, load_class
 from mor_bench.specs.region_spec import (
     BoxRegion,
@@ -82,6 +82,7 @@ __all__ = [
     "TetrahedraGeometry",
     "TwoLameMaterial",
     "VoxelsGeometry",
+    "all_configurations",
     "check_method",
     "check_parameters",
     "find_suite",

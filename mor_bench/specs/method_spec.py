@@ -139,11 +139,11 @@ class MethodSpec(StrictModel):
 
     def swept_keys(self, profile: str) -> list[str]:
         """Return the parameters that the sweep of the profile, or else of the file, varies."""
-        return list(self._sweep_of(profile))
+        return list(self.sweep_of(profile))
 
     def configurations(self, profile: str) -> list[dict[str, Any]]:
         """Return the parameters of every swept configuration; the first key varies slowest."""
-        sweep = self._sweep_of(profile)
+        sweep = self.sweep_of(profile)
         return [
             {**self.parameters_of(profile), **dict(zip(sweep, row, strict=True))}
             for row in itertools.product(*sweep.values())
@@ -152,7 +152,8 @@ class MethodSpec(StrictModel):
     def _profile(self, name: str) -> Profile:
         return self.profiles.get(name, Profile())  # type: ignore[call-overload, no-any-return]
 
-    def _sweep_of(self, profile: str) -> dict[str, list[Any]]:
+    def sweep_of(self, profile: str) -> dict[str, list[Any]]:
+        """Return the swept parameters of the profile, or else of the file, with their values."""
         return self._profile(profile).sweep or self.sweep
 
 
@@ -164,11 +165,23 @@ def check_method(spec: MethodSpec) -> None:
     SpecError, MissingDependencyError
     """
     surrogate = spec.load_class()
-    for profile in ("quick", "full"):
-        for configuration in spec.configurations(profile):
-            check_parameters(surrogate, configuration, f"method {spec.name} ({profile})")
+    for where, configurations in all_configurations(spec).items():
+        for configuration in configurations:
+            check_parameters(surrogate, configuration, where)
+
+
+def all_configurations(spec: MethodSpec) -> dict[str, list[dict[str, Any]]]:
+    """Return all parameters that a method file gives to its class, by place in the file."""
     battery = spec.battery
     races = [race.parameters for race in battery.races]
     observed = battery.parameters_for(observed=True)
-    for cheap in (battery.parameters, observed, battery.benchmark, *races):
-        check_parameters(surrogate, {**spec.parameters, **cheap}, f"method {spec.name} (battery)")
+    return {
+        **{
+            f"method {spec.name} ({profile})": spec.configurations(profile)
+            for profile in ("quick", "full")
+        },
+        f"method {spec.name} (battery)": [
+            {**spec.parameters, **cheap}
+            for cheap in (battery.parameters, observed, battery.benchmark, *races)
+        ],
+    }

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import numbers
 import sys
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
+from traceback import walk_tb
 from types import SimpleNamespace
 from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, create_model
 
-from mor_bench.errors import MissingDependencyError, SpecError
+from mor_bench.errors import MissingDependencyError, SpecError, UnusableClassError
 from mor_bench.specs.one_line_errors import nearest_name, validated
 
 
@@ -24,6 +26,8 @@ def load_class(target: str, folder: Path | None = None) -> type[Any]:
     ------
     MissingDependencyError
         If an optional dependency is not installed; the message names the extra.
+    UnusableClassError
+        If the module raises an error or ends Python, or the class is abstract or no method.
     SpecError
         If the module or the class does not exist.
     """
@@ -38,6 +42,11 @@ def load_class(target: str, folder: Path | None = None) -> type[Any]:
                 f"{target} needs torch: pip install 'mor-bench[learn]'"
             ) from error
         raise SpecError(f"surrogate {target!r} cannot be imported: {error}") from error
+    except (Exception, SystemExit) as error:  # foreign code runs here
+        raise UnusableClassError(
+            f"surrogate {target!r} cannot be imported: {type(error).__name__}: {error}"
+            f"{_line_in(folder, error)}"
+        ) from error
     if not hasattr(loaded, name):
         raise SpecError(
             f"surrogate {target!r}: module {module!r} has no class {name!r}"
@@ -46,7 +55,27 @@ def load_class(target: str, folder: Path | None = None) -> type[Any]:
     found = getattr(loaded, name)
     if not isinstance(found, type):
         raise SpecError(f"surrogate {target!r} is not a class.")
+    _check_usable(found, target)
     return found
+
+
+def _line_in(folder: Path | None, error: BaseException) -> str:
+    """Name the last line of a folder's files that an error passed; "" if there is none."""
+    places = [(Path(f.f_code.co_filename), line) for f, line in walk_tb(error.__traceback__)]
+    own = [place for place in places if folder is not None and place[0].is_relative_to(folder)]
+    return f" ({own[-1][0].name}, line {own[-1][1]})" if own else ""
+
+
+def _check_usable(found: type[Any], target: str) -> None:
+    missing = [verb for verb in ("fit", "predict") if not callable(getattr(found, verb, None))]
+    if missing:
+        raise UnusableClassError(
+            f"surrogate {target!r} is not a subclass of mor_bench.Surrogate, and has no methods "
+            "`fit` and `predict`."
+        )
+    if inspect.isabstract(found):
+        names = ", ".join(f"`{name}`" for name in sorted(found.__abstractmethods__))
+        raise UnusableClassError(f"surrogate {target!r} is abstract: it lacks {names}.")
 
 
 def check_parameters(
@@ -67,7 +96,17 @@ def check_parameters(
         __config__=ConfigDict(extra="forbid", strict=True),
         **_annotated_defaults(surrogate),
     )
-    return validated(model, parameters, where or surrogate.__name__).model_dump()
+    plain = {name: python_number(value) for name, value in parameters.items()}
+    return validated(model, plain, where or surrogate.__name__).model_dump()
+
+
+def python_number(value: Any) -> Any:
+    """Return a number of NumPy as a number of Python, and everything else unchanged."""
+    if isinstance(value, bool | int | float):
+        return value
+    if isinstance(value, numbers.Integral):
+        return int(value)
+    return float(value) if isinstance(value, numbers.Real) else value
 
 
 def _annotated_defaults(surrogate: type[Any]) -> dict[str, Any]:

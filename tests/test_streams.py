@@ -1,0 +1,132 @@
+"""Closed and full streams, plain terminals, signals, and a full disk, as a user meets them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.small_runs import COMMAND
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
+
+ROOT = Path(__file__).parents[1]
+
+MOR_BENCH = " ".join(COMMAND)
+
+
+def shell(line: str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run a line of bash in which $M stands for mor-bench."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "M": MOR_BENCH, **variables}
+    command = ["bash", "-o", "pipefail", "-c", line]
+    return subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "line",
+    [
+        "$M list >&-",
+        "$M list >&- 2>&- <&-",
+        "$M check $FILE >&-",
+        "$M run beam-tiny -m linear-fem --dry-run --cache c --limit 60 >&-",
+        "$M --help >&-",
+    ],
+)
+def test_closed_streams_are_no_error(line: str, tmp_path: Path) -> None:
+    done = shell(line, tmp_path, FILE=str(ROOT / "datasets" / "beam-tiny.toml"))
+    assert (done.returncode, done.stdout) == (0, ""), done
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arguments", ["list", "list --json", "--help", "check"])
+def test_a_pipe_that_closes_early_ends_the_command_quietly(arguments: str, tmp_path: Path) -> None:
+    done = shell(f"$M {arguments} | (exec <&-; sleep 0.1)", tmp_path)
+    assert done.returncode in (0, 1, 141)
+    assert not done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("arguments", ["list", "list --json", "--help"])
+def test_a_full_disk_under_standard_output_is_one_line(arguments: str, tmp_path: Path) -> None:
+    done = shell(f"$M {arguments} > /dev/full", tmp_path)
+    words = "mor-bench: standard output or a temporary file: No space left on device\n"
+    assert (done.returncode, done.stderr) == (2, words)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", ["$M generate beam-tiny --cache d", "$M run beam-tiny --out d/o"])
+def test_a_limit_on_written_bytes_is_one_line_that_names_the_file(
+    line: str, tmp_path: Path
+) -> None:
+    methods = "-m linear-fem --cache c" if " run " in line else ""
+    done = shell(f"ulimit -f 20; {line} {methods} --limit 60 --workers 1", tmp_path)
+    assert done.returncode == 2, done
+    assert done.stderr.splitlines()[-1].startswith("mor-bench: ")
+    assert "File too large" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+@pytest.mark.slow
+def test_plain_terminals_and_encodings_change_no_result(tmp_path: Path) -> None:
+    settings = {
+        "dumb": {"TERM": "dumb"},
+        "c": {"LANG": "C", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        "ascii": {"PYTHONIOENCODING": "ascii"},
+    }
+    for name, variables in settings.items():
+        line = f"$M run beam-tiny -m linear-fem --cache c --limit 60 --out {name} && $M list"
+        done = shell(line, tmp_path, **variables)
+        assert done.returncode == 0, done.stderr
+        assert "linear-fem" in done.stdout
+        assert (tmp_path / name / "report.html").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
+def test_a_signal_ends_a_command_with_one_line_and_leaves_nothing(
+    name: str, tmp_path: Path
+) -> None:
+    (tmp_path / "tmp").mkdir()
+    number = getattr(signal, name)
+    command = [*COMMAND, "run", "beam-tiny", "-m", "umesh-small", "--train", "--limit=60"]
+    process = subprocess.Popen(
+        [*command, "--cache=c", "--out=o"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path / "tmp")},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    training = tmp_path / "c" / "fits"
+    while process.poll() is None and not list(training.glob("*/training")):
+        time.sleep(0.05)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    by = "" if name == "SIGINT" else f" by {name}"
+    assert said.splitlines()[-1].startswith(f"mor-bench: stopped{by}; finished samples and rows")
+    assert "Traceback" not in said
+    assert not list((tmp_path / "tmp").glob("mor-bench-*"))
+
+
+@pytest.mark.slow
+def test_nohup_is_respected(tmp_path: Path) -> None:
+    code = (
+        "import os, signal\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "from mor_bench.cli.clear_errors import clear_errors\n"
+        "with clear_errors():\n    os.kill(os.getpid(), signal.SIGHUP)\nprint('alive')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "alive\n"
