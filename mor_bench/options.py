@@ -317,11 +317,8 @@ def _bounds(metadata: list[Any], scale: float) -> str:
     bounds: dict[str, float] = {}
     for item in metadata:
         bounds |= {name: getattr(item, name) for name in ("ge", "gt", "le") if hasattr(item, name)}
+    if "ge" in bounds and "le" in bounds:
+        return f" in [{bounds['ge']}, {bounds['le']}]"
     if "ge" in bounds:
-        least = bounds["ge"]
-        return (
-            f" in [{least}, {bounds['le']}]"
-            if "le" in bounds
-            else f" of at least {least / scale:g}"
-        )
+        return f" of at least {bounds['ge'] / scale:g}"
     return f" above {bounds['gt'] / scale:g}" if "gt" in bounds else ""
