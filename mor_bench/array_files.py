@@ -29,20 +29,6 @@ FREE_BYTES, MOST_RATIO = 2**26, 50
 MOST_OBJECTS = 10_000
 """Limit of the number of arrays and groups in a file."""
 
-UNREADABLE = (
-    OSError,
-    ValueError,
-    EOFError,
-    TypeError,
-    KeyError,
-    AttributeError,
-    RuntimeError,
-    ArithmeticError,
-    zipfile.BadZipFile,
-    NotImplementedError,
-)
-"""Errors that the readers of other libraries raise for damaged files."""
-
 
 def read_npz(path: Path, error: type[MorBenchError] = StoreError) -> Arrays:
     """Read every array of an NPZ file.
@@ -64,7 +50,9 @@ def read_npz(path: Path, error: type[MorBenchError] = StoreError) -> Arrays:
             }
     except _RefusedError as reason:
         raise error(f"{path}: {reason}") from None
-    except UNREADABLE as reason:
+    except (MorBenchError, MemoryError):
+        raise
+    except Exception as reason:  # damaged files raise errors of many kinds
         raise error(f"{path}: not a readable .npz file of arrays: {_words(reason)}") from None
 
 
@@ -116,7 +104,7 @@ def read_npy(path: Path, error: type[MorBenchError] = StoreError) -> NDArray[Any
     check_file(path, error=error)
     try:
         return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
-    except UNREADABLE as reason:
+    except Exception as reason:
         raise error(f"{path}: not a readable .npy file: {_words(reason)}") from None
 
 
@@ -133,9 +121,9 @@ def open_hdf5(path: Path, error: type[MorBenchError] = StoreError) -> Iterator[h
             yield file
     except _RefusedError as reason:
         raise error(f"{path}: {reason}") from None
-    except MorBenchError:
+    except (MorBenchError, MemoryError):
         raise
-    except UNREADABLE as reason:
+    except Exception as reason:  # damaged files raise errors of many kinds
         raise error(f"{path}: not a readable HDF5 file of arrays: {_words(reason)}") from None
 
 

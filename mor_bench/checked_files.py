@@ -65,14 +65,15 @@ def read_bytes(
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     try:
         with open(os.open(path, flags), "rb") as file:
-            _check_status(path, os.fstat(file.fileno()), most_bytes, error)
-            content = file.read(most_bytes + 1)
+            status = os.fstat(file.fileno())
+            _check_status(path, status, most_bytes, error)
+            content = file.read(status.st_size + 1)
     except FileNotFoundError:
         raise
     except (OSError, ValueError) as reason:
         raise error(f"{path}: cannot be read: {_words(reason)}.") from None
-    if len(content) > most_bytes:  # it grew, or its file system reports no size
-        raise error(f"{path}: larger than {most_bytes:,} bytes.")
+    if len(content) > status.st_size:
+        raise error(f"{path}: grew while it was read.")
     return content
 
 

@@ -29,7 +29,7 @@ ROW = {
 
 
 def comparison(out: Path) -> Comparison:
-    made = Comparison(out, {"cores": 2})
+    made = Comparison(out, {"cores": 2}, datasets={"d": {"title": "D"}})
     made.put(Row.model_validate(ROW))
     return made
 
@@ -56,6 +56,29 @@ def test_a_row_may_lack_the_swept_parameters(tmp_path: Path) -> None:
     del content["rows"][0]["swept"]
     path.write_text(json.dumps(content))
     assert Comparison.read(tmp_path).rows[0].swept == {}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("datasets", {}, "`datasets` lacks 'd', which rows name"),
+        ("datasets", {"d": {"needs": {"error": "small"}}}, r"`datasets.d`: .*needs.error"),
+        ("datasets", {"d": True}, r"`datasets.d`: Input should be a valid dictionary"),
+        ("methods", {"pod": {"regime": {"min_dofs": "many"}}}, r"`methods.pod`: .*min_dofs"),
+        ("settings", {"limit": "few"}, r"`settings`: .*limit"),
+        ("rows", {}, r"`rows`: Input should be a valid list"),
+        ("schema_version", "2" * 1000, r"schema version 2{50}…"),
+    ],
+)
+def test_a_damaged_table_is_refused_with_its_name_and_the_key(
+    tmp_path: Path, key: str, value: object, message: str
+) -> None:
+    comparison(tmp_path)
+    path = tmp_path / "results.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
+    with pytest.raises(StoreError, match=rf"results\.json: {message}") as caught:
+        Comparison.read(tmp_path)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ def _missing(row: Row, regime: Mapping[str, Any], device: str) -> list[str]:
     has = {
         "min_dofs": (row.n_dofs, "degrees of freedom"),
         "min_train": (row.n_train, "training samples"),
-        "min_iterations": (trained or row.parameters.get("iterations"), "iterations"),
+        "min_iterations": (trained or _number(row.parameters.get("iterations")), "iterations"),
     }
     missing = [
         f"{n or 0:,} of {regime[name]:,} {what}"
@@ -98,6 +98,10 @@ def _missing(row: Row, regime: Mapping[str, Any], device: str) -> list[str]:
         trained_on = row.training.device if row.training else device
         missing.append("no graphics processor" if trained_on == "cpu" else QUERIES_ON_CPU)
     return missing
+
+
+def _number(value: Any) -> int | None:
+    return value if isinstance(value, int) else None
 
 
 def tuning(comparison: Comparison) -> list[dict[str, Any]]:

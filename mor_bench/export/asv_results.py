@@ -127,9 +127,10 @@ def export_asv(
         If the working folder is not a checkout of mor-bench or lacks the commit; if no row has
         finished; or if `machine` is not given and the comparison ran on another machine.
     StoreError
-        If a file in `out` is not asv's, or has another version.
+        If a file in `out` is not asv's or has another version, or the machine is not recorded.
     """
     out = Path(out)
+    _check_machine(comparison)
     commit_hash, date = commit_and_date(commit)
     name = machine_name(comparison.machine, machine)
     figures = _figures(comparison)
@@ -158,6 +159,12 @@ def export_asv(
     write_file(machine_path, about, "machine")
     write_file(path, content, "results")
     return [machine_path, path, describe(out)]
+
+
+def _check_machine(comparison: Comparison) -> None:
+    for name in ("python", "processor", "cores", "system"):
+        if not isinstance(comparison.machine.get(name), str | int):
+            raise StoreError(f"{comparison.out}: `machine.{name}` of results.json is missing.")
 
 
 def _merged(path: Path, commit_hash: str, figures: Mapping[str, Figures]) -> dict[str, Any]:

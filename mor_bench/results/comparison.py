@@ -21,7 +21,7 @@ from pydantic import ValidationError
 
 from mor_bench.array_files import read_hdf5
 from mor_bench.checked_files import read_json
-from mor_bench.errors import StoreError
+from mor_bench.errors import StoreError, printable
 from mor_bench.results.arrays import write_arrays
 from mor_bench.results.json_file import write_json
 from mor_bench.results.row import LearningPoint, ResultsFile, Row
@@ -170,7 +170,7 @@ class Comparison:
             version = content["schema_version"]
             if version != SCHEMA_VERSION:
                 raise StoreError(
-                    f"{path}: schema version {version}; "
+                    f"{path}: schema version {printable(str(version), 50)}; "
                     f"this version of mor-bench reads version {SCHEMA_VERSION}."
                 )
             file = ResultsFile.model_validate(content)
@@ -179,7 +179,9 @@ class Comparison:
         except ValidationError as error:
             first = error.errors()[0]
             key = ".".join(map(str, first["loc"]))
-            raise StoreError(f"{path}: `{key}`: {first['msg']}.") from None
+            named = f"`{printable(key, 200)}`: " if key else ""
+            reason = first["msg"].removeprefix("Value error, ")
+            raise StoreError(f"{path}: {named}{printable(reason, 500)}.") from None
         except (ValueError, KeyError, TypeError) as error:
             raise StoreError(f"{path}: not a results file of mor-bench: {error}") from None
         return cls(

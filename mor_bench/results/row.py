@@ -8,9 +8,10 @@ from __future__ import annotations
 from math import nan
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
-from mor_bench.results.parts import Part, Real, SeedSpread, TrainedElsewhere, TrainingRecord
+from mor_bench.results.parts import Label, Part, Real, SeedSpread, TrainedElsewhere, TrainingRecord
+from mor_bench.results.recorded import RecordedDataset, RecordedMethod, RecordedSettings
 from mor_bench.specs.method_spec import Told
 
 Status = Literal["ok", "failed", "skipped"]
@@ -265,10 +266,10 @@ class Row(Part):
         Tuning budget that the configuration used, s.
     """
 
-    dataset: str
-    split: str
-    method: str
-    label: str
+    dataset: Label
+    split: Label
+    method: Label
+    label: Label
     parameters: dict[str, Any] = Field(default={})
     swept: dict[str, Any] = Field(default={})
     told: Told | None = None
@@ -336,9 +337,9 @@ class Row(Part):
 class LearningPoint(Part):
     """One point of a learning curve: training samples, fitting time (s) and error."""
 
-    dataset: str
-    method: str
-    label: str
+    dataset: Label
+    method: Label
+    label: Label
     n_train: int
     status: Status
     reason: str | None = None
@@ -351,11 +352,18 @@ class ResultsFile(Part):
 
     schema_version: int
     machine: dict[str, Any]
-    settings: dict[str, Any]
-    datasets: dict[str, dict[str, Any]]
-    methods: dict[str, dict[str, Any]]
+    settings: RecordedSettings
+    datasets: dict[Label, RecordedDataset]
+    methods: dict[Label, RecordedMethod]
     rows: list[Row]
     learning: list[LearningPoint]
+
+    @model_validator(mode="after")
+    def _complete(self) -> ResultsFile:
+        for row in self.rows:
+            if row.ok and row.dataset not in self.datasets:
+                raise ValueError(f"`datasets` lacks {row.dataset!r}, which rows name")
+        return self
 
 
 def label_of(method: str, swept: dict[str, Any]) -> str:

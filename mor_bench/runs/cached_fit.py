@@ -139,6 +139,23 @@ class FitRecord(BaseModel):
         return (self.training or {}).get("iterations")
 
 
+def read_fit_record(path: Path) -> FitRecord:
+    """Read a fit.json.
+
+    Raises
+    ------
+    StoreError
+        If it is damaged.
+    FileNotFoundError
+        If it does not exist.
+    """
+    try:
+        return FitRecord.model_validate(read_json(path))
+    except ValidationError as error:
+        reason = " ".join(str(error).split())
+        raise StoreError(f"{path}: not the record of a fit: {reason}") from None
+
+
 class CachedFit:
     """A configuration and its cache folder; also its process if the method cannot be saved.
 
@@ -201,10 +218,10 @@ class CachedFit:
     def record(self) -> FitRecord | None:
         """The record of the fit; None if there is none or it is damaged."""
         try:
-            record = FitRecord.model_validate(read_json(self.folder / "fit.json"))
+            record = read_fit_record(self.folder / "fit.json")
             checksum = record.model_sha256
             damaged = checksum is not None and checksum != digest_of_file(self.model)
-        except (OSError, StoreError, ValidationError):
+        except (OSError, StoreError):
             return None
         return None if damaged else record
 

@@ -11,9 +11,6 @@ from pathlib import Path
 from statistics import median
 from time import perf_counter
 
-from pydantic import ValidationError
-
-from mor_bench.checked_files import read_json
 from mor_bench.errors import StoreError
 from mor_bench.measure.latency import (
     BATCH_S,
@@ -26,7 +23,7 @@ from mor_bench.measure.machine_speed import MachineSpeed, recorded_machines
 from mor_bench.measure.method_session import SETTLE_QUERIES
 from mor_bench.measure.timing import BATCHES
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.runs.cached_fit import FitRecord
+from mor_bench.runs.cached_fit import FitRecord, read_fit_record
 from mor_bench.runs.compilation import uncompiled
 from mor_bench.runs.configurations import OWN, Configuration, may_train
 from mor_bench.runs.run_context import RunContext
@@ -147,8 +144,8 @@ def _earlier_fits(cache: Path, configuration: Configuration) -> list[FitRecord]:
     """Return records of earlier fits of a method, with the same parameters if there are any."""
     records = []
     for path in (cache / "fits").glob(f"{configuration.method.name}-*/fit.json"):
-        with suppress(OSError, StoreError, ValidationError):
-            record = FitRecord.model_validate(read_json(path))
+        with suppress(OSError, StoreError):
+            record = read_fit_record(path)
             if record.trained_elsewhere is None:
                 records.append(record)
     wanted = configuration.parameters.items()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mor_bench.array_files import is_hdf5, open_hdf5
 from mor_bench.checked_files import check_file, limited_memory, read_bytes
-from mor_bench.errors import SpecError
+from mor_bench.errors import SpecError, printable
 from mor_bench.scene.gmsh1 import is_gmsh1, read_gmsh1
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.point_sets import PointSets, check_abaqus, named_point_sets
@@ -191,4 +191,5 @@ def _reason(error: BaseException, text: str, suffix: str) -> str:
         return f"cannot be read as {suffix[1:].upper()}: it is {broken}"
     if "need at least one array" in text:
         return "the file is empty or holds no mesh"
-    return f"meshio cannot read it ({' '.join(text.split()) or type(error).__name__})"
+    words = printable(" ".join(text.split()), 300) or type(error).__name__
+    return f"meshio cannot read it ({words})"

@@ -12,7 +12,7 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-from mor_bench.errors import SpecError
+from mor_bench.errors import SpecError, printable
 
 _NAMES = (
     "line triangle quad tetra hexahedron wedge pyramid line3 triangle6 quad9 tetra10 hexahedron27 "
@@ -57,10 +57,10 @@ def read_gmsh1(path: Path) -> meshio.Mesh:
     except KeyError as error:
         raise SpecError(
             f"{path}: invalid Gmsh 1 file: it has no node, or no element type, with the "
-            f"number {error}."
+            f"number {printable(str(error), 300)}."
         ) from None
-    except ValueError as error:
-        raise SpecError(f"{path}: invalid Gmsh 1 file: {error}.") from None
+    except (ValueError, OverflowError) as error:
+        raise SpecError(f"{path}: invalid Gmsh 1 file: {printable(str(error), 300)}.") from None
 
 
 def _section(lines: Sequence[str], name: str) -> list[list[str]]:

@@ -104,7 +104,8 @@ def check_abaqus(path: Path) -> None:
     repeated = sorted({name for name in names if name is not None and names.count(name) > 1})
     if repeated:
         raise SpecError(
-            f"{path}: NSET {repeated[0]!r} is defined more than once; join its parts into one set."
+            f"{path}: NSET {repeated[0][:100]!r} is defined more than once; "
+            "join its parts into one set."
         )
     if (n_blocks := len(_keywords(path, "NODE", "NSET"))) > 1:
         raise SpecError(

@@ -1,0 +1,207 @@
+"""Seeded mutations of files, and the loop that gives them to a reader under limits."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mor_bench.errors import MorBenchError
+
+QUICK, SLOW = 200, 2000
+"""Mutations of each reader's files in the quick and in the slow part of the tests."""
+
+LIMIT_S, WAIT_S, LIMIT_BYTES = 2.0, 60.0, 500_000_000
+"""Limits for one mutated file: processor time, time on the clock, and memory."""
+
+LONGEST = 5000
+"""Most letters of a message."""
+
+VALUES: tuple[Any, ...] = (
+    *(None, True, False, 0, 1, -1, 3, 2**31, 2**63, -(2**63), 10**18, 10**40),
+    *(0.5, -0.0, 1e-320, 1e308, -1e308, float("nan"), float("inf"), -float("inf")),
+    *("", "nan", "inf", "true", "1", "ü", "\x1b[31m", "\u202e", "\x00", "../../x", "/dev/zero"),
+    *("<script>alert(1)</script>", "a" * 20_000, "{}", "%s", "\n"),
+    *([], {}, [[]], [1, "a", None], {"a": {"b": []}}, {"": 0}),
+)
+"""Values that take the place of others in tables."""
+
+SNIPPETS = (
+    *(b"\x00", b"\xff\xfe", b"\xef\xbb\xbf", b"9" * 400, b"-1", b"nan", b"1e999", b"[" * 500),
+    *(b"\n", b" ", b'"', b"{", b"}", b"true", b"\\u0000", b"\\ud800", b"<!ENTITY a 'b'>", b"'''"),
+)
+"""Pieces that are put between other bytes."""
+
+
+def mutated_bytes(content: bytes, generator: np.random.Generator) -> bytes:
+    """Flip, remove, repeat, insert or cut off some bytes."""
+    changed = bytearray(content)
+    for _ in range(int(generator.integers(1, 4))):
+        at = int(generator.integers(0, len(changed) + 1))
+        length = int(generator.choice([1, 2, 8, 100]))
+        match generator.integers(6):
+            case 0:
+                changed[at : at + length] = generator.bytes(len(changed[at : at + length]))
+            case 1:
+                del changed[at : at + length]
+            case 2:
+                changed[at:at] = changed[at : at + length] * int(generator.integers(1, 30))
+            case 3:
+                changed[at:at] = SNIPPETS[generator.integers(len(SNIPPETS))]
+            case 4:
+                del changed[at:]
+            case _:
+                if at < len(changed):
+                    changed[at] ^= 1 << int(generator.integers(8))
+    return bytes(changed)
+
+
+def mutated_words(content: bytes, generator: np.random.Generator) -> bytes:
+    """Replace, drop or repeat some words of a text."""
+    words = content.split(b" ")
+    for _ in range(int(generator.integers(1, 4))):
+        at = int(generator.integers(len(words)))
+        match generator.integers(4):
+            case 0:
+                words[at] = str(VALUES[generator.integers(len(VALUES))]).encode()
+            case 1:
+                words.insert(at, words[int(generator.integers(len(words)))])
+            case 2 if len(words) > 1:
+                del words[at]
+            case _:
+                words[at] = SNIPPETS[generator.integers(len(SNIPPETS))]
+    return b" ".join(words)
+
+
+def mutated_json(content: bytes, generator: np.random.Generator) -> bytes:
+    """Replace, drop, rename, nest or repeat some values of a JSON text."""
+    value = json.loads(content)
+    for _ in range(int(generator.integers(1, 4))):
+        places = list(_places(value))
+        table, key = places[generator.integers(len(places))]
+        match generator.integers(5):
+            case 0 if isinstance(table, dict):
+                table[str(VALUES[generator.integers(len(VALUES))])[:50]] = table.pop(key)
+            case 1:
+                del table[key]
+            case 2:
+                for _ in range(int(generator.choice([1, 3, 100]))):
+                    table[key] = [table[key]]
+            case 3:
+                other, name = places[generator.integers(len(places))]
+                if name in other if isinstance(other, dict) else name < len(other):
+                    table[key] = json.loads(json.dumps(other[name]))
+            case _:
+                table[key] = VALUES[generator.integers(len(VALUES))]
+        if not value:
+            break
+    return json.dumps(value).encode()
+
+
+def _places(value: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield every table or list with each of its keys."""
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    for key, item in list(items):
+        yield value, key
+        if isinstance(item, dict | list):
+            yield from _places(item)
+
+
+Mutator = Callable[[bytes, np.random.Generator], bytes]
+
+
+def attack(read: Callable[[Path], Any], path: Path, mutators: list[Mutator], n: int) -> int:
+    """Write n mutations of a file one by one and read each; return how many were accepted.
+
+    Anything but success or a `MorBenchError` of one line, and every excess of a limit, is an error
+    with the number of the mutation, which is also its seed.
+    """
+    read(path)  # the sound file; it also imports what is imported on demand
+    original, accepted = path.read_bytes(), 0
+    with warnings.catch_warnings(), np.errstate(all="ignore"), _less_memory():
+        warnings.simplefilter("ignore")
+        for seed in range(n):
+            generator = np.random.default_rng([seed, n])
+            content = mutators[seed % len(mutators)](original, generator)
+            path.write_bytes(content)
+            try:
+                with _less_time():
+                    read(path)
+                accepted += 1
+            except MorBenchError as error:
+                if "\n" in str(error) or len(str(error)) > LONGEST:
+                    raise AssertionError(f"mutation {seed} of {path}: {error}") from error
+            except BaseException as error:
+                path.with_name(f"mutation-{seed}").write_bytes(content)
+                raise AssertionError(f"mutation {seed} of {path}: {error!r}") from error
+    return accepted
+
+
+@contextmanager
+def _less_time() -> Iterator[None]:
+    if not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def late(*_: Any) -> None:
+        raise TimeoutError(f"it takes more than {LIMIT_S} s of work, or waits for {WAIT_S} s")
+
+    clocks = {
+        signal.SIGPROF: (signal.ITIMER_PROF, LIMIT_S),
+        signal.SIGALRM: (signal.ITIMER_REAL, WAIT_S),
+    }
+    before = {number: signal.signal(number, late) for number in clocks}
+    for clock, limit_s in clocks.values():
+        signal.setitimer(clock, limit_s)
+    try:
+        yield
+    finally:
+        for clock, _ in clocks.values():
+            signal.setitimer(clock, 0.0)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _less_memory() -> Iterator[None]:
+    if sys.platform != "linux":
+        yield
+        return
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + LIMIT_BYTES, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+TEXT: list[Mutator] = [mutated_words, mutated_bytes]
+JSON: list[Mutator] = [mutated_json, mutated_json, mutated_bytes]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader of files, how to write a sound file for it, and how to damage the file."""
+
+    name: str
+    write: Callable[[Path], object]
+    read: Callable[[Path], object]
+    mutators: list[Mutator]
+
+
+def attacked(reader: Reader, folder: Path, n: int) -> None:
+    (folder / "datasets").mkdir()
+    path = folder / "datasets" / reader.name
+    reader.write(path)
+    attack(reader.read, path, reader.mutators, n)

@@ -1,0 +1,257 @@
+"""Every reader of a file answers a damaged or forged one with its content or one clear line."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import meshio
+import numpy as np
+import pytest
+
+import mor_bench
+from mor_bench.array_files import read_npy
+from mor_bench.export.asv_files import read_file
+from mor_bench.measure.discretisation_error import measured
+from mor_bench.runs.cached_fit import read_fit_record
+from mor_bench.scene.files import read_mesh
+from mor_bench.scene.mesh import box_mesh
+from mor_bench.scene.snapshot_file import read_arrays
+from mor_bench.scene.surfaces import read_surface
+from mor_bench.snapshots.manifest import Manifest, read_manifest
+from mor_bench.snapshots.solve import GENERATOR_VERSION
+from mor_bench.snapshots.store import (
+    HEADER_BYTES,
+    SCHEMA_VERSION,
+    Shard,
+    header_line,
+    read_shard,
+    write_shard,
+)
+from mor_bench.specs import (
+    SourceFile,
+    check_parameters,
+    load_dataset_spec,
+    load_generated_spec,
+    load_method_spec,
+)
+from tests.mutations import JSON, QUICK, SLOW, TEXT, Reader, attacked, mutated_bytes, mutated_json
+
+SUITE = Path(mor_bench.__file__).parents[1]
+
+
+def of_suite(kind: str, name: str) -> Callable[[Path], object]:
+    return lambda path: shutil.copyfile(SUITE / kind / name, path)
+
+
+def build(path: Path) -> None:
+    mor_bench.load_scene(load_dataset_spec(path))
+
+
+def mesh_of(tetrahedra: bool = False) -> meshio.Mesh:
+    mesh = box_mesh((2.0, 1.0, 1.0), (2, 1, 1), tetrahedra)
+    held = (mesh.points[:, 0] == 0.0).astype(int)
+    kind = "tetra" if tetrahedra else "hexahedron"
+    return meshio.Mesh(mesh.points, [(kind, mesh.cells)], point_data={"held": held})
+
+
+def checked_method(path: Path) -> None:
+    spec = load_method_spec(path)
+    check_parameters(spec.load_class(), spec.configurations("full")[0])
+
+
+def written_as(file_format: str, **options: Any) -> Callable[[Path], object]:
+    return lambda path: meshio.write(path, mesh_of(), file_format=file_format, **options)
+
+
+def plain_msh(path: Path) -> None:
+    mesh = mesh_of()
+    mesh.point_data.clear()
+    meshio.write(path, mesh, file_format="gmsh22", binary=False)
+
+
+def surface(path: Path) -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    meshio.write(path, meshio.Mesh(points, [("triangle", faces)]))
+
+
+def body(path: Path) -> object:
+    return read_mesh(path, 1.0)
+
+
+def source(path: Path) -> object:
+    return read_arrays(SourceFile(path=str(path), sha256=sha256(path.read_bytes())))
+
+
+def sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def snapshots() -> dict[str, np.ndarray]:
+    mesh, generator = box_mesh((2.0, 1.0, 1.0), (2, 1, 1)), np.random.default_rng(0)
+    shape = (6, mesh.n_nodes, 3)
+    fixed = np.flatnonzero(mesh.points[:, 0] == 0.0)
+    moved = generator.normal(size=shape)
+    moved[:, fixed] = 0.0
+    return {
+        "points": mesh.points,
+        "cells": mesh.cells,
+        "forces": generator.normal(size=shape),
+        "displacements": moved,
+        "fixed_nodes": fixed,
+        "regions": np.arange(6) % 3,
+    }
+
+
+def snapshots_npz(path: Path) -> None:
+    np.savez(path, allow_pickle=False, **snapshots())
+
+
+def snapshots_h5(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        for name, array in snapshots().items():
+            file.create_dataset(name, data=array, compression="gzip")
+
+
+def repacked(content: bytes, generator: np.random.Generator) -> bytes:
+    """Mutate the arrays of an NPZ file, not the archive."""
+    arrays = dict(np.load(io.BytesIO(content)))
+    name = list(arrays)[generator.integers(len(arrays))]
+    array = arrays[name]
+    match generator.integers(6):
+        case 0:
+            del arrays[name]
+        case 1:
+            kinds = ("f4", "f8", "i1", "i8", "u8", "c16", "U5", "?", "M8[s]", "S3")
+            with np.errstate(all="ignore"):
+                arrays[name] = array.astype(kinds[generator.integers(len(kinds))])
+        case 2:
+            arrays[name] = array[None] if generator.random() < 0.5 else array.ravel()
+        case 3:
+            arrays[name] = array[: int(generator.integers(0, len(array) + 1))]
+        case 4:
+            flat = array.astype(float).ravel()
+            values = [np.nan, np.inf, -1.0, 1e308, 1e-320, 7.0, 1e12, 0.0]
+            flat[generator.integers(flat.size)] = values[generator.integers(len(values))]
+            arrays[name] = flat.reshape(array.shape).astype(array.dtype)
+        case _:
+            arrays["extra"] = array
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def a_shard(path: Path) -> None:
+    vectors = np.ones((3, 1, 3))
+    patches, status = np.zeros((3, 1), np.int64), np.zeros(3, np.uint8)
+    write_shard(path, Shard("key", 0, patches, vectors, np.zeros((3, 9)), np.ones(3), status))
+
+
+def forged_shard(content: bytes, generator: np.random.Generator) -> bytes:
+    """Mutate the HDF5 part of a shard, with a header that fits."""
+    rest = mutated_bytes(content[HEADER_BYTES:], generator)
+    return header_line(SCHEMA_VERSION, len(rest), sha256(rest)) + rest
+
+
+def a_manifest(path: Path) -> None:
+    manifest = Manifest(load_generated_spec("beam-tiny"), GENERATOR_VERSION, 10, 100, ({"a": "b"},))
+    path.write_bytes(manifest.to_json())
+
+
+def manifest_of(path: Path) -> object:
+    return read_manifest(path.parent)
+
+
+def forged_manifest(content: bytes, generator: np.random.Generator) -> bytes:
+    """Mutate a manifest, with a checksum that fits."""
+    changed = json.loads(mutated_json(content, generator))
+    if isinstance(changed, dict):
+        changed.pop("sha256", None)
+        changed["sha256"] = sha256(json.dumps(changed, sort_keys=True).encode())
+    return json.dumps(changed).encode()
+
+
+def a_fit(path: Path) -> None:
+    record = {
+        "method": "pod",
+        "n_train": 10,
+        "n_dofs": 30,
+        "fit_s": 1.0,
+        "fit_core_s": 1.0,
+        "fit_memory_bytes": 10**8,
+        "model_bytes": 1000,
+        "needs_snapshots": True,
+        "parameters": {"n_modes": 5},
+        "training": {"iterations": 5, "loss": [1.0, float("nan")]},
+        "warnings": ["w"],
+    }
+    path.write_text(json.dumps(record))
+
+
+def asv(path: Path) -> None:
+    path.write_text(json.dumps({"version": 2, "results": {"a": [1, 2]}, "params": {}}))
+
+
+def gmsh1(path: Path) -> None:
+    points, cells = mesh_of().points, mesh_of().cells[0].data
+    nodes = [f"{i + 1} {x} {y} {z}" for i, (x, y, z) in enumerate(points)]
+    elements = [
+        f"{i + 1} 5 7 7 8 {' '.join(str(n + 1) for n in cell)}" for i, cell in enumerate(cells)
+    ]
+    lines = ["$NOD", str(len(nodes)), *nodes, "$ENDNOD", "$ELM", str(len(cells)), *elements]
+    path.write_text("\n".join([*lines, "$ENDELM", ""]))
+
+
+READERS = [
+    Reader("dataset.toml", of_suite("datasets", "beam-tiny.toml"), build, TEXT),
+    Reader("l-shape.toml", of_suite("datasets", "l-shape.toml"), load_dataset_spec, TEXT),
+    Reader(
+        "method.toml",
+        of_suite("methods", "pod.toml"),
+        checked_method,
+        TEXT,
+    ),
+    Reader("mesh.vtu", written_as("vtu", binary=False), body, TEXT),
+    Reader("packed.vtu", written_as("vtu"), body, [mutated_bytes]),
+    Reader("mesh.vtk", written_as("vtk", binary=False), body, TEXT),
+    Reader("mesh.msh", plain_msh, body, TEXT),
+    Reader("packed.msh", written_as("gmsh"), body, [mutated_bytes]),
+    Reader("mesh1.msh", gmsh1, body, TEXT),
+    Reader("mesh.inp", written_as("abaqus"), body, TEXT),
+    Reader("mesh.med", written_as("med"), body, [mutated_bytes]),
+    Reader("surface.stl", surface, read_surface, TEXT),
+    Reader("surface.obj", surface, read_surface, TEXT),
+    Reader("snapshots.npz", snapshots_npz, source, [mutated_bytes]),
+    Reader("arrays.npz", snapshots_npz, source, [repacked]),
+    Reader("snapshots.h5", snapshots_h5, source, [mutated_bytes]),
+    Reader("predictions.npy", lambda path: np.save(path, np.ones((3, 4))), read_npy, TEXT),
+    Reader("shard.h5", a_shard, read_shard, [mutated_bytes, forged_shard]),
+    Reader("manifest.json", a_manifest, manifest_of, [*JSON, forged_manifest]),
+    Reader("fit.json", a_fit, read_fit_record, JSON),
+    Reader("asv.json", asv, lambda path: read_file(path, "results"), JSON),
+    Reader(
+        "beam-tiny.refine.json",
+        of_suite("datasets", "beam-tiny.refine.json"),
+        lambda p: measured(load_generated_spec("beam-tiny"), p.parent, p.parents[1]),
+        JSON,
+    ),
+]
+"""Results, raw samples, models and checkpoints are in `tests.test_mutated_results`."""
+
+
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+def test_mutated_files_are_read_or_refused(reader: Reader, tmp_path: Path) -> None:
+    attacked(reader, tmp_path, QUICK)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+def test_many_mutated_files_are_read_or_refused(reader: Reader, tmp_path: Path) -> None:
+    attacked(reader, tmp_path, SLOW)

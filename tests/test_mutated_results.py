@@ -1,0 +1,163 @@
+"""Damaged and forged results, models and checkpoints give their readers one clear line."""
+
+from __future__ import annotations
+
+import atexit
+import io
+import json
+import shutil
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+from safetensors.numpy import load as load_arrays
+from safetensors.numpy import save as serialise
+
+import mor_bench
+from mor_bench.analysis.analyse import analyse
+from mor_bench.method_loading import load_fitted
+from mor_bench.model_file import model_digest
+from mor_bench.report.console_tables import print_tables
+from mor_bench.report.page import render
+from mor_bench.results.comparison import Comparison
+from mor_bench.runs.pick import pick
+from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.dataset import Dataset
+from mor_bench.surrogates.pod import PODGalerkin
+from tests.mutations import (
+    JSON,
+    QUICK,
+    SLOW,
+    Reader,
+    attacked,
+    mutated_bytes,
+    mutated_json,
+)
+from tests.synthetic import synthetic_comparison
+
+DATASET = "beam-tiny"
+
+
+@cache
+def sound_run() -> Path:
+    """Write a run with few rows, which are of different methods; return its folder."""
+    folder = Path(mkdtemp())
+    atexit.register(shutil.rmtree, folder)
+    made = synthetic_comparison(folder, DATASET, n_regions=3, per_region=2)
+    made.rows = list({row.method: row for row in made.rows}.values())[:4]
+    made.write()
+    return folder
+
+
+def a_run(path: Path) -> None:
+    shutil.copytree(sound_run(), path.parent, dirs_exist_ok=True)
+
+
+def concluded(path: Path) -> None:
+    """Read a run, draw its conclusions, print its tables and pick from it."""
+    comparison = Comparison.read(path.parent)
+    print_tables(comparison, Console(file=io.StringIO(), width=120), analyse(comparison))
+    if DATASET in comparison.datasets:
+        pick(DATASET, comparison=comparison).text()
+
+
+def drawn(path: Path) -> None:
+    concluded(path)
+    render(Comparison.read(path.parent))
+
+
+def a_sample(path: Path) -> None:
+    comparison = Comparison.read(sound_run())
+    shutil.copyfile(comparison.samples_path(comparison.rows[0]), path)
+
+
+def samples_of(path: Path) -> object:
+    """Read a file of raw samples in the place of a row's own."""
+    comparison = Comparison.read(sound_run())
+    own = Comparison(path.parent, {}, comparison.rows)
+    own.samples_path(own.rows[0]).parent.mkdir(exist_ok=True)
+    own.samples_path(own.rows[0]).write_bytes(path.read_bytes())
+    return own.samples(own.rows[0])
+
+
+def forged_model(content: bytes, generator: np.random.Generator) -> bytes:
+    """Mutate the header or an array of a model, with a checksum that fits."""
+    length = int.from_bytes(content[:8], "little")
+    header: dict[str, str] = json.loads(content[8 : 8 + length])["__metadata__"]
+    arrays: dict[str, Any] = load_arrays(content)
+    name = list(arrays)[generator.integers(len(arrays))]
+    match generator.integers(5):
+        case 0:
+            header["scene"] = mutated_json(header["scene"].encode(), generator).decode()
+        case 1:
+            header["parameters"] = mutated_json(header["parameters"].encode(), generator).decode()
+        case 2:
+            key = ("scene", "parameters", "surrogate")[generator.integers(3)]
+            header[key] = mutated_bytes(header[key].encode(), generator).decode("latin1")
+        case 3:
+            del arrays[name]
+        case _:
+            kinds = ("f4", "f8", "i1", "i8", "u8", "?")
+            arrays[name] = np.resize(arrays[name], generator.integers(0, 9)).astype(
+                kinds[generator.integers(len(kinds))]
+            )
+    return serialise(arrays, metadata={**header, "sha256": model_digest(header, arrays)})
+
+
+READERS = [
+    Reader("results.json", a_run, lambda path: Comparison.read(path.parent), JSON),
+    Reader("samples.h5", a_sample, samples_of, [mutated_bytes]),
+]
+
+
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+def test_mutated_results_are_read_or_refused(reader: Reader, tmp_path: Path) -> None:
+    attacked(reader, tmp_path, QUICK)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+def test_many_mutated_results_are_read_or_refused(reader: Reader, tmp_path: Path) -> None:
+    attacked(reader, tmp_path, SLOW)
+
+
+@pytest.mark.parametrize("n", [QUICK // 25, pytest.param(QUICK, marks=pytest.mark.slow)])
+def test_mutated_results_are_concluded_on_or_refused(n: int, tmp_path: Path) -> None:
+    attacked(Reader("results.json", a_run, concluded, JSON), tmp_path, n)
+
+
+@pytest.mark.slow
+def test_mutated_results_are_drawn_or_refused(tmp_path: Path) -> None:
+    attacked(Reader("results.json", a_run, drawn, JSON), tmp_path, QUICK // 5)
+
+
+@pytest.fixture(scope="module")
+def model(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sound") / "model.safetensors"
+    mor_bench.load_method("pod", n_modes=3).fit(tiny.scene, tiny.train).save(path)
+    return path
+
+
+def model_reader(model: Path, read: Callable[[Path], object]) -> Reader:
+    def write(path: Path) -> None:
+        shutil.copyfile(model, path)
+
+    return Reader("model.safetensors", write, read, [mutated_bytes, forged_model])
+
+
+@pytest.mark.parametrize("n", [QUICK, pytest.param(SLOW, marks=pytest.mark.slow)])
+def test_mutated_models_are_read_or_refused(
+    model: Path, tiny_scene: Scene, tmp_path: Path, n: int
+) -> None:
+    read = partial(load_fitted, surrogate=PODGalerkin, scene=tiny_scene)
+    attacked(model_reader(model, read), tmp_path, n)
+
+
+@pytest.mark.slow
+def test_mutated_models_with_their_scenes_are_read_or_refused(model: Path, tmp_path: Path) -> None:
+    attacked(model_reader(model, mor_bench.load_surrogate), tmp_path, SLOW)
