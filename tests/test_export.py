@@ -159,7 +159,7 @@ def test_the_export_commands_print_the_files_they_write(
     refused = command("export", "vtu", *sample, "--part", "trian", cwd=tmp_path)
     assert refused.returncode == 2
     assert (
-        "`--part` must be train, validation, test, in-range, 2x, 4x, unseen-regions"
+        "`--part` must be train, validation, test, in-range, 2x, 4x, paper-amplitude, unseen-"
         in refused.stderr
     )
 

@@ -196,7 +196,9 @@ class Peeker(Zero):
         found += [
             "snapshots"
             for item in gc.get_objects()
-            if isinstance(item, Snapshots) and item is not snapshots
+            if isinstance(item, Snapshots)
+            and item is not snapshots
+            and item is not self.training.validation
         ]
         if (
             snapshots is not None

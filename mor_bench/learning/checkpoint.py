@@ -160,7 +160,7 @@ def _check_tensors(loop: TrainingLoop, tensors: Mapping[str, Tensor]) -> None:
     rows, held, order = (tensors[name] for name in ("rows", "held", "order"))
     every = torch.cat([rows, held]).sort().values
     if (
-        not torch.equal(every, torch.arange(loop.problem.n_samples))
+        not torch.equal(every, torch.arange(loop.n_rows + loop.n_held))
         or not torch.isin(order, rows).all()
         or len(set(order.tolist())) < len(order)
     ):
@@ -169,7 +169,7 @@ def _check_tensors(loop: TrainingLoop, tensors: Mapping[str, Tensor]) -> None:
 
 def _expected_tensors(loop: TrainingLoop) -> dict[str, Tensor]:
     """Return tensors with the required names, types and shapes of a checkpoint."""
-    weights, n_rows = loop.network.state_dict(), loop.problem.n_samples - loop.n_held
+    weights, n_rows = loop.network.state_dict(), loop.n_rows
     batch_size = min(loop.plan.batch_size, n_rows)
     n_drawn = batch_size * ((loop.iteration - 1) % (n_rows // batch_size) + 1)
     expected = _prefixed("network.", weights)

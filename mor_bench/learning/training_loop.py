@@ -73,11 +73,16 @@ class TrainingLoop:
 
     @property
     def n_held(self) -> int:
-        """Number of training samples to hold out."""
+        """Number of samples that decide on early stopping."""
         fraction, n = self.plan.validation_fraction, self.problem.n_samples
-        if fraction == 0 or n == 1 or self.problem.n_validation:
-            return 0
-        return max(1, round(fraction * n))
+        if fraction == 0 or self.problem.n_validation:
+            return self.problem.n_validation if fraction > 0 else 0
+        return max(1, round(fraction * n)) if n > 1 else 0
+
+    @property
+    def n_rows(self) -> int:
+        """Number of samples to learn from."""
+        return self.problem.n_samples - (0 if self.problem.n_validation else self.n_held)
 
     @property
     def validation_interval(self) -> int:
@@ -93,8 +98,8 @@ class TrainingLoop:
 
     def begin(self) -> None:
         """Choose the samples that decide on early stopping, and set the number of iterations."""
-        if self.plan.validation_fraction > 0 and self.problem.n_validation:
-            self.held = self.problem.n_samples + torch.arange(self.problem.n_validation)
+        if self.n_held and self.problem.n_validation:
+            self.held = self.n_rows + torch.arange(self.n_held)
         elif self.n_held:
             order = torch.randperm(self.problem.n_samples, generator=self.generator)
             self.held = order[: self.n_held].sort().values
