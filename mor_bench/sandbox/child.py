@@ -127,7 +127,8 @@ def main() -> None:
         from mor_bench.sandbox.fork_server import serve
 
         control = socket.socket(fileno=int(sys.argv[1]))
-        serve(control, session_class(sys.argv[2]).preload, answer_requests)
+        # Importing the class takes seconds, in which the parent may die.
+        serve(control, lambda: session_class(sys.argv[2]).preload(), answer_requests)
     else:
         answer_requests(os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb"))
 

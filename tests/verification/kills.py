@@ -81,13 +81,13 @@ def leftovers(folder: Path) -> list[str]:
     return sorted({str(path) for pattern in patterns for path in folder.rglob(pattern)})
 
 
-def processes(folder: Path) -> list[int]:
-    """Return the processes that a command in a folder has started, by their environment."""
+def processes(folder: Path) -> list[str]:
+    """Describe the processes that a command in a folder has started, by their environment."""
     found = []
     for process in psutil.process_iter():
         try:
             if process.environ().get(MARK) == str(folder) and process.status() != "zombie":
-                found.append(process.pid)
+                found.append(" ".join(process.cmdline()[1:]) or str(process.pid))
         except psutil.Error:
             continue
     return found
@@ -134,7 +134,7 @@ def kill_often(
             process.send_signal(number)
             code = process.wait()
             time.sleep(GRACE_S)
-        outcome.wrong += [f"process {pid} outlived the command" for pid in processes(folder)]
+        outcome.wrong += [f"outlived: {process}" for process in processes(folder)]
         if code == 0:
             _check_end(folder, expected, outcome)
             folder = folder.with_name(f"{command}-{number.name}-{outcome.finished}")
