@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mor_bench.checked_files import parse_json
-from mor_bench.errors import MorBenchError, NotFittedError, StoreError, UnsupportedSceneError
+from mor_bench.errors import (
+    MorBenchError,
+    NotFittedError,
+    StoreError,
+    UnsupportedSceneError,
+    UnusableClassError,
+)
 from mor_bench.model_file import StoredModel, class_path, read_model
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Snapshots
@@ -45,6 +51,13 @@ def load_method(source: str | Path, **parameters: Any) -> Surrogate:
     spec = load_method_spec(source)
     surrogate = spec.load_class()
     return make_surrogate(surrogate, {**spec.parameters, **parameters})
+
+
+def check_predicts(surrogate: type[Any], name: str) -> None:
+    """Raise `UnusableClassError` if a class has no prediction of its own."""
+    own = (getattr(surrogate, verb, None) for verb in ("predict", "answer", "answer_observed"))
+    if all(function in vars(Surrogate).values() for function in own):
+        raise UnusableClassError(f"surrogate {name!r} has neither `answer` nor `predict`.")
 
 
 def make_surrogate(surrogate: type[Any], parameters: Mapping[str, Any]) -> Surrogate:

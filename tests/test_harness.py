@@ -207,13 +207,15 @@ def test_a_folder_that_holds_no_run_is_refused(tmp_path: Path) -> None:
 def test_a_broken_method_spoils_only_its_row_and_other_errors_keep_every_digit(
     small_run: Comparison, tmp_path: Path
 ) -> None:
+    notes = tmp_path / "notes"
+    notes.mkdir()
     recorders = [
         method_file(
             tmp_path,
             f"recorder-{spoil}",
             "tests.third_party:Recorder",
             spoil=spoil,
-            notes=str(tmp_path / f"{spoil}.json"),
+            notes=str(notes / f"{spoil}.json"),
         )
         for spoil in ("test", "train", "exit")
     ]
@@ -223,7 +225,7 @@ def test_a_broken_method_spoils_only_its_row_and_other_errors_keep_every_digit(
     assert found.rows[-1].error == row_of(small_run, "linear-fem").error
     data = mor_bench.load_dataset("beam-tiny", LIMIT, cache=cache)
     for spoil in ("test", "train", "exit"):
-        seen = json.loads((tmp_path / f"{spoil}.json").read_text())
+        seen = json.loads((notes / f"{spoil}.json").read_text())
         np.testing.assert_array_equal(seen["vectors"], data.train.loads.vectors)
         assert not set(seen["regions"]) & set(data.test.regions)
 
@@ -254,7 +256,9 @@ def test_a_stopped_run_resumes_and_another_run_is_refused(tmp_path: Path) -> Non
     assert [row.error for row in whole[:3]] == [row.error for row in begun]
     again = run_small(methods, out, cache).rows
     assert [row.latency_ms for row in again] == [row.latency_ms for row in whole]
-    with pytest.raises(InvalidInputError, match="holds a run with other settings"):
+    with pytest.raises(
+        InvalidInputError, match="holds another run, with `split` = None instead of 'sample'"
+    ):
         run_small(methods, out, cache, split="sample")
     assert len(Comparison.read(out).rows) == 4
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import log
+from math import exp, log
 
 import numpy as np
 import pytest
@@ -237,10 +237,10 @@ def test_resampling_regions_covers_the_truth_and_resampling_samples_does_not(k: 
 
 
 def test_the_interval_of_a_seed_is_a_t_interval_on_the_logarithm() -> None:
-    low, high = seed_interval([1.0, np.e, np.e**2])
+    low, high = seed_interval([1.0, exp(1.0), exp(2.0)])
     half = 4.302653 * (1 + 1 / 3) ** 0.5  # t with two degrees of freedom; deviation 1 about 1
     assert (log(low), log(high)) == pytest.approx((1 - half, 1 + half))
-    assert seed_interval([1.0, np.e, np.e**2, np.inf]) == pytest.approx((low, np.inf))
+    assert seed_interval([1.0, exp(1.0), exp(2.0), np.inf]) == pytest.approx((low, np.inf))
     assert seed_interval([1.0]) == seed_interval([1.0, np.inf]) == (0.0, np.inf)
     assert coverage_of_seeds(3, 0.2, 2000, np.random.default_rng(0)) == pytest.approx(
         0.95, abs=0.015

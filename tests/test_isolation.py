@@ -160,7 +160,10 @@ def test_a_method_can_come_from_a_module_beside_its_file(cache: Path, tmp_path: 
     [
         ("import no_such_module", "cannot be imported"),
         ("", "has no class 'Mine'"),
-        ("class Mine:\n    def __init__(self): pass", "unknown key `x`"),
+        (
+            "from tests.third_party import Zero\n\nclass Mine(Zero):\n    def __init__(self): pass",
+            "unknown key `x`",
+        ),
     ],
 )
 def test_a_mistake_in_a_users_method_is_reported_before_anything_runs(

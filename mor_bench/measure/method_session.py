@@ -22,14 +22,13 @@ from mor_bench.errors import (
     InvalidInputError,
     SolverError,
     UnknownRangeError,
-    UnusableClassError,
 )
 from mor_bench.machine import peak_memory_bytes, pinned_threads
 from mor_bench.measure.fit_clock import fit_clock
 from mor_bench.measure.predictions import predict_all
 from mor_bench.measure.query_cost import cost_of
 from mor_bench.measure.timed_loads import TimedLoads
-from mor_bench.method_loading import load_fitted, make_surrogate
+from mor_bench.method_loading import check_predicts, load_fitted, make_surrogate
 from mor_bench.sandbox.handover import read_snapshots
 from mor_bench.sandbox.session import Session
 from mor_bench.scene.scene import Scene, load_scene
@@ -141,9 +140,7 @@ class MethodSession(Session):
     ) -> dict[str, Any]:
         """Import a class, and check that it predicts and takes the parameters."""
         loaded = load_class(surrogate)
-        own = (getattr(loaded, verb, None) for verb in ("predict", "answer", "answer_observed"))
-        if all(function in vars(Surrogate).values() for function in own):
-            raise UnusableClassError(f"surrogate {surrogate!r} has neither `answer` nor `predict`.")
+        check_predicts(loaded, surrogate)
         for configuration in configurations:
             check_parameters(loaded, configuration, where)
         return {}

@@ -17,7 +17,7 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.machine import pinned_threads
 from mor_bench.measure.error_metrics import sample_errors, summary
 from mor_bench.measure.predictions import predict_all
-from mor_bench.method_loading import make_surrogate
+from mor_bench.method_loading import check_predicts, make_surrogate
 from mor_bench.model_file import weights_to_start_from
 from mor_bench.options import FitOptions
 from mor_bench.runs.listener import Listener
@@ -145,6 +145,7 @@ def fit(
 
 def _unfitted(spec: MethodSpec, parameters: Mapping[str, Any]) -> Surrogate:
     surrogate = spec.load_class()
+    check_predicts(surrogate, spec.surrogate)
     chosen = {**spec.configurations("full")[0], **parameters}
     check_parameters(surrogate, chosen, f"method {spec.name}")
     return make_surrogate(surrogate, chosen)
