@@ -66,7 +66,8 @@ def row(method: str, seconds: float = 1e-3, **fields: Any) -> Row:
 
 def comparison(*rows: Row, **machine: Any) -> Comparison:
     ran_on = {**describe_machine(), **machine}
-    return Comparison(Path("run"), ran_on, list(rows), settings={"profile": "quick"})
+    datasets: dict[str, dict[str, Any]] = {row.dataset: {} for row in rows}
+    return Comparison(Path("run"), ran_on, list(rows), datasets, settings={"profile": "quick"})
 
 
 def git(folder: Path, *arguments: str) -> str:

@@ -40,6 +40,14 @@ def data(tiny: Dataset, cache: Path, tmp_path_factory: pytest.TempPathFactory) -
 
 
 @pytest.fixture(scope="module")
+def whole(data: Dataset, cache: Path) -> Dataset:
+    """The same, with all samples but those of the test for training."""
+    content = data.scene.generated.model_dump(mode="json")
+    split = {**content["split"], "validation_fraction": 0.01}
+    return mor_bench.load_dataset({**content, "split": split}, cache=cache)
+
+
+@pytest.fixture(scope="module")
 def linear(data: Dataset) -> Surrogate:
     return mor_bench.load_method("linear-fem").fit(data.scene)
 
@@ -86,8 +94,9 @@ def test_regularisation_reduces_the_effect_of_noise_on_gappy_pod(data: Dataset) 
     "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in sorted(SPECS)]
 )
 def test_a_method_completes_observed_displacements_or_says_that_it_needs_forces(
-    name: str, data: Dataset
+    name: str, whole: Dataset
 ) -> None:
+    data = whole
     method = cheap_method(name, observed=True)
     if method.supports(data.scene) is not None:
         with pytest.raises(UnsupportedSceneError):

@@ -319,12 +319,13 @@ def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis
         "Hidden test set",
         "Tuning budget",
         "Error measures of the networks",
+        "Against the paper, by slope and relative error",
         "Comparison at the same error",
         "Comparison at the same time",
         "Performance profile",
         "In its regime",
     ]
-    assert page.count("<img ") == 6
+    assert page.count("<img ") == 7
     text = text_of(page)
     for said in (
         "processes differ by 14 %",

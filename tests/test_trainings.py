@@ -158,7 +158,7 @@ def test_a_killed_comparison_resumes_in_the_middle_of_a_training(
     assert resumed.offline_s is not None
     assert resumed.offline_s.fit > 0.7  # includes the time before the kill
     assert resumed.offline_s.fit_core_s is not None
-    assert 0 < resumed.offline_s.fit_core_s < resumed.offline_s.fit  # the training naps
+    assert 0 < resumed.offline_s.fit_core_s < (os.cpu_count() or 1) * resumed.offline_s.fit
     assert not left.exists()
     model = tmp_path / "whole.safetensors"
     whole = mor_bench.fit("beam-tiny", path, out=model, cache=own_cache, limit=LIMIT, threads=1)
@@ -238,7 +238,9 @@ def test_a_fit_that_is_stopped_after_its_training_does_not_train_again(
         'title = "t"\nsource = "s"\nsurrogate = "stopped:Stopped"\n'
     )
     configuration = Configuration(
-        load_method_spec(tmp_path / "stopped.toml"), {"iterations": 20}, training=TrainingOptions()
+        load_method_spec(tmp_path / "stopped.toml"),
+        {"iterations": 20},
+        training=TrainingOptions(),
     )
 
     def cached(name: str) -> CachedFit:
@@ -251,7 +253,8 @@ def test_a_fit_that_is_stopped_after_its_training_does_not_train_again(
             fit_configuration(cached("a"), 100.0)
     assert cached("a").checkpoint.exists()
     resumed, whole = fit_configuration(cached("a"), 100.0), fit_configuration(cached("b"), 100.0)
-    assert (resumed.warnings, whole.warnings) == (["0 steps"], ["20 steps"])
+    steps = [[text for text in fit.warnings if "steps" in text] for fit in (resumed, whole)]
+    assert steps == [["0 steps"], ["20 steps"]]
     assert resumed.training == whole.training
     assert resumed.model_sha256 == whole.model_sha256 is not None
     assert not list(tmp_path.glob("*/fits/*/training/*"))

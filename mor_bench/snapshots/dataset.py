@@ -88,14 +88,14 @@ class Snapshots:
     @property
     def free_forces(self) -> NDArray[np.float64]:
         """(n_samples, n_free) nodal forces at the free dofs, N."""
-        return self.forces.reshape(len(self), -1)[:, self.scene.free_dofs]
+        return self.forces.reshape(len(self), self.scene.mesh.n_dofs)[:, self.scene.free_dofs]
 
     @cached_property
     def displacements(self) -> NDArray[np.float64]:
         """(n_samples, n_nodes, 3) nodal displacements, m."""
         full = np.zeros((len(self), self.scene.mesh.n_dofs))
         full[:, self.scene.free_dofs] = self.free_displacements
-        return read_only(full.reshape(len(self), -1, 3))
+        return read_only(full.reshape(len(self), self.scene.mesh.n_nodes, 3))
 
     @property
     def regions(self) -> NDArray[np.int64]:

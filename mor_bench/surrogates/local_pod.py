@@ -184,4 +184,5 @@ def _clusters(directions: Array, n_clusters: int) -> tuple[Array, NDArray[np.int
 
     n_distinct = len(np.unique(directions, axis=0))
     found = KMeans(min(n_clusters, n_distinct), n_init=4, random_state=0).fit(directions)
-    return found.cluster_centers_, found.labels_.astype(np.int64)
+    used, labels = np.unique(found.labels_, return_inverse=True)  # rounding may empty a cluster
+    return found.cluster_centers_[used], labels.astype(np.int64)
