@@ -38,6 +38,7 @@ GRACE_S = 1.0
 """Time for which a process may outlive the command, s."""
 
 FIT = ["fit", "beam-tiny", "-m", "umesh-small", "--set", "iterations=150", "--limit", "200"]
+FIT += ["--set", "inference=packed"]  # "auto" keeps times in the model
 COMMANDS = {
     "run": ["run", "beam-tiny", "-m", "linear-fem", "-m", "pod", "--limit", "200", "--out", "out"],
     "fit": [*FIT, "--threads", "1", "--out", "net.safetensors"],
