@@ -32,7 +32,7 @@ def test_a_leak_and_a_drift_are_found(how: str, tiny: Dataset) -> None:
         kept: list[Any]
 
         def predict(self, forces: Any) -> Any:
-            self.kept.append(np.ones(200) if how == "leaks" else 0)
+            self.kept.append(np.ones(2_000) if how == "leaks" else 0)
             return super().predict(forces) * (1 + 1e-16 * len(self.kept) * (how == "drifts"))
 
     method = Spoiled().fit(tiny.scene)
