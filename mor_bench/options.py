@@ -5,10 +5,10 @@ read these models. A bad value or an unknown name raises one clear `InvalidInput
 
 >>> RunOptions(seeds=0)
 Traceback (most recent call last):
-mor_bench.errors.InvalidInputError: `seeds` must be an integer in [1, 100]; got 0.
+mor_bench.options.InvalidOptionError: `seeds` must be an integer in [1, 100]; got 0.
 >>> RunOptions(sed=3)
 Traceback (most recent call last):
-mor_bench.errors.InvalidInputError: unknown option `sed`; did you mean 'seeds'?
+mor_bench.options.InvalidOptionError: unknown option `sed`; did you mean 'seeds'?
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -89,6 +88,8 @@ def test_an_impossible_export_is_refused_and_nothing_is_written(
             export_vtu(data, **{"sample": 0, "out": out, **options})
     with pytest.raises(InvalidInputError, match=r"`out` must end in .npz; got 'x.npy'"):
         export_numpy(tiny, "x.npy")
+    with pytest.raises(InvalidInputError, match="`out` must have a name of lower-case letters"):
+        export_numpy(tiny, out / "My samples.npz")
     assert not out.exists()
 
 
@@ -118,14 +119,11 @@ def test_exported_arrays_read_back_with_the_same_parts(
             np.testing.assert_array_equal(one[name], two[name])
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows forbids such file names")
 @pytest.mark.parametrize("name", ["😀", 'a"b\\c', "tab\tdel\x7fesc\x1bé"])
-def test_files_with_any_name_and_title_can_be_read_back(
-    name: str, tiny: Dataset, tmp_path: Path
-) -> None:
+def test_files_with_any_title_can_be_read_back(name: str, tiny: Dataset, tmp_path: Path) -> None:
     spec = tiny.scene.spec.model_copy(update={"title": name, "source": name + "\n\x00"})
     data = replace(tiny, scene=replace(tiny.scene, spec=spec))
-    npz, toml = export_numpy(data, tmp_path / f"{name}.npz")
+    npz, toml = export_numpy(data, tmp_path / "mine.npz")
     assert tomllib.loads(toml.read_text(encoding="utf-8"))["snapshots"]["file"] == npz.name
     again = mor_bench.load_scene(toml).spec
     assert (again.title, again.source) == (spec.title, spec.source)

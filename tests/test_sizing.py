@@ -313,7 +313,10 @@ def test_a_cached_fit_depends_on_the_need_only_if_sizes_are_chosen(
 
     def key(need: float, **knobs: Any) -> str:
         job: Any = SimpleNamespace(
-            method=load_method_spec(tmp_path / "sized.toml"), parameters=knobs, training=None
+            method=load_method_spec(tmp_path / "sized.toml"),
+            parameters=knobs,
+            training=None,
+            shipped=None,
         )
         data = TrainingData(needing(tiny.scene, need), tiny.train, tiny.validation, {}, tmp_path)
         return CachedFit(job, data, place).key

@@ -269,7 +269,7 @@ from pathlib import Path
 from mor_bench.sandbox.seal import seal
 from mor_bench.snapshots.store import write_atomically
 own = Path({str(own)!r})
-seal([{str(tmp_path / "fits")!r}], str(own))
+seal([Path({str(tmp_path / "fits")!r})], own)
 write_atomically(own / "checkpoint", b"weights")
 print((own / "checkpoint").read_bytes())
 others = "../score.h5", "../../mine/score.h5", "link", "../training-of-another"

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.errors import InvalidInputError
 from mor_bench.export.output_path import new_file
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.imported_dataset import NodalLoads
 from mor_bench.snapshots.store import write_atomically
+from mor_bench.specs.base import NAME_PATTERN
 
 
 def export_numpy(data: Dataset, out: str | Path) -> list[Path]:
@@ -25,9 +28,15 @@ def export_numpy(data: Dataset, out: str | Path) -> list[Path]:
     Raises
     ------
     InvalidInputError
-        If the file's name does not end in .npz, or one of the two files exists.
+        If the file's name does not end in .npz, or cannot be the name of a dataset, or one of the
+        two files exists.
     """
     out = new_file(out, ".npz", ".toml")
+    if not re.match(NAME_PATTERN, out.stem):
+        raise InvalidInputError(
+            "`out` must have a name of lower-case letters, digits and hyphens, because the dataset "
+            f"gets it; got {out.name!r}."
+        )
     out.parent.mkdir(parents=True, exist_ok=True)
     buffer = io.BytesIO()
     np.savez(buffer, **snapshot_arrays(data))  # type: ignore[arg-type]

@@ -39,7 +39,8 @@ Modulus = Annotated[Positive, in_range(1e-6, 1e15, "Pa")]
 Coordinate = Annotated[Finite, in_range(-1e9, 1e9, "m")]
 Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
 Text = Annotated[str, Field(max_length=10_000), AfterValidator(_printable)]
-Name = Annotated[str, Field(pattern=r"^[a-z0-9-]+$", max_length=100)]
+NAME_PATTERN = r"^[a-z0-9-]+$"
+Name = Annotated[str, Field(pattern=NAME_PATTERN, max_length=100)]
 """A name that is safe in the names of folders."""
 
 

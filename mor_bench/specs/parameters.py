@@ -96,7 +96,9 @@ def check_parameters(
         __config__=ConfigDict(extra="forbid", strict=True),
         **_annotated_defaults(surrogate),
     )
-    plain = {name: python_number(value) for name, value in parameters.items()}
+    plain: Any = parameters
+    if isinstance(parameters, Mapping):
+        plain = {name: python_number(value) for name, value in parameters.items()}
     return validated(model, plain, where or surrogate.__name__).model_dump()
 
 
