@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.checked_files import check_file, limited_memory
-from mor_bench.errors import MorBenchError, StoreError
+from mor_bench.errors import MorBenchError, StoreError, printable
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -166,4 +166,4 @@ def is_hdf5(path: Path) -> bool:
 
 
 def _words(reason: Exception) -> str:
-    return " ".join(str(reason).split())[:300] or type(reason).__name__
+    return printable(" ".join(str(reason).split()), 300) or type(reason).__name__

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mor_bench.errors import MorBenchError, StoreError
+from mor_bench.errors import MorBenchError, StoreError, printable
 
 MOST_TOML_BYTES = 2**20
 MOST_JSON_BYTES = 2**24
@@ -133,7 +133,7 @@ def _parsed(
     except RecursionError:
         deep = True
     except (ValueError, ArithmeticError) as reason:
-        raise error(f"{where}: not valid {kind}: {reason}") from None
+        raise error(f"{where}: not valid {kind}: {printable(str(reason), 500, '')}") from None
     if deep:
         raise error(f"{where}: tables and lists are nested more than {MOST_LEVELS} deep.")
     return value

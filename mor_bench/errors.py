@@ -11,11 +11,11 @@ class MorBenchError(Exception):
     """Base class of the errors of mor-bench."""
 
 
-def printable(text: str, most: int = 2000) -> str:
+def printable(text: str, most: int = 2000, keep: str = "\n\t") -> str:
     """Return a text that is safe to print: control characters escaped, and not endless."""
     shown = text if len(text) <= most else f"{text[:most]}…"
     return "".join(
-        letter if letter.isprintable() or letter in "\n\t" else ascii(letter)[1:-1]
+        letter if letter.isprintable() or letter in keep else ascii(letter)[1:-1]
         for letter in shown
     )
 

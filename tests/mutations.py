@@ -118,44 +118,60 @@ def _places(value: Any) -> Iterator[tuple[Any, Any]]:
 Mutator = Callable[[bytes, np.random.Generator], bytes]
 
 
-def attack(read: Callable[[Path], Any], path: Path, mutators: list[Mutator], n: int) -> int:
-    """Write n mutations of a file one by one and read each; return how many were accepted.
+TEXT: list[Mutator] = [mutated_words, mutated_bytes]
+JSON: list[Mutator] = [mutated_json, mutated_json, mutated_bytes]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader of files, how to write a sound file for it, and how to damage the file."""
+
+    name: str
+    write: Callable[[Path], object]
+    read: Callable[[Path], object]
+    mutators: list[Mutator]
+    limit_s: float = LIMIT_S
+
+
+def attacked(reader: Reader, folder: Path, n: int) -> None:
+    """Write n mutations of a file one by one and read each.
 
     Anything but success or a `MorBenchError` of one line, and every excess of a limit, is an error
     with the number of the mutation, which is also its seed.
     """
-    read(path)  # the sound file; it also imports what is imported on demand
-    original, accepted = path.read_bytes(), 0
+    (folder / "datasets").mkdir()
+    path = folder / "datasets" / reader.name
+    reader.write(path)
+    reader.read(path)  # the sound file; it also imports what is imported on demand
+    original = path.read_bytes()
     with warnings.catch_warnings(), np.errstate(all="ignore"), _less_memory():
         warnings.simplefilter("ignore")
         for seed in range(n):
             generator = np.random.default_rng([seed, n])
-            content = mutators[seed % len(mutators)](original, generator)
+            content = reader.mutators[seed % len(reader.mutators)](original, generator)
             path.write_bytes(content)
             try:
-                with _less_time():
-                    read(path)
-                accepted += 1
+                with _less_time(reader.limit_s):
+                    reader.read(path)
             except MorBenchError as error:
                 if "\n" in str(error) or len(str(error)) > LONGEST:
                     raise AssertionError(f"mutation {seed} of {path}: {error}") from error
             except BaseException as error:
                 path.with_name(f"mutation-{seed}").write_bytes(content)
                 raise AssertionError(f"mutation {seed} of {path}: {error!r}") from error
-    return accepted
 
 
 @contextmanager
-def _less_time() -> Iterator[None]:
+def _less_time(limit_s: float) -> Iterator[None]:
     if not hasattr(signal, "setitimer"):
         yield
         return
 
     def late(*_: Any) -> None:
-        raise TimeoutError(f"it takes more than {LIMIT_S} s of work, or waits for {WAIT_S} s")
+        raise TimeoutError(f"it takes more than {limit_s} s of work, or waits for {WAIT_S} s")
 
     clocks = {
-        signal.SIGPROF: (signal.ITIMER_PROF, LIMIT_S),
+        signal.SIGPROF: (signal.ITIMER_PROF, limit_s),
         signal.SIGALRM: (signal.ITIMER_REAL, WAIT_S),
     }
     before = {number: signal.signal(number, late) for number in clocks}
@@ -184,24 +200,3 @@ def _less_memory() -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-TEXT: list[Mutator] = [mutated_words, mutated_bytes]
-JSON: list[Mutator] = [mutated_json, mutated_json, mutated_bytes]
-
-
-@dataclass(frozen=True)
-class Reader:
-    """A reader of files, how to write a sound file for it, and how to damage the file."""
-
-    name: str
-    write: Callable[[Path], object]
-    read: Callable[[Path], object]
-    mutators: list[Mutator]
-
-
-def attacked(reader: Reader, folder: Path, n: int) -> None:
-    (folder / "datasets").mkdir()
-    path = folder / "datasets" / reader.name
-    reader.write(path)
-    attack(reader.read, path, reader.mutators, n)

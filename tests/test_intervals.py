@@ -154,14 +154,31 @@ def test_the_analysis_of_variance_separates_common_from_specific_noise() -> None
     assert found.specific.sd == pytest.approx(0.01, rel=0.1)
     assert found.common.sd == pytest.approx(np.std(common, ddof=1), rel=0.02)
     assert [found.specific.df, found.common.df] == pytest.approx([29 * 49, 29])
-    two = spreads_of(samples[:2])
-    ratios = np.log(samples[0]["latency_ms"] / samples[1]["latency_ms"])
+    few = [{name: values[:3] for name, values in one.items()} for one in samples]
+    two = spreads_of(few[:2])
+    ratios = np.log(few[0]["latency_ms"] / few[1]["latency_ms"])
     assert two.specific.sd == pytest.approx(ratios.std(ddof=1) / 2**0.5)
-    one = spreads_of(samples[:1])
-    total = np.std(common[:, 0] + private[:, 0], ddof=1)
-    assert one.specific.sd == one.own[0] == pytest.approx(total)
+    one = spreads_of(few[:1])
+    total = np.std((common[:, 0] + private[:, 0])[:3], ddof=1)
+    assert one.specific.sd == pytest.approx(total)
+    assert one.own[0] == pytest.approx(total)
     assert one.common == spreads_of([{"latency_ms": np.ones(5)}]).specific == Spread(0.0, 0.0)
     assert Spread(0.0, 0.0).moderated(0.014) == Spread(0.014, 2.0)
+
+
+@pytest.mark.parametrize(("n_processes", "widens"), [(3, True), (8, False)])
+def test_a_process_that_is_slow_throughout_does_not_widen_the_interval_of_a_median_of_many(
+    n_processes: int, widens: bool
+) -> None:
+    generator = np.random.default_rng(8)
+    noise, speed = Noise(process=0.01, slow_processes=0, drift=0), np.zeros((n_processes, 4))
+    samples = [measure(generator, noise, speed) for _ in range(10)]
+    steady = spreads_of(samples)
+    for one in samples[:4]:
+        one["latency_ms"][one["process"] == 1] *= 1.3
+    disturbed = spreads_of(samples)
+    assert (disturbed.specific.sd > 3 * steady.specific.sd) == widens
+    assert (disturbed.own[0] > 3 * steady.specific.sd) == widens
 
 
 def test_draws_of_latencies_share_the_common_part() -> None:

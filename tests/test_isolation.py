@@ -100,7 +100,8 @@ def test_no_method_can_change_what_another_learns_from(tmp_path: Path, cache: Pa
 def test_no_method_sees_a_test_load_before_all_configurations_are_fitted(
     cache: Path, tmp_path: Path
 ) -> None:
-    note = tmp_path / "forces.npy"
+    note = tmp_path / "notes" / "forces.npy"  # beside the results nothing can be created
+    note.parent.mkdir()
     path = method_file(
         tmp_path, "leaky", "tests.third_party:Leaky", sweep={"n": [1, 2, 3]}, path=str(note)
     )
@@ -266,5 +267,5 @@ def test_a_module_that_cannot_be_imported_is_one_line_of_check_and_fit(
     assert done.returncode == 2, done
     assert BROKEN_MODULES[how][1] in done.stderr
     assert "Traceback" not in done.stderr
-    assert len([line for line in done.stderr.splitlines() if "%" not in line]) == 1, done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
     assert not list(tmp_path.glob("*m.safetensors*"))

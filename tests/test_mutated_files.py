@@ -255,3 +255,10 @@ def test_mutated_files_are_read_or_refused(reader: Reader, tmp_path: Path) -> No
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
 def test_many_mutated_files_are_read_or_refused(reader: Reader, tmp_path: Path) -> None:
     attacked(reader, tmp_path, SLOW)
+
+
+def test_the_documented_counts_are_those_of_these_tests() -> None:
+    text = (SUITE / "docs" / "attacks.md").read_text(encoding="utf-8")
+    assert f"| files of {len(READERS)} kinds, see below | {len(READERS) * SLOW:,} |" in text
+    for reader in READERS:
+        assert f"`{reader.name}`" in text

@@ -17,9 +17,12 @@ import pytest
 from rich.console import Console
 from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as serialise
+from typer.testing import CliRunner
 
 import mor_bench
 from mor_bench.analysis.analyse import analyse
+from mor_bench.cli.app import app
+from mor_bench.errors import StoreError
 from mor_bench.method_loading import load_fitted
 from mor_bench.model_file import model_digest
 from mor_bench.report.console_tables import print_tables
@@ -41,6 +44,9 @@ from tests.mutations import (
 from tests.synthetic import synthetic_comparison
 
 DATASET = "beam-tiny"
+
+DRAWING_S, DRAWN = 60.0, 40
+"""Processor time for all figures of a report, and number of reports that are drawn."""
 
 
 @cache
@@ -115,6 +121,10 @@ READERS = [
 ]
 
 
+CONCLUDED = 200
+"""Runs of which tables and a choice are made. It takes tens of milliseconds each."""
+
+
 @pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
 def test_mutated_results_are_read_or_refused(reader: Reader, tmp_path: Path) -> None:
     attacked(reader, tmp_path, QUICK)
@@ -126,14 +136,31 @@ def test_many_mutated_results_are_read_or_refused(reader: Reader, tmp_path: Path
     attacked(reader, tmp_path, SLOW)
 
 
-@pytest.mark.parametrize("n", [QUICK // 25, pytest.param(QUICK, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [CONCLUDED // 25, pytest.param(CONCLUDED, marks=pytest.mark.slow)])
 def test_mutated_results_are_concluded_on_or_refused(n: int, tmp_path: Path) -> None:
     attacked(Reader("results.json", a_run, concluded, JSON), tmp_path, n)
 
 
 @pytest.mark.slow
 def test_mutated_results_are_drawn_or_refused(tmp_path: Path) -> None:
-    attacked(Reader("results.json", a_run, drawn, JSON), tmp_path, QUICK // 5)
+    attacked(Reader("results.json", a_run, drawn, JSON, DRAWING_S), tmp_path, DRAWN)
+
+
+def test_without_raw_samples_nothing_is_picked_or_reported(tmp_path: Path) -> None:
+    a_run(tmp_path / "results.json")
+    chosen = pick(DATASET, comparison=tmp_path).text()
+    comparison = Comparison.read(tmp_path)
+    lost = comparison.samples_path(comparison.rows[1])
+    kept = lost.rename(tmp_path / "kept.h5")
+    message = "raw samples of 1 of 4 configurations are missing"
+    with pytest.raises(StoreError, match=message) as caught:
+        pick(DATASET, comparison=tmp_path)
+    assert str(lost) in str(caught.value)
+    answer = CliRunner().invoke(app, ["report", str(tmp_path)])
+    assert answer.exit_code == 2
+    assert message in answer.output
+    kept.rename(lost)
+    assert pick(DATASET, comparison=tmp_path).text() == chosen
 
 
 @pytest.fixture(scope="module")
@@ -161,3 +188,13 @@ def test_mutated_models_are_read_or_refused(
 @pytest.mark.slow
 def test_mutated_models_with_their_scenes_are_read_or_refused(model: Path, tmp_path: Path) -> None:
     attacked(model_reader(model, mor_bench.load_surrogate), tmp_path, SLOW)
+
+
+def test_the_documented_counts_are_those_of_these_tests() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "attacks.md").read_text(encoding="utf-8")
+    cells = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("|")]
+    documented = {name.strip(): number.strip() for name, number in cells}
+    assert documented["results.json and raw samples of a run"] == f"{len(READERS) * SLOW:,}"
+    assert documented["models, with and without the scene in the file"] == f"{2 * SLOW:,}"
+    assert documented["runs, with all tables and a choice"] == f"{CONCLUDED:,}"
+    assert documented["runs, with all figures and the page"] == f"{DRAWN:,}"

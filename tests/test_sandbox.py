@@ -20,6 +20,7 @@ import pytest
 
 from mor_bench.errors import SpecError
 from mor_bench.measure.method_session import FitRequest, MethodSession
+from mor_bench.results.comparison import Comparison
 from mor_bench.sandbox import landlock
 from mor_bench.sandbox.fork_server import CAN_FORK, ForkServer
 from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
@@ -178,6 +179,11 @@ def test_the_kernel_keeps_a_method_out_of_sealed_folders(
     never = way == "by_a_process_of_the_fork_server"
     assert said.startswith("refused" if sealed or never else "saw "), said
     assert not sealed or secret.read_bytes() == b"0123456789"
+
+
+def test_the_kind_of_isolation_is_recorded(small_run: Comparison) -> None:
+    expected = "landlock" if landlock.version() else "audit hook"
+    assert Comparison.read(small_run.out).machine["isolation"] == expected
 
 
 def test_a_sealed_process_works_beside_the_sealed_folders(

@@ -115,7 +115,7 @@ def test_a_signal_ends_a_command_with_one_line_and_leaves_nothing(
     _, said = process.communicate(timeout=60)
     assert process.returncode == 128 + number
     by = "" if name == "SIGINT" else f" by {name}"
-    assert said.splitlines()[-1].startswith(f"mor-bench: stopped{by}; finished samples and rows")
+    assert said.splitlines()[-1].startswith(f"mor-bench: stopped{by}. Finished samples and rows")
     assert "Traceback" not in said
     assert not list((tmp_path / "tmp").glob("mor-bench-*"))
 

@@ -28,6 +28,12 @@ It is 0.7 % within a run, and it cancels in ratios.
 PRIOR_DF = 2.0
 """Degrees of freedom of the typical values: two processes can agree to 0.01 % by chance."""
 
+NORMAL_MEDIAN = 0.6745
+"""Median size of a standard normal variable."""
+
+ENOUGH = 4
+"""Number of processes from which on a median ignores one that is slow throughout."""
+
 Samples = Mapping[str, NDArray[Any]]
 """Raw samples of a configuration: `latency_ms`, `process` and `round` of each query, (n,) each.
 
@@ -96,7 +102,9 @@ def spreads_of(all_samples: Sequence[Samples]) -> Spreads:
     """Estimate the spread between processes by a two-way analysis of variance of the log medians.
 
     The configurations were timed in turns, so process p and round r are the same moment for all.
-    With a single configuration, all spread counts as specific.
+    With a single configuration, all spread counts as specific. Now and then, a process is a third
+    slower throughout. The median over `ENOUGH` processes ignores it, so the specific spread is then
+    a scale that ignores it too.
     """
     cube = _cube(all_samples)
     n, degrees = len(cube), np.maximum(np.isfinite(cube).any(axis=2).sum(axis=1) - 1.0, 0.0)
@@ -108,12 +116,14 @@ def spreads_of(all_samples: Sequence[Samples]) -> Spreads:
             else np.zeros(cube.shape[1:])
         )
         rest = _centred(_nan_median(cube - moments))
-        own = np.where(degrees > 0, np.sqrt(correction * np.nansum(rest**2, axis=1) / degrees), nan)
+        own = np.where(
+            degrees > 0, np.sqrt(correction * (degrees + 1) / degrees) * _scale(rest, axis=1), nan
+        )
         shared = _nan_mean(_centred(_nan_median(cube)), axis=0)
     df, most = float(degrees.sum()) / correction, float(degrees.max())
     if df == 0:
         return Spreads(Spread(0.0, 0.0), Spread(0.0, 0.0), own)
-    specific = float(np.nansum(rest**2)) / df
+    specific = float(_scale(rest)) ** 2 * np.isfinite(rest).sum() / df
     common = float(np.nansum(shared**2)) / most - specific / n if n > 1 else 0.0
     return Spreads(
         Spread(sqrt(max(common, 0.0)), most if n > 1 else 0.0), Spread(sqrt(specific), df), own
@@ -129,6 +139,16 @@ def _nan_median(cube: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _nan_mean(array: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
     return np.asarray(np.nansum(array, axis=axis) / np.isfinite(array).sum(axis=axis))
+
+
+def _scale(array: NDArray[np.float64], axis: int | None = None) -> NDArray[np.float64]:
+    """Root mean square; with `ENOUGH` columns, the median size, scaled to agree for normal values.
+
+    NaN entries are left out.
+    """
+    if array.shape[1] < ENOUGH:
+        return np.asarray(np.sqrt(np.nanmean(array**2, axis=axis)))
+    return np.asarray(np.nanmedian(np.abs(array), axis=axis) / NORMAL_MEDIAN)
 
 
 def _centred(array: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -21,6 +21,7 @@ COMMANDS = {
     "doctor": ("doctor_command", "Show what is installed, and the speed of this machine."),
     "generate": ("data_commands", "Generate the snapshots of a dataset."),
     "refine": ("data_commands", "Measure the discretisation error of a dataset's mesh."),
+    "cache": ("cache_command", "List generated datasets and finished fits, or delete them."),
     "stress": ("stress_command", "Try the hard cases on the full-order model and on methods."),
     "export": ("export_commands", "Write samples and results for other programs."),
 }

@@ -14,8 +14,8 @@ import typer
 
 from mor_bench.errors import MorBenchError, printable
 
-STOPPED = (
-    "stopped{}; finished samples and rows are kept. "
+KEPT = (
+    "Finished samples and rows are kept. "
     "Repeat the command with the same --out to continue a run. "
     "A training resumes from its last checkpoint."
 )
@@ -50,11 +50,13 @@ def clear_errors() -> Iterator[None]:
             _forget_output()
             where = "standard output or a temporary file"
         _exit(f"{where}: {error.strerror or error}", "red", 2)
+    except MemoryError as error:
+        _exit(f"memory is short{f': {error}' if str(error) else ''}. {KEPT}", "red", 2)
     except StoppedBySignal as stop:
         by = f" by {signal.Signals(stop.number).name}"
-        _exit(STOPPED.format(by), "yellow", 128 + stop.number)
+        _exit(f"stopped{by}. {KEPT}", "yellow", 128 + stop.number)
     except KeyboardInterrupt:
-        _exit(STOPPED.format(""), "yellow", 130)
+        _exit(f"stopped. {KEPT}", "yellow", 130)
 
 
 @contextmanager

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Annotated
 
 import typer
 
@@ -11,6 +13,7 @@ from mor_bench.cli.option_groups import Json
 from mor_bench.measure.machine_speed import MachineSpeed
 from mor_bench.runs.installation import Installation
 from mor_bench.runs.plan import plan
+from mor_bench.runs.self_test import require, self_test
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -28,14 +31,39 @@ SPEEDS = {
 
 
 @app.command()
-def doctor(as_json: Json = False) -> None:
+def doctor(
+    test: Annotated[
+        bool,
+        typer.Option(
+            "--self-test",
+            help="Instead, test generation, model files, isolation, limits and clean-up.",
+        ),
+    ] = False,
+    as_json: Json = False,
+) -> None:
     """Show what is installed, its size, missing extras, and the speed of this machine."""
+    if test:
+        _self_test(as_json)
+        return
     found, seconds = Installation.inspect(), plan().seconds
     if as_json:
         print(json.dumps({**found.as_dict(), "default_run_s": seconds}, indent=1))
         return
     for line in _lines(found, seconds):
         print(line)
+
+
+def _self_test(as_json: bool) -> None:
+    """Print the checks as they end; the exit code is 2 if one fails."""
+    done = []
+    for check in self_test():
+        done.append(check)
+        if not as_json:
+            word = {True: "passed", False: "FAILED", None: "not here"}[check.passed]
+            print(f"{check.name:<16}{word:<10}{check.detail}", flush=True)
+    if as_json:
+        print(json.dumps([asdict(check) for check in done], indent=1))
+    require(done)
 
 
 def _lines(found: Installation, seconds: float) -> Iterator[str]:

@@ -70,6 +70,7 @@ def report(
 ) -> None:
     """Print the tables of a finished run, and draw its figures and report again."""
     comparison = mor_bench.Comparison.read(out)
+    comparison.check_samples()
     if told is not None:
         print_tables(told_at_most(comparison, told), make_console())
         return

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mor_bench.checked_files import read_json, read_toml
-from mor_bench.errors import InvalidInputError, StoreError
+from mor_bench.errors import InvalidInputError, StoreError, printable
 from mor_bench.machine import describe_machine
 from mor_bench.snapshots.store import write_atomically
 
@@ -84,8 +84,8 @@ def read_file(path: Path, kind: str) -> dict[str, Any] | None:
         raise StoreError(f"{path}: not an asv file: {error!r}") from None
     if version != VERSION[kind]:
         raise StoreError(
-            f"{path}: the file has asv's {kind} in version {version}; this version of "
-            f"mor-bench reads version {VERSION[kind]}."
+            f"{path}: the file has asv's {kind} in version {printable(str(version), 50, '')}; "
+            f"this version of mor-bench reads version {VERSION[kind]}."
         )
     return dict(content)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,7 +131,7 @@ def export_asv(
         If a file in `out` is not asv's or has another version, or the machine is not recorded.
     """
     out = Path(out)
-    _check_machine(comparison)
+    _check_recorded(comparison)
     commit_hash, date = commit_and_date(commit)
     name = machine_name(comparison.machine, machine)
     figures = _figures(comparison)
@@ -161,7 +162,14 @@ def export_asv(
     return [machine_path, path, describe(out)]
 
 
-def _check_machine(comparison: Comparison) -> None:
+def _check_recorded(comparison: Comparison) -> None:
+    for row in comparison.rows:
+        # asv's page puts names of benchmarks and parameters into its own text as they are.
+        if not re.fullmatch(r"[a-z0-9-]+", row.dataset) or re.search(r"[<>&]", row.label):
+            raise StoreError(
+                f"{comparison.out}: a row's names are not fit for a page: "
+                f"{row.dataset!r}, {row.label!r}."
+            )
     for name in ("python", "processor", "cores", "system"):
         if not isinstance(comparison.machine.get(name), str | int):
             raise StoreError(f"{comparison.out}: `machine.{name}` of results.json is missing.")

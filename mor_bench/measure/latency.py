@@ -65,7 +65,7 @@ class Protocol:
         return -(-LEAST_QUERIES // (self.processes * self.rounds))
 
 
-PROTOCOLS = {"quick": Protocol(2, 5), "full": Protocol(8, 5)}
+PROTOCOLS = {"quick": Protocol(4, 3), "full": Protocol(8, 5)}
 
 
 def probe_s() -> float:

@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 
 SCHEMA_VERSION = 2
 
+MOST_LETTERS = 10_000
+"""Most letters of a text with control characters."""
+
 
 @dataclass
 class Comparison:
@@ -127,6 +130,23 @@ class Comparison:
         """
         return read_hdf5(self._samples_path(name))
 
+    def check_samples(self, dataset: str | None = None) -> None:
+        """Check that the raw samples of all rows that ran exist, of one dataset or of all.
+
+        Raises
+        ------
+        StoreError
+            If some are missing: without them there are no intervals, and verdicts would differ.
+        """
+        ran = [row for row in self.rows if row.ok and dataset in (None, row.dataset)]
+        missing = [path for path in map(self.samples_path, ran) if not path.exists()]
+        if missing:
+            raise StoreError(
+                f"{missing[0]}: no such file. The raw samples of {len(missing)} of {len(ran)} "
+                "configurations are missing, so their intervals are not known. Restore the "
+                "folder `samples`, or run the comparison again."
+            )
+
     def samples_path(self, row: Row) -> Path:
         """Return the file of a row's raw samples."""
         return self._samples_path(f"{row.dataset}--{row.label}")
@@ -166,11 +186,11 @@ class Comparison:
         """
         path = Path(out) / "results.json"
         try:
-            content = read_json(path)
+            content = _without_controls(read_json(path))
             version = content["schema_version"]
             if version != SCHEMA_VERSION:
                 raise StoreError(
-                    f"{path}: schema version {printable(str(version), 50)}; "
+                    f"{path}: schema version {printable(str(version), 50, '')}; "
                     f"this version of mor-bench reads version {SCHEMA_VERSION}."
                 )
             file = ResultsFile.model_validate(content)
@@ -179,9 +199,9 @@ class Comparison:
         except ValidationError as error:
             first = error.errors()[0]
             key = ".".join(map(str, first["loc"]))
-            named = f"`{printable(key, 200)}`: " if key else ""
+            named = f"`{printable(key, 200, '')}`: " if key else ""
             reason = first["msg"].removeprefix("Value error, ")
-            raise StoreError(f"{path}: {named}{printable(reason, 500)}.") from None
+            raise StoreError(f"{path}: {named}{printable(reason, 500, '')}.") from None
         except (ValueError, KeyError, TypeError) as error:
             raise StoreError(f"{path}: not a results file of mor-bench: {error}") from None
         return cls(
@@ -193,3 +213,12 @@ class Comparison:
             file.methods,
             file.learning,
         )
+
+
+def _without_controls(value: Any) -> Any:
+    """Escape control characters in all texts, which would steer a terminal."""
+    if isinstance(value, str):
+        return value if value.isprintable() else printable(value, MOST_LETTERS)
+    if isinstance(value, dict):
+        return {_without_controls(key): _without_controls(item) for key, item in value.items()}
+    return [_without_controls(item) for item in value] if isinstance(value, list) else value

@@ -31,7 +31,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from mor_bench.array_files import read_hdf5
 from mor_bench.checked_files import read_json
 from mor_bench.digests import digest_of_arrays
-from mor_bench.errors import StoreError
+from mor_bench.errors import StoreError, printable
 from mor_bench.machine import describe_machine, gpu_name
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.results.arrays import write_arrays
@@ -152,7 +152,7 @@ def read_fit_record(path: Path) -> FitRecord:
     try:
         return FitRecord.model_validate(read_json(path))
     except ValidationError as error:
-        reason = " ".join(str(error).split())
+        reason = printable(" ".join(str(error).split()), 500)
         raise StoreError(f"{path}: not the record of a fit: {reason}") from None
 
 

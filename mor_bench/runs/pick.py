@@ -56,7 +56,7 @@ def pick(
     InvalidInputError
         If a limit is not positive, or the comparison does not hold this dataset.
     SpecError, StoreError
-        If the dataset is not valid, or the run's folder cannot be read.
+        If the dataset is not valid, or the run's folder cannot be read or lacks raw samples.
     """
     spec = load_dataset_spec(dataset, suite)
     given = {name: limit for name, limit in limits.items() if limit is not None}
@@ -76,6 +76,7 @@ def pick(
             "`comparison` must be a Comparison or the folder of a run; "
             f"got {type(comparison).__name__}."
         )
+    evidence.check_samples(spec.name)
     return verdict_on(told_at_most(evidence, told), spec.name, requirements)
 
 

@@ -13,6 +13,7 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.machine import describe_machine, gpu_name
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.run_context import RunContext
+from mor_bench.sandbox.seal import isolation
 from mor_bench.scratch import identity, is_running
 from mor_bench.snapshots.store import remove_leftovers
 from mor_bench.specs import AnyDatasetSpec, MethodSpec
@@ -47,7 +48,9 @@ def open_run(
     else:
         _check_no_foreign(folder)
         gpu = {"gpu": gpu_name()} if context.training.device == "cuda" else {}
-        comparison = Comparison(folder, {**describe_machine(), **gpu}, settings=settings)
+        comparison = Comparison(
+            folder, {**describe_machine(), **isolation(), **gpu}, settings=settings
+        )
     comparison.methods |= {
         method.name: method.model_dump(mode="json", exclude={"folder"}) for method in methods
     }

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mor_bench.checked_files import read_json
 from mor_bench.digests import digest_of_arrays
-from mor_bench.errors import StoreError
+from mor_bench.errors import StoreError, printable
 from mor_bench.runs.cached_fit import LOAD_LIMIT_S, CachedFit, FitRecord, RunEnvironment
 from mor_bench.runs.code_digest import learning_digest
 from mor_bench.runs.configurations import Configuration
@@ -168,7 +168,7 @@ def shipped_models(folder: Path | None = None) -> dict[Path, ShippedModel]:
         try:
             record = ShippedModel.model_validate(read_json(path))
         except (OSError, ValidationError) as error:
-            reason = " ".join(str(error).split())
+            reason = printable(" ".join(str(error).split()), 500)
             raise StoreError(f"{path}: not a valid record of trained weights: {reason}") from None
         found[path.with_suffix(".safetensors")] = record
     return found

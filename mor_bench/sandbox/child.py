@@ -21,7 +21,7 @@ from threading import Thread
 from traceback import walk_tb
 from typing import Any, BinaryIO
 
-from mor_bench.errors import MorBenchError
+from mor_bench.errors import MorBenchError, printable
 from mor_bench.sandbox.seal import Restrictions, seal
 from mor_bench.sandbox.session import Session, session_class
 
@@ -60,10 +60,10 @@ class _Child:
                 name = request.pop("do")
                 answer = (self.start if name == "start" else getattr(self.session, name))(**request)
             except MorBenchError as error:
-                answer = {"error": type(error).__name__, "message": _printable(error)}
+                answer = {"error": type(error).__name__, "message": _shown(error)}
             except (Exception, SystemExit) as error:  # foreign code runs here
                 answer = {"error": None, "message": _crash(error)}
-        notes = [_printable(w.message) for w in caught if issubclass(w.category, UserWarning)]
+        notes = [_shown(w.message) for w in caught if issubclass(w.category, UserWarning)]
         return {**answer, "warnings": list(dict.fromkeys(notes))}
 
 
@@ -73,12 +73,12 @@ def _crash(error: BaseException) -> str:
     own = [place for place in places if not place[0].startswith(("<", *LIBRARIES))]
     file, line = (own or places)[-1]
     where = f"{Path(file).name}, line {line}"
-    return _printable(f"crashed with {type(error).__name__}: {error} ({where})")
+    return _shown(f"crashed with {type(error).__name__}: {error} ({where})")
 
 
-def _printable(error: object) -> str:
+def _shown(error: object) -> str:
     """Return the text of an error with every character that UTF-8 cannot hold replaced."""
-    return str(error).encode("utf-8", "replace").decode()
+    return printable(str(error).encode("utf-8", "replace").decode())
 
 
 def _read(requests: BinaryIO, queue: SimpleQueue[dict[str, Any]]) -> None:
@@ -127,7 +127,8 @@ def main() -> None:
         from mor_bench.sandbox.fork_server import serve
 
         control = socket.socket(fileno=int(sys.argv[1]))
-        serve(control, session_class(sys.argv[2]).preload, answer_requests)
+        # Importing the class takes seconds, in which the parent may die.
+        serve(control, lambda: session_class(sys.argv[2]).preload(), answer_requests)
     else:
         answer_requests(os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb"))
 

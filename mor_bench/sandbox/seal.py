@@ -102,6 +102,11 @@ def seal(folders: Sequence[Path], exempt: Path | None = None) -> None:
     _guard_hdf5(check)
 
 
+def isolation() -> dict[str, str]:
+    """Return the kind of isolation on this machine, for the description of the machine."""
+    return {"isolation": "landlock" if landlock.version() else "audit hook"}
+
+
 def _prefix(path: str | bytes | os.PathLike[Any]) -> str:
     return os.path.realpath(os.fsdecode(path)) + os.sep
 

@@ -191,5 +191,5 @@ def _reason(error: BaseException, text: str, suffix: str) -> str:
         return f"cannot be read as {suffix[1:].upper()}: it is {broken}"
     if "need at least one array" in text:
         return "the file is empty or holds no mesh"
-    words = printable(" ".join(text.split()), 300) or type(error).__name__
+    words = printable(" ".join(text.split()), 300, keep="") or type(error).__name__
     return f"meshio cannot read it ({words})"

@@ -55,12 +55,14 @@ def read_gmsh1(path: Path) -> meshio.Mesh:
             cell_data={"gmsh:physical": [np.array(groups) for _, groups in blocks.values()]},
         )
     except KeyError as error:
+        reason = printable(str(error), 300, keep="")
         raise SpecError(
             f"{path}: invalid Gmsh 1 file: it has no node, or no element type, with the "
-            f"number {printable(str(error), 300)}."
+            f"number {reason}."
         ) from None
     except (ValueError, OverflowError) as error:
-        raise SpecError(f"{path}: invalid Gmsh 1 file: {printable(str(error), 300)}.") from None
+        reason = printable(str(error), 300, keep="")
+        raise SpecError(f"{path}: invalid Gmsh 1 file: {reason}.") from None
 
 
 def _section(lines: Sequence[str], name: str) -> list[list[str]]:

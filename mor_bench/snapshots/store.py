@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.checked_files import parse_json, read_bytes
-from mor_bench.errors import NewerSchemaError, StoreError
+from mor_bench.errors import NewerSchemaError, StoreError, printable
 from mor_bench.scratch import host_name
 
 SCHEMA_VERSION = 3
@@ -205,6 +205,6 @@ def check_version(version: object, where: str) -> None:
     kind: type[StoreError] = NewerSchemaError if newer else StoreError
     remedy = "update mor-bench to read it, or remove it" if newer else "generate the dataset again"
     raise kind(
-        f"{where}: schema version {version}; "
+        f"{where}: schema version {printable(str(version), 50, '')}; "
         f"this version of mor-bench reads version {SCHEMA_VERSION}: {remedy}."
     )

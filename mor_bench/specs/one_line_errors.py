@@ -12,7 +12,7 @@ from pydantic import BaseModel, Discriminator, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from mor_bench.errors import SpecError
+from mor_bench.errors import SpecError, printable
 from mor_bench.specs.region_spec import REGIONS
 
 _M = TypeVar("_M", bound=BaseModel)
@@ -45,7 +45,8 @@ def validated(
     try:
         return model.model_validate(dict(content), context=folder)
     except ValidationError as error:
-        raise SpecError(f"{where}: {_message(error.errors(include_url=False), model)}") from None
+        message = _message(error.errors(include_url=False), model)
+        raise SpecError(f"{where}: {printable(message, keep='')}") from None
 
 
 def nearest_name(name: str, valid: Iterable[str]) -> str:

@@ -1,0 +1,132 @@
+"""Text from files stays text: in the report, in the terminal, and in names of files."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from mor_bench.analysis.analyse import analyse
+from mor_bench.errors import StoreError
+from mor_bench.export.asv_results import export_asv
+from mor_bench.report.console_tables import print_tables
+from mor_bench.report.page import render
+from mor_bench.results.comparison import Comparison
+from tests.synthetic import synthetic_comparison
+
+HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(1)><svg onload=a()> $x_ {{ 7*7 }}"
+
+TAGS = {
+    *("html", "head", "meta", "title", "style", "body", "h1", "h2", "h3", "p", "b", "br", "small"),
+    *("div", "table", "thead", "tbody", "tr", "th", "td", "figure", "img", "figcaption", "dl"),
+    *("dt", "dd", "a", "fieldset", "legend", "label", "input", "details", "summary", "code"),
+    *("ul", "li", "pre"),
+}
+ATTRIBUTES = {
+    *("charset", "name", "content", "http-equiv", "lang", "class", "colspan", "rowspan", "alt"),
+    *("src", "href", "id", "type", "checked", "data-told"),
+}
+
+
+class Page(HTMLParser):
+    """All tags and attributes of a page, and its policy."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: set[str] = set()
+        self.attributes: set[str] = set()
+        self.sources: set[str] = set()
+        self.policy = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.attributes |= {name for name, _ in attrs}
+        self.sources |= {(value or "")[:10] for name, value in attrs if name in ("src", "href")}
+        found = dict(attrs)
+        if found.get("http-equiv") == "Content-Security-Policy":
+            self.policy = str(found["content"])
+
+
+def hostile(value: Any) -> Any:
+    """Add a hostile text to every text of a table that is free text."""
+    if isinstance(value, dict):
+        return {key: hostile(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [hostile(item) for item in value]
+    return value + HOSTILE if isinstance(value, str) else value
+
+
+def spoiled_rows(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    for i, row in enumerate(rows):
+        spoiled = {name: row[name] + HOSTILE for name in ("method", "label", "split")}
+        spoiled |= {"warnings": [HOSTILE, f"<b>{i}</b>"], "swept": {HOSTILE: HOSTILE}}
+        spoiled["parameters"] = {HOSTILE: HOSTILE}
+        if i == 1:
+            spoiled |= {"status": "failed", "reason": HOSTILE + "\x1b]0;title\x07"}
+        yield {**row, **spoiled}
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Comparison:
+    """A run in which every free text is hostile, and whose dataset is named like a path."""
+    folder, name = tmp_path / "outer" / "run", "beam-coarse"
+    made = synthetic_comparison(folder, name, n_regions=3, per_region=2)
+    arrays = [made.samples(row) for row in made.rows[:4]]
+    whole = made.dataset_arrays(name)
+    path = folder / "results.json"
+    content = json.loads(path.read_text())
+    content["rows"] = list(spoiled_rows(content["rows"][:4]))
+    content["machine"] = hostile(content["machine"])
+    content["datasets"][name] = {
+        **hostile(content["datasets"][name]),
+        "needs": content["datasets"][name]["needs"],
+    }
+    content["methods"] = {key + HOSTILE: table for key, table in content["methods"].items()}
+    content["learning"] = []
+    text = json.dumps(content).replace('"dataset": "beam-coarse"', '"dataset": "../../escaped"')
+    content = json.loads(text)
+    content["datasets"] = {"../../escaped": content["datasets"][name]}
+    path.write_text(json.dumps(content))
+    read = Comparison.read(folder)
+    for row, samples in zip(read.rows, arrays, strict=True):
+        read.put(row, samples)
+    read.add_dataset("../../escaped", read.datasets["../../escaped"], whole)
+    read.write()
+    return Comparison.read(folder)
+
+
+def test_no_text_of_a_file_becomes_markup_or_leads_out_of_the_folder(
+    run: Comparison, tmp_path: Path
+) -> None:
+    text = render(run)[-1].read_text(encoding="utf-8")
+    page = Page(text)
+    assert page.tags <= TAGS
+    assert page.attributes <= ATTRIBUTES
+    assert all(not source.startswith(("http", "//", "java")) for source in page.sources)
+    assert "default-src 'none'" in page.policy
+    assert "script-src" not in page.policy
+    assert "&lt;script&gt;alert(1)" in text
+    assert "{{ 7*7 }}" in text
+    assert [path.name for path in tmp_path.iterdir()] == ["outer"]
+    assert [path.name for path in (tmp_path / "outer").iterdir()] == ["run"]
+
+
+def test_the_terminal_gets_no_control_characters(run: Comparison) -> None:
+    out = io.StringIO()
+    print_tables(run, Console(file=out, width=200), analyse(run))
+    assert "<script>" in out.getvalue()
+    assert not {"\x1b", "\x07"} & set(out.getvalue())
+
+
+def test_an_exported_dashboard_holds_no_markup(run: Comparison, tmp_path: Path) -> None:
+    run.machine |= {"python": "3", "processor": "p", "cores": 2, "system": "s"}
+    with pytest.raises(StoreError, match="names are not fit for a page"):
+        export_asv(run, tmp_path / "asv")
+    assert not (tmp_path / "asv").exists()

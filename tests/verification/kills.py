@@ -1,0 +1,190 @@
+"""Kill runs, fits and generations at random moments; then check results, files and processes.
+
+    python -m tests.verification.kills --kills 50
+
+kills each command 50 times with each of SIGKILL, SIGTERM and SIGHUP, in about an hour. The command
+is repeated until it ends, killed or not, and then starts over in an empty folder. It must give the
+same bytes as an undisturbed one. One second after a kill no process of it may be left. After a
+repetition that ended no temporary file or folder may be left; after SIGTERM and SIGHUP never.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import psutil
+
+from mor_bench.scratch import remove_abandoned
+
+ROOT = Path(__file__).parents[2]
+
+MARK = "MOR_BENCH_KILL_TEST"
+"""Environment variable by which all processes of a command are found."""
+
+SIGNALS = ("SIGKILL", "SIGTERM", "SIGHUP")
+
+GRACE_S = 1.0
+"""Time for which a process may outlive the command, s."""
+
+FIT = ["fit", "beam-tiny", "-m", "umesh-small", "--set", "iterations=150", "--limit", "200"]
+COMMANDS = {
+    "run": ["run", "beam-tiny", "-m", "linear-fem", "-m", "pod", "--limit", "200", "--out", "out"],
+    "fit": [*FIT, "--threads", "1", "--out", "net.safetensors"],
+    "generate": ["generate", "beam-tiny", "--workers", "2"],
+}
+
+EXACT = ("*.safetensors", "shard-*.h5")
+"""Files that must not depend on interruptions; results.json is compared without times."""
+
+
+@dataclass
+class Outcome:
+    """Number of kills that hit, and everything that was wrong."""
+
+    kills: int = 0
+    finished: int = 0
+    wrong: list[str] = field(default_factory=list)
+
+
+def result(folder: Path) -> dict[str, str]:
+    """Return a digest of every result in a folder."""
+    found = {
+        path.name if path.parent == folder else f"{path.parent.name}/{path.name}": hashlib.sha256(
+            path.read_bytes()
+        ).hexdigest()
+        for pattern in EXACT
+        for path in folder.rglob(pattern)
+        if not path.name.startswith(".")
+    }
+    for path in folder.glob("out/results.json"):
+        rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
+        found["rows"] = json.dumps(
+            [[row[key] for key in ("label", "status", "error", "sizes", "cost")] for row in rows]
+        )
+    return found
+
+
+def leftovers(folder: Path) -> list[str]:
+    """Return the temporary files and folders below a folder."""
+    patterns = ("*.tmp", ".*.tmp", "tmp/mor-bench-*", ".running", ".*.checkpoint")
+    return sorted({str(path) for pattern in patterns for path in folder.rglob(pattern)})
+
+
+def processes(folder: Path) -> list[str]:
+    """Describe the processes that a command in a folder has started, by their environment."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if process.environ().get(MARK) == str(folder) and process.status() != "zombie":
+                found.append(" ".join(process.cmdline()[1:]) or str(process.pid))
+        except psutil.Error:
+            continue
+    return found
+
+
+def start(command: str, folder: Path) -> subprocess.Popen[bytes]:
+    (folder / "tmp").mkdir(parents=True, exist_ok=True)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "TMPDIR": str(folder / "tmp"),
+        MARK: str(folder),
+    }
+    with open(folder / "log.txt", "ab") as log:
+        return subprocess.Popen(
+            [sys.executable, "-m", "mor_bench", *COMMANDS[command], "--cache", "cache"],
+            cwd=folder,
+            env=environment,
+            stdout=log,
+            stderr=log,
+        )
+
+
+def undisturbed(command: str, folder: Path) -> tuple[dict[str, str], float]:
+    """Return the result and the seconds of a command that nothing disturbs."""
+    begun = time.monotonic()
+    code = start(command, folder).wait()
+    assert code == 0, (folder / "log.txt").read_text(encoding="utf-8")
+    return result(folder), time.monotonic() - begun
+
+
+def kill_often(
+    command: str, number: signal.Signals, kills: int, parent: Path, seed: int
+) -> Outcome:
+    """Kill a command many times and compare it with an undisturbed one."""
+    draw, outcome = random.Random(seed), Outcome()
+    expected, seconds = undisturbed(command, parent / f"{command}-undisturbed")
+    folder = parent / f"{command}-{number.name}-0"
+    while outcome.kills < kills:
+        process = start(command, folder)
+        try:
+            code = process.wait(draw.uniform(0.0, seconds))
+        except subprocess.TimeoutExpired:
+            process.send_signal(number)
+            code = process.wait()
+            time.sleep(GRACE_S)
+        outcome.wrong += [f"outlived: {process}" for process in processes(folder)]
+        if code == 0:
+            _check_end(folder, expected, outcome)
+            folder = folder.with_name(f"{command}-{number.name}-{outcome.finished}")
+            continue
+        outcome.kills += 1
+        if code not in (-number, 128 + number):
+            outcome.wrong.append(f"exit code {code}")
+        if number != signal.SIGKILL and code != -number:
+            outcome.wrong += leftovers_of_stopped(folder)
+    code = start(command, folder).wait()
+    if code:
+        outcome.wrong.append(f"exit code {code} of the repetition")
+    _check_end(folder, expected, outcome)
+    return outcome
+
+
+def leftovers_of_stopped(folder: Path) -> list[str]:
+    """Return what a command that could clean up has left; it keeps a checkpoint."""
+    return [f"left {path}" for path in leftovers(folder) if not path.endswith(".checkpoint")]
+
+
+def _check_end(folder: Path, expected: dict[str, str], outcome: Outcome) -> None:
+    outcome.finished += 1
+    if result(folder) != expected:
+        outcome.wrong.append(f"{folder.name}: another result than undisturbed")
+    before = tempfile.tempdir
+    tempfile.tempdir = str(folder / "tmp")  # as the next run there would
+    remove_abandoned()
+    tempfile.tempdir = before
+    outcome.wrong += [f"left {path}" for path in leftovers(folder)]
+
+
+def main() -> None:
+    """Print a line per command and signal; exit with 1 if anything was wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=int(time.time()))
+    given = parser.parse_args()
+    wrong = 0
+    with tempfile.TemporaryDirectory() as parent:
+        for command in COMMANDS:
+            for name in SIGNALS:
+                folder = Path(parent) / f"{command}-{name}"
+                number = signal.Signals[name]
+                found = kill_often(command, number, given.kills, folder, given.seed)
+                wrong += len(found.wrong)
+                print(f"{command} {name}: {found.kills} kills, {found.finished} finished", end="")
+                print(f", {len(found.wrong)} wrong {found.wrong[:5]}", flush=True)
+    sys.exit(wrong > 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,24 @@
+"""A few kills of each command; `python -m tests.verification.kills` makes many."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.verification.kills import COMMANDS, SIGNALS, kill_often
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("name", SIGNALS)
+def test_a_killed_command_leaves_nothing_and_ends_with_the_same_result(
+    command: str, name: str, tmp_path: Path
+) -> None:
+    found = kill_often(command, signal.Signals[name], 2, tmp_path, int(time.time()))
+    assert found.kills == 2
+    assert not found.wrong
