@@ -152,7 +152,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"seeds": True}, r"`seeds` must be an integer in \[1, 100\]; got True"),
     ({"retime": "yes"}, "`retime` must be true or false; got 'yes'"),
     ({"time_limit_s": float("inf")}, "`time_limit_s` must be a number above 0; got inf"),
-    ({"methods": "pod"}, "`methods` must be a list of names, such as ['pod']; got 'pod'"),
+    ({"methods": "pod"}, "`methods` must be a list of names, such as .'pod'.; got 'pod'"),
     ({"methods": []}, "must each hold at least one name"),
     ({"datasets": []}, "must each hold at least one name"),
     ({"datasets": ["beam-tiny"] * 2}, "two datasets are called 'beam-tiny'"),

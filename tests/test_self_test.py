@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mor_bench.cli.app import app
+from mor_bench.method_loading import load_method
 from mor_bench.runs import self_test
 from mor_bench.sandbox import landlock, process
 
@@ -24,7 +25,7 @@ def test_the_self_test_passes() -> None:
 
 @pytest.mark.slow
 def test_the_self_test_notices_what_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(self_test, "load_surrogate", lambda path: self_test.load_method("pod"))
+    monkeypatch.setattr(self_test, "load_surrogate", lambda path: load_method("pod"))
     monkeypatch.setattr(process, "MEMORY_CHECK_S", 100.0)
     checks = {check.name: check.passed for check in self_test.self_test()}
     assert not checks["damaged models"]

@@ -217,7 +217,7 @@ class Peeker(Zero):
         for folder in map(Path, self.folders):
             for way in (self._list, self._open, self._hdf5, self._program, self._load):
                 try:
-                    found += [f"{way.__name__} {item}" for item in way(folder)]
+                    found += [f"{way.__name__} {item}" for item in way(folder)[:3]]
                 except (OSError, subprocess.SubprocessError, MorBenchError):
                     continue
         return found
