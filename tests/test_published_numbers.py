@@ -1,0 +1,65 @@
+"""README and docs say what the stored evidence says: tables, numbers in sentences, pictures."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.published.blocks import pages, with_blocks
+from tests.published.claims import EVERY_PAGE, statements, without_evidence, wrong_numbers
+from tests.published.compact import ERRORS, wrong_summaries
+from tests.published.pictures import stale_pictures
+from tests.published.stored import REPORTS, ROOT
+
+NAMES = [path.relative_to(ROOT).as_posix() for path in pages()]
+RUNS = sorted(
+    path.parent.relative_to(REPORTS).as_posix()
+    for path in REPORTS.rglob(ERRORS)
+    if "runs" not in path.relative_to(REPORTS).parts
+)
+MOST_BYTES = 50e6
+
+
+def _read(page: str) -> str:
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("page", NAMES)
+def test_every_table_is_generated_from_the_evidence(page: str) -> None:
+    assert with_blocks(_read(page)) == _read(page), "run python -m tests.published.write"
+
+
+@pytest.mark.parametrize("page", NAMES)
+def test_every_number_in_a_sentence_is_that_of_the_evidence(page: str) -> None:
+    wrong = list(wrong_numbers(page, _read(page), statements()))
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("page", NAMES)
+def test_every_number_has_evidence_or_a_reason_why_it_needs_none(page: str) -> None:
+    found = list(without_evidence(page, _read(page), statements()))
+    assert not found, "\n".join([f"{len(found)} numbers without an entry in claims.toml:", *found])
+
+
+@pytest.mark.parametrize("page", NAMES)
+def test_every_picture_is_drawn_from_the_evidence(page: str) -> None:
+    stale = list(stale_pictures(ROOT / page, _read(page)))
+    assert not stale, "\n".join(stale)
+
+
+def test_every_entry_of_the_ledger_belongs_to_a_page() -> None:
+    assert {statement.page for statement in statements()} <= {EVERY_PAGE, *NAMES}
+    texts = [_read(page) for page in NAMES]
+    general = [statement for statement in statements() if statement.page == EVERY_PAGE]
+    unused = [s.text for s in general if not any(map(s.pattern().search, texts))]
+    assert not unused
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_the_errors_of_a_run_are_those_of_its_samples(run: str) -> None:
+    wrong = list(wrong_summaries(REPORTS / run))
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_evidence_is_small() -> None:
+    files = [p for p in REPORTS.rglob("*") if p.is_file() and REPORTS / "runs" not in p.parents]
+    assert sum(path.stat().st_size for path in files) <= MOST_BYTES
