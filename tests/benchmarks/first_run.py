@@ -73,10 +73,11 @@ def first_run(torch: str | None, environment: Mapping[str, str]) -> dict[str, An
         installed = perf_counter()
         said = _call([".venv/bin/mor-bench", "run", "--dry-run"], clone, env)
         estimated = perf_counter()
-        ended = json.loads(_call([".venv/bin/python", "-c", RUN, "out"], clone, env).split("\n")[-1])
+        printed = _call([".venv/bin/python", "-c", RUN, "out"], clone, env)
         drawn = perf_counter()
         _call([".venv/bin/mor-bench", "report", "out"], clone, env)
         report_s = perf_counter() - drawn
+    ended = json.loads(printed.splitlines()[-1])
     return {
         "install_s": installed - begun,
         "estimated_s": _minutes(said) * 60,
@@ -93,7 +94,9 @@ def first_run(torch: str | None, environment: Mapping[str, str]) -> dict[str, An
 def _call(command: list[str], folder: Path, environment: Mapping[str, str]) -> str:
     whole = {**os.environ, **environment}
     whole.pop("PYTHONPATH", None)
-    done = subprocess.run(command, cwd=folder, env=whole, check=True, capture_output=True, text=True)
+    done = subprocess.run(
+        command, cwd=folder, env=whole, check=True, capture_output=True, text=True
+    )
     return done.stdout.strip()
 
 

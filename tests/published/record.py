@@ -29,14 +29,12 @@ from mor_bench.machine import describe_machine
 from mor_bench.snapshots.store import write_atomically
 from tests.published.compact import compact
 from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of
+from tests.verification.trust_record import CODE, git
 
 SOURCES = "reports/sources.toml"
 
 RAW = "runs"
 """Folder in `reports/` that keeps the whole folder of a run on this machine; git ignores it."""
-
-CODE = ("mor_bench", "methods", "datasets", "tests")
-"""Folders that must have no uncommitted changes."""
 
 
 def experiments() -> dict[str, dict[str, Any]]:
@@ -51,11 +49,6 @@ def record_of(name: str) -> tuple[Path, str]:
     """Return the `run.toml` of an experiment, and the experiment's key in it."""
     path = REPORTS / name
     return (path.parent / "run.toml", path.name) if path.suffix else (path / "run.toml", "run")
-
-
-def _git(*words: str) -> str:
-    command = ["git", "-C", str(ROOT), *words]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def _toml(content: dict[str, Any]) -> str:
@@ -85,11 +78,11 @@ def record(name: str, allow_changes: bool = False) -> None:
     if name not in experiments():
         raise EvidenceError(f"{SOURCES} has no experiment {name!r}.")
     command = experiments()[name]["command"]
-    if _git("status", "--porcelain", "--", *CODE) and not allow_changes:
+    if git("status", "--porcelain", "--", *CODE) and not allow_changes:
         raise EvidenceError("The code has uncommitted changes; commit them first.")
     path, key = record_of(name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    machine, commit = describe_machine(), _git("rev-parse", "HEAD")
+    machine, commit = describe_machine(), git("rev-parse", "HEAD")
     begun, date = perf_counter(), datetime.now(UTC)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / ("out" + (REPORTS / name).suffix)

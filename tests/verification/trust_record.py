@@ -9,15 +9,22 @@ from typing import Any
 
 from mor_bench.machine import describe_machine
 
+CODE = ("mor_bench", "methods", "datasets", "tests")
+"""Folders whose uncommitted changes count."""
+
 
 def trust_record() -> dict[str, Any]:
-    """Return the commit of the source (with "-dirty" if it was changed), machine and date."""
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.strip()
+    """Return the commit of the code (with "-dirty" if it was changed), machine and date."""
+    changed = "-dirty" if git("status", "--porcelain", "--", *CODE) else ""
     date = datetime.now(UTC).isoformat(timespec="seconds")
-    return {"commit": commit, "machine": describe_machine(), "date": date}
+    return {
+        "commit": git("rev-parse", "HEAD") + changed,
+        "machine": describe_machine(),
+        "date": date,
+    }
+
+
+def git(*words: str) -> str:
+    """Return what git prints in the root of the repository."""
+    command = ["git", "-C", str(Path(__file__).parents[2]), *words]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
