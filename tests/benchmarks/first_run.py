@@ -73,7 +73,7 @@ def first_run(torch: str | None, environment: Mapping[str, str]) -> dict[str, An
         installed = perf_counter()
         said = _call([".venv/bin/mor-bench", "run", "--dry-run"], clone, env)
         estimated = perf_counter()
-        printed = _call([".venv/bin/python", "-c", RUN, "out"], clone, env)
+        printed = _call([".venv/bin/python", "-I", "-c", RUN, "out"], clone, env)
         drawn = perf_counter()
         _call([".venv/bin/mor-bench", "report", "out"], clone, env)
         report_s = perf_counter() - drawn
