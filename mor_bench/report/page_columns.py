@@ -38,9 +38,9 @@ GROUPS: dict[str, dict[str, Cell]] = {
         "max e": figure_cell("error", "max_dof_m", metres),
         "ē, free dofs": figure_cell("error", "mean_free_dof_m", metres),
     },
-    "offline (s)": {
-        "data": figure_cell("offline_s", "data"),
-        "fit": figure_cell("offline_s", "fit"),
+    "offline": {
+        "data (core-s)": figure_cell("offline_s", "data"),
+        "fit (s)": figure_cell("offline_s", "fit"),
     },
     "nodal (m)": {
         "max": figure_cell("error", "max_nodal_m", metres),
