@@ -63,7 +63,7 @@ def _target_parts(shown: TextTable, width: int) -> list[RenderableType]:
     for method, *cells in shown.rows:
         texts = (Text(cell, style="dim" if cell == NOT_REACHED else "") for cell in cells)
         table.add_row(Text(method), *texts)
-    return _titled(f"{shown.title} ", table, Text(TARGETS_NOTE, style="dim"))
+    return _titled(shown.title, table, Text(TARGETS_NOTE, style="dim"))
 
 
 def _pairwise_parts(
