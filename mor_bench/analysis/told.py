@@ -14,8 +14,9 @@ CLASSES: tuple[Told, ...] = get_args(Told)
 """All classes, the one with the least information first."""
 
 LEGEND = (
-    "What a method is told at query time: the force only; also its linear response, which needs "
-    "the equations once; or the equations. Snapshots: whether it learned from samples."
+    "What a method is told at query time: the force (or the observed displacements) only; also its "
+    "linear response, which needs the equations once; or the equations. Snapshots: whether it "
+    "learned from samples."
 )
 
 
