@@ -17,8 +17,8 @@ from mor_bench.results.row import Row
 from mor_bench.specs.method_spec import Told
 
 RULE = (
-    "Qualified are configurations that answer every load and whose 95 % upper bounds of error (on "
-    "the validation part) and latency meet the limits; the fastest of them is the winner."
+    "A configuration qualifies if it answers every load and its 95 % upper bounds meet the limits. "
+    "The error is that on the validation part. The fastest qualified configuration wins."
 )
 
 Figures = Mapping[str, Mapping[str, float]]
@@ -193,7 +193,6 @@ class Verdict:
         named = {name: getattr(self, name) for name in ("choice", "runner_up", "cheapest")}
         return {
             "dataset": self.dataset,
-            "rule": RULE,
             "headline": self.headline,
             "evidence": list(self.evidence),
             "beside": list(self.beside),
