@@ -123,7 +123,7 @@ def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: A
     title = str(comparison.datasets.get(dataset, {}).get("title", ""))
     marks = (
         "Pareto *: no other configuration is both faster and more accurate (medians). "
-        "ref: a full-order solve on the dataset's mesh, which competes for no rank of errors."
+        "ref: a full-order solve on the dataset's mesh; its error is not ranked."
     )
     if any(entry.unstable for entry in entries):
         marks += " Latency ~: not stable, see below."
