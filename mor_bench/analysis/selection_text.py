@@ -18,7 +18,7 @@ FIGURE_NAMES = {
     "error": "error",
     "latency_ms": "latency",
     "memory_bytes": "memory",
-    "offline_s": "offline time",
+    "offline_s": "offline cost",
 }
 """Names of the figures that requirements limit."""
 
