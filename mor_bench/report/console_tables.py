@@ -12,7 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.selection_text import needs_text
 from mor_bench.analysis.told import LEGEND
+from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.caveat_tables import out_of_range
 from mor_bench.report.console_columns import configuration_table
 from mor_bench.report.entries import (
@@ -21,7 +23,6 @@ from mor_bench.report.entries import (
     best_per_method,
     dataset_names,
     entries_of,
-    needs_of,
     verdict_of,
 )
 from mor_bench.report.number_format import explain_short_names, metres, number, percent
@@ -35,7 +36,6 @@ from mor_bench.report.speed_tables import (
 from mor_bench.report.summary import (
     discretisation_error,
     interval_basis,
-    needs_text,
     notes_of,
     warnings_of,
 )
@@ -71,8 +71,7 @@ def _pairwise_parts(
 ) -> list[RenderableType]:
     """Compare speeds at the error that the dataset requires, if two or more methods reach it."""
     error = needs_of(comparison, dataset).error
-    pairs = pairs_at(comparison, dataset, error, analysis)
-    if len(pairs.methods) < 2:
+    if error is None or len((pairs := pairs_at(comparison, dataset, error, analysis)).methods) < 2:
         return []
     table = _empty_table()
     table.add_column("", overflow="fold")

@@ -25,22 +25,6 @@ Analysis = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Needs:
-    """Accuracy and speed that a dataset requires; infinite where it requires none.
-
-    Attributes
-    ----------
-    error : float
-        Median relative L2 error, as a fraction.
-    latency_ms : float
-        Median latency, ms.
-    """
-
-    error: float = inf
-    latency_ms: float = inf
-
-
-@dataclass(frozen=True)
 class Entry:
     """A row of the results with conclusions about it.
 
@@ -148,12 +132,6 @@ class Entry:
 def dataset_names(comparison: Comparison) -> list[str]:
     """List the datasets that were recorded or have rows."""
     return list(dict.fromkeys([*comparison.datasets, *(row.dataset for row in comparison.rows)]))
-
-
-def needs_of(comparison: Comparison, dataset: str) -> Needs:
-    """Return the needs of a dataset."""
-    stated = comparison.datasets.get(dataset, {}).get("needs") or {}
-    return Needs(float(stated.get("error", inf)), float(stated.get("latency_ms", inf)))
 
 
 def entries_of(

@@ -11,7 +11,9 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.selection_text import needs_text
 from mor_bench.analysis.told import LEGEND, classes_of, is_observed, told_text
+from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.canvas import Drawn
 from mor_bench.report.details import dataset_details, overall
 from mor_bench.report.entries import (
@@ -19,7 +21,6 @@ from mor_bench.report.entries import (
     Entry,
     dataset_names,
     entries_of,
-    needs_of,
     verdict_of,
 )
 from mor_bench.report.figures import write_figures
@@ -29,7 +30,6 @@ from mor_bench.report.speed_tables import target_table
 from mor_bench.report.summary import (
     discretisation_error,
     interval_basis,
-    needs_text,
     notes_of,
     warnings_of,
 )
