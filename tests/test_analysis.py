@@ -339,7 +339,6 @@ def test_tuning_reports_the_used_and_the_allowed_budget(tmp_path: Path) -> None:
             "method": "a",
             "configurations": 2,
             "seconds": 10.0,
-            "seeds": 1,
             "configurations_allowed": 2,
             "seconds_allowed": 15.0,
         }

@@ -119,6 +119,10 @@ def test_the_map_of_the_error_has_a_panel_for_the_best_of_each_class(tmp_path: P
     assert dots[0] == pytest.approx(np.array([2.0, 20.0]))
     assert dots[1] == pytest.approx(np.array([6.0, 60.0]))
     assert scales[0] == scales[1] == pytest.approx((2.0, 60.0))
+    made.add_dataset("beam", {"observed": {"region": "x-max"}}, {**arrays, "test_regions": regions})
+    picture = error_over_position(made, "beam")
+    assert picture is not None
+    assert "told: observed displacements only" in picture.figure.axes[0].get_title(loc="left")
     made.add_dataset("beam", {}, {"test_regions": regions})
     assert error_over_position(made, "beam") is None
 

@@ -80,6 +80,10 @@ def test_the_page_filters_rows_without_a_script(made: Comparison) -> None:
     assert page.count('type="checkbox"') == 3
     table = page.split("<h3>Configurations</h3>")[1].split("</table>")[0]
     assert table.count('data-told="input"') == 3
+    assert "checked> force only</label>" in page
+    made.datasets["beam-tiny"]["observed"] = {"region": "x-max"}
+    page = render(made)[-1].read_text(encoding="utf-8")
+    assert "checked> observed displacements only</label>" in page
 
 
 def test_the_console_names_each_group_before_its_rows(made: Comparison) -> None:

@@ -14,7 +14,7 @@ from mor_bench.analysis.frontier import compare
 from mor_bench.analysis.pairs import add_intervals
 from mor_bench.analysis.performance_profile import profile
 from mor_bench.analysis.selection import decide
-from mor_bench.analysis.verdict import Requirements, Verdict
+from mor_bench.analysis.verdict import Requirements, Verdict, needs_of
 from mor_bench.results.comparison import Comparison
 
 N_RESAMPLES = 2000
@@ -80,12 +80,6 @@ def analyse(
     analysis["regimes"] = regimes(comparison)
     analysis["tuning"] = tuning(comparison)
     return analysis
-
-
-def needs_of(comparison: Comparison, dataset: str) -> Requirements:
-    """Return the limits that a dataset's file states."""
-    stated = comparison.datasets.get(dataset, {}).get("needs") or {}
-    return Requirements(stated.get("error"), stated.get("latency_ms"))
 
 
 def verdict_on(comparison: Comparison, dataset: str, requirements: Requirements) -> Verdict:

@@ -123,7 +123,6 @@ def tuning(comparison: Comparison) -> list[dict[str, Any]]:
                 "method": method,
                 "configurations": len(tried),
                 "seconds": sum(map(_tuning_seconds, tried)),
-                "seeds": max((row.seeds.n if row.seeds else 1 for row in tried), default=0),
                 "configurations_allowed": budget.get("configurations"),
                 "seconds_allowed": budget.get("seconds"),
             }

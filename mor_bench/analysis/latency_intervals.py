@@ -103,8 +103,8 @@ def spreads_of(all_samples: Sequence[Samples]) -> Spreads:
 
     The configurations were timed in turns, so process p and round r are the same moment for all.
     With a single configuration, all spread counts as specific. Now and then, a process is a third
-    slower throughout. The median over `ENOUGH` processes ignores it, so the specific spread is then
-    a scale that ignores it too.
+    slower throughout. The median over `ENOUGH` processes ignores it. So the specific spread is then
+    a median size of deviations, which such a process changes less than their root mean square.
     """
     cube = _cube(all_samples)
     n, degrees = len(cube), np.maximum(np.isfinite(cube).any(axis=2).sum(axis=1) - 1.0, 0.0)

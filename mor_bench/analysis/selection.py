@@ -75,7 +75,7 @@ def decide(
 
 
 def _figures(row: Row, intervals: Mapping[str, Interval]) -> dict[str, float]:
-    """Return the upper bounds of a row by the names in `FIGURES`; infinite where unknown."""
+    """Return the upper bounds of a row by the names of the limits; infinite where unknown."""
     error = selecting_error(row)
     _, error_high = intervals.get(VALIDATION if row.validation else "rel_l2_median", (0.0, error))
     fresh = number_or_inf(row.hidden.rel_l2_median) if row.hidden else 0.0

@@ -10,7 +10,7 @@ from typing import Any
 
 from mor_bench.analysis.frontier import median_error, median_latency_ms
 from mor_bench.analysis.told import class_text, told_text
-from mor_bench.analysis.verdict import RULE, Verdict
+from mor_bench.analysis.verdict import RULE, Requirements, Verdict
 from mor_bench.options import RunOptions, command_line
 from mor_bench.results.row import ErrorSummary, Row, SetErrors
 
@@ -18,7 +18,7 @@ FIGURE_NAMES = {
     "error": "error",
     "latency_ms": "latency",
     "memory_bytes": "memory",
-    "offline_s": "offline time",
+    "offline_s": "offline cost",
 }
 """Names of the figures that requirements limit."""
 
@@ -51,16 +51,16 @@ def worded(verdict: Verdict) -> Verdict:
     source = filter(None, [str(verdict.run or ""), kind(verdict), timed_on(verdict)])
     return replace(
         verdict,
-        headline=f"{needs(verdict)} {headline(verdict)}",
+        headline=f"{verdict.dataset} needs {needs_text(verdict.requirements)}. {headline(verdict)}",
         beside=[*beside(verdict), f"Evidence: {', '.join(source)}."],
         evidence=evidence(verdict, shown) if shown else [],
     )
 
 
-def needs(verdict: Verdict) -> str:
-    """State the limits."""
-    limits = [limit_text(name, limit) for name, limit in verdict.requirements.asked.items()]
-    return f"{verdict.dataset} needs {', '.join(limits) or 'nothing in particular'}."
+def needs_text(needs: Requirements) -> str:
+    """State limits, such as "error <= 1 % (relative l2, median), latency <= 3 ms (median)"."""
+    limits = (limit_text(name, limit) for name, limit in needs.asked.items())
+    return ", ".join(limits) or "nothing in particular"
 
 
 def headline(verdict: Verdict) -> str:

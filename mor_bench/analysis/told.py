@@ -14,12 +14,13 @@ CLASSES: tuple[Told, ...] = get_args(Told)
 """All classes, the one with the least information first."""
 
 LEGEND = (
-    "What a method is told at query time: the force only; also its linear response, which needs "
-    "the equations once; or the equations. Snapshots: whether it learned from samples."
+    "What a method is told at query time: the force (or the observed displacements) only; also its "
+    "linear response, which needs the equations once; or the equations. Snapshots: whether it "
+    "learned from samples."
 )
 
 
-def told_text(told: Told | None, observed: bool = False) -> str:
+def told_text(told: Told | None, observed: bool) -> str:
     """Name a class, such as "force and linear response".
 
     `observed` holds for scenes that give observed displacements instead of forces.
@@ -29,7 +30,7 @@ def told_text(told: Told | None, observed: bool = False) -> str:
     return names.get(told or "", told or "not stated")
 
 
-def class_text(row: Row, observed: bool = False) -> str:
+def class_text(row: Row, observed: bool) -> str:
     """Describe a row's information, such as "equations, snapshots, reference"."""
     learned = {True: "snapshots", False: "no snapshots", None: ""}[row.snapshots]
     parts = (told_text(row.told, observed), learned, "reference" if row.reference else "")

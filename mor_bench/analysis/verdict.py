@@ -12,13 +12,14 @@ from mor_bench.analysis.draws import Interval
 from mor_bench.analysis.frontier import median_latency_ms, number_or_inf, selecting_error
 from mor_bench.analysis.told import classes_of
 from mor_bench.errors import InvalidInputError
+from mor_bench.results.comparison import Comparison
 from mor_bench.results.json_file import without_nan
 from mor_bench.results.row import Row
 from mor_bench.specs.method_spec import Told
 
 RULE = (
-    "Qualified are configurations that answer every load and whose 95 % upper bounds of error (on "
-    "the validation part) and latency meet the limits; the fastest of them is the winner."
+    "A configuration qualifies if it answers every load and its 95 % upper bounds meet the limits. "
+    "The error is that on the validation part. The fastest qualified configuration wins."
 )
 
 Figures = Mapping[str, Mapping[str, float]]
@@ -61,6 +62,12 @@ class Requirements:
     def asked(self) -> dict[str, float]:
         """The given limits, by name."""
         return {name: limit for name, limit in asdict(self).items() if limit is not None}
+
+
+def needs_of(comparison: Comparison, dataset: str) -> Requirements:
+    """Return the limits that a dataset's file states."""
+    stated = comparison.datasets.get(dataset, {}).get("needs") or {}
+    return Requirements(stated.get("error"), stated.get("latency_ms"))
 
 
 @dataclass(frozen=True)
@@ -193,7 +200,6 @@ class Verdict:
         named = {name: getattr(self, name) for name in ("choice", "runner_up", "cheapest")}
         return {
             "dataset": self.dataset,
-            "rule": RULE,
             "headline": self.headline,
             "evidence": list(self.evidence),
             "beside": list(self.beside),

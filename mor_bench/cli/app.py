@@ -13,7 +13,7 @@ from mor_bench.cli.clear_errors import clear_errors, open_streams
 COMMANDS = {
     "run": ("run_command", "Fit, score and time methods on datasets, and write a report."),
     "fit": ("fit_command", "Fit one configuration on a dataset and save the model."),
-    "pick": ("result_commands", "Name the cheapest configuration that meets a dataset's needs."),
+    "pick": ("result_commands", "Name the fastest configuration that meets a dataset's needs."),
     "report": ("result_commands", "Print tables and draw figures of a finished run again."),
     "list": ("suite_commands", "List the datasets and methods of the suite."),
     "check": ("suite_commands", "Check dataset and method files for errors."),

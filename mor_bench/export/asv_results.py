@@ -32,6 +32,7 @@ from mor_bench.export.asv_files import (
 )
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
+from mor_bench.specs.base import NAME_PATTERN
 
 GROUP = "comparison"
 PARAMETERS = ("configuration", "setting")
@@ -165,7 +166,7 @@ def export_asv(
 def _check_recorded(comparison: Comparison) -> None:
     for row in comparison.rows:
         # asv's page puts names of benchmarks and parameters into its own text as they are.
-        if not re.fullmatch(r"[a-z0-9-]+", row.dataset) or re.search(r"[<>&]", row.label):
+        if not re.fullmatch(NAME_PATTERN, row.dataset) or re.search(r"[<>&]", row.label):
             raise StoreError(
                 f"{comparison.out}: a row's names are not fit for a page: "
                 f"{row.dataset!r}, {row.label!r}."

@@ -32,7 +32,7 @@ def export_numpy(data: Dataset, out: str | Path) -> list[Path]:
         two files exists.
     """
     out = new_file(out, ".npz", ".toml")
-    if not re.match(NAME_PATTERN, out.stem):
+    if not re.fullmatch(NAME_PATTERN, out.stem):
         raise InvalidInputError(
             "`out` must have a name of lower-case letters, digits and hyphens, because the dataset "
             f"gets it; got {out.name!r}."

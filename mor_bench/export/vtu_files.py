@@ -44,7 +44,7 @@ def export_vtu(
         Number of the sample in its part.
     out : path
         Folder; created if it does not exist.
-    part : {"train", "test"} or the name of a test set
+    part : {"train", "validation", "test"} or the name of a test set
         The dataset must have been read with that test set.
     models : sequence of paths
         Fitted models, see `Surrogate.save`. Each file is named after its model's file.

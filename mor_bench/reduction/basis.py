@@ -286,13 +286,15 @@ def _randomised(
         q = qr(images, mode="economic", overwrite_a=True, check_finite=False)[0]
         n_directions = q.shape[1]
         found = _Decomposition(snapshots.T @ q, inner_product, n_samples, energy)
-        if n_modes is None and n_directions < min(n_samples, n):
-            many = found.rank if energy_tolerance is None else found.n_modes_of(energy_tolerance)
-            if many > n_directions - OVERSAMPLING:
-                directions, n_directions = found.modes(found.rank), 2 * n_directions
-                if most is not None and n_directions > most:
-                    return None
-                continue
+        if (
+            energy_tolerance is not None
+            and n_directions < min(n_samples, n)
+            and found.n_modes_of(energy_tolerance) > n_directions - OVERSAMPLING
+        ):
+            directions, n_directions = found.modes(found.rank), 2 * n_directions
+            if most is not None and n_directions > most:
+                return None
+            continue
         if more == 0:
             return found
         more -= 1

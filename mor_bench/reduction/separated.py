@@ -56,13 +56,10 @@ class Separation:
     ----------
     terms : tuple of Term
     vectors : (n_terms, n_outputs) float64
-    residuals : (n_terms,) float64
-        Norm of the residual after each term, relative to the targets.
     """
 
     terms: tuple[Term, ...]
     vectors: Array
-    residuals: Array
 
 
 def _regularised(matrix: Array, ridge: float) -> Array:
@@ -153,7 +150,7 @@ def separate(targets: Array, families: Sequence[Family], n_terms: int, ridge: fl
     norm = float(np.linalg.norm(targets))
     terms: list[Term] = []
     sampled = np.zeros((len(targets), 0))
-    vectors, residual, residuals = np.zeros((0, targets.shape[1])), targets, []
+    vectors, residual = np.zeros((0, targets.shape[1])), targets
     while len(terms) < n_terms and np.linalg.norm(residual) > EXHAUSTED * norm:
         found = [
             (number, term)
@@ -174,5 +171,4 @@ def separate(targets: Array, families: Sequence[Family], n_terms: int, ridge: fl
         sampled = np.hstack([sampled, z[:, None]])
         vectors = _solve(sampled.T @ sampled, sampled.T @ targets, ridge)
         residual = targets - sampled @ vectors
-        residuals.append(float(np.linalg.norm(residual)) / norm)
-    return Separation(tuple(terms), vectors, np.array(residuals))
+    return Separation(tuple(terms), vectors)

@@ -57,26 +57,24 @@ def predict_corrected(
     modes: NDArray[np.float64],
     model: FullOrderModel,
     rest_factor: Factor,
-    loads: NDArray[np.float64],
+    load: NDArray[np.float64],
     tolerance: float,
 ) -> NDArray[np.float64]:
-    """Return reduced equilibria under loads (n, n_free), N, with static corrections, (n, n_free) m.
+    """Return the reduced equilibrium under a load (n_free,), N, with static correction, m.
 
     The modes are those of the problem on all free dofs. The factor is that of the model's stiffness
     at rest. Raises `SolverError` if the reduced model has no valid equilibrium, or if its
     correction inverts cells.
     """
-    out = np.empty(loads.shape)
-    count(multiply_adds=2 * modes.size * len(loads))
-    for row, load in zip(out, loads, strict=True):
-        reduced = modes.T @ load
-        if isinstance(problem, TensorProblem):
-            q = problem.solve(reduced, tolerance)
-        else:
-            q = solve_equilibrium(problem, reduced, options=NewtonOptions(tolerance)).displacement
-        row[:] = rest_factor.solve(load) + modes @ (q - problem.rest_factor.solve(reduced))
-        refuse_inverted(model, row)
-    return out
+    count(multiply_adds=2 * modes.size)
+    reduced = modes.T @ load
+    if isinstance(problem, TensorProblem):
+        q = problem.solve(reduced, tolerance)
+    else:
+        q = solve_equilibrium(problem, reduced, options=NewtonOptions(tolerance)).displacement
+    u = rest_factor.solve(load) + modes @ (q - problem.rest_factor.solve(reduced))
+    refuse_inverted(model, u)
+    return u
 
 
 def refuse_inverted(model: FullOrderModel, u: NDArray[np.float64]) -> None:

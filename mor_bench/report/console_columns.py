@@ -11,7 +11,7 @@ from rich.text import Text
 
 from mor_bench.report.entries import Entry, by_group
 from mor_bench.report.number_format import DASH, metres, number, percent, span
-from mor_bench.report.text_table import Cell, figure_cell
+from mor_bench.report.text_table import Cell, figure_cell, marked_latency
 
 LABEL_WIDTH = 25
 """Least width of the label, in characters; columns are left out to make room for it."""
@@ -48,10 +48,6 @@ def _qualified_mark(entry: Entry) -> str:
     return "yes" if entry.qualified else "no"
 
 
-def _latency(entry: Entry) -> str:
-    return number(entry.figure("latency_ms", "median")) + ("~" if entry.unstable else "")
-
-
 def _seeds_error(entry: Entry) -> str:
     spread = entry.row.seeds and entry.row.seeds.rel_l2_median
     return span(spread.interval, percent) if spread else DASH
@@ -69,7 +65,7 @@ COLUMNS = (
     Column("rel L2\nmed %", figure_cell("error", "rel_l2_median", percent), REQUIRED),
     Column("\np95 %", figure_cell("error", "rel_l2_p95", _bounded), 8),
     Column("\nmax %", figure_cell("error", "rel_l2_max", _bounded), 8),
-    Column("latency\nmed ms", _latency, REQUIRED),
+    Column("latency\nmed ms", marked_latency, REQUIRED),
     Column("\n95 %", lambda e: span(e.intervals.get("latency_ms")), 7),
     Column("\np95", figure_cell("latency_ms", "p95"), 8),
     Column("\np99", figure_cell("latency_ms", "p99"), 5),

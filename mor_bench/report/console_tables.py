@@ -12,7 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.selection_text import needs_text
 from mor_bench.analysis.told import LEGEND
+from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.caveat_tables import out_of_range
 from mor_bench.report.console_columns import configuration_table
 from mor_bench.report.entries import (
@@ -21,7 +23,6 @@ from mor_bench.report.entries import (
     best_per_method,
     dataset_names,
     entries_of,
-    needs_of,
     verdict_of,
 )
 from mor_bench.report.number_format import explain_short_names, metres, number, percent
@@ -35,7 +36,6 @@ from mor_bench.report.speed_tables import (
 from mor_bench.report.summary import (
     discretisation_error,
     interval_basis,
-    needs_text,
     notes_of,
     warnings_of,
 )
@@ -63,7 +63,7 @@ def _target_parts(shown: TextTable, width: int) -> list[RenderableType]:
     for method, *cells in shown.rows:
         texts = (Text(cell, style="dim" if cell == NOT_REACHED else "") for cell in cells)
         table.add_row(Text(method), *texts)
-    return _titled(f"{shown.title} ", table, Text(TARGETS_NOTE, style="dim"))
+    return _titled(shown.title, table, Text(TARGETS_NOTE, style="dim"))
 
 
 def _pairwise_parts(
@@ -71,8 +71,7 @@ def _pairwise_parts(
 ) -> list[RenderableType]:
     """Compare speeds at the error that the dataset requires, if two or more methods reach it."""
     error = needs_of(comparison, dataset).error
-    pairs = pairs_at(comparison, dataset, error, analysis)
-    if len(pairs.methods) < 2:
+    if error is None or len((pairs := pairs_at(comparison, dataset, error, analysis)).methods) < 2:
         return []
     table = _empty_table()
     table.add_column("", overflow="fold")
@@ -123,7 +122,7 @@ def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: A
     title = str(comparison.datasets.get(dataset, {}).get("title", ""))
     marks = (
         "Pareto *: no other configuration is both faster and more accurate (medians). "
-        "ref: a full-order solve on the dataset's mesh, which competes for no rank of errors."
+        "ref: a full-order solve on the dataset's mesh; its error is not ranked."
     )
     if any(entry.unstable for entry in entries):
         marks += " Latency ~: not stable, see below."

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any
 
+from mor_bench.analysis.draws import Interval
 from mor_bench.analysis.frontier import (
     Point,
     is_point,
@@ -21,24 +22,6 @@ from mor_bench.results.row import Row
 
 Analysis = Mapping[str, Any]
 """Content of comparison.json, from `mor_bench.analysis.analyse.analyse`."""
-
-Interval = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Needs:
-    """Accuracy and speed that a dataset requires; infinite where it requires none.
-
-    Attributes
-    ----------
-    error : float
-        Median relative L2 error, as a fraction.
-    latency_ms : float
-        Median latency, ms.
-    """
-
-    error: float = inf
-    latency_ms: float = inf
 
 
 @dataclass(frozen=True)
@@ -83,7 +66,7 @@ class Entry:
 
     @property
     def pareto_mark(self) -> str:
-        """A star on the Pareto front; a reference is marked as such and competes for no star."""
+        """A star on the Pareto front; "ref" for a reference, which gets no star."""
         return "ref" if self.row.reference else "*" if self.on_front else ""
 
     @property
@@ -149,12 +132,6 @@ class Entry:
 def dataset_names(comparison: Comparison) -> list[str]:
     """List the datasets that were recorded or have rows."""
     return list(dict.fromkeys([*comparison.datasets, *(row.dataset for row in comparison.rows)]))
-
-
-def needs_of(comparison: Comparison, dataset: str) -> Needs:
-    """Return the needs of a dataset."""
-    stated = comparison.datasets.get(dataset, {}).get("needs") or {}
-    return Needs(float(stated.get("error", inf)), float(stated.get("latency_ms", inf)))
 
 
 def entries_of(
@@ -235,10 +212,7 @@ def _intervals(record: Mapping[str, Any]) -> dict[str, Interval]:
 
 
 def best_per_method(entries: Sequence[Entry]) -> list[Entry]:
-    """Return the configuration of each method that ran with the smallest ē, as validation sees it.
-
-    Without validation errors, the test errors select.
-    """
+    """Return each method's configuration with the smallest ē, on the validation part if any."""
     ran = [entry for entry in entries if entry.ran]
     methods = dict.fromkeys(entry.method for entry in ran)
     return [

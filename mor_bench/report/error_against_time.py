@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from math import isfinite
+from math import inf, isfinite
 from textwrap import fill
 
 import numpy as np
@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from mor_bench.analysis.verdict import Requirements, needs_of
 from mor_bench.report.canvas import (
     INK,
     Note,
@@ -26,7 +27,7 @@ from mor_bench.report.canvas import (
     plain,
     shortened,
 )
-from mor_bench.report.entries import Analysis, Entry, Needs, by_group, entries_of, needs_of
+from mor_bench.report.entries import Analysis, Entry, by_group, entries_of
 from mor_bench.report.number_format import explain_short_names, number, short_swept
 from mor_bench.results.comparison import Comparison
 
@@ -104,13 +105,14 @@ def _caption(entries: Sequence[Entry], shown: Sequence[Entry]) -> str:
     return " ".join(sentence for sentence, applies in sentences.items() if applies)
 
 
-def _log_limits(axes: Axes, shown: Sequence[Entry], needs: Needs) -> None:
+def _log_limits(axes: Axes, shown: Sequence[Entry], needs: Requirements) -> None:
     """Set logarithmic axes that hold the points, their bars and the corner of the needs."""
     axes.set_xscale("log")
     axes.set_yscale("log")
     bars = np.array([_bars(e) for e in shown])
-    x = [v for v in (*bars[:, 0].ravel().tolist(), needs.latency_ms) if isfinite(v) and v > 0]
-    y = [v for v in (*bars[:, 1].ravel().tolist(), 100 * needs.error) if isfinite(v)]
+    corner = needs.latency_ms or inf, 100 * (needs.error or inf)
+    x = [v for v in (*bars[:, 0].ravel().tolist(), corner[0]) if isfinite(v) and v > 0]
+    y = [v for v in (*bars[:, 1].ravel().tolist(), corner[1]) if isfinite(v)]
     axes.set_xlim(min(x) / 1.6, max(x) * 1.6)
     axes.set_ylim(min(y) / 2.0, max(y) * 2.0)
     log_ticks(axes.xaxis, x)
@@ -130,9 +132,9 @@ def _bars(entry: Entry) -> NDArray[np.float64]:
     return np.stack([np.minimum(ends[:, 0], [x, y]), np.maximum(ends[:, 1], [x, y])], axis=1)
 
 
-def _draw_needs(axes: Axes, needs: Needs) -> Artist | None:
+def _draw_needs(axes: Axes, needs: Requirements) -> Artist | None:
     """Draw the box in which the needs are met, with the error in percent; return its label."""
-    if not (isfinite(needs.error) and isfinite(needs.latency_ms)):
+    if needs.error is None or needs.latency_ms is None:
         return None
     (x0, _), (y0, _) = axes.get_xlim(), axes.get_ylim()
     x1, y1 = needs.latency_ms, 100 * needs.error

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mor_bench.analysis.told import classes_of, told_text
+from mor_bench.analysis.told import classes_of, is_observed, told_text
 from mor_bench.report.canvas import (
     GREY,
     INK,
@@ -40,17 +40,21 @@ PANEL_IN = 3.4
 
 READING = (
     "Each dot is a load patch. Its colour is the median relative L2 error of the test samples with "
-    "a load there. Small grey dots are patches without a test sample. Each panel shows the "
-    "configuration with the smallest ē among the methods that are told the same, selected on "
-    "validation samples if there are any."
+    "a load there. A cross marks an infinite median. Small grey dots are patches without a test "
+    "sample. Each panel shows the configuration with the smallest ē among the methods that are "
+    "told the same, selected on validation samples if there are any."
 )
 
 
 @dataclass(frozen=True)
 class PatchErrors:
-    """A configuration and its median relative L2 error at each patch; NaN without a sample."""
+    """A configuration, what it is told, and its median relative L2 error at each patch.
+
+    The error is NaN without a sample.
+    """
 
     entry: Entry
+    told: str
     errors: NDArray[np.float64]
 
     @property
@@ -59,7 +63,7 @@ class PatchErrors:
         return self.errors[np.isfinite(self.errors) & (self.errors > 0)]
 
     def sentence(self, centres: NDArray[np.float64]) -> str:
-        """Say where the error is smallest and largest."""
+        """State the range of the error, and where it is largest."""
         if not len(self.finite):
             return ""
         low, high = self.finite.min(), self.finite.max()
@@ -100,13 +104,14 @@ def error_over_position(comparison: Comparison, dataset: str) -> Picture | None:
         centres, regions = np.asarray(arrays["patch_centres"]), np.asarray(arrays["test_regions"])
     except (OSError, KeyError):
         return None
-    maps = []
+    maps, observed = [], is_observed(comparison, dataset)
     for entry in _best_of_each_class(entries_of(comparison, dataset)):
         try:
             relative = np.asarray(comparison.samples(entry.row)["relative_l2"])
         except (OSError, KeyError):
             continue
-        maps.append(PatchErrors(entry, median_per_patch(relative, regions, len(centres))))
+        errors = median_per_patch(relative, regions, len(centres))
+        maps.append(PatchErrors(entry, told_text(entry.row.told, observed), errors))
     finite = np.concatenate([np.zeros(0), *(found.finite for found in maps)])
     if not len(finite):
         return None
@@ -187,5 +192,4 @@ def _draw_patches(
     )
     axes.plot(*screen[known & ~shown].T, "x", color=INK, ms=size, zorder=6)
     name = shortened(f"{found.entry.method}  {short_swept(found.entry.swept)}".rstrip(), 44)
-    told = f"told: {told_text(found.entry.row.told)}"
-    axes.set_title(plain(f"{name}\n{told}"), fontsize=9.5, loc="left", color=INK)
+    axes.set_title(plain(f"{name}\ntold: {found.told}"), fontsize=9.5, loc="left", color=INK)

@@ -11,7 +11,9 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from mor_bench.analysis.analyse import analyse
-from mor_bench.analysis.told import LEGEND, classes_of, told_text
+from mor_bench.analysis.selection_text import needs_text
+from mor_bench.analysis.told import LEGEND, classes_of, is_observed, told_text
+from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.canvas import Drawn
 from mor_bench.report.details import dataset_details, overall
 from mor_bench.report.entries import (
@@ -19,7 +21,6 @@ from mor_bench.report.entries import (
     Entry,
     dataset_names,
     entries_of,
-    needs_of,
     verdict_of,
 )
 from mor_bench.report.figures import write_figures
@@ -29,7 +30,6 @@ from mor_bench.report.speed_tables import target_table
 from mor_bench.report.summary import (
     discretisation_error,
     interval_basis,
-    needs_text,
     notes_of,
     warnings_of,
 )
@@ -82,6 +82,7 @@ def render(comparison: Comparison, analysis: Analysis | None = None) -> list[Pat
     analysis = analysis or analyse(comparison)
     drawn = write_figures(comparison, analysis)
     names = dataset_names(comparison)
+    observed = all(is_observed(comparison, name) for name in names)
     environment = Environment(
         loader=PackageLoader("mor_bench.report"),
         autoescape=True,
@@ -95,7 +96,7 @@ def render(comparison: Comparison, analysis: Analysis | None = None) -> list[Pat
         overall=overall(analysis),
         overall_figures=[figure for figure in drawn if figure.dataset not in names],
         machine=list(_flat(comparison.machine)),
-        told={told or "": told_text(told) for told in classes_of(comparison.rows)},
+        told={told or "": told_text(told, observed) for told in classes_of(comparison.rows)},
         legend=LEGEND,
     )
     path = comparison.out / "report.html"

@@ -6,15 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mor_bench.report.entries import Entry
-from mor_bench.report.number_format import DASH, bytes_text, metres, number, percent, span
-from mor_bench.report.text_table import Cell, figure_cell
+from mor_bench.report.number_format import DASH, bytes_text, metres, percent, span
+from mor_bench.report.text_table import Cell, figure_cell, marked_latency
 
 INTERVAL = "95 %"
 """Heading of the columns of intervals; they are left out if there are no intervals."""
-
-
-def _median_latency(entry: Entry) -> str:
-    return number(entry.figure("latency_ms", "median")) + ("~" if entry.unstable else "")
 
 
 def _discretisation(entry: Entry) -> str:
@@ -30,7 +26,7 @@ GROUPS: dict[str, dict[str, Cell]] = {
         "max": figure_cell("error", "rel_l2_max", percent),
     },
     "latency (ms)": {
-        "median": _median_latency,
+        "median": marked_latency,
         INTERVAL: lambda e: span(e.intervals.get("latency_ms")),
         "p95": figure_cell("latency_ms", "p95"),
         "p99": figure_cell("latency_ms", "p99"),
@@ -42,9 +38,9 @@ GROUPS: dict[str, dict[str, Cell]] = {
         "max e": figure_cell("error", "max_dof_m", metres),
         "ē, free dofs": figure_cell("error", "mean_free_dof_m", metres),
     },
-    "offline (s)": {
-        "data": figure_cell("offline_s", "data"),
-        "fit": figure_cell("offline_s", "fit"),
+    "offline": {
+        "data (core-s)": figure_cell("offline_s", "data"),
+        "fit (s)": figure_cell("offline_s", "fit"),
     },
     "nodal (m)": {
         "max": figure_cell("error", "max_nodal_m", metres),

@@ -9,7 +9,8 @@ from typing import Any
 
 from mor_bench.analysis.frontier import TARGET_ERRORS
 from mor_bench.analysis.performance_profile import share_within
-from mor_bench.report.entries import Analysis, Entry, entries_of, needs_of, told_by_method
+from mor_bench.analysis.verdict import needs_of
+from mor_bench.report.entries import Analysis, Entry, entries_of, told_by_method
 from mor_bench.report.number_format import (
     bytes_text,
     number,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from mor_bench.report.entries import Analysis, Entry, Needs, entries_of
+from mor_bench.report.entries import Analysis, Entry, entries_of
 from mor_bench.report.number_format import metres, number, percent
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.parts import TrainedElsewhere
@@ -100,9 +100,3 @@ def discretisation_error(entries: Sequence[Entry]) -> str:
     relative = row.discretisation_rel_l2
     beside = "" if relative is None else f", relative L2 (median) {percent(relative)} %"
     return f"{metres(row.discretisation_error_m)} m{beside}; {MESH_NOTE}"
-
-
-def needs_text(needs: Needs) -> str:
-    """State the needs, such as ``median relative L2 error ≤ 1 %, median latency ≤ 3 ms``."""
-    error, latency = percent(needs.error), number(needs.latency_ms)
-    return f"median relative L2 error ≤ {error} %, median latency ≤ {latency} ms"

@@ -51,3 +51,8 @@ def table_of(
 def figure_cell(part: str, name: str, shown: Callable[[float | None], str] = number) -> Cell:
     """Make the cell of one figure, such as ``figure_cell("latency_ms", "median")``."""
     return lambda entry: shown(entry.figure(part, name))
+
+
+def marked_latency(entry: Entry) -> str:
+    """Format the median latency in ms; a tilde marks a timing that is not stable."""
+    return number(entry.figure("latency_ms", "median")) + ("~" if entry.unstable else "")

@@ -38,10 +38,10 @@ class Autoencoder(_LinearRest):
 
     The encoder E and the decoder D are trained to reproduce the remainder's coordinates
     c = Φᵀ(u - K₀⁻¹f). The regression R maps coordinates z of the linear response to E(c). It is
-    trained with D, so that D∘R gives c. The loss is the sum of the three squared errors. Only D and
-    R are kept. The networks work between principal coordinates, as in Fulton et al.: Latent-space
-    dynamics for reduced deformable simulation, Computer Graphics Forum 38 (2019). The paper solves
-    equations for the latent coordinates. See also `CoordinateRegression`.
+    trained with D, so that D∘R gives c. The loss is a weighted sum of three squared errors. Only D
+    and R are kept. The networks work between principal coordinates, as in Fulton et al.:
+    Latent-space dynamics for reduced deformable simulation, Computer Graphics Forum 38 (2019). The
+    paper solves equations for the latent coordinates. See also `CoordinateRegression`.
 
     Parameters
     ----------

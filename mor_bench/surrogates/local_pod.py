@@ -152,15 +152,14 @@ class LocalPOD(Surrogate):
 
     def _solve(self, load: Array) -> Array:
         nearest = self.nearest(load)
-        found = predict_corrected(
+        return predict_corrected(
             self.problems_[nearest],
             self.bases_[nearest],
             self.model_,
             self.compliance_,
-            load[None],
+            load,
             self.tolerance,
         )
-        return np.asarray(found[0])
 
 
 def _of_cluster(model: Mapping[str, NDArray[Any]], cluster: int) -> dict[str, NDArray[Any]]:

@@ -19,7 +19,7 @@ from mor_bench.reduction.tensors import TensorProblem, polynomial_pays
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
-from mor_bench.surrogates.free_dofs import galerkin_or_polynomial
+from mor_bench.surrogates.free_dofs import answer_each, galerkin_or_polynomial
 
 N_WATCHED = 300
 """Linear responses to the largest loads that decide where det F is monitored."""
@@ -71,10 +71,9 @@ class ModalDerivatives(Surrogate):
         self.problem_.prepare()
 
     def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        out = np.zeros((len(forces), self.scene_.mesh.n_dofs))
-        free = self.scene_.free_dofs
-        loads = forces.reshape(out.shape)[:, free]
-        out[:, free] = predict_corrected(
-            self.problem_, self.modes_, self.model_, self.compliance_, loads, self.tolerance
+        return answer_each(self.scene_, forces, self._solve)
+
+    def _solve(self, load: NDArray[np.float64]) -> NDArray[np.float64]:
+        return predict_corrected(
+            self.problem_, self.modes_, self.model_, self.compliance_, load, self.tolerance
         )
-        return out.reshape(forces.shape)

@@ -233,7 +233,7 @@ def splits(source: str, dataset: str = "", methods: str = "") -> str:
         headings.append(f"split by {rows[0].split}: selected; e (free dofs), m; median %; max %")
     body = []
     for method, first in columns[0].items():
-        cells = [f"`{method}`", class_text(first)]
+        cells = [f"`{method}`", class_text(first, is_observed(runs[0], first.dataset))]
         for run, column in zip(runs, columns, strict=True):
             row = column.get(method)
             if row is None or row.error is None:
