@@ -6,12 +6,15 @@ import os
 import platform
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 import psutil
 from threadpoolctl import threadpool_limits
+
+MEMBERSHIP, GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 
 
 @contextmanager
@@ -27,6 +30,36 @@ def pinned_threads(threads: int) -> Iterator[None]:
         finally:
             if torch:
                 torch.set_num_threads(before)
+
+
+def memory_limit_bytes(membership: Path = MEMBERSHIP, groups: Path = GROUPS) -> float:
+    """Return the memory that this process may use: the machine's, or less in a container.
+
+    Parameters
+    ----------
+    membership, groups : Path
+        Linux's list of the process's control groups, and the folder of all groups.
+    """
+    limits = [float(psutil.virtual_memory().total)]
+    with suppress(OSError):
+        for line in membership.read_text(encoding="utf-8").splitlines():
+            _, kinds, path = line.split(":", 2)
+            if kinds and "memory" not in kinds.split(","):
+                continue
+            top, name = (
+                (groups / "memory", "memory.limit_in_bytes") if kinds else (groups, "memory.max")
+            )
+            group = top / path.lstrip("/")
+            for place in (group, *group.parents):
+                if place.is_relative_to(top):
+                    with suppress(OSError, ValueError):  # "max" is no limit
+                        limits.append(float((place / name).read_text(encoding="ascii")))
+    return min(limits)
+
+
+def free_memory_bytes() -> float:
+    """Return the memory that is free, or the limit of this process if that is less."""
+    return min(float(psutil.virtual_memory().available), memory_limit_bytes())
 
 
 def peak_memory_bytes() -> int:

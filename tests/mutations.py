@@ -22,6 +22,9 @@ QUICK, SLOW = 200, 2000
 LIMIT_S, WAIT_S, LIMIT_BYTES = 2.0, 60.0, 500_000_000
 """Limits for one mutated file: processor time, time on the clock, and memory."""
 
+PAGE = Path(__file__).parents[1] / "docs" / "attacks.md"
+"""The page that gives the counts of all attacks."""
+
 LONGEST = 5000
 """Most letters of a message."""
 
@@ -120,6 +123,14 @@ Mutator = Callable[[bytes, np.random.Generator], bytes]
 
 TEXT: list[Mutator] = [mutated_words, mutated_bytes]
 JSON: list[Mutator] = [mutated_json, mutated_json, mutated_bytes]
+
+
+def documented() -> dict[str, int]:
+    """Return the counts in the tables of the page, by the text of their first column."""
+    lines = PAGE.read_text(encoding="utf-8").splitlines()
+    rows = [line.strip("| ").split(" | ") for line in lines if line.startswith("| ")]
+    counts = {row[0]: row[-1].replace(",", "") for row in rows}
+    return {name: int(count) for name, count in counts.items() if count.isdigit()}
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import re
 import shutil
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -185,6 +185,77 @@ def test_an_impossible_export_is_refused_and_nothing_is_written(checkout: Path) 
     (checkout / "pyproject.toml").unlink()
     with pytest.raises(InvalidInputError, match="is not in a git checkout of mor-bench"):
         export_asv(fem, out)
+
+
+HOSTILE = "<img src=x onerror=alert(1)>"
+
+HOSTILE_RUNS: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
+    "dataset": ({"dataset": "../../x"}, {}, "a dataset is called '../../x'"),
+    "label": ({"label": HOSTILE}, {}, "is not fit for a page"),
+    "split": ({"split": HOSTILE}, {}, "is not fit for a page"),
+    "processor": ({}, {"processor": HOSTILE}, "is not fit for a page"),
+    "system": ({}, {"system": HOSTILE}, "is not fit for a page"),
+    "cores": ({}, {"cores": HOSTILE}, "is not fit for a page"),
+    "python": ({}, {"python": "3.11/../../x"}, "`machine.python` must be a version"),
+}
+"""Changed fields of a row and of the machine of a run, and the words of the refusal."""
+
+
+@pytest.mark.parametrize("part", [*HOSTILE_RUNS, "profile"])
+def test_no_text_of_a_run_becomes_markup_of_the_dashboard(part: str, checkout: Path) -> None:
+    fields, machine, words = HOSTILE_RUNS.get(part, ({}, {}, "is not fit for a page"))
+    made = comparison(row("fem", **fields), **machine)
+    if part == "profile":
+        made.settings["profile"] = HOSTILE
+    with pytest.raises(StoreError, match=words) as caught:
+        export_asv(made, checkout / "results", machine="abacus")
+    assert "results.json" in str(caught.value)
+    assert not (checkout / "results").exists()
+
+
+def stored_figures(content: dict[str, Any]) -> list[Any]:
+    found: list[Any] = content["results"]["comparison.beam-tiny.latency"]
+    return found
+
+
+FORGED: dict[str, Callable[[dict[str, Any]], object]] = {
+    "benchmark": lambda stored: stored["results"].update({f"comparison.{HOSTILE}.latency": []}),
+    "quantity": lambda stored: stored["results"].update(
+        {"comparison.x.y": stored_figures(stored), "params.x.latency": stored_figures(stored)}
+    ),
+    "parameter": lambda stored: stored_figures(stored)[1][0].__setitem__(0, HOSTILE),
+    "value": lambda stored: stored_figures(stored)[0].__setitem__(0, "1"),
+    "missing value": lambda stored: stored_figures(stored)[0].pop(),
+    "statistics": lambda stored: stored_figures(stored)[3].append(1.0),
+    "columns": lambda stored: stored["result_columns"].reverse(),
+    "date": lambda stored: stored.update(date="today"),
+    "results": lambda stored: stored.update(results=3),
+    "commit": lambda stored: stored.pop("commit_hash"),
+}
+
+
+@pytest.mark.parametrize("part", FORGED)
+def test_forged_results_of_another_commit_never_reach_the_dashboard(
+    part: str, checkout: Path
+) -> None:
+    out = checkout / "results"
+    path = export_asv(comparison(row("fem"), row("pod")), out, commit="HEAD~1")[1]
+    content = json.loads(path.read_text())
+    FORGED[part](content)
+    path.write_text(json.dumps(content))
+    before = (out / "benchmarks.json").read_bytes()
+    with pytest.raises(StoreError, match=path.name) as caught:
+        export_asv(comparison(row("fem")), out)
+    assert "\n" not in str(caught.value)
+    assert (out / "benchmarks.json").read_bytes() == before
+
+
+def test_a_forged_description_of_a_machine_is_refused(checkout: Path) -> None:
+    path = checkout / "results" / "abacus" / "machine.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({"version": 1, "machine": "abacus", "cpu": HOSTILE}))
+    with pytest.raises(StoreError, match=r"machine\.json: the text .* is not fit for a page"):
+        export_asv(comparison(row("fem")), checkout / "results", machine="abacus")
 
 
 @pytest.mark.slow

@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 from safetensors import safe_open
+from typer.testing import CliRunner
 
 import mor_bench
+from mor_bench.cli.app import app
 from mor_bench.errors import InvalidInputError, MorBenchError, SpecError
 from mor_bench.runs.listener import Listener
 from mor_bench.runs.single_fit import Fit
@@ -263,6 +265,23 @@ def test_a_fit_takes_the_first_swept_value_and_scores_on_the_test_part(
     assert fitted.error["mean_dof_m"] == pytest.approx(off.mean())
     assert fitted.n_train + fitted.n_validation + fitted.n_test == LIMIT
     assert fitted.iterations is None
+
+
+def test_the_command_says_which_swept_value_it_took(cache: Path, tmp_path: Path) -> None:
+    path = descent_file(tmp_path, sweep={"iterations": [20, 40, 60], "seed": [3, 4]})
+    options = ["fit", "beam-tiny", "-m", str(path), f"--limit={LIMIT}", f"--cache={cache}"]
+    options += ["--threads=1", f"--out={tmp_path / 'a.safetensors'}"]
+    done = CliRunner().invoke(app, [*options, "--seed=4"])
+    assert done.exit_code == 0, done.output
+    assert done.stdout.splitlines()[0] == (
+        "iterations = 20, the first of 3 values in the method's file; "
+        "choose another one with --set iterations=VALUE"
+    )
+    assert "20 iterations, " in done.stdout
+    assert done.stdout.count("the first of") == 1
+    given = CliRunner().invoke(app, [*options, "--seed=4", "--set=iterations=40"])
+    assert "the first of" not in given.stdout
+    assert "40 iterations, " in given.stdout
 
 
 class FixedLength(Descent):

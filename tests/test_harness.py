@@ -194,6 +194,15 @@ def test_method_files_and_the_folder_are_checked_before_anything_runs(
         mor_bench.run(["beam-tiny"], ["fem"], out=out, cache=cache)
 
 
+@pytest.mark.parametrize("name", ["results.csv", "comparison.json", "report.html", "samples"])
+def test_a_folder_with_files_of_someone_else_is_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(InvalidInputError, match=f"but has a '{name}', which would be overwritten"):
+        run_small(["linear-fem"], tmp_path, tmp_path / "cache")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "mine"
+
+
 def test_a_folder_that_holds_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="no such file"):
         Comparison.read(tmp_path)

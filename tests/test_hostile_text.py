@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
+import sys
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -11,13 +13,15 @@ from typing import Any
 
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
 from mor_bench.analysis.analyse import analyse
-from mor_bench.errors import StoreError
-from mor_bench.export.asv_results import export_asv
+from mor_bench.cli.app import app
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.page import render
 from mor_bench.results.comparison import Comparison
+from mor_bench.specs import list_suite
+from tests.small_runs import method_file, run_small
 from tests.synthetic import synthetic_comparison
 
 HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(1)><svg onload=a()> $x_ {{ 7*7 }}"
@@ -125,8 +129,58 @@ def test_the_terminal_gets_no_control_characters(run: Comparison) -> None:
     assert not {"\x1b", "\x07"} & set(out.getvalue())
 
 
-def test_an_exported_dashboard_holds_no_markup(run: Comparison, tmp_path: Path) -> None:
-    run.machine |= {"python": "3", "processor": "p", "cores": 2, "system": "s"}
-    with pytest.raises(StoreError, match="names are not fit for a page"):
-        export_asv(run, tmp_path / "asv")
-    assert not (tmp_path / "asv").exists()
+def listed(suite: Path) -> str:
+    """List a suite that must be refused; return the line on standard error."""
+    done = CliRunner().invoke(app, ["list", "--suite", str(suite)])
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    return done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="names that Windows forbids")
+@pytest.mark.parametrize("name", ["A<b>.toml", "x\x1b[31m.toml", "a\nb.toml", "...toml"])
+def test_odd_file_names_of_a_suite_are_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    suite = tmp_path / "suite"
+    (suite / "datasets").mkdir(parents=True)
+    shutil.copyfile(list_suite("datasets")["beam-tiny"], suite / "datasets" / name)
+    assert "`name`" in listed(suite)
+    (suite / "methods").mkdir()
+    (suite / "datasets" / name).rename(suite / "methods" / name)
+    shutil.copyfile(list_suite("methods")["pod"], suite / "methods" / name)
+    if not name.isprintable():
+        assert "\x1b" not in listed(suite)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no /dev")
+def test_a_suite_neither_waits_for_devices_nor_shows_other_files(tmp_path: Path) -> None:
+    suite = tmp_path / "suite"
+    (suite / "datasets").mkdir(parents=True)
+    (suite / "datasets" / "a.toml").symlink_to("/dev/zero")
+    assert "a device or pipe, not a file" in listed(suite)
+    (suite / "datasets" / "a.toml").unlink()
+    secret = tmp_path / "secret.msh"
+    secret.write_text("the-secret 1 2 3\n")
+    shipped = list_suite("datasets")["beam-tiny"].read_text(encoding="utf-8")
+    shape = 'shape  = "box"\nsize_m = [2.0, 1.0, 1.0]\ncells  = [6, 2, 2]'
+    assert shape in shipped
+    text = shipped.replace(shape, 'shape = "file"\nfile = "../../secret.msh"')
+    (suite / "datasets" / "b.toml").write_text(text, encoding="utf-8")
+    done = CliRunner().invoke(app, ["check", str(suite / "datasets" / "b.toml")])
+    assert done.exit_code == 2
+    assert "secret.msh" in done.stderr
+    assert "the-secret" not in done.output
+
+
+@pytest.mark.slow
+def test_a_method_with_markup_for_a_name_stays_in_its_folders(tmp_path: Path) -> None:
+    folder, own = tmp_path / "suite" / "methods", tmp_path / "cache"
+    folder.mkdir(parents=True)
+    if sys.platform == "win32":
+        pytest.skip("names that Windows forbids")
+    method = method_file(folder, "<script>alert(1)<", "tests.third_party:Zero")
+    found = run_small([method], tmp_path / "out", own)
+    (row,) = found.rows
+    assert row.ok, row.reason
+    assert "<script>" not in render(found)[-1].read_text(encoding="utf-8")
+    assert {path.name for path in tmp_path.iterdir()} == {"suite", "out", "cache"}
+    assert len(list((own / "fits").iterdir())) == 1

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from mor_bench.errors import StoreError, WorkerError
-from mor_bench.scratch import host_name
+from mor_bench.scratch import host_name, identity
 from mor_bench.snapshots import generate as generate_module
 from mor_bench.snapshots import store
 from mor_bench.snapshots.dataset import Dataset
@@ -145,18 +145,21 @@ def test_leftovers_of_dead_processes_are_removed_and_files_of_live_ones_are_kept
 ) -> None:
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    host, living = host_name(), os.getppid()
-    stale = f".d.h5.{host}.{living}.01.tmp"
+    host, parent = host_name(), os.getppid()
+    living, gone, another = identity(parent), f"{dead.pid}-1", f"{parent}-1"
+    stale = f".d.h5.elsewhere.{gone}.01.tmp"
     kept = {
         f".b.h5.{host}.{living}.00.tmp",
-        f".c.h5.elsewhere.{dead.pid}.00.tmp",
+        f".c.h5.elsewhere.{gone}.00.tmp",
         ".of-someone-else.tmp",
         "shard-00000.h5",
     }
-    for name in (*kept, stale, f".a.h5.{host}.{dead.pid}.00.tmp"):
+    ended = [f".a.h5.{host}.{owner}.00.tmp" for owner in (gone, another)]
+    for name in (*kept, *ended, stale):
         (tmp_path / name).touch()
     an_hour_ago = time.time() - store.STALE_AFTER_S - 1
-    os.utime(tmp_path / stale, (an_hour_ago, an_hour_ago))
+    for name in (stale, f".b.h5.{host}.{living}.00.tmp"):  # the clock may have jumped
+        os.utime(tmp_path / name, (an_hour_ago, an_hour_ago))
     remove_leftovers(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == kept
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
-from psutil import virtual_memory
 
+from mor_bench.machine import free_memory_bytes
 from mor_bench.measure import latency
 from mor_bench.measure.latency import (
     LEAST_TURN_S,
@@ -19,6 +25,7 @@ from mor_bench.measure.latency import (
     measure_latencies,
     probe_s,
 )
+from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.measure.timing import BATCHES, Timing, check_answers, timing_summary, why_unstable
 from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
@@ -94,7 +101,7 @@ def test_the_speed_probe_of_the_machine_is_short() -> None:
 
 
 def test_a_group_of_methods_fits_into_half_of_the_free_memory() -> None:
-    half = 0.5 * virtual_memory().available
+    half = 0.5 * free_memory_bytes()
     methods = {
         name: TimedMethod(lambda _: pytest.fail("not opened"), size * half)
         for name, size in (("a", 0.3), ("b", 0.3), ("c", 0.9), ("d", 5.0))
@@ -145,6 +152,38 @@ def test_configurations_are_timed_in_turns_and_fail_alone(
         assert found.memory_bytes > 5e7
     assert np.median(timings["slow"].latency_ms) > 2 * np.median(timings["plain"].latency_ms)
     assert turns == sorted(turns)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends itself SIGINT")
+def test_an_interrupt_while_workers_open_ends_them(
+    tiny: Dataset, queries: Queries, tmp_path: Path
+) -> None:
+    limit_s, opening = 60.0, []
+
+    def hanging(server: ForkServer | None) -> SandboxedProcess:
+        process = SandboxedProcess(MethodSession, fork_server=server, scene=tiny.scene)
+        opening.append(process.pid)
+        how = {"how": "hang"}
+        request = FitRequest("tests.third_party:Broken", how, tmp_path, tmp_path / "m", 1, limit_s)
+        process.ask("fit", limit_s, request=request)
+        return process
+
+    def interrupt() -> None:
+        while not opening:
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    began = time.monotonic()
+    threading.Thread(target=interrupt, daemon=True).start()
+    methods = {name: TimedMethod(hanging, 1e8) for name in ("a", "b", "c")}
+    with pytest.raises(KeyboardInterrupt):
+        measure_latencies(methods, queries, Protocol(1, 2), 1)
+    assert time.monotonic() - began < limit_s, "it waited for the workers"
+    assert opening
+    until = time.monotonic() + 10.0
+    while any(map(psutil.pid_exists, opening)) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not any(map(psutil.pid_exists, opening))
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -17,9 +18,11 @@ import pytest
 
 import mor_bench
 from mor_bench.array_files import read_npy
-from mor_bench.export.asv_files import read_file
+from mor_bench.export.asv_files import COLUMNS, Figure, Figures, to_columns, write_file
+from mor_bench.export.asv_results import describe
 from mor_bench.measure.discretisation_error import measured
 from mor_bench.runs.cached_fit import read_fit_record
+from mor_bench.runs.shipped_models import shipped_models
 from mor_bench.scene.files import read_mesh
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.scene.snapshot_file import read_arrays
@@ -41,7 +44,18 @@ from mor_bench.specs import (
     load_generated_spec,
     load_method_spec,
 )
-from tests.mutations import JSON, QUICK, SLOW, TEXT, Reader, attacked, mutated_bytes, mutated_json
+from tests.mutations import (
+    JSON,
+    PAGE,
+    QUICK,
+    SLOW,
+    TEXT,
+    Reader,
+    attacked,
+    documented,
+    mutated_bytes,
+    mutated_json,
+)
 
 SUITE = Path(mor_bench.__file__).parents[1]
 
@@ -196,7 +210,18 @@ def a_fit(path: Path) -> None:
 
 
 def asv(path: Path) -> None:
-    path.write_text(json.dumps({"version": 2, "results": {"a": [1, 2]}, "params": {}}))
+    figures: Figures = {
+        ("'pod'", "'quick'"): Figure(1.0, {"q_25": 0.9}),
+        ("'fem'", "'quick'"): Figure(None),
+    }
+    content = {
+        "commit_hash": "0" * 40,
+        "date": 0,
+        "params": {},
+        "result_columns": COLUMNS,
+        "results": {"comparison.beam-tiny.latency": to_columns(figures)},
+    }
+    write_file(path, content, "results")
 
 
 def gmsh1(path: Path) -> None:
@@ -235,7 +260,13 @@ READERS = [
     Reader("shard.h5", a_shard, read_shard, [mutated_bytes, forged_shard]),
     Reader("manifest.json", a_manifest, manifest_of, [*JSON, forged_manifest]),
     Reader("fit.json", a_fit, read_fit_record, JSON),
-    Reader("asv.json", asv, lambda path: read_file(path, "results"), JSON),
+    Reader("0-mor-bench-py3.11.json", asv, lambda path: describe(path.parents[1]), JSON),
+    Reader(
+        "umesh-beam-coarse.json",
+        of_suite("trained", "umesh-beam-coarse.json"),
+        lambda path: shipped_models(path.parent),
+        JSON,
+    ),
     Reader(
         "beam-tiny.refine.json",
         of_suite("datasets", "beam-tiny.refine.json"),
@@ -258,7 +289,6 @@ def test_many_mutated_files_are_read_or_refused(reader: Reader, tmp_path: Path) 
 
 
 def test_the_documented_counts_are_those_of_these_tests() -> None:
-    text = (SUITE / "docs" / "attacks.md").read_text(encoding="utf-8")
-    assert f"| files of {len(READERS)} kinds, see below | {len(READERS) * SLOW:,} |" in text
-    for reader in READERS:
-        assert f"`{reader.name}`" in text
+    assert documented()[f"files of {len(READERS)} kinds, see below"] == len(READERS) * SLOW
+    named = re.findall("`([^`]*)`", PAGE.read_text(encoding="utf-8").partition("The kinds are ")[2])
+    assert named[: len(READERS)] == [reader.name for reader in READERS]

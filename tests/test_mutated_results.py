@@ -38,6 +38,7 @@ from tests.mutations import (
     SLOW,
     Reader,
     attacked,
+    documented,
     mutated_bytes,
     mutated_json,
 )
@@ -191,10 +192,8 @@ def test_mutated_models_with_their_scenes_are_read_or_refused(model: Path, tmp_p
 
 
 def test_the_documented_counts_are_those_of_these_tests() -> None:
-    text = (Path(__file__).parents[1] / "docs" / "attacks.md").read_text(encoding="utf-8")
-    cells = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("|")]
-    documented = {name.strip(): number.strip() for name, number in cells}
-    assert documented["results.json and raw samples of a run"] == f"{len(READERS) * SLOW:,}"
-    assert documented["models, with and without the scene in the file"] == f"{2 * SLOW:,}"
-    assert documented["runs, with all tables and a choice"] == f"{CONCLUDED:,}"
-    assert documented["runs, with all figures and the page"] == f"{DRAWN:,}"
+    counts = documented()
+    assert counts["results.json and raw samples of a run"] == len(READERS) * SLOW
+    assert counts["models, with and without the scene in the file"] == 2 * SLOW
+    assert counts["runs, with all tables and a choice"] == CONCLUDED
+    assert counts["runs, with all figures and the page"] == DRAWN

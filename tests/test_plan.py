@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 from mor_bench.cli.app import app
+from mor_bench.errors import MissingDependencyError
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.code_digest import code_digest, imported_sources
+from mor_bench.runs.durations import Pace
 from mor_bench.runs.plan import plan
-from mor_bench.specs import list_suite, load_method_spec
+from mor_bench.specs import MethodSpec, list_suite, load_method_spec
 from tests.small_runs import LIMIT, method_file
 
 
@@ -38,6 +41,28 @@ def test_a_method_of_unknown_duration_is_reported(tmp_path: Path) -> None:
     shown = CliRunner().invoke(app, arguments)
     assert shown.exit_code == 0, shown.output
     assert "1 steps of unknown duration" in shown.output
+
+
+def test_a_method_whose_library_is_missing_takes_no_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load_class = MethodSpec.load_class
+
+    def load(method: MethodSpec) -> type[Any]:
+        if method.name == "umesh":
+            raise MissingDependencyError("it needs torch")
+        return load_class(method)
+
+    monkeypatch.setattr(MethodSpec, "load_class", load)
+    monkeypatch.setattr(Pace, "measured", lambda: Pace(1.0, 1.0, 1.0))
+    options: dict[str, Any] = {"cache": tmp_path / "cache", "limit": LIMIT}
+    found = plan(["beam-tiny"], ["linear-fem", "umesh"], **options)
+    (step,) = (step for step in found.steps if "umesh" in step.label)
+    assert step.label.endswith("(left out: it needs torch)")
+    assert step.seconds == 0.0
+    alone = plan(["beam-tiny"], ["linear-fem"], **options)
+    for stage in ("compilation_s", "scoring_s", "timing_s", "report_s"):
+        assert getattr(found, stage) == getattr(alone, stage)
 
 
 def test_other_seeds_and_trainings_of_given_length_are_planned(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from mor_bench.errors import StoreError
 from mor_bench.results.comparison import Comparison
-from mor_bench.results.row import Row
+from mor_bench.results.row import Row, label_of
 from mor_bench.results.schema import SCHEMA_FILE, schema_text
 
 ROW = {
@@ -106,3 +106,10 @@ def test_a_label_names_the_method_and_the_swept_parameters(tmp_path: Path) -> No
     assert table["error.rel_l2_median"][0] == 0.02
     assert json.loads(table["parameters"][0]) == ROW["parameters"]
     assert not [column for column in table.columns if column.startswith("swept")]
+
+
+@pytest.mark.parametrize("value", ["a\nb", "\x1b[31m", "long" * 1000, ["\u202e"]])
+def test_a_swept_text_cannot_spoil_the_label_of_a_row(value: object) -> None:
+    row = Row.model_validate({**ROW, "label": label_of("mine", {"text": value})})
+    assert row.label.isprintable()
+    assert row.label.startswith("mine [text=")

@@ -120,6 +120,19 @@ def test_a_signal_ends_a_command_with_one_line_and_leaves_nothing(
     assert not list((tmp_path / "tmp").glob("mor-bench-*"))
 
 
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_signal_while_a_command_is_looked_up_ends_it_in_the_same_way(name: str) -> None:
+    code = (
+        "import os, signal\n"
+        "from mor_bench.cli.app import LazyCommands, app\n"
+        f"LazyCommands.get_command = lambda *_: os.kill(os.getpid(), signal.{name})\n"
+        "app(['list'])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 128 + getattr(signal, name)
+    assert done.stderr.startswith(f"mor-bench: stopped by {name}. Finished samples and rows")
+
+
 @pytest.mark.slow
 def test_nohup_is_respected(tmp_path: Path) -> None:
     code = (
@@ -130,3 +143,54 @@ def test_nohup_is_respected(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "alive\n"
+
+
+LARGE = {
+    "cells": ("cells  = [6, 2, 2]", "cells  = [100, 100, 100]"),
+    "samples": ("samples_per_patch = 10", "samples_per_patch = 476_190"),
+}
+"""Changes of beam-tiny that lie just below the limits: a million cells, ten million samples."""
+
+SILENT_S = 2.0
+"""Time after which a command must have said something, s, beside its start."""
+
+BEGUN = [
+    "check $FILE",
+    "run $FILE -m linear-fem --dry-run --cache c",
+    "generate $FILE --cache c --workers 1 --limit 2",
+    "fit $FILE -m linear-fem --cache c --out m --limit 2",
+]
+
+
+def first_word_s(line: str, folder: Path, file: Path) -> float:
+    """Return the seconds until a command prints something, and end it then."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "FILE": str(file)}
+    begun = time.monotonic()
+    with subprocess.Popen(
+        ["bash", "-c", f"exec {MOR_BENCH} {line}"],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    ) as process:
+        assert process.stdout
+        first = process.stdout.read(1)
+        seconds = time.monotonic() - begun
+        process.terminate()
+        rest = process.stdout.read()
+    assert first, "it ended without a word"
+    assert b"Traceback" not in rest
+    return seconds
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", LARGE)
+@pytest.mark.parametrize("line", BEGUN)
+def test_large_inputs_are_not_met_with_silence(what: str, line: str, tmp_path: Path) -> None:
+    text = (ROOT / "datasets" / "beam-tiny.toml").read_text(encoding="utf-8")
+    file = tmp_path / "large.toml"
+    assert LARGE[what][0] in text
+    file.write_text(text.replace(*LARGE[what]), encoding="utf-8")
+    start_s = first_word_s("list", tmp_path, file)
+    start_s = max(start_s, first_word_s("check $FILE", tmp_path, ROOT / "methods" / "pod.toml"))
+    assert first_word_s(line, tmp_path, file) < SILENT_S + 1.5 * start_s

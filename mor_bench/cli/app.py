@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from mor_bench.cli.clear_errors import clear_errors, open_streams
+from mor_bench.cli.windows_job import end_children_with_this_process
 
 COMMANDS = {
     "run": ("run_command", "Fit, score and time methods on datasets, and write a report."),
@@ -47,6 +48,7 @@ class LazyCommands(TyperGroup):
 
     def main(self, *args: Any, **extra: Any) -> Any:
         open_streams()
+        end_children_with_this_process()
         with clear_errors():
             return super().main(*args, **extra)
 

@@ -24,8 +24,11 @@ ENDING = ("SIGTERM", "SIGHUP")
 """Signals that stop a command as an interrupt does."""
 
 
-class StoppedBySignal(KeyboardInterrupt):
-    """A signal asks this process to end; ``number`` names the signal."""
+class StoppedBySignal(BaseException):
+    """A signal asks this process to end; ``number`` names the signal.
+
+    It is no `KeyboardInterrupt`, which Typer turns into an exit code of its own.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -112,5 +115,5 @@ def _forget_output() -> None:
 
 def _exit(message: str, colour: str, code: int) -> None:
     with suppress(OSError):  # the terminal may be gone
-        typer.secho(f"mor-bench: {printable(message)}", fg=colour, err=True)
+        typer.secho(f"mor-bench: {printable(message, keep='')}", fg=colour, err=True)
     raise SystemExit(code) from None

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -20,11 +21,14 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.results.row import Row
 from mor_bench.runs.listener import Listener
 
 PRINT_EVERY_S = 10.0
 """Interval between printed lines of progress if there is no terminal for a bar, s."""
+
+PREPARING = "Preparing; large meshes and datasets take a minute."
 
 
 @contextmanager
@@ -38,8 +42,10 @@ def show_progress(console: Console) -> Iterator[Listener]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True) as progress:
-        bars = _Bars(progress)
+    with ExitStack() as stack:
+        progress = stack.enter_context(Progress(*columns, console=console, transient=True))
+        spoken = stack.enter_context(notice_if_slow(PREPARING, partial(_print_plain, console)))
+        bars = _Bars(progress, spoken)
         yield Listener(
             compiling=bars.compiling,
             generating=bars.generating,
@@ -53,6 +59,9 @@ def show_progress(console: Console) -> Iterator[Listener]:
 @dataclass
 class _Bars:
     progress: Progress
+    spoken: Callable[[], None]
+    """Called when a line or bar is shown."""
+
     tasks: dict[str, TaskID] = field(default_factory=dict)
     begun: dict[str, tuple[int, float]] = field(default_factory=dict)
     """Number done and time at the first call: earlier work does not count for the rate."""
@@ -93,6 +102,7 @@ class _Bars:
                 f"fit {row.offline_s.fit:.3g} s"
             ) + (" (trained elsewhere)" if row.trained_elsewhere else "")
         label = f"[bold]{escape(row.label):<46}[/bold]"
+        self.spoken()
         self.progress.console.print(f"{label} {escape(text)}", highlight=False)
 
     def timing(self, dataset: str, done: int, total: int) -> None:
@@ -109,6 +119,8 @@ class _Bars:
             self._print(f"training: {done:,} of {total:,} iterations, loss {loss:.3g}")
 
     def _begin(self, name: str, description: str, done: int, total: int) -> None:
+        if self.progress.console.is_terminal:
+            self.spoken()
         if name not in self.tasks:
             self.tasks[name] = self.progress.add_task(
                 description, total=total, completed=done, rate=""
@@ -130,4 +142,9 @@ class _Bars:
         return due
 
     def _print(self, text: str) -> None:
-        self.progress.console.print(text, highlight=False, markup=False)
+        self.spoken()
+        _print_plain(self.progress.console, text)
+
+
+def _print_plain(console: Console, text: str) -> None:
+    console.print(text, highlight=False, markup=False)

@@ -15,6 +15,7 @@ from mor_bench.analysis.told import told_at_most
 from mor_bench.cli.console import make_console
 from mor_bench.cli.option_groups import DatasetName, with_options
 from mor_bench.cli.progress_bars import show_progress
+from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.options import CommandLine, FolderOptions
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.page import render
@@ -69,16 +70,19 @@ def report(
     ] = None,
 ) -> None:
     """Print the tables of a finished run, and draw its figures and report again."""
-    comparison = mor_bench.Comparison.read(out)
-    comparison.check_samples()
-    if told is not None:
-        print_tables(told_at_most(comparison, told), make_console())
-        return
-    analysis = analyse(comparison)
-    comparison.finish(analysis)
-    print_tables(comparison, make_console(), analysis)
-    for path in render(comparison, analysis):
-        print(path)
+    with notice_if_slow("Reading the run and drawing its figures.") as spoken:
+        comparison = mor_bench.Comparison.read(out)
+        comparison.check_samples()
+        if told is not None:
+            spoken()
+            print_tables(told_at_most(comparison, told), make_console())
+            return
+        analysis = analyse(comparison)
+        comparison.finish(analysis)
+        spoken()
+        print_tables(comparison, make_console(), analysis)
+        for path in render(comparison, analysis):
+            print(path)
 
 
 @app.command()

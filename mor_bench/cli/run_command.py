@@ -12,12 +12,15 @@ import mor_bench
 from mor_bench.cli.console import make_console
 from mor_bench.cli.option_groups import Json, with_options
 from mor_bench.cli.progress_bars import show_progress
+from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.options import RunOptions
 from mor_bench.report.console_tables import print_plan, print_tables
 from mor_bench.report.page import render
 from mor_bench.runs.plan import plan
 
 app = typer.Typer(rich_markup_mode=None)
+
+DRAWING = "Drawing figures and writing the report."
 
 
 @app.command()
@@ -63,7 +66,8 @@ def run(
             names, method or None, out=out, listener=listener, **options.model_dump()
         )
     analysis = comparison.analysis
-    written = render(comparison, analysis)  # first, since the tables may meet a closed pipe
+    with notice_if_slow(DRAWING):  # first, since the tables may meet a closed pipe
+        written = render(comparison, analysis)
     print_tables(comparison, console, analysis)
     for path in written:
         console.print(str(path), highlight=False, soft_wrap=True)
@@ -77,7 +81,8 @@ def run(
 def _print_plan(
     datasets: list[str], methods: list[str] | None, options: RunOptions, as_json: bool
 ) -> None:
-    planned = plan(datasets, methods, **options.model_dump())
+    with notice_if_slow("Planning; a few samples are solved to estimate the times."):
+        planned = plan(datasets, methods, **options.model_dump())
     if as_json:
         print(json.dumps(planned.as_dict(), indent=1))
     print_plan(planned, make_console(stderr=as_json))

@@ -8,10 +8,13 @@ from typing import Annotated
 
 import typer
 
+from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.errors import MissingDependencyError, MorBenchError, printable
 from mor_bench.specs import list_suite, load_dataset_spec, load_method_spec
 
 app = typer.Typer(rich_markup_mode=None)
+
+BUSY = "still checking; large files take a minute."
 
 Suite = Annotated[
     Path | None,
@@ -66,13 +69,15 @@ def check(
     problems = 0
     for path in files or shipped:
         try:
-            print(f"{path}: {check_file(path)}")
+            with notice_if_slow(printable(f"{path}: {BUSY}")):
+                found = check_file(path)
+            print(printable(f"{path}: {found}", keep=""))
         except MissingDependencyError as error:
-            print(f"{path}: not checked in full: {error}")
+            print(printable(f"{path}: not checked in full: {error}"))
         except MorBenchError as error:
             problems += 1
             message = str(error)
             line = message if message.startswith(str(path)) else f"{path}: {message}"
-            typer.secho(printable(line), fg="red", err=True)
+            typer.secho(printable(line, keep=""), fg="red", err=True)
     if problems:
         raise typer.Exit(2)

@@ -9,10 +9,12 @@ import os
 import platform
 import re
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
+
+from pydantic import AfterValidator, BaseModel, Strict, ValidationError, model_validator
 
 from mor_bench.checked_files import read_json, read_toml
 from mor_bench.errors import InvalidInputError, StoreError, printable
@@ -25,6 +27,68 @@ VERSION = {"machine": 1, "benchmarks": 2, "results": 2}
 STATISTICS = ("ci_99_a", "ci_99_b", "q_25", "q_75", "number", "repeat")
 COLUMNS = ("result", "params", "version", *(f"stats_{name}" for name in STATISTICS))
 """asv's columns of a result."""
+
+
+def _fit_for_page(text: str) -> str:
+    if re.search("[<>&]", text) or not text.isprintable():
+        raise ValueError(f"{printable(text, 100, '')!r} is not fit for a page")
+    return text
+
+
+_Text = Annotated[str, AfterValidator(_fit_for_page)]
+_Column = list[Annotated[float, Strict()] | None]
+_Statistics = _Column | None
+_Row = tuple[
+    _Column,
+    tuple[list[_Text], list[_Text]],
+    str,
+    _Statistics,
+    _Statistics,
+    _Statistics,
+    _Statistics,
+    _Statistics,
+    _Statistics,
+]
+
+
+class StoredResults(BaseModel):
+    """The parts of a file of results that are read again; the page of asv shows its texts."""
+
+    commit_hash: str
+    date: Annotated[int, Strict()]
+    result_columns: list[str]
+    results: dict[_Text, _Row]
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if self.result_columns != list(COLUMNS):
+            raise ValueError("its columns are others")
+        for name, (values, parameters, _, *statistics) in self.results.items():
+            n = math.prod(map(len, parameters))
+            if any(len(column) != n for column in (values, *filter(None, statistics))):
+                raise ValueError(f"{name}: a column must have {n} values")
+        return self
+
+
+def check_results(content: Mapping[str, Any], path: Path) -> None:
+    """Raise `StoreError` unless a file of results is whole and its texts are fit for a page."""
+    try:
+        StoredResults.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))[:100]
+        reason = printable(f"`{where}`: {first['msg']}", keep="")
+        raise StoreError(f"{path}: not written by mor-bench: {reason}.") from None
+
+
+def check_texts(texts: Iterable[str], path: Path) -> None:
+    """Raise `StoreError` if a text could become markup; asv's page shows some as they are."""
+    try:
+        for text in texts:
+            _fit_for_page(text)
+    except ValueError as error:
+        raise StoreError(f"{path}: the text {error}.") from None
+
 
 Key = tuple[str, ...]
 """Values of a benchmark's parameters, stored by asv as Python prints them."""

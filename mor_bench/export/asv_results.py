@@ -17,11 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mor_bench.errors import InvalidInputError, StoreError
+from mor_bench.errors import InvalidInputError, StoreError, printable
 from mor_bench.export.asv_files import (
     COLUMNS,
     Figure,
     Figures,
+    check_results,
+    check_texts,
     commit_and_date,
     describe_for_asv,
     from_columns,
@@ -99,6 +101,8 @@ QUANTITIES = {
 }
 """Exported figures, by the last part of the benchmark's name."""
 
+_BENCHMARK = re.compile(rf"{GROUP}\.[a-z0-9-]+\.({'|'.join(QUANTITIES)})")
+
 
 def export_asv(
     comparison: Comparison,
@@ -129,7 +133,8 @@ def export_asv(
         If the working folder is not a checkout of mor-bench or lacks the commit; if no row has
         finished; or if `machine` is not given and the comparison ran on another machine.
     StoreError
-        If a file in `out` is not asv's or has another version, or the machine is not recorded.
+        If a file in `out` is not asv's or has another version, if the machine is not recorded, or
+        if a text could become markup.
     """
     out = Path(out)
     _check_recorded(comparison)
@@ -146,6 +151,7 @@ def export_asv(
     machine_path = out / name / "machine.json"
     read_file(out / "benchmarks.json", "benchmarks")  # refuse a bad one before writing anything
     about = read_file(machine_path, "machine") or describe_for_asv(comparison.machine, name)
+    check_texts(map(str, about.values()), machine_path)
     content = {
         "commit_hash": commit_hash,
         "env_name": environment,
@@ -164,16 +170,17 @@ def export_asv(
 
 
 def _check_recorded(comparison: Comparison) -> None:
-    for row in comparison.rows:
-        # asv's page puts names of benchmarks and parameters into its own text as they are.
-        if not re.fullmatch(NAME_PATTERN, row.dataset) or re.search(r"[<>&]", row.label):
-            raise StoreError(
-                f"{comparison.out}: a row's names are not fit for a page: "
-                f"{row.dataset!r}, {row.label!r}."
-            )
+    where = comparison.out / "results.json"
     for name in ("python", "processor", "cores", "system"):
         if not isinstance(comparison.machine.get(name), str | int):
             raise StoreError(f"{comparison.out}: `machine.{name}` of results.json is missing.")
+        check_texts([str(comparison.machine[name])], where)
+    if not re.fullmatch(r"\d+\.\d+[\w.+-]*", str(comparison.machine["python"])):
+        raise StoreError(f"{where}: `machine.python` must be a version.")
+    for row in comparison.rows:
+        if not re.fullmatch(NAME_PATTERN, row.dataset):
+            raise StoreError(f"{where}: a dataset is called {printable(row.dataset, 100, '')!r}.")
+        check_texts([row.label, _setting(comparison, row)], where)
 
 
 def _merged(path: Path, commit_hash: str, figures: Mapping[str, Figures]) -> dict[str, Any]:
@@ -234,22 +241,12 @@ def _entry(benchmark: str, parameters: list[list[str]]) -> dict[str, Any]:
 def _read_results(path: Path) -> dict[str, Any] | None:
     """Read a file of results that `export_asv` wrote; None if it does not exist."""
     content = read_file(path, "results")
-    if content is not None and not _ours(content):
-        raise StoreError(f"{path}: not written by mor-bench.")
+    if content is not None:
+        check_results(content, path)
+        for name in content["results"]:
+            if not _BENCHMARK.fullmatch(name):
+                raise StoreError(f"{path}: {printable(name, 100, '')!r} is not of mor-bench.")
     return content
-
-
-def _ours(content: Mapping[str, Any]) -> bool:
-    known = all(
-        name.startswith(f"{GROUP}.") and name.rpartition(".")[2] in QUANTITIES
-        for name in content.get("results") or ()
-    )
-    return (
-        known
-        and content.get("result_columns") == list(COLUMNS)
-        and "commit_hash" in content
-        and "date" in content
-    )
 
 
 def _figures(comparison: Comparison) -> dict[str, Figures]:

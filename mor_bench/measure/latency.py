@@ -8,7 +8,6 @@ processes, because the memory layout of a process changes the latency of all its
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from os import cpu_count
@@ -23,12 +22,12 @@ from numpy.typing import NDArray
 
 from mor_bench.array_files import read_npy
 from mor_bench.errors import MorBenchError, StoreError
-from mor_bench.machine import pinned_threads
+from mor_bench.machine import free_memory_bytes, pinned_threads
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.measure.method_session import MethodSession
 from mor_bench.measure.timing import BATCHES, Timing
 from mor_bench.sandbox.fork_server import CAN_FORK, ForkServer
-from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess
+from mor_bench.sandbox.process import MethodFailedError, SandboxedProcess, stoppable_threads
 
 LEAST_QUERIES = 200
 """Number of single queries of each configuration, over all processes; fewer if it is slow."""
@@ -181,7 +180,7 @@ def measure_latencies(
 
 def groups_that_fit(methods: Mapping[str, TimedMethod]) -> list[list[str]]:
     """Return the labels in groups that fit into half of the free memory."""
-    free = 0.5 * psutil.virtual_memory().available
+    free = 0.5 * free_memory_bytes()
     groups: list[list[str]] = []
     room = 0.0
     for label, method in methods.items():
@@ -200,7 +199,7 @@ def _open_all(
     wanted = {label: turn for label, turn in turns.items() if not turn.timing.failed}
     for turn in wanted.values():
         stack.callback(turn.end)
-    with ThreadPoolExecutor(cpu_count() or 1) as pool:
+    with stoppable_threads(cpu_count() or 1) as pool:
         list(pool.map(lambda turn: turn.open(server, seed), wanted.values()))
     return {label: turn for label, turn in wanted.items() if not turn.timing.failed}
 

@@ -4,23 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, WithJsonSchema
+from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
 Real = Annotated[
     float,
     WithJsonSchema({"anyOf": [{"type": "number"}, {"enum": ["nan", "inf", "-inf"]}]}),
 ]
 """A float. Files hold NaN and infinity as strings, because JSON lacks them."""
-
-
-def _printable(text: str) -> str:
-    if not text.isprintable():
-        raise ValueError("it must not hold control characters")
-    return text
-
-
-Label = Annotated[str, Field(max_length=500), AfterValidator(_printable)]
-"""A name in tables and in names of files."""
 
 
 class Part(BaseModel):

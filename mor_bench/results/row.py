@@ -10,9 +10,14 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from mor_bench.results.parts import Label, Part, Real, SeedSpread, TrainedElsewhere, TrainingRecord
+from mor_bench.errors import printable
+from mor_bench.results.parts import Part, Real, SeedSpread, TrainedElsewhere, TrainingRecord
 from mor_bench.results.recorded import RecordedDataset, RecordedMethod, RecordedSettings
+from mor_bench.specs.base import Label
 from mor_bench.specs.method_spec import Told
+
+MOST_LETTERS = 450
+"""Letters of a label before it is cut."""
 
 Status = Literal["ok", "failed", "skipped"]
 
@@ -369,4 +374,4 @@ class ResultsFile(Part):
 def label_of(method: str, swept: dict[str, Any]) -> str:
     """Return a configuration's name: the method, and the swept parameters in brackets."""
     inside = ", ".join(f"{key}={value}" for key, value in swept.items())
-    return f"{method} [{inside}]" if inside else method
+    return printable(f"{method} [{inside}]" if inside else method, MOST_LETTERS, keep="")

@@ -16,12 +16,13 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from time import time
+from threading import Event, Thread
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,9 @@ from mor_bench.training_options import TrainingOptions
 
 LOAD_LIMIT_S = 300.0
 """Time limit for loading a model, s."""
+
+RECORD_EVERY_S = 0.1
+"""Interval at which the time of a training is recorded if its checkpoint has changed, s."""
 
 
 @dataclass(frozen=True)
@@ -260,19 +264,48 @@ class CachedFit:
 
     def begin_training(self) -> None:
         """Create the folder of a checkpoint; read the training time up to an existing one."""
-        record, taken = self.folder / "training.json", 0.0
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self.checkpoint.parent)
-        with suppress(OSError, StoreError, ValueError, KeyError, TypeError):
-            kept, written = read_json(record), self.checkpoint.stat().st_mtime
-            taken = float(kept["taken_s"]) + max(0.0, written - float(kept["began"]))
-        write_atomically(record, json.dumps({"taken_s": taken, "began": time()}).encode())
-        self.taken_s = taken
+        self.taken_s = 0.0
+        if self.checkpoint.exists():
+            with suppress(OSError, StoreError, ValueError, KeyError, TypeError):
+                self.taken_s = max(0.0, float(read_json(self._training_record)["taken_s"]))
+
+    @property
+    def _training_record(self) -> Path:
+        return self.folder / "training.json"
+
+    @contextmanager
+    def _recorded_training(self) -> Iterator[None]:
+        """Record the training time up to the newest checkpoint, while the body trains.
+
+        A steady clock measures it: the system clock, and so the age of a file, may jump.
+        """
+        began, over = monotonic(), Event()
+
+        def record() -> None:
+            seen, last = _version_of(self.checkpoint), False
+            while not last:
+                last = over.wait(RECORD_EVERY_S)
+                now = _version_of(self.checkpoint)
+                if now not in (None, seen):
+                    content = {"taken_s": self.taken_s + monotonic() - began}
+                    with suppress(OSError):
+                        write_atomically(self._training_record, json.dumps(content).encode())
+                seen = now
+
+        recorder = Thread(target=record, daemon=True)
+        recorder.start()
+        try:
+            yield
+        finally:
+            over.set()
+            recorder.join()
 
     def end_training(self) -> None:
         """Delete a checkpoint. The folder stays, because another run may write to it."""
         self.checkpoint.unlink(missing_ok=True)
-        (self.folder / "training.json").unlink(missing_ok=True)
+        self._training_record.unlink(missing_ok=True)
 
     def worker(
         self, fork_server: ForkServer | None = None, exempt: Path | None = None
@@ -305,7 +338,8 @@ class CachedFit:
             training=training and replace(training, checkpoint=checkpoint),
             validation=self.data.validation_folder if training else None,
         )
-        answer = worker.ask("fit", limit_s, request=request)
+        with self._recorded_training() if request.training else nullcontext():
+            answer = worker.ask("fit", limit_s, request=request)
         if answer["needs_snapshots"]:
             self.data.check_unchanged()
         return answer, model
@@ -339,6 +373,15 @@ class CachedFit:
         if self._held:
             self._held.end()
             self._held = None
+
+
+def _version_of(path: Path) -> tuple[int, int] | None:
+    """Return numbers that change when a file is replaced; None if there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
 
 
 def _code_of_named(parameters: Mapping[str, Any]) -> list[str]:

@@ -121,6 +121,17 @@ def may_train(method: MethodSpec) -> bool:
     return _ask_class(method, lambda surrogate: bool(surrogate.trains()), of_others=True)
 
 
+def missing_library(method: MethodSpec) -> str | None:
+    """Return why a class of this package cannot be used here; None if it can."""
+    if not method.surrogate.startswith(OWN):
+        return None
+    try:
+        method.load_class()
+    except MissingDependencyError as error:
+        return str(error)
+    return None
+
+
 def draws_randomly(configuration: Configuration) -> bool:
     """Return whether a fit draws random numbers.
 

@@ -16,6 +16,7 @@ from mor_bench.runs.configurations import (
     checked_specs,
     configurations_of,
     draws_randomly,
+    missing_library,
 )
 from mor_bench.runs.durations import (
     REPORT_S,
@@ -130,6 +131,7 @@ def plan(
             : context.budget.configurations
         ]
     ]
+    usable = [item for item in configurations if missing_library(item.method) is None]
     pace = Pace.measured()
     steps: list[Step] = []
     compilation_s = scoring_s = timing_s = 0.0
@@ -140,11 +142,13 @@ def plan(
         held = spec.split.test_fraction + spec.split.validation_fraction
         n_scored = round(n_train * held / (1 - held))
         undone = [
-            item for item, step in zip(configurations, own[1:], strict=False) if not step.done
+            item
+            for item, step in zip(configurations, own[1:], strict=False)
+            if not step.done and item in usable
         ]
-        compilation_s += compile_seconds(spec, configurations, pace)
+        compilation_s += compile_seconds(spec, usable, pace)
         scoring_s += sum(scoring_seconds(item, n_scored, query_s, pace) for item in undone)
-        timing_s += timing_seconds(configurations, context, query_s, pace)
+        timing_s += timing_seconds(usable, context, query_s, pace)
         steps += own
     report_s = REPORT_S * pace.interpreter * len(specs)
     return Plan(steps, compilation_s, scoring_s, timing_s, report_s)
@@ -164,6 +168,9 @@ def _steps(
     fits = []
     for configuration in configurations:
         method, label = configuration.method.name, configuration.label
+        if missing := missing_library(configuration.method):
+            fits.append(Step(spec.name, f"{label} (left out: {missing})", False, 0.0))
+            continue
         if _is_shipped(configuration, spec, context):
             fits.append(Step(spec.name, f"{label} (trained elsewhere)", False, 0.0))
             continue

@@ -22,6 +22,7 @@ import psutil
 
 from mor_bench import errors
 from mor_bench.errors import MorBenchError
+from mor_bench.machine import memory_limit_bytes
 from mor_bench.sandbox.fork_server import CHILD_MODULE, ForkServer, environment
 from mor_bench.sandbox.seal import Restrictions
 from mor_bench.sandbox.session import Session
@@ -33,12 +34,12 @@ START_LIMIT_S = 120.0
 """Time limit for a process to start, s."""
 
 MEMORY_SHARE = 0.75
-"""Default memory limit of a method, as a share of the machine's memory."""
+"""Default memory limit of a method, as a share of the memory of the machine or container."""
 
 
 def default_memory_limit_bytes() -> float:
     """Return the default memory limit of a method."""
-    return MEMORY_SHARE * float(psutil.virtual_memory().total)
+    return MEMORY_SHARE * memory_limit_bytes()
 
 
 _ALIVE: set[SandboxedProcess] = set()

@@ -13,7 +13,6 @@ import json
 import os
 import re
 import secrets
-import sys
 import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 
 from mor_bench.checked_files import parse_json, read_bytes
 from mor_bench.errors import NewerSchemaError, StoreError, printable
-from mor_bench.scratch import host_name
+from mor_bench.scratch import host_name, identity, is_running
 
 SCHEMA_VERSION = 3
 FORMAT = "mor-bench snapshots"
@@ -33,7 +32,7 @@ HEADER_BYTES = 512
 STATUSES = ("ok", "inverted", "no-equilibrium")
 
 STALE_AFTER_S = 3600.0
-"""Age after which a temporary file is a leftover of some process, s. No write takes as long."""
+"""Age after which a temporary file of another machine is a leftover, s. No write takes as long."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,8 @@ def temporary_beside(path: Path) -> Path:
 
     The name identifies the writer, even if several machines share the folder.
     """
-    return path.with_name(f".{path.name}.{host_name()}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    owner = f"{host_name()}.{identity(os.getpid())}"
+    return path.with_name(f".{path.name}.{owner}.{secrets.token_hex(4)}.tmp")
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -109,23 +109,19 @@ def remove_leftovers(folder: Path, of: str = "*") -> None:
     """
     for path in folder.glob(f".{of}.*.tmp"):
         with suppress(FileNotFoundError):  # another process may remove it first
-            if _writer_is_dead(path) or time.time() - path.stat().st_mtime > STALE_AFTER_S:
+            if _is_abandoned(path):
                 path.unlink()
 
 
-def _writer_is_dead(temporary: Path) -> bool:
-    """Return whether the writer is a dead process of this machine; False if unknown."""
-    named = re.fullmatch(r"\..*\.(?P<host>[^.]*)\.(?P<pid>\d+)\.[0-9a-f]+\.tmp", temporary.name)
-    # On Windows signal 0 would end the process.
-    if named is None or named["host"] != host_name() or sys.platform == "win32":
-        return False
-    try:
-        os.kill(int(named["pid"]), 0)
-    except ProcessLookupError:
-        return True
-    except OSError:
-        return False
-    return False
+def _is_abandoned(temporary: Path) -> bool:
+    """Return whether a writer has ended: by its process here, by age on other machines.
+
+    Ages depend on the system clock, which may jump.
+    """
+    named = re.fullmatch(r"\..*\.([^.]*)\.(\d+-\d+)\.[0-9a-f]+\.tmp", temporary.name)
+    if named and named[1] == host_name():
+        return not is_running(named[2])
+    return time.time() - temporary.stat().st_mtime > STALE_AFTER_S
 
 
 def shard_bytes(shard: Shard) -> bytes:

@@ -24,6 +24,12 @@ def in_range(low: float, high: float, unit: str) -> AfterValidator:
     return AfterValidator(check)
 
 
+def _one_line(text: str) -> str:
+    if not text.isprintable():
+        raise ValueError("it must not hold control characters")
+    return text
+
+
 def _printable(text: str) -> str:
     if not all(letter.isprintable() or letter in "\n\t" for letter in text):
         raise ValueError("it must not hold control characters")
@@ -39,6 +45,9 @@ Modulus = Annotated[Positive, in_range(1e-6, 1e15, "Pa")]
 Coordinate = Annotated[Finite, in_range(-1e9, 1e9, "m")]
 Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
 Text = Annotated[str, Field(max_length=10_000), AfterValidator(_printable)]
+Label = Annotated[str, Field(max_length=500), AfterValidator(_one_line)]
+"""A name in tables and in names of files."""
+
 NAME_PATTERN = r"^[a-z0-9-]+$"
 Name = Annotated[str, Field(pattern=NAME_PATTERN, max_length=100)]
 """A name that is safe in the names of folders."""

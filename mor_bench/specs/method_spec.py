@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from mor_bench.specs.base import Count, Positive, StrictModel, Text
+from mor_bench.specs.base import Count, Label, Positive, StrictModel, Text
 from mor_bench.specs.battery import Battery
 from mor_bench.specs.loads_spec import SplitBy
 from mor_bench.specs.parameters import check_parameters, load_class
@@ -85,7 +85,7 @@ class MethodSpec(StrictModel):
         Settings of shared tests and benchmarks.
     """
 
-    name: Text
+    name: Label
     title: Text
     surrogate: Text
     source: Text

@@ -13,6 +13,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from time import perf_counter
 
@@ -25,6 +26,9 @@ from mor_bench.errors import MissingDependencyError, SolverError
 from mor_bench.runs.configurations import CORE_METHODS
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.surrogate import Surrogate
+
+PREDICTIONS = 1_000_000
+"""Predictions of each method; a prediction every 30 ms would take 8 hours."""
 
 PARTS, FIXED = 100, 5
 """Number of checks, and number of loads whose answers are compared."""
@@ -42,6 +46,8 @@ class Load:
 
     Attributes
     ----------
+    n : int
+        Number of predictions.
     growth_bytes : float
         Growth of the resident memory after the first tenth.
     drifted : int
@@ -49,6 +55,7 @@ class Load:
     seconds : float
     """
 
+    n: int
     growth_bytes: float
     drifted: int
     seconds: float
@@ -59,8 +66,8 @@ class Load:
         return self.drifted == 0 and self.growth_bytes <= MOST_GROWTH_BYTES
 
 
-def predict_often(method: Surrogate, data: Dataset, n: int) -> Load:
-    """Make single predictions of random loads, with checks in between."""
+def predict_often(method: Surrogate, data: Dataset, n: int, limit_s: float = inf) -> Load:
+    """Make single predictions of random loads until a time limit, with checks in between."""
     draw, forces = np.random.default_rng(0), data.test.forces
     fixed = forces[:: max(1, len(forces) // FIXED)][:FIXED]
     before = [method.predict(force) for force in fixed]
@@ -78,8 +85,11 @@ def predict_often(method: Surrogate, data: Dataset, n: int) -> Load:
             for force, answer in zip(fixed, before, strict=True)
         )
         memory.append(process.memory_info().rss)
-    growth = float(max(memory[PARTS // 10 :]) - memory[PARTS // 10])
-    return Load(growth, drifted, perf_counter() - begun)
+        if perf_counter() - begun > limit_s:
+            break
+    settled = memory[len(memory) // 10 :]
+    growth = float(max(settled) - settled[0])
+    return Load(n // PARTS * len(memory), growth, drifted, perf_counter() - begun)
 
 
 def loaded(name: str, data: Dataset) -> Surrogate:
@@ -92,7 +102,8 @@ def loaded(name: str, data: Dataset) -> Surrogate:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print a line per method; exit with 1 if any grew or drifted."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--predictions", type=int, default=1_000_000)
+    parser.add_argument("--predictions", type=int, default=PREDICTIONS)
+    parser.add_argument("--seconds", type=float, default=inf, help="time limit of each method")
     parser.add_argument("--methods", nargs="*", default=list(CORE_METHODS))
     parser.add_argument("--cache", type=Path, default=None)
     given = parser.parse_args(arguments)
@@ -101,13 +112,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         data = load_dataset("beam-tiny", cache=given.cache)
         for name in given.methods:
             try:
-                found = predict_often(loaded(name, data), data, given.predictions)
+                found = predict_often(loaded(name, data), data, given.predictions, given.seconds)
             except MissingDependencyError as error:
                 print(f"{name}: {error}")
                 continue
             failed |= not found.ok
             print(
-                f"{name}: {given.predictions:,} predictions in {found.seconds:,.0f} s, memory "
+                f"{name}: {found.n:,} predictions in {found.seconds:,.0f} s, memory "
                 f"{found.growth_bytes / 1e6:+.1f} MB, {found.drifted} drifts",
                 flush=True,
             )
