@@ -5,7 +5,7 @@
 `reruns` repeats the measurement of some methods and counts the medians inside the interval of the
 measurement before, for the quick and the full protocol. `pairs` times identical code under two
 names, and code slowed by 10 %. `busy` times a method beside a busy process. It prints every count
-out of its total and exits with 1 if one misses its goal. Together they take about 25 minutes on two
+out of its total and exits with 1 if one misses its goal. Together they take about 24 minutes on two
 cores. With `--out`, each part is stored as soon as it ends, and a later call with the same file
 skips the parts that were stored at the same commit.
 """
