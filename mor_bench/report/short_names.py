@@ -30,7 +30,7 @@ class ShortName:
 
 def short_names(rows: Iterable[Row]) -> dict[str, ShortName]:
     """Return the short name of each configuration of one dataset, by its label."""
-    names = {}
+    names: dict[str, ShortName] = {}
     for method, mine in _by_method(rows).items():
         varied = varied_keys(mine)
         values = [value_text({key: row.swept.get(key) for key in varied}) for row in mine]
