@@ -13,7 +13,7 @@ from matplotlib.lines import AxLine
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from mor_bench.report.canvas import Picture, styles_of
+from mor_bench.report.canvas import Picture
 from mor_bench.report.entries import entries_of
 from mor_bench.report.error_against_deformation import error_against_deformation
 from mor_bench.report.error_against_time import error_against_time
@@ -59,7 +59,7 @@ def axes_of(picture: Picture | None) -> Axes:
 
 
 def test_points_bars_and_the_needs_box_are_in_percent_and_ms(made: Comparison) -> None:
-    axes = axes_of(error_against_time(made, "beam", styles_of(made), intervals(made)))
+    axes = axes_of(error_against_time(made, "beam", intervals(made)))
     rows = [(e.latency_ms, 100 * e.error) for e in entries_of(made, "beam")]
     points = {tuple(xy) for line in axes.lines for xy in np.column_stack(line.get_data())}
     assert points >= set(rows)
@@ -75,22 +75,16 @@ def test_points_bars_and_the_needs_box_are_in_percent_and_ms(made: Comparison) -
     assert "(%)" in axes.get_ylabel()
 
 
-def test_each_label_of_the_legend_belongs_to_its_curve(made: Comparison) -> None:
-    axes = axes_of(singular_values(made, "beam", styles_of(made)))
-    legend = axes.get_legend()
-    assert legend is not None
-    colours = {
-        text.get_text(): handle.get_color()  # type: ignore[union-attr]
-        for text, handle in zip(legend.get_texts(), legend.legend_handles, strict=True)
-    }
-    curves = {line.get_color(): line.get_ydata() for line in axes.lines[:2]}
-    assert curves[colours[SIGMA]] == pytest.approx(SIGMAS / 9.0)
-    left_out = np.sqrt([(9 + 4 + 1) / 95, (4 + 1) / 95, 1 / 95])
-    assert curves[colours[TAIL]] == pytest.approx(left_out)
-    (ranks,) = (line for line in axes.lines if line.get_label() == "pod")
-    assert np.column_stack(ranks.get_data()) == pytest.approx(
-        np.column_stack([[2, 3], left_out[1:]])
-    )
+def test_singular_values_are_in_percent_and_ranks_lie_on_their_curve(made: Comparison) -> None:
+    picture = singular_values(made, "beam")
+    axes = axes_of(picture)
+    curves = {line.get_label(): np.column_stack(line.get_data()) for line in axes.lines}
+    left_out = 100 * np.sqrt([(9 + 4 + 1) / 95, (4 + 1) / 95, 1 / 95])
+    assert curves[SIGMA][:, 1] == pytest.approx(100 * SIGMAS / 9.0)
+    assert curves[TAIL][:, 1] == pytest.approx(left_out)
+    assert curves["pod"] == pytest.approx(np.column_stack([[2, 3], left_out[1:]]))
+    assert picture is not None
+    assert picture.finding.startswith("At least 4 modes are needed for 2 %")
 
 
 def test_the_median_per_patch_counts_a_sample_at_each_of_its_patches() -> None:
@@ -140,7 +134,7 @@ def test_the_slope_of_the_paper_is_drawn_on_its_scenes_only(
     made = Comparison(tmp_path, {})
     row = a_row("pod", dataset=dataset, error={"mean_dof_m": 0.002})
     made.put(row, {"amplitude_m": np.array([0.1, 0.3]), "mean_dof_m": np.array([0.001, 0.003])})
-    picture = error_against_deformation(made, dataset, styles_of(made))
+    picture = error_against_deformation(made, dataset)
     assert picture is not None
     (axes,) = picture.figure.axes
     slopes = [line.get_slope() for line in axes.lines if isinstance(line, AxLine)]

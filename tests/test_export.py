@@ -10,9 +10,11 @@ from typing import Any
 import meshio
 import numpy as np
 import pytest
+from PIL import Image
 
 import mor_bench
 from mor_bench.errors import InvalidInputError
+from mor_bench.export.load_path import export_load_path
 from mor_bench.export.npz_file import export_numpy
 from mor_bench.export.vtu_files import export_vtu
 from mor_bench.scene.interpolation import interpolation_matrix
@@ -160,6 +162,25 @@ def test_the_export_commands_print_the_files_they_write(
         "`--part` must be train, validation, test, in-range, 2x, 4x, paper-amplitude, unseen-"
         in refused.stderr
     )
+
+
+@pytest.mark.slow
+def test_a_load_path_grows_to_the_whole_load(tiny: Dataset, tmp_path: Path) -> None:
+    path = export_load_path(tiny, 3, tmp_path / "load.gif", n_steps=4)
+    with Image.open(path) as gif:
+        assert gif.n_frames == 5  # type: ignore[attr-defined]
+        frames = []
+        for i in range(5):
+            gif.seek(i)
+            frames.append(np.asarray(gif.convert("RGB"), dtype=float))
+    changes = [np.abs(frame - frames[0]).sum() for frame in frames]
+    assert changes[0] == 0
+    assert changes[-1] > 2 * changes[1] > 0
+    assert path.stat().st_size < 500_000
+    with pytest.raises(InvalidInputError, match="not overwritten"):
+        export_load_path(tiny, 3, path)
+    with pytest.raises(InvalidInputError, match="`sample` must be"):
+        export_load_path(tiny, len(tiny.test), tmp_path / "other.gif")
 
 
 @pytest.mark.parametrize("there", ["body.toml", "body.npz"])

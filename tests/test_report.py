@@ -222,17 +222,22 @@ def test_the_page_lists_every_configuration_once_and_omits_unmeasured_figures(
     assert not re.search(r"<tbody>\s*</tbody>", page)
 
 
-def test_figures_are_png_files_with_content(comparison: Comparison, written: list[Path]) -> None:
+def test_figures_are_png_and_svg_files_with_content(
+    comparison: Comparison, written: list[Path]
+) -> None:
     kinds = ["error-against-time", "error-against-deformation", "worst-samples", "singular-values"]
     assert [path.name for path in written] == [
         *(f"beam-tiny--{kind}.png" for kind in kinds),
-        "all-datasets--performance-profile.png",
         "report.html",
     ]
     for path in written[:-1]:
         assert path.parent == comparison.out / "figures"
         pixels = imread(path)[..., :3]
         assert pixels.shape[1] == 1410
+        svg = path.with_suffix(".svg").read_text(encoding="utf-8")
+        assert svg.startswith("<?xml")
+        assert "<dc:date>" not in svg
+        assert "<script" not in svg
         assert pixels.std() > 0.03
         colours = np.unique(pixels @ np.array([1.0, 7.3, 53.1]))
         assert len(colours) > 50  # more than black on white

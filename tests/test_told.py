@@ -1,4 +1,4 @@
-"""What methods are told: groups of tables, markers of figures, the filter of the page, `--told`."""
+"""What methods are told: groups of tables, the filter of the page, `--told`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 
 from mor_bench.analysis.told import told_at_most
 from mor_bench.cli.app import app
-from mor_bench.report.canvas import styles_of
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.entries import by_group, entries_of
 from mor_bench.report.page import render
@@ -67,8 +66,6 @@ def test_rows_are_grouped_by_what_their_methods_are_told(made: Comparison) -> No
         "equations, no snapshots, reference": ["fem"],
     }
     assert [entry.pareto_mark for entry in entries] == ["ref", "*", "*", "*", "", ""]
-    markers = {method: style.marker for method, style in styles_of(made).items()}
-    assert markers == {"fem": "^", "pod": "^", "linear": "s", "pca": "o", "wild": "o"}
     observed = load_dataset_spec("liver-hex-observed").model_dump(mode="json")["observed"]
     made.datasets["beam-tiny"] = {**made.datasets["beam-tiny"], "observed": observed}
     assert entries_of(made, "beam-tiny")[3].group == "observed displacements only, snapshots"

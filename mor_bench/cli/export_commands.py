@@ -15,6 +15,7 @@ from mor_bench.cli.option_groups import DatasetName, with_options
 from mor_bench.cli.progress_bars import show_progress
 from mor_bench.errors import InvalidInputError
 from mor_bench.export.asv_results import export_asv
+from mor_bench.export.load_path import export_load_path
 from mor_bench.export.npz_file import export_numpy
 from mor_bench.export.onnx_file import export_onnx
 from mor_bench.export.vtu_files import PARTS, export_vtu
@@ -55,6 +56,24 @@ def vtu(
     data = _load(dataset, options, [name for name in SET_NAMES if name == part])
     for path in export_vtu(data, sample, out, part=known[part], models=model or []):
         print(path)
+
+
+@export.command()
+@with_options
+def gif(
+    dataset: DatasetName,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="GIF file to write.")],
+    sample: Annotated[
+        int, typer.Option(min=0, help="Number of the test sample, counted from 0.")
+    ] = 0,
+    *,
+    options: DataOptions,
+) -> None:
+    """Write the deformation under the growing load of a test sample as animated GIF.
+
+    The extra `viz` renders the meshes with PyVista; without it, matplotlib draws them.
+    """
+    print(export_load_path(_load(dataset, options), sample, out))
 
 
 @export.command()

@@ -2,115 +2,169 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import ceil
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from mor_bench.report.canvas import (
     INK,
-    LIGHT,
+    LABEL,
+    NOTE,
     Picture,
-    Style,
     dress,
+    length_unit,
     new_figure,
     plain,
     shortened,
 )
 from mor_bench.report.entries import Entry, best_per_method, entries_of
-from mor_bench.report.number_format import number, short_swept
+from mor_bench.report.method_styles import style_of
+from mor_bench.report.number_format import number
 from mor_bench.report.published_figures import SCENES, scene_of
+from mor_bench.report.short_names import ShortName, short_names
 from mor_bench.results.comparison import Comparison
+
+MOST_PANELS = 12
+
+FAR = 2.0
+"""Samples above this multiple of the 99th percentile lie beyond the axis."""
 
 CAPTION = (
     "Each dot is a test sample. Each panel shows a method's configuration "
     "with the smallest ē, of the validation part if there is one. "
+    "Full-order solves on the dataset's mesh are left out. "
     "The line is the least-squares line through the origin. "
-    "Its slope (m of error per m of deformation) compares methods at a glance. "
+    "Its slope (mm of error per m of deformation) compares methods at a glance. "
     "Every panel has its own vertical scale. "
     "Samples without a prediction are not drawn; the panel gives their number."
 )
 
 
-def error_against_deformation(
-    comparison: Comparison, dataset: str, styles: dict[str, Style]
-) -> Picture | None:
+@dataclass(frozen=True)
+class Samples:
+    """A configuration with the largest displacement and the error e of its samples, m."""
+
+    entry: Entry
+    amplitude: NDArray[np.float64]
+    e: NDArray[np.float64]
+
+    @property
+    def finite(self) -> NDArray[np.bool_]:
+        return np.asarray(np.isfinite(self.e) & np.isfinite(self.amplitude))
+
+    @property
+    def slope(self) -> float | None:
+        """Slope of the least-squares line through the origin; None without an error."""
+        x, y = self.amplitude[self.finite], self.e[self.finite]
+        return float(x @ y / (x @ x)) if len(x) and x.max() > 0 and y.max() > 0 else None
+
+
+def error_against_deformation(comparison: Comparison, dataset: str) -> Picture | None:
     """Draw the error e of every test sample over its largest displacement.
 
-    None if there are no raw samples.
+    None if there are no raw samples with an error.
     """
-    panels = []
-    for entry in best_per_method(entries_of(comparison, dataset)):
-        try:
-            arrays = comparison.samples(entry.row)
-            panels.append(
-                (entry, np.asarray(arrays["amplitude_m"]), np.asarray(arrays["mean_dof_m"]))
-            )
-        except (OSError, KeyError):
-            continue
+    entries = entries_of(comparison, dataset)
+    best = [e for e in best_per_method(entries) if not e.row.reference]
+    found = [s for e in best if (s := _read(comparison, e)) is not None]
+    panels = [samples for samples in found if samples.slope is not None]
     if not panels:
         return None
-    title, scene = "Error against deformation", SCENES.get(scene_of(dataset))
-    caption, slope = CAPTION, scene.network.slope if scene else None
+    caption, left_out = CAPTION, [s.entry.method for s in found if s.slope is None]
+    if left_out:
+        caption += f" Without errors: {', '.join(left_out)}."
+    if len(panels) > MOST_PANELS:
+        panels.sort(key=lambda s: s.entry.selecting_error_m)
+        more = [s.entry.method for s in panels[MOST_PANELS:]]
+        caption += f" Not drawn, because their ē is larger: {', '.join(more)}."
+        panels = panels[:MOST_PANELS]
+    scene = SCENES.get(scene_of(dataset))
+    slope = scene.network.slope if scene else None
     if scene:
-        largest = max(float(amplitude.max()) for _, amplitude, _ in panels)
-        line = f"; the dashed line has its slope, {slope:g}" if slope else ", without a slope"
+        largest = max(float(samples.amplitude.max()) for samples in panels)
+        line = f"; the dashed line has its slope, {1e3 * slope:.3g} mm/m" if slope else ""
+        line = line or ", without a slope"
         caption += (
             f" The paper's U-Mesh is on this scene with deformations of up to "
             f"{scene.amplitude_m:g} m{line}. The largest here is {number(largest)} m."
         )
     columns = min(3, len(panels))
     rows = ceil(len(panels) / columns)
-    figure = new_figure(0.6 + 2.7 * rows, f"{title} – {dataset}")
+    finding = _finding(panels)
+    subject = f"{dataset}: mean error e over the largest displacement, a dot per test sample"
+    if slope:
+        subject += f"; dashed: the paper's U-Mesh, {number(1e3 * slope)} mm/m"
+    figure = new_figure(0.4 + (2.3 if columns > 1 else 3.6) * rows, finding, subject)
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.ravel()[len(panels) :]:
         axes.set_visible(False)
-    for axes, (entry, amplitude, e) in zip(grid.ravel(), panels, strict=False):
-        _panel(axes, entry, (amplitude, e), styles[entry.method], slope)
-    figure.supxlabel("largest nodal displacement of the reference (m)", fontsize=10)
-    figure.supylabel("mean error per dof, e (m)", fontsize=10)
-    return Picture("error-against-deformation", title, caption, figure)
+    names = short_names([e.row for e in entries])
+    x_unit = length_unit(max(float(s.amplitude[s.finite].max()) for s in panels))
+    y_unit = length_unit(max(float(s.e[s.finite].max()) for s in panels))
+    for axes, samples in zip(grid.ravel(), panels, strict=False):
+        _panel(axes, samples, names[samples.entry.label], slope, (x_unit, y_unit))
+    figure.supxlabel(f"largest nodal displacement of the reference ({x_unit[0]})", fontsize=LABEL)
+    figure.supylabel(f"mean error per degree of freedom, e ({y_unit[0]})", fontsize=LABEL)
+    return Picture(
+        "error-against-deformation", "Error against deformation", caption, figure, finding
+    )
+
+
+def _read(comparison: Comparison, entry: Entry) -> Samples | None:
+    try:
+        arrays = comparison.samples(entry.row)
+        return Samples(entry, np.asarray(arrays["amplitude_m"]), np.asarray(arrays["mean_dof_m"]))
+    except (OSError, KeyError):
+        return None
+
+
+def _finding(panels: list[Samples]) -> str:
+    """Name the methods with the smallest and the largest slope."""
+    slopes = {s.entry.method: 1e3 * s.slope for s in panels if s.slope is not None}
+    least, most = min(slopes, key=lambda m: slopes[m]), max(slopes, key=lambda m: slopes[m])
+    text = f"Per metre of deformation, {shortened(least, 30)} errs by {number(slopes[least])} mm"
+    if least == most:
+        return text
+    return f"{text}, {shortened(most, 30)} by {number(slopes[most])} mm"
 
 
 def _panel(
     axes: Axes,
-    entry: Entry,
-    samples: tuple[NDArray[np.float64], NDArray[np.float64]],
-    style: Style,
+    samples: Samples,
+    name: ShortName,
     published: float | None,
+    units: tuple[tuple[str, float], tuple[str, float]],
 ) -> None:
-    """Draw the samples (largest displacement, e) of one configuration, m, and the paper's slope."""
-    amplitude, e = samples
-    finite = np.isfinite(e) & np.isfinite(amplitude)
-    x, y = amplitude[finite], e[finite]
+    """Draw the samples of one configuration, and the paper's slope."""
+    finite, slope = samples.finite, samples.slope or 0.0
+    (_, x_unit), (unit, per_m) = units
+    x, e = x_unit * samples.amplitude[finite], samples.e[finite]
+    usual = FAR * float(np.percentile(e, 99))
+    beyond = e > usual if usual > 0 else np.zeros(len(e), dtype=bool)
+    top = float(e[~beyond].max())
     dress(axes)
-    (dots,) = axes.plot(x, y, ".", color=style.colour, alpha=0.5, rasterized=True)
-    dots.set(ms=4.5 if len(x) > 300 else 8, mew=0)
-    name = f"{entry.method}\n{shortened(short_swept(entry.swept), 40)}".rstrip()
-    axes.set_title(plain(name), fontsize=10, loc="left", color=INK)
-    remarks = []
-    if len(x) and x.max() > 0:
-        slope = float(x @ y / (x @ x))
-        axes.axline((0, 0), slope=slope, color=INK, linewidth=1.3)
-        axes.set_xlim(0, 1.05 * float(x.max()))
-        remarks.append(f"slope {slope:.1e}" if y.max() > 0 else "e = 0 on every sample")
-        if published is not None and y.max() > 0:
-            axes.axline((0, 0), slope=published, color=INK, linewidth=1.3, linestyle=(0, (4, 3)))
-            remarks.append(f"paper's U-Mesh {published:.1e}")
-    if len(y) and y.max() > 0:
-        axes.set_ylim(0, 1.05 * float(y.max()))
-    else:
-        axes.yaxis.set_visible(False)
-        axes.set_ylim(0, 1)
+    (dots,) = axes.plot(x[~beyond], per_m * e[~beyond], ".", rasterized=True)
+    dots.set(color=style_of(samples.entry.method).colour, alpha=0.5, mew=0)
+    dots.set_markersize(5 if len(x) > 300 else 9)
+    axes.set_xlim(0, 1.05 * float(x.max()))
+    axes.set_ylim(0, 1.12 * per_m * top)
+    axes.axline((0, 0), slope=slope * per_m / x_unit, color=INK, linewidth=1.4)
+    remarks = [f"slope {number(1e3 * slope)} mm/m"]
+    if published is not None:
+        dashes = (0, (4, 3))
+        line = published * per_m / x_unit
+        axes.axline((0, 0), slope=line, color=INK, linewidth=1.4, linestyle=dashes)
     if not finite.all():
-        remarks.append(f"{int((~finite).sum())} of {len(e)} without prediction")
-    frame = {"facecolor": "white", "edgecolor": LIGHT, "pad": 2.5}
-    place: dict[str, Any] = {"xycoords": "axes fraction", "va": "top", "fontsize": 9, "color": INK}
-    axes.annotate("\n".join(remarks), (0.04, 0.95), bbox=frame, **place)
-    axes.yaxis.set_major_locator(MaxNLocator(5))
-    axes.yaxis.set_major_formatter(
-        FuncFormatter(lambda value, _: f"{value:.1e}" if 0 < value < 1e-3 else f"{value:.3g}")
-    )
+        remarks.append(f"{int((~finite).sum())} of {len(finite)} without prediction")
+    if beyond.any():
+        remarks.append(f"↑ {int(beyond.sum())} up to {number(per_m * float(e.max()))} {unit}")
+        height = np.full(int(beyond.sum()), 1.08 * per_m * top)
+        axes.plot(x[beyond], height, "^", color=style_of(samples.entry.method).colour, ms=6)
+    title = plain("\n".join([shortened(str(name), 27), *remarks]))
+    axes.set_title(title, fontsize=NOTE, loc="left", color=INK)
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.xaxis.set_major_locator(MaxNLocator(4))

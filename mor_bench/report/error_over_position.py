@@ -17,16 +17,21 @@ from mor_bench.analysis.told import classes_of, is_observed, told_text
 from mor_bench.report.canvas import (
     GREY,
     INK,
+    LABEL,
+    NOTE,
+    TICK,
     WIDTH_IN,
     Picture,
     log_ticks,
     new_figure,
     plain,
     shortened,
+    uncut,
 )
 from mor_bench.report.entries import Entry, entries_of
-from mor_bench.report.number_format import percent, short_swept
+from mor_bench.report.number_format import percent
 from mor_bench.report.projection import View
+from mor_bench.report.short_names import short_names
 from mor_bench.results.comparison import Comparison
 from mor_bench.scene.mesh import Mesh
 
@@ -35,7 +40,7 @@ COLOUR_MAP = "viridis_r"
 AZIMUTH, ELEVATION = -68.0, 52.0
 """Direction of view, in degrees; from below if most loads act there."""
 
-PANEL_IN = 3.4
+PANEL_IN = 2.8
 """Largest height of a panel, in inches."""
 
 READING = (
@@ -48,14 +53,15 @@ READING = (
 
 @dataclass(frozen=True)
 class PatchErrors:
-    """A configuration, what it is told, and its median relative L2 error at each patch.
+    """A configuration, what it is told, its errors at the patches, and its short name.
 
-    The error is NaN without a sample.
+    An error is the median relative L2 error; it is NaN at a patch without a sample.
     """
 
     entry: Entry
     told: str
     errors: NDArray[np.float64]
+    name: str
 
     @property
     def finite(self) -> NDArray[np.float64]:
@@ -105,21 +111,50 @@ def error_over_position(comparison: Comparison, dataset: str) -> Picture | None:
     except (OSError, KeyError):
         return None
     maps, observed = [], is_observed(comparison, dataset)
-    for entry in _best_of_each_class(entries_of(comparison, dataset)):
+    entries = entries_of(comparison, dataset)
+    names = short_names([e.row for e in entries])
+    for entry in _best_of_each_class(entries):
         try:
             relative = np.asarray(comparison.samples(entry.row)["relative_l2"])
         except (OSError, KeyError):
             continue
         errors = median_per_patch(relative, regions, len(centres))
-        maps.append(PatchErrors(entry, told_text(entry.row.told, observed), errors))
+        told = told_text(entry.row.told, observed)
+        maps.append(PatchErrors(entry, told, errors, str(names[entry.label])))
     finite = np.concatenate([np.zeros(0), *(found.finite for found in maps)])
     if not len(finite):
         return None
-    scale = LogNorm(100 * float(finite.min()), 100 * float(finite.max()) * (1 + 1e-9))
+    low, high = uncut(finite)
+    scale = LogNorm(100 * low, 100 * high * (1 + 1e-9))
+    finding = _finding(maps)
+    subject = f"{dataset}: error over the position of the load; a dot is a load patch"
+    figure = _draw(mesh, centres, maps, scale, (finding, subject))
+    details = " ".join(filter(None, (found.sentence(centres) for found in maps)))
+    if float(finite.max()) > high * (1 + 1e-9):
+        details += f" The colours end at {percent(high)} %; the largest error is "
+        details += f"{percent(float(finite.max()))} %."
     title = "Error over the position of the load"
-    figure = _draw(mesh, centres, maps, scale, f"{title} – {dataset}")
-    finding = " ".join(filter(None, (found.sentence(centres) for found in maps)))
-    return Picture("error-over-position", title, f"{finding} {READING}", figure, finding)
+    return Picture("error-over-position", title, f"{details} {READING}", figure, finding)
+
+
+def _finding(maps: list[PatchErrors]) -> str:
+    """Say which method depends most on the position of the load."""
+    spread = {
+        found.name: float(found.finite.max() / found.finite.min())
+        for found in maps
+        if len(found.finite)
+    }
+    most = max(spread, key=lambda method: spread[method])
+    least = min(spread, key=lambda method: spread[method])
+    if spread[most] < 1.05 * spread[least]:
+        return (
+            f"The error of {shortened(most, 40)} varies {spread[most]:.2g}-fold with the position"
+        )
+    least = min(spread, key=lambda method: spread[method])
+    return (
+        f"The position of the load changes the error of {shortened(most, 30)} "
+        f"{spread[most]:.2g}-fold, of {shortened(least, 30)} {spread[least]:.2g}-fold"
+    )
 
 
 def _best_of_each_class(entries: list[Entry]) -> list[Entry]:
@@ -136,8 +171,9 @@ def _draw(
     centres: NDArray[np.float64],
     maps: list[PatchErrors],
     scale: LogNorm,
-    title: str,
+    heading: tuple[str, str],
 ) -> Figure:
+    """Draw a panel per map; `heading` is the finding and the subject."""
     columns = min(3, len(maps))
     rows = ceil(len(maps) / columns)
     above = centres[:, 2].mean() >= mesh.bounds[:, 2].mean()
@@ -147,7 +183,7 @@ def _draw(
     low, high = screen.min(axis=0) - margin, screen.max(axis=0) + margin
     wide, tall = high - low
     points_per_m = 72 * min(0.96 * WIDTH_IN / columns / wide, PANEL_IN / tall)
-    figure = new_figure(1.2 + rows * (0.5 + points_per_m / 72 * tall), title)
+    figure = new_figure(0.75 + rows * (0.42 + points_per_m / 72 * tall), *heading)
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.ravel():
         axes.set_axis_off()
@@ -158,8 +194,13 @@ def _draw(
         view.draw_surface(axes, mesh.points, mesh.boundary_facets, (BODY, BODY_EDGE))
         _draw_patches(axes, view.project(centres)[0], found, scale, points_per_m)
     mappable = ScalarMappable(scale, COLOUR_MAP)
-    bar = figure.colorbar(mappable, ax=grid, orientation="horizontal", aspect=45, pad=0.02)
-    bar.set_label("median relative L2 error of the loads on a patch (%)", fontsize=10, color=INK)
+    most = max(float(found.finite.max(initial=0.0)) for found in maps)
+    extend = "max" if 100 * most > (scale.vmax or np.inf) else "neither"
+    bar = figure.colorbar(
+        mappable, ax=grid, orientation="horizontal", aspect=50, pad=0.02, extend=extend
+    )
+    bar.ax.tick_params(labelsize=TICK)
+    bar.set_label("median relative L2 error of the loads on a patch (%)", fontsize=LABEL, color=INK)
     log_ticks(bar.ax.xaxis, (scale.vmin or 1.0, scale.vmax or 1.0))
     return figure
 
@@ -191,5 +232,5 @@ def _draw_patches(
         zorder=6,
     )
     axes.plot(*screen[known & ~shown].T, "x", color=INK, ms=size, zorder=6)
-    name = shortened(f"{found.entry.method}  {short_swept(found.entry.swept)}".rstrip(), 44)
-    axes.set_title(plain(f"{name}\ntold: {found.told}"), fontsize=9.5, loc="left", color=INK)
+    title = plain(f"{shortened(found.name, 30)}\ntold: {found.told}")
+    axes.set_title(title, fontsize=NOTE, loc="left", color=INK)

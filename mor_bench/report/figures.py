@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mor_bench.report.canvas import Drawn, save, styles_of
+from mor_bench.report.canvas import Drawn, save
 from mor_bench.report.entries import Analysis, dataset_names
 from mor_bench.report.error_against_deformation import error_against_deformation
 from mor_bench.report.error_against_time import error_against_time
@@ -19,18 +19,17 @@ ALL = "all datasets"
 
 def write_figures(comparison: Comparison, analysis: Analysis) -> list[Drawn]:
     """Draw and write every figure for which there is data, dataset by dataset."""
-    styles = styles_of(comparison)
     drawn = []
     for dataset in dataset_names(comparison):
         for picture in (
-            error_against_time(comparison, dataset, styles, analysis),
-            learning_curves(comparison, dataset, styles),
-            loss_curves(comparison, dataset, styles),
-            error_against_deformation(comparison, dataset, styles),
+            error_against_time(comparison, dataset, analysis),
+            learning_curves(comparison, dataset),
+            loss_curves(comparison, dataset),
+            error_against_deformation(comparison, dataset),
             error_over_position(comparison, dataset),
-            worst_samples(comparison, dataset, styles),
-            singular_values(comparison, dataset, styles),
+            worst_samples(comparison, dataset),
+            singular_values(comparison, dataset),
         ):
             drawn += [save(picture, comparison, dataset)] if picture else []
-    profile = performance_profile(analysis, styles)
+    profile = performance_profile(analysis)
     return drawn + ([save(profile, comparison, ALL)] if profile else [])

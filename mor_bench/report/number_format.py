@@ -14,7 +14,7 @@ SHORT_NAMES = {
     "tolerance": "tol",
     "cubature_tolerance": "ctol",
     "n_input_modes": "k",
-    "n_output_modes": "r",
+    "n_output_modes": "m",
 }
 """Names of swept parameters where space is short; others use the initials of their words."""
 

@@ -10,6 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from numpy.typing import NDArray
 
+from mor_bench.report.method_styles import channels
+
 Array = NDArray[np.float64]
 
 
@@ -22,11 +24,16 @@ class View:
 
     def project(self, points: Array) -> tuple[Array, Array]:
         """Rotate points into screen coordinates (n, 2), m, and nearness to the viewer (n,), m."""
+        towards, right, up = self.axes()
+        return points @ np.stack([right, up]).T, points @ towards
+
+    def axes(self) -> tuple[Array, Array, Array]:
+        """Unit vectors towards the viewer, to the right and upwards on the screen."""
         azimuth, elevation = np.deg2rad([self.azimuth, self.elevation])
         ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
         towards = np.array([ce * ca, ce * sa, se])
         right = np.array([-sa, ca, 0.0])
-        return points @ np.stack([right, np.cross(towards, right)]).T, points @ towards
+        return towards, right, np.asarray(np.cross(towards, right))
 
     def facing(self, points: Array, facets: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Mark the facets with a visible outer side."""
@@ -41,18 +48,20 @@ class View:
         axes.add_collection(LineCollection(list(self.project(points)[0][edges]), **look))
 
     def draw_surface(
-        self, axes: Axes, points: Array, facets: NDArray[np.int64], colours: tuple[str, str]
+        self, axes: Axes, points: Array, facets: NDArray[np.int64], colours: tuple[str | Array, str]
     ) -> None:
         """Draw visible facets from far to near; facets that face upwards are brighter.
 
-        ``colours`` are those of the facets, such as ``#7fb2d6``, and of their edges.
+        ``colours`` are those of the facets, such as ``#7fb2d6`` or one (n_facets, 3) each, and of
+        their edges.
         """
-        seen = facets[self.facing(points, facets)]
+        facing = self.facing(points, facets)
+        seen = facets[facing]
         screen, nearness = self.project(points)
         order = np.argsort(nearness[seen].mean(axis=1))
         normal = normals(points, seen)
         up = normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)
-        base = np.array([int(colours[0][i : i + 2], 16) / 255 for i in (1, 3, 5)])
+        base = np.array(channels(colours[0])) if isinstance(colours[0], str) else colours[0][facing]
         shade = 1.0 - 0.75 * (0.35 + 0.3 * np.clip(up, -1, 1))[:, None]
         faces = 1.0 - (1.0 - base) * np.clip(shade, 0.3, 1.0)
         axes.add_collection(

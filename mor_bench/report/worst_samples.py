@@ -1,4 +1,4 @@
-"""The figure of worst test samples: predicted mesh over reference, in parallel projection."""
+"""The figure of worst test samples: meshes coloured by their error, in parallel projection."""
 
 from __future__ import annotations
 
@@ -8,28 +8,43 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from mor_bench.report.canvas import (
+    DPI,
     GREY,
     INK,
+    LABEL,
+    NOTE,
+    TICK,
     WIDTH_IN,
     Picture,
-    Style,
+    length_unit,
+    log_ticks,
     new_figure,
     plain,
     shortened,
+    uncut,
 )
 from mor_bench.report.entries import Entry, best_per_method, entries_of
-from mor_bench.report.number_format import metres, percent, short_swept
+from mor_bench.report.number_format import number, percent
 from mor_bench.report.projection import View, normals
+from mor_bench.report.rendering import WIRE, Look, Shot, show_shots
+from mor_bench.report.short_names import short_names
 from mor_bench.results.comparison import Comparison
 from mor_bench.scene.mesh import Mesh
 
-REFERENCE, REFERENCE_EDGE = "#7fb2d6", "#33607f"
-REST, PREDICTION, FORCE = "#c4c4c4", "#D55E00", "#222222"
+FORCE = "#B00020"
+COLOUR_MAP = "viridis_r"
+
+DECADES = 2.5
+"""Decades of the colour scale below the largest error."""
+
+MOST_PANELS = 12
 
 VIEW = View(azimuth=-68.0, elevation=20.0)
 """x points right, z points up; the faces y-min and z-max are visible."""
@@ -37,11 +52,12 @@ VIEW = View(azimuth=-68.0, elevation=20.0)
 CAPTION = (
     "Each panel shows a method's configuration with the smallest ē (of the "
     "validation part if there is one), on its test sample "
-    "with the largest e. A mean hides such samples. Samples without a prediction cannot "
-    "be drawn; the title gives their number. Filled: the reference. Lines: the "
-    "prediction. Grey: the body at rest. Deformations are not magnified, and all panels "
-    "have the same scale. The arrow shows the direction and place of the force, not its "
-    "size."
+    "with the largest e. A mean hides such samples. Full-order solves on the dataset's mesh are "
+    "left out. Samples without a prediction cannot "
+    "be drawn; the title gives their number. Colours: distance of each node of the prediction "
+    "from the reference. Dark lines: the reference. Grey lines: the body at rest. Deformations "
+    "are not magnified, and all panels have the same scale. The red arrow shows the direction and "
+    "place of the force, not its size."
 )
 
 
@@ -67,42 +83,117 @@ class WorstSample:
     error_m: float
     relative_l2: float
 
+    @property
+    def nodal_m(self) -> NDArray[np.float64]:
+        """Distance of each node from the reference (n_nodes,), m; NaN without a prediction."""
+        return np.asarray(np.linalg.norm(self.prediction - self.reference, axis=1))
 
-def worst_samples(comparison: Comparison, dataset: str, styles: dict[str, Style]) -> Picture | None:
+    @property
+    def largest_m(self) -> float:
+        """Largest distance of a node, m; zero without a prediction."""
+        found = self.nodal_m[np.isfinite(self.nodal_m)]
+        return float(found.max(initial=0.0))
+
+
+def worst_samples(comparison: Comparison, dataset: str) -> Picture | None:
     """Draw the worst sample of each method's best configuration; None if there are none."""
     try:
         arrays = comparison.dataset_arrays(dataset)
         mesh = Mesh(np.asarray(arrays["points"]), np.asarray(arrays["cells"]))
     except (OSError, KeyError):
         return None
-    best = best_per_method(entries_of(comparison, dataset))
-    samples = [sample for entry in best if (sample := _read(comparison, entry)) is not None]
+    entries = entries_of(comparison, dataset)
+    best = [e for e in best_per_method(entries) if not e.row.reference]
+    found = [s for e in best if (s := _read(comparison, e)) is not None]
+    samples = [s for s in found if s.largest_m > 0 or not np.isfinite(s.error_m)]
+    samples = sorted(samples, key=lambda s: s.largest_m)[:MOST_PANELS]
     if not samples:
         return None
+    caption, drawn = CAPTION, {s.entry.method for s in samples}
+    if left_out := [s.entry.method for s in found if s.entry.method not in drawn]:
+        caption += (
+            f" Not drawn, because without an error or with a larger one: {', '.join(left_out)}."
+        )
+    names = short_names([e.row for e in entries])
+    titles = [str(names[s.entry.label]) for s in samples]
+    figure, how = _draw(mesh, samples, titles, dataset)
+    return Picture(
+        "worst-samples",
+        "Worst test sample of each method",
+        f"{caption} {how}",
+        figure,
+        _finding(samples),
+    )
+
+
+def _draw(
+    mesh: Mesh, samples: list[WorstSample], titles: list[str], dataset: str
+) -> tuple[Figure, str]:
+    """Draw a panel per sample; return also how the meshes were drawn, in a sentence."""
     columns = min(3 if len(samples) > 4 else 2, len(samples))
     rows = ceil(len(samples) / columns)
     arrows = [_arrow(mesh, sample) for sample in samples]
     limits = _limits(mesh, samples, arrows)
     tall = float(np.divide(*np.diff(limits, axis=0)[0, ::-1]))
-    title = "Worst test sample of each method"
-    height = 0.9 + rows * (0.45 + WIDTH_IN / columns * min(tall, 1.0))
-    figure = new_figure(height, f"{title} – {dataset}")
+    subject = f"{dataset}: the worst test sample of each method, coloured by its error"
+    height = 0.95 + rows * (0.5 + WIDTH_IN / columns * min(tall, 1.0))
+    figure = new_figure(height, _finding(samples), subject)
     grid = figure.subplots(rows, columns, squeeze=False)
+    high = uncut([s.largest_m for s in samples])[1]
+    width = round(1.5 * DPI * WIDTH_IN / columns)
+    colours = (high / 10**DECADES, high)
+    look = Look(mesh.boundary_facets, VIEW, limits, colours, COLOUR_MAP, width)
+    shots = [
+        Shot(mesh.points + s.prediction, s.nodal_m, mesh.points + s.reference, mesh.points)
+        for s in samples
+    ]
     for axes in grid.ravel():
         axes.set_axis_off()
-    for axes, sample, arrow in zip(grid.ravel(), samples, arrows, strict=False):
-        axes.set_aspect("equal")
-        axes.set_xlim(limits[0, 0], limits[1, 0])
-        axes.set_ylim(limits[0, 1], limits[1, 1])
-        _draw_sample(axes, mesh, sample, arrow)
+    panels = grid.ravel()[: len(samples)]
+    how = show_shots(list(panels), shots, look)
+    for axes, sample, arrow, title in zip(panels, samples, arrows, titles, strict=True):
+        _write_panel(axes, sample, arrow, title)
+    _draw_keys(figure, grid, look, max(s.largest_m for s in samples))
+    return figure, how
+
+
+def _draw_keys(figure: Figure, grid: NDArray[Any], look: Look, largest_m: float) -> None:
+    """Draw the scale of the colours and the legend of the lines."""
+    low, high = look.values
+    unit, per_m = length_unit(high)
+    bar = figure.colorbar(
+        ScalarMappable(LogNorm(per_m * low, per_m * high), COLOUR_MAP),
+        ax=grid,
+        orientation="horizontal",
+        aspect=50,
+        pad=0.02,
+        extend="both" if largest_m > 1.001 * high else "min",
+    )
+    bar.ax.tick_params(labelsize=TICK)
+    log_ticks(bar.ax.xaxis, (per_m * low, per_m * high))
+    bar.set_label(f"distance of each node from the reference ({unit})", fontsize=LABEL, color=INK)
     handles = [
+        Line2D([], [], color=WIRE, linewidth=1.0, label="reference"),
         Line2D([], [], color=GREY, linewidth=0.8, label="at rest"),
-        Patch(facecolor=REFERENCE, edgecolor=REFERENCE_EDGE, label="reference (full-order)"),
-        Line2D([], [], color=PREDICTION, linewidth=1.5, label="prediction"),
-        Line2D([], [], color=FORCE, linewidth=1.5, marker=">", label="total force"),
+        Line2D([], [], color=FORCE, linewidth=1.6, marker=">", label="total force"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    return Picture("worst-samples", title, CAPTION, figure)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=3, fontsize=NOTE, frameon=False
+    )
+
+
+def _finding(samples: list[WorstSample]) -> str:
+    """Name the methods with the smallest and the largest error of a node on their worst sample."""
+    answered = [s for s in samples if s.largest_m > 0]
+    if not answered:
+        return "No method predicts its worst sample"
+    least, most = answered[0], answered[-1]
+    unit, per_m = length_unit(most.largest_m)
+    text = f"On its worst sample, {shortened(least.entry.method, 30)} errs by up to "
+    text += f"{number(per_m * least.largest_m)} {unit}"
+    if least is most:
+        return text
+    return f"{text}, {shortened(most.entry.method, 30)} by {number(per_m * most.largest_m)} {unit}"
 
 
 def _read(comparison: Comparison, entry: Entry) -> WorstSample | None:
@@ -160,34 +251,29 @@ def _arrow(mesh: Mesh, sample: WorstSample) -> NDArray[np.float64] | None:
     return np.stack([place - arrow, place] if pushes else [place, place + arrow])
 
 
-def _draw_sample(
-    axes: Axes, mesh: Mesh, sample: WorstSample, arrow: NDArray[np.float64] | None
+def _write_panel(
+    axes: Axes, sample: WorstSample, arrow: NDArray[np.float64] | None, name: str
 ) -> None:
-    facets = mesh.boundary_facets
-    VIEW.draw_edges(axes, mesh.points, facets, {"colors": REST, "linewidths": 0.5, "zorder": 1})
-    VIEW.draw_surface(axes, mesh.points + sample.reference, facets, (REFERENCE, REFERENCE_EDGE))
-    predicted = np.asarray(np.isfinite(sample.prediction).all(axis=1))
+    """Write a panel's title, and draw the arrow of the force."""
     figures = "no prediction: the method failed on it"
-    if predicted.any():
-        points = mesh.points + sample.prediction
-        whole = facets[predicted[facets].all(axis=1)]
-        look = {"colors": PREDICTION, "linewidths": 0.9, "zorder": 4}
-        VIEW.draw_edges(axes, points, whole[VIEW.facing(points, whole)], look)
-        figures = f"e = {metres(sample.error_m)} m, relative L2 = {percent(sample.relative_l2)} %"
+    if np.isfinite(sample.prediction).all(axis=1).any():
+        unit, per_m = length_unit(sample.largest_m)
+        figures = f"up to {number(per_m * sample.largest_m)} {unit}, "
+        figures += f"rel. L2 {percent(sample.relative_l2)} %"
         if sample.entry.n_failed:
             figures += f"; {sample.entry.n_failed} failed"
     if arrow is not None:
         start, end = VIEW.project(arrow)[0]
         _draw_force(axes, start, end, float(np.linalg.norm(sample.forces.sum(axis=0))))
-    name = shortened(f"{sample.entry.method}  {short_swept(sample.entry.swept)}".rstrip(), 44)
-    axes.set_title(plain(f"{name}\n{figures}"), fontsize=9.5, loc="left", color=INK)
+    title = plain(f"{shortened(name, 30)}\n{figures}")
+    axes.set_title(title, fontsize=NOTE, loc="left", color=INK)
 
 
 def _draw_force(
     axes: Axes, start: NDArray[np.float64], end: NDArray[np.float64], newton: float
 ) -> None:
     """Draw the arrow of the force with its size in N beside the upper end."""
-    shape = {"arrowstyle": "-|>", "color": FORCE, "linewidth": 1.6, "shrinkA": 0, "shrinkB": 0}
+    shape = {"arrowstyle": "-|>", "color": FORCE, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops=shape, zorder=6)
     frame = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
     beside, other = (end, start) if end[1] > start[1] else (start, end)
@@ -202,7 +288,7 @@ def _draw_force(
         f"{newton:.2g} N",
         (beside[0], beside[1]),
         **place,
-        fontsize=8.5,
+        fontsize=NOTE,
         color=FORCE,
         bbox=frame,
         zorder=6,

@@ -4,7 +4,7 @@ OUT/results.json       schema version, machine, rows, learning curves
 OUT/results.csv        the same rows, flat
 OUT/comparison.json    conclusions from all rows, see `mor_bench.analysis.analyse.analyse`
 OUT/samples/*.h5       raw latencies and per-sample errors of each row, arrays of each dataset
-OUT/figures/*.png, OUT/report.html
+OUT/figures/*.png and *.svg, OUT/report.html
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ EXTRAS = {
     "mkl": (("pypardiso",), "the method `fem-pardiso` and the solver `pardiso`"),
     "cluster": (("distributed",), "data generation and fits on a Dask cluster"),
     "onnx": (("onnx", "onnxruntime"), "`mor-bench export onnx` and its check"),
+    "viz": (("pyvista",), "rendered meshes; without it, matplotlib draws them"),
 }
 """The modules of each extra, and its use."""
 

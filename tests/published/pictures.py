@@ -20,7 +20,7 @@ from matplotlib import image
 from numpy.typing import NDArray
 from PIL import Image
 
-from mor_bench.report.canvas import DPI, styles_of
+from mor_bench.report.canvas import as_png
 from mor_bench.report.error_against_time import error_against_time
 from mor_bench.snapshots.store import write_atomically
 from tests.published.stored import ROOT, EvidenceError, run_of
@@ -37,19 +37,15 @@ def drawn(source: str, kind: str, dataset: str) -> bytes:
     if kind != "error-against-time":
         raise EvidenceError(f"{source}: there is no picture {kind!r}.")
     run = run_of(source)
-    picture = error_against_time(run, dataset, styles_of(run), run.analysis or {})
+    picture = error_against_time(run, dataset, run.analysis or {})
     if picture is None:
         raise EvidenceError(f"{source}: no configuration of {dataset} can be drawn.")
-    buffer = io.BytesIO()
-    picture.figure.savefig(buffer, format="png", dpi=DPI)
-    digests = {
+    digests: dict[str, str | None] = {
         "Software": f"matplotlib {matplotlib.__version__}",
         "Source": f"{source} {kind} {dataset} {source_digest(source)}",
-        "Comment": pixel_digest(buffer.getvalue()),
+        "Comment": pixel_digest(as_png(picture.figure, {})),
     }
-    buffer = io.BytesIO()
-    picture.figure.savefig(buffer, format="png", dpi=DPI, metadata=digests)
-    return buffer.getvalue()
+    return as_png(picture.figure, digests)
 
 
 def source_digest(source: str) -> str:
