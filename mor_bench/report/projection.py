@@ -61,9 +61,12 @@ class View:
         order = np.argsort(nearness[seen].mean(axis=1))
         normal = normals(points, seen)
         up = normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)
-        base = np.array(channels(colours[0])) if isinstance(colours[0], str) else colours[0][facing]
-        shade = 1.0 - 0.75 * (0.35 + 0.3 * np.clip(up, -1, 1))[:, None]
-        faces = 1.0 - (1.0 - base) * np.clip(shade, 0.3, 1.0)
+        if isinstance(colours[0], str):
+            base = np.array(channels(colours[0]))
+            shade = 1.0 - 0.75 * (0.35 + 0.3 * np.clip(up, -1, 1))[:, None]
+            faces = 1.0 - (1.0 - base) * np.clip(shade, 0.3, 1.0)
+        else:  # colours that mean values stay near the colour scale
+            faces = colours[0][facing] * (0.93 + 0.07 * np.clip(up, -1, 1))[:, None]
         axes.add_collection(
             PolyCollection(
                 list(screen[seen[order]]),
