@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from mor_bench.errors import MorBenchError as MorBenchError
     from mor_bench.method_loading import load_method as load_method
     from mor_bench.method_loading import load_surrogate as load_surrogate
-    from mor_bench.results.comparison import Comparison as Comparison
-    from mor_bench.runs.compare import run as run
+    from mor_bench.report.notebook import Comparison as Comparison
+    from mor_bench.report.notebook import run as run
     from mor_bench.runs.pick import Verdict as Verdict
     from mor_bench.runs.pick import pick as pick
     from mor_bench.runs.single_fit import Fit as Fit
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from mor_bench.surrogate import Surrogate as Surrogate
 
 _HOMES = {
-    "Comparison": "mor_bench.results.comparison",
+    "Comparison": "mor_bench.report.notebook",
     "Fit": "mor_bench.runs.single_fit",
     "MorBenchError": "mor_bench.errors",
     "Scene": "mor_bench.scene.scene",
@@ -53,7 +53,7 @@ _HOMES = {
     "load_scene": "mor_bench.scene.scene",
     "load_surrogate": "mor_bench.method_loading",
     "pick": "mor_bench.runs.pick",
-    "run": "mor_bench.runs.compare",
+    "run": "mor_bench.report.notebook",
 }
 
 

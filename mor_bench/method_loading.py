@@ -13,6 +13,7 @@ from mor_bench.checked_files import parse_json
 from mor_bench.errors import (
     MorBenchError,
     NotFittedError,
+    SpecError,
     StoreError,
     UnsupportedSceneError,
     UnusableClassError,
@@ -28,6 +29,7 @@ from mor_bench.specs import (
     load_method_spec,
     load_recorded_spec,
 )
+from mor_bench.specs.inline_parameters import split_method
 from mor_bench.surrogate import Surrogate
 
 
@@ -37,7 +39,8 @@ def load_method(source: str | Path, **parameters: Any) -> Surrogate:
     Parameters
     ----------
     source : str or Path
-        A name in ``methods/``, or the path of a TOML file.
+        A name in ``methods/``, or the path of a TOML file; values may stand in brackets behind it,
+        as in ``"pod[n_modes=20]"``.
     **parameters
         Replace the file's hyperparameters.
 
@@ -49,6 +52,8 @@ def load_method(source: str | Path, **parameters: Any) -> Surrogate:
         If the method needs an extra that is not installed.
     """
     spec = load_method_spec(source)
+    if isinstance(source, str) and any(len(v) > 1 for v in split_method(source)[1].values()):
+        raise SpecError(f"{source}: each parameter must have one value here.")
     surrogate = spec.load_class()
     return make_surrogate(surrogate, {**spec.parameters, **parameters})
 

@@ -16,10 +16,10 @@ from __future__ import annotations
 import difflib
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal, Self, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args, get_origin
 
 from pydantic import (
     BaseModel,
@@ -49,18 +49,24 @@ class CommandLine:
     ----------
     flag : str
         Name of the flag. Default: the option's name with hyphens.
+    short : str
+        Short name of the flag, such as ``-q``.
     metavar : str or None
         Placeholder of the value in the help.
     default : str or None
         Description of a default that depends on something else.
     scale : float
         Factor from the number on the command line to the option's value.
+    panel : str
+        Heading in the help; that of the class which declares the option.
     """
 
     flag: str = ""
     metavar: str | None = None
     default: str | None = None
     scale: float = 1.0
+    panel: str = ""
+    short: str = ""
 
 
 Cluster = Annotated[
@@ -79,7 +85,12 @@ class InvalidOptionError(InvalidInputError):
 
 
 class Options(BaseModel):
-    """A frozen group of options, checked at construction."""
+    """A frozen group of options, checked at construction.
+
+    `panel` is the heading in the help of the options that a class declares.
+    """
+
+    panel: ClassVar[str] = "Options"
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -133,6 +144,8 @@ class Options(BaseModel):
 class FolderOptions(Options):
     """Folders that every command with data uses."""
 
+    panel: ClassVar[str] = "Folders"
+
     cache: Annotated[
         Path | None,
         Field(description="Folder for generated datasets and finished fits."),
@@ -148,6 +161,8 @@ class FolderOptions(Options):
 class DataOptions(FolderOptions):
     """Options of every command that reads a dataset."""
 
+    panel: ClassVar[str] = "Data"
+
     limit: Annotated[
         int | None,
         Field(ge=1, description="Use only the first samples; they cover the load regions evenly."),
@@ -162,6 +177,8 @@ class DataOptions(FolderOptions):
 
 class TrainOptions(DataOptions):
     """Options of every command that fits."""
+
+    panel: ClassVar[str] = "Training"
 
     split: Annotated[
         SplitBy | None,
@@ -184,6 +201,8 @@ class TrainOptions(DataOptions):
 
 class FitOptions(TrainOptions):
     """Options of `mor_bench.fit`."""
+
+    panel: ClassVar[str] = "Training"
 
     threads: Annotated[
         int | None,
@@ -208,6 +227,8 @@ class FitOptions(TrainOptions):
 
 class RunOptions(TrainOptions):
     """Options of `mor_bench.run`."""
+
+    panel: ClassVar[str] = "Comparison"
 
     profile: Annotated[
         Profile,
@@ -283,11 +304,14 @@ def command_line(options: type[Options]) -> Iterator[tuple[str, FieldInfo, Comma
     for name, field in options.model_fields.items():
         shown = next((item for item in field.metadata if isinstance(item, CommandLine)), None)
         shown = shown or CommandLine()
-        yield name, field, shown if shown.flag else _with_flag(shown, name)
+        flag = shown.flag or f"--{name.replace('_', '-')}"
+        yield name, field, replace(shown, flag=flag, panel=_owner(options, name).panel)
 
 
-def _with_flag(shown: CommandLine, name: str) -> CommandLine:
-    return CommandLine(f"--{name.replace('_', '-')}", shown.metavar, shown.default, shown.scale)
+def _owner(options: type[Options], name: str) -> type[Options]:
+    """Return the class that declares an option."""
+    groups = [base for base in options.__mro__ if issubclass(base, Options)]
+    return next(base for base in reversed(groups) if name in base.model_fields)
 
 
 def allowed_values(field: FieldInfo, scale: float = 1.0) -> str:

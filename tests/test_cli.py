@@ -109,7 +109,11 @@ def test_list_names_every_dataset_and_method() -> None:
     for kind in ("datasets", "methods"):
         names = [entry["name"] for entry in listed[kind]]
         assert names == [*list_suite(kind)]
-        assert all(f"  {entry['name']}" in plain for entry in listed[kind])
+        assert all(f"  {entry['name']} " in plain for entry in listed[kind])
+        for entry in listed[kind]:
+            assert f"{kind.capitalize()}: {entry['family']}\n" in plain
+            assert entry["needs"] in plain
+            assert entry["title"].split()[0] in plain
 
 
 def test_check_fails_if_any_file_is_invalid_and_reports_all(tmp_path: Path) -> None:
@@ -178,6 +182,9 @@ def test_generate_prints_the_folder_of_the_dataset_and_of_its_test_sets(tmp_path
             "export vtu beam-tiny --sample 0 --out . --part no",
             "`--part` must be train, validation, test",
         ),
+        ("show hpdo", "'hpdo' is no run, method or dataset; did you mean 'hpod'?"),
+        ("run beam-tiny --quiet --verbose", "`--quiet` and `--verbose` cannot be used together."),
+        ("run beam-tiny -m pod[n_mods=3]", "unknown key `n_mods`; did you mean 'n_modes'?"),
         ("new-method Bad", "the name of a method must hold lower-case letters"),
     ],
 )

@@ -86,8 +86,10 @@ def test_the_page_filters_rows_without_a_script(made: Comparison) -> None:
 def test_the_console_names_each_group_before_its_rows(made: Comparison) -> None:
     stream = io.StringIO()
     print_tables(made, Console(file=stream, width=120))
-    lines = [line.split("  ")[0].strip() for line in stream.getvalue().splitlines()]
-    assert lines.index("– equations, snapshots –") + 1 == lines.index("pod")
+    lines = [
+        line.removeprefix("  ").split("  ")[0].strip() for line in stream.getvalue().splitlines()
+    ]
+    assert lines.index("– equations, snapshots –") + 1 == lines.index("* pod")
 
 
 def test_told_keeps_methods_that_are_told_no_more(made: Comparison) -> None:

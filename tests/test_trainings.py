@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 import mor_bench
-from mor_bench.report.console_tables import print_tables
+from mor_bench.report.console_tables import Detail, print_tables
 from mor_bench.report.page import render
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
@@ -55,7 +55,8 @@ def comparison(tmp_path_factory: pytest.TempPathFactory, own_cache: Path) -> Com
 def shown(comparison: Comparison) -> list[str]:
     """The console tables and the page of the comparison."""
     stream = io.StringIO()
-    print_tables(comparison, Console(file=stream, width=220))
+    console, detail = Console(file=stream, width=220), Detail(verbose=True, wide=True)
+    print_tables(comparison, console, detail=detail)
     return [stream.getvalue(), unescape(render(comparison)[-1].read_text(encoding="utf-8"))]
 
 
@@ -115,7 +116,7 @@ def test_a_training_out_of_time_reports_its_expected_duration(
     assert row.status == "failed"
     reason = OUT_OF_TIME.format("1.67")
     assert str(row.reason).startswith(reason)
-    assert f"{row.label}: failed: {reason}" in shown[0]
+    assert f"descent · channels 100: failed: {reason}" in shown[0]
     assert reason in shown[1]
 
 

@@ -61,7 +61,7 @@ def decide(
         settings={
             **comparison.settings,
             "datasets": list(comparison.datasets) or [dataset],
-            "methods": list(comparison.methods),
+            "methods": [table.get("asked") or name for name, table in comparison.methods.items()],
         },
     )
     if qualified:

@@ -8,14 +8,22 @@ from typing import Annotated
 
 import typer
 
+from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import Json
+from mor_bench.report.number_format import bytes_text
 from mor_bench.runs.cache_folder import cache_entries
 from mor_bench.snapshots.generate import default_cache
 
 app = typer.Typer(rich_markup_mode=None)
 
 
-@app.command()
+@command(
+    app,
+    {
+        "cache": "List everything in the cache.",
+        "cache beam-fine --clean": "Delete the generated samples of one dataset.",
+    },
+)
 def cache(
     names: Annotated[
         list[str] | None,
@@ -47,7 +55,7 @@ def cache(
     for entry in entries:
         many = f", {len(entry.folders)} folders" if len(entry.folders) > 1 else ""
         print(
-            f"{entry.kind:<8}{entry.name:<32}{entry.size_bytes / 1e6:>10,.1f} MB  "
+            f"{entry.kind:<8}{entry.name:<32}{bytes_text(entry.size_bytes):>9}  "
             f"{entry.changed:%Y-%m-%d}{many}"
         )
-    print(f"{folder}: {total / 1e6:,.1f} MB{' deleted' if clean else ''}")
+    print(f"{folder}: {bytes_text(total)}{' deleted' if clean else ''}")

@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from contextlib import suppress
 
 from rich.console import Console
 
+DEFAULT_WIDTH, LEAST_WIDTH = 80, 40
+"""Width without a terminal, and the least width that tables are fitted to, in characters."""
 
-def make_console(stderr: bool = False) -> Console:
-    """Make a console as wide as the terminal, or 120 columns wide if there is no terminal."""
-    stream = sys.stderr if stderr else sys.stdout
-    return Console(stderr=stderr, width=None if stream.isatty() else 120)
+
+def make_console(stderr: bool = False, quiet: bool = False) -> Console:
+    """Make a console for standard output or standard error; a quiet one prints nothing."""
+    return Console(stderr=stderr, quiet=quiet, width=console_width())
+
+
+def console_width() -> int:
+    """Return the environment's COLUMNS, else the width of the terminal, also beside a pipe."""
+    given = os.environ.get("COLUMNS", "")
+    if given.isdecimal() and int(given) > 0:
+        return max(int(given), LEAST_WIDTH)
+    for stream in (sys.stdout, sys.stderr, sys.stdin):
+        with suppress(OSError, ValueError, AttributeError):
+            if columns := os.get_terminal_size(stream.fileno()).columns:
+                return max(columns, LEAST_WIDTH)
+    return DEFAULT_WIDTH

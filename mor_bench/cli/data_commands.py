@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from functools import partial
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import typer
 from pydantic import Field
 from threadpoolctl import threadpool_limits
 
 from mor_bench.cli.console import make_console
-from mor_bench.cli.option_groups import DatasetName, Json, with_options
+from mor_bench.cli.help_texts import command
+from mor_bench.cli.option_groups import DatasetName, Json, QuietOutput, with_options
 from mor_bench.cli.progress_bars import show_progress
 from mor_bench.measure.discretisation_error import RefinementPlan
 from mor_bench.measure.discretisation_error import refine as refine_dataset
@@ -27,11 +28,15 @@ app = typer.Typer(rich_markup_mode=None)
 class GenerateOptions(DataOptions):
     """Options of `mor-bench generate`."""
 
+    panel: ClassVar[str] = "Data"
+
     cluster: Cluster = None
 
 
 class RefineOptions(FolderOptions):
     """Options of `mor-bench refine`."""
+
+    panel: ClassVar[str] = "Refinement"
 
     n_loads: Annotated[
         int,
@@ -46,7 +51,14 @@ class RefineOptions(FolderOptions):
     ] = 150_000
 
 
-@app.command()
+@command(
+    app,
+    {
+        "generate beam-coarse": "Generate all samples, on all cores.",
+        "generate beam-fine --tests --workers 2": "Generate the named test sets too, in two "
+        "processes.",
+    },
+)
 @with_options
 def generate(
     dataset: DatasetName,
@@ -55,6 +67,7 @@ def generate(
     ] = False,
     *,
     options: GenerateOptions,
+    output: QuietOutput,
 ) -> None:
     """Generate the snapshots of a dataset and print its folder.
 
@@ -62,7 +75,7 @@ def generate(
     """
     spec = load_generated_spec(dataset, options.suite)
     items = with_test_sets(spec) if tests else [spec]
-    with show_progress(make_console(stderr=True)) as listener:
+    with show_progress(make_console(stderr=True), quiet=output.quiet) as listener:
         for item in items:
             progress = partial(listener.generating, item.name)
             folder = generate_shards(
@@ -71,15 +84,29 @@ def generate(
             print(folder)
 
 
-@app.command()
+@command(
+    app,
+    {
+        "refine beam-coarse": "Solve five samples on meshes with two and four times the cells per "
+        "axis.",
+        "refine beam-tiny --levels 1 --json": "Refine once, and print the record as JSON.",
+    },
+)
 @with_options
-def refine(dataset: DatasetName, *, options: RefineOptions, as_json: Json = False) -> None:
+def refine(
+    dataset: DatasetName,
+    *,
+    options: RefineOptions,
+    output: QuietOutput,
+    as_json: Json = False,
+) -> None:
     """Measure the discretisation error of a dataset's mesh on refined meshes.
 
     Later runs show it beside the errors of the methods.
     """
     spec = load_generated_spec(dataset, options.suite)
-    with show_progress(make_console(stderr=True)) as listener, threadpool_limits(1):
+    console = make_console(stderr=True)
+    with show_progress(console, quiet=output.quiet) as listener, threadpool_limits(1):
         record = refine_dataset(
             spec,
             RefinementPlan(options.n_loads, options.levels, options.max_dofs),

@@ -9,8 +9,10 @@ from typing import Annotated
 
 import typer
 
+from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import Json
 from mor_bench.measure.machine_speed import MachineSpeed
+from mor_bench.report.number_format import bytes_text, seconds_text
 from mor_bench.runs.installation import Installation
 from mor_bench.runs.plan import plan
 from mor_bench.runs.self_test import require, self_test
@@ -30,7 +32,14 @@ SPEEDS = {
 """Names of the measured speeds; of the last one, more is better."""
 
 
-@app.command()
+@command(
+    app,
+    {
+        "doctor": "Show versions, sizes, missing extras and the speed of this machine.",
+        "doctor --self-test": "Test whether mor-bench works here.",
+    },
+    {2: "With --self-test: a check failed."},
+)
 def doctor(
     test: Annotated[
         bool,
@@ -68,13 +77,13 @@ def _self_test(as_json: bool) -> None:
 
 def _lines(found: Installation, seconds: float) -> Iterator[str]:
     machine = found.machine
-    memory = machine["memory_bytes"] / 1e9
-    yield f"{machine['processor']}, {machine['cores']} cores, {memory:.0f} GB of memory"
+    memory = bytes_text(machine["memory_bytes"])
+    yield f"{machine['processor']}, {machine['cores']} cores, {memory} of memory"
     yield f"{machine['system']}, Python {machine['python']}"
     yield ""
-    yield f"Installed: {len(found.libraries)} libraries, {found.size_bytes / 1e6:,.0f} MB"
+    yield f"Installed: {len(found.libraries)} libraries, {bytes_text(found.size_bytes)}"
     for library in found.libraries[:SHOWN]:
-        yield f"  {library.name} {library.version}: {library.size_bytes / 1e6:,.0f} MB"
+        yield f"  {library.name} {library.version}: {bytes_text(library.size_bytes)}"
     if "learn" not in found.missing:
         yield f"  PyTorch is built for {f'CUDA {found.cuda}' if found.cuda else 'processors only'}."
     for extra, use in found.missing.items():
@@ -92,7 +101,7 @@ def _lines(found: Installation, seconds: float) -> Iterator[str]:
         if item.run_min is not None:
             yield f"  `mor-bench run` took {item.run_min:g} min on {item.name}."
     yield ""
-    yield f"`mor-bench run` is expected to take about {seconds / 60:.1f} min here."
+    yield f"`mor-bench run` is expected to take about {seconds_text(seconds)} here."
 
 
 def _shown(speed: MachineSpeed, name: str) -> str:

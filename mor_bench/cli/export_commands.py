@@ -11,6 +11,7 @@ import typer
 
 import mor_bench
 from mor_bench.cli.console import make_console
+from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import DatasetName, with_options
 from mor_bench.cli.progress_bars import show_progress
 from mor_bench.errors import InvalidInputError
@@ -33,7 +34,14 @@ export = typer.Typer(
 app.add_typer(export, name="export")
 
 
-@export.command()
+@command(
+    export,
+    {
+        "export vtu beam-tiny --sample 3 --out vtu": "Write test sample 3.",
+        "export vtu beam-tiny --sample 3 --model pod.safetensors --out vtu": "Write the prediction "
+        "of a fitted model too.",
+    },
+)
 @with_options
 def vtu(
     dataset: DatasetName,
@@ -58,7 +66,13 @@ def vtu(
         print(path)
 
 
-@export.command()
+@command(
+    export,
+    {
+        "export numpy beam-tiny --out tiny.npz": "Write all samples.",
+        "export numpy beam-coarse --limit 500 --out some.npz": "Write the first 500 samples.",
+    },
+)
 @with_options
 def gif(
     dataset: DatasetName,
@@ -95,7 +109,13 @@ def numpy(
         print(path)
 
 
-@export.command()
+@command(
+    export,
+    {
+        "export onnx net.safetensors --out net.onnx": "Write a fitted network.",
+        "fit beam-tiny -m umesh-small --out net.safetensors": "Make such a file first.",
+    },
+)
 def onnx(
     model: Annotated[Path, typer.Argument(help="File of a fitted model that has a network.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="ONNX file to write.")],
@@ -114,7 +134,14 @@ def onnx(
     typer.echo(compared, err=True)
 
 
-@export.command()
+@command(
+    export,
+    {
+        "export asv reports/runs/RUN --out .asv/results": "Write a run under the commit of this "
+        "checkout.",
+        "export asv RUN_DIR --out .asv/results --commit v1.0": "Write it under another commit.",
+    },
+)
 def asv(
     folder: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="Folder of a run.")],
     out: Annotated[

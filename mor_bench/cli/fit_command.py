@@ -2,30 +2,63 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import typer
+from pydantic import Field
 
 import mor_bench
 from mor_bench.cli.console import make_console
-from mor_bench.cli.option_groups import DatasetName, with_options
+from mor_bench.cli.help_texts import command
+from mor_bench.cli.option_groups import (
+    OUTPUT,
+    DatasetName,
+    QuietOutput,
+    complete_methods,
+    with_options,
+)
 from mor_bench.cli.progress_bars import show_progress
 from mor_bench.errors import InvalidInputError
-from mor_bench.options import FitOptions
+from mor_bench.options import CommandLine, FitOptions
+from mor_bench.report.number_format import seconds_text
+from mor_bench.specs.inline_parameters import parse_value
 
 app = typer.Typer(rich_markup_mode=None)
 
 
-@app.command()
+class FitOutput(QuietOutput):
+    """Output of `mor-bench fit`."""
+
+    panel: ClassVar[str] = OUTPUT
+
+    out: Annotated[
+        Path,
+        Field(description="Safetensors file to write or to overwrite."),
+        CommandLine(metavar="FILE"),
+    ]
+
+
+@command(
+    app,
+    {
+        "fit beam-tiny -m 'pod[n_modes=20]' --out pod.safetensors": "Fit POD with 20 modes.",
+        "fit beam-coarse -m umesh --fit-seconds 60 --out net.safetensors": "Train a network "
+        "for about a minute.",
+    },
+)
 @with_options
 def fit(
     dataset: DatasetName,
-    method: Annotated[str, typer.Option("--method", "-m", help="Name or TOML file of a method.")],
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="Safetensors file to write or to overwrite.")
+    method: Annotated[
+        str,
+        typer.Option(
+            "--method",
+            "-m",
+            help="Name or TOML file of a method, with values in brackets as in 'pod[n_modes=20]'.",
+            autocompletion=complete_methods,
+        ),
     ],
     parameters: Annotated[
         list[str] | None,
@@ -43,6 +76,7 @@ def fit(
     ] = None,
     *,
     options: FitOptions,
+    output: FitOutput,
 ) -> None:
     """Fit one configuration on the training part of a dataset, and save the model.
 
@@ -51,10 +85,13 @@ def fit(
     given = parse_hyperparameters(parameters or [])
     if seed is not None:
         given["seed"] = seed
-    with show_progress(make_console(stderr=True)) as listener:
+    with show_progress(make_console(stderr=True), quiet=output.quiet) as listener:
         fitted = mor_bench.fit(
-            dataset, method, given, out=out, listener=listener, **options.model_dump()
+            dataset, method, given, out=output.out, listener=listener, **options.model_dump()
         )
+    if output.quiet:
+        print(fitted.out)
+        return
     error = fitted.error
     iterations = "" if fitted.iterations is None else f", {fitted.iterations:,} iterations"
     for name, values in fitted.first_of.items():
@@ -62,7 +99,8 @@ def fit(
             f"{name} = {values[0]!r}, the first of {len(values)} values in the method's file; "
             f"choose another one with --set {name}=VALUE"
         )
-    print(f"fit: {fitted.seconds:.3g} s{iterations}, {fitted.n_train:,} training samples")
+    seconds = seconds_text(fitted.seconds)
+    print(f"fit: {seconds}{iterations}, {fitted.n_train:,} training samples")
     relative = ", ".join(
         f"{name} {error[f'rel_l2_{name}']:.3%}" for name in ("median", "p95", "max")
     )
@@ -84,8 +122,5 @@ def parse_hyperparameters(given: Sequence[str]) -> dict[str, Any]:
         name, equals, value = item.partition("=")
         if not equals or not name.strip():
             raise InvalidInputError(f"`--set` takes PARAMETER=VALUE; got {item!r}.")
-        try:
-            parsed[name.strip()] = tomllib.loads(f"value = {value}")["value"]
-        except tomllib.TOMLDecodeError:
-            parsed[name.strip()] = value.strip()
+        parsed[name.strip()] = parse_value(value)
     return parsed

@@ -14,13 +14,21 @@ from typing import Annotated
 
 import typer
 
+from mor_bench.cli.help_texts import command
 from mor_bench.errors import SpecError
 from mor_bench.specs import list_suite
 
 app = typer.Typer(rich_markup_mode=None)
 
 
-@app.command(name="new-method")
+@command(
+    app,
+    {
+        "new-method my-method": "Write my-method.toml and my_method.py to this folder.",
+        "new-method my-method --folder ideas": "Write them to another folder.",
+    },
+    name="new-method",
+)
 def new_method(
     name: Annotated[str, typer.Argument(help="Name: lower-case letters, digits and hyphens.")],
     folder: Annotated[

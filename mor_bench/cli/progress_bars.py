@@ -1,4 +1,4 @@
-"""Progress bars of generation, configurations, timing and training."""
+"""Progress bars of generation and of a single training."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from rich.progress import (
 )
 
 from mor_bench.cli.slow_notice import notice_if_slow
-from mor_bench.results.row import Row
 from mor_bench.runs.listener import Listener
 
 PRINT_EVERY_S = 10.0
@@ -32,8 +31,11 @@ PREPARING = "Preparing; large meshes and datasets take a minute."
 
 
 @contextmanager
-def show_progress(console: Console) -> Iterator[Listener]:
-    """Show the progress of a run, fit or generation; print one line per fitted configuration."""
+def show_progress(console: Console, *, quiet: bool = False) -> Iterator[Listener]:
+    """Show the progress of a generation or a fit."""
+    if quiet:
+        yield Listener()
+        return
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -44,16 +46,9 @@ def show_progress(console: Console) -> Iterator[Listener]:
     )
     with ExitStack() as stack:
         progress = stack.enter_context(Progress(*columns, console=console, transient=True))
-        spoken = stack.enter_context(notice_if_slow(PREPARING, partial(_print_plain, console)))
+        spoken = stack.enter_context(notice_if_slow(PREPARING, partial(print_plain, console)))
         bars = _Bars(progress, spoken)
-        yield Listener(
-            compiling=bars.compiling,
-            generating=bars.generating,
-            starting=bars.starting,
-            fitted=bars.fitted,
-            timing=bars.timing,
-            training=bars.training,
-        )
+        yield Listener(generating=bars.generating, training=bars.training)
 
 
 @dataclass
@@ -68,16 +63,6 @@ class _Bars:
 
     printed_at: dict[str, float] = field(default_factory=dict)
 
-    def compiling(self, method: str, done: int, total: int) -> None:
-        if "compiling" not in self.tasks:
-            self._print("Compiling numerical kernels. This happens once per machine and version.")
-        self._begin("compiling", "", 0, total)
-        self._update("compiling", done, description=f"compiling {escape(method)}")
-        if done < total and self._is_due("compiling", perf_counter()):
-            self._print(f"compiling {method} ({done + 1} of {total})")
-        if done == total:
-            self.progress.remove_task(self.tasks.pop("compiling"))
-
     def generating(self, dataset: str, done: int, total: int) -> None:
         now = perf_counter()
         self._begin(dataset, f"samples of {escape(dataset)}", done, total)
@@ -89,28 +74,6 @@ class _Bars:
             self._print(
                 f"{dataset}: {done:,} of {total:,} samples, {rate:.1f}/s, {left:.0f} s left"
             )
-
-    def starting(self, dataset: str, label: str, number: int, total: int) -> None:
-        self._begin("run", "", 0, total)
-        self._update("run", number - 1, description=escape(f"{dataset}: {label}"))
-
-    def fitted(self, row: Row) -> None:
-        text = f"{row.status}: {row.reason}"
-        if row.ok and row.error and row.offline_s:
-            text = (
-                f"ē {row.error.mean_dof_m:.2e} m   rel. l2 {row.error.rel_l2_median:.3%}   "
-                f"fit {row.offline_s.fit:.3g} s"
-            ) + (" (trained elsewhere)" if row.trained_elsewhere else "")
-        label = f"[bold]{escape(row.label):<46}[/bold]"
-        self.spoken()
-        self.progress.console.print(f"{label} {escape(text)}", highlight=False)
-
-    def timing(self, dataset: str, done: int, total: int) -> None:
-        name = f"timing {dataset}"
-        if name not in self.tasks and not self.progress.console.is_terminal:
-            self._print(f"{dataset}: all configurations are fitted; timing them in turns")
-        self._begin(name, escape(name), 0, total)
-        self._update(name, done)
 
     def training(self, done: int, total: int, loss: float) -> None:
         self._begin("training", "training", done, total)
@@ -143,8 +106,9 @@ class _Bars:
 
     def _print(self, text: str) -> None:
         self.spoken()
-        _print_plain(self.progress.console, text)
+        print_plain(self.progress.console, text)
 
 
-def _print_plain(console: Console, text: str) -> None:
+def print_plain(console: Console, text: str) -> None:
+    """Print a text as it is."""
     console.print(text, highlight=False, markup=False)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import typer
 from pydantic import Field
@@ -13,12 +14,20 @@ import mor_bench
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.told import told_at_most
 from mor_bench.cli.console import make_console
-from mor_bench.cli.option_groups import DatasetName, with_options
-from mor_bench.cli.progress_bars import show_progress
+from mor_bench.cli.help_texts import command
+from mor_bench.cli.option_groups import (
+    OUTPUT,
+    DatasetName,
+    QuietOutput,
+    TableOutput,
+    with_options,
+)
+from mor_bench.cli.run_progress import show_run
 from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.options import CommandLine, FolderOptions
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.page import render
+from mor_bench.runs.plan import plan
 from mor_bench.specs.method_spec import Told
 
 app = typer.Typer(rich_markup_mode=None)
@@ -29,6 +38,8 @@ TOLD_HELP = "The most that a method may be told at query time; others are left o
 
 class PickOptions(FolderOptions):
     """Options of `mor-bench pick`."""
+
+    panel: ClassVar[str] = "Limits and evidence"
 
     error: Annotated[
         float | None,
@@ -62,48 +73,75 @@ class PickOptions(FolderOptions):
     ] = None
 
 
-@app.command()
+@command(
+    app,
+    {
+        "report reports/runs/20261122-101500-beam-coarse": "Print the verdict and six columns, and "
+        "write the report again.",
+        "report RUN_DIR --wide | less -S": "Look at every column and table.",
+    },
+)
+@with_options
 def report(
     out: Annotated[Path, typer.Argument(metavar="RUN_DIR", help="Folder of a run.")],
     told: Annotated[
         Told | None, typer.Option(help=f"{TOLD_HELP} Then only the tables are printed.")
     ] = None,
+    *,
+    output: TableOutput,
 ) -> None:
     """Print the tables of a finished run, and draw its figures and report again."""
+    detail = output.detail
     with notice_if_slow("Reading the run and drawing its figures.") as spoken:
         comparison = mor_bench.Comparison.read(out)
         comparison.check_samples()
         if told is not None:
             spoken()
-            print_tables(told_at_most(comparison, told), make_console())
+            print_tables(told_at_most(comparison, told), make_console(), detail=detail)
             return
         analysis = analyse(comparison)
         comparison.finish(analysis)
         spoken()
-        print_tables(comparison, make_console(), analysis)
-        for path in render(comparison, analysis):
-            print(path)
+        print_tables(comparison, make_console(), analysis, detail)
+        written = render(comparison, analysis)
+    for path in written if detail.verbose else written[-1:]:
+        print(path)
 
 
-@app.command()
+@command(
+    app,
+    {
+        "pick beam-coarse": "Choose by the limits of the dataset's [needs].",
+        "pick beam-coarse --error 0.003 --memory 0.5": "Choose with an error of at most 0.3 % and "
+        "with at most 0.5 GB.",
+    },
+    {1: "No configuration qualifies; the output says how far the limits must be relaxed."},
+)
 @with_options
 def pick(
     dataset: DatasetName,
     *,
     options: PickOptions,
+    output: QuietOutput,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print the choice to standard output as JSON.")
+        bool,
+        typer.Option(
+            "--json",
+            help="Print the choice to standard output as JSON.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = False,
 ) -> None:
     """Name the fastest configuration that meets a dataset's needs, with the evidence.
 
     If there is none, the exit code is 1 and the output says how far the needs must be relaxed.
     """
-    with show_progress(make_console(stderr=True)) as listener:
+    planned = partial(plan, [dataset], cache=options.cache, suite=options.suite)
+    with show_run(make_console(stderr=True), planned, quiet=output.quiet) as listener:
         chosen = mor_bench.pick(dataset, listener=listener, **options.model_dump())
     if as_json:
         print(json.dumps(chosen.as_json(), indent=1, ensure_ascii=False, allow_nan=False))
     else:
-        print(chosen.text())
+        print(chosen.headline if output.quiet else chosen.text())
     if chosen.choice is None:
         raise typer.Exit(1)

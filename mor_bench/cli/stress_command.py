@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import typer
 from pydantic import Field
 from rich.status import Status
 
 from mor_bench.cli.console import make_console
-from mor_bench.cli.option_groups import Json, with_options
+from mor_bench.cli.help_texts import command
+from mor_bench.cli.option_groups import Json, QuietOutput, complete_methods, with_options
 from mor_bench.errors import InvalidInputError
 from mor_bench.hard_cases.suite import stress as run_cases
 from mor_bench.options import FolderOptions, Profile
@@ -23,13 +24,22 @@ app = typer.Typer(rich_markup_mode=None)
 class StressOptions(FolderOptions):
     """Options of `mor-bench stress`."""
 
+    panel: ClassVar[str] = "Cases"
+
     profile: Annotated[
         Profile,
         Field(description="Parameters of the method files; quick also shortens trainings."),
     ] = "quick"
 
 
-@app.command()
+@command(
+    app,
+    {
+        "stress -m pod -m my-method.toml": "Try all hard cases on two methods.",
+        "stress --case zero-force --out stress.json": "Try one case on all methods, and keep the "
+        "numbers.",
+    },
+)
 @with_options
 def stress(
     method: Annotated[
@@ -38,6 +48,7 @@ def stress(
             "--method",
             "-m",
             help="Name or TOML file of a method; repeat for more. [default: all of the suite]",
+            autocompletion=complete_methods,
         ),
     ] = None,
     case: Annotated[
@@ -47,6 +58,7 @@ def stress(
     *,
     options: StressOptions,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="JSON file to write.")] = None,
+    output: QuietOutput,
     as_json: Json = False,
 ) -> None:
     """Try the hard cases on the full-order model and on methods.
@@ -57,7 +69,7 @@ def stress(
     if out is not None and not out.resolve().parent.is_dir():
         raise InvalidInputError(f"`--out`: there is no folder {out.resolve().parent}.")
     console = make_console(stderr=as_json)
-    with Status("", console=console) as status:
+    with Status("", console=make_console(True, output.quiet)) as status:
         found = run_cases(
             method or None,
             case or None,
@@ -66,7 +78,7 @@ def stress(
             ),
             **options.model_dump(),
         )
-    print_stress(found, console)
+    print_stress(found, console, output.quiet)
     if out is not None:
         found.write(out)
         console.print(str(out), highlight=False, soft_wrap=True)

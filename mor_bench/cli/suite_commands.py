@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from textwrap import wrap
 from typing import Annotated
 
 import typer
 
+from mor_bench.cli.console import console_width
+from mor_bench.cli.help_texts import command
+from mor_bench.cli.option_groups import OUTPUT
 from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.errors import MissingDependencyError, MorBenchError, printable
-from mor_bench.specs import list_suite, load_dataset_spec, load_method_spec
+from mor_bench.report.suite_overview import LEGEND, Item, by_family, overview
+from mor_bench.specs import list_suite
 
 app = typer.Typer(rich_markup_mode=None)
 
 BUSY = "still checking; large files take a minute."
+
+LEAST_TITLE = 20
+"""Least width of the column of titles, in characters."""
 
 Suite = Annotated[
     Path | None,
@@ -22,33 +31,55 @@ Suite = Annotated[
 ]
 
 
-@app.command(name="list")
+@command(
+    app,
+    {
+        "list": "List datasets and methods by family, with what each needs.",
+        "list --json": "Print the same as JSON.",
+    },
+    name="list",
+)
 def list_suite_command(
     suite: Suite = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the lists as JSON.")] = False,
+    as_json: Annotated[
+        bool,
+        typer.Option("--json", help="Print the lists as JSON.", rich_help_panel=OUTPUT),
+    ] = False,
 ) -> None:
-    """List the datasets and methods of the suite."""
-    datasets = {
-        name: load_dataset_spec(path).title for name, path in list_suite("datasets", suite).items()
-    }
-    methods = {
-        name: load_method_spec(path).title for name, path in list_suite("methods", suite).items()
-    }
+    """List the datasets and methods of the suite by family, with what each needs."""
+    found = overview(suite)
     if as_json:
-        lists = {
-            kind: [{"name": name, "title": title} for name, title in titles.items()]
-            for kind, titles in (("datasets", datasets), ("methods", methods))
-        }
+        lists = {kind: [vars(item) for item in items] for kind, items in found.items()}
         print(json.dumps(lists, indent=1, ensure_ascii=False))
         return
-    width = max(map(len, [*datasets, *methods]))
-    for heading, titles in (("Datasets", datasets), ("Methods", methods)):
-        print(heading)
-        for name, title in titles.items():
-            print(f"  {name:<{width}}  {title}")
+    width = console_width()
+    for kind, items in found.items():
+        print(*_lines(kind, items, width), sep="\n")
+    print(*wrap(LEGEND, width), sep="\n")
 
 
-@app.command()
+def _lines(kind: str, items: list[Item], width: int) -> Iterator[str]:
+    """Yield the items of a kind by family; long titles continue in their column."""
+    for family, members in by_family(items).items():
+        yield f"{kind.capitalize()}: {family}"
+        name, needs = (max(len(getattr(m, part)) for m in members) for part in ("name", "needs"))
+        room = max(width - name - needs - 6, LEAST_TITLE)
+        for item in members:
+            first, *others = wrap(item.title, room, break_on_hyphens=False) or [""]
+            yield f"  {item.name:<{name}}  {item.needs:<{needs}}  {first}".rstrip()
+            for line in others:
+                yield " " * (name + needs + 6) + line
+        yield ""
+
+
+@command(
+    app,
+    {
+        "check": "Check every file of the suite.",
+        "check my-scene.toml my-method.toml": "Check two files of your own.",
+    },
+    {2: "A file is not valid. Standard error has one line for each."},
+)
 def check(
     files: Annotated[
         list[Path] | None,
@@ -59,10 +90,7 @@ def check(
     ] = None,
     suite: Suite = None,
 ) -> None:
-    """Check dataset and method files: keys, ranges, meshes, regions and hyperparameters.
-
-    The exit code is 2 if any file is not valid.
-    """
+    """Check dataset and method files: keys, ranges, meshes, regions and hyperparameters."""
     from mor_bench.runs.file_check import check_file  # slow to import, and `list` needs none of it
 
     shipped = [*list_suite("datasets", suite).values(), *list_suite("methods", suite).values()]

@@ -55,8 +55,11 @@ class MachineSpeed(BaseModel):
     bandwidth_gb_s: float
 
     @classmethod
-    def measure(cls) -> Self:
-        """Measure this machine, in about two seconds if kernels are compiled."""
+    def measure(cls, networks: bool = True) -> Self:
+        """Measure this machine, in about two seconds if kernels are compiled.
+
+        Without `networks`, the convolution is left out and PyTorch is not imported.
+        """
         with pinned_threads(1):
             model = FullOrderModel(load_scene(SCENE))
             q = np.zeros(model.scene.mesh.n_dofs)[model.scene.free_dofs]
@@ -73,7 +76,7 @@ class MachineSpeed(BaseModel):
             interpreter_ms=1e3 * times[0],
             residual_us=1e6 * times[1],
             back_solve_us=1e6 * times[2],
-            convolution_ms=_convolution_ms(),
+            convolution_ms=_convolution_ms() if networks else None,
             bandwidth_gb_s=2e-9 * source.nbytes / times[3],
         )
 

@@ -1,22 +1,23 @@
-"""Console output: the tables of a comparison, of discretisation errors and of a plan."""
+"""Console output: a comparison, discretisation errors, and a plan."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from math import hypot
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from mor_bench.analysis.analyse import analyse
-from mor_bench.analysis.selection_text import needs_text
 from mor_bench.analysis.told import LEGEND
-from mor_bench.analysis.verdict import needs_of
+from mor_bench.analysis.verdict import RULE, needs_of
 from mor_bench.report.caveat_tables import out_of_range
-from mor_bench.report.console_columns import configuration_table
+from mor_bench.report.console_columns import NOTE, configuration_lines
 from mor_bench.report.entries import (
     Analysis,
     Entry,
@@ -25,7 +26,14 @@ from mor_bench.report.entries import (
     entries_of,
     verdict_of,
 )
-from mor_bench.report.number_format import explain_short_names, metres, number, percent
+from mor_bench.report.number_format import (
+    explain_short_names,
+    metres,
+    number,
+    percent,
+    seconds_text,
+)
+from mor_bench.report.short_names import ShortName, constants, renamed, short_names
 from mor_bench.report.speed_tables import (
     NOT_REACHED,
     PAIRWISE_LEGEND,
@@ -33,17 +41,38 @@ from mor_bench.report.speed_tables import (
     pairs_at,
     target_table,
 )
-from mor_bench.report.summary import (
-    discretisation_error,
-    interval_basis,
-    notes_of,
-    warnings_of,
-)
+from mor_bench.report.summary import hidden_doubts, interval_basis, notes_of, warnings_of
 from mor_bench.report.text_table import TextTable
 from mor_bench.results.comparison import Comparison
 
 if TYPE_CHECKING:
-    from mor_bench.runs.plan import Plan
+    from mor_bench.runs.plan import Plan, StageName
+
+AGAIN = " Time again: "
+"""Words between the sentence on unstable timings and the command that repeats them."""
+
+
+UNLIMITED = 10_000
+"""Width of tables that must not be cut, in characters."""
+
+
+@dataclass(frozen=True)
+class Detail:
+    """How much is printed of a comparison.
+
+    Attributes
+    ----------
+    quiet : bool
+        The verdicts only.
+    verbose : bool
+        Every note.
+    wide : bool
+        Every column and table, in lines of any length.
+    """
+
+    quiet: bool = False
+    verbose: bool = False
+    wide: bool = False
 
 
 def _empty_table() -> Table:
@@ -54,12 +83,10 @@ def _titled(title: str, *parts: RenderableType) -> list[RenderableType]:
     return [Text(""), Text(title, style="bold"), *parts]
 
 
-def _target_parts(shown: TextTable, width: int) -> list[RenderableType]:
-    table = _empty_table()
-    table.add_column("method", overflow="fold", min_width=8)
-    cell_width = len(NOT_REACHED) if width >= 100 else 8
-    for heading in shown.headings[1:]:
-        table.add_column(heading, justify="right", overflow="fold", min_width=cell_width)
+def _target_parts(shown: TextTable) -> list[RenderableType]:
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1), show_edge=False)
+    for i, heading in enumerate(shown.headings):
+        table.add_column(heading, justify="right" if i else "left", no_wrap=True)
     for method, *cells in shown.rows:
         texts = (Text(cell, style="dim" if cell == NOT_REACHED else "") for cell in cells)
         table.add_row(Text(method), *texts)
@@ -74,7 +101,7 @@ def _pairwise_parts(
     if error is None or len((pairs := pairs_at(comparison, dataset, error, analysis)).methods) < 2:
         return []
     table = _empty_table()
-    table.add_column("", overflow="fold")
+    table.add_column("", no_wrap=True)
     for i in range(len(pairs.methods)):
         table.add_column(f"({i + 1})", justify="right", min_width=5)
     for i, (method, line) in enumerate(zip(pairs.methods, pairs.cells, strict=True)):
@@ -93,77 +120,150 @@ def _out_of_range_parts(entries: Sequence[Entry]) -> list[RenderableType]:
         return []
     table = _empty_table()
     for i, heading in enumerate(found.headings):
-        table.add_column(heading, justify="right" if i else "left", overflow="fold")
+        table.add_column(heading, justify="right" if i else "left", no_wrap=True)
     for row in found.rows:
         table.add_row(*map(Text, row))
     title = "Out of range: does the best configuration of each learned method flag large errors?"
     return _titled(title, table, Text(found.note, style="dim"))
 
 
+def _verdict_lines(
+    verdict: Mapping[str, Any], names: Mapping[str, ShortName], width: int
+) -> Iterator[Text]:
+    """Yield the verdict, with short names; the command that repeats timings keeps its line."""
+    needs, _, finding = renamed(verdict["headline"], names).partition(". ")
+    yield from _wrapped(finding, width, "bold")
+    for sentence in (f"{needs}.", *verdict["beside"]):
+        if sentence == RULE:
+            continue
+        text, again, command = renamed(sentence, names).partition(AGAIN)
+        yield from _wrapped(f"- {text}{' Time again:' if again else ''}", width, "", "  ")
+        if again:
+            yield Text(f"  {command}", no_wrap=True)
+
+
+def _wrapped(text: str, width: int, style: str = "", indent: str = "") -> Iterator[Text]:
+    """Yield a text in lines that end between words; a longer word is not broken."""
+    for line in wrap(
+        text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    ):
+        yield Text(line, style=style, no_wrap=True)
+
+
+def _failures(entries: Sequence[Entry], names: Mapping[str, ShortName]) -> Iterator[Text]:
+    """Yield a line per reason for which configurations have no result or lack predictions."""
+    reasons: dict[str, list[str]] = {}
+    for entry in entries:
+        if entry.trouble:
+            reasons.setdefault(entry.trouble, []).append(str(names[entry.label]))
+    for reason, labels in reasons.items():
+        yield Text(f"{', '.join(labels)}: {reason}", style="red")
+
+
 def _notes(
     comparison: Comparison, dataset: str, entries: Sequence[Entry], analysis: Analysis
-) -> list[Text]:
-    """Failures in red; unused samples, doubts and warnings in yellow."""
+) -> Iterator[Text]:
+    """Yield every doubt and warning, and the number of unused samples."""
     unused = max((entry.row.n_unused for entry in entries), default=0)
-    lines = [f"{label}: {doubt}" for label, doubt in notes_of(comparison, dataset, analysis)]
-    lines += [f"{label}: warning: {warning}" for label, warning in warnings_of(entries)]
     if unused:
-        lines.insert(
-            0, f"{unused:,} samples have forces on both sides of the split; they are unused"
+        text = f"{unused:,} samples have forces on both sides of the split; they are unused"
+        yield Text(text, style="yellow")
+    for label, doubt in notes_of(comparison, dataset, analysis):
+        yield Text(f"{label}: {doubt}", style="yellow")
+    for label, warning in warnings_of(entries):
+        yield Text(f"{label}: warning: {warning}", style="yellow")
+
+
+def _short_notes(
+    comparison: Comparison, dataset: str, entries: Sequence[Entry], analysis: Analysis
+) -> Iterator[Text]:
+    """Yield the doubts that bear on the choice, and the number of the other notes."""
+    doubts = hidden_doubts(dataset, analysis)
+    names = short_names(entry.row for entry in entries)
+    for label, doubt in doubts:
+        yield Text(f"{names[label]}: {doubt}", style="yellow")
+    n = len(list(_notes(comparison, dataset, entries, analysis))) - len(doubts)
+    if n:
+        yield Text(
+            f"{n} note{'s' * (n > 1)} on methods, timings and samples: --verbose shows them", "dim"
         )
-    return [
-        *(Text(f"{e.label}: {e.trouble}", style="red") for e in entries if e.trouble),
-        *(Text(line, style="yellow") for line in lines),
-    ]
 
 
-def _dataset_group(comparison: Comparison, dataset: str, width: int, analysis: Analysis) -> Group:
+def _dataset_parts(
+    comparison: Comparison, dataset: str, analysis: Analysis, console: Console, detail: Detail
+) -> Iterator[RenderableType]:
     entries = entries_of(comparison, dataset, analysis)
+    names = short_names(entry.row for entry in entries)
     title = str(comparison.datasets.get(dataset, {}).get("title", ""))
-    marks = (
-        "Pareto *: no other configuration is both faster and more accurate (medians). "
-        "ref: a full-order solve on the dataset's mesh; its error is not ranked."
-    )
-    if any(entry.unstable for entry in entries):
-        marks += " Latency ~: not stable, see below."
-    parts: list[RenderableType] = [
-        Text(f"{dataset} – {title}" if title else dataset, style="bold"),
-        Text(f"needs: {needs_text(needs_of(comparison, dataset))}"),
-        Text(f"discretisation error of the dataset's mesh: {discretisation_error(entries)}"),
-        Text(""),
-        configuration_table(entries, width),
-        Text(marks, style="dim"),
-        Text(LEGEND, style="dim"),
-        *_notes(comparison, dataset, entries, analysis),
-    ]
+    yield Text(f"{dataset} – {title}" if title else dataset, style="bold underline")
+    verdict = verdict_of(analysis, dataset)
+    if not verdict:
+        yield Text("No configuration.\n")
+        return
+    yield from _verdict_lines(verdict, names, console.width)
+    yield Text("")
+    yield from configuration_lines(entries, names, None if detail.wide else console.width)
+    swept = (entry.swept for entry in entries)
+    fixed = constants(entry.row for entry in entries)
+    for text in (NOTE, explain_short_names(swept), f"Same in all rows: {fixed}." if fixed else ""):
+        if text:
+            yield from _wrapped(text, console.width, "dim")
+    yield from _failures(entries, names)
+    notes = _notes if detail.verbose else _short_notes
+    yield from notes(comparison, dataset, entries, analysis)
+    if detail.wide:
+        yield from _wide_parts(comparison, dataset, entries, analysis)
+    yield Text("")
+
+
+def _wide_parts(
+    comparison: Comparison, dataset: str, entries: Sequence[Entry], analysis: Analysis
+) -> Iterator[RenderableType]:
+    """Yield what the six columns leave out: the rule, the winner's figures, further tables."""
+    yield Text(f"{RULE} {LEGEND}", style="dim")
+    yield from _titled("Figures of the winner, or of the nearest without a winner")
+    yield from map(Text, verdict_of(analysis, dataset)["evidence"])
     for kind in ("time_at_error", "error_at_time"):
-        parts += _target_parts(target_table(comparison, dataset, kind, analysis), width)
-    names = explain_short_names(entry.swept for entry in entries)
-    basis = [interval_basis(dataset, analysis), names, "Nothing is extrapolated."]
-    parts.append(Text("  ".join(filter(None, basis)), style="dim"))
-    parts += _pairwise_parts(comparison, dataset, analysis)
-    parts += _out_of_range_parts(entries)
-    return Group(*parts, *_verdict_parts(verdict_of(analysis, dataset)))
-
-
-def _verdict_parts(verdict: Mapping[str, Any]) -> list[RenderableType]:
-    lines = [*verdict["evidence"], *verdict["beside"]]
-    return [Text(""), Text(verdict["headline"], style="bold"), *map(Text, lines), Text("")]
+        yield from _target_parts(target_table(comparison, dataset, kind, analysis))
+    basis = [interval_basis(dataset, analysis), "Nothing is extrapolated."]
+    yield Text("  ".join(filter(None, basis)), style="dim")
+    yield from _pairwise_parts(comparison, dataset, analysis)
+    yield from _out_of_range_parts(entries)
 
 
 def print_tables(
-    comparison: Comparison, console: Console, analysis: Analysis | None = None
+    comparison: Comparison,
+    console: Console,
+    analysis: Analysis | None = None,
+    detail: Detail = Detail(),
 ) -> None:
-    """Print all tables of a comparison; `analyse` makes the analysis if it is not given."""
+    """Print verdicts and tables; `analyse` makes the analysis if it is not given."""
     analysis = analysis or analyse(comparison)
     with console.capture() as captured:
         for name in dataset_names(comparison):
-            group = _dataset_group(comparison, name, console.width, analysis)
-            console.print(group, highlight=False)
+            if detail.quiet:
+                names = short_names(row for row in comparison.rows if row.dataset == name)
+                headline = verdict_of(analysis, name).get("headline", f"{name}: no configuration.")
+                console.print(Text(renamed(headline, names)), soft_wrap=True)
+                continue
+            for part in _dataset_parts(comparison, name, analysis, console, detail):
+                _print(part, console)
     # A redirected stream with a legacy code page must not make a long run fail at its end.
     encoding = console.encoding or "utf-8"
     console.file.write(captured.get().encode(encoding, "replace").decode(encoding))
     console.file.flush()
+
+
+def _print(part: RenderableType, console: Console) -> None:
+    """Print a part; tables and lines that must not be broken may be wider than the console."""
+    width = console.width
+    if isinstance(part, Table):
+        console.width = UNLIMITED
+    if isinstance(part, Text) and part.no_wrap:
+        console.print(part, crop=False, overflow="ignore")
+    else:
+        console.print(part, highlight=False)
+    console.width = width
 
 
 def print_discretisation(record: Mapping[str, Any], console: Console) -> None:
@@ -208,13 +308,20 @@ def print_plan(plan: Plan, console: Console) -> None:
         table.add_column(heading)
     table.add_column("estimate", justify="right")
     for step in plan.steps:
-        estimate = "unknown" if step.seconds is None else f"{number(step.seconds)} s"
+        estimate = "unknown" if step.seconds is None else seconds_text(step.seconds)
         table.add_row(step.dataset, Text(step.label), "in the cache" if step.done else estimate)
     console.print(table, highlight=False)
     unknown = f", and {plan.n_unknown} steps of unknown duration" if plan.n_unknown else ""
-    stages = {"compilation, once per machine": plan.compilation_s, "scores": plan.scoring_s}
-    stages |= {"timing": plan.timing_s, "report": plan.report_s}
-    parts = ", ".join(f"{name} {number(seconds)} s" for name, seconds in stages.items() if seconds)
+    stages: dict[str, StageName] = {
+        "compilation, once per machine": "compilation",
+        "scores": "scores",
+        "timing": "timing",
+        "report": "report",
+    }
+    known = {name: plan.stage_seconds(stage) for name, stage in stages.items()}
+    parts = ", ".join(
+        f"{name} {seconds_text(seconds)}" for name, seconds in known.items() if seconds
+    )
     console.print(Text(f"beside these steps: {parts}"))
-    total = f"about {plan.seconds / 60:.1f} min"
+    total = f"about {seconds_text(plan.seconds)}"
     console.print(Text(total + unknown, style="bold"))

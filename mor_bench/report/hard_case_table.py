@@ -21,8 +21,23 @@ def ordered(found: StressResults) -> list[CaseResult]:
     return sorted(found.rows, key=lambda row: places[row.case, row.part])
 
 
-def print_stress(found: StressResults, console: Console) -> None:
-    """Print all rows and the counts, then the names of the methods that fell short."""
+def print_stress(found: StressResults, console: Console, quiet: bool = False) -> None:
+    """Print all rows unless quiet, the counts, and the names of the methods that fell short."""
+    if not quiet:
+        console.print(_table(found))
+    short = [row for row in ordered(found) if row.verdict == "fall short"]
+    counts = (
+        f"{len(found.rows)} tried: {found.count('pass')} pass, {len(short)} fall short, "
+        f"{found.count('not applicable')} not applicable."
+    )
+    console.print(counts, highlight=False)
+    if short:
+        names = (f"{row.case} ({row.part})" if row.part else row.case for row in short)
+        cases = (f"{name} of {row.method}" for name, row in zip(names, short, strict=True))
+        console.print(f"Fall short: {', '.join(cases)}.", highlight=False, markup=False)
+
+
+def _table(found: StressResults) -> Table:
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     longest = max((len(row.method) for row in found.rows), default=0)
     for heading, width in (
@@ -42,14 +57,4 @@ def print_stress(found: StressResults, console: Console) -> None:
                 Text(first[0]), Text(row.method), Text(first[1]), Text(row.happened), verdict
             )
         table.add_section()
-    console.print(table)
-    short = [row for row in ordered(found) if row.verdict == "fall short"]
-    counts = (
-        f"{len(found.rows)} tried: {found.count('pass')} pass, {len(short)} fall short, "
-        f"{found.count('not applicable')} not applicable."
-    )
-    console.print(counts, highlight=False)
-    if short:
-        names = (f"{row.case} ({row.part})" if row.part else row.case for row in short)
-        cases = (f"{name} of {row.method}" for name, row in zip(names, short, strict=True))
-        console.print(f"Fall short: {', '.join(cases)}.", highlight=False, markup=False)
+    return table

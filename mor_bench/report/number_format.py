@@ -9,6 +9,14 @@ from typing import Any
 DASH = "–"
 """Placeholder of a figure that was not measured."""
 
+UNITS_OF_TIME = (
+    ("h", 3600.0, 7200.0),
+    ("min", 60.0, 120.0),
+    ("s", 1.0, 0.9995),
+    ("ms", 1e-3, 1e-4),
+)
+"""Units of time: name, size in seconds, and the least duration that is given in it, s."""
+
 SHORT_NAMES = {
     "n_modes": "r",
     "tolerance": "tol",
@@ -46,6 +54,23 @@ def metres(value: float | None) -> str:
 def percent(value: float | None) -> str:
     """Format a fraction in percent, without the sign."""
     return number(None if value is None else 100 * value)
+
+
+def seconds_text(seconds: float | None) -> str:
+    """Format a duration in µs, ms, s, min or h with three digits; a dash if there is none."""
+    if seconds is None:
+        return DASH
+    if not isfinite(seconds):
+        return str(seconds)
+    for unit, size, least in UNITS_OF_TIME:
+        if seconds >= least:
+            return f"{number(seconds / size)} {unit}"
+    return f"{number(1e6 * seconds)} µs" if seconds else "0 s"
+
+
+def milliseconds_text(value: float | None) -> str:
+    """Format milliseconds as `seconds_text`."""
+    return seconds_text(None if value is None else value / 1000)
 
 
 def bytes_text(n_bytes: float | None) -> str:

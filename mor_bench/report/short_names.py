@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -40,6 +41,15 @@ def short_names(rows: Iterable[Row]) -> dict[str, ShortName]:
             row.label: ShortName(method, text) for row, text in zip(mine, values, strict=True)
         }
     return names
+
+
+def renamed(text: str, names: Mapping[str, ShortName]) -> str:
+    """Return a text with the short names of configurations instead of their labels."""
+    labels = [label for label, name in names.items() if str(name) != label]
+    if not labels:
+        return text
+    longest_first = "|".join(map(re.escape, sorted(labels, key=len, reverse=True)))
+    return re.sub(rf"(?<![\w-])({longest_first})", lambda found: str(names[found[0]]), text)
 
 
 def varied_keys(rows: Sequence[Row]) -> list[str]:

@@ -40,11 +40,7 @@ def notes_of(comparison: Comparison, dataset: str, analysis: Analysis) -> list[t
         for entry in entries
         if entry.row.trained_elsewhere
     ]
-    for record in analysis["hidden"]:
-        if record["dataset"] == dataset and record["worse"]:
-            ratio = "infinitely" if record["ratio"] is None else f"{number(record['ratio'])} times"
-            doubt = f"the median error is {ratio} as large on the hidden test set as on the shipped"
-            notes.append((record["label"], f"{doubt} one"))
+    notes += hidden_doubts(dataset, analysis)
     methods = {entry.method for entry in entries}
     notes += [
         (record["method"], record["verdict"])
@@ -52,6 +48,17 @@ def notes_of(comparison: Comparison, dataset: str, analysis: Analysis) -> list[t
         if record["method"] in methods and record["in_regime"] is False
     ]
     return notes
+
+
+def hidden_doubts(dataset: str, analysis: Analysis) -> list[tuple[str, str]]:
+    """List the configurations that are clearly worse on the hidden test set, and by how much."""
+    doubts = []
+    for record in analysis["hidden"]:
+        if record["dataset"] == dataset and record["worse"]:
+            ratio = "infinitely" if record["ratio"] is None else f"{number(record['ratio'])} times"
+            doubt = f"the median error is {ratio} as large on the hidden test set as on the shipped"
+            doubts.append((record["label"], f"{doubt} one"))
+    return doubts
 
 
 def _origin(training: TrainedElsewhere) -> str:

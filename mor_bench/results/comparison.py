@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from numpy.typing import NDArray
 from pydantic import ValidationError
@@ -176,7 +176,7 @@ class Comparison:
         write_atomically(self.out / "results.csv", self.table.to_csv(index=False).encode())
 
     @classmethod
-    def read(cls, out: str | Path) -> Comparison:
+    def read(cls, out: str | Path) -> Self:
         """Read a run's folder.
 
         Raises

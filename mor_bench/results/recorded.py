@@ -43,6 +43,7 @@ class _Regime(_Table):
 
 
 class _Method(_Table):
+    asked: str | None = None
     regime: _Regime | None = None
 
 

@@ -67,10 +67,10 @@ class Pace:
     training: float
 
     @classmethod
-    def measured(cls) -> Pace:
-        """Measure this machine."""
+    def measured(cls, networks: bool) -> Pace:
+        """Measure this machine; without `networks`, trainings count as on the reference machine."""
         reference = recorded_machines()[0]
-        here, there = MachineSpeed.measure(), reference.speed
+        here, there = MachineSpeed.measure(networks), reference.speed
         training = 1.0
         if here.convolution_ms and there.convolution_ms:
             cores = reference.cores / (os.cpu_count() or 1)
@@ -157,7 +157,7 @@ def scoring_seconds(
     configuration: Configuration, n_scored: int, query_s: float, pace: Pace
 ) -> float:
     """Estimate the seconds of scoring a configuration, with its processes' starts."""
-    start = 2 * START_S + (2 * TORCH_S if _needs_torch(configuration) else 0.0)
+    start = 2 * START_S + (2 * TORCH_S if needs_torch(configuration) else 0.0)
     return pace.interpreter * start + n_scored * query_s
 
 
@@ -169,7 +169,7 @@ def timing_seconds(
     turn = min(MOST_TURN_S, max(LEAST_TURN_S, (protocol.queries + SETTLE_QUERIES) * query_s))
     batches = [max(BATCH_S, n * query_s) for n in BATCHES if n * query_s <= MOST_BATCH_S]
     turns = protocol.processes * (protocol.rounds + 1) * turn + sum(batches)
-    starts = [START_S + (TORCH_S if _needs_torch(item) else 0.0) for item in configurations]
+    starts = [START_S + (TORCH_S if needs_torch(item) else 0.0) for item in configurations]
     opened = protocol.processes * (SERVER_S + sum(starts) / cores)
     return len(configurations) * turns + pace.interpreter * opened
 
@@ -179,5 +179,6 @@ def query_seconds(n_dofs: int, pace: Pace) -> float:
     return QUERY_S * pace.solver * n_dofs / REFERENCE_DOFS
 
 
-def _needs_torch(configuration: Configuration) -> bool:
+def needs_torch(configuration: Configuration) -> bool:
+    """Return whether a configuration is a network of this package."""
     return configuration.method.surrogate.startswith(OWN) and may_train(configuration.method)

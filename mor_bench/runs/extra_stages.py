@@ -82,6 +82,7 @@ def _trainings(stage: Stage, cached: CachedFit, row: Row) -> tuple[list[SeedTrai
     errors: list[Score] = []
     for other in range(seed + 1, seed + stage.context.seeds):
         configuration = replace(first, parameters={**first.parameters, "seed": other})
+        stage.context.listener.repeating(stage.spec.name, row.label, "other seeds")
         try:
             scored = stage.fit_and_score(CachedFit(configuration, main, stage.environment))
         except MorBenchError as error:
@@ -177,6 +178,7 @@ def _learning_point(stage: Stage, cached: CachedFit, n: int, row: Row) -> Learni
     )
     if n == stage.training_data.n_train:
         return point
+    stage.context.listener.repeating(stage.spec.name, row.label, "learning curve")
     smaller = CachedFit(cached.reproducible, stage.training_data.first(n), stage.environment)
     try:
         scored = stage.fit_and_score(smaller)

@@ -26,6 +26,9 @@ class Listener:
         Called with (dataset, label, number of the configuration, number of configurations).
     fitted : callable
         Called with a row that is scored but not yet timed.
+    repeating : callable
+        Called with (dataset, label, stage) before each further fit of a configuration, in the stage
+        "other seeds" or "learning curve".
     timing : callable
         Called with (dataset, turns done, all turns).
     finished : callable
@@ -38,6 +41,7 @@ class Listener:
     generating: Callable[[str, int, int], None] = _ignore
     starting: Callable[[str, str, int, int], None] = _ignore
     fitted: Callable[[Row], None] = _ignore
+    repeating: Callable[[str, str, str], None] = _ignore
     timing: Callable[[str, int, int], None] = _ignore
     finished: Callable[[Row], None] = _ignore
     training: Callable[[int, int, float], None] = _ignore

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 from mor_bench.options import RunOptions
 from mor_bench.runs.cached_fit import CachedFit, RunEnvironment
@@ -23,6 +23,7 @@ from mor_bench.runs.durations import (
     Pace,
     compile_seconds,
     fit_seconds,
+    needs_torch,
     query_seconds,
     sample_seconds,
     scoring_seconds,
@@ -49,9 +50,14 @@ LEARNING_POINTS = 4
 """Typical number of points of a learning curve, beside that of all samples."""
 
 
+StageName = Literal[
+    "samples", "compilation", "fit", "scores", "other seeds", "timing", "learning curve", "report"
+]
+
+
 @dataclass(frozen=True)
 class Step:
-    """A dataset to generate or a configuration to fit.
+    """A dataset to generate, a configuration to fit, or a stage that treats all configurations.
 
     Attributes
     ----------
@@ -60,40 +66,43 @@ class Step:
         Whether the cache has it.
     seconds : float or None
         None if unknown.
+    stage : str
+    method : str
+        Empty if the step belongs to no method.
     """
 
     dataset: str
     label: str
     done: bool
     seconds: float | None
+    stage: StageName = "fit"
+    method: str = ""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The steps of a run, and the seconds of the stages that treat all steps.
+    """The steps of a run, and the stages that treat all steps.
 
     Attributes
     ----------
     steps : list of Step
-    compilation_s : float
-        To compile kernels, once per machine.
-    scoring_s, timing_s : float
-        To score and to time all configurations.
-    report_s : float
-        To start, and to write tables, figures and report.
+        Samples, fits, and further fits of learning curves and other seeds.
+    stages : list of Step
+        Per dataset: compilation (once per machine), scores of each method, timing, and the report.
     """
 
     steps: list[Step]
-    compilation_s: float
-    scoring_s: float
-    timing_s: float
-    report_s: float
+    stages: list[Step]
+
+    def stage_seconds(self, stage: StageName) -> float:
+        """Return the seconds of a stage on all datasets."""
+        return sum(step.seconds or 0.0 for step in self.stages if step.stage == stage)
 
     @property
     def seconds(self) -> float:
         """Seconds of everything that is known and not done."""
-        stages = self.compilation_s + self.scoring_s + self.timing_s + self.report_s
-        return stages + sum(step.seconds or 0.0 for step in self.steps if not step.done)
+        steps = (*self.steps, *self.stages)
+        return sum(step.seconds or 0.0 for step in steps if not step.done)
 
     @property
     def n_unknown(self) -> int:
@@ -102,7 +111,15 @@ class Plan:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content for JSON."""
-        return {**asdict(self), "seconds": self.seconds, "n_unknown": self.n_unknown}
+        return {
+            "steps": [asdict(step) for step in self.steps],
+            "compilation_s": self.stage_seconds("compilation"),
+            "scoring_s": self.stage_seconds("scores"),
+            "timing_s": self.stage_seconds("timing"),
+            "report_s": self.stage_seconds("report"),
+            "seconds": self.seconds,
+            "n_unknown": self.n_unknown,
+        }
 
 
 def plan(
@@ -132,26 +149,45 @@ def plan(
         ]
     ]
     usable = [item for item in configurations if missing_library(item.method) is None]
-    pace = Pace.measured()
+    pace = Pace.measured(any(map(needs_torch, usable)))
     steps: list[Step] = []
-    compilation_s = scoring_s = timing_s = 0.0
+    stages: list[Step] = []
     for spec in specs:
         own = _steps(spec, configurations, context, pace)
-        n_dofs, n_train = _problem_size(spec, context)
-        query_s = query_seconds(n_dofs, pace)
-        held = spec.split.test_fraction + spec.split.validation_fraction
-        n_scored = round(n_train * held / (1 - held))
+        steps += own
         undone = [
             item
             for item, step in zip(configurations, own[1:], strict=False)
             if not step.done and item in usable
         ]
-        compilation_s += compile_seconds(spec, usable, pace)
-        scoring_s += sum(scoring_seconds(item, n_scored, query_s, pace) for item in undone)
-        timing_s += timing_seconds(usable, context, query_s, pace)
-        steps += own
-    report_s = REPORT_S * pace.interpreter * len(specs)
-    return Plan(steps, compilation_s, scoring_s, timing_s, report_s)
+        stages += _stages(spec, usable, undone, context, pace)
+    return Plan(steps, stages)
+
+
+def _stages(
+    spec: AnyDatasetSpec,
+    configurations: Sequence[Configuration],
+    undone: Sequence[Configuration],
+    context: RunContext,
+    pace: Pace,
+) -> list[Step]:
+    """Return the stages on one dataset that treat all its steps; scores are listed by method."""
+    n_dofs, n_train = _problem_size(spec, context)
+    query_s = query_seconds(n_dofs, pace)
+    held = spec.split.test_fraction + spec.split.validation_fraction
+    n_scored = round(n_train * held / (1 - held))
+    scores = dict.fromkeys((item.method.name for item in undone), 0.0)
+    for item in undone:
+        scores[item.method.name] += scoring_seconds(item, n_scored, query_s, pace)
+    name = spec.name
+    compiled = compile_seconds(spec, configurations, pace)
+    timed = timing_seconds(configurations, context, query_s, pace)
+    return [
+        Step(name, "compilation", False, compiled, "compilation"),
+        *(Step(name, f"{m}: scores", False, s, "scores", m) for m, s in scores.items()),
+        Step(name, "timing", False, timed, "timing"),
+        Step(name, "report", False, REPORT_S * pace.interpreter, "report"),
+    ]
 
 
 def _steps(
@@ -169,16 +205,18 @@ def _steps(
     for configuration in configurations:
         method, label = configuration.method.name, configuration.label
         if missing := missing_library(configuration.method):
-            fits.append(Step(spec.name, f"{label} (left out: {missing})", False, 0.0))
+            title = f"{label} (left out: {missing})"
+            fits.append(Step(spec.name, title, False, 0.0, method=method))
             continue
         if _is_shipped(configuration, spec, context):
-            fits.append(Step(spec.name, f"{label} (trained elsewhere)", False, 0.0))
+            title = f"{label} (trained elsewhere)"
+            fits.append(Step(spec.name, title, False, 0.0, method=method))
             continue
         expected = fit_seconds(configuration, context, size, pace)
         seconds = _within_budget(expected, left_s[method], configuration)
         left_s[method] -= seconds or 0.0
         shared = None if seconds is None else seconds / context.options.jobs
-        fits.append(Step(spec.name, label, label in done, shared))
+        fits.append(Step(spec.name, label, label in done, shared, method=method))
     return [data, *fits, *_extra_steps(spec.name, configurations, fits, context)]
 
 
@@ -219,16 +257,16 @@ def _extra_steps(
             if configuration.method.name == method
         ]
         (first, _), (_, last_s) = mine[0], mine[-1]
-        names, seconds = [], 0.0
+        extra: dict[StageName, float] = {}
         if context.seeds > 1 and draws_randomly(first):
-            names.append("other seeds")
-            seconds += (context.seeds - 1) * sum(item for _, item in mine)
+            extra["other seeds"] = (context.seeds - 1) * sum(item for _, item in mine)
         if curves:
-            names.append("learning curve")
             trains = "iterations" in first.parameters
-            seconds += LEARNING_POINTS * last_s if trains else last_s / (LEARNING_STEP - 1)
-        if names:
-            steps.append(Step(dataset, f"{method}: {', '.join(names)}", False, seconds))
+            extra["learning curve"] = (
+                LEARNING_POINTS * last_s if trains else last_s / (LEARNING_STEP - 1)
+            )
+        for stage, seconds in extra.items():
+            steps.append(Step(dataset, f"{method}: {stage}", False, seconds, stage, method))
     return steps
 
 
@@ -245,7 +283,7 @@ def _problem_size(spec: AnyDatasetSpec, context: RunContext) -> tuple[int, int]:
 
 def _data_step(spec: AnyDatasetSpec, context: RunContext) -> Step:
     if not isinstance(spec, DatasetSpec):
-        return Step(spec.name, "imported snapshots", True, 0.0)
+        return Step(spec.name, "imported snapshots", True, 0.0, "samples")
     n = n_samples_to_generate(spec, context.options.limit)
     folder = dataset_folder(spec, context.cache)
     missing = sum(
@@ -254,10 +292,10 @@ def _data_step(spec: AnyDatasetSpec, context: RunContext) -> Step:
         if not shard_path(folder, start // SHARD_SIZE).exists()
     )
     if not missing:
-        return Step(spec.name, f"{n:,} samples", True, 0.0)
+        return Step(spec.name, f"{n:,} samples", True, 0.0, "samples")
     workers = context.options.workers or os.cpu_count() or 1
     seconds = missing * sample_seconds(spec) / workers
-    return Step(spec.name, f"{missing:,} of {n:,} samples", False, seconds)
+    return Step(spec.name, f"{missing:,} of {n:,} samples", False, seconds, "samples")
 
 
 def _cached_labels(

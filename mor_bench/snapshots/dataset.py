@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any, Unpack, get_args
 
@@ -129,6 +130,30 @@ class Dataset:
     n_refused: int
     n_unused: int = 0
     tests: dict[str, Snapshots] = field(default_factory=dict)
+
+    def _repr_html_(self) -> str:
+        """Show the parts of the dataset in a notebook."""
+        mesh = self.scene.mesh
+        parts = {"train": self.train, "validation": self.validation, "test": self.test}
+        rows = "".join(_html_row(name, part) for name, part in {**parts, **self.tests}.items())
+        headings = ("part", "samples", "load regions", "largest displacement along an axis (m)")
+        head = "".join(f'<th scope="col">{text}</th>' for text in headings)
+        return (
+            f"<table><caption>{escape(self.scene.name)}: {mesh.n_nodes:,} nodes, "
+            f"{mesh.n_cells:,} cells, {mesh.n_dofs:,} degrees of freedom; "
+            f"{self.n_refused:,} samples without equilibrium, {self.n_unused:,} unused</caption>"
+            f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+        )
+
+
+def _html_row(name: str, part: Snapshots) -> str:
+    nodal = part.free_displacements
+    largest = f"{np.abs(nodal).max():.3g}" if nodal.size else "–"
+    cells = (f"{len(part):,}", f"{len(np.unique(part.regions)):,}", largest)
+    return (
+        f'<tr><th scope="row">{escape(name)}</th>'
+        f"{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
+    )
 
 
 def load_dataset(

@@ -70,6 +70,10 @@ class MethodSpec(StrictModel):
         The class, ``package.module:Class``.
     told : Told, optional
         What the method is told at query time. A parameter `input` takes precedence.
+    snapshots : bool
+        Whether the method learns from snapshots with the parameters of the file.
+    extra : str, optional
+        Extra of mor-bench that the method needs.
     reference : bool
         Whether the method solves the full equations on the dataset's own mesh. Its error is then
         that of its tolerance.
@@ -77,6 +81,8 @@ class MethodSpec(StrictModel):
         Where the method fails, in plain words.
     folder : Path, optional
         Folder of the file, which may also hold the module. None for the suite's own methods.
+    asked : str
+        Name or path by which the method was asked for, with the parameters in brackets.
     fit_s : float, optional
         Approximate time of a fit on beam-coarse with two cores, s.
     compile_s : float, optional
@@ -90,10 +96,13 @@ class MethodSpec(StrictModel):
     surrogate: Text
     source: Text
     told: Told | None = None
+    snapshots: bool = True
+    extra: Literal["learn", "mkl"] | None = None
     reference: bool = False
     limits: Text = ""
     regime: Regime | None = None
     folder: Path | None = None
+    asked: str = ""
     fit_s: Positive | None = None
     compile_s: Positive | None = None
     parameters: dict[str, Any] = Field(default_factory=dict)

@@ -94,7 +94,7 @@ def check_parameters(
     model = create_model(
         surrogate.__name__,
         __config__=ConfigDict(extra="forbid", strict=True),
-        **_annotated_defaults(surrogate),
+        **annotated_defaults(surrogate),
     )
     plain: Any = parameters
     if isinstance(parameters, Mapping):
@@ -111,7 +111,7 @@ def python_number(value: Any) -> Any:
     return float(value) if isinstance(value, numbers.Real) else value
 
 
-def _annotated_defaults(surrogate: type[Any]) -> dict[str, Any]:
+def annotated_defaults(surrogate: type[Any]) -> dict[str, Any]:
     """Return annotation and default of each parameter of ``__init__``; ``...`` for no default."""
     if surrogate.__init__ is object.__init__:
         return {}

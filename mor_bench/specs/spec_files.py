@@ -13,6 +13,7 @@ from mor_bench.specs.dataset_spec import (
     ImportedDatasetSpec,
     generated,
 )
+from mor_bench.specs.inline_parameters import split_method
 from mor_bench.specs.method_spec import MethodSpec
 from mor_bench.specs.one_line_errors import validated
 from mor_bench.specs.source_file import RECORDED
@@ -89,15 +90,46 @@ def is_method_file(path: Path) -> bool:
 
 
 def load_method_spec(source: str | Path, suite: Path | None = None) -> MethodSpec:
-    """Read and validate a method: a name in the suite or the path of a TOML.
+    """Read and validate a method.
+
+    Parameters
+    ----------
+    source : str or Path
+        A name in the suite or the path of a TOML. Values in brackets, as in
+        ``"pod[n_modes=10,20]"``, replace those of the file and are swept.
+    suite : Path, optional
+        Folder to look in first.
 
     Raises
     ------
     SpecError
         If the method is unknown or its file is not valid.
     """
+    asked = str(source)
+    swept: dict[str, list[Any]] = {}
+    if isinstance(source, str):
+        source, swept = split_method(source)
     path = find_file("methods", source, suite)
     content = read_toml(path)
     own = str(content.get("surrogate", "")).startswith("mor_bench.")
     folder = None if own else path.parent.resolve()
-    return validated(MethodSpec, {**content, "name": path.stem, "folder": folder}, str(path))
+    content |= {"name": path.stem, "folder": folder, "asked": asked}
+    spec = validated(MethodSpec, content, str(path))
+    return validated(MethodSpec, _with_sweep(content, swept), asked) if swept else spec
+
+
+def _with_sweep(content: dict[str, Any], swept: Mapping[str, list[Any]]) -> dict[str, Any]:
+    """Return a valid method file's content with some parameters swept over other values."""
+    firsts = {name: values[0] for name, values in swept.items()}
+    profiles = {
+        name: {**profile, "sweep": {**profile["sweep"], **swept}}
+        if profile.get("sweep")
+        else profile
+        for name, profile in content.get("profiles", {}).items()
+    }
+    return {
+        **content,
+        "parameters": {**content.get("parameters", {}), **firsts},
+        "sweep": {**content.get("sweep", {}), **swept},
+        "profiles": profiles,
+    }

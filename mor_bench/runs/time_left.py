@@ -1,0 +1,125 @@
+"""The time left in a run, from its plan and from the durations of what it has done."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from mor_bench.runs.plan import Plan, StageName, Step
+
+ORDER: tuple[tuple[StageName, ...], ...] = (
+    ("compilation",),
+    ("samples",),
+    ("fit", "scores"),
+    ("other seeds",),
+    ("timing",),
+    ("learning curve",),
+)
+"""Stages of a run on one dataset, in order. A method's fits and scores are one task."""
+
+UNKNOWN_S = 5.0
+"""Assumed duration of a fit that nothing is known about, s."""
+
+PRIOR_S = 15.0
+"""Planned seconds of finished tasks whose measured pace counts as much as the prior one."""
+
+MOST_CORRECTION = 5.0
+"""Largest factor by which the pace of a stage corrects the plan."""
+
+OVERTIME = 0.1
+"""Share of its duration so far that a task which takes longer than planned is expected to take."""
+
+
+class Task(NamedTuple):
+    """A part of a run with a planned duration."""
+
+    dataset: str
+    stage: StageName
+    method: str = ""
+
+
+def tasks_of(plan: Plan) -> Iterator[tuple[Task, list[float]]]:
+    """Yield the tasks of a plan and the planned seconds of their steps, in the order of the run."""
+    every = [*plan.steps, *plan.stages]
+    for dataset in dict.fromkeys(step.dataset for step in every):
+        for stages in ORDER:
+            mine = [s for s in every if s.dataset == dataset and s.stage in stages]
+            for method in dict.fromkeys(step.method for step in mine):
+                steps = [step for step in mine if step.method == method]
+                yield Task(dataset, stages[0], method), [_seconds(step) for step in steps]
+    yield Task("", "report"), [plan.stage_seconds("report")]
+
+
+def _seconds(step: Step) -> float:
+    if step.done:
+        return 0.0
+    return UNKNOWN_S if step.seconds is None else step.seconds
+
+
+@dataclass
+class TimeLeft:
+    """An estimate of the time left, which learns from every finished task.
+
+    Attributes
+    ----------
+    steps : dict
+        Planned seconds of each step of each task, in the order of the run.
+    spent : dict
+        Measured seconds of each finished task.
+    """
+
+    steps: dict[Task, list[float]]
+    spent: dict[Task, float] = field(default_factory=dict)
+    _current: Task | None = None
+    _since: float = 0.0
+    _seen: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def of(cls, plan: Plan) -> TimeLeft:
+        """Make the estimate of a planned run."""
+        return cls(dict(tasks_of(plan)))
+
+    def share(self, task: Task, n: int) -> float:
+        """Return the planned share of the first steps of a task."""
+        steps = self.steps.get(task, [])
+        return sum(steps[:n]) / sum(steps) if sum(steps) else 0.0
+
+    def enter(self, task: Task, now: float, fraction: float = 0.0) -> None:
+        """Record at a time, s, that a task has begun, or how much of it is done."""
+        if task not in self.steps:
+            return
+        if task != self._current:
+            if self._current is not None:
+                self.spent[self._current] = now - self._since
+            self._current, self._since = task, now
+        self._seen = fraction, now - self._since
+
+    def seconds(self, now: float) -> float:
+        """Estimate the seconds from now to the end of the run."""
+        order = list(self.steps)
+        first = 0 if self._current is None else order.index(self._current) + 1
+        ahead = sum(sum(self.steps[task]) * self._pace(task.stage) for task in order[first:])
+        return ahead + self._left_in_current(now)
+
+    def _pace(self, stage: StageName) -> float:
+        """Return measured over planned seconds: of the stage, or of all while it is short."""
+        common = self._ratio(list(self.spent), 1.0)
+        pace = self._ratio([task for task in self.spent if task.stage == stage], common)
+        return min(max(pace, 1 / MOST_CORRECTION), MOST_CORRECTION)
+
+    def _ratio(self, done: Sequence[Task], prior: float) -> float:
+        planned = sum(sum(self.steps[task]) for task in done)
+        spent = sum(self.spent[task] for task in done)
+        return (spent + PRIOR_S * prior) / (planned + PRIOR_S)
+
+    def _left_in_current(self, now: float) -> float:
+        if self._current is None:
+            return 0.0
+        total = sum(self.steps[self._current]) * self._pace(self._current.stage)
+        fraction, at_s = self._seen
+        if fraction > 0:
+            trust = min(1.0, 2 * fraction)
+            total = (1 - trust) * total + trust * at_s / fraction
+        elapsed = now - self._since
+        return max(total - elapsed, OVERTIME * elapsed * (1 - fraction))

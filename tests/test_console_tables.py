@@ -1,0 +1,137 @@
+"""The tables of a comparison on the console: verdict, six columns, notes, and everything."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from mor_bench.analysis.analyse import analyse
+from mor_bench.report.aligned_lines import Line, aligned_lines
+from mor_bench.report.console_tables import Detail, print_tables
+from mor_bench.report.number_format import milliseconds_text, seconds_text
+from mor_bench.report.short_names import renamed, short_names
+from mor_bench.results.comparison import Comparison
+from tests.synthetic import a_row, synthetic_comparison
+
+LONG = "a-method-of-somebody-else-whose-name-is-longer-than-the-whole-first-column"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+    """All methods, an unstable timing, a doubt by the hidden set, and rows without a result."""
+    found = synthetic_comparison(tmp_path_factory.mktemp("run"), per_region=8)
+    reason = "OutOfMemoryError: 31 GiB <needed> & 24 GiB there"
+    for method, status in (("fno", "failed"), ("deeponet", "failed"), (LONG, "skipped")):
+        row = a_row(method, dataset="beam-coarse", status=status, reason=reason, n_failed=None)
+        found.put(row)
+    found.rows[3] = found.rows[3].with_parts(warnings=["only 12 modes of <25>"])
+    return found
+
+
+@pytest.fixture(scope="module")
+def analysis(made: Comparison) -> dict[str, Any]:
+    return analyse(made, n_resamples=200)
+
+
+@pytest.fixture
+def shown(made: Comparison, analysis: dict[str, Any]) -> Any:
+    """Print with a width and a detail, and return the text."""
+
+    def text(width: int, **detail: bool) -> str:
+        stream = io.StringIO()
+        print_tables(made, Console(file=stream, width=width), analysis, Detail(**detail))
+        return stream.getvalue()
+
+    return text
+
+
+@pytest.mark.parametrize("width", [80, 100, 120])
+def test_six_columns_fit_the_width_and_no_name_is_broken(
+    made: Comparison, shown: Any, width: int
+) -> None:
+    lines = shown(width).splitlines()
+    uncut = [line for line in lines if not line.startswith("  mor-bench run ")]
+    assert max(map(len, uncut)) <= width
+    start = next(i for i, line in enumerate(lines) if line.startswith("  configuration"))
+    end = next(i for i, line in enumerate(lines) if line.startswith("*: on the Pareto"))
+    assert lines[start].split()[1:] == ["median", "p95", "median", "offline", "qualifies"]
+    table = "\n".join(lines[start:end])
+    for name in map(str, short_names(made.rows).values()):
+        assert re.search(rf"^[* ] {re.escape(name)}( |$)", table, re.MULTILINE), name
+    after = lines[lines.index(f"  {LONG}") + 1]
+    assert after.split() == ["–", "–", "–", "–", "skipped"]
+
+
+def test_the_verdict_comes_first_and_is_alone_if_quiet(
+    shown: Any, made: Comparison, analysis: dict[str, Any]
+) -> None:
+    headline = renamed(analysis["verdicts"][0]["headline"], short_names(made.rows))
+    assert " · " in headline
+    needs, finding = headline.split(". ", 1)
+    assert shown(10_000).splitlines()[1:3] == [finding, f"- {needs}."]
+    assert shown(40, quiet=True) == f"{headline}\n"
+
+
+def test_doubts_about_the_choice_are_named_and_other_notes_counted(shown: Any) -> None:
+    text = shown(80)
+    flat = " ".join(text.split())
+    assert re.search(r"^  linear-fem +[\d.]+ % +[\d.]+ % +~[\d.]+ µs", text, re.MULTILINE)
+    assert "pca-regression · k5: the median error is" in flat
+    assert "- 1 of 18 timings were not stable" in flat
+    again = next(line for line in text.splitlines() if line.startswith("  mor-bench run "))
+    assert again.endswith("--retime")
+    assert "fno, deeponet: failed: OutOfMemoryError: 31 GiB <needed> & 24 GiB there" in flat
+    assert "notes on methods, timings and samples: --verbose" in flat
+    for noise in ("processes differ by 14 %", "only 12 modes", "Who is faster"):
+        assert noise not in flat
+    full = shown(80, verbose=True)
+    assert "linear-fem: timing not stable: processes differ by 14 %" in full
+    assert "warning: only 12 modes of <25>" in full
+
+
+def test_wide_output_has_every_column_and_table_in_whole_lines(shown: Any) -> None:
+    text = shown(80, wide=True)
+    lines = text.splitlines()
+    rows = [line for line in lines if re.match(r"[* ] (fem|pod|hpod) · ", line)]
+    assert len({len(line) for line in rows[:2]}) == 1
+    assert min(map(len, rows)) > 200
+    for said in ("Time at error", "Who is faster at 1 %, the required error", "queries/s", "ē"):
+        assert said in text
+    assert re.search(r"^\(1\) fem +· +\+[\d.]+ +-[\d.]+", text, re.MULTILINE)
+
+
+def test_swept_parameters_that_do_not_vary_stand_in_the_caption(tmp_path: Path, shown: Any) -> None:
+    assert "hpod · r10, ctol 0.001" in shown(80)
+    made = Comparison(tmp_path, {})
+    for r in (3, 5):
+        made.rows.append(a_row("pod", {"n_modes": r, "how": "fast"}, status="skipped"))
+    stream = io.StringIO()
+    print_tables(made, Console(file=stream, width=80))
+    assert "  pod · r3  " in stream.getvalue()
+    assert "Same in all rows: pod: fast." in stream.getvalue()
+
+
+def test_durations_have_readable_units() -> None:
+    values = (None, 0.0, 1.3e-5, 5.5e-4, 0.0123, 0.9999, 12.34, 119.0, 300.0, 7300.0, float("inf"))
+    texts = ["–", "0 s", "13 µs", "0.55 ms", "12.3 ms", "1 s", "12.3 s", "119 s", "5 min"]
+    assert [seconds_text(value) for value in values] == [*texts, "2.03 h", "inf"]
+    assert milliseconds_text(0.62) == "0.62 ms"
+
+
+def test_columns_align_by_the_width_of_letters() -> None:
+    lines = [Line(["ē", "1"]), Line(["名前", "22"]), Line(["group"]), Line(["long name", "3"])]
+    found = [text.plain for text in aligned_lines(["a", "b\nc"], lines, 9)]
+    assert found == [
+        "       b",
+        "a      c",
+        "ē      1",
+        "名前  22",
+        "group",
+        "long name",
+        "       3",
+    ]

@@ -1,0 +1,167 @@
+"""What a user sees in a terminal: widths, help texts, lists, cards, and completion."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from mor_bench.cli.app import COMMANDS, app
+from mor_bench.cli.console import DEFAULT_WIDTH
+from mor_bench.cli.help_texts import EXIT_CODES
+from mor_bench.options import RunOptions, command_line
+from mor_bench.report.suite_overview import overview
+from mor_bench.results.comparison import Comparison
+from mor_bench.specs import list_suite, load_method_spec
+from mor_bench.version import __version__
+from tests.commands import mor_bench_command
+from tests.synthetic import synthetic_comparison
+
+EXPORTS = [("export", name) for name in ("vtu", "numpy", "onnx", "asv")]
+
+
+def mor_bench(*arguments: str, columns: str | None = None, **env: str | None) -> Result:
+    return CliRunner(env={"COLUMNS": columns, **env}).invoke(app, arguments, prog_name="mor-bench")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+    made = synthetic_comparison(tmp_path_factory.mktemp("runs") / "first", per_region=4)
+    made.rows[:] = [row.with_parts(told="equations") for row in made.rows]
+    made.write()
+    return made
+
+
+@pytest.mark.parametrize("columns", ["80", "120", None])
+def test_a_report_in_a_pipe_has_the_width_of_columns(run: Comparison, columns: str | None) -> None:
+    shown = mor_bench("report", str(run.out), "--told", "equations", columns=columns)
+    assert shown.exit_code == 0, shown.output
+    lines = [line for line in shown.stdout.splitlines() if not line.startswith("  mor-bench ")]
+    width = int(columns or DEFAULT_WIDTH)
+    assert width - 12 < max(map(len, lines)) <= width
+    assert any(re.match(r"\* fem · tol 0\.1 +[\d.]+ % +[\d.]+ % +[\d.]+ ms", li) for li in lines)
+
+
+def test_wide_tables_show_every_column_in_whole_lines(run: Comparison) -> None:
+    shown = mor_bench("report", str(run.out), "--told", "equations", "--wide", columns="80")
+    head = next(line for line in shown.stdout.splitlines() if line.startswith("  configuration"))
+    assert len(head) > 150
+    for word in ("queries/s", "memory", "model", "σ(e)", "Time at error", "Qualified are"):
+        assert word in shown.stdout
+
+
+@pytest.mark.parametrize("name", [*((name,) for name in COMMANDS if name != "export"), *EXPORTS])
+def test_every_command_shows_examples_and_exit_codes(name: tuple[str, ...]) -> None:
+    shown = mor_bench(*name, "--help", columns="80").stdout
+    assert max(map(len, shown.splitlines())) <= 80
+    examples, codes = shown.partition("Examples:\n")[2].split("Exit codes:\n")
+    assert len(re.findall("^  mor-bench ", examples, re.MULTILINE)) == 2
+    assert set(re.findall(r"^  (\d+) ", codes, re.MULTILINE)) >= set(map(str, EXIT_CODES))
+
+
+def test_the_help_groups_options_and_commands_by_panels() -> None:
+    shown = mor_bench("run", "--help", columns="100").stdout
+    place = {panel: shown.index(f"\n{panel}:\n") for panel in ("Comparison", "Training", "Output")}
+    assert place["Comparison"] < shown.index("--memory-limit")
+    assert place["Training"] < shown.index("--fit-seconds") < place["Output"] or place["Output"]
+    panels = {line.panel for _, _, line in command_line(RunOptions)}
+    assert panels == {"Comparison", "Training", "Data", "Folders"}
+    assert all(f"\n{panel}:\n" in shown for panel in panels)
+    listed = mor_bench("--help").stdout
+    assert all(f"\n{panel}:\n" in listed for panel in ("Compare", "Look up", "Methods", "Data"))
+    assert "--install-completion" in listed
+
+
+def test_the_version_is_printed() -> None:
+    assert mor_bench("--version").stdout == f"{__version__}\n"
+
+
+def test_an_unknown_command_gets_the_nearest_one() -> None:
+    found = mor_bench("rum")
+    assert found.exit_code == 2
+    assert "No such command 'rum'. Did you mean 'run'?" in " ".join(found.output.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("mor-bench re", ["report", "refine"]),
+        ("mor-bench run beam-t", ["beam-tiny"]),
+        ("mor-bench run beam-tiny -m hpo", ["hpod"]),
+        ("mor-bench show pod-t", ["pod-tensor"]),
+        ("mor-bench run --verb", ["--verbose"]),
+    ],
+)
+def test_the_shell_completes_commands_names_and_options(words: str, expected: list[str]) -> None:
+    count = str(len(words.split()) - 1)
+    env = {"_MOR_BENCH_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": count}
+    assert mor_bench(**env).stdout.split() == expected
+
+
+def test_lists_group_by_family_and_fit_the_width() -> None:
+    for columns in ("80", "120"):
+        shown = mor_bench("list", columns=columns).stdout.splitlines()
+        assert max(map(len, shown)) <= int(columns)
+        assert "Methods: hyper-reduction" in shown
+        assert "Datasets: boxes of hexahedra" in shown
+    line = next(line for line in shown if line.startswith("  umesh-small "))
+    assert "force, snapshots, [learn]" in line
+    assert load_method_spec("umesh-small").title in line
+
+
+@pytest.mark.slow
+def test_what_method_files_state_about_needs_is_true() -> None:
+    for name in list_suite("methods"):
+        spec = load_method_spec(name)
+        needs = spec.load_class()(**spec.parameters).needs_snapshots
+        assert needs == spec.snapshots, name
+    needing = {item.name for item in overview()["methods"] if "[learn]" in item.needs}
+    code = """
+import sys
+sys.modules["torch"] = None
+from mor_bench.errors import MissingDependencyError
+from mor_bench.specs import list_suite, load_method_spec
+for name in list_suite("methods"):
+    try:
+        load_method_spec(name).load_class()
+    except MissingDependencyError:
+        print(name)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) == needing
+
+
+def test_show_prints_a_method_a_dataset_or_a_run(run: Comparison, tmp_path: Path) -> None:
+    method = mor_bench("show", "hpod", columns="80").stdout
+    assert max(map(len, method.splitlines())) <= 80
+    for text in ("hyper-reduction", "equations, snapshots", "ECSW", "n_cubature_snapshots"):
+        assert text in method
+    assert re.search(
+        r"^  n_modes +1, 3, 5, 10, 20, 40 +an integer of at least 1", method, re.MULTILINE
+    )
+    dataset = mor_bench("show", "beam-tiny", columns="80").stdout
+    for text in ("24 cells, 63 nodes", "saint-venant-kirchhoff", "≤ 1 %, ≤ 3 ms", "mor-bench pick"):
+        assert text in dataset
+    shown = mor_bench("show", str(run.out), columns="80").stdout
+    assert "18 (18 ok)" in shown
+    assert f"mor-bench report {run.out}" in shown
+    content = json.loads(mor_bench("show", "hpod", "--json").stdout)
+    assert content["facts"]["family"] == "hyper-reduction"
+
+
+@pytest.mark.slow
+def test_a_quiet_run_prints_the_verdict_and_the_report_alone(tmp_path: Path, cache: Path) -> None:
+    options = ["-m", "linear-fem", "-m", "pod[n_modes=3,9]", "--cache", str(cache), "--quiet"]
+    done = mor_bench_command("run", "beam-tiny", "--out", "out", *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    headline, path = done.stdout.splitlines()
+    assert headline.startswith("beam-tiny needs ")
+    assert path.endswith("report.html")
+    assert done.stderr == ""
+    rows = Comparison.read(tmp_path / "out").rows
+    assert [row.label for row in rows] == ["linear-fem", "pod [n_modes=3]", "pod [n_modes=9]"]
