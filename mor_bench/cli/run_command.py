@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Annotated, ClassVar
 
 import typer
 from pydantic import Field
+from rich.console import Console
 
 import mor_bench
 from mor_bench.cli.console import make_console
@@ -26,7 +28,7 @@ from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.options import CommandLine, RunOptions
 from mor_bench.report.console_tables import print_plan, print_tables
 from mor_bench.report.page import render
-from mor_bench.runs.plan import plan
+from mor_bench.runs.plan import Plan, plan
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -93,11 +95,7 @@ def run(
     names = datasets or ["beam-coarse"]
     planned = partial(plan, names, method or None, **options.model_dump())
     if dry_run:
-        with notice_if_slow("Planning; a few samples are solved to estimate the times."):
-            found = planned()
-        if output.json_:
-            print(json.dumps(found.as_dict(), indent=1))
-        print_plan(found, console)
+        _print_plan(planned, console, output.json_)
         return
     with show_run(console, planned, quiet=detail.quiet, verbose=detail.verbose) as listener:
         comparison = mor_bench.run(
@@ -116,3 +114,11 @@ def run(
     failed = options.fail_fast and any(row.status == "failed" for row in comparison.rows)
     if failed or not any(row.ok for row in comparison.rows):
         raise typer.Exit(1)
+
+
+def _print_plan(planned: Callable[[], Plan], console: Console, as_json: bool) -> None:
+    with notice_if_slow("Planning; a few samples are solved to estimate the times."):
+        found = planned()
+    if as_json:
+        print(json.dumps(found.as_dict(), indent=1))
+    print_plan(found, console)
