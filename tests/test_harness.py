@@ -106,6 +106,9 @@ def test_the_figures_of_a_row_follow_from_its_raw_samples(small_run: Comparison)
     assert not set(arrays["validation_regions"].ravel()) & set(arrays["test_regions"].ravel())
     worst = np.abs(samples["worst_prediction"] - samples["worst_reference"]).mean()
     assert worst == pytest.approx(row.error.max_dof_m)
+    typical = np.abs(samples["typical_prediction"] - samples["typical_reference"]).mean()
+    ordered = np.sort(samples["mean_dof_m"])
+    assert typical == pytest.approx(ordered[(len(ordered) - 1) // 2])
 
 
 def test_errors_estimated_from_the_residual_agree_with_measured_ones(small_run: Comparison) -> None:

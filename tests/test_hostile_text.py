@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import io
 import json
+import re
 import shutil
 import sys
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import pytest
 from rich.console import Console
@@ -21,25 +22,25 @@ from mor_bench.report.console_tables import print_tables
 from mor_bench.report.page import render
 from mor_bench.results.comparison import Comparison
 from mor_bench.specs import list_suite
+from tests.hostile_runs import HOSTILE, hostile_run
 from tests.small_runs import method_file, run_small
-from tests.synthetic import synthetic_comparison
-
-HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(1)><svg onload=a()> $x_ {{ 7*7 }}"
 
 TAGS = {
     *("html", "head", "meta", "title", "style", "body", "h1", "h2", "h3", "p", "b", "br", "small"),
     *("div", "table", "thead", "tbody", "tr", "th", "td", "figure", "img", "figcaption", "dl"),
     *("dt", "dd", "a", "fieldset", "legend", "label", "input", "details", "summary", "code"),
-    *("ul", "li", "pre"),
+    *("ul", "li", "pre", "header", "nav", "main", "section", "footer", "noscript", "caption"),
+    *("button", "dialog", "form", "script", "span"),
 }
 ATTRIBUTES = {
     *("charset", "name", "content", "http-equiv", "lang", "class", "colspan", "rowspan", "alt"),
-    *("src", "href", "id", "type", "checked", "data-told"),
+    *("src", "href", "id", "type", "checked", "data-told", "value", "scope", "tabindex", "role"),
+    *("aria-label", "aria-labelledby", "data-chart", "data-index", "method"),
 }
 
 
 class Page(HTMLParser):
-    """All tags and attributes of a page, and its policy."""
+    """All tags and attributes of a page, its policy, and its scripts with their types."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -47,6 +48,8 @@ class Page(HTMLParser):
         self.attributes: set[str] = set()
         self.sources: set[str] = set()
         self.policy = ""
+        self.scripts: list[tuple[str, str]] = []
+        self.in_script = False
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -54,56 +57,24 @@ class Page(HTMLParser):
         self.attributes |= {name for name, _ in attrs}
         self.sources |= {(value or "")[:10] for name, value in attrs if name in ("src", "href")}
         found = dict(attrs)
+        self.in_script = tag == "script"
+        if self.in_script:
+            self.scripts.append((found.get("type") or "", ""))
         if found.get("http-equiv") == "Content-Security-Policy":
             self.policy = str(found["content"])
 
+    def handle_data(self, data: str) -> None:
+        if self.in_script:
+            kind, text = self.scripts[-1]
+            self.scripts[-1] = kind, text + data
 
-def hostile(value: Any) -> Any:
-    """Add a hostile text to every text of a table that is free text."""
-    if isinstance(value, dict):
-        return {key: hostile(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [hostile(item) for item in value]
-    return value + HOSTILE if isinstance(value, str) else value
-
-
-def spoiled_rows(rows: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    for i, row in enumerate(rows):
-        spoiled = {name: row[name] + HOSTILE for name in ("method", "label", "split")}
-        spoiled |= {"warnings": [HOSTILE, f"<b>{i}</b>"], "swept": {HOSTILE: HOSTILE}}
-        spoiled["parameters"] = {HOSTILE: HOSTILE}
-        if i == 1:
-            spoiled |= {"status": "failed", "reason": HOSTILE + "\x1b]0;title\x07"}
-        yield {**row, **spoiled}
+    def handle_endtag(self, tag: str) -> None:
+        self.in_script = False
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Comparison:
-    """A run in which every free text is hostile, and whose dataset is named like a path."""
-    folder, name = tmp_path / "outer" / "run", "beam-coarse"
-    made = synthetic_comparison(folder, name, n_regions=3, per_region=2)
-    arrays = [made.samples(row) for row in made.rows[:4]]
-    whole = made.dataset_arrays(name)
-    path = folder / "results.json"
-    content = json.loads(path.read_text())
-    content["rows"] = list(spoiled_rows(content["rows"][:4]))
-    content["machine"] = hostile(content["machine"])
-    content["datasets"][name] = {
-        **hostile(content["datasets"][name]),
-        "needs": content["datasets"][name]["needs"],
-    }
-    content["methods"] = {key + HOSTILE: table for key, table in content["methods"].items()}
-    content["learning"] = []
-    text = json.dumps(content).replace('"dataset": "beam-coarse"', '"dataset": "../../escaped"')
-    content = json.loads(text)
-    content["datasets"] = {"../../escaped": content["datasets"][name]}
-    path.write_text(json.dumps(content))
-    read = Comparison.read(folder)
-    for row, samples in zip(read.rows, arrays, strict=True):
-        read.put(row, samples)
-    read.add_dataset("../../escaped", read.datasets["../../escaped"], whole)
-    read.write()
-    return Comparison.read(folder)
+    return hostile_run(tmp_path / "outer" / "run")
 
 
 def test_no_text_of_a_file_becomes_markup_or_leads_out_of_the_folder(
@@ -114,12 +85,27 @@ def test_no_text_of_a_file_becomes_markup_or_leads_out_of_the_folder(
     assert page.tags <= TAGS
     assert page.attributes <= ATTRIBUTES
     assert all(not source.startswith(("http", "//", "java")) for source in page.sources)
-    assert "default-src 'none'" in page.policy
-    assert "script-src" not in page.policy
     assert "&lt;script&gt;alert(1)" in text
     assert "{{ 7*7 }}" in text
     assert [path.name for path in tmp_path.iterdir()] == ["outer"]
     assert [path.name for path in (tmp_path / "outer").iterdir()] == ["run"]
+
+
+def test_only_the_packages_own_scripts_may_run(run: Comparison) -> None:
+    page = Page(render(run)[-1].read_text(encoding="utf-8"))
+    rules = dict(rule.strip().split(" ", 1) for rule in page.policy.split(";"))
+    assert rules["default-src"] == "'none'"
+    allowed = re.findall(r"'sha256-([^']+)'", rules["script-src"])
+    assert rules["script-src"] == " ".join(f"'sha256-{digest}'" for digest in allowed)
+    runs = [text for kind, text in page.scripts if kind != "application/json"]
+    assert [sha256_of(text) for text in runs] == allowed
+    (data,) = (text for kind, text in page.scripts if kind == "application/json")
+    assert not {"<", ">", "&"} & set(data)
+    assert HOSTILE in json.loads(data)[0]["rows"][0]["label"]
+
+
+def sha256_of(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
 def test_the_terminal_gets_no_control_characters(run: Comparison) -> None:

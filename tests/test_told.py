@@ -74,8 +74,9 @@ def test_rows_are_grouped_by_what_their_methods_are_told(made: Comparison) -> No
 def test_the_page_filters_rows_without_a_script(made: Comparison) -> None:
     page = render(made)[-1].read_text(encoding="utf-8")
     assert 'tr[data-told="input"] { display: none; }' in page
-    assert page.count('type="checkbox"') == 3
-    table = page.split("<h3>Configurations</h3>")[1].split("</table>")[0]
+    markup = page.split("<script", 1)[0]
+    assert markup.count('type="checkbox"') == 3
+    table = markup.split("<caption>Configurations of")[1].split("</table>")[0]
     assert table.count('data-told="input"') == 3
     assert "checked> force only</label>" in page
     made.datasets["beam-tiny"]["observed"] = {"region": "x-max"}

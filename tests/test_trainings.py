@@ -104,7 +104,7 @@ def test_a_failed_seed_is_recorded_and_shown(comparison: Comparison, shown: list
     assert comparison.table.loc[0, "seeds.mean_dof_m.max"] == inf
     assert "–inf" in shown[0]
     assert reason in shown[0]
-    assert "<h3>Training seeds</h3>" in shown[1]
+    assert "<caption>Training seeds</caption>" in shown[1]
     assert "2 of 3" in shown[1]
     assert (comparison.out / "figures" / "beam-tiny--loss-curves.png").exists()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from mor_bench.report.caveat_tables import (
     hidden_table,
     named_sets,
@@ -9,7 +11,7 @@ from mor_bench.report.caveat_tables import (
     regimes_table,
     tuning_table,
 )
-from mor_bench.report.entries import Analysis, entries_of
+from mor_bench.report.entries import Analysis, Entry, best_per_method, entries_of
 from mor_bench.report.measurement_tables import indicated, resources, seeds, timing, training
 from mor_bench.report.paper_tables import against_the_paper, error_measures, same_error_or_time
 from mor_bench.report.speed_tables import break_even_table, pairwise, profile_table
@@ -30,7 +32,6 @@ def dataset_details(comparison: Comparison, dataset: str, analysis: Analysis) ->
         out_of_range(entries),
         training(entries),
         seeds(entries),
-        hidden_table(dataset, entries, analysis),
         tuning_table(dataset, analysis),
         error_measures(dataset, entries),
         against_the_paper(dataset, entries),
@@ -39,7 +40,22 @@ def dataset_details(comparison: Comparison, dataset: str, analysis: Analysis) ->
     return [table for table in tables if table is not None]
 
 
+def hard_cases(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> list[TextTable]:
+    """List the tables about loads that are harder than those of the main test set, or fresh.
+
+    Each method has its best configuration there.
+    """
+    best = best_per_method(entries)
+    tables = (
+        named_sets(best),
+        out_of_range([entry for entry in best if entry.row.sets]),
+        hidden_table(dataset, entries, analysis),
+    )
+    return [table for table in tables if table is not None]
+
+
 def overall(analysis: Analysis) -> list[TextTable]:
-    """List the tables over all datasets."""
-    tables = (profile_table(analysis), regimes_table(analysis))
+    """List the tables over all datasets; a profile over one dataset says nothing about others."""
+    several = analysis["profile"]["n_datasets"] > 1
+    tables = (profile_table(analysis) if several else None, regimes_table(analysis))
     return [table for table in tables if table is not None]

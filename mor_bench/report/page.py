@@ -15,7 +15,7 @@ from mor_bench.analysis.selection_text import needs_text
 from mor_bench.analysis.told import LEGEND, classes_of, is_observed, told_text
 from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.canvas import Drawn
-from mor_bench.report.details import dataset_details, overall
+from mor_bench.report.details import dataset_details, hard_cases, overall
 from mor_bench.report.entries import (
     Analysis,
     Entry,
@@ -24,8 +24,13 @@ from mor_bench.report.entries import (
     verdict_of,
 )
 from mor_bench.report.figures import write_figures
-from mor_bench.report.number_format import explain_short_names
-from mor_bench.report.page_columns import ConfigurationTable, configuration_columns
+from mor_bench.report.number_format import bytes_text, explain_short_names
+from mor_bench.report.page_data import Shown, cells_of, payload, reading_order
+from mor_bench.report.page_findings import Chart, charts, frontier
+from mor_bench.report.page_scripts import embedded_json, policy, scripts, styles
+from mor_bench.report.page_tables import figure_tables, with_content
+from mor_bench.report.page_verdict import Card, card
+from mor_bench.report.short_names import constants, short_names
 from mor_bench.report.speed_tables import target_table
 from mor_bench.report.summary import (
     discretisation_error,
@@ -37,6 +42,8 @@ from mor_bench.report.text_table import TextTable
 from mor_bench.results.comparison import Comparison
 from mor_bench.snapshots.store import write_atomically
 
+UNSTEADY = "timing not stable: "
+
 
 @dataclass(frozen=True)
 class Event:
@@ -44,31 +51,36 @@ class Event:
 
     label: str
     text: str
-    failed: bool = False
 
 
 @dataclass(frozen=True)
 class Section:
     """Content of the page about one dataset.
 
-    `verdict` is the summary of the verdict. `classes` maps labels and methods to what they are
-    told, for the filter. `facts` describe the run. `basis` and `short_names` are sentences under
-    the tables. `targets` are time at error and error at time; `details` are the tables after the
-    figures.
+    `rows` are the entries with their short names and cells; `constants` are parameters that do not
+    vary. `events` are failures, doubts and warnings other than unstable timings, which are
+    `unsteady`. `hard` are tables about difficult loads, `targets` and `details` all further tables.
+    `body_picture` replaces the turning bodies on paper. `data` is the content for the scripts.
     """
 
     name: str
     title: str
-    verdict: Mapping[str, Any]
-    classes: Mapping[str, str]
-    facts: list[tuple[str, str]]
-    configurations: ConfigurationTable
-    basis: str
+    card: Card
+    needs: str
+    frontier: Chart
+    charts: list[Chart]
+    rows: list[tuple[Entry, str, Mapping[str, list[str]]]]
+    constants: str
     short_names: str
+    basis: str
+    facts: list[tuple[str, str]]
+    failures: list[Event]
     events: list[Event]
-    targets: list[TextTable]
+    unsteady: list[Event]
+    hard: list[TextTable]
     details: list[TextTable]
-    figures: list[Drawn]
+    body_picture: Drawn | None
+    data: dict[str, Any]
 
 
 def render(comparison: Comparison, analysis: Analysis | None = None) -> list[Path]:
@@ -91,13 +103,18 @@ def render(comparison: Comparison, analysis: Analysis | None = None) -> list[Pat
         lstrip_blocks=True,
     )
     environment.filters["data_uri"] = _data_uri
+    sections = [_section(comparison, name, drawn, analysis) for name in names]
+    included = scripts()
     page = environment.get_template("page.html.j2").render(
-        sections=[_section(comparison, name, drawn, analysis) for name in names],
-        overall=overall(analysis),
-        overall_figures=[figure for figure in drawn if figure.dataset not in names],
-        machine=list(_flat(comparison.machine)),
+        sections=sections,
+        overall=with_content(overall(analysis)),
+        machine=[_readable(*pair) for pair in _flat(comparison.machine)],
         told={told or "": told_text(told, observed) for told in classes_of(comparison.rows)},
         legend=LEGEND,
+        styles=styles(),
+        scripts=included,
+        policy=policy(included),
+        data=embedded_json([section.data for section in sections]),
     )
     path = comparison.out / "report.html"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -113,32 +130,56 @@ def _section(
     comparison: Comparison, dataset: str, drawn: Sequence[Drawn], analysis: Analysis
 ) -> Section:
     entries = entries_of(comparison, dataset, analysis)
+    rows = [entry.row for entry in entries]
+    names = {label: str(name) for label, name in short_names(rows).items()}
+    verdict = card(verdict_of(analysis, dataset), entries, names) if entries else _EMPTY_CARD
+    data = payload(
+        Shown(comparison, dataset, analysis, entries, names, verdict),
+        len(dataset_names(comparison)),
+    )
+    notes = notes_of(comparison, dataset, analysis)
+    events = [Event(label, doubt) for label, doubt in notes if not doubt.startswith(UNSTEADY)]
+    events += [Event(label, f"warning: {warning}") for label, warning in warnings_of(entries)]
+    tables = [target_table(comparison, dataset, kind, analysis) for kind in _TARGETS]
+    pictures = (d for d in drawn if d.dataset == dataset and "worst-samples" in d.path.name)
     return Section(
         name=dataset,
         title=str(comparison.datasets.get(dataset, {}).get("title") or ""),
-        verdict=verdict_of(analysis, dataset),
-        classes={name: e.row.told or "" for e in entries for name in (e.method, e.label)},
-        facts=_facts(comparison, dataset, entries),
-        configurations=configuration_columns(entries),
-        basis=interval_basis(dataset, analysis),
-        short_names=explain_short_names(entry.swept for entry in entries),
-        events=_events(entries, notes_of(comparison, dataset, analysis)),
-        targets=[
-            target_table(comparison, dataset, kind, analysis)
-            for kind in ("time_at_error", "error_at_time")
+        card=verdict,
+        needs=needs_text(needs_of(comparison, dataset)),
+        frontier=frontier(data, _frontier_title(verdict)),
+        charts=charts(data),
+        rows=[
+            (entry, names[entry.label], cells_of(entry))
+            for entry in sorted(entries, key=reading_order)
         ],
-        details=dataset_details(comparison, dataset, analysis),
-        figures=[figure for figure in drawn if figure.dataset == dataset],
+        constants=constants(rows),
+        short_names=explain_short_names(entry.swept for entry in entries),
+        basis=interval_basis(dataset, analysis),
+        facts=_facts(comparison, dataset, entries),
+        failures=[Event(e.label, e.trouble) for e in entries if e.trouble],
+        events=events,
+        unsteady=[Event(e.label, "; ".join(e.unstable)) for e in entries if e.unstable],
+        hard=with_content(hard_cases(dataset, entries, analysis)),
+        details=with_content(
+            [*tables, *dataset_details(comparison, dataset, analysis), *figure_tables(entries)]
+        ),
+        body_picture=next(pictures, None),
+        data=data,
     )
 
 
-def _events(entries: Sequence[Entry], notes: Sequence[tuple[str, str]]) -> list[Event]:
-    """List failures and skips, then doubts, then warnings."""
-    return [
-        *(Event(e.label, e.trouble, failed=True) for e in entries if e.trouble),
-        *(Event(label, doubt) for label, doubt in notes),
-        *(Event(label, f"warning: {warning}") for label, warning in warnings_of(entries)),
-    ]
+_TARGETS = ("time_at_error", "error_at_time")
+
+_EMPTY_CARD = Card([], "No configuration was run.", "No configuration was run.", "", "", "", [], [])
+
+
+def _frontier_title(verdict: Card) -> str:
+    """State who wins, as the title of the chart."""
+    if not verdict.rankings:
+        return "No configuration meets both needs"
+    first = verdict.rankings[0].picks[0]
+    return f"{first.name} answers in {first.latency} ms with an error of {first.error} %"
 
 
 def _facts(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> list[tuple[str, str]]:
@@ -154,11 +195,10 @@ def _facts(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> li
         f"{sum(r.status == status for r in rows)} {status}" for status in ("failed", "skipped")
     )
     facts = [("source", str(spec["source"]))] if spec.get("source") else []
-    facts += [
-        (key, "; ".join(f"{k}: {v}" if k else v for k, v in _flat(spec[key])))
-        for key in ("geometry", "material", "supports", "loads", "snapshots")
-        if key in spec
-    ]
+    for key in ("geometry", "material", "supports", "loads", "snapshots"):
+        if key in spec:
+            pairs = [f"{k}: {v}" if k else v for k, v in _flat(spec[key]) if v != "None"]
+            facts.append((key, "; ".join(pairs)))
     return [
         *facts,
         ("split", split),
@@ -172,6 +212,12 @@ def _facts(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> li
 def _values(found: Iterable[object]) -> str:
     """Join the different values, in order; a dash if there are none."""
     return ", ".join(dict.fromkeys(map(str, found))) or "–"
+
+
+def _readable(key: str, text: str) -> tuple[str, str]:
+    """Format a size in bytes."""
+    name = key.removesuffix("_bytes")
+    return (name, bytes_text(float(text))) if name != key and text.isdecimal() else (key, text)
 
 
 def _flat(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:

@@ -117,6 +117,7 @@ class Comparison:
         `seeds_relative_l2`, `seeds_validation_relative_l2` (n_seeds - 1, n): of other seeds.
         `worst_prediction`, `worst_reference`, `worst_forces` (n_nodes, 3): the sample with the
         largest finite error.
+        `typical_prediction`, `typical_reference`, `typical_forces`: the one with the median error.
         `loss_curve`, `validation_curve` (n_intervals,): losses, evenly spread over the training.
         """
         return read_hdf5(self.samples_path(row))

@@ -34,7 +34,7 @@ SCORE_CHUNK = 256
 """Number of samples in one request for predictions."""
 
 Score = dict[str, NDArray[Any]]
-"""Per-sample errors on a test set, range flags if the method has them, and the worst sample."""
+"""Per-sample errors on a test set, range flags if any, and the worst and the typical sample."""
 
 
 @dataclass(frozen=True)
@@ -95,9 +95,14 @@ class _Scorer:
                 indicated.add(start, forces, predicted)
                 found = self.worker.ask("flag", LOAD_LIMIT_S, forces=forces)["flagged"]
                 flags = None if found is None or flags is None else flags + found
-        score: Score = {
-            name: np.concatenate([getattr(part, name) for part in errors]) for name in ERRORS
-        }
+            score: Score = {
+                name: np.concatenate([getattr(part, name) for part in errors]) for name in ERRORS
+            }
+            typical = _typical(score["mean_dof_m"])
+            left_s = max(1.0, until - monotonic())
+            again = self._predictions(test.forces[[typical]], left_s, Path(folder) / "answers.npy")[
+                0
+            ]
         if flags is not None:
             score["flagged"] = np.asarray(flags, dtype=bool)
         has_forces = data.scene.observed_nodes is None
@@ -107,6 +112,9 @@ class _Scorer:
             "worst_prediction": worst.prediction,
             "worst_reference": test.references[worst.number],
             "worst_forces": test.forces[worst.number] * has_forces,  # nothing to draw otherwise
+            "typical_prediction": again,
+            "typical_reference": test.references[typical],
+            "typical_forces": test.forces[typical] * has_forces,
         }
 
     def _predictions(
@@ -143,6 +151,11 @@ class _Scorer:
 
 _COST: TypeAdapter[dict[str, float] | None] = TypeAdapter(dict[str, float] | None)
 """The content of cost-SET.json."""
+
+
+def _typical(errors: NDArray[np.float64]) -> int:
+    """Return the number of the sample with the median error; infinite errors count as largest."""
+    return int(np.argsort(np.nan_to_num(errors, nan=np.inf), kind="stable")[(len(errors) - 1) // 2])
 
 
 class _Worst:

@@ -1,0 +1,229 @@
+"""The data of the page's charts and tables, as one JSON object per dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import isfinite, log
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.analysis.verdict import needs_of
+from mor_bench.report.entries import Analysis, Entry, by_group
+from mor_bench.report.method_styles import style_of
+from mor_bench.report.number_format import number, percent, span
+from mor_bench.report.page_bodies import bodies
+from mor_bench.report.page_samples import (
+    deformations,
+    distributions,
+    losses,
+    mesh_of,
+    positions,
+    sampled,
+    singular_values,
+)
+from mor_bench.report.page_tables import details_of
+from mor_bench.report.page_verdict import Card, offline_text
+from mor_bench.results.comparison import Comparison
+
+BODY_BYTES = 1_800_000
+"""Room for the bodies of all datasets, in letters of the page."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A dataset's entries with their short names and the verdict card."""
+
+    comparison: Comparison
+    dataset: str
+    analysis: Analysis
+    entries: Sequence[Entry]
+    names: Mapping[str, str]
+    card: Card
+
+
+def payload(shown: Shown, n_datasets: int) -> dict[str, Any]:
+    """Return all data of a dataset's charts; a chart without data is None or empty."""
+    comparison, dataset, entries = shown.comparison, shown.dataset, shown.entries
+    picks = [pick.entry for ranking in shown.card.rankings for pick in ranking.picks]
+    found = sampled(comparison, entries, picks)
+    arrays = dataset_arrays(comparison, dataset)
+    mesh = mesh_of(arrays)
+    needs = needs_of(comparison, dataset)
+    mesh_error = (entry.row.discretisation_rel_l2 for entry in entries)
+    return {
+        "dataset": dataset,
+        "needs": {
+            "error": None if needs.error is None else 100 * needs.error,
+            "latency": needs.latency_ms,
+        },
+        "mesh_error": next((100 * value for value in mesh_error if value is not None), None),
+        "winner": shown.card.rankings[0].picks[0].entry.label if shown.card.rankings else None,
+        "styles": {entry.method: vars(style_of(entry.method)) for entry in entries},
+        "groups": list(by_group(entries)),
+        "rows": [_row(comparison, entry, shown.names) for entry in entries],
+        "order": [entry.label for entry in sorted(entries, key=reading_order)],
+        "distributions": distributions(found),
+        "deformations": deformations(found),
+        "positions": positions(found, arrays, mesh),
+        "singular": singular_values(arrays),
+        "ranks": _ranks(entries),
+        "learning": _learning(comparison, dataset),
+        "losses": losses(comparison, entries),
+        "costs": costs(shown),
+        "bodies": bodies(found, mesh, BODY_BYTES // n_datasets),
+    }
+
+
+def reading_order(entry: Entry) -> tuple[bool, bool, float]:
+    """Put qualified configurations first and failed ones last, each group by latency."""
+    return not entry.qualified, bool(entry.trouble), entry.latency_ms
+
+
+def dataset_arrays(comparison: Comparison, dataset: str) -> Mapping[str, NDArray[Any]]:
+    """Read a dataset's arrays; empty if there are none."""
+    try:
+        return comparison.dataset_arrays(dataset)
+    except (OSError, KeyError):
+        return {}
+
+
+def _row(comparison: Comparison, entry: Entry, names: Mapping[str, str]) -> dict[str, Any]:
+    """Return the figures of one configuration: errors in %, latencies in ms, cost in core-s."""
+    error, latency = entry.intervals.get("rel_l2_median"), entry.intervals.get("latency_ms")
+    return {
+        "label": entry.label,
+        "name": names[entry.label],
+        "method": entry.method,
+        "told": entry.row.told or "",
+        "group": entry.group,
+        "status": entry.row.status,
+        "failed": bool(entry.trouble),
+        "reference": entry.row.reference,
+        "qualified": entry.qualified,
+        "front": entry.pareto_mark == "*",
+        "unstable": bool(entry.unstable),
+        "error": {
+            "median": _percent(entry, "rel_l2_median"),
+            "p95": _percent(entry, "rel_l2_p95"),
+            "max": _percent(entry, "rel_l2_max"),
+            "span": None if error is None else [100 * end for end in error],
+        },
+        "latency": {
+            "median": entry.figure("latency_ms", "median"),
+            "p95": entry.figure("latency_ms", "p95"),
+            "max": _slowest(comparison, entry),
+            "span": latency,
+        },
+        "work": entry.figure("cost", "multiply_adds"),
+        "offline": entry.row.offline_core_s,
+        "cells": cells_of(entry),
+        "hover": hover_of(entry, names),
+        "details": details_of(entry),
+    }
+
+
+def cells_of(entry: Entry) -> dict[str, list[str]]:
+    """Return the texts of the table's figures: the value, and its interval if there is one."""
+    error, latency = entry.intervals.get("rel_l2_median"), entry.intervals.get("latency_ms")
+    return {
+        "error": [
+            percent(entry.figure("error", "rel_l2_median")),
+            span(error, percent) if error else "",
+        ],
+        "latency": [
+            number(entry.figure("latency_ms", "median")) + ("~" if entry.unstable else ""),
+            span(latency) if latency else "",
+        ],
+        "offline": [offline_text(entry), ""],
+    }
+
+
+def hover_of(entry: Entry, names: Mapping[str, str]) -> list[str]:
+    """Return the lines that a chart shows for a configuration."""
+    cells = cells_of(entry)
+    lines = [
+        names[entry.label],
+        f"error {cells['error'][0]} %" + (f" [{cells['error'][1]}]" if cells["error"][1] else ""),
+        f"latency {cells['latency'][0].rstrip('~')} ms"
+        + (f" [{cells['latency'][1]}]" if cells["latency"][1] else ""),
+        f"offline {cells['offline'][0]}",
+        f"told: {entry.group}",
+        *(f"{key} = {value}" for key, value in entry.row.parameters.items()),
+    ]
+    return lines + (["timing not stable"] if entry.unstable else [])
+
+
+def _percent(entry: Entry, name: str) -> float | None:
+    value = entry.figure("error", name)
+    return None if value is None else 100 * value
+
+
+def _slowest(comparison: Comparison, entry: Entry) -> float | None:
+    """Return the longest latency among the raw samples, ms."""
+    if not entry.ran:
+        return None
+    try:
+        raw = comparison.samples(entry.row).get("latency_ms", ())
+    except (OSError, KeyError):
+        return None
+    return float(np.max(raw)) if len(raw) else None
+
+
+def _ranks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
+    """List the swept ranks of each method."""
+    used: dict[str, set[int]] = {}
+    for entry in entries:
+        rank = entry.swept.get("n_modes")
+        if isinstance(rank, int) and rank >= 1:
+            used.setdefault(entry.method, set()).add(rank)
+    return [{"method": method, "ranks": sorted(ranks)} for method, ranks in used.items()]
+
+
+def _learning(comparison: Comparison, dataset: str) -> list[dict[str, Any]]:
+    """List learning curves with at least two points: samples against median error in %."""
+    lines: dict[tuple[str, str], list[tuple[int, float]]] = {}
+    for point in comparison.learning:
+        if point.dataset == dataset and point.error and point.error.rel_l2_median > 0:
+            value = 100 * point.error.rel_l2_median
+            if isfinite(value):
+                lines.setdefault((point.method, point.label), []).append((point.n_train, value))
+    return [
+        {"method": method, "label": label, "points": sorted(points)}
+        for (method, label), points in lines.items()
+        if len(points) > 1
+    ]
+
+
+def costs(shown: Shown) -> dict[str, Any] | None:
+    """Return offline and online cost of the methods that reach the required error, in core-s."""
+    records = [r for r in shown.analysis["break_even"] if r["dataset"] == shown.dataset]
+    needed = needs_of(shown.comparison, shown.dataset).error
+    targets = {record["target_rel_l2_median"] for record in records if record["label"]}
+    if not targets:
+        return None
+    target = min(targets, key=lambda t: abs(log(t / needed)) if needed else -t)
+    by_label = {entry.label: entry for entry in shown.entries}
+    mine = [r for r in records if r["target_rel_l2_median"] == target and r["label"]]
+    full_order = next((r["fem_label"] for r in mine if r["fem_label"]), None)
+    lines = [_cost(by_label[record["label"]], record["queries"]) for record in mine]
+    if full_order in by_label:
+        lines.insert(0, _cost(by_label[full_order], None))
+    known = [line for line in lines if line is not None]
+    return {"target": 100 * target, "full_order": full_order, "lines": known} if known else None
+
+
+def _cost(entry: Entry, queries: int | None) -> dict[str, Any] | None:
+    offline, latency = entry.row.offline_s, entry.figure("latency_ms", "median")
+    fit = entry.row.fit_core_s
+    if offline is None or latency is None or fit is None or offline.data is None:
+        return None
+    return {
+        "label": entry.label,
+        "data": offline.data,
+        "fit": fit,
+        "query": 1e-3 * latency * entry.row.threads,
+        "break_even": queries,
+    }

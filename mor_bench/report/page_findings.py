@@ -1,0 +1,189 @@
+"""Titles and captions of the page's charts: each title states the finding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mor_bench.report.number_format import number, whole
+
+Data = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart of the page: its kind for the scripts, a heading, the finding and how to read it."""
+
+    kind: str
+    heading: str
+    finding: str
+    reading: str
+
+
+def charts(data: Data) -> list[Chart]:
+    """List the charts of a dataset for which there is data, in reading order."""
+    found = []
+    for kind, (heading, key, finding, reading) in _CHARTS.items():
+        if data[key]:
+            found.append(Chart(kind, heading, finding(data), reading))
+    return found
+
+
+def frontier(data: Data, title: str) -> Chart:
+    """Return the chart of error against latency."""
+    reading = (
+        "Left and down is better. Lines join the configurations of a method. Bars are 95 % "
+        "intervals. Open markers: the timing was not stable. The dashed steps are the Pareto "
+        "front. References solve the full equations on the dataset's own mesh. "
+        "Click on the legend to hide a method, double-click to isolate it."
+    )
+    return Chart("frontier", "Error against time", title, reading)
+
+
+def _row(data: Data, label: str) -> Data:
+    return next(row for row in data["rows"] if row["label"] == label)
+
+
+def _first(data: Data, lines: Sequence[Data]) -> Data:
+    """Return the winner's method among some lines, or the first one."""
+    rows = {row["label"]: row["method"] for row in data["rows"]}
+    method = rows.get(data["winner"])
+    return next((line for line in lines if rows.get(line["label"]) == method), lines[0])
+
+
+def _name(data: Data, line: Data) -> str:
+    return str(_row(data, line["label"])["name"])
+
+
+def _ecdf(data: Data) -> str:
+    line = _first(data, data["distributions"])
+    error = _row(data, line["label"])["error"]
+    return (
+        f"{_name(data, line)}: 95 % of the test loads have an error below "
+        f"{number(error['p95'])} %, the worst has {number(error['max'])} %"
+    )
+
+
+def _deformation(data: Data) -> str:
+    line = _first(data, data["deformations"])
+    low, high = line["median_y"][0], line["median_y"][-1]
+    return (
+        f"{_name(data, line)}: the median error e is {number(low)} mm at the smallest "
+        f"deformations and {number(high)} mm at the largest"
+    )
+
+
+def _position(data: Data) -> str:
+    maps = [m for m in data["positions"]["maps"] if any(m["error"])]
+    line = _first(data, maps)
+    known = [value for value in line["error"] if value is not None]
+    place = data["positions"]["centres"][line["error"].index(max(known))]
+    where = ", ".join(f"{x:.3g}" for x in place)
+    return (
+        f"{_name(data, line)}: {number(min(known))} to {number(max(known))} %, largest where the "
+        f"load acts around ({where}) m"
+    )
+
+
+def _singular(data: Data) -> str:
+    tail = data["singular"]["tail"]
+    needed = (data["needs"]["error"] or 0.0) / 100
+    rank = next((i + 1 for i, value in enumerate(tail) if value is not None and value <= needed), 0)
+    if rank > 1:
+        return f"{rank} modes represent the training snapshots to {number(100 * tail[rank - 1])} %"
+    return f"{len(tail)} modes leave out {number(100 * (tail[-1] or 0.0))} %"
+
+
+def _learning(data: Data) -> str:
+    line = data["learning"][0]
+    (n0, e0), (n1, e1) = line["points"][0], line["points"][-1]
+    return (
+        f"{line['label']}: {number(e0)} % with {whole(n0)} training samples, "
+        f"{number(e1)} % with {whole(n1)}"
+    )
+
+
+def _losses(data: Data) -> str:
+    n = len(data["losses"])
+    return f"Loss of {n} {'training' if n == 1 else 'trainings'} from beginning to end"
+
+
+def _costs(data: Data) -> str:
+    lines = data["costs"]["lines"]
+    paid = [line for line in lines if line["break_even"] is not None]
+    target = f"at {number(data['costs']['target'])} %"
+    if not paid:
+        return f"No method pays off against the full-order model {target}"
+    best = min(paid, key=lambda line: line["break_even"])
+    return f"{_name(data, best)} pays off first {target}, after {whole(best['break_even'])} queries"
+
+
+def _bodies(data: Data) -> str:
+    line = _first(data, data["bodies"]["samples"])
+    return f"{_name(data, line)}, {line['kind']} test load: {line['text']}"
+
+
+_CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
+    "bodies": (
+        "Deformed bodies",
+        "bodies",
+        _bodies,
+        "Coloured: the prediction, by its error in mm. Blue lines: the full-order reference. "
+        "Grey lines: the body at rest. The arrow shows place and direction of the force. "
+        "Worst: the test load with the largest mean error e. Typical: with the median one. "
+        "Drag to turn; both views turn together. Errors beyond half the body's size are cut.",
+    ),
+    "positions": (
+        "Error over the position of the load",
+        "positions",
+        _position,
+        "Each dot is a load patch on the body. Its colour is the median relative L2 error of the "
+        "test loads there. Hollow dots have no test load.",
+    ),
+    "deformations": (
+        "Error against deformation",
+        "deformations",
+        _deformation,
+        "Lines: medians of e (mean absolute error per degree of freedom) in ten groups of test "
+        "loads, by the largest displacement of the reference. Dots: the test loads of one method.",
+    ),
+    "distributions": (
+        "Distribution of errors and latencies",
+        "distributions",
+        _ecdf,
+        "Height: the share of test loads (or queries) with at most this error (or latency). A "
+        "curve that ends below 100 % has loads without a prediction.",
+    ),
+    "costs": (
+        "Whole cost and break-even",
+        "costs",
+        _costs,
+        "Core-seconds of training data, fit and queries, for the fastest configuration of each "
+        "method that is accurate enough. Left: total over the number of queries; a diamond marks "
+        "the break-even with the full-order model. Right: its parts for one number of queries.",
+    ),
+    "singular": (
+        "Singular values of the training snapshots",
+        "singular",
+        _singular,
+        "Tail: the relative root-mean-square error of the best linear basis of r modes on the "
+        "training snapshots. No method with a linear basis of r modes can be more accurate "
+        "there. Markers: the ranks that were tried.",
+    ),
+    "learning": (
+        "Learning curves",
+        "learning",
+        _learning,
+        "Median error on the test set of the same configuration, fitted to more and more "
+        "training samples.",
+    ),
+    "losses": (
+        "Training losses",
+        "losses",
+        _losses,
+        "Each method minimises its own loss, so compare only curves of one method. Dashed: "
+        "loss on held-out samples.",
+    ),
+}
+"""By kind: heading, key of the data, function of the finding, and how to read the chart."""

@@ -1,0 +1,98 @@
+"""Every figure of a configuration, in groups: tables of the appendix, and details on demand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mor_bench.report.entries import Entry
+from mor_bench.report.number_format import DASH, bytes_text, metres, percent, span
+from mor_bench.report.speed_tables import NOT_REACHED
+from mor_bench.report.text_table import Cell, TextTable, figure_cell, marked_latency, table_of
+
+INTERVAL = "95 %"
+"""Name of the intervals in each group."""
+
+EMPTY = {DASH, "", "0", "no", "none", NOT_REACHED}
+"""Cells without information."""
+
+
+def _discretisation(entry: Entry) -> str:
+    value = entry.row.discretisation_error_m
+    return "not measured" if value is None else metres(value)
+
+
+GROUPS: dict[str, dict[str, Cell]] = {
+    "Relative L2 error (%)": {
+        "median": figure_cell("error", "rel_l2_median", percent),
+        INTERVAL: lambda e: span(e.intervals.get("rel_l2_median"), percent),
+        "p95": figure_cell("error", "rel_l2_p95", percent),
+        "max": figure_cell("error", "rel_l2_max", percent),
+        "validation median": figure_cell("validation", "rel_l2_median", percent),
+    },
+    "Latency of one query (ms)": {
+        "median": marked_latency,
+        INTERVAL: lambda e: span(e.intervals.get("latency_ms")),
+        "p95": figure_cell("latency_ms", "p95"),
+        "p99": figure_cell("latency_ms", "p99"),
+    },
+    "Error per degree of freedom (m)": {
+        "ē": figure_cell("error", "mean_dof_m", metres),
+        INTERVAL: lambda e: span(e.intervals.get("mean_dof_m"), metres),
+        "σ(e)": figure_cell("error", "std_dof_m", metres),
+        "max e": figure_cell("error", "max_dof_m", metres),
+        "ē, free dofs": figure_cell("error", "mean_free_dof_m", metres),
+    },
+    "Offline cost": {
+        "data (core-s)": figure_cell("offline_s", "data"),
+        "fit (s)": figure_cell("offline_s", "fit"),
+    },
+    "Nodal error and error over deformation": {
+        "largest nodal (m)": figure_cell("error", "max_nodal_m", metres),
+        "largest at the tip (m)": figure_cell("error", "tip_max_m", metres),
+        "slope": figure_cell("error", "slope", metres),
+        "largest u (m)": figure_cell("error", "amplitude_m"),
+    },
+    "Error at the tip (%)": {
+        "median": figure_cell("error", "tip_rel_median", percent),
+        "p95": figure_cell("error", "tip_rel_p95", percent),
+        "max": figure_cell("error", "tip_rel_max", percent),
+    },
+    "Size and samples": {
+        "model": lambda e: bytes_text(e.row.model_bytes),
+        "threads": lambda e: str(e.row.threads),
+        "training": lambda e: str(e.row.n_train),
+        "test": lambda e: str(e.row.n_test),
+        "without prediction": lambda e: DASH if e.row.n_failed is None else str(e.row.n_failed),
+        "discretisation error (m)": _discretisation,
+    },
+}
+"""Groups of figures; `table_of` leaves out those that no configuration has."""
+
+
+def figure_tables(entries: Sequence[Entry]) -> list[TextTable]:
+    """Build one table per group of figures, with a row per configuration."""
+    tables = (table_of(title, "", entries, cells) for title, cells in GROUPS.items())
+    return [table for table in tables if table is not None]
+
+
+def details_of(entry: Entry) -> list[tuple[str, list[tuple[str, str]]]]:
+    """List all known figures of one configuration, by group."""
+    given = {key: str(value) for key, value in entry.row.parameters.items()}
+    sizes = {f"{key} (chosen)": str(value) for key, value in entry.row.sizes.items()}
+    found = [("Hyperparameters", [*given.items(), *sizes.items()])]
+    for group, cells in GROUPS.items():
+        figures = [(name, cell(entry)) for name, cell in cells.items()]
+        found.append((group, [(name, text) for name, text in figures if text != DASH]))
+    notes = [("status", entry.trouble or entry.row.status)]
+    notes += [("timing not stable", reason) for reason in entry.unstable]
+    notes += [("warning", warning) for warning in entry.row.warnings]
+    return [(group, figures) for group, figures in [("Notes", notes), *found] if figures]
+
+
+def with_content(tables: Sequence[TextTable]) -> list[TextTable]:
+    """Leave out tables in which no cell beside the names holds information."""
+    return [
+        table
+        for table in tables
+        if any(cell.split("\n")[0] not in EMPTY for row in table.rows for cell in row[1:])
+    ]

@@ -1,0 +1,167 @@
+"""The verdict card of the page: the choice, its rivals, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+from mor_bench.report.entries import Entry
+from mor_bench.report.number_format import DASH, number, percent, span
+
+MOST_NAMES = 4
+"""Most names in a sentence; the others are counted."""
+
+
+@dataclass(frozen=True)
+class Pick:
+    """A configuration on the card: its part, names, and figures with 95 % intervals."""
+
+    part: str
+    entry: Entry
+    name: str
+    error: str
+    error_span: str
+    latency: str
+    latency_span: str
+    offline: str
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The first and the second of the qualified ones by `by`, and what cannot be told apart."""
+
+    by: str
+    title: str
+    picks: list[Pick]
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Card:
+    """The verdict card.
+
+    Attributes
+    ----------
+    rankings : list of Ranking
+        By latency and by offline cost; the one by latency is the verdict. Empty without a winner.
+    title : str
+        The finding without a winner, or the winner.
+    headline : str
+        The verdict in a sentence or two.
+    mesh, stability, command : str
+        Discretisation error, stability of the timings, and the command that repeats them.
+    sentences, evidence : list of str
+        Everything else.
+    """
+
+    rankings: list[Ranking]
+    title: str
+    headline: str
+    mesh: str
+    stability: str
+    command: str
+    sentences: list[str]
+    evidence: list[str]
+
+
+def card(verdict: Mapping[str, Any], entries: Sequence[Entry], names: Mapping[str, str]) -> Card:
+    """Build the card of a dataset from its verdict."""
+    by_label = {entry.label: entry for entry in entries}
+    qualified = [by_label[label] for label in verdict["qualified"] if label in by_label]
+    sentences = list(verdict["beside"])
+    unsteady = next((s for s in sentences if "timings w" in s), "")
+    stability, _, command = unsteady.partition(" Time again: ")
+    mesh = next((s for s in sentences if s.startswith("The discretisation error")), "")
+    rankings = []
+    if qualified:
+        undecided = [names[label] for label in verdict["undecided"] if label in names]
+        rankings = [
+            _by_latency(qualified, verdict["runner_up"], undecided, names),
+            _by_offline(qualified, verdict["cheapest"], names),
+        ]
+    return Card(
+        rankings,
+        rankings[0].title if rankings else verdict["headline"].split(". ", 1)[-1],
+        verdict["headline"],
+        mesh,
+        stability,
+        command,
+        sentences,
+        list(verdict["evidence"]),
+    )
+
+
+def _by_latency(
+    qualified: Sequence[Entry],
+    runner_up: str | None,
+    undecided: Sequence[str],
+    names: Mapping[str, str],
+) -> Ranking:
+    first = qualified[0]
+    second = next((e for e in qualified if e.label == runner_up), None)
+    picks = [_pick("fastest", first, names)]
+    picks += [_pick("runner-up of another method", second, names)] if second else []
+    if undecided:
+        sentence = f"Its latency cannot be told apart from that of {listed(undecided)}."
+    elif len(qualified) > 1:
+        sentence = "It is faster than every other configuration that qualifies."
+    else:
+        sentence = "No other configuration qualifies."
+    return Ranking("latency", f"Take {names[first.label]}", picks, sentence)
+
+
+def _by_offline(
+    qualified: Sequence[Entry], cheapest: str | None, names: Mapping[str, str]
+) -> Ranking:
+    def cost(entry: Entry) -> float:
+        seconds = entry.row.offline_core_s
+        return inf if seconds is None else seconds
+
+    ordered = sorted(qualified, key=cost)
+    first = next((e for e in qualified if e.label == cheapest), ordered[0])
+    second = next((e for e in ordered if e.method != first.method), None)
+    picks = [_pick("cheapest offline", first, names)]
+    picks += [_pick("next of another method", second, names)] if second else []
+    sentence = (
+        "Offline cost: core-seconds of training data and fit. Repeated fits differ, so costs "
+        "are compared with two digits."
+    )
+    return Ranking("offline cost", f"Take {names[first.label]}", picks, sentence)
+
+
+def _pick(part: str, entry: Entry, names: Mapping[str, str]) -> Pick:
+    return Pick(
+        part,
+        entry,
+        names[entry.label],
+        percent(entry.figure("error", "rel_l2_median")),
+        _interval(entry, "rel_l2_median", percent),
+        number(entry.figure("latency_ms", "median")),
+        _interval(entry, "latency_ms", number),
+        offline_text(entry),
+    )
+
+
+def _interval(entry: Entry, name: str, shown: Callable[[float | None], str]) -> str:
+    interval = entry.intervals.get(name)
+    return "" if interval is None else span(interval, shown)
+
+
+def offline_text(entry: Entry) -> str:
+    """Format the core-seconds of data and fit in seconds, minutes or hours."""
+    seconds = entry.row.offline_core_s
+    if seconds is None:
+        return DASH
+    for size, unit in ((3600.0, "h"), (60.0, "min")):
+        if seconds >= 2 * size:
+            return f"{number(seconds / size)} {unit}"
+    return f"{number(seconds)} s"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Join names, and count those that are too many for a sentence."""
+    shown = list(names[:MOST_NAMES])
+    shown += [f"{len(names) - MOST_NAMES} more"] if len(names) > MOST_NAMES else []
+    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"

@@ -1,0 +1,276 @@
+"use strict";
+// The plain charts: distributions, deformations, positions, costs, singular values, trainings.
+Report.kinds.distributions = (figure, data) => {
+  const R = Report;
+  const plot = figure.querySelector(".plot");
+  const kind = R.choice(figure, "show", [["error", "error"], ["latency", "latency"]], () => show());
+  function show() {
+    const traces = data.distributions.filter((line) => line[kind.value].x.length).map((line) => ({
+      type: "scatter", mode: "lines", name: R.plain(R.nameOf(data, line.label)),
+      x: line[kind.value].x, y: line[kind.value].share.map((s) => 100 * s),
+      line: { color: R.colour(data, line.label), shape: "hv", width: 2,
+        dash: R.dashOf(data, line.label) },
+      hovertemplate: `%{y:.3~g} % of ${kind.value === "error" ? "the loads" : "the queries"}: ` +
+        `at most %{x:.3~g} ${kind.value === "error" ? "%" : "ms"}`,
+    }));
+    const all = data.distributions.map((line) => line[kind.value]).filter((line) => line.x.length);
+    const at = (line, share) => line.x[Math.max(0, line.share.findIndex((s) => s >= share))];
+    const low = Math.min(...all.map((line) => at(line, 0.01)).filter((v) => v > 0));
+    const high = 1.5 * Math.max(...all.map((line) => at(line, 0.99)));
+    const unit = kind.value === "error" ? "%" : "ms";
+    const beyond = data.distributions.filter((line) => line[kind.value].x.at(-1) > high);
+    const named = kind.value === "error" ? "relative L2 error (%)" : "latency of one query (ms)";
+    const limit = data.needs[kind.value];
+    const lines = limit ? [{ type: "line", x0: limit, x1: limit, yref: "paper", y0: 0, y1: 1,
+      line: { color: R.theme().needInk, dash: "dot", width: 1.5 } }] : [];
+    const notes = limit ? [{ x: Math.log10(limit), xanchor: "left", y: 0.02, yref: "paper",
+      yanchor: "bottom", text: "needed", showarrow: false, font: { color: R.theme().needInk } }] : [];
+    return R.draw(plot, traces, R.layout({
+      xaxis: R.logAxis(named, { range: [Math.log10(low), Math.log10(high)] }),
+      yaxis: R.axis("share (%)", { range: [0, 102] }), shapes: lines,
+      annotations: [...notes, ...beyond.map((line, i) => ({
+        xref: "paper", x: 0.995, xanchor: "right", y: 90 - 7 * i, showarrow: false,
+        font: { size: 12, color: R.colour(data, line.label) },
+        text: R.plain(`${R.nameOf(data, line.label)}: up to ${R.short(line[kind.value].x.at(-1))} ${unit} →`),
+      }))], ...R.legend(traces.length, 400),
+    }));
+  }
+  return show;
+};
+
+// Members of one method family have similar hues; dashes tell their lines apart.
+Report.dashOf = (data, label) => {
+  const row = Report.rowOf(data, label);
+  const family = Report.styleOf(data, row).family;
+  const methods = [...new Set(data.rows.map((r) => r.method))];
+  const mine = methods.filter((m) => data.styles[m].family === family);
+  return ["solid", "dash", "dot", "dashdot"][mine.indexOf(row.method) % 4];
+};
+
+Report.kinds.deformations = (figure, data) => {
+  const R = Report;
+  const plot = figure.querySelector(".plot");
+  const dots = R.choice(figure, "dots of", R.options(data, data.deformations), () => show());
+  function show() {
+    const traces = data.deformations.map((line) => ({
+      type: "scatter", mode: "lines+markers", name: R.plain(R.nameOf(data, line.label)),
+      x: line.median_x, y: line.median_y,
+      line: { color: R.colour(data, line.label), width: 1.5 },
+      marker: { symbol: R.symbol(data, line.label), size: 7, color: R.colour(data, line.label) },
+      hovertemplate: "median e %{y:.3~g} mm at %{x:.3~g} mm",
+    }));
+    const line = data.deformations.find((l) => l.label === dots.value);
+    traces.unshift({
+      type: "scatter", mode: "markers", name: "test loads", x: line.x, y: line.y, showlegend: false,
+      marker: { color: R.colour(data, line.label), size: 5, opacity: 0.35 },
+      hovertemplate: "e %{y:.3~g} mm at %{x:.3~g} mm<extra></extra>",
+    });
+    const medians = data.deformations.flatMap((l) => l.median_y).filter((v) => v > 0);
+    const top = Math.max(...medians, ...line.y);
+    const range = [Math.log10(Math.min(...medians)) - 0.5, Math.log10(top) + 0.2];
+    return R.draw(plot, traces, R.layout({
+      xaxis: R.axis("largest displacement (mm)"),
+      yaxis: R.logAxis("error e (mm)", { range }), ...R.legend(traces.length, 420),
+    }));
+  }
+  return show;
+};
+
+Report.kinds.positions = (figure, data) => {
+  const R = Report;
+  const plot = figure.querySelector(".plot");
+  const found = data.positions;
+  const maps = found.maps.filter((map) => map.error.some((e) => e > 0));
+  const method = R.choice(figure, "method", R.options(data, maps), () => show());
+  function show() {
+    const map = maps.find((m) => m.label === method.value);
+    const edges = { x: [], y: [] };
+    for (let i = 0; i < found.edges.length; i += 4) {
+      edges.x.push(found.edges[i], found.edges[i + 2], null);
+      edges.y.push(found.edges[i + 1], found.edges[i + 3], null);
+    }
+    const known = found.x.map((_, i) => i).filter((i) => map.error[i] > 0);
+    const other = found.x.map((_, i) => i).filter((i) => !(map.error[i] > 0));
+    const logs = known.map((i) => Math.log10(map.error[i]));
+    const [low, high] = [Math.min(...logs), Math.max(...logs)];
+    const ticks = [0, 0.25, 0.5, 0.75, 1].map((t) => low + t * (high - low));
+    const at = (i) => `(${found.centres[i].join(", ")}) m`;
+    const traces = [
+      { type: "scatter", mode: "lines", ...edges, hoverinfo: "skip", line: { color: R.theme().quiet, width: 1 } },
+      { type: "scatter", mode: "markers", x: other.map((i) => found.x[i]), y: other.map((i) => found.y[i]),
+        marker: { symbol: "circle-open", size: 8, color: R.theme().quiet },
+        hovertext: other.map((i) => `no test load at ${at(i)}`), hoverinfo: "text" },
+      { type: "scatter", mode: "markers", x: known.map((i) => found.x[i]), y: known.map((i) => found.y[i]),
+        hovertext: known.map((i) => `${R.short(map.error[i])} % at ${at(i)}`), hoverinfo: "text",
+        marker: {
+          size: found.x.length > 400 ? 8 : 15, color: logs, colorscale: "Viridis", reversescale: true,
+          line: { color: R.theme().ink, width: 0.5 }, cmin: low, cmax: high,
+          colorbar: { title: { text: "error (%)" }, tickvals: ticks, thickness: 14,
+            ticktext: ticks.map((t) => R.short(10 ** t)) },
+        } },
+    ];
+    const bare = { visible: false, zeroline: false };
+    return R.draw(plot, traces, R.layout({
+      xaxis: bare, yaxis: { ...bare, scaleanchor: "x" }, showlegend: false,
+      height: R.isNarrow() ? 320 : 430, margin: { l: 8, r: 8, t: 8, b: 8 },
+    }));
+  }
+  return show;
+};
+
+Report.kinds.singular = (figure, data) => {
+  const R = Report;
+  const plot = figure.querySelector(".plot");
+  const { sigma, tail } = data.singular;
+  return function show() {
+    const { quiet, ink } = R.theme();
+    const count = sigma.map((_, i) => i + 1);
+    const line = (name, y, colour, width) => ({ type: "scatter", mode: "lines", name, y,
+      x: count.slice(0, y.length), line: { color: colour, width },
+      hovertemplate: `%{x}: %{y:.3~g}` });
+    const traces = [
+      line("singular value / largest", sigma, quiet, 1.5),
+      line("tail: left out by r modes", tail, ink, 2.5),
+    ];
+    for (const { method, ranks } of data.ranks) {
+      const shown = ranks.filter((r) => r <= tail.length);
+      const style = data.styles[method];
+      traces.push({ type: "scatter", mode: "markers", name: R.plain(method), x: shown,
+        y: shown.map((r) => tail[r - 1]),
+        marker: { symbol: style.symbol, size: 11, color: R.colourOf(style) },
+        hovertemplate: "r = %{x}: %{y:.3~g}" });
+    }
+    return R.draw(plot, traces, R.layout({
+      xaxis: R.logAxis("number of modes r"), ...R.legend(traces.length, 400),
+      yaxis: R.logAxis("relative to all snapshots", {
+        range: [Math.log10(Math.max(Math.min(...tail.filter((t) => t > 0)) / 3, 1e-12)), 0.1] }),
+    }));
+  };
+};
+
+Report.kinds.learning = (figure, data) => {
+  const R = Report;
+  const plot = figure.querySelector(".plot");
+  return function show() {
+    const traces = data.learning.map(({ method, label, points }) => ({
+      type: "scatter", mode: "lines+markers", name: R.plain(R.nameOf(data, label)),
+      x: points.map((p) => p[0]), y: points.map((p) => p[1]),
+      line: { color: data.styles[method] ? R.colourOf(data.styles[method]) : R.theme().ink },
+      marker: { size: 9, symbol: data.styles[method]?.symbol },
+      hovertemplate: "%{x} samples: %{y:.3~g} %",
+    }));
+    const sizes = [...new Set(data.learning.flatMap((line) => line.points.map((p) => p[0])))];
+    return R.draw(plot, traces, R.layout({
+      xaxis: R.logAxis("training samples", { tickvals: sizes, ticktext: sizes.map(String) }),
+      yaxis: R.logAxis("relative L2 error, median (%)"), ...R.legend(traces.length, 400),
+    }));
+  };
+};
+
+Report.kinds.losses = (figure, data) => {
+  const R = Report;
+  const plot = figure.querySelector(".plot");
+  return function show() {
+    const traces = data.losses.flatMap((line) => [["loss", "solid"], ["validation", "dash"]]
+      .filter(([key]) => line[key]).map(([key, dash]) => ({
+        type: "scatter", mode: "lines", x: line[key].map((_, i) => (100 * (i + 1)) / line[key].length),
+        y: line[key], name: R.plain(R.nameOf(data, line.label)) + (key === "loss" ? "" : ", held out"),
+        line: { color: R.colour(data, line.label), dash, width: 1.5 },
+        hovertemplate: "%{y:.3~g} after %{x:.0f} %",
+      })));
+    return R.draw(plot, traces, R.layout({
+      xaxis: R.axis("part of the training (%)"), yaxis: R.logAxis("loss"),
+      ...R.legend(traces.length, 380),
+    }));
+  };
+};
+
+Report.kinds.costs = (figure, data) => {
+  const R = Report;
+  const { lines, full_order: fullOrder } = data.costs;
+  const [left, right] = R.pair(figure);
+  const pays = lines.map((l) => l.break_even).filter((q) => q > 0);
+  const first = Math.ceil(Math.log10(Math.max(1, ...pays))) + 1;
+  const number = R.slider(figure, "queries on the right", [0, 9, 1, Math.min(first, 9)], () => parts());
+
+  const out = document.createElement("output");
+  number.after(out);
+  const total = (line, n) => line.data + line.fit + n * line.query;
+
+  function totals() {
+    const top = Math.max(7, ...pays.map((q) => Math.log10(q) + 1));
+    const counts = Array.from({ length: 41 }, (_, i) => 10 ** ((top * i) / 40));
+    const traces = lines.map((line) => ({
+      type: "scatter", mode: "lines", name: R.plain(R.nameOf(data, line.label)), x: counts,
+      y: counts.map((n) => total(line, n)), legendgroup: R.plain(line.label),
+      line: { color: R.colour(data, line.label), width: line.label === fullOrder ? 3 : 1.8,
+        dash: R.dashOf(data, line.label) },
+      hovertemplate: "%{y:.3~g} core-s for %{x:.2~g} queries",
+    }));
+    for (const line of lines.filter((l) => l.break_even > 0)) {
+      traces.push({ type: "scatter", mode: "markers", showlegend: false, legendgroup: R.plain(line.label),
+        x: [line.break_even], y: [total(line, line.break_even)],
+        marker: { symbol: "diamond", size: 11, color: R.colour(data, line.label),
+          line: { color: R.theme().ink, width: 1 } },
+        hovertext: [R.hover([R.nameOf(data, line.label), `pays off after ${line.break_even} queries`])],
+        hoverinfo: "text" });
+    }
+    return R.draw(left, traces, R.layout({
+      xaxis: R.logAxis("number of queries", { tickformat: "~e", dtick: 1 }),
+      yaxis: R.logAxis("core-seconds"), height: 440,
+      legend: { orientation: "h", y: -0.2, font: { size: 12 } },
+    }));
+  }
+
+  function parts() {
+    const n = 10 ** Number(number.value);
+    const count = `1e${number.value}`;
+    out.value = count;
+    const named = lines.map((line) => R.plain(R.nameOf(data, line.label)));
+    const sums = lines.map((line) => total(line, n)).sort((a, b) => a - b);
+    // One costly method must not hide the others: the axis ends, and the bar gets its value.
+    const end = 1.15 * Math.min(sums.at(-1), 4 * sums[Math.floor((sums.length - 1) / 2)]);
+    const { ink, fitted, reference, rest } = R.theme();
+    // The library has no bars: wide lines from the end of one part to the end of the next.
+    const begun = lines.map(() => 0);
+    const part = (name, value, colour) => {
+      const [x, y, hovertext] = [[], [], []];
+      lines.forEach((line, i) => {
+        const from = begun[i];
+        begun[i] += value(line);
+        x.push(from, begun[i], null);
+        y.push(named[i], named[i], null);
+        const text = R.hover([R.nameOf(data, line.label), `${name}: ${R.short(value(line))} core-s`]);
+        hovertext.push(text, text, "");
+      });
+      return { type: "scatter", mode: "lines", name, x, y, hovertext, hoverinfo: "text",
+        line: { width: 22, color: colour } };
+    };
+    const cut = lines.filter((line) => total(line, n) > end).map((line) => ({
+      y: R.plain(R.nameOf(data, line.label)), x: end, xanchor: "right", showarrow: false,
+      text: `${R.short(total(line, n))} →`, bgcolor: R.theme().paper, font: { size: 12, color: ink },
+    }));
+    return R.draw(right, [
+      part("training data", (l) => l.data, reference),
+      part("fit", (l) => l.fit, fitted),
+      part(`${count} queries`, (l) => n * l.query, rest),
+    ], R.layout({
+      height: 440, xaxis: R.axis("core-seconds", { range: [0, end] }),
+      yaxis: R.axis("", { range: [lines.length - 0.4, -0.6], type: "category", tickformat: "" }), annotations: cut,
+      legend: { orientation: "h", y: -0.2, font: { size: 12 } },
+    }));
+  }
+  return () => Promise.all([totals(), parts()]);
+};
+
+// Two plots beside each other in one figure.
+Report.pair = (figure) => {
+  const plot = figure.querySelector(".plot");
+  plot.classList.add("pair");
+  return [0, 1].map(() => {
+    const box = document.createElement("div");
+    box.append(document.createElement("div"));
+    plot.append(box);
+    return box.firstChild;
+  });
+};

@@ -1,0 +1,147 @@
+"use strict";
+// The chart of error against latency or work.
+Report.kinds.frontier = (figure, data) => {
+  const R = Report;
+  const plot = figure.querySelector(".plot");
+  // Much smaller errors than needed are of no use, and would compress the scale.
+  const needed = data.rows.filter((r) => !r.reference && r.error.median > 0).map((r) => r.error.median);
+  const FLOOR = Math.max(1e-4, Math.min(...needed, data.needs.error ?? Infinity) / 10);
+  const TOP = 200; // Larger errors are of no use; one outlier would stretch the axis.
+  const redraw = () => show();
+  const error = R.choice(figure, "error", [
+    ["median", "median"], ["p95", "95th percentile"], ["max", "maximum"],
+  ], redraw);
+  const time = R.choice(figure, "against", [
+    ["median", "latency, median"], ["p95", "latency, 95th percentile"], ["max", "latency, maximum"],
+    ["work", "work: multiply-adds"],
+  ], redraw);
+
+  const x = (row) => (time.value === "work" ? row.work : row.latency[time.value]);
+  const y = (row) => row.error[error.value];
+  const inside = (value) => Math.min(Math.max(value, FLOOR), TOP);
+
+  function shownRows() {
+    const hidden = [...document.querySelectorAll(".filter input:not(:checked)")].map((i) => i.value);
+    return data.rows.filter(
+      (row) => x(row) > 0 && y(row) !== null && y(row) >= 0 && !hidden.includes(row.told),
+    );
+  }
+
+  function bars(rows, part, value) {
+    const spans = rows.map((row) => row[part].span);
+    const end = (i, sign) => rows.map((row, n) => {
+      const limit = spans[n] && spans[n][i];
+      const known = limit !== null && limit !== undefined && y(row) === inside(y(row));
+      return !known ? 0 : Math.max(0, sign * (limit - value(row)));
+    });
+    return {
+      type: "data", symmetric: false, array: end(1, 1), arrayminus: end(0, -1), thickness: 1, width: 0,
+    };
+  }
+
+  function trace(rows, group) {
+    const style = R.styleOf(data, rows[0]);
+    const colour = R.colourOf(style);
+    const medians = error.value === "median" && time.value === "median";
+    const open = (row) => (row.unstable ? "-open" : "");
+    return {
+      type: "scatter", mode: "lines+markers+text", name: R.plain(rows[0].method),
+      legendgroup: R.plain(group), legendgrouptitle: { text: R.plain(group), font: { size: 12 } },
+      x: rows.map(x), y: rows.map((row) => inside(y(row))),
+      text: rows.map((row) => (row.front ? R.plain(row.name.split(" · ")[1] ?? row.name) : "")),
+      textposition: "top right", textfont: { color: colour, size: 12 },
+      hovertext: rows.map((row) => R.hover(row.hover)), hoverinfo: "text",
+      line: { color: colour, width: 1 },
+      marker: {
+        color: colour, size: 10, line: { color: colour, width: 1.5 },
+        symbol: rows.map((row) => style.symbol + open(row)),
+      },
+      error_x: medians ? { ...bars(rows, "latency", x), color: colour } : undefined,
+      error_y: medians ? { ...bars(rows, "error", (row) => inside(y(row))), color: colour } : undefined,
+    };
+  }
+
+  function front(rows) {
+    const sorted = rows.filter((row) => !row.reference).sort((a, b) => x(a) - x(b) || y(a) - y(b));
+    const best = [];
+    for (const row of sorted) {
+      if (y(row) < 100 && (!best.length || y(row) < y(best.at(-1)))) best.push(row);
+    }
+    return {
+      type: "scatter", mode: "lines", name: "Pareto front", x: best.map(x),
+      y: best.map((row) => inside(y(row))), hoverinfo: "skip",
+      line: { shape: "hv", dash: "dash", width: 1.5, color: R.theme().ink },
+    };
+  }
+
+  function marks(range) {
+    const { need, needInk, mesh, ink } = R.theme();
+    const shapes = [], annotations = [];
+    const write = (text, at, more) => annotations.push({
+      text, x: at[0], y: at[1], showarrow: false, font: { size: 12, color: ink }, ...more,
+    });
+    const low = [10 ** range.x[0], 10 ** range.y[0]];
+    if (error.value === "median" && data.mesh_error > low[1]) {
+      const top = Math.min(data.mesh_error, 10 ** range.y[1]);
+      shapes.push({ type: "rect", xref: "paper", x0: 0, x1: 1, y0: low[1], y1: top,
+        fillcolor: mesh, line: { width: 0 }, layer: "below" });
+      write(`grey: below the mesh’s own error (${R.short(data.mesh_error)} %)`, [0, 1],
+        { xref: "paper", yref: "paper", xanchor: "left", yanchor: "bottom" });
+    }
+    if (error.value === "median" && time.value === "median" && data.needs.error && data.needs.latency) {
+      shapes.push({ type: "rect", x0: low[0], x1: data.needs.latency, y0: low[1], y1: data.needs.error,
+        fillcolor: need, line: { color: needInk, width: 1 }, layer: "below" });
+      write(`needed: ≤ ${R.short(data.needs.error)} %, ≤ ${R.short(data.needs.latency)} ms`,
+        [range.x[0], range.y[0]],
+        { xanchor: "left", yanchor: "bottom", font: { size: 12, color: needInk } });
+    }
+    return { shapes, annotations };
+  }
+
+  // Values beyond the axis stand at its edge, with an arrow and the value.
+  function cuts(rows) {
+    return rows.filter((row) => y(row) > TOP || y(row) < FLOOR).map((row, i) => ({
+      x: Math.log10(x(row)), y: Math.log10(inside(y(row))), ax: 0,
+      ay: (y(row) > TOP ? 1 : -1) * (26 + 16 * (i % 2)),
+      text: `${R.short(y(row))} %`, arrowhead: 2, arrowside: "start", startarrowhead: 0,
+      font: { size: 11, color: R.theme().ink }, arrowcolor: R.theme().quiet,
+    }));
+  }
+
+  function rangeOf(values, extra) {
+    const logs = [...values, ...extra].filter((v) => v > 0 && Number.isFinite(v)).map(Math.log10);
+    const margin = 0.06 * (Math.max(...logs) - Math.min(...logs)) + 0.12;
+    return [Math.min(...logs) - margin, Math.max(...logs) + margin];
+  }
+
+  function show() {
+    const rows = shownRows();
+    const wanted = time.value === "work" || error.value !== "median" ? [] : [data.needs.latency];
+    const range = {
+      x: rangeOf(rows.map(x), wanted),
+      y: rangeOf(rows.map((row) => inside(y(row))), [data.needs.error]),
+    };
+    const traces = [];
+    for (const group of data.groups) {
+      const mine = rows.filter((row) => row.group === group);
+      for (const method of new Set(mine.map((row) => row.method))) {
+        traces.push(trace(mine.filter((row) => row.method === method), group));
+      }
+    }
+    traces.push(front(rows));
+    const { shapes, annotations } = marks(range);
+    const title = time.value === "work" ? "multiply-adds of one query"
+      : `latency of one query, ${time.selectedOptions[0].text.split(", ")[1]} (ms)`;
+    const its = R.layout({
+      xaxis: R.logAxis(title, { range: range.x }),
+      yaxis: R.logAxis(`relative L2 error, ${error.selectedOptions[0].text} (%)`, { range: range.y }),
+      shapes, annotations: [...annotations, ...cuts(rows)],
+      ...R.legend(traces.length + data.groups.length, R.isNarrow() ? 400 : 560),
+    });
+    its.legend.groupclick = "toggleitem";
+    return R.draw(plot, traces, its);
+  }
+
+  document.querySelectorAll(".filter input").forEach((i) => i.addEventListener("change", redraw));
+  return show;
+};

@@ -1,0 +1,97 @@
+"""The data inside the report page are those of the run."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mor_bench.analysis.analyse import analyse
+from mor_bench.report.number_format import percent
+from mor_bench.report.page import render
+from mor_bench.results.comparison import Comparison
+from tests.report_runs import N_TEST, add_row, data_of, markup_of, text_of, tiny
+from tests.synthetic import MESH, changed
+
+
+@pytest.fixture(scope="module")
+def comparison(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
+    """A sweep, and a row without some predictions."""
+    made = tiny(tmp_path_factory.mktemp("run"))
+    for rank, error, latency in ((5, 0.05, 1.0), (20, 0.008, 2.5), (25, 0.002, 4.0)):
+        add_row(made, "pod", {"n_modes": rank}, error, latency)
+    add_row(made, "partial", {}, 0.004, 5.0, n_failed=3)
+    return made
+
+
+@pytest.fixture(scope="module")
+def page(comparison: Comparison) -> str:
+    return render(comparison)[-1].read_text(encoding="utf-8")
+
+
+def test_the_data_of_the_charts_are_those_of_the_rows(comparison: Comparison, page: str) -> None:
+    (data,) = data_of(page)
+    for shown, row in zip(data["rows"], comparison.rows, strict=True):
+        if row.error and np.isfinite(row.error.rel_l2_median):
+            assert shown["error"]["median"] == 100 * row.error.rel_l2_median
+            assert f"error {percent(row.error.rel_l2_median)} %" in shown["hover"][1]
+        if row.latency_ms:
+            assert shown["latency"]["median"] == row.latency_ms.median
+            slowest = comparison.samples(row)["latency_ms"].max()
+            assert shown["latency"]["max"] == slowest
+    assert data["winner"] == "pod [n_modes=20]"
+    (line,) = (d for d in data["distributions"] if d["label"] == "partial")
+    assert line["error"]["share"][-1] == pytest.approx(1 - 3 / N_TEST)
+    (dots,) = (d for d in data["deformations"] if d["label"] == "partial")
+    assert dots["n_missing"] == 3
+    assert max(dots["x"]) == pytest.approx(200.0)
+    assert data["singular"]["tail"][0] == pytest.approx(0.8, rel=1e-3)
+
+
+def test_a_body_keeps_its_shape_and_its_error(comparison: Comparison, page: str) -> None:
+    bodies = data_of(page)[0]["bodies"]
+    sample = next(s for s in bodies["samples"] if s["label"] == "pod [n_modes=20]")
+    assert sample["kind"] == "worst"
+    row = comparison.row("beam-tiny", "pod [n_modes=20]")
+    arrays = comparison.samples(row)
+    nodes = np.unique(MESH.boundary_facets)
+    for name, exact in (
+        ("reference", arrays["worst_reference"][nodes]),
+        ("error", (arrays["worst_prediction"] - arrays["worst_reference"])[nodes]),
+    ):
+        packed = np.frombuffer(base64.b64decode(sample[name]["data"]), "<i2").reshape(-1, 3)
+        scale = np.abs(exact).max()
+        np.testing.assert_allclose(packed * sample[name]["scale"], exact, atol=1e-4 * scale)
+    facets = np.frombuffer(base64.b64decode(bodies["facets"]), "<i4").reshape(-1, 4)
+    np.testing.assert_array_equal(nodes[facets], MESH.boundary_facets)
+
+
+def test_many_unstable_timings_become_one_line(tmp_path: Path) -> None:
+    made = tiny(tmp_path)
+    for i in range(5):
+        row = add_row(made, "pod", {"n_modes": i + 1}, 0.005, 1.0 + i)
+        doubt = {"stable": False, "unstable_because": [f"processes differ by {10 + i} %"]}
+        made.put(changed(row, latency_ms=doubt))
+    page = render(made, analyse(made, n_resamples=50))[-1].read_text(encoding="utf-8")
+    outside = re.sub(r"<details>.*?</details>", "", markup_of(page), flags=re.DOTALL)
+    text = text_of(outside)
+    assert text.count("5 of 5 timings were not stable") == 1
+    assert text.count("5 unstable timings") == 1
+    assert "processes differ" not in text
+    assert "--retime" in text
+    assert "processes differ by 14 %" in text_of(page)
+
+
+def test_the_vendored_scripts_are_those_of_their_packages() -> None:
+    vendor = files("mor_bench.report") / "vendor"
+    noted = re.findall(
+        r"^\| `([^`]+)` .*`([0-9a-f]{64})` \|$", (vendor / "README.md").read_text(), re.M
+    )
+    assert {name for name, _ in noted} == {p.name for p in vendor.iterdir() if ".min." in p.name}
+    for name, digest in noted:
+        assert hashlib.sha256((vendor / name).read_bytes()).hexdigest() == digest
