@@ -133,6 +133,19 @@ def test_a_signal_while_a_command_is_looked_up_ends_it_in_the_same_way(name: str
     assert done.stderr.startswith(f"mor-bench: stopped by {name}. Finished samples and rows")
 
 
+def test_a_library_that_cannot_be_loaded_is_one_line() -> None:
+    code = (
+        "import sys\n"
+        "from mor_bench.cli.app import app\n"
+        "sys.modules['numpy'] = None\n"
+        "app(['check'])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("mor-bench: a library cannot be loaded: import of numpy")
+    assert len(done.stderr.splitlines()) == 1
+
+
 @pytest.mark.slow
 def test_nohup_is_respected(tmp_path: Path) -> None:
     code = (
