@@ -53,6 +53,8 @@ def clear_errors() -> Iterator[None]:
             _forget_output()
             where = "standard output or a temporary file"
         _exit(f"{where}: {error.strerror or error}", "red", 2)
+    except ImportError as error:  # an incomplete installation, or no memory for a library
+        _exit(f"a library cannot be loaded: {error}", "red", 2)
     except MemoryError as error:
         _exit(f"memory is short{f': {error}' if str(error) else ''}. {KEPT}", "red", 2)
     except StoppedBySignal as stop:

@@ -209,7 +209,7 @@ class DatasetRun:
             )
             reason = f"beyond the tuning budget of {limit}"
             return _Attempt(row.with_parts(status="skipped", reason=reason))
-        began = monotonic()
+        began, spent = monotonic(), 0.0
         cached, warnings = self._cached_fit(configuration)
         row = row.with_parts(parameters=cached.configuration.parameters, warnings=warnings)
         try:

@@ -38,7 +38,10 @@ KILLS = 50
 """Kills of each command by each signal."""
 
 GRACE_S = 1.0
-"""Time for which a process may outlive the command, s; longer if processes wait for a core."""
+"""Time for which a process may outlive the command, s."""
+
+STARVED_S = 60.0
+"""The same for a process that has had less than `GRACE_S` of a processor, on a busy machine, s."""
 
 FIT = ["fit", "beam-tiny", "-m", "umesh-small", "--set", "iterations=150", "--limit", "200"]
 FIT += ["--set", "inference=packed"]  # "auto" keeps times in the model
@@ -85,16 +88,28 @@ def leftovers(folder: Path) -> list[str]:
     return sorted({str(path) for pattern in patterns for path in folder.rglob(pattern)})
 
 
-def processes(folder: Path) -> list[str]:
-    """Describe the processes that a command in a folder has started, by their environment."""
-    found = []
+def processes(folder: Path) -> dict[str, float]:
+    """Return the processes that a command in a folder has started, with their processor time, s."""
+    found = {}
     for process in psutil.process_iter():
         try:
             if process.environ().get(MARK) == str(folder) and process.status() != "zombie":
-                found.append(" ".join(process.cmdline()[1:]) or str(process.pid))
+                name = " ".join([str(process.pid), *process.cmdline()[1:]])
+                found[name] = sum(process.cpu_times()[:2])
         except psutil.Error:
             continue
     return found
+
+
+def outliving(folder: Path) -> list[str]:
+    """Return the processes that outlive a command that was killed a moment ago."""
+    time.sleep(GRACE_S)
+    until = time.monotonic() + STARVED_S
+    while left := processes(folder):
+        if time.monotonic() > until or max(left.values()) > GRACE_S:
+            break
+        time.sleep(0.1)
+    return [f"outlived: {name}" for name in left]
 
 
 def start(command: str, folder: Path) -> subprocess.Popen[bytes]:
@@ -137,8 +152,7 @@ def kill_often(
         except subprocess.TimeoutExpired:
             process.send_signal(number)
             code = process.wait()
-            time.sleep(GRACE_S * max(1.0, psutil.getloadavg()[0] / (os.cpu_count() or 1)))
-        outcome.wrong += [f"outlived: {process}" for process in processes(folder)]
+        outcome.wrong += outliving(folder)
         if code == 0:
             _check_end(folder, expected, outcome)
             folder = folder.with_name(f"{command}-{number.name}-{outcome.finished}")
