@@ -38,10 +38,7 @@ KILLS = 50
 """Kills of each command by each signal."""
 
 GRACE_S = 1.0
-"""Time for which a process may outlive the command, s."""
-
-STARVED_S = 60.0
-"""The same for a process that has had less than `GRACE_S` of a processor, on a busy machine, s."""
+"""Time for which a process may outlive the command, s; longer if processes wait for a core."""
 
 FIT = ["fit", "beam-tiny", "-m", "umesh-small", "--set", "iterations=150", "--limit", "200"]
 FIT += ["--set", "inference=packed"]  # "auto" keeps times in the model
@@ -88,28 +85,17 @@ def leftovers(folder: Path) -> list[str]:
     return sorted({str(path) for pattern in patterns for path in folder.rglob(pattern)})
 
 
-def processes(folder: Path) -> dict[str, float]:
-    """Return the processes that a command in a folder has started, with their processor time, s."""
-    found = {}
+def outliving(folder: Path) -> list[str]:
+    """Return the processes that outlive a command that was killed a moment ago."""
+    time.sleep(GRACE_S * max(1.0, psutil.getloadavg()[0] / (os.cpu_count() or 1)))
+    found = []
     for process in psutil.process_iter():
         try:
             if process.environ().get(MARK) == str(folder) and process.status() != "zombie":
-                name = " ".join([str(process.pid), *process.cmdline()[1:]])
-                found[name] = sum(process.cpu_times()[:2])
+                found.append(" ".join(["outlived:", *process.cmdline()[1:]]))
         except psutil.Error:
             continue
     return found
-
-
-def outliving(folder: Path) -> list[str]:
-    """Return the processes that outlive a command that was killed a moment ago."""
-    time.sleep(GRACE_S)
-    until = time.monotonic() + STARVED_S
-    while left := processes(folder):
-        if time.monotonic() > until or max(left.values()) > GRACE_S:
-            break
-        time.sleep(0.1)
-    return [f"outlived: {name}" for name in left]
 
 
 def start(command: str, folder: Path) -> subprocess.Popen[bytes]:
