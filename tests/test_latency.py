@@ -159,6 +159,7 @@ def test_an_interrupt_while_workers_open_ends_them(
     tiny: Dataset, queries: Queries, tmp_path: Path
 ) -> None:
     limit_s, opening = 60.0, []
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def hanging(server: ForkServer | None) -> SandboxedProcess:
         process = SandboxedProcess(MethodSession, fork_server=server, scene=tiny.scene)
@@ -176,8 +177,11 @@ def test_an_interrupt_while_workers_open_ends_them(
     began = time.monotonic()
     threading.Thread(target=interrupt, daemon=True).start()
     methods = {name: TimedMethod(hanging, 1e8) for name in ("a", "b", "c")}
-    with pytest.raises(KeyboardInterrupt):
-        measure_latencies(methods, queries, Protocol(1, 2), 1)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            measure_latencies(methods, queries, Protocol(1, 2), 1)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert time.monotonic() - began < limit_s, "it waited for the workers"
     assert opening
     until = time.monotonic() + 10.0

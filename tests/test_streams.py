@@ -125,6 +125,7 @@ def test_a_signal_while_a_command_is_looked_up_ends_it_in_the_same_way(name: str
     code = (
         "import os, signal\n"
         "from mor_bench.cli.app import LazyCommands, app\n"
+        f"signal.signal(signal.{name}, signal.SIG_DFL)\n"
         f"LazyCommands.get_command = lambda *_: os.kill(os.getpid(), signal.{name})\n"
         "app(['list'])\n"
     )

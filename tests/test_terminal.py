@@ -22,7 +22,7 @@ from mor_bench.version import __version__
 from tests.commands import mor_bench_command
 from tests.synthetic import synthetic_comparison
 
-EXPORTS = [("export", name) for name in ("vtu", "numpy", "onnx", "asv")]
+EXPORTS = [("export", name) for name in ("vtu", "gif", "numpy", "onnx", "asv")]
 
 
 def mor_bench(*arguments: str, columns: str | None = None, **env: str | None) -> Result:

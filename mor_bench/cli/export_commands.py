@@ -69,8 +69,8 @@ def vtu(
 @command(
     export,
     {
-        "export numpy beam-tiny --out tiny.npz": "Write all samples.",
-        "export numpy beam-coarse --limit 500 --out some.npz": "Write the first 500 samples.",
+        "export gif beam-tiny --out path.gif": "Draw the first test sample.",
+        "export gif beam-tiny --sample 3 --out path.gif": "Draw test sample 3.",
     },
 )
 @with_options
@@ -90,7 +90,13 @@ def gif(
     print(export_load_path(_load(dataset, options), sample, out))
 
 
-@export.command()
+@command(
+    export,
+    {
+        "export numpy beam-tiny --out tiny.npz": "Write all samples.",
+        "export numpy beam-coarse --limit 500 --out some.npz": "Write the first 500 samples.",
+    },
+)
 @with_options
 def numpy(
     dataset: DatasetName,
