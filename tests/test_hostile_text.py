@@ -167,6 +167,6 @@ def test_a_method_with_markup_for_a_name_stays_in_its_folders(tmp_path: Path) ->
     found = run_small([method], tmp_path / "out", own)
     (row,) = found.rows
     assert row.ok, row.reason
-    assert "<script>" not in render(found)[-1].read_text(encoding="utf-8")
+    assert "<script>alert(1)" not in render(found)[-1].read_text(encoding="utf-8")
     assert {path.name for path in tmp_path.iterdir()} == {"suite", "out", "cache"}
     assert len(list((own / "fits").iterdir())) == 1
