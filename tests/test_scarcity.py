@@ -70,8 +70,10 @@ PLACES = {
 
 @linux_only
 @pytest.mark.slow
-@pytest.mark.parametrize("place", [*PLACES, "tmp"])
-@pytest.mark.parametrize("free_bytes", [0, 100_000, DISK_BYTES // 100, 1_500_000])
+@pytest.mark.parametrize(
+    ("place", "free_bytes"),
+    [("out", 0), ("cache", 100_000), ("both", DISK_BYTES // 100), ("tmp", 0)],
+)
 def test_a_run_on_a_full_disk_ends_with_one_line_and_goes_on_with_room(
     place: str, free_bytes: int, undisturbed: dict[str, str], tmp_path: Path
 ) -> None:
@@ -105,7 +107,8 @@ def test_a_run_on_a_full_disk_ends_with_one_line_and_goes_on_with_room(
         check_rows(tmp_path / ("kept" if place in ("out", "both") else "out"), undisturbed)
     found = result(tmp_path / "whole") if place in ("out", "both") else result(tmp_path)
     assert found["rows"] == undisturbed["rows"]
-    assert free_bytes or code == 2, "the disk was not full"
+    # Python passes over a full folder for temporary files and takes another one.
+    assert free_bytes or place == "tmp" or code == 2, "the disk was not full"
 
 
 def check_rows(out: Path, undisturbed: dict[str, str]) -> None:
