@@ -268,8 +268,7 @@ def test_a_module_that_cannot_be_imported_is_one_line_of_check_and_fit(
     fit = ["beam-tiny", "-m", file, "--out", "m.safetensors", "--cache", str(cache), "--limit=60"]
     done = mor_bench_command(command, *([file] if command == "check" else fit), cwd=tmp_path)
     assert done.returncode == 2, done
-    assert BROKEN_MODULES[how][1] in done.stderr
-    assert "Traceback" not in done.stderr
-    (line,) = [text for text in done.stderr.splitlines() if text.startswith("mor-bench: ")]
-    assert done.stderr.strip().endswith(line), "only the notice of a slow command may stand before"
+    *before, line = done.stderr.strip().splitlines()
+    assert BROKEN_MODULES[how][1] in line
+    assert not any(words in text for text in before for words in ("Traceback", "mor-bench: ")), before
     assert not list(tmp_path.glob("*m.safetensors*"))

@@ -24,6 +24,10 @@ ENDING = ("SIGTERM", "SIGHUP")
 """Signals that stop a command as an interrupt does."""
 
 
+NO_THREAD = "can't start new thread"
+"""Message of the `RuntimeError` by which Python reports that there is no memory for a thread."""
+
+
 class StoppedBySignal(BaseException):
     """A signal asks this process to end; ``number`` names the signal.
 
@@ -55,7 +59,9 @@ def clear_errors() -> Iterator[None]:
         _exit(f"{where}: {error.strerror or error}", "red", 2)
     except ImportError as error:  # an incomplete installation, or no memory for a library
         _exit(f"a library cannot be loaded: {error}", "red", 2)
-    except MemoryError as error:
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and str(error) != NO_THREAD:
+            raise
         _exit(f"memory is short{f': {error}' if str(error) else ''}. {KEPT}", "red", 2)
     except StoppedBySignal as stop:
         by = f" by {signal.Signals(stop.number).name}"

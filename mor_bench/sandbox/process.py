@@ -54,22 +54,26 @@ def stoppable_threads(n: int) -> Iterator[ThreadPoolExecutor]:
     """
     own: set[int] = set()
     executor = ThreadPoolExecutor(n, initializer=lambda: own.add(get_ident()))
-    left = Event()
+    stop, left = Event(), Event()
 
     def end_processes() -> None:
+        stop.wait()
         while not left.wait(0.05):
             for process in [item for item in tuple(_ALIVE) if item.thread in own]:
                 process.end()
 
+    # It starts first, since later there may be no memory for another thread.
+    Thread(target=end_processes, daemon=True).start()
     try:
         yield executor
     except BaseException:
-        Thread(target=end_processes, daemon=True).start()
+        stop.set()
         executor.shutdown(cancel_futures=True)
         raise
     finally:
         executor.shutdown()
         left.set()
+        stop.set()
 
 
 class MethodFailedError(MorBenchError):

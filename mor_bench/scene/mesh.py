@@ -65,10 +65,13 @@ class Mesh:
         """(n_facets, 4 or 3) node numbers of the faces of a single cell, oriented outwards."""
         faces = FACES[self.cells.shape[1]]
         faces = self.cells[:, faces].reshape(-1, faces.shape[1])
-        _, first, count = np.unique(
-            np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
-        )
-        return np.asarray(faces[np.sort(first[count == 1])])
+        nodes = np.zeros((len(faces), 4), dtype=np.int64)
+        nodes[:, -faces.shape[1] :] = np.sort(faces, axis=1)
+        keys = nodes[:, ::2] * self.n_nodes + nodes[:, 1::2]
+        order = np.lexsort(keys.T)
+        is_new = np.ones(len(faces) + 1, dtype=bool)
+        is_new[1:-1] = (keys[order[1:]] != keys[order[:-1]]).any(axis=1)
+        return np.asarray(faces[np.sort(order[is_new[:-1] & is_new[1:]])])
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
