@@ -270,5 +270,5 @@ def test_a_module_that_cannot_be_imported_is_one_line_of_check_and_fit(
     assert done.returncode == 2, done
     *before, line = done.stderr.strip().splitlines()
     assert BROKEN_MODULES[how][1] in line
-    assert not any(words in text for text in before for words in ("Traceback", "mor-bench: ")), before
+    assert not [text for text in before if "Traceback" in text or "mor-bench: " in text]
     assert not list(tmp_path.glob("*m.safetensors*"))

@@ -43,7 +43,7 @@ from mor_bench.runs.training_data import TrainingData, digest_of_file
 from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.process import SandboxedProcess
 from mor_bench.sandbox.seal import Restrictions
-from mor_bench.snapshots.store import remove_leftovers, temporary_beside, write_atomically
+from mor_bench.snapshots.store import remove_leftovers, replacing, write_atomically
 from mor_bench.specs import list_suite, load_method_spec
 from mor_bench.training_options import TrainingOptions
 
@@ -240,9 +240,8 @@ class CachedFit:
         self.folder.mkdir(parents=True, exist_ok=True)
         if model is not None:
             remove_leftovers(self.folder)
-            partial = temporary_beside(self.model)
-            shutil.copyfile(model, partial)
-            os.replace(partial, self.model)
+            with replacing(self.model) as partial:
+                shutil.copyfile(model, partial)
             checksum = {"model_sha256": digest_of_file(self.model)}
             record = record.model_copy(update=checksum)
         write_atomically(self.folder / "fit.json", record.model_dump_json(indent=1).encode())
