@@ -317,13 +317,11 @@ def test_a_plan_of_too_many_samples_is_refused() -> None:
         far_apart(np.zeros((20_000, 3)).tobytes(), 2, 1.0)
 
 
-def test_a_sweep_of_too_many_configurations_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "pod.toml"
+def test_a_sweep_of_too_many_configurations_is_refused() -> None:
     shipped = load_method_spec("pod").model_dump(mode="json", exclude={"name", "folder"})
     whole = {"name": "pod", **shipped, "sweep": {"n_modes": list(range(1, 1002))}}
     with pytest.raises(ValueError, match="at most 1,000 configurations; got 1,001"):
         MethodSpec.model_validate(whole)
-    assert not path.exists()
 
 
 def forged_model(scene: Any) -> bytes:
@@ -354,7 +352,7 @@ def test_the_scene_of_a_model_names_no_local_file(tmp_path: Path) -> None:
 
 def test_a_dataset_whose_name_is_a_path_is_refused(tmp_path: Path) -> None:
     spec = load_generated_spec("beam-tiny").model_dump(mode="json")
-    for name in ("../../x", "/tmp/x", "..", "", "a b", "A", "a\n", "x" * 300):
+    for name in ("../../x", str(tmp_path / "x"), "..", "", "a b", "A", "a\n", "x" * 300):
         with pytest.raises(SpecError, match="name"):
             mor_bench.load_dataset({**spec, "name": name}, cache=tmp_path / "cache")
     assert not list(tmp_path.iterdir())

@@ -23,7 +23,6 @@ def test_the_libraries_are_those_of_the_package_with_their_sizes() -> None:
 
 
 def test_every_extra_for_users_is_known() -> None:
-
     assert set(metadata("mor-bench").get_all("Provides-Extra") or []) - {"all", "dev"} == set(
         EXTRAS
     )
