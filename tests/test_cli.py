@@ -15,7 +15,6 @@ from typer.testing import CliRunner, Result
 import mor_bench as mor_bench_package
 from mor_bench.cli.app import COMMANDS, app
 from mor_bench.cli.suite_commands import BUSY
-from mor_bench.errors import InvalidInputError
 from mor_bench.options import FitOptions, Options, RunOptions, command_line
 from mor_bench.specs import list_suite
 
@@ -215,8 +214,3 @@ def test_errors_name_an_option_as_the_command_line_does(option: str, words: str)
 def test_numbers_of_numpy_are_numbers() -> None:
     assert RunOptions(limit=np.int64(3), time_limit_s=np.float32(2.0)).limit == 3
     assert mor_bench_package.load_method("pod", n_modes=np.int64(3)).parameters["n_modes"] == 3
-
-
-def test_a_single_name_is_refused_with_the_list_that_is_meant() -> None:
-    with pytest.raises(InvalidInputError, match=r"a list of names, such as \['pod'\]; got 'pod'"):
-        mor_bench_package.run(methods="pod")

@@ -261,13 +261,6 @@ def test_a_failed_fit_leaves_nothing_but_hyperparameters_and_options(
     assert vars(method) == {"how": how, "time_limit_s": 5.0}
 
 
-def test_unknown_parameters_of_a_dataclass_are_named() -> None:
-    with pytest.raises(SpecError, match=r"n_mode.*did you mean 'n_modes'"):
-        mor_bench.load_method("pod", n_mode=3)
-    with pytest.raises(SpecError, match="n_modes"):
-        mor_bench.load_method("pod", n_modes=0)
-
-
 def test_a_plain_class_with_fit_and_predict_is_adapted(tiny: Dataset, tmp_path: Path) -> None:
     method = make_surrogate(Plain, {"factor": 2.0})
     assert method.parameters == {"factor": 2.0}

@@ -229,18 +229,6 @@ def test_a_run_has_rows_of_supported_methods_and_reasons_for_the_others(
     assert comparison.datasets["beam-tiny-observed"]["observed"] == {"region": "z-max"}
 
 
-def test_the_fit_command_scores_predictions_from_observed_displacements(
-    data: Dataset, cache: Path, tmp_path: Path
-) -> None:
-    fitted = mor_bench.fit(
-        written(tmp_path, TOP), "linear-fem", out=tmp_path / "model.safetensors", cache=cache
-    )
-    predicted = fitted.method.predict(data.test.given)
-    assert fitted.error["rel_l2_median"] == pytest.approx(
-        np.median(relative_l2(predicted, data.test.displacements))
-    )
-
-
 def test_the_cache_does_not_return_a_model_of_other_observed_nodes(
     data: Dataset, tiny: Dataset, tmp_path: Path
 ) -> None:

@@ -248,6 +248,8 @@ def test_an_unknown_name_gives_an_error_with_the_nearest_one() -> None:
 
 def test_load_method_takes_hyperparameters_and_checks_them() -> None:
     assert mor_bench.load_method("pod", n_modes=7).parameters["n_modes"] == 7
+    with pytest.raises(SpecError, match=r"n_mode.*did you mean 'n_modes'"):
+        mor_bench.load_method("pod", n_mode=3)
     with pytest.raises(SpecError, match="PODGalerkin: `n_modes` must be greater than or equal to"):
         mor_bench.load_method("pod", n_modes=0)
 
