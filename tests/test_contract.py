@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache as kept
 from pathlib import Path
 from typing import Any
 
@@ -47,20 +46,6 @@ BATTERY = [
     name if name in QUICK.values() else pytest.param(name, marks=pytest.mark.slow)
     for name in GIVEN_FORCES
 ]
-
-
-@pytest.fixture(scope="module")
-def fitted_by_name(tiny: Dataset) -> Callable[[str], Surrogate]:
-    """Fit a method with its cheap hyperparameters, once."""
-
-    @kept
-    def fit(name: str) -> Surrogate:
-        method = cheap_method(name)
-        if reason := method.supports(tiny.scene):
-            pytest.skip(reason)
-        return method.fit(tiny.scene, tiny.train if method.needs_snapshots else None)
-
-    return fit
 
 
 @pytest.fixture(params=BATTERY)
