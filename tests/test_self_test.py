@@ -5,17 +5,16 @@ from __future__ import annotations
 import json
 
 import pytest
-from typer.testing import CliRunner
 
-from mor_bench.cli.app import app
 from mor_bench.method_loading import load_method
 from mor_bench.runs import self_test
 from mor_bench.sandbox import landlock, process
+from tests.commands import invoke
 
 
 @pytest.mark.slow
 def test_the_self_test_passes() -> None:
-    done = CliRunner().invoke(app, ["doctor", "--self-test", "--json"])
+    done = invoke("doctor", "--self-test", "--json")
     assert done.exit_code == 0, done.output
     found = {check["name"]: check["passed"] for check in json.loads(done.stdout)}
     assert len(found) == 5

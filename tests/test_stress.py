@@ -28,7 +28,7 @@ from mor_bench.surrogates import pod as pod_module
 from mor_bench.surrogates.fem import FullFEM
 from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.pod import PODGalerkin
-from tests.commands import mor_bench_command
+from tests.commands import invoke
 from tests.suite_methods import SPECS
 from tests.wrong_replacements import (
     all_weights_one,
@@ -354,15 +354,16 @@ def test_numbers_that_are_not_finite_are_written_as_null(tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_the_command_prints_and_writes_the_same_results(tmp_path: Path, cache: Path) -> None:
+    out = tmp_path / "stress.json"
     options = ["-m", "pod", "-m", "linear-fem", "--case", "zero-force", "--case", "symmetry"]
-    written = ["--cache", str(cache), "--json", "--out", "stress.json"]
-    done = mor_bench_command("stress", *options, *written, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    written = ["--cache", str(cache), "--json", "--out", str(out)]
+    done = invoke("stress", *options, *written)
+    assert done.exit_code == 0, done.stderr
     printed = json.loads(done.stdout)
     assert [(row["method"], row["case"]) for row in printed["rows"]] == [
         (m, c) for m in ("pod", "linear-fem") for c in ("zero-force", "symmetry")
     ]
-    assert json.loads((tmp_path / "stress.json").read_text(encoding="utf-8")) == printed
+    assert json.loads(out.read_text(encoding="utf-8")) == printed
     assert "4 tried: 4 pass, 0 fall short" in done.stderr
 
 
