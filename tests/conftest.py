@@ -16,7 +16,7 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import load_generated_spec
 from mor_bench.surrogate import Surrogate
-from tests.small_runs import Heard, method_file, run_small
+from tests.small_runs import PLAIN, Heard, method_file, run_small
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -90,6 +90,13 @@ def small_run(tmp_path_factory: pytest.TempPathFactory, cache: Path, heard: Hear
     ]
     out = folder / "reports" / "runs" / "first"
     return run_small(["linear-fem", pod, *broken], out, cache, listener=heard.listener())
+
+
+@pytest.fixture(scope="session")
+def plain_run(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Comparison:
+    """A comparison of two methods of the suite, fitted one after the other."""
+    out = tmp_path_factory.mktemp("plain") / "out"
+    return run_small(PLAIN, out, cache)
 
 
 @pytest.fixture(params=[1, 2])

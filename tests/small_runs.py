@@ -23,6 +23,9 @@ LIMIT = 60
 
 COMMAND = [sys.executable, "-m", "mor_bench"]
 
+PLAIN: list[str | Path] = ["linear-fem", "pca-regression-force"]
+"""Methods of the suite that are quick to fit: one learns from samples."""
+
 
 def method_file(
     folder: Path,

@@ -18,10 +18,10 @@ from mor_bench.runs.plan import plan
 from mor_bench.scratch import identity
 from mor_bench.snapshots.dataset import Dataset
 from tests.commands import mor_bench_command
-from tests.small_runs import method_file, run_small
+from tests.small_runs import PLAIN, method_file, run_small
 from tests.third_party import Peeker
 
-FORCES = "pca-regression-force"
+FORCES = str(PLAIN[1])
 
 
 def broken_file(folder: Path, how: str) -> Path:
@@ -84,15 +84,16 @@ def test_failed_fits_use_up_the_tuning_budget(cache: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_no_method_can_change_what_another_learns_from(tmp_path: Path, cache: Path) -> None:
+def test_no_method_can_change_what_another_learns_from(
+    tmp_path: Path, plain_run: Comparison
+) -> None:
     poison = method_file(tmp_path, "poison", "tests.third_party:Poison")
     poisoned = run_small([poison, FORCES], tmp_path / "a", tmp_path / "cache").rows
-    clean = run_small([FORCES], tmp_path / "b", cache).rows
     assert (poisoned[0].status, poisoned[0].reason) == (
         "failed",
         "the method overwrote the training samples",
     )
-    assert poisoned[1].error == clean[0].error
+    assert poisoned[1].error == plain_run.rows[1].error
 
 
 @pytest.mark.slow
@@ -216,9 +217,8 @@ def test_a_damaged_fit_is_made_again(tmp_path: Path) -> None:
     again = run_small([FORCES], tmp_path / "b", cache).rows[0]
     assert again.ok
     assert again.error == first.error
-    for content in (b"null", b"{}", b'{"model_sha256": null}'):
-        next(cache.glob(f"fits/{FORCES}-*/fit.json")).write_bytes(content)
-        assert run_small([FORCES], tmp_path / "b", cache).rows[0].error == first.error
+    next(cache.glob(f"fits/{FORCES}-*/fit.json")).write_bytes(b"{}")
+    assert run_small([FORCES], tmp_path / "b", cache).rows[0].error == first.error
 
 
 BROKEN_MODULES = {
@@ -258,7 +258,7 @@ def test_a_module_that_cannot_be_imported_costs_its_own_row(cache: Path, tmp_pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", BROKEN_MODULES)
+@pytest.mark.parametrize("how", ["syntax", "exit", "abstract"])
 @pytest.mark.parametrize("command", ["check", "fit"])
 def test_a_module_that_cannot_be_imported_is_one_line_of_check_and_fit(
     how: str, command: str, cache: Path, tmp_path: Path
