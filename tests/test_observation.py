@@ -17,7 +17,6 @@ from mor_bench.errors import (
 from mor_bench.export.npz_file import export_numpy
 from mor_bench.export.onnx_file import export_onnx
 from mor_bench.export.vtu_files import export_vtu
-from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.options import RunOptions
 from mor_bench.runs.configurations import OBSERVATION_METHODS, checked_specs
 from mor_bench.runs.training_data import TrainingData
@@ -27,6 +26,7 @@ from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.specs import NO_FORCES
 from mor_bench.surrogate import Surrogate
 from tests.observed_scenes import TOP, scene_of, written
+from tests.relative_errors import relative_l2
 from tests.small_runs import PLAIN, short_timing
 from tests.suite_methods import SPECS, cheap_method
 
@@ -56,10 +56,6 @@ def linear(data: Dataset) -> Surrogate:
 @pytest.fixture(scope="module")
 def gappy(data: Dataset) -> Surrogate:
     return mor_bench.load_method("gappy-pod").fit(data.scene, data.train)
-
-
-def relative_l2(predicted: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    return sample_errors(predicted, reference).relative_l2
 
 
 def test_gappy_pod_reproduces_displacements_in_the_span_of_its_modes(data: Dataset) -> None:
