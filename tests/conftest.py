@@ -41,6 +41,12 @@ def tiny(cache: Path) -> Dataset:
 
 
 @pytest.fixture(scope="session")
+def coarse(cache: Path) -> Dataset:
+    """The first samples of beam-coarse."""
+    return mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
+
+
+@pytest.fixture(scope="session")
 def fitted_by_name(tiny: Dataset) -> Callable[[str], Surrogate]:
     """Fit a method to beam-tiny with its cheap hyperparameters, once; no test may change it."""
     from tests.suite_methods import cheap_method  # it reads every method file

@@ -18,11 +18,6 @@ from mor_bench.surrogates.hybrid import Hybrid
 from tests.relative_errors import relative_l2
 
 
-@pytest.fixture(scope="module")
-def coarse(cache: Path) -> Dataset:
-    return mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
-
-
 def error(method: Surrogate, data: Dataset, n: int = 40) -> float:
     found = method.predict(data.test.forces[:n])
     return float(relative_l2(found, data.test.displacements[:n]).mean())

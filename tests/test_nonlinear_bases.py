@@ -230,19 +230,19 @@ def test_local_pod_with_one_cluster_and_all_modes_reproduces_its_snapshots(
 
 
 @pytest.mark.slow
-def test_clusters_of_similar_loads_do_better_than_one_basis(cache: Path) -> None:
+def test_clusters_of_similar_loads_do_better_than_one_basis(coarse: Dataset) -> None:
     """This holds for five modes; with twenty, clusters gain little (see the method's limits)."""
-    data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
     one, many = (
-        median_error(LocalPOD(n, 5, 1e-4).fit(data.scene, data.train), data.test) for n in (1, 16)
+        median_error(LocalPOD(n, 5, 1e-4).fit(coarse.scene, coarse.train), coarse.test)
+        for n in (1, 16)
     )
     assert many < 0.85 * one
 
 
 @pytest.mark.slow
-def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_predictions(cache: Path) -> None:
+def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_predictions() -> None:
     """Small loads get the linear response even at a loose tolerance."""
-    scene = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache).scene
+    scene = mor_bench.load_scene("beam-coarse")
     forces = draw_loads(scene, 0, 30).nodal_forces(scene.patch_weights)
     whole = mor_bench.load_method("quadratic-manifold", n_modes=4, cubature_tolerance=0.0).fit(
         scene, None
@@ -261,14 +261,13 @@ def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_predictions(cache:
 
 
 @pytest.mark.slow
-def test_the_autoencoder_learns_the_difference_from_linear_elasticity(cache: Path) -> None:
+def test_the_autoencoder_learns_the_difference_from_linear_elasticity(coarse: Dataset) -> None:
     pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
-    data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
     medians = {}
     for name, knobs in (("linear-fem", {}), ("autoencoder", {"n_latent": 10, "iterations": 1000})):
-        method = mor_bench.load_method(name, **knobs).fit(data.scene, data.train)
-        medians[name] = median_error(method, data.test)
-        assert not method.predict(np.zeros((data.scene.mesh.n_nodes, 3))).any()
+        method = mor_bench.load_method(name, **knobs).fit(coarse.scene, coarse.train)
+        medians[name] = median_error(method, coarse.test)
+        assert not method.predict(np.zeros((coarse.scene.mesh.n_nodes, 3))).any()
     assert medians["autoencoder"] <= 0.7 * medians["linear-fem"]
 
 

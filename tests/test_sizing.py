@@ -42,11 +42,6 @@ def needing(scene: Scene, error: float) -> Scene:
     )
 
 
-@pytest.fixture(scope="module")
-def coarse(cache: Path) -> Dataset:
-    return mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
-
-
 @pytest.mark.slow
 def test_the_smallest_number_of_modes_that_meets_the_need_is_chosen(coarse: Dataset) -> None:
     scene = needing(coarse.scene, 0.05)
