@@ -6,10 +6,6 @@ import json
 import math
 import os
 import re
-import socket
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +21,7 @@ from mor_bench.results.row import ErrorSummary, Latency, Row
 from mor_bench.runs.listener import Listener
 from mor_bench.snapshots.generate import generation_seconds
 from mor_bench.specs import list_suite, load_generated_spec
+from tests.dask_cluster import Cluster
 from tests.small_runs import LIMIT, PLAIN, Heard, method_file, run_small, short_timing
 
 GUIDE = Path(__file__).parents[1] / "docs" / "comparison.md"
@@ -347,25 +344,7 @@ def test_several_fits_at_once_give_the_same_errors(
 
 @pytest.mark.slow
 def test_a_cluster_fits_and_this_machine_times(tmp_path: Path, plain_run: Comparison) -> None:
-    pytest.importorskip("distributed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    address = f"tcp://127.0.0.1:{port}"
-    scheduler = ["scheduler", "--host", "127.0.0.1", "--port", str(port)]
-    worker = ["worker", address, "--nthreads", "1", "--nworkers", "1", "--no-nanny"]
-    running = [
-        subprocess.Popen(
-            [sys.executable, "-m", f"distributed.cli.dask_{name}", *options, "--no-dashboard"],
-            stderr=subprocess.DEVNULL,
-        )
-        for name, *options in (scheduler, worker)
-    ]
-    try:
-        time.sleep(1)
-        there = run_small(PLAIN, tmp_path / "there", tmp_path / "cache", cluster=address).rows
-    finally:
-        for process in running[::-1]:
-            process.terminate()
-            process.wait()
+    with Cluster(tmp_path / "cluster", ("only",)) as cluster:
+        options = {"cluster": cluster.address}
+        there = run_small(PLAIN, tmp_path / "there", tmp_path / "cache", **options).rows
     check_same_errors(plain_run.rows, there)
