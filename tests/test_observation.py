@@ -27,7 +27,7 @@ from mor_bench.specs import NO_FORCES
 from mor_bench.surrogate import Surrogate
 from tests.observed_scenes import TOP, scene_of, written
 from tests.relative_errors import relative_l2
-from tests.small_runs import PLAIN, short_timing
+from tests.small_runs import PLAIN, method_file, short_timing
 from tests.suite_methods import SPECS, cheap_method
 
 QUICK = {"fem", "gappy-pod", "linear-fem", "pca-regression"}
@@ -196,10 +196,8 @@ def test_without_forces_no_error_is_indicated_and_no_range_is_known(
 def test_a_run_has_rows_of_supported_methods_and_reasons_for_the_others(
     data: Dataset, cache: Path, tmp_path: Path
 ) -> None:
-    path, pod = written(tmp_path, TOP), tmp_path / "pod.toml"
-    pod.write_text(
-        'title = "t"\nsource = "s"\nsurrogate = "mor_bench.surrogates.pod:PODGalerkin"\n'
-    )
+    path = written(tmp_path, TOP)
+    pod = method_file(tmp_path, "pod", "mor_bench.surrogates.pod:PODGalerkin")
     with short_timing():
         comparison = mor_bench.run([path], [*PLAIN, pod], out=tmp_path / "out", cache=cache)
     rows = {row.label: row for row in comparison.rows}

@@ -30,6 +30,7 @@ from mor_bench.surrogates.pca_regression import PCARegression
 from mor_bench.surrogates.pod import PODGalerkin
 from tests.model_files import rewrite
 from tests.relative_errors import median_error, relative_l2
+from tests.small_runs import method_file
 
 
 def needing(scene: Scene, error: float) -> Scene:
@@ -266,16 +267,6 @@ def _replace(arrays: dict[str, Any], forgery: dict[str, Any]) -> None:
             del arrays[name]
 
 
-SIZED = """
-title = "POD"
-surrogate = "mor_bench.surrogates.pod:PODGalerkin"
-source = ""
-[parameters]
-n_modes = "auto"
-tolerance = 1e-3
-"""
-
-
 @pytest.mark.slow
 def test_the_record_of_a_fit_shows_the_chosen_sizes(tmp_path: Path, tiny: Dataset) -> None:
     write_snapshots(tmp_path / "train", tiny.train)
@@ -295,12 +286,13 @@ def test_the_record_of_a_fit_shows_the_chosen_sizes(tmp_path: Path, tiny: Datase
 def test_a_cached_fit_depends_on_the_need_only_if_sizes_are_chosen(
     tmp_path: Path, tiny: Dataset
 ) -> None:
-    (tmp_path / "sized.toml").write_text(SIZED)
+    pod = "mor_bench.surrogates.pod:PODGalerkin"
+    path = method_file(tmp_path, "sized", pod, n_modes="auto", tolerance=1e-3)
     place: Any = SimpleNamespace(machine="here", fit_threads=1, cache=tmp_path)
 
     def key(need: float, **knobs: Any) -> str:
         job: Any = SimpleNamespace(
-            method=load_method_spec(tmp_path / "sized.toml"),
+            method=load_method_spec(path),
             parameters=knobs,
             training=None,
             shipped=None,

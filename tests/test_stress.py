@@ -29,6 +29,7 @@ from mor_bench.surrogates.fem import FullFEM
 from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.pod import PODGalerkin
 from tests.commands import invoke
+from tests.small_runs import method_file
 from tests.suite_methods import SPECS
 from tests.wrong_replacements import (
     all_weights_one,
@@ -191,16 +192,12 @@ def test_a_flawed_method_falls_short_exactly_in_the_cases_of_its_flaw(
         assert "not known" in happened["out-of-distribution", "2x"]
 
 
-def method_file(folder: Path, name: str) -> Path:
-    path = folder / f"{name}.toml"
-    target = f"tests.flawed_methods:{name.capitalize()}"
-    path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "{target}"\n', encoding="utf-8")
-    return path
-
-
 @pytest.mark.slow
 def test_a_third_party_s_failure_costs_its_own_rows_only(tmp_path: Path, cache: Path) -> None:
-    methods = [method_file(tmp_path, name) for name in ("ending", "unfit", "good")]
+    methods = [
+        method_file(tmp_path, name, f"tests.flawed_methods:{name.capitalize()}")
+        for name in ("ending", "unfit", "good")
+    ]
     found = stress(methods, ["zero-force", "symmetry"], cache=cache)
     assert [(row.method, row.case, row.verdict) for row in found.rows] == [
         ("ending", "zero-force", "fall short"),

@@ -28,7 +28,7 @@ from mor_bench.runs.training_data import TrainingData
 from mor_bench.sandbox.process import MethodFailedError
 from mor_bench.specs import load_method_spec
 from mor_bench.training_options import TrainingOptions
-from tests.small_runs import COMMAND, LIMIT, descent_file, run_small, wait_for
+from tests.small_runs import COMMAND, LIMIT, descent_file, method_file, run_small, wait_for
 
 OUT_OF_TIME = "OutOfTimeError: all iterations would take {} h; the limit is"
 
@@ -234,11 +234,8 @@ def test_a_fit_that_is_stopped_after_its_training_does_not_train_again(
 ) -> None:
     pytest.importorskip("torch")
     (tmp_path / "stopped.py").write_text(STOPPED)
-    (tmp_path / "stopped.toml").write_text(
-        'title = "t"\nsource = "s"\nsurrogate = "stopped:Stopped"\n'
-    )
     configuration = Configuration(
-        load_method_spec(tmp_path / "stopped.toml"),
+        load_method_spec(method_file(tmp_path, "stopped", "stopped:Stopped")),
         {"iterations": 20},
         training=TrainingOptions(),
     )
