@@ -97,10 +97,3 @@ class Heard:
                 f"timed {row.label} {row.latency_ms is not None}"
             ),
         )
-
-
-def checkpoint_always() -> None:
-    """Let trainings of networks write a checkpoint as often as they can."""
-    from mor_bench.learning import training
-
-    training.CHECKPOINT_EVERY_S = 0.0
