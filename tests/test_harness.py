@@ -335,9 +335,7 @@ def check_same_errors(rows: list[Row], others: list[Row]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two cores")
-def test_several_fits_at_once_give_the_same_errors(
-    plain_run: Comparison, tmp_path: Path
-) -> None:
+def test_several_fits_at_once_give_the_same_errors(plain_run: Comparison, tmp_path: Path) -> None:
     two = run_small(PLAIN, tmp_path / "two", tmp_path / "cache", jobs=2).rows
     check_same_errors(plain_run.rows, two)
 

@@ -173,4 +173,3 @@ def ends_at_disagreement(console: Console) -> Iterator[None]:
     except DisagreementError as error:
         console.print(f"no comparison: {error}", style="red", markup=False)
         raise typer.Exit(1) from None
-

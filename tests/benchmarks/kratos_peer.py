@@ -33,6 +33,7 @@ TUNED_AMGCL = {
     "tolerance": 1e-3,
 }
 
+
 @contextmanager
 def silent() -> Iterator[None]:
     """Send to nowhere what is printed, from compiled code too: a package's banner."""

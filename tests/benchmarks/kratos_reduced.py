@@ -176,4 +176,3 @@ def kratos_cubature(hpod: HyperReducedPOD, snapshots: Snapshots) -> HyperReduced
     order = np.argsort(selector.z)
     cubature = {"cells": selector.z[order], "weights": selector.w.ravel()[order]}
     return copy(hpod).restore(hpod.scene_, {"modes": hpod.modes_, **cubature}, hpod.sizes_)
-
