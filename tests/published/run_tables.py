@@ -191,50 +191,6 @@ def verdict(source: str, dataset: str = "") -> str:
     return "\n".join([found["headline"], *(f"- {line}" for line in beside)])
 
 
-def splits(source: str, dataset: str = "", methods: str = "") -> str:
-    """Show the selected configuration of each method on two splits; SOURCE is FOLDER,FOLDER."""
-    runs = [run_of(folder) for folder in source.split(",")]
-    headings = ["method", "is given"]
-    columns: list[dict[str, Row]] = []
-    for run in runs:
-        rows = _rows(run, dataset, methods)
-        columns.append({m: chosen(own) for m, own in _by_method(rows).items()})
-        headings.append(f"split by {rows[0].split}: selected; e (free dofs), m; median %; max %")
-    body = []
-    for method, first in columns[0].items():
-        cells = [f"`{method}`", class_text(first, is_observed(runs[0], first.dataset))]
-        for run, column in zip(runs, columns, strict=True):
-            row = column.get(method)
-            if row is None or row.error is None:
-                cells.append(DASH)
-                continue
-            error = row.error
-            cells.append(
-                f"{_configuration(row)}; {_mean_error(error)}; {_error(run, row)}; "
-                f"{_percent(error.rel_l2_max)}"
-            )
-        body.append([*cells, _latency(runs[0], first)])
-    return markdown([*headings, "ms"], body)
-
-
-def seeds(source: str, dataset: str = "", methods: str = "") -> str:
-    """Show the scatter of errors over the seeds of the trained methods."""
-    run = run_of(source)
-    return markdown(
-        ["configuration", "seeds", "e, m: median (range)", "median %: median (range)"],
-        [
-            [
-                row.label,
-                str(row.seeds.n),
-                f"{_metres(e.median)} ({_metres(e.min)}–{_metres(e.max)})",
-                f"{_percent(r.median)} ({_percent(r.min)}–{_percent(r.max)})",
-            ]
-            for row in _rows(run, dataset, methods)
-            if row.seeds and (e := row.seeds.mean_dof_m) and (r := row.seeds.rel_l2_median)
-        ],
-    )
-
-
 def indicated(source: str, methods: str = "") -> str:
     """Show how well errors are estimated without the reference; SOURCE is FOLDER,FOLDER,…."""
     runs = [run_of(folder) for folder in source.split(",")]
@@ -299,8 +255,6 @@ RUN_TABLES: dict[str, Callable[..., str]] = {
     "selected": selected,
     "fastest": fastest,
     "verdict": verdict,
-    "splits": splits,
-    "seeds": seeds,
     "indicated": indicated,
     "paper": paper,
     "facts": facts,
