@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache as kept
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,8 @@ from mor_bench.results.comparison import Comparison
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import load_generated_spec
-from tests.small_runs import Heard, method_file, run_small
+from mor_bench.surrogate import Surrogate
+from tests.small_runs import PLAIN, Heard, method_file, run_small
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -36,6 +38,27 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tiny(cache: Path) -> Dataset:
     """beam-tiny with its default split."""
     return mor_bench.load_dataset("beam-tiny", cache=cache, workers=1)
+
+
+@pytest.fixture(scope="session")
+def coarse(cache: Path) -> Dataset:
+    """The first samples of beam-coarse."""
+    return mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
+
+
+@pytest.fixture(scope="session")
+def fitted_by_name(tiny: Dataset) -> Callable[[str], Surrogate]:
+    """Fit a method to beam-tiny with its cheap hyperparameters, once; no test may change it."""
+    from tests.suite_methods import cheap_method  # it reads every method file
+
+    @kept
+    def fit(name: str) -> Surrogate:
+        method = cheap_method(name)
+        if reason := method.supports(tiny.scene):
+            pytest.skip(reason)
+        return method.fit(tiny.scene, tiny.train if method.needs_snapshots else None)
+
+    return fit
 
 
 @pytest.fixture(scope="session")
@@ -73,6 +96,13 @@ def small_run(tmp_path_factory: pytest.TempPathFactory, cache: Path, heard: Hear
     ]
     out = folder / "reports" / "runs" / "first"
     return run_small(["linear-fem", pod, *broken], out, cache, listener=heard.listener())
+
+
+@pytest.fixture(scope="session")
+def plain_run(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Comparison:
+    """A comparison of two methods of the suite, fitted one after the other."""
+    out = tmp_path_factory.mktemp("plain") / "out"
+    return run_small(PLAIN, out, cache)
 
 
 @pytest.fixture(params=[1, 2])

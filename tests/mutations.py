@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 import warnings
@@ -27,6 +28,9 @@ PAGE = Path(__file__).parents[1] / "docs" / "attacks.md"
 
 LONGEST = 5000
 """Most letters of a message."""
+
+FAILED = "failed"
+"""File with the message of a process that found an error."""
 
 VALUES: tuple[Any, ...] = (
     *(None, True, False, 0, 1, -1, 3, 2**31, 2**63, -(2**63), 10**18, 10**40),
@@ -145,19 +149,54 @@ class Reader:
 
 
 def attacked(reader: Reader, folder: Path, n: int) -> None:
-    """Write n mutations of a file one by one and read each.
+    """Write n mutations of a file one by one and read each, a share of them per core.
 
     Anything but success or a `MorBenchError` of one line, and every excess of a limit, is an error
     with the number of the mutation, which is also its seed.
     """
-    (folder / "datasets").mkdir()
+    reader.read(_sound(reader, folder / "sound"))  # it also imports what is imported on demand
+    shares = (os.cpu_count() or 1) if hasattr(os, "fork") else 1
+    seeds = [range(first, n, shares) for first in range(shares)]
+    own, *others = ((folder / str(share[0]), share) for share in seeds if share)
+    children = [(there, _forked(reader, there, n, share)) for there, share in others]
+    try:
+        _attack(reader, own[0], n, own[1])
+    finally:
+        ended = [(there, os.waitpid(child, 0)[1]) for there, child in children]
+    for there, status in ended:
+        said = there / FAILED
+        assert status == 0, said.read_text(encoding="utf-8") if said.exists() else str(status)
+
+
+def _forked(reader: Reader, folder: Path, n: int, seeds: range) -> int:
+    """Attack in a process of its own; return its number."""
+    child = os.fork()
+    if child:
+        return child
+    status = 1
+    try:
+        _attack(reader, folder, n, seeds)
+        status = 0
+    except BaseException as error:
+        (folder / FAILED).write_text(str(error), encoding="utf-8")
+    finally:
+        os._exit(status)
+
+
+def _sound(reader: Reader, folder: Path) -> Path:
+    """Write the sound file, and return its path."""
+    (folder / "datasets").mkdir(parents=True)
     path = folder / "datasets" / reader.name
     reader.write(path)
-    reader.read(path)  # the sound file; it also imports what is imported on demand
+    return path
+
+
+def _attack(reader: Reader, folder: Path, n: int, seeds: range) -> None:
+    path = _sound(reader, folder)
     original = path.read_bytes()
     with warnings.catch_warnings(), np.errstate(all="ignore"), _less_memory():
         warnings.simplefilter("ignore")
-        for seed in range(n):
+        for seed in seeds:
             generator = np.random.default_rng([seed, n])
             content = reader.mutators[seed % len(reader.mutators)](original, generator)
             path.write_bytes(content)

@@ -23,6 +23,9 @@ LIMIT = 60
 
 COMMAND = [sys.executable, "-m", "mor_bench"]
 
+PLAIN: list[str | Path] = ["linear-fem", "pca-regression-force"]
+"""Methods of the suite that are quick to fit: one learns from samples."""
+
 
 def method_file(
     folder: Path,
@@ -94,10 +97,3 @@ class Heard:
                 f"timed {row.label} {row.latency_ms is not None}"
             ),
         )
-
-
-def checkpoint_always() -> None:
-    """Let trainings of networks write a checkpoint as often as they can."""
-    from mor_bench.learning import training
-
-    training.CHECKPOINT_EVERY_S = 0.0

@@ -7,14 +7,14 @@ import shutil
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from mor_bench.cli.app import app
 from mor_bench.snapshots.dataset import Dataset, load_dataset
+from tests.commands import invoke
 
 
 def cache_command(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["cache", *map(str, arguments)])
+    return invoke("cache", *map(str, arguments))
 
 
 @pytest.fixture

@@ -10,18 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
-import mor_bench as mor_bench_package
-from mor_bench.cli.app import COMMANDS, app
+import mor_bench
+from mor_bench.cli.app import COMMANDS
 from mor_bench.cli.suite_commands import BUSY
-from mor_bench.errors import InvalidInputError
 from mor_bench.options import FitOptions, Options, RunOptions, command_line
 from mor_bench.specs import list_suite
-
-
-def mor_bench(*arguments: str) -> Result:
-    return CliRunner().invoke(app, arguments)
+from tests.commands import invoke
 
 
 def printed(code: str) -> str:
@@ -54,8 +49,8 @@ print("torch" in sys.modules)
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_a_help_text_and_a_summary_in_the_list(name: str) -> None:
-    assert COMMANDS[name][1] in " ".join(mor_bench("--help").output.split())
-    found = mor_bench(name, "--help")
+    assert COMMANDS[name][1] in " ".join(invoke("--help").output.split())
+    found = invoke(name, "--help")
     assert found.exit_code == 0
     assert f"Usage: mor-bench {name}" in found.output.replace("root", "mor-bench")
 
@@ -64,7 +59,7 @@ def test_every_command_has_a_help_text_and_a_summary_in_the_list(name: str) -> N
 def test_the_help_shows_every_option_with_its_description_and_default(
     name: str, model: type[Options]
 ) -> None:
-    shown = " ".join(mor_bench(name, "--help").output.split())
+    shown = " ".join(invoke(name, "--help").output.split())
     for option, field, line in command_line(model):
         assert f" {line.flag} " in shown, option
         assert str(field.description) in shown, option
@@ -98,15 +93,15 @@ def test_run_writes_all_results_and_report_redraws_them(tmp_path: Path, cache: P
     assert '"rows":[{"label":' in page
     for figure in figures:
         figure.unlink()
-    again = mor_bench("report", str(out))
+    again = invoke("report", str(out))
     assert again.exit_code == 0
     assert sorted(out.glob("figures/*.png")) == figures
     assert "linear-fem" in again.stdout
 
 
 def test_list_names_every_dataset_and_method() -> None:
-    listed = json.loads(mor_bench("list", "--json").stdout)
-    plain = mor_bench("list").stdout
+    listed = json.loads(invoke("list", "--json").stdout)
+    plain = invoke("list").stdout
     for kind in ("datasets", "methods"):
         names = [entry["name"] for entry in listed[kind]]
         assert names == [*list_suite(kind)]
@@ -119,13 +114,13 @@ def test_list_names_every_dataset_and_method() -> None:
 
 def test_check_fails_if_any_file_is_invalid_and_reports_all(tmp_path: Path) -> None:
     good = [str(list_suite("datasets")["beam-tiny"]), str(list_suite("methods")["pod"])]
-    assert mor_bench("check", *good).exit_code == 0
+    assert invoke("check", *good).exit_code == 0
     bad = []
     for name in ("first", "second"):
         bad.append(str(tmp_path / f"{name}.toml"))
         Path(bad[-1]).write_text('title = "x"\nsurogate = "y"\n', encoding="utf-8")
     for files in ([bad[0], *good], [good[0], bad[0], good[1]], [*good, *bad]):
-        done = mor_bench("check", *files)
+        done = invoke("check", *files)
         wrong = [file for file in files if file in bad]
         assert done.exit_code == 2
         lines = [line for line in done.stderr.splitlines() if BUSY not in line]
@@ -136,13 +131,13 @@ def test_check_fails_if_any_file_is_invalid_and_reports_all(tmp_path: Path) -> N
 def test_check_without_files_checks_the_whole_suite(monkeypatch: pytest.MonkeyPatch) -> None:
     checked: list[Path] = []
     monkeypatch.setattr("mor_bench.runs.file_check.check_file", lambda path: checked.append(path))
-    assert mor_bench("check").exit_code == 0
+    assert invoke("check").exit_code == 0
     assert checked == [*list_suite("datasets").values(), *list_suite("methods").values()]
 
 
 def test_refine_prints_and_keeps_its_record(tmp_path: Path) -> None:
     options = ["--loads", "2", "--levels", "1", "--cache", str(tmp_path), "--json"]
-    done = mor_bench("refine", "beam-tiny", *options)
+    done = invoke("refine", "beam-tiny", *options)
     assert done.exit_code == 0
     (path,) = tmp_path.rglob("discretisation.json")
     assert json.loads(done.stdout) == json.loads(path.read_text(encoding="utf-8"))
@@ -150,7 +145,7 @@ def test_refine_prints_and_keeps_its_record(tmp_path: Path) -> None:
 
 def test_generate_prints_the_folder_of_the_dataset_and_of_its_test_sets(tmp_path: Path) -> None:
     options = ["--limit", "5", "--workers", "1", "--cache", str(tmp_path)]
-    done = mor_bench("generate", "beam-tiny", "--tests", *options)
+    done = invoke("generate", "beam-tiny", "--tests", *options)
     assert done.exit_code == 0
     folders = [Path(line) for line in done.stdout.splitlines()]
     sets = ["in-range", "2x", "4x", "unseen-regions", "several-forces"]
@@ -193,7 +188,7 @@ def test_an_error_is_one_line_and_nothing_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: str, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    done = mor_bench(*arguments.split())
+    done = invoke(*arguments.split())
     assert done.exit_code == 2
     assert message in done.stderr
     assert "\n" not in done.stderr.strip()
@@ -209,15 +204,10 @@ def test_an_error_is_one_line_and_nothing_is_written(
     ],
 )
 def test_errors_name_an_option_as_the_command_line_does(option: str, words: str) -> None:
-    found = mor_bench("run", option)
+    found = invoke("run", option)
     assert (found.exit_code, found.stderr) == (2, f"mor-bench: {words}\n")
 
 
 def test_numbers_of_numpy_are_numbers() -> None:
     assert RunOptions(limit=np.int64(3), time_limit_s=np.float32(2.0)).limit == 3
-    assert mor_bench_package.load_method("pod", n_modes=np.int64(3)).parameters["n_modes"] == 3
-
-
-def test_a_single_name_is_refused_with_the_list_that_is_meant() -> None:
-    with pytest.raises(InvalidInputError, match=r"a list of names, such as \['pod'\]; got 'pod'"):
-        mor_bench_package.run(methods="pod")
+    assert mor_bench.load_method("pod", n_modes=np.int64(3)).parameters["n_modes"] == 3

@@ -18,8 +18,8 @@ from tests.small_runs import method_file
 SCRIPT = """
 import json, sys
 from pathlib import Path
-import mor_bench
 from mor_bench.runs.listener import Listener
+from tests.small_runs import run_small
 
 kernels, cache, out = map(Path, sys.argv[1:])
 compiled = lambda: sorted(path.name for path in kernels.rglob("*.nbc"))
@@ -28,9 +28,7 @@ listener = Listener(
     compiling=lambda method, done, total: heard.append([method, done, total]),
     generating=lambda *_: at_start.append(compiled()),
 )
-mor_bench.run(
-    ["beam-tiny"], ["linear-fem", "pod"], out=out, cache=cache, limit=60, listener=listener
-)
+run_small(["linear-fem", "pod"], out, cache, listener=listener)
 print(json.dumps([heard, at_start[0], compiled()]))
 """
 

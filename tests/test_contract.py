@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache as kept
 from pathlib import Path
 from typing import Any
 
@@ -47,20 +46,6 @@ BATTERY = [
     name if name in QUICK.values() else pytest.param(name, marks=pytest.mark.slow)
     for name in GIVEN_FORCES
 ]
-
-
-@pytest.fixture(scope="module")
-def fitted_by_name(tiny: Dataset) -> Callable[[str], Surrogate]:
-    """Fit a method with its cheap hyperparameters, once."""
-
-    @kept
-    def fit(name: str) -> Surrogate:
-        method = cheap_method(name)
-        if reason := method.supports(tiny.scene):
-            pytest.skip(reason)
-        return method.fit(tiny.scene, tiny.train if method.needs_snapshots else None)
-
-    return fit
 
 
 @pytest.fixture(params=BATTERY)
@@ -259,13 +244,6 @@ def test_a_failed_fit_leaves_nothing_but_hyperparameters_and_options(
     with pytest.raises(InvalidInputError):
         method.fit(tiny.scene)
     assert vars(method) == {"how": how, "time_limit_s": 5.0}
-
-
-def test_unknown_parameters_of_a_dataclass_are_named() -> None:
-    with pytest.raises(SpecError, match=r"n_mode.*did you mean 'n_modes'"):
-        mor_bench.load_method("pod", n_mode=3)
-    with pytest.raises(SpecError, match="n_modes"):
-        mor_bench.load_method("pod", n_modes=0)
 
 
 def test_a_plain_class_with_fit_and_predict_is_adapted(tiny: Dataset, tmp_path: Path) -> None:

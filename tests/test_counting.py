@@ -33,7 +33,7 @@ from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.given import Forces
 from mor_bench.specs import SolverName
 from mor_bench.surrogate import Surrogate
-from tests.suite_methods import SPECS, cheap_method
+from tests.suite_methods import SPECS
 
 
 @pytest.mark.parametrize(("n", "bandwidth"), [(1, 0), (7, 6), (9, 2), (12, 11)])
@@ -335,12 +335,9 @@ QUICK = {"fem", "linear-fem", "pod", "hpod", "pca-regression"}
     [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in SPECS],
 )
 def test_a_batch_costs_what_its_samples_cost_and_counting_changes_nothing(
-    tiny: Dataset, loads: np.ndarray, name: str
+    fitted_by_name: Callable[[str], Surrogate], loads: np.ndarray, name: str
 ) -> None:
-    method = cheap_method(name)
-    if reason := method.supports(tiny.scene):
-        pytest.skip(reason)
-    method.fit(tiny.scene, tiny.train if method.needs_snapshots else None)
+    method = fitted_by_name(name)
     uncounted_answer = method.predict(loads)
     with counted() as batch:
         answer = method.predict(loads)

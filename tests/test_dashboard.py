@@ -27,7 +27,7 @@ from mor_bench.specs import list_suite
 from tests.benchmarks.bench_full_order import FullOrder
 from tests.benchmarks.bench_surrogates import METHODS
 from tests.benchmarks.publish import LOCAL, make_offline, publish
-from tests.commands import mor_bench_command as command
+from tests.commands import invoke as command
 from tests.synthetic import a_row
 
 CHROMIUM = next(
@@ -259,16 +259,19 @@ def test_a_forged_description_of_a_machine_is_refused(checkout: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_export_command_prints_the_files_it_writes(checkout: Path, tmp_path: Path) -> None:
+def test_the_export_command_prints_the_files_it_writes(
+    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     comparison(row("fem")).write()
     export = ("export", "asv", str(checkout / "run"), "--out", "results")
-    done = command(*export, cwd=checkout)
-    assert done.returncode == 0, done.stderr
+    done = command(*export)
+    assert done.exit_code == 0, done.stderr
     written = {path.relative_to(checkout) for path in checkout.glob("results/**/*.json")}
     assert {Path(line) for line in done.stdout.splitlines()} == written
     found = results(checkout / "results", git(checkout, "rev-parse", "HEAD"))
     assert found["relative_error"]["result"] == [0.02]
-    assert command(*export, cwd=tmp_path).returncode == 2
+    monkeypatch.chdir(tmp_path)
+    assert command(*export).exit_code == 2
 
 
 def test_asv_follows_every_method_of_the_suite() -> None:

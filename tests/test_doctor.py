@@ -7,12 +7,11 @@ import json
 from importlib.metadata import metadata
 
 import pytest
-from typer.testing import CliRunner
 
-from mor_bench.cli.app import app
 from mor_bench.measure.machine_speed import recorded_machines
 from mor_bench.runs import installation
 from mor_bench.runs.installation import EXTRAS, installed_libraries
+from tests.commands import invoke
 
 
 def test_the_libraries_are_those_of_the_package_with_their_sizes() -> None:
@@ -23,7 +22,6 @@ def test_the_libraries_are_those_of_the_package_with_their_sizes() -> None:
 
 
 def test_every_extra_for_users_is_known() -> None:
-
     assert set(metadata("mor-bench").get_all("Provides-Extra") or []) - {"all", "dev"} == set(
         EXTRAS
     )
@@ -40,12 +38,12 @@ def test_recorded_machines_differ_where_instructions_matter() -> None:
 def test_the_doctor_names_missing_extras_and_the_speed(monkeypatch: pytest.MonkeyPatch) -> None:
     there = importlib.util.find_spec("json")
     monkeypatch.setattr(installation, "find_spec", lambda name: None if name == "onnx" else there)
-    shown = CliRunner().invoke(app, ["doctor"])
+    shown = invoke("doctor")
     assert shown.exit_code == 0, shown.output
     assert "The extra `onnx` is missing" in shown.output
     assert "The extra `learn` is missing" not in shown.output
     assert "residual" in shown.output
-    found = json.loads(CliRunner().invoke(app, ["doctor", "--json"]).output)
+    found = json.loads(invoke("doctor", "--json").output)
     assert found["speed"]["residual_us"] > 0
     assert found["default_run_s"] > 0
     assert list(found["missing_extras"]) == ["onnx"]

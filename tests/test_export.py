@@ -20,7 +20,7 @@ from mor_bench.export.vtu_files import export_vtu
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets
 from mor_bench.snapshots.dataset import Dataset
-from tests.commands import mor_bench_command as command
+from tests.commands import invoke as command
 
 
 @pytest.fixture(scope="module")
@@ -145,19 +145,20 @@ def test_snapshots_without_regions_are_exported_without_regions(
 
 @pytest.mark.slow
 def test_the_export_commands_print_the_files_they_write(
-    pod: Path, cache: Path, tmp_path: Path
+    pod: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     shared = ["beam-tiny", "--cache", str(cache)]
-    done = command("export", "numpy", *shared, "--out", "tiny.npz", cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (0, "tiny.npz\ntiny.toml\n"), done.stderr
+    done = command("export", "numpy", *shared, "--out", "tiny.npz")
+    assert (done.exit_code, done.stdout) == (0, "tiny.npz\ntiny.toml\n"), done.stderr
     sample = [*shared, "--sample", "3", "--out", "vtu"]
-    done = command("export", "vtu", *sample, "--part", "train", "--model", str(pod), cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = command("export", "vtu", *sample, "--part", "train", "--model", str(pod))
+    assert done.exit_code == 0, done.stderr
     written = [str(path.relative_to(tmp_path)) for path in tmp_path.glob("vtu/*")]
     assert sorted(done.stdout.split()) == sorted(written)
     assert len(written) == 2
-    refused = command("export", "vtu", *sample, "--part", "trian", cwd=tmp_path)
-    assert refused.returncode == 2
+    refused = command("export", "vtu", *sample, "--part", "trian")
+    assert refused.exit_code == 2
     assert (
         "`--part` must be train, validation, test, in-range, 2x, 4x, paper-amplitude, unseen-"
         in refused.stderr

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,17 +12,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from safetensors import safe_open
-from typer.testing import CliRunner
 
 import mor_bench
-from mor_bench.cli.app import app
 from mor_bench.errors import InvalidInputError, MorBenchError, SpecError
 from mor_bench.runs.listener import Listener
 from mor_bench.runs.single_fit import Fit
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots, load_dataset
 from mor_bench.specs import load_generated_spec
+from tests.commands import invoke
 from tests.small_runs import COMMAND, LIMIT, descent_file, method_file, wait_for
 from tests.third_party import Descent
 
@@ -48,10 +44,10 @@ def changed_since(path: Path, time: float) -> bool:
 def test_a_killed_fit_resumes_and_ends_with_the_same_bytes(cache: Path, tmp_path: Path) -> None:
     load_dataset("beam-tiny", LIMIT, cache=cache)
     path, out = descent_file(tmp_path), tmp_path / "model.safetensors"
+    checkpoint, seen = tmp_path / "kept", 0.0
     options = [f"--limit={LIMIT}", f"--cache={cache}", "--threads=1", f"--out={out}"]
-    options += ["--set=iterations=400", "--seed=3"]
+    options += [f"--checkpoint={checkpoint}", "--set=iterations=400", "--seed=3"]
     command = [*COMMAND, "fit", "beam-tiny", "-m", str(path), *options]
-    checkpoint, seen = tmp_path / ".model.safetensors.checkpoint", 0.0
     # A background job of a shell ignores the interrupt, and so would its children.
     listening = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     for how in (signal.SIGKILL, signal.SIGINT):
@@ -80,51 +76,6 @@ def test_a_killed_fit_resumes_and_ends_with_the_same_bytes(cache: Path, tmp_path
     assert f"ē {whole.error['mean_dof_m']:.2e} m" in last.stdout
     other = fit_tiny(path, {**parameters, "seed": 4}, tmp_path / "b.safetensors", cache)
     assert other.out.read_bytes() != whole.out.read_bytes()
-
-
-@pytest.mark.slow
-def test_a_killed_training_of_u_mesh_resumes_too(cache: Path, tmp_path: Path) -> None:
-    pytest.importorskip("torch")
-    load_dataset("beam-tiny", LIMIT, cache=cache)
-    parameters = {**NETWORK, "iterations": 300}
-    out, checkpoint = tmp_path / "model.safetensors", tmp_path / "kept"
-    code = (
-        "import tests.small_runs as t; t.checkpoint_always(); "
-        "from mor_bench.cli.app import app; app()"
-    )
-    options = [f"--limit={LIMIT}", f"--cache={cache}", "--threads=1", f"--out={out}"]
-    options += [f"--checkpoint={checkpoint}", *(f"--set={k}={v}" for k, v in parameters.items())]
-
-    def iteration() -> int:
-        if not checkpoint.exists():
-            return 0
-        with safe_open(str(checkpoint), framework="numpy") as file:
-            return int(json.loads(file.metadata()["numbers"])["iteration"])
-
-    with subprocess.Popen(
-        [sys.executable, "-c", code, "fit", "beam-tiny", "-m", "umesh-small", *options],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        wait_for(lambda: iteration() > 60, process)
-        process.kill()
-        process.communicate()
-    assert 60 < iteration() < 300
-    seen: list[int] = []
-    listener = Listener(training=lambda done, total, loss: seen.append(done))
-    kept = {"checkpoint": checkpoint, "listener": listener}
-    with pytest.raises(InvalidInputError, match="the checkpoint belongs to another training"):
-        fit_tiny("umesh-small", {**parameters, "seed": 1}, out, cache, **kept)
-    fit_tiny("umesh-small", parameters, out, cache, **kept)
-    assert seen[0] >= 100
-    assert seen[-1] == 300
-    whole = fit_tiny("umesh-small", parameters, tmp_path / "whole.safetensors", cache)
-    assert out.read_bytes() == whole.out.read_bytes()
-    other = tmp_path / "b.safetensors"
-    with pytest.raises(InvalidInputError, match="model with `channels` 2; got one with"):
-        fit_tiny("umesh-small", {**parameters, "channels": 2}, other, cache, start_from=out)
-    assert not other.exists()
 
 
 @pytest.mark.slow
@@ -271,7 +222,7 @@ def test_the_command_says_which_swept_value_it_took(cache: Path, tmp_path: Path)
     path = descent_file(tmp_path, sweep={"iterations": [20, 40, 60], "seed": [3, 4]})
     options = ["fit", "beam-tiny", "-m", str(path), f"--limit={LIMIT}", f"--cache={cache}"]
     options += ["--threads=1", f"--out={tmp_path / 'a.safetensors'}"]
-    done = CliRunner().invoke(app, [*options, "--seed=4"])
+    done = invoke(*options, "--seed=4")
     assert done.exit_code == 0, done.output
     assert done.stdout.splitlines()[0] == (
         "iterations = 20, the first of 3 values in the method's file; "
@@ -279,7 +230,7 @@ def test_the_command_says_which_swept_value_it_took(cache: Path, tmp_path: Path)
     )
     assert "20 iterations, " in done.stdout
     assert done.stdout.count("the first of") == 1
-    given = CliRunner().invoke(app, [*options, "--seed=4", "--set=iterations=40"])
+    given = invoke(*options, "--seed=4", "--set=iterations=40")
     assert "the first of" not in given.stdout
     assert "40 iterations, " in given.stdout
 

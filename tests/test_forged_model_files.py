@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from safetensors.numpy import save as serialise
 
 import mor_bench
 from mor_bench.errors import StoreError
-from mor_bench.model_file import model_digest, read_header_and_arrays
+from mor_bench.model_file import read_header_and_arrays
 from mor_bench.snapshots.dataset import Dataset
+from tests.model_files import sealed
 
 torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
 
@@ -37,11 +37,6 @@ def refused(path: Path, content: bytes) -> None:
     with pytest.raises(StoreError, match=r"model\.safetensors") as error:
         mor_bench.load_surrogate(path)
     assert "\n" not in str(error.value)
-
-
-def forged(header: dict[str, str], arrays: dict[str, np.ndarray]) -> bytes:
-    """Return a file with a valid checksum."""
-    return serialise(arrays, metadata={**header, "sha256": model_digest(header, arrays)})
 
 
 @pytest.fixture
@@ -74,14 +69,14 @@ def test_forged_parameters_are_refused_before_weights_are_allocated(
     _, header, arrays = parts
     monkeypatch.setattr(torch.nn.Module, "to_empty", allocated)
     knobs = {**json.loads(header["parameters"]), **knobs}
-    refused(path, forged({**header, "parameters": json.dumps(knobs)}, arrays))
+    refused(path, sealed({**header, "parameters": json.dumps(knobs)}, arrays))
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "{", "null", "[]", '{"channels":' + "9" * 5000])
 @pytest.mark.parametrize("key", ["parameters", "scene"])
 def test_forged_json_is_refused(parts: Any, path: Path, key: str, text: str) -> None:
     _, header, arrays = parts
-    refused(path, forged({**header, key: text}, arrays))
+    refused(path, sealed({**header, key: text}, arrays))
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
@@ -91,7 +86,7 @@ def test_an_endless_scene_file_is_refused(parts: Any, path: Path) -> None:
     for endless in ("/dev/zero", str(path.parent / "pipe")):
         file = {"shape": "file", "file": {"path": endless, "sha256": "0" * 64}}
         scene = {**json.loads(header["scene"]), "geometry": file}
-        refused(path, forged({**header, "scene": json.dumps(scene)}, arrays))
+        refused(path, sealed({**header, "scene": json.dumps(scene)}, arrays))
 
 
 @pytest.mark.parametrize(
@@ -100,7 +95,7 @@ def test_an_endless_scene_file_is_refused(parts: Any, path: Path) -> None:
 )
 def test_a_class_that_no_method_names_is_refused(parts: Any, path: Path, name: str) -> None:
     _, header, arrays = parts
-    refused(path, forged({**header, "surrogate": name}, arrays))
+    refused(path, sealed({**header, "surrogate": name}, arrays))
 
 
 @pytest.mark.slow
@@ -126,7 +121,7 @@ def test_forged_arrays_are_refused(parts: Any, path: Path) -> None:
     for change in changes:
         changed = {**arrays, **change}
         kept = {name: array for name, array in changed.items() if array is not None}
-        refused(path, forged(header, kept))
+        refused(path, sealed(header, kept))
 
 
 def test_damaged_bytes_are_refused(parts: Any, path: Path) -> None:

@@ -6,10 +6,6 @@ import json
 import math
 import os
 import re
-import socket
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +21,8 @@ from mor_bench.results.row import ErrorSummary, Latency, Row
 from mor_bench.runs.listener import Listener
 from mor_bench.snapshots.generate import generation_seconds
 from mor_bench.specs import list_suite, load_generated_spec
-from tests.small_runs import LIMIT, Heard, method_file, run_small
+from tests.dask_cluster import Cluster
+from tests.small_runs import LIMIT, PLAIN, Heard, method_file, run_small, short_timing
 
 GUIDE = Path(__file__).parents[1] / "docs" / "comparison.md"
 
@@ -297,7 +294,8 @@ def test_a_region_of_outputs_without_nodes_is_an_error_of_the_dataset(
 def test_errors_count_only_the_requested_nodes(tip_only: Path, cache: Path, tmp_path: Path) -> None:
     tensor = "mor_bench.surrogates.pod_tensor:TensorPOD"
     path = method_file(tmp_path, "tensor", tensor, n_modes=10)
-    comparison = mor_bench.run([tip_only], [path], out=tmp_path / "run", cache=cache, limit=LIMIT)
+    with short_timing():
+        run = mor_bench.run([tip_only], [path], out=tmp_path / "run", cache=cache, limit=LIMIT)
     data = mor_bench.load_dataset(tip_only, LIMIT, cache=cache)
     tip = data.scene.output_nodes
     assert (data.scene.mesh.points[tip, 0] == data.scene.mesh.points[:, 0].max()).all()
@@ -305,7 +303,7 @@ def test_errors_count_only_the_requested_nodes(tip_only: Path, cache: Path, tmp_
     predicted, reference = method.predict(data.test.forces), data.test.displacements
     assert np.isnan(np.delete(predicted, tip, axis=1)).all()
     errors = np.abs(predicted[:, tip] - reference[:, tip]).mean(axis=(1, 2))
-    row = comparison.rows[0]
+    row = run.rows[0]
     assert row.error is not None
     assert row.error.mean_dof_m == pytest.approx(errors.mean(), rel=1e-6)
     assert row.indicator is None
@@ -340,37 +338,14 @@ def check_same_errors(rows: list[Row], others: list[Row]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="needs two cores")
-def test_several_fits_at_once_give_the_same_errors(
-    small_run: Comparison, cache: Path, tmp_path: Path
-) -> None:
-    methods: list[str | Path] = ["linear-fem", "pca-regression-force"]
-    one = run_small(methods, tmp_path / "one", cache).rows
-    two = run_small(methods, tmp_path / "two", tmp_path / "cache", jobs=2).rows
-    check_same_errors(one, two)
+def test_several_fits_at_once_give_the_same_errors(plain_run: Comparison, tmp_path: Path) -> None:
+    two = run_small(PLAIN, tmp_path / "two", tmp_path / "cache", jobs=2).rows
+    check_same_errors(plain_run.rows, two)
 
 
 @pytest.mark.slow
-def test_a_cluster_fits_and_this_machine_times(tmp_path: Path, cache: Path) -> None:
-    pytest.importorskip("distributed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    address = f"tcp://127.0.0.1:{port}"
-    scheduler = ["scheduler", "--host", "127.0.0.1", "--port", str(port)]
-    worker = ["worker", address, "--nthreads", "1", "--nworkers", "1", "--no-nanny"]
-    running = [
-        subprocess.Popen(
-            [sys.executable, "-m", f"distributed.cli.dask_{name}", *options, "--no-dashboard"],
-            stderr=subprocess.DEVNULL,
-        )
-        for name, *options in (scheduler, worker)
-    ]
-    methods: list[str | Path] = ["linear-fem", "pca-regression-force"]
-    try:
-        time.sleep(1)
-        there = run_small(methods, tmp_path / "there", tmp_path / "cache", cluster=address).rows
-    finally:
-        for process in running[::-1]:
-            process.terminate()
-            process.wait()
-    check_same_errors(run_small(methods, tmp_path / "here", cache).rows, there)
+def test_a_cluster_fits_and_this_machine_times(tmp_path: Path, plain_run: Comparison) -> None:
+    with Cluster(tmp_path / "cluster", ("only",)) as cluster:
+        options = {"cluster": cluster.address}
+        there = run_small(PLAIN, tmp_path / "there", tmp_path / "cache", **options).rows
+    check_same_errors(plain_run.rows, there)

@@ -14,14 +14,13 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
 from mor_bench.analysis.analyse import analyse
-from mor_bench.cli.app import app
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.page import render
 from mor_bench.results.comparison import Comparison
 from mor_bench.specs import list_suite
+from tests.commands import invoke
 from tests.hostile_runs import HOSTILE, hostile_run
 from tests.small_runs import method_file, run_small
 
@@ -117,7 +116,7 @@ def test_the_terminal_gets_no_control_characters(run: Comparison) -> None:
 
 def listed(suite: Path) -> str:
     """List a suite that must be refused; return the line on standard error."""
-    done = CliRunner().invoke(app, ["list", "--suite", str(suite)])
+    done = invoke("list", "--suite", str(suite))
     assert (done.exit_code, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1, done.stderr
     return done.stderr
@@ -151,7 +150,7 @@ def test_a_suite_neither_waits_for_devices_nor_shows_other_files(tmp_path: Path)
     assert shape in shipped
     text = shipped.replace(shape, 'shape = "file"\nfile = "../../secret.msh"')
     (suite / "datasets" / "b.toml").write_text(text, encoding="utf-8")
-    done = CliRunner().invoke(app, ["check", str(suite / "datasets" / "b.toml")])
+    done = invoke("check", str(suite / "datasets" / "b.toml"))
     assert done.exit_code == 2
     assert "secret.msh" in done.stderr
     assert "the-secret" not in done.output

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import mor_bench
 from mor_bench.counting import Cost, counted
 from mor_bench.errors import InvalidInputError, SolverError
 from mor_bench.hard_cases.setups import LAW
@@ -165,10 +163,8 @@ def test_the_interpolated_tangent_is_the_derivative_of_the_force_and_exact_at_re
     difference = method.problem_.linearise(q + h)[0] - method.problem_.linearise(q - h)[0]
     np.testing.assert_allclose(2 * tangent @ h, difference, atol=1e-6 * np.abs(difference).max())
     assert np.abs(tangent - tangent.T).max() > 1e-6 * np.abs(tangent).max()
-    linear = model.rest_tangent
     stiff = np.array([modes.T @ model.force(modes @ q).force])
     assert np.linalg.norm(force - stiff) <= 0.02 * np.linalg.norm(stiff)
-    assert len(linear) > 0
 
 
 def test_deim_without_an_equilibrium_raises_a_typed_error(tiny: Dataset) -> None:
@@ -242,16 +238,15 @@ def wanted_at_the_tip(method: HyperReducedPOD) -> tuple[HyperReducedPOD, HyperRe
 
 
 @pytest.mark.slow
-def test_a_query_for_few_outputs_does_not_depend_on_the_mesh(cache: Path) -> None:
+def test_a_query_for_few_outputs_does_not_depend_on_the_mesh(coarse: Dataset) -> None:
     """The counted work from forces to requested displacements is exactly the same."""
-    data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
-    fitted = HyperReducedPOD(10, 1e-2, tolerance=1e-4, sampling="cells").fit(data.scene, data.train)
-    coarse, fine = wanted_at_the_tip(fitted)
-    assert len(coarse.scene_.output_nodes) == len(fine.scene_.output_nodes) == 16
+    fitted = HyperReducedPOD(10, 1e-2, tolerance=1e-4, sampling="cells")
+    given, fine = wanted_at_the_tip(fitted.fit(coarse.scene, coarse.train))
+    assert len(given.scene_.output_nodes) == len(fine.scene_.output_nodes) == 16
     equal = 0
     for corner in ([4.0, 0.0, 1.0], [4.0, 1.0, 1.0], [4.0, 0.0, 0.0]):
         loads = []
-        for method in (coarse, fine):
+        for method in (given, fine):
             load = np.zeros((method.scene_.mesh.n_nodes, 3))
             load[np.linalg.norm(method.scene_.mesh.points - corner, axis=1).argmin()] = [
                 0.01,
@@ -260,15 +255,15 @@ def test_a_query_for_few_outputs_does_not_depend_on_the_mesh(cache: Path) -> Non
             ]
             loads.append(load)
         with counted() as own:
-            answer = coarse.predict(loads[0])
+            answer = given.predict(loads[0])
         with counted() as other:
             again = fine.predict(loads[1])
-        tips = [u[method.scene_.output_nodes] for method, u in ((coarse, answer), (fine, again))]
+        tips = [u[method.scene_.output_nodes] for method, u in ((given, answer), (fine, again))]
         assert np.linalg.norm(tips[1] - tips[0]) <= 0.05 * np.linalg.norm(
             tips[0]
         )  # another quadrature of the same body
         assert np.isnan(answer).any()
-        if steps(own, len(coarse.cells_)) == steps(other, len(fine.cells_)):
+        if steps(own, len(given.cells_)) == steps(other, len(fine.cells_)):
             assert own == other != Cost()
             equal += 1
     assert equal > 0

@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,9 @@ from tests.mutations import (
 )
 
 SUITE = Path(mor_bench.__file__).parents[1]
+
+
+tiny_spec = cache(partial(load_generated_spec, "beam-tiny"))
 
 
 def of_suite(kind: str, name: str) -> Callable[[Path], object]:
@@ -175,7 +179,7 @@ def forged_shard(content: bytes, generator: np.random.Generator) -> bytes:
 
 
 def a_manifest(path: Path) -> None:
-    manifest = Manifest(load_generated_spec("beam-tiny"), GENERATOR_VERSION, 10, 100, ({"a": "b"},))
+    manifest = Manifest(tiny_spec(), GENERATOR_VERSION, 10, 100, ({"a": "b"},))
     path.write_bytes(manifest.to_json())
 
 
@@ -270,7 +274,7 @@ READERS = [
     Reader(
         "beam-tiny.refine.json",
         of_suite("datasets", "beam-tiny.refine.json"),
-        lambda p: measured(load_generated_spec("beam-tiny"), p.parent, p.parents[1]),
+        lambda path: measured(tiny_spec(), path.parent, path.parents[1]),
         JSON,
     ),
 ]

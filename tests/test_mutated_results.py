@@ -16,15 +16,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 from safetensors.numpy import load as load_arrays
-from safetensors.numpy import save as serialise
-from typer.testing import CliRunner
 
 import mor_bench
 from mor_bench.analysis.analyse import analyse
-from mor_bench.cli.app import app
 from mor_bench.errors import StoreError
 from mor_bench.method_loading import load_fitted
-from mor_bench.model_file import model_digest
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.page import render
 from mor_bench.results.comparison import Comparison
@@ -32,6 +28,8 @@ from mor_bench.runs.pick import pick
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.pod import PODGalerkin
+from tests.commands import invoke
+from tests.model_files import sealed
 from tests.mutations import (
     JSON,
     QUICK,
@@ -113,7 +111,7 @@ def forged_model(content: bytes, generator: np.random.Generator) -> bytes:
             arrays[name] = np.resize(arrays[name], generator.integers(0, 9)).astype(
                 kinds[generator.integers(len(kinds))]
             )
-    return serialise(arrays, metadata={**header, "sha256": model_digest(header, arrays)})
+    return sealed(header, arrays)
 
 
 READERS = [
@@ -157,7 +155,7 @@ def test_without_raw_samples_nothing_is_picked_or_reported(tmp_path: Path) -> No
     with pytest.raises(StoreError, match=message) as caught:
         pick(DATASET, comparison=tmp_path)
     assert str(lost) in str(caught.value)
-    answer = CliRunner().invoke(app, ["report", str(tmp_path)])
+    answer = invoke("report", str(tmp_path))
     assert answer.exit_code == 2
     assert message in answer.output
     kept.rename(lost)

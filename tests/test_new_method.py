@@ -101,7 +101,7 @@ def test_in_a_checkout_the_method_passes_check_the_battery_and_a_run(
         shutil.copytree(ROOT / folder, tmp_path / folder)  # with the kernels that Numba compiled
     in_folder(tmp_path, "mor_bench", "new-method", "mine")
     assert "method, 3 quick" in in_folder(tmp_path, "mor_bench", "check", "methods/mine.toml")
-    out = ["--cache", str(cache), "--out", "out"]
+    out = ["--limit", "60", "--cache", str(cache), "--out", "out"]
     assert "mine" in in_folder(tmp_path, "mor_bench", "run", "beam-tiny", "-m", "mine", *out)
     (tmp_path / "tests").mkdir()
     for path in (*ROOT.glob("tests/*.py"), ROOT / "pyproject.toml"):

@@ -29,6 +29,7 @@ from mor_bench.specs import load_generated_spec
 from mor_bench.surrogates.local_pod import LocalPOD
 from mor_bench.surrogates.quadratic_manifold import QuadraticManifoldGalerkin
 from mor_bench.training_options import TrainingOptions
+from tests.relative_errors import median_error, relative_l2
 
 LAWS: dict[str, dict[str, Any]] = {
     "saint-venant-kirchhoff": {"young_pa": 500.0, "poisson": 0.4},
@@ -172,13 +173,10 @@ def test_bases_without_snapshots_beat_linear_elasticity_for_every_law(
     loads = draw_loads(scene, 0, 21)
     forces = loads.nodal_forces(scene.patch_weights)
     exact = mor_bench.load_method("fem", tolerance=1e-8).fit(scene, None).predict(forces)
-    sizes = np.linalg.norm(exact, axis=(1, 2))
     errors = {
-        method: np.linalg.norm(
-            mor_bench.load_method(method, **its).fit(scene, None).predict(forces) - exact,
-            axis=(1, 2),
+        method: relative_l2(
+            mor_bench.load_method(method, **its).fit(scene, None).predict(forces), exact
         )
-        / sizes
         for method, its in ((name, knobs), ("linear-fem", {}))
     }
     assert np.median(errors[name]) <= 0.3 * np.median(errors["linear-fem"])
@@ -196,10 +194,7 @@ def test_nonlinear_bases_work_with_other_elements_and_integration(
     forces = draw_loads(scene, 0, 10).nodal_forces(scene.patch_weights)
     exact = mor_bench.load_method("fem", tolerance=1e-8).fit(scene, None).predict(forces)
     found = mor_bench.load_method(name, **knobs).fit(scene, None).predict(forces)
-    assert (
-        np.median(np.linalg.norm(found - exact, axis=(1, 2)) / np.linalg.norm(exact, axis=(1, 2)))
-        <= 0.01
-    )
+    assert np.median(relative_l2(found, exact)) <= 0.01
 
 
 def test_a_load_uses_the_basis_of_its_direction(tiny: Dataset) -> None:
@@ -235,25 +230,19 @@ def test_local_pod_with_one_cluster_and_all_modes_reproduces_its_snapshots(
 
 
 @pytest.mark.slow
-def test_clusters_of_similar_loads_do_better_than_one_basis(cache: Path) -> None:
+def test_clusters_of_similar_loads_do_better_than_one_basis(coarse: Dataset) -> None:
     """This holds for five modes; with twenty, clusters gain little (see the method's limits)."""
-    data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
-    medians = []
-    for n_clusters in (1, 16):
-        found = LocalPOD(n_clusters, 5, 1e-4).fit(data.scene, data.train).predict(data.test.forces)
-        medians.append(
-            np.median(
-                np.linalg.norm(found - data.test.displacements, axis=(1, 2))
-                / np.linalg.norm(data.test.displacements, axis=(1, 2))
-            )
-        )
-    assert medians[1] < 0.85 * medians[0]
+    one, many = (
+        median_error(LocalPOD(n, 5, 1e-4).fit(coarse.scene, coarse.train), coarse.test)
+        for n in (1, 16)
+    )
+    assert many < 0.85 * one
 
 
 @pytest.mark.slow
-def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_predictions(cache: Path) -> None:
+def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_predictions() -> None:
     """Small loads get the linear response even at a loose tolerance."""
-    scene = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache).scene
+    scene = mor_bench.load_scene("beam-coarse")
     forces = draw_loads(scene, 0, 30).nodal_forces(scene.patch_weights)
     whole = mor_bench.load_method("quadratic-manifold", n_modes=4, cubature_tolerance=0.0).fit(
         scene, None
@@ -262,8 +251,7 @@ def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_predictions(cache:
     assert len(sampled.cells_) < 0.3 * scene.mesh.n_cells
     assert (sampled.weights_ > 0).all()
     expected, found = whole.predict(forces), sampled.predict(forces)
-    apart = np.linalg.norm(found - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
-    assert np.median(apart) <= 1e-3
+    assert np.median(relative_l2(found, expected)) <= 1e-3
     loose = QuadraticManifoldGalerkin(4, 0.1, 1e-8).fit(scene, None)
     assert len(loose.cells_) < len(sampled.cells_)
     linear = mor_bench.load_method("linear-fem").fit(scene, None).predict(1e-5 * forces)
@@ -273,17 +261,13 @@ def test_the_cubature_of_the_manifold_keeps_few_cells_and_the_predictions(cache:
 
 
 @pytest.mark.slow
-def test_the_autoencoder_learns_the_difference_from_linear_elasticity(cache: Path) -> None:
+def test_the_autoencoder_learns_the_difference_from_linear_elasticity(coarse: Dataset) -> None:
     pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
-    data = mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
-    sizes, medians = np.linalg.norm(data.test.displacements, axis=(1, 2)), {}
+    medians = {}
     for name, knobs in (("linear-fem", {}), ("autoencoder", {"n_latent": 10, "iterations": 1000})):
-        method = mor_bench.load_method(name, **knobs).fit(data.scene, data.train)
-        medians[name] = np.median(
-            np.linalg.norm(method.predict(data.test.forces) - data.test.displacements, axis=(1, 2))
-            / sizes
-        )
-        assert not method.predict(np.zeros((data.scene.mesh.n_nodes, 3))).any()
+        method = mor_bench.load_method(name, **knobs).fit(coarse.scene, coarse.train)
+        medians[name] = median_error(method, coarse.test)
+        assert not method.predict(np.zeros((coarse.scene.mesh.n_nodes, 3))).any()
     assert medians["autoencoder"] <= 0.7 * medians["linear-fem"]
 
 

@@ -17,7 +17,6 @@ from mor_bench.errors import (
 from mor_bench.export.npz_file import export_numpy
 from mor_bench.export.onnx_file import export_onnx
 from mor_bench.export.vtu_files import export_vtu
-from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.options import RunOptions
 from mor_bench.runs.configurations import OBSERVATION_METHODS, checked_specs
 from mor_bench.runs.training_data import TrainingData
@@ -27,6 +26,8 @@ from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.specs import NO_FORCES
 from mor_bench.surrogate import Surrogate
 from tests.observed_scenes import TOP, scene_of, written
+from tests.relative_errors import relative_l2
+from tests.small_runs import PLAIN, method_file, short_timing
 from tests.suite_methods import SPECS, cheap_method
 
 QUICK = {"fem", "gappy-pod", "linear-fem", "pca-regression"}
@@ -55,10 +56,6 @@ def linear(data: Dataset) -> Surrogate:
 @pytest.fixture(scope="module")
 def gappy(data: Dataset) -> Surrogate:
     return mor_bench.load_method("gappy-pod").fit(data.scene, data.train)
-
-
-def relative_l2(predicted: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    return sample_errors(predicted, reference).relative_l2
 
 
 def test_gappy_pod_reproduces_displacements_in_the_span_of_its_modes(data: Dataset) -> None:
@@ -199,13 +196,10 @@ def test_without_forces_no_error_is_indicated_and_no_range_is_known(
 def test_a_run_has_rows_of_supported_methods_and_reasons_for_the_others(
     data: Dataset, cache: Path, tmp_path: Path
 ) -> None:
-    path, pod = written(tmp_path, TOP), tmp_path / "pod.toml"
-    pod.write_text(
-        'title = "t"\nsource = "s"\nsurrogate = "mor_bench.surrogates.pod:PODGalerkin"\n'
-    )
-    comparison = mor_bench.run(
-        [path], ["linear-fem", "pca-regression-force", pod], out=tmp_path / "out", cache=cache
-    )
+    path = written(tmp_path, TOP)
+    pod = method_file(tmp_path, "pod", "mor_bench.surrogates.pod:PODGalerkin")
+    with short_timing():
+        comparison = mor_bench.run([path], [*PLAIN, pod], out=tmp_path / "out", cache=cache)
     rows = {row.label: row for row in comparison.rows}
     assert set(rows) == {"linear-fem", "pca-regression-force", "pod"}
     direct = (
@@ -227,18 +221,6 @@ def test_a_run_has_rows_of_supported_methods_and_reasons_for_the_others(
             assert row.latency_ms.median > 0
             assert row.indicator is None
     assert comparison.datasets["beam-tiny-observed"]["observed"] == {"region": "z-max"}
-
-
-def test_the_fit_command_scores_predictions_from_observed_displacements(
-    data: Dataset, cache: Path, tmp_path: Path
-) -> None:
-    fitted = mor_bench.fit(
-        written(tmp_path, TOP), "linear-fem", out=tmp_path / "model.safetensors", cache=cache
-    )
-    predicted = fitted.method.predict(data.test.given)
-    assert fitted.error["rel_l2_median"] == pytest.approx(
-        np.median(relative_l2(predicted, data.test.displacements))
-    )
 
 
 def test_the_cache_does_not_return_a_model_of_other_observed_nodes(

@@ -24,7 +24,8 @@ from mor_bench.scene.snapshot_file import MAX_SIZE
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.given import MAX_FORCE_N
 from mor_bench.specs import ImportedDatasetSpec, load_generated_spec
-from tests.commands import mor_bench_command as command
+from tests.commands import invoke as command
+from tests.small_runs import short_timing
 from tests.spoiled_arrays import Arrays, doubled, first, hinged, put, with_, without
 from tests.suite_methods import SPECS, cheap_method
 
@@ -209,11 +210,15 @@ def test_only_methods_that_learn_from_samples_run_by_default(
 
 
 @pytest.mark.slow
-def test_a_run_ends_with_tables_and_a_report(arrays: Arrays, tmp_path: Path) -> None:
+def test_a_run_ends_with_tables_and_a_report(
+    arrays: Arrays, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     written(tmp_path, arrays)
+    monkeypatch.chdir(tmp_path)
     methods = ["-m", "fem-jacobi-pcg", "-m", "linear-fem", "-m", "pca-regression-force"]
-    done = command("run", "mine.toml", *methods, "--out", "out", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    with short_timing():
+        done = command("run", "mine.toml", *methods, "--out", "out", "--cache", "cache")
+    assert done.exit_code == 0, done.output
     rows = mor_bench.Comparison.read(tmp_path / "out").rows
     assert [row.status for row in rows] == ["skipped", "skipped", "ok"]
     assert (rows[0].reason or "").endswith(IMPORTED)
@@ -221,14 +226,14 @@ def test_a_run_ends_with_tables_and_a_report(arrays: Arrays, tmp_path: Path) -> 
     assert rows[2].offline_s.data is None
     assert rows[2].discretisation_error_m is None
     assert "mine.npz" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    checked = command("check", "mine.toml", cwd=tmp_path).stdout
+    checked = command("check", "mine.toml").stdout
     counts = (
         "24 cells, 63 nodes, 9 of them fixed, 140 samples to train, 30 to validate and 40 to test"
     )
     assert f"dataset of imported snapshots, {counts}" in checked
     for verb in ("generate", "refine"):
-        refused = command(verb, "mine.toml", cwd=tmp_path)
-        assert refused.returncode == 2
+        refused = command(verb, "mine.toml")
+        assert refused.exit_code == 2
         assert refused.stderr.endswith(f"mor-bench: mine: {IMPORTED}.\n")
 
 

@@ -6,15 +6,8 @@ import pytest
 
 import mor_bench
 from mor_bench.scene.scene import Scene
-from tests.benchmarks.peers import (
-    MAX_DIFFERENCE,
-    PEERS,
-    DisagreementError,
-    Entry,
-    Ours,
-    compare,
-    pick_loads,
-)
+from tests.benchmarks.contenders import MAX_DIFFERENCE, DisagreementError
+from tests.benchmarks.peers import PEERS, Entry, Ours, compare, pick_loads
 
 
 @pytest.mark.parametrize("entry", PEERS, ids=lambda entry: entry.label)

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 import mor_bench
-from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.reduction.separated import Separation, separate
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.pgd import SeparatedLoad, load_coordinates
+from tests.relative_errors import median_error
 
 Array = NDArray[np.float64]
 
@@ -154,11 +154,7 @@ def test_on_unseen_load_regions_it_is_far_better_than_the_linear_response(
     tiny = tiny_without_validation
     method = SeparatedLoad(n_terms=20, position_degree=2).fit(tiny.scene, tiny.train)
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
-    mine, theirs = (
-        np.median(sample_errors(one.predict(tiny.test.forces), tiny.test.displacements).relative_l2)
-        for one in (method, linear)
-    )
-    assert mine <= 0.4 * theirs
+    assert median_error(method, tiny.test) <= 0.4 * median_error(linear, tiny.test)
 
 
 def test_outside_the_training_positions_the_prediction_is_that_of_their_edge(tiny: Dataset) -> None:

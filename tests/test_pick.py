@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 import mor_bench
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.selection_text import retime_command
 from mor_bench.analysis.verdict import Requirements, speed_rank
-from mor_bench.cli.app import app
 from mor_bench.errors import InvalidInputError
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.pick import newest_run
 from mor_bench.specs import load_dataset_spec
+from tests.commands import invoke
 from tests.small_runs import LIMIT, short_timing
 
 
@@ -35,7 +35,7 @@ def test_the_command_that_times_again_has_the_options_of_the_run(small_run: Comp
     assert words[words.index("--limit") + 1] == str(LIMIT)
     assert words[words.index("--time-limit") + 1] == "1200"
     known = words[1 : words.index("-m")] + words[words.index("--time-limit") :]
-    assert CliRunner().invoke(app, [*known, "-m", "linear-fem", "--dry-run"]).exit_code == 0
+    assert invoke(*known, "-m", "linear-fem", "--dry-run").exit_code == 0
 
 
 def test_a_real_comparison_gives_a_choice(small_run: Comparison) -> None:
@@ -109,7 +109,7 @@ def test_without_evidence_a_comparison_is_run(
 
 def test_the_command_prints_a_choice_and_its_exit_code(small_run: Comparison) -> None:
     def command(*options: str) -> Result:
-        return CliRunner().invoke(app, ["pick", "beam-tiny", f"--run={small_run.out}", *options])
+        return invoke("pick", "beam-tiny", f"--run={small_run.out}", *options)
 
     limits = ["--error=10", "--latency=10000", "--offline=1000", "--memory=1e3", "--json"]
     done = command(*limits)

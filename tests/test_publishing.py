@@ -58,7 +58,7 @@ def test_an_error_that_its_samples_do_not_give_is_found(stored: Path, tmp_path: 
     assert "linear-fem: rel_l2_median" in found
 
 
-@pytest.mark.parametrize("table", ["selected", "verdict", "fastest", "configurations", "facts"])
+@pytest.mark.parametrize("table", ["selected", "verdict", "fastest", "facts"])
 def test_a_table_that_was_edited_is_generated_again(stored: Path, table: str) -> None:
     page = with_blocks(f"Text\n\n<!-- from: {stored} {table} -->\nstale\n<!-- end -->\n\nMore\n")
     assert "stale" not in page
@@ -71,13 +71,13 @@ def test_a_table_that_was_edited_is_generated_again(stored: Path, table: str) ->
 def test_a_table_shows_the_numbers_of_the_run(stored: Path) -> None:
     row = run_of(str(stored)).row("beam-coarse", "linear-fem")
     assert row.error is not None
-    page = with_blocks(f"<!-- from: {stored} configurations -->\n<!-- end -->")
-    (line,) = [line for line in page.splitlines() if line.startswith("| linear-fem ")]
+    page = with_blocks(f"<!-- from: {stored} selected -->\n<!-- end -->")
+    (line,) = [line for line in page.splitlines() if line.startswith("| `linear-fem` ")]
     assert f"| {100 * row.error.rel_l2_median:.3g} (" in line
     assert " * |" in line
 
 
-@pytest.mark.parametrize("spec", ["no-such-folder configurations", "{} no-such-table"])
+@pytest.mark.parametrize("spec", ["no-such-folder selected", "{} no-such-table"])
 def test_a_table_without_evidence_is_refused(stored: Path, spec: str) -> None:
     with pytest.raises(EvidenceError, match="there is no"):
         with_blocks(f"<!-- from: {spec.format(stored)} -->\n<!-- end -->")

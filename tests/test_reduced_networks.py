@@ -15,24 +15,15 @@ from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.reduction.coordinates import error_weights, input_axes
 from mor_bench.reduction.sensitivity import sensitivities
-from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.snapshots.dataset import Dataset
 from mor_bench.training_options import TrainingOptions
+from tests.relative_errors import median_error
 
 torch = pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
 
 from mor_bench.surrogates.pod_nn import DERIVATIVE_WEIGHT  # noqa: E402 - after the check that torch is there
 
 BRIEF: dict[str, Any] = {"n_hidden": 32, "iterations": 300}
-
-
-def relative_errors(method: mor_bench.Surrogate, samples: Snapshots) -> Any:
-    sizes = np.linalg.norm(samples.displacements, axis=(1, 2))
-    errors = method.predict(samples.forces) - samples.displacements
-    return np.linalg.norm(errors, axis=(1, 2)) / sizes
-
-
-def median_error(method: mor_bench.Surrogate, train: Snapshots, test: Snapshots) -> float:
-    return float(np.median(relative_errors(method.fit(train.scene, train), test)))
 
 
 @pytest.mark.parametrize("of_force", [False, True])
@@ -167,7 +158,9 @@ def test_the_training_loss_equals_the_loss_of_the_predictions(
 def test_derivatives_lower_the_error_with_few_samples(tiny: Dataset) -> None:
     few = tiny.train[::6]
     without, with_them = (
-        median_error(mor_bench.load_method("pod-nn", derivatives=d, **BRIEF), few, tiny.test)
+        median_error(
+            mor_bench.load_method("pod-nn", derivatives=d, **BRIEF).fit(tiny.scene, few), tiny.test
+        )
         for d in (False, True)
     )
     assert with_them <= 0.8 * without
@@ -196,7 +189,7 @@ def test_the_learned_part_is_of_second_order_in_the_load(
 def test_training_loads_are_learned_from_the_force_alone(tiny: Dataset) -> None:
     knobs = {**BRIEF, "input": "force", "n_input_modes": 40, "iterations": 600}
     method = mor_bench.load_method("pod-nn", **knobs)
-    assert median_error(method, tiny.train, tiny.train) < 0.7
+    assert median_error(method.fit(tiny.scene, tiny.train), tiny.train) < 0.7
     forces = np.zeros((2, tiny.scene.mesh.n_nodes, 3))
     forces[1] = tiny.test.forces[0]
     assert not method.predict(forces)[0].any()
@@ -210,8 +203,8 @@ def test_a_training_starts_from_a_saved_model_in_other_bases(
     for start in (None, tmp_path / "model.safetensors"):
         method = mor_bench.load_method("pod-nn", **{**BRIEF, "iterations": 1})
         method.training = TrainingOptions(start_from=start)
-        errors.append(median_error(method, tiny.train[::2], tiny.test))
-    own = float(np.median(relative_errors(fitted, tiny.test)))
+        errors.append(median_error(method.fit(tiny.scene, tiny.train[::2]), tiny.test))
+    own = median_error(fitted, tiny.test)
     assert errors[1] <= 1.5 * own
     assert errors[0] > 2 * own
 

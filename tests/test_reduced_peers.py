@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mor_bench.snapshots.dataset import Dataset
-from tests.benchmarks.peers import MAX_DIFFERENCE, DisagreementError, installed
+from tests.benchmarks.contenders import MAX_DIFFERENCE, DisagreementError, installed
+from tests.benchmarks.kratos_reduced import KRATOS_ROM
 from tests.benchmarks.reduced_peers import (
-    KRATOS_ROM,
     METHODS,
     SAME_AS_POD,
     Ours,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import mor_bench
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.mechanics.elements import element_of, shape_gradients
+from mor_bench.report.published_figures import scene_of
 from mor_bench.scene.loads import cut_patches
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.scene.scene import Scene, load_scene, with_cells
@@ -175,8 +176,8 @@ def test_a_users_surface_becomes_a_scene_from_any_folder(tmp_path: Path) -> None
         load_scene(first.spec)
 
 
-SLOW = {"beam-fine", "beam-fine-paper", "liver-hex", "liver-tet"}
-QUICK = {*list_suite("datasets")} - SLOW - {"liver-hex-observed"}  # it has the loads of liver-hex
+SLOW = {"beam-fine", "liver-hex", "liver-tet"}
+QUICK = {*map(scene_of, list_suite("datasets"))} - SLOW - {"liver-hex-observed"}  # as liver-hex
 
 
 @pytest.mark.parametrize(

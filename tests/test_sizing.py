@@ -29,6 +29,8 @@ from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.pca_regression import PCARegression
 from mor_bench.surrogates.pod import PODGalerkin
 from tests.model_files import rewrite
+from tests.relative_errors import median_error, relative_l2
+from tests.small_runs import method_file
 
 
 def needing(scene: Scene, error: float) -> Scene:
@@ -39,11 +41,6 @@ def needing(scene: Scene, error: float) -> Scene:
             update={"needs": scene.spec.needs.model_copy(update={"error": error})}
         ),
     )
-
-
-@pytest.fixture(scope="module")
-def coarse(cache: Path) -> Dataset:
-    return mor_bench.load_dataset("beam-coarse", limit=640, cache=cache)
 
 
 @pytest.mark.slow
@@ -76,20 +73,11 @@ def test_the_score_comes_from_models_that_never_saw_the_load_region(coarse: Data
     for fitted, held in validation_folds(coarse.train):
         assert not set(coarse.train.regions[fitted]) & set(coarse.train.regions[held])
         model = PODGalerkin(24, 1e-3).fit(coarse.scene, coarse.train[fitted])
-        reference = coarse.train[held].displacements
-        difference = np.linalg.norm(
-            model.predict(coarse.train[held].forces) - reference, axis=(1, 2)
-        )
-        errors += list(difference / np.linalg.norm(reference, axis=(1, 2)))
+        few = coarse.train[held]
+        errors += list(relative_l2(model.predict(few.forces), few.displacements))
     assert score.error == pytest.approx(np.median(errors), rel=1e-9)
     seen = PODGalerkin(24, 1e-3).fit(coarse.scene, coarse.train)
-    own = np.linalg.norm(
-        seen.predict(coarse.train.forces[::4]) - coarse.train.displacements[::4], axis=(1, 2)
-    )
-    assert (
-        np.median(own / np.linalg.norm(coarse.train.displacements[::4], axis=(1, 2)))
-        < 0.8 * score.error
-    )
+    assert median_error(seen, coarse.train[::4]) < 0.8 * score.error
 
 
 @pytest.mark.parametrize("n_forces", [1, 2])
@@ -279,16 +267,6 @@ def _replace(arrays: dict[str, Any], forgery: dict[str, Any]) -> None:
             del arrays[name]
 
 
-SIZED = """
-title = "POD"
-surrogate = "mor_bench.surrogates.pod:PODGalerkin"
-source = ""
-[parameters]
-n_modes = "auto"
-tolerance = 1e-3
-"""
-
-
 @pytest.mark.slow
 def test_the_record_of_a_fit_shows_the_chosen_sizes(tmp_path: Path, tiny: Dataset) -> None:
     write_snapshots(tmp_path / "train", tiny.train)
@@ -308,12 +286,13 @@ def test_the_record_of_a_fit_shows_the_chosen_sizes(tmp_path: Path, tiny: Datase
 def test_a_cached_fit_depends_on_the_need_only_if_sizes_are_chosen(
     tmp_path: Path, tiny: Dataset
 ) -> None:
-    (tmp_path / "sized.toml").write_text(SIZED)
+    pod = "mor_bench.surrogates.pod:PODGalerkin"
+    path = method_file(tmp_path, "sized", pod, n_modes="auto", tolerance=1e-3)
     place: Any = SimpleNamespace(machine="here", fit_threads=1, cache=tmp_path)
 
     def key(need: float, **knobs: Any) -> str:
         job: Any = SimpleNamespace(
-            method=load_method_spec(tmp_path / "sized.toml"),
+            method=load_method_spec(path),
             parameters=knobs,
             training=None,
             shipped=None,

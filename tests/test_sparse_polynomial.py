@@ -10,7 +10,7 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import InvalidInputError
-from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.coordinate_regression import CoordinateSamples
 from mor_bench.surrogates.monomials import (
     MAX_DEGREE,
@@ -22,16 +22,7 @@ from mor_bench.surrogates.monomials import (
     terms_to_array,
 )
 from mor_bench.surrogates.sparse_polynomial import SparsePolynomial
-
-
-def median_error(method: mor_bench.Surrogate, samples: Snapshots) -> float:
-    found = method.predict(samples.forces)
-    return float(
-        np.median(
-            np.linalg.norm(found - samples.displacements, axis=(1, 2))
-            / np.linalg.norm(samples.displacements, axis=(1, 2))
-        )
-    )
+from tests.relative_errors import median_error
 
 
 def test_the_cheapest_terms_match_an_exhaustive_list() -> None:

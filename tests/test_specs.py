@@ -10,6 +10,7 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import MissingDependencyError, MorBenchError, SpecError
+from mor_bench.report.published_figures import SAME_AMPLITUDE, scene_of
 from mor_bench.runs.file_check import check_file
 from mor_bench.specs import list_suite, load_generated_spec, load_method_spec
 
@@ -47,6 +48,20 @@ def test_every_shipped_dataset_has_its_pinned_counts(name: str) -> None:
 
 def test_the_counts_of_every_dataset_are_pinned() -> None:
     assert set(list_suite("datasets")) == set(SHIPPED)
+
+
+@pytest.mark.parametrize("name", [name for name in SHIPPED if name.endswith(SAME_AMPLITUDE)])
+def test_a_dataset_at_the_deformation_of_the_paper_has_only_larger_forces(name: str) -> None:
+    """So what tests say of the meshes, supports and patches of its scene holds for it too."""
+    own, paper = (
+        load_generated_spec(n).model_dump(mode="json", exclude={"name", "title", "source"})
+        for n in (scene_of(name), name)
+    )
+    forces = own["loads"].pop("magnitude_n"), paper["loads"].pop("magnitude_n")
+    assert forces[0][0] == forces[1][0] == 0.0
+    assert forces[0][1] < forces[1][1]
+    assert own["tests"].pop("paper_magnitude_n") != paper["tests"].pop("paper_magnitude_n", None)
+    assert own == paper
 
 
 @pytest.mark.parametrize("name", list_suite("methods"))
@@ -248,6 +263,8 @@ def test_an_unknown_name_gives_an_error_with_the_nearest_one() -> None:
 
 def test_load_method_takes_hyperparameters_and_checks_them() -> None:
     assert mor_bench.load_method("pod", n_modes=7).parameters["n_modes"] == 7
+    with pytest.raises(SpecError, match=r"n_mode.*did you mean 'n_modes'"):
+        mor_bench.load_method("pod", n_mode=3)
     with pytest.raises(SpecError, match="PODGalerkin: `n_modes` must be greater than or equal to"):
         mor_bench.load_method("pod", n_modes=0)
 

@@ -28,7 +28,8 @@ from mor_bench.surrogates import pod as pod_module
 from mor_bench.surrogates.fem import FullFEM
 from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.pod import PODGalerkin
-from tests.commands import mor_bench_command
+from tests.commands import invoke
+from tests.small_runs import method_file
 from tests.suite_methods import SPECS
 from tests.wrong_replacements import (
     all_weights_one,
@@ -191,16 +192,12 @@ def test_a_flawed_method_falls_short_exactly_in_the_cases_of_its_flaw(
         assert "not known" in happened["out-of-distribution", "2x"]
 
 
-def method_file(folder: Path, name: str) -> Path:
-    path = folder / f"{name}.toml"
-    target = f"tests.flawed_methods:{name.capitalize()}"
-    path.write_text(f'title = "t"\nsource = "s"\nsurrogate = "{target}"\n', encoding="utf-8")
-    return path
-
-
 @pytest.mark.slow
 def test_a_third_party_s_failure_costs_its_own_rows_only(tmp_path: Path, cache: Path) -> None:
-    methods = [method_file(tmp_path, name) for name in ("ending", "unfit", "good")]
+    methods = [
+        method_file(tmp_path, name, f"tests.flawed_methods:{name.capitalize()}")
+        for name in ("ending", "unfit", "good")
+    ]
     found = stress(methods, ["zero-force", "symmetry"], cache=cache)
     assert [(row.method, row.case, row.verdict) for row in found.rows] == [
         ("ending", "zero-force", "fall short"),
@@ -354,15 +351,16 @@ def test_numbers_that_are_not_finite_are_written_as_null(tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_the_command_prints_and_writes_the_same_results(tmp_path: Path, cache: Path) -> None:
+    out = tmp_path / "stress.json"
     options = ["-m", "pod", "-m", "linear-fem", "--case", "zero-force", "--case", "symmetry"]
-    written = ["--cache", str(cache), "--json", "--out", "stress.json"]
-    done = mor_bench_command("stress", *options, *written, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    written = ["--cache", str(cache), "--json", "--out", str(out)]
+    done = invoke("stress", *options, *written)
+    assert done.exit_code == 0, done.stderr
     printed = json.loads(done.stdout)
     assert [(row["method"], row["case"]) for row in printed["rows"]] == [
         (m, c) for m in ("pod", "linear-fem") for c in ("zero-force", "symmetry")
     ]
-    assert json.loads((tmp_path / "stress.json").read_text(encoding="utf-8")) == printed
+    assert json.loads(out.read_text(encoding="utf-8")) == printed
     assert "4 tried: 4 pass, 0 fall short" in done.stderr
 
 

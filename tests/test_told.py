@@ -10,16 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
 from mor_bench.analysis.told import told_at_most
-from mor_bench.cli.app import app
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.entries import by_group, entries_of
 from mor_bench.report.page import render
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 from mor_bench.specs import load_dataset_spec
+from tests.commands import invoke
 from tests.synthetic import a_row
 
 
@@ -96,13 +95,14 @@ def test_the_console_names_each_group_before_its_rows(made: Comparison) -> None:
 def test_told_keeps_methods_that_are_told_no_more(made: Comparison) -> None:
     for told, n in (("input", 3), ("linear-response", 4), ("equations", 6), (None, 6)):
         assert len(told_at_most(made, told).rows) == n  # type: ignore[arg-type]
-    shown = CliRunner().invoke(app, ["report", str(made.out), "--told", "input"])
+    shown = invoke("report", str(made.out), "--told", "input")
     assert shown.exit_code == 0, shown.stderr
     assert "wild" in shown.stdout
     assert "linear" not in shown.stdout.replace("linear response", "")
     assert not (made.out / "comparison.json").exists()
     for told, winner in (("linear-response", "linear"), ("equations", "linear")):
         options = ["--run", str(made.out), "--told", told, "--json"]
-        found = CliRunner().invoke(app, ["pick", "beam-tiny", *options])
+        found = invoke("pick", "beam-tiny", *options)
         assert json.loads(found.stdout)["choice"]["label"] == winner
-    assert CliRunner().invoke(app, ["pick", "beam-tiny", "--told", "input", *options[:2]]).exit_code
+    none = invoke("pick", "beam-tiny", "--told", "input", *options[:2])
+    assert none.exit_code == 1

@@ -28,7 +28,7 @@ from mor_bench.runs.training_data import TrainingData
 from mor_bench.sandbox.process import MethodFailedError
 from mor_bench.specs import load_method_spec
 from mor_bench.training_options import TrainingOptions
-from tests.small_runs import COMMAND, LIMIT, descent_file, run_small, wait_for
+from tests.small_runs import COMMAND, LIMIT, descent_file, method_file, run_small, wait_for
 
 OUT_OF_TIME = "OutOfTimeError: all iterations would take {} h; the limit is"
 
@@ -209,10 +209,10 @@ STOPPED = """
 import os
 import warnings
 
-from mor_bench.surrogates.{module} import {base}
+from mor_bench.surrogates.autoencoder import Autoencoder
 
 
-class Stopped({base}):
+class Stopped(Autoencoder):
     def train(self, networks, loss, data, generator):
         calls = []
 
@@ -223,23 +223,19 @@ class Stopped({base}):
         known = super().train(networks, counted, data, generator)
         if "STOPPED" in os.environ:
             raise RuntimeError("stopped")
-        warnings.warn(f"{{len(calls)}} steps")
+        warnings.warn(f"{len(calls)} steps")
         return known
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("module", "base"), [("pod_nn", "PODNN"), ("autoencoder", "Autoencoder")])
 def test_a_fit_that_is_stopped_after_its_training_does_not_train_again(
-    module: str, base: str, data: TrainingData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: TrainingData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("torch")
-    (tmp_path / "stopped.py").write_text(STOPPED.format(module=module, base=base))
-    (tmp_path / "stopped.toml").write_text(
-        'title = "t"\nsource = "s"\nsurrogate = "stopped:Stopped"\n'
-    )
+    (tmp_path / "stopped.py").write_text(STOPPED)
     configuration = Configuration(
-        load_method_spec(tmp_path / "stopped.toml"),
+        load_method_spec(method_file(tmp_path, "stopped", "stopped:Stopped")),
         {"iterations": 20},
         training=TrainingOptions(),
     )

@@ -18,6 +18,7 @@ from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.specs import list_suite, load_method_spec
 from mor_bench.surrogate import Surrogate
 from mor_bench.training_options import TrainingOptions
+from tests.relative_errors import median_error
 
 pytest.importorskip("torch", reason="needs pip install 'mor-bench[learn]'")
 
@@ -42,17 +43,6 @@ def started(method: Surrogate, path: Path, samples: Snapshots) -> Surrogate:
     return method.fit(samples.scene, samples)
 
 
-def error(method: Surrogate, samples: Snapshots) -> float:
-    norms = (
-        np.linalg.norm(values, axis=(1, 2))
-        for values in (
-            method.predict(samples.forces) - samples.displacements,
-            samples.displacements,
-        )
-    )
-    return float(np.median(np.divide(*norms)))
-
-
 @pytest.fixture(scope="module")
 def files(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A model of each method, trained for one step."""
@@ -72,10 +62,10 @@ def test_the_branch_is_transformed_to_the_bases_of_other_samples(
     others = tiny.train[1:48:2]
     first.save(tmp_path / "model.safetensors")
     second = make(name, **knobs, seed=3, learning_rate=1e-12)
-    random, own = error(second.fit(tiny.scene, others), others), error(first, others)
+    random, own = median_error(second.fit(tiny.scene, others), others), median_error(first, others)
     assert own < 0.8 * random
     again = started(second, tmp_path / "model.safetensors", others)
-    assert error(again, others) == pytest.approx(own, rel=0.02)
+    assert median_error(again, others) == pytest.approx(own, rel=0.02)
 
 
 def test_a_model_of_another_class_is_refused(files: dict[str, Path], tiny: Dataset) -> None:

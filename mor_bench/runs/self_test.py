@@ -36,6 +36,9 @@ N_SAMPLES, N_DAMAGED = 120, 200
 GRACE_S = 5.0
 """Time in which the processes of a killed one must end, s; usually it takes milliseconds."""
 
+HOLD_S = 20.0
+"""Time for which a process holds too much memory unless it is ended, s."""
+
 SECRET = b"sealed"
 
 
@@ -64,10 +67,10 @@ class SealedSession(Session):
         descriptor = ctypes.CDLL(None).open(os.fsencode(path), os.O_RDONLY)
         return {"read": descriptor >= 0 and os.read(descriptor, 99) == SECRET}
 
-    def hoard(self) -> dict[str, Any]:
-        """Fill a gigabyte of memory and wait."""
+    def hoard(self, hold_s: float) -> dict[str, Any]:
+        """Fill a gigabyte of memory and hold it for some seconds."""
         filled = np.ones(125_000_000)
-        time.sleep(20)
+        time.sleep(hold_s)
         return {"n": len(filled)}
 
 
@@ -135,7 +138,7 @@ def _memory_limit(folder: Path) -> tuple[bool, str]:
     restrictions = Restrictions(scratch=folder, memory_bytes=5e8)
     with SandboxedProcess(SealedSession, restrictions) as worker:
         try:
-            worker.ask("hoard", 60.0)
+            worker.ask("hoard", 60.0, hold_s=HOLD_S)
         except MethodFailedError as error:
             return "more memory than the limit" in str(error), str(error)
     return False, "a process exceeds its limit"

@@ -120,13 +120,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--turns", type=int, default=20)
     parser.add_argument("--queries", type=int, default=5, help="of a back end in each turn")
-    parser.add_argument(
-        "--quick", action="store_true", help="small networks, one thread, three turns"
-    )
     parser.add_argument("--out", type=Path, help="JSON file to write")
     options = parser.parse_args()
-    if options.quick:
-        options.channels, options.steps, options.threads, options.turns = [8, 16], [2, 3], [1], 3
     rows = []
     for row in table(
         options.scene or list(SCENES),

@@ -139,22 +139,6 @@ def random_loads(source: str) -> str:
     return markdown(headings, body)
 
 
-def network_latency(source: str) -> str:
-    """Show the latency of the network alone, by back end; cells hold one and two threads."""
-    found: dict[tuple[str, int, int], dict[str, dict[int, float]]] = {}
-    for row in content_of(source)["rows"]:
-        size = (row["scene"], row["channels"], row["steps"])
-        by_threads = found.setdefault(size, {}).setdefault(row["backend"], {})
-        by_threads[row["threads"]] = row["median_ms"]
-    backends = list(dict.fromkeys(name for cells in found.values() for name in cells))
-    body = [
-        [scene, str(c), str(k)]
-        + [" / ".join(number(ms) for _, ms in sorted(cells.get(b, {}).items())) for b in backends]
-        for (scene, c, k), cells in found.items()
-    ]
-    return markdown(["grid", "c", "k", *(f"{b}, ms" for b in backends)], body)
-
-
 def umesh_choices(source: str, group: str = "open") -> str:
     """Show errors of U-Mesh's variants on validation and test samples."""
     body = []
@@ -314,7 +298,6 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "scaling": scaling,
     "generation": generation,
     "random-loads": random_loads,
-    "network-latency": network_latency,
     "umesh-choices": umesh_choices,
     "paper-amplitude": paper_amplitude,
     "records": records,

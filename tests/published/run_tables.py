@@ -181,18 +181,6 @@ def fastest(source: str, dataset: str = "", methods: str = "") -> str:
     return markdown([*headings, "smallest median %; its max %"], body)
 
 
-def configurations(source: str, dataset: str = "", methods: str = "") -> str:
-    """Show every configuration: errors, latency, offline cost."""
-    run = run_of(source)
-    return markdown(
-        ["configuration", *ERRORS_SHOWN, "ms", "data + fit, core-s"],
-        [
-            [row.label.replace("|", "/"), *_errors(run, row), _latency(run, row), _offline(row)]
-            for row in _rows(run, dataset, methods)
-        ],
-    )
-
-
 def verdict(source: str, dataset: str = "") -> str:
     """State the verdict on a dataset in the words of the report."""
     run = run_of(source)
@@ -201,69 +189,6 @@ def verdict(source: str, dataset: str = "") -> str:
     beside = [line for line in found["beside"] if not line.startswith("Evidence:")]
     beside = [line.partition(" Time again:")[0] for line in beside]
     return "\n".join([found["headline"], *(f"- {line}" for line in beside)])
-
-
-def verdicts(source: str, dataset: str = "", target: str = "0.01", methods: str = "") -> str:
-    """Show which method of each pair is faster at an error."""
-    run = run_of(source)
-    names = list(_by_method(_rows(run, dataset, methods)))
-    name = dataset or next(iter(run.datasets))
-    found = {
-        (record["a"], record["b"]): record["verdict"]
-        for record in (run.analysis or {})["pairwise"]
-        if record["dataset"] == name and record["target_rel_l2_median"] == float(target)
-    }
-    return markdown(
-        ["is → than ↓", *(f"`{a}`" for a in names)],
-        [
-            [f"`{b}`", *(DASH if a == b else found.get((a, b), "not reached") for a in names)]
-            for b in names
-        ],
-    )
-
-
-def splits(source: str, dataset: str = "", methods: str = "") -> str:
-    """Show the selected configuration of each method on two splits; SOURCE is FOLDER,FOLDER."""
-    runs = [run_of(folder) for folder in source.split(",")]
-    headings = ["method", "is given"]
-    columns: list[dict[str, Row]] = []
-    for run in runs:
-        rows = _rows(run, dataset, methods)
-        columns.append({m: chosen(own) for m, own in _by_method(rows).items()})
-        headings.append(f"split by {rows[0].split}: selected; e (free dofs), m; median %; max %")
-    body = []
-    for method, first in columns[0].items():
-        cells = [f"`{method}`", class_text(first, is_observed(runs[0], first.dataset))]
-        for run, column in zip(runs, columns, strict=True):
-            row = column.get(method)
-            if row is None or row.error is None:
-                cells.append(DASH)
-                continue
-            error = row.error
-            cells.append(
-                f"{_configuration(row)}; {_mean_error(error)}; {_error(run, row)}; "
-                f"{_percent(error.rel_l2_max)}"
-            )
-        body.append([*cells, _latency(runs[0], first)])
-    return markdown([*headings, "ms"], body)
-
-
-def seeds(source: str, dataset: str = "", methods: str = "") -> str:
-    """Show the scatter of errors over the seeds of the trained methods."""
-    run = run_of(source)
-    return markdown(
-        ["configuration", "seeds", "e, m: median (range)", "median %: median (range)"],
-        [
-            [
-                row.label,
-                str(row.seeds.n),
-                f"{_metres(e.median)} ({_metres(e.min)}–{_metres(e.max)})",
-                f"{_percent(r.median)} ({_percent(r.min)}–{_percent(r.max)})",
-            ]
-            for row in _rows(run, dataset, methods)
-            if row.seeds and (e := row.seeds.mean_dof_m) and (r := row.seeds.rel_l2_median)
-        ],
-    )
 
 
 def indicated(source: str, methods: str = "") -> str:
@@ -311,35 +236,6 @@ def paper(source: str, methods: str = "") -> str:
     return markdown(["scene", *headings], body)
 
 
-def out_of_range(source: str, dataset: str = "", methods: str = "") -> str:
-    """Show errors on the named test sets: median and 95th percentile, and flagged loads."""
-    run = run_of(source)
-    rows = [chosen(own) for own in _by_method(_rows(run, dataset, methods)).values()]
-    names = list(dict.fromkeys(name for row in rows for name in row.sets))
-    if not names:
-        raise EvidenceError(f"{source}: no named test sets were scored.")
-
-    def cell(row: Row, name: str) -> str:
-        found = row.sets.get(name)
-        if found is None:
-            return DASH
-        flagged = "" if found.n_flagged is None else f"; {found.n_flagged / found.n:.0%} flagged"
-        return f"{_percent(found.rel_l2_median)} / {_percent(found.rel_l2_p95)}{flagged}"
-
-    return markdown(
-        ["median % / p95 %", "test", *names],
-        [
-            [
-                f"`{row.method}`",
-                f"{_percent(row.error.rel_l2_median)} / {_percent(row.error.rel_l2_p95)}",
-                *(cell(row, name) for name in names),
-            ]
-            for row in rows
-            if row.error
-        ],
-    )
-
-
 def facts(source: str, dataset: str = "") -> str:
     """State the settings of a run in one line: machine, samples, commit of the code."""
     run = run_of(source)
@@ -358,13 +254,8 @@ def facts(source: str, dataset: str = "") -> str:
 RUN_TABLES: dict[str, Callable[..., str]] = {
     "selected": selected,
     "fastest": fastest,
-    "configurations": configurations,
     "verdict": verdict,
-    "verdicts": verdicts,
-    "splits": splits,
-    "seeds": seeds,
     "indicated": indicated,
     "paper": paper,
-    "out-of-range": out_of_range,
     "facts": facts,
 }

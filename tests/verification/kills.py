@@ -52,6 +52,15 @@ EXACT = ("*.safetensors", "shard-*.h5")
 """Files that must not depend on interruptions; results.json is compared without times."""
 
 
+@dataclass(frozen=True)
+class Undisturbed:
+    """Results and seconds of a command that nothing disturbed."""
+
+    command: str
+    results: dict[str, str]
+    seconds: float
+
+
 @dataclass
 class Outcome:
     """Number of kills that hit, and everything that was wrong."""
@@ -116,31 +125,30 @@ def start(command: str, folder: Path) -> subprocess.Popen[bytes]:
         )
 
 
-def undisturbed(command: str, folder: Path) -> tuple[dict[str, str], float]:
-    """Return the result and the seconds of a command that nothing disturbs."""
+def undisturbed(command: str, folder: Path) -> Undisturbed:
+    """Run a command that nothing disturbs."""
     begun = time.monotonic()
     code = start(command, folder).wait()
     assert code == 0, (folder / "log.txt").read_text(encoding="utf-8")
-    return result(folder), time.monotonic() - begun
+    return Undisturbed(command, result(folder), time.monotonic() - begun)
 
 
 def kill_often(
-    command: str, number: signal.Signals, kills: int, parent: Path, seed: int
+    expected: Undisturbed, number: signal.Signals, kills: int, parent: Path, seed: int
 ) -> Outcome:
     """Kill a command many times and compare it with an undisturbed one."""
-    draw, outcome = random.Random(seed), Outcome()
-    expected, seconds = undisturbed(command, parent / f"{command}-undisturbed")
+    draw, outcome, command = random.Random(seed), Outcome(), expected.command
     folder = parent / f"{command}-{number.name}-0"
     while outcome.kills < kills:
         process = start(command, folder)
         try:
-            code = process.wait(draw.uniform(0.0, seconds))
+            code = process.wait(draw.uniform(0.0, expected.seconds))
         except subprocess.TimeoutExpired:
             process.send_signal(number)
             code = process.wait()
         outcome.wrong += outliving(folder)
         if code == 0:
-            _check_end(folder, expected, outcome)
+            _check_end(folder, expected.results, outcome)
             folder = folder.with_name(f"{command}-{number.name}-{outcome.finished}")
             continue
         outcome.kills += 1
@@ -151,7 +159,7 @@ def kill_often(
     code = start(command, folder).wait()
     if code:
         outcome.wrong.append(f"exit code {code} of the repetition")
-    _check_end(folder, expected, outcome)
+    _check_end(folder, expected.results, outcome)
     return outcome
 
 
@@ -181,10 +189,11 @@ def main() -> None:
     wrong = 0
     with tempfile.TemporaryDirectory() as parent:
         for command in given.commands:
+            expected = undisturbed(command, Path(parent) / f"{command}-undisturbed")
             for name in SIGNALS:
                 folder = Path(parent) / f"{command}-{name}"
                 number = signal.Signals[name]
-                found = kill_often(command, number, given.kills, folder, given.seed)
+                found = kill_often(expected, number, given.kills, folder, given.seed)
                 wrong += len(found.wrong)
                 print(f"{command} {name}: {found.kills} kills, {found.finished} finished", end="")
                 print(f", {len(found.wrong)} wrong {found.wrong[:5]}", flush=True)
