@@ -142,11 +142,12 @@ def fit_seconds(
 
 def _earlier_fits(cache: Path, configuration: Configuration) -> list[FitRecord]:
     """Return records of earlier fits of a method, with the same parameters if there are any."""
-    records = []
-    for path in (cache / "fits").glob(f"{configuration.method.name}-*/fit.json"):
+    records, name = [], configuration.method.name
+    for path in (cache / "fits").glob(f"{name}-*/fit.json"):
         with suppress(OSError, StoreError):
             record = read_fit_record(path)
-            if record.trained_elsewhere is None:
+            # The pattern for `pod` also matches the folders of `pod-tensor`.
+            if record.method == name and record.trained_elsewhere is None:
                 records.append(record)
     wanted = configuration.parameters.items()
     same = [record for record in records if record.parameters.items() >= wanted]
