@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from pathlib import Path
@@ -13,6 +14,7 @@ from mor_bench.errors import InvalidInputError, SpecError
 from mor_bench.options import RunOptions
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
+from mor_bench.runs import dataset_run
 from mor_bench.runs.configurations import CORE_METHODS, checked_specs
 from mor_bench.runs.plan import plan
 from mor_bench.scratch import identity
@@ -82,6 +84,18 @@ def test_failed_fits_use_up_the_tuning_budget(cache: Path, tmp_path: Path) -> No
     assert [row.status for row in rows] == ["failed", "skipped", "skipped"]
     assert rows[1].reason == "beyond the tuning budget of 2 s of fitting"
     assert (rows[0].tuning_s or 0.0) >= 2.0
+
+
+@pytest.mark.slow
+def test_a_full_disk_during_a_fit_is_reported_as_such(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def on_a_full_disk(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "the disk is full", "fit.json")
+
+    monkeypatch.setattr(dataset_run, "fit_configuration", on_a_full_disk)
+    with pytest.raises(OSError, match="the disk is full"):
+        run_small(["linear-fem"], tmp_path / "out", cache)
 
 
 @pytest.mark.slow
