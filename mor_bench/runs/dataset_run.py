@@ -134,7 +134,7 @@ class DatasetRun:
 
     def _load(self) -> Dataset:
         options, spec = self.context.options, self.spec
-        full = options.profile == "full" and isinstance(spec, DatasetSpec)
+        full = options.profile == "full"
         return load_dataset(
             spec,
             options.limit,
@@ -233,7 +233,7 @@ class DatasetRun:
                 return own, []
             return adopt(*found, configuration, self.training_data, self.environment), []
         except MorBenchError as error:
-            return own, [f"{error} So the network was trained here."]
+            return own, [f"trained here, because the suite's weights cannot be used: {error}"]
 
     def _announce(self, configuration: Configuration) -> None:
         n = len(self.configurations)
