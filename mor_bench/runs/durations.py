@@ -106,8 +106,7 @@ def compile_seconds(
     """Estimate the seconds of compiling what is not compiled yet."""
     waiting = uncompiled(spec, configurations)
     each = [
-        (group.configurations[0].method.compile_s or METHOD_S)
-        + (TORCH_S if may_train(group.configurations[0].method) else START_S)
+        (group.method.compile_s or METHOD_S) + (TORCH_S if may_train(group.method) else START_S)
         for group in waiting
     ]
     return pace.interpreter * (sum(each) + (KERNELS_S if waiting else 0.0))
