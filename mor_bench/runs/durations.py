@@ -55,11 +55,11 @@ class Pace:
     Attributes
     ----------
     interpreter : float
-        Of Python code and of compilation.
+        Ratio for Python code and compilation.
     solver : float
-        Of residuals and back-solves.
+        Ratio for residuals and back-solves.
     training : float
-        Of trainings, which use all cores.
+        Ratio for trainings, which use all cores.
     """
 
     interpreter: float

@@ -130,9 +130,10 @@ def plan(
 ) -> Plan:
     """Plan the steps of `mor_bench.run` for the same arguments, without taking them.
 
-    The time of a fit follows from earlier fits of the method in the cache, or else from the
-    method's file, scaled by this machine's speed. Both are scaled by the numbers of unknowns and of
-    training samples. The time of generating data follows from a few samples that are solved here.
+    The time of a fit follows from earlier fits of the method in the cache. Without any, it is that
+    of the method's file, scaled by this machine's speed. Both are scaled by the numbers of unknowns
+    and of training samples. The time of generating data follows from a few samples that are solved
+    here.
 
     Raises
     ------
