@@ -144,6 +144,7 @@ def test_two_runs_cannot_write_to_the_same_folder(cache: Path, tmp_path: Path) -
     (tmp_path / ".running").write_text(str(identity(os.getppid())))
     with pytest.raises(InvalidInputError, match=r"another run \(process"):
         run_small(["linear-fem"], tmp_path, cache)
+    assert [path.name for path in tmp_path.iterdir()] == [".running"]
 
 
 @pytest.mark.slow
