@@ -116,9 +116,10 @@ def _bad_value(
         ]
         if len(expected) > 1:
             key, message = str(location[0]), " or ".join(expected)
-    given = "" if problem["type"] == "value_error" and not key else f"; got {_shown(problem)}"
+    if not key:
+        return f"{message}."
     verb = " must be" if problem["msg"].startswith("Input should") else ":"
-    return f"`{key}`{verb} {message}{given}."
+    return f"`{key}`{verb} {message}; got {_shown(problem)}."
 
 
 def _shown(problem: ErrorDetails) -> str:
