@@ -69,14 +69,14 @@ def compile_kernels(
     waiting = uncompiled(spec, configurations)
     restrictions = Restrictions(memory_bytes=context.memory_limit_bytes)
     problem: TrainingData | None = None
-    with suppress(MorBenchError), tempfile.TemporaryDirectory(dir=scratch) as folder:
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
         for number, group in enumerate(waiting):
             context.listener.compiling(group.method.name, number, len(waiting))
-            if problem is None:
-                # A fork server compiles while it starts; two processes would compile twice.
-                SandboxedProcess(MethodSession, restrictions, fork_server).end()
-                problem = _small_problem(spec, context, Path(folder))
             with suppress(MorBenchError):
+                if problem is None:
+                    # A fork server compiles while it starts; two processes would compile twice.
+                    SandboxedProcess(MethodSession, restrictions, fork_server).end()
+                    problem = _small_problem(spec, context, Path(folder))
                 for configuration in _ends(group.configurations):
                     with SandboxedProcess(
                         MethodSession, restrictions, fork_server, scene=problem.scene
