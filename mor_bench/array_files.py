@@ -30,6 +30,25 @@ MOST_OBJECTS = 10_000
 """Limit of the number of arrays and groups in a file."""
 
 
+class _RefusedError(Exception):
+    """The end of a message that says what is wrong with a file."""
+
+
+@contextmanager
+def _reading(path: Path, kind: str, error: type[MorBenchError]) -> Iterator[None]:
+    """Check a file; turn the errors of its reader into one line that names the file."""
+    check_file(path, error=error)
+    try:
+        yield
+    except _RefusedError as reason:
+        raise error(f"{path}: {reason}") from None
+    except (MorBenchError, MemoryError):
+        raise
+    except Exception as reason:  # damaged files raise errors of many kinds
+        words = printable(" ".join(str(reason).split()), 300) or type(reason).__name__
+        raise error(f"{path}: not a readable {kind}: {words}") from None
+
+
 def read_npz(path: Path, error: type[MorBenchError] = StoreError) -> Arrays:
     """Read every array of an NPZ file.
 
@@ -40,24 +59,13 @@ def read_npz(path: Path, error: type[MorBenchError] = StoreError) -> Arrays:
     FileNotFoundError
         If it does not exist.
     """
-    check_file(path, error=error)
-    try:
-        with limited_memory(path, error), zipfile.ZipFile(path) as archive:
-            _check_members(archive.infolist(), path.stat().st_size)
-            return {
-                member.filename.removesuffix(".npy"): _array(archive.read(member))
-                for member in archive.infolist()
-            }
-    except _RefusedError as reason:
-        raise error(f"{path}: {reason}") from None
-    except (MorBenchError, MemoryError):
-        raise
-    except Exception as reason:  # damaged files raise errors of many kinds
-        raise error(f"{path}: not a readable .npz file of arrays: {_words(reason)}") from None
-
-
-class _RefusedError(Exception):
-    """The end of a message that says what is wrong with a file."""
+    limits = limited_memory(path, error)
+    with _reading(path, ".npz file of arrays", error), limits, zipfile.ZipFile(path) as archive:
+        _check_members(archive.infolist(), path.stat().st_size)
+        return {
+            member.filename.removesuffix(".npy"): _array(archive.read(member))
+            for member in archive.infolist()
+        }
 
 
 def _check_members(members: list[zipfile.ZipInfo], file_bytes: int) -> None:
@@ -101,11 +109,8 @@ def _array(content: bytes) -> NDArray[Any]:
 
 def read_npy(path: Path, error: type[MorBenchError] = StoreError) -> NDArray[Any]:
     """Map the array of an NPY file into memory; errors as in `read_npz`."""
-    check_file(path, error=error)
-    try:
+    with _reading(path, ".npy file", error):
         return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
-    except Exception as reason:
-        raise error(f"{path}: not a readable .npy file: {_words(reason)}") from None
 
 
 @contextmanager
@@ -114,17 +119,10 @@ def open_hdf5(path: Path, error: type[MorBenchError] = StoreError) -> Iterator[h
 
     Errors are as in `read_npz`, also for what the caller reads inside the context.
     """
-    check_file(path, error=error)
-    try:
-        with limited_memory(path, error), h5py.File(path, "r") as file:
-            check_hdf5(file, path.stat().st_size)
-            yield file
-    except _RefusedError as reason:
-        raise error(f"{path}: {reason}") from None
-    except (MorBenchError, MemoryError):
-        raise
-    except Exception as reason:  # damaged files raise errors of many kinds
-        raise error(f"{path}: not a readable HDF5 file of arrays: {_words(reason)}") from None
+    limits = limited_memory(path, error)
+    with _reading(path, "HDF5 file of arrays", error), limits, h5py.File(path, "r") as file:
+        check_hdf5(file, path.stat().st_size)
+        yield file
 
 
 def check_hdf5(file: h5py.File, file_bytes: int) -> None:
@@ -163,7 +161,3 @@ def read_hdf5(path: Path, error: type[MorBenchError] = StoreError) -> Arrays:
 def is_hdf5(path: Path) -> bool:
     """Return whether a regular file is in HDF5 format."""
     return bool(h5py.is_hdf5(path))
-
-
-def _words(reason: Exception) -> str:
-    return printable(" ".join(str(reason).split()), 300) or type(reason).__name__

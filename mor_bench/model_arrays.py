@@ -11,6 +11,13 @@ from numpy.typing import DTypeLike, NDArray
 from mor_bench.errors import InvalidInputError
 
 
+def has_shape(array: NDArray[Any], shape: tuple[int | None, ...]) -> bool:
+    """Return whether an array has a shape, in which None stands for any length but 0."""
+    return array.ndim == len(shape) and all(
+        n == m if m is not None else n > 0 for n, m in zip(array.shape, shape, strict=True)
+    )
+
+
 def take_array(
     model: Mapping[str, NDArray[Any]],
     name: str,
@@ -34,10 +41,7 @@ def take_array(
     if name not in model:
         raise InvalidInputError(f"the array `{name}` is missing.")
     array = model[name]
-    fits = array.ndim == len(shape) and all(
-        n == m if m is not None else n > 0 for n, m in zip(array.shape, shape, strict=True)
-    )
-    if array.dtype != dtype or not fits or not np.isfinite(array).all():
+    if array.dtype != dtype or not has_shape(array, shape) or not np.isfinite(array).all():
         wanted = ", ".join("any" if length is None else str(length) for length in shape)
         raise InvalidInputError(
             f"`{name}` must be a finite {np.dtype(dtype)} array of shape ({wanted}); "

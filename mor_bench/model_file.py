@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mor_bench.checked_files import check_file, parse_json
 from mor_bench.digests import digest_of_arrays
 from mor_bench.errors import InvalidInputError, MorBenchError, StoreError
+from mor_bench.model_arrays import has_shape
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import check_parameters
 
@@ -225,11 +226,7 @@ def fitting_arrays(
             got = f"got {arrays[name].dtype}" if name in arrays else "it is missing"
             raise StoreError(f"{path}: `{name}` must be {np.dtype(dtype)}; {got}.")
         array = arrays[name]
-        if (
-            array.ndim != len(shape)
-            or 0 in array.shape
-            or any(length not in (None, n) for n, length in zip(array.shape, shape, strict=True))
-        ):
+        if not has_shape(array, shape):
             wanted = ", ".join("at least 1" if n is None else str(n) for n in shape)
             raise InvalidInputError(
                 f"{path}: `start_from`: the array `{name}` must be of shape ({wanted}); "

@@ -6,14 +6,13 @@ read these models. A bad value or an unknown name raises one clear `InvalidInput
 >>> RunOptions(seeds=0)
 Traceback (most recent call last):
 mor_bench.options.InvalidOptionError: `seeds` must be an integer in [1, 100]; got 0.
->>> RunOptions(sed=3)
+>>> RunOptions(sed=3)  # doctest: +ELLIPSIS
 Traceback (most recent call last):
-mor_bench.options.InvalidOptionError: unknown option `sed`; did you mean 'seeds'?
+mor_bench.options.InvalidOptionError: unknown option `sed`; did you mean 'seeds'? Options: ...
 """
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -33,6 +32,7 @@ from pydantic.fields import FieldInfo
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.specs.loads_spec import SplitBy
+from mor_bench.specs.one_line_errors import nearest_name
 from mor_bench.specs.parameters import python_number
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -133,11 +133,8 @@ class Options(BaseModel):
     def _message(cls, name: str, values: dict[str, Any]) -> str:
         field = cls.model_fields.get(name)
         if field is None:
-            near = difflib.get_close_matches(name, cls.model_fields, n=1)
-            hint = (
-                f"did you mean {near[0]!r}?" if near else f"options: {', '.join(cls.model_fields)}."
-            )
-            return f"unknown option `{name}`; {hint}"
+            hint = nearest_name(name, cls.model_fields)
+            return f"unknown option `{name}`{hint} Options: {', '.join(cls.model_fields)}."
         return f"`{name}` must be {allowed_values(field)}; got {values[name]!r}."
 
 

@@ -16,6 +16,7 @@ import pytest
 import mor_bench
 from mor_bench.measure import latency, timing
 from mor_bench.results.comparison import Comparison
+from mor_bench.runs.cached_fit import FitRecord
 from mor_bench.runs.listener import Listener
 
 LIMIT = 60
@@ -49,6 +50,27 @@ def descent_file(
 ) -> Path:
     """Write the file of a method that trains by gradient descent in milliseconds."""
     return method_file(folder, "descent", "tests.third_party:Descent", sweep, **parameters)
+
+
+def keep_fit_record(
+    cache: Path, method: str, parameters: dict[str, Any], size: tuple[int, int], fit_s: float
+) -> None:
+    """Write the record of a fit to a cache; the size is the number of dofs and of samples."""
+    record = FitRecord(
+        method=method,
+        n_dofs=size[0],
+        n_train=size[1],
+        fit_s=fit_s,
+        fit_core_s=fit_s,
+        fit_memory_bytes=1,
+        model_bytes=1,
+        needs_snapshots=True,
+        parameters=parameters,
+        warnings=[],
+    )
+    folder = cache / "fits" / f"{method}-0123456789"
+    folder.mkdir(parents=True)
+    (folder / "fit.json").write_text(record.model_dump_json())
 
 
 def wait_for(done: Callable[[], Any], process: Popen[str], within_s: float = 120.0) -> None:

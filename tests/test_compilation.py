@@ -46,7 +46,7 @@ def test_methods_that_differ_in_words_are_compiled_apart(tmp_path: Path) -> None
     methods = [load_method_spec(source) for source in ("pod", "hpod", other)]
     groups = uncompiled(_never_seen(), configurations_of(methods, "full"))
     words = [
-        (group.method, {item.parameters.get("sampling") for item in group.configurations})
+        (group.method.name, {item.parameters.get("sampling") for item in group.configurations})
         for group in groups
     ]
     assert words == [("pod", {None}), ("hpod", {"points"}), ("hpod", {"cells"})]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from pathlib import Path
@@ -13,6 +14,7 @@ from mor_bench.errors import InvalidInputError, SpecError
 from mor_bench.options import RunOptions
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
+from mor_bench.runs import dataset_run
 from mor_bench.runs.configurations import CORE_METHODS, checked_specs
 from mor_bench.runs.plan import plan
 from mor_bench.scratch import identity
@@ -84,6 +86,18 @@ def test_failed_fits_use_up_the_tuning_budget(cache: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+def test_a_full_disk_during_a_fit_is_reported_as_such(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def on_a_full_disk(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "the disk is full", "fit.json")
+
+    monkeypatch.setattr(dataset_run, "fit_configuration", on_a_full_disk)
+    with pytest.raises(OSError, match="the disk is full"):
+        run_small(["linear-fem"], tmp_path / "out", cache)
+
+
+@pytest.mark.slow
 def test_no_method_can_change_what_another_learns_from(
     tmp_path: Path, plain_run: Comparison
 ) -> None:
@@ -130,6 +144,7 @@ def test_two_runs_cannot_write_to_the_same_folder(cache: Path, tmp_path: Path) -
     (tmp_path / ".running").write_text(str(identity(os.getppid())))
     with pytest.raises(InvalidInputError, match=r"another run \(process"):
         run_small(["linear-fem"], tmp_path, cache)
+    assert [path.name for path in tmp_path.iterdir()] == [".running"]
 
 
 @pytest.mark.slow

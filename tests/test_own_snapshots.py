@@ -19,13 +19,15 @@ from mor_bench.measure.discretisation_error import refine
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.options import RunOptions
 from mor_bench.runs.configurations import CORE_METHODS, DATA_METHODS, checked_specs
+from mor_bench.runs.durations import Pace
 from mor_bench.runs.file_check import check_file
+from mor_bench.runs.plan import plan
 from mor_bench.scene.snapshot_file import MAX_SIZE
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.given import MAX_FORCE_N
 from mor_bench.specs import ImportedDatasetSpec, load_generated_spec
 from tests.commands import invoke as command
-from tests.small_runs import short_timing
+from tests.small_runs import keep_fit_record, short_timing
 from tests.spoiled_arrays import Arrays, doubled, first, hinged, put, with_, without
 from tests.suite_methods import SPECS, cheap_method
 
@@ -104,6 +106,17 @@ def test_imported_samples_are_split_by_sample_direction_and_region(
     message = r"a split by region needs the array `regions` in .*mine.npz; or split by sample"
     with pytest.raises(InvalidInputError, match=message):
         mor_bench.load_dataset(path)
+
+
+def test_a_plan_counts_the_training_samples_of_the_file(
+    arrays: Arrays, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Pace, "measured", lambda *_: Pace(1.0, 1.0, 1.0))
+    path, method = written(tmp_path, arrays), SPECS["pca-regression-force"]
+    data = mor_bench.load_dataset(path)
+    size = data.scene.mesh.n_dofs, len(data.train)
+    keep_fit_record(tmp_path, method.name, method.configurations("quick")[0], size, 7.0)
+    assert plan([path], [method.name], cache=tmp_path).steps[1].seconds == pytest.approx(7.0)
 
 
 def test_imported_samples_are_split_as_the_file_specifies(arrays: Arrays, tmp_path: Path) -> None:

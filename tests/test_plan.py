@@ -8,13 +8,16 @@ from typing import Any
 import pytest
 
 from mor_bench.errors import MissingDependencyError
+from mor_bench.options import RunOptions
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.code_digest import code_digest, imported_sources
-from mor_bench.runs.durations import Pace
+from mor_bench.runs.configurations import configurations_of
+from mor_bench.runs.durations import REFERENCE_DOFS, REFERENCE_TRAINING, Pace, fit_seconds
 from mor_bench.runs.plan import plan
+from mor_bench.runs.run_context import RunContext
 from mor_bench.specs import MethodSpec, list_suite, load_method_spec
 from tests.commands import invoke
-from tests.small_runs import LIMIT, method_file
+from tests.small_runs import LIMIT, keep_fit_record, method_file
 
 
 def test_a_dry_run_computes_nothing_and_names_every_step(tmp_path: Path) -> None:
@@ -61,6 +64,17 @@ def test_a_method_whose_library_is_missing_takes_no_time(
     alone = plan(["beam-tiny"], ["linear-fem"], **options)
     for stage in ("compilation_s", "scoring_s", "timing_s", "report_s"):
         assert found.as_dict()[stage] == alone.as_dict()[stage]
+
+
+def test_only_earlier_fits_of_the_same_method_predict_its_time(tmp_path: Path) -> None:
+    configuration = configurations_of([load_method_spec("pod")], "quick")[0]
+    size = REFERENCE_DOFS, REFERENCE_TRAINING
+    arguments = configuration, RunContext.of(RunOptions(cache=tmp_path)), size, Pace(1.0, 1.0, 1.0)
+    stated = fit_seconds(*arguments)
+    keep_fit_record(tmp_path, "pod-tensor", configuration.parameters, size, 1e6)
+    assert fit_seconds(*arguments) == stated != 1e6
+    keep_fit_record(tmp_path, "pod", configuration.parameters, size, 1e6)
+    assert fit_seconds(*arguments) == 1e6
 
 
 def test_other_seeds_and_trainings_of_given_length_are_planned(tmp_path: Path) -> None:

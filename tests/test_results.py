@@ -63,10 +63,10 @@ def test_a_row_may_lack_the_swept_parameters(tmp_path: Path) -> None:
     [
         ("datasets", {}, "`datasets` lacks 'd', which rows name"),
         ("datasets", {"d": {"needs": {"error": "small"}}}, r"`datasets.d`: .*needs.error"),
-        ("datasets", {"d": True}, r"`datasets.d`: Input should be a valid dictionary"),
+        ("datasets", {"d": True}, r"`datasets.d` must be a valid dictionary; got True"),
         ("methods", {"pod": {"regime": {"min_dofs": "many"}}}, r"`methods.pod`: .*min_dofs"),
         ("settings", {"limit": "few"}, r"`settings`: .*limit"),
-        ("rows", {}, r"`rows`: Input should be a valid list"),
+        ("rows", {}, r"`rows` must be a valid list; got \{\}"),
         ("schema_version", "2" * 1000, r"schema version 2{50}…"),
     ],
 )
@@ -84,9 +84,9 @@ def test_a_damaged_table_is_refused_with_its_name_and_the_key(
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("status", "fine", r"`rows.0.status`: Input should be 'ok', 'failed' or 'skipped'"),
-        ("n_train", "many", r"`rows.0.n_train`: "),
-        ("error", {"rel_l2_median": "low"}, r"`rows.0.error.rel_l2_median`: "),
+        ("status", "fine", r"`rows\[0\].status` must be 'ok', 'failed' or 'skipped'; got 'fine'"),
+        ("n_train", "many", r"`rows\[0\].n_train` must be a valid integer"),
+        ("error", {"rel_l2_median": "low"}, r"`rows\[0\].error.rel_l2_median` must be a valid"),
     ],
 )
 def test_a_damaged_file_is_refused_with_its_name_and_the_key(

@@ -18,7 +18,7 @@ import numpy as np
 import psutil
 import pytest
 
-from mor_bench.errors import SpecError
+from mor_bench.errors import MorBenchError, SpecError
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.results.comparison import Comparison
 from mor_bench.sandbox import landlock
@@ -179,6 +179,16 @@ def test_the_kernel_keeps_a_method_out_of_sealed_folders(
     never = way == "by_a_process_of_the_fork_server"
     assert said.startswith("refused" if sealed or never else "saw "), said
     assert not sealed or secret.read_bytes() == b"0123456789"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Landlock is part of Linux")
+def test_a_kernel_that_refuses_to_close_folders_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(landlock, "version", lambda: 1)
+    monkeypatch.setattr(landlock, "CREATE_RULESET", 9999)
+    with pytest.raises(MorBenchError, match="refuses to close folders"):
+        landlock.close_folders([tmp_path])
 
 
 def test_the_kind_of_isolation_is_recorded(small_run: Comparison) -> None:

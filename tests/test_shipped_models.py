@@ -132,7 +132,7 @@ def test_damaged_and_forged_weights_are_refused_with_a_warning(
     assert len(row.warnings) == 1
     record.write_text("{}")
     [warning] = _row(tmp_path, "broken").warnings
-    assert "not a valid record" in warning
+    assert "key `binding` is missing" in warning
 
 
 def test_a_record_is_written_and_read_unchanged(tmp_path: Path) -> None:

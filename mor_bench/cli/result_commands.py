@@ -16,8 +16,8 @@ from mor_bench.analysis.told import told_at_most
 from mor_bench.cli.console import make_console
 from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import (
-    OUTPUT,
     DatasetName,
+    Json,
     QuietOutput,
     TableOutput,
     with_options,
@@ -123,14 +123,7 @@ def pick(
     *,
     options: PickOptions,
     output: QuietOutput,
-    as_json: Annotated[
-        bool,
-        typer.Option(
-            "--json",
-            help="Print the choice to standard output as JSON.",
-            rich_help_panel=OUTPUT,
-        ),
-    ] = False,
+    as_json: Json = False,
 ) -> None:
     """Name the fastest configuration that meets a dataset's needs, with the evidence.
 

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from mor_bench.cli.console import make_console
 from mor_bench.cli.help_texts import command
-from mor_bench.cli.option_groups import OUTPUT, complete_datasets, complete_methods
+from mor_bench.cli.option_groups import Json, complete_datasets, complete_methods
 from mor_bench.errors import InvalidInputError
 from mor_bench.report.cards import Card, dataset_card, method_card, run_card
 from mor_bench.results.comparison import Comparison
@@ -52,10 +52,7 @@ def show(
         Path | None,
         typer.Option(metavar="DIR", help="Folder with datasets/ and methods/ to search first."),
     ] = None,
-    as_json: Annotated[
-        bool,
-        typer.Option("--json", help="Print the same as JSON.", rich_help_panel=OUTPUT),
-    ] = False,
+    as_json: Json = False,
 ) -> None:
     """Show one run, method or dataset in detail."""
     card = card_of(name, suite)

@@ -12,7 +12,7 @@ import typer
 
 from mor_bench.cli.console import console_width
 from mor_bench.cli.help_texts import command
-from mor_bench.cli.option_groups import OUTPUT
+from mor_bench.cli.option_groups import Json
 from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.errors import MissingDependencyError, MorBenchError, printable
 from mor_bench.report.suite_overview import LEGEND, Item, by_family, overview
@@ -41,10 +41,7 @@ Suite = Annotated[
 )
 def list_suite_command(
     suite: Suite = None,
-    as_json: Annotated[
-        bool,
-        typer.Option("--json", help="Print the lists as JSON.", rich_help_panel=OUTPUT),
-    ] = False,
+    as_json: Json = False,
 ) -> None:
     """List the datasets and methods of the suite by family, with what each needs."""
     found = overview(suite)

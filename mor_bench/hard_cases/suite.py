@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
-from difflib import get_close_matches
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -23,6 +22,7 @@ from mor_bench.sandbox.process import (
 from mor_bench.sandbox.seal import Restrictions
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import MethodSpec, list_suite, load_method_spec
+from mor_bench.specs.one_line_errors import nearest_name
 from mor_bench.version import __version__
 
 CASE_S = 300.0
@@ -142,10 +142,9 @@ def _check_arguments(
         raise InvalidInputError(f"`profile` must be {' or '.join(LONGEST)}; got {profile!r}.")
     for name in cases or ():
         if name not in CASE_NAMES:
-            near = get_close_matches(name, CASE_NAMES, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else "."
             raise InvalidInputError(
-                f"`cases` must be names of {', '.join(CASE_NAMES)}; got {name!r}{hint}"
+                f"`cases` must be names of {', '.join(CASE_NAMES)}; got {name!r}"
+                f"{nearest_name(name, CASE_NAMES)}"
             )
     if methods is not None and (isinstance(methods, str | Path) or not methods):
         raise InvalidInputError(

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from mor_bench.array_files import read_hdf5
 from mor_bench.checked_files import read_json
@@ -26,6 +25,7 @@ from mor_bench.results.arrays import write_arrays
 from mor_bench.results.json_file import write_json
 from mor_bench.results.row import LearningPoint, ResultsFile, Row
 from mor_bench.snapshots.store import write_atomically
+from mor_bench.specs.one_line_errors import validated
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -194,15 +194,9 @@ class Comparison:
                     f"{path}: schema version {printable(str(version), 50, '')}; "
                     f"this version of mor-bench reads version {SCHEMA_VERSION}."
                 )
-            file = ResultsFile.model_validate(content)
+            file = validated(ResultsFile, content, str(path), error=StoreError)
         except FileNotFoundError:
             raise StoreError(f"{path}: no such file; is {out} the folder of a run?") from None
-        except ValidationError as error:
-            first = error.errors()[0]
-            key = ".".join(map(str, first["loc"]))
-            named = f"`{printable(key, 200, '')}`: " if key else ""
-            reason = first["msg"].removeprefix("Value error, ")
-            raise StoreError(f"{path}: {named}{printable(reason, 500, '')}.") from None
         except (ValueError, KeyError, TypeError) as error:
             raise StoreError(f"{path}: not a results file of mor-bench: {error}") from None
         return cls(

@@ -228,7 +228,7 @@ class Row(Part):
     parameters, swept : dict
         All given parameters, and those that the sweep varies.
     told : Told or None
-        What the method is told at query time; None if its file does not state it.
+        Information that the method gets at query time; None if its file does not state it.
     snapshots : bool or None
         Whether the method learned from snapshots; None before its fit.
     reference : bool

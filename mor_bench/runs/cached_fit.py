@@ -14,7 +14,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
@@ -27,12 +26,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from mor_bench.array_files import read_hdf5
 from mor_bench.checked_files import read_json
 from mor_bench.digests import digest_of_arrays
-from mor_bench.errors import StoreError, printable
+from mor_bench.errors import StoreError
 from mor_bench.machine import describe_machine, gpu_name
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.results.arrays import write_arrays
@@ -43,8 +42,9 @@ from mor_bench.runs.training_data import TrainingData, digest_of_file
 from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.process import SandboxedProcess
 from mor_bench.sandbox.seal import Restrictions
-from mor_bench.snapshots.store import remove_leftovers, replacing, write_atomically
+from mor_bench.snapshots.store import remove_leftovers, write_atomically
 from mor_bench.specs import list_suite, load_method_spec
+from mor_bench.specs.one_line_errors import validated
 from mor_bench.training_options import TrainingOptions
 
 LOAD_LIMIT_S = 300.0
@@ -153,11 +153,7 @@ def read_fit_record(path: Path) -> FitRecord:
     FileNotFoundError
         If it does not exist.
     """
-    try:
-        return FitRecord.model_validate(read_json(path))
-    except ValidationError as error:
-        reason = printable(" ".join(str(error).split()), 500)
-        raise StoreError(f"{path}: not the record of a fit: {reason}") from None
+    return validated(FitRecord, read_json(path), str(path), error=StoreError)
 
 
 class CachedFit:
@@ -240,8 +236,7 @@ class CachedFit:
         self.folder.mkdir(parents=True, exist_ok=True)
         if model is not None:
             remove_leftovers(self.folder)
-            with replacing(self.model) as partial:
-                shutil.copyfile(model, partial)
+            write_atomically(self.model, model.read_bytes())
             checksum = {"model_sha256": digest_of_file(self.model)}
             record = record.model_copy(update=checksum)
         write_atomically(self.folder / "fit.json", record.model_dump_json(indent=1).encode())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -74,18 +74,19 @@ def run(
     _check_test_seed(context.options.test_seed, specs)
     comparison = open_run(out, specs, methods_found, context)
     configurations = configurations_of(methods_found, profile, context.training)
-    with ExitStack() as stack:
-        stack.enter_context(only_run_in(comparison.out))
-        fork_server = None
-        if CAN_FORK:
-            fork_server = stack.enter_context(closing(ForkServer(MethodSession, passive_wait=True)))
-        scratch = stack.enter_context(scratch_folder())
-        stack.enter_context(suppress(StopRunError))
-        for number, spec in enumerate(specs):
-            compile_kernels(spec, configurations, context, fork_server, scratch)
-            part = RunPart(number, len(specs), scratch / f"{number}", fork_server)
-            DatasetRun(spec, configurations, comparison, context, part).run()
-    comparison.finish(analyse(comparison))
+    with only_run_in(comparison.out):
+        with ExitStack() as stack:
+            fork_server = None
+            if CAN_FORK:
+                fork_server = ForkServer(MethodSession, passive_wait=True)
+                stack.callback(fork_server.close)
+            scratch = stack.enter_context(scratch_folder())
+            stack.enter_context(suppress(StopRunError))
+            for number, spec in enumerate(specs):
+                compile_kernels(spec, configurations, context, fork_server, scratch)
+                part = RunPart(number, len(specs), scratch / f"{number}", fork_server)
+                DatasetRun(spec, configurations, comparison, context, part).run()
+        comparison.finish(analyse(comparison))
     return comparison
 
 

@@ -29,7 +29,7 @@ from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.process import SandboxedProcess
 from mor_bench.sandbox.seal import Restrictions
 from mor_bench.snapshots.dataset import load_dataset
-from mor_bench.specs import AnyDatasetSpec
+from mor_bench.specs import AnyDatasetSpec, MethodSpec
 
 N_SAMPLES, N_QUERIES = 40, 4
 """Number of samples of the dataset on which methods are compiled, and of queries after each fit."""
@@ -43,15 +43,15 @@ LIMIT_S = 300.0
 
 @dataclass(frozen=True)
 class Uncompiled:
-    """Configurations that use the same kernels, and the name of the marker of these kernels."""
+    """Configurations that use the same kernels, and the marker of these kernels."""
 
     configurations: Sequence[Configuration]
-    marker: str
+    marker: Path
 
     @property
-    def method(self) -> str:
-        """Name of the method."""
-        return self.configurations[0].method.name
+    def method(self) -> MethodSpec:
+        """The method."""
+        return self.configurations[0].method
 
 
 def compile_kernels(
@@ -69,22 +69,23 @@ def compile_kernels(
     waiting = uncompiled(spec, configurations)
     restrictions = Restrictions(memory_bytes=context.memory_limit_bytes)
     problem: TrainingData | None = None
-    with suppress(MorBenchError), tempfile.TemporaryDirectory(dir=scratch) as folder:
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
         for number, group in enumerate(waiting):
-            context.listener.compiling(group.method, number, len(waiting))
-            if problem is None:
-                # A fork server compiles while it starts; two processes would compile twice.
-                SandboxedProcess(MethodSession, restrictions, fork_server).end()
-                problem = _small_problem(spec, context, Path(folder))
+            context.listener.compiling(group.method.name, number, len(waiting))
             with suppress(MorBenchError):
+                if problem is None:
+                    # A fork server compiles while it starts; two processes would compile twice.
+                    SandboxedProcess(MethodSession, restrictions, fork_server).end()
+                    problem = _small_problem(spec, context, Path(folder))
                 for configuration in _ends(group.configurations):
                     with SandboxedProcess(
                         MethodSession, restrictions, fork_server, scene=problem.scene
                     ) as worker:
                         _fit_and_query(configuration, problem, worker)
-                _leave_marker(group)
+                with suppress(OSError):
+                    group.marker.touch()
         if waiting:
-            context.listener.compiling(waiting[-1].method, len(waiting), len(waiting))
+            context.listener.compiling(waiting[-1].method.name, len(waiting), len(waiting))
 
 
 def uncompiled(spec: AnyDatasetSpec, configurations: Sequence[Configuration]) -> list[Uncompiled]:
@@ -99,11 +100,8 @@ def uncompiled(spec: AnyDatasetSpec, configurations: Sequence[Configuration]) ->
     for configuration in configurations:
         if configuration.method.surrogate.startswith(OWN):
             groups.setdefault(_marker(spec, configuration), []).append(configuration)
-    return [
-        Uncompiled(group, marker)
-        for marker, group in groups.items()
-        if not (folder / marker).exists()
-    ]
+    found = [Uncompiled(group, folder / marker) for marker, group in groups.items()]
+    return [group for group in found if not group.marker.exists()]
 
 
 def _ends(group: Sequence[Configuration]) -> Sequence[Configuration]:
@@ -131,14 +129,6 @@ def _marker(spec: AnyDatasetSpec, configuration: Configuration) -> str:
     parts = [code_digest(method.surrogate), method.surrogate, words, processor, scene]
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
     return f"compiled-{method.name}-{digest[:20]}"
-
-
-def _leave_marker(group: Uncompiled) -> None:
-    folder = _marker_folder()
-    with suppress(OSError):
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / group.marker).touch()
 
 
 def _small_problem(spec: AnyDatasetSpec, context: RunContext, folder: Path) -> TrainingData:

@@ -134,7 +134,7 @@ class DatasetRun:
 
     def _load(self) -> Dataset:
         options, spec = self.context.options, self.spec
-        full = options.profile == "full" and isinstance(spec, DatasetSpec)
+        full = options.profile == "full"
         return load_dataset(
             spec,
             options.limit,
@@ -214,13 +214,13 @@ class DatasetRun:
         row = row.with_parts(parameters=cached.configuration.parameters, warnings=warnings)
         try:
             spent = fit_configuration(cached, left, self._remote(pool, configuration)).fit_s
+            attempt = _Attempt(row.with_parts(tuning_s=spent), cached)
         except MorBenchError as error:
             spent = monotonic() - began + cached.taken_s  # a failed fit uses the budget, too
-            return _Attempt(failed_row(row, error).with_parts(tuning_s=spent))
-        finally:
-            with self._lock:
-                self._spent[method] = self._spent.get(method, 0.0) + spent
-        return _Attempt(row.with_parts(tuning_s=spent), cached)
+            attempt = _Attempt(failed_row(row, error).with_parts(tuning_s=spent))
+        with self._lock:
+            self._spent[method] = self._spent.get(method, 0.0) + spent
+        return attempt
 
     def _cached_fit(self, configuration: Configuration) -> tuple[CachedFit, list[str]]:
         """Return a configuration's fit, with shipped weights if there are any; and warnings."""
@@ -233,7 +233,7 @@ class DatasetRun:
                 return own, []
             return adopt(*found, configuration, self.training_data, self.environment), []
         except MorBenchError as error:
-            return own, [f"{error} So the network was trained here."]
+            return own, [f"trained here, because the suite's weights cannot be used: {error}"]
 
     def _announce(self, configuration: Configuration) -> None:
         n = len(self.configurations)

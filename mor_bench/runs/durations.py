@@ -55,11 +55,11 @@ class Pace:
     Attributes
     ----------
     interpreter : float
-        Of Python code and of compilation.
+        Ratio for Python code and compilation.
     solver : float
-        Of residuals and back-solves.
+        Ratio for residuals and back-solves.
     training : float
-        Of trainings, which use all cores.
+        Ratio for trainings, which use all cores.
     """
 
     interpreter: float
@@ -106,8 +106,7 @@ def compile_seconds(
     """Estimate the seconds of compiling what is not compiled yet."""
     waiting = uncompiled(spec, configurations)
     each = [
-        (group.configurations[0].method.compile_s or METHOD_S)
-        + (TORCH_S if may_train(group.configurations[0].method) else START_S)
+        (group.method.compile_s or METHOD_S) + (TORCH_S if may_train(group.method) else START_S)
         for group in waiting
     ]
     return pace.interpreter * (sum(each) + (KERNELS_S if waiting else 0.0))
@@ -142,11 +141,12 @@ def fit_seconds(
 
 def _earlier_fits(cache: Path, configuration: Configuration) -> list[FitRecord]:
     """Return records of earlier fits of a method, with the same parameters if there are any."""
-    records = []
-    for path in (cache / "fits").glob(f"{configuration.method.name}-*/fit.json"):
+    records, name = [], configuration.method.name
+    for path in (cache / "fits").glob(f"{name}-*/fit.json"):
         with suppress(OSError, StoreError):
             record = read_fit_record(path)
-            if record.trained_elsewhere is None:
+            # The pattern for `pod` also matches the folders of `pod-tensor`.
+            if record.method == name and record.trained_elsewhere is None:
                 records.append(record)
     wanted = configuration.parameters.items()
     same = [record for record in records if record.parameters.items() >= wanted]

@@ -35,7 +35,7 @@ class Library:
 
 @dataclass(frozen=True)
 class Installation:
-    """What is installed, and how fast this machine is.
+    """The installed libraries and extras, and the speed of this machine.
 
     Attributes
     ----------

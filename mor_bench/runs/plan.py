@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from mor_bench.options import RunOptions
@@ -34,6 +33,7 @@ from mor_bench.runs.run_context import RunContext
 from mor_bench.runs.shipped_models import find_shipped
 from mor_bench.runs.training_data import TrainingData
 from mor_bench.scene.scene import load_scene
+from mor_bench.scratch import scratch_folder
 from mor_bench.snapshots.dataset import load_dataset
 from mor_bench.snapshots.generate import (
     SHARD_SIZE,
@@ -130,9 +130,10 @@ def plan(
 ) -> Plan:
     """Plan the steps of `mor_bench.run` for the same arguments, without taking them.
 
-    The time of a fit follows from earlier fits of the method in the cache, or else from the
-    method's file, scaled by this machine's speed. Both are scaled by the numbers of unknowns and of
-    training samples. The time of generating data follows from a few samples that are solved here.
+    The time of a fit follows from earlier fits of the method in the cache. Without any, it is that
+    of the method's file, scaled by this machine's speed. Both are scaled by the numbers of unknowns
+    and of training samples. The time of generating data follows from a few samples that are solved
+    here.
 
     Raises
     ------
@@ -272,13 +273,12 @@ def _extra_steps(
 
 def _problem_size(spec: AnyDatasetSpec, context: RunContext) -> tuple[int, int]:
     """Return the degrees of freedom and, roughly, the training samples of a dataset."""
-    limit = context.options.limit
-    if isinstance(spec, DatasetSpec):
-        n = n_samples_to_generate(spec, limit)
-    else:
-        n = len(load_dataset(spec, limit).train)
+    n_dofs, options = load_scene(spec).mesh.n_dofs, context.options
+    if not isinstance(spec, DatasetSpec):
+        return n_dofs, len(load_dataset(spec, options.limit, split=options.split).train)
     held_out = spec.split.test_fraction + spec.split.validation_fraction
-    return load_scene(spec).mesh.n_dofs, max(1, round((1 - held_out) * n))
+    n = n_samples_to_generate(spec, options.limit)
+    return n_dofs, max(1, round((1 - held_out) * n))
 
 
 def _data_step(spec: AnyDatasetSpec, context: RunContext) -> Step:
@@ -305,8 +305,8 @@ def _cached_labels(
     options = context.options
     data = load_dataset(spec, options.limit, split=options.split, cache=context.cache)
     environment = RunEnvironment(context.cache, jobs=options.jobs, threads=options.threads)
-    with TemporaryDirectory(prefix="mor-bench-") as scratch:
-        training_data = TrainingData.of(data, Path(scratch))
+    with scratch_folder() as scratch:
+        training_data = TrainingData.of(data, scratch)
         return {
             item.label
             for item in configurations

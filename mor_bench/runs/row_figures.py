@@ -48,18 +48,13 @@ def error_summary(score: Score) -> ErrorSummary:
 
 def set_errors(score: Score, flags: Flags | None = None, seed: int | None = None) -> SetErrors:
     """Summarise the errors and range flags on a named test set."""
-    figures = error_summary(score)
+    figures = error_summary(score).model_dump(include=set(SetErrors.model_fields))
     more: dict[str, Any] = {} if seed is None else {"seed": seed}
     return SetErrors(
         n=len(score["mean_dof_m"]),
         n_failed=n_failed(score),
         n_flagged=int(score["flagged"].sum()) if "flagged" in score else None,
-        mean_dof_m=figures.mean_dof_m,
-        rel_l2_median=figures.rel_l2_median,
-        rel_l2_p95=figures.rel_l2_p95,
-        rel_l2_max=figures.rel_l2_max,
-        slope=figures.slope,
-        amplitude_m=figures.amplitude_m,
+        **figures,
         **(flags.of(score) if flags else {}),
         **more,
     )

@@ -60,7 +60,7 @@ class RunContext:
 
     @property
     def uses_shipped_weights(self) -> bool:
-        """Whether configurations may use weights that the suite ships instead of a training."""
+        """True if configurations may use weights that the suite ships instead of a training."""
         options = self.options
         may = options.profile == "quick" and not options.train and self.seeds == 1
         return may and options.limit is None and self.training == TrainingOptions()

@@ -18,6 +18,9 @@ from mor_bench.scratch import identity, is_running
 from mor_bench.snapshots.store import remove_leftovers
 from mor_bench.specs import AnyDatasetSpec, MethodSpec
 
+LOCK = ".running"
+"""File that names the process of a live run."""
+
 
 def open_run(
     out: str | Path | None,
@@ -30,9 +33,12 @@ def open_run(
     Raises
     ------
     InvalidInputError
-        If the folder holds another run or cannot be written.
+        If the folder holds another run, is in use or cannot be written.
+    StoreError
+        If the results in the folder are damaged.
     """
     folder = Path(out) if out else _default_folder([spec.name for spec in specs])
+    _check_unused(folder)
     datasets = {spec.name: spec.model_dump(mode="json") for spec in specs}
     settings = context.recorded()
     if (folder / "results.json").exists():
@@ -89,6 +95,18 @@ def _check_no_foreign(folder: Path) -> None:
         )
 
 
+def _check_unused(folder: Path) -> None:
+    """Raise `InvalidInputError` if another live run writes to a folder."""
+    other = ""
+    with suppress(OSError, ValueError):
+        other = (folder / LOCK).read_text(encoding="ascii")
+    if other != identity(os.getpid()) and is_running(other):
+        raise InvalidInputError(
+            f"{folder}: another run (process {other.partition('-')[0]}) writes to this folder; "
+            "wait for it or choose another folder."
+        )
+
+
 def _default_folder(names: Sequence[str]) -> Path:
     return Path("reports") / "runs" / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{'-'.join(names)}"
 
@@ -102,17 +120,11 @@ def only_run_in(folder: Path) -> Iterator[None]:
     InvalidInputError
         If another run writes there.
     """
-    lock, mine, other = folder / ".running", str(identity(os.getpid())), ""
-    with suppress(OSError, ValueError):
-        other = lock.read_text(encoding="ascii")
-    if other != mine and is_running(other):
-        raise InvalidInputError(
-            f"{folder}: another run (process {other.partition('-')[0]}) writes to this folder; "
-            "wait for it or choose another folder."
-        )
+    _check_unused(folder)
     for part in (folder, folder / "samples", folder / "figures"):
         remove_leftovers(part)
-    lock.write_text(mine, encoding="ascii")
+    lock = folder / LOCK
+    lock.write_text(str(identity(os.getpid())), encoding="ascii")
     try:
         yield
     finally:

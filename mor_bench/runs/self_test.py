@@ -129,7 +129,7 @@ def _sealed_folders(folder: Path) -> tuple[bool | None, str]:
         if by_python:
             return False, "Python code reads a sealed folder"
         if not landlock.version():
-            return None, "held by the audit hook only: native code is not held off"
+            return None, "only the audit hook seals: native code can still read"
         by_native_code = worker.ask("by_native_code", 60.0, path=str(secret))["read"]
     return not by_native_code, f"Landlock {landlock.version()}; native code reads: {by_native_code}"
 

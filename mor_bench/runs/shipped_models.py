@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from mor_bench.checked_files import read_json
 from mor_bench.digests import digest_of_arrays
-from mor_bench.errors import StoreError, printable
+from mor_bench.errors import StoreError
 from mor_bench.runs.cached_fit import LOAD_LIMIT_S, CachedFit, FitRecord, RunEnvironment
 from mor_bench.runs.code_digest import learning_digest
 from mor_bench.runs.configurations import Configuration
@@ -28,6 +28,7 @@ from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.generate import dataset_key
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import AnyDatasetSpec, DatasetSpec, find_suite
+from mor_bench.specs.one_line_errors import validated
 
 FOLDER = "trained"
 """Folder of the suite with shipped weights, beside ``datasets`` and ``methods``."""
@@ -165,11 +166,7 @@ def shipped_models(folder: Path | None = None) -> dict[Path, ShippedModel]:
     folder = folder or find_suite() / FOLDER
     found = {}
     for path in sorted(folder.glob("*.json")):
-        try:
-            record = ShippedModel.model_validate(read_json(path))
-        except (OSError, ValidationError) as error:
-            reason = printable(" ".join(str(error).split()), 500)
-            raise StoreError(f"{path}: not a valid record of trained weights: {reason}") from None
+        record = validated(ShippedModel, read_json(path), str(path), error=StoreError)
         found[path.with_suffix(".safetensors")] = record
     return found
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.array_files import read_npy
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.imported_dataset import NodalLoads
@@ -42,13 +43,11 @@ def write_arrays(folder: Path, arrays: Mapping[str, NDArray[np.generic]]) -> Non
 
 def read_snapshots(folder: Path, scene: Scene) -> Snapshots:
     """Read what `write_snapshots` wrote. The large arrays are memory-mapped and read-only."""
-    arrays = {
-        path.stem: np.load(path, mmap_mode="r", allow_pickle=False) for path in folder.glob("*.npy")
-    }
-    patches = np.asarray(arrays["patches"])
+    arrays = {path.stem: read_npy(path) for path in folder.glob("*.npy")}
+    patches = arrays["patches"]
     loads = (
         NodalLoads(arrays["forces"], patches)
         if "forces" in arrays
-        else PatchLoads(patches, np.asarray(arrays["vectors"]))
+        else PatchLoads(patches, arrays["vectors"])
     )
     return Snapshots(scene, loads, arrays["free_displacements"], arrays["min_det_f"])

@@ -18,6 +18,8 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
+from mor_bench.errors import MorBenchError
+
 CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
 """Numbers of the system calls, the same on all processors."""
 
@@ -31,7 +33,9 @@ REFER, TRUNCATE = 1 << 13, 1 << 14
 OF_FILES = WRITE_FILE | READ_FILE | TRUNCATE
 
 SCOPES = 1 << 0 | 1 << 1
-"""No signals to, and no abstract sockets of, processes outside."""
+"""Blocks signals to processes outside, and their abstract sockets."""
+
+_REFUSED = "the kernel has Landlock, but refuses to close folders to the method's process."
 
 
 @cache
@@ -42,8 +46,8 @@ def version() -> int:
     return max(0, _call(CREATE_RULESET, None, 0, VERSION_FLAG))
 
 
-def close_folders(folders: Sequence[Path], exempt: Path | None = None) -> bool:
-    """Close folders to this thread and to all that it starts; return whether the kernel does so.
+def close_folders(folders: Sequence[Path], exempt: Path | None = None) -> None:
+    """Close folders to this thread and to all that it starts, if the kernel has Landlock.
 
     Parameters
     ----------
@@ -51,9 +55,14 @@ def close_folders(folders: Sequence[Path], exempt: Path | None = None) -> bool:
         Folders or files, which need not exist yet.
     exempt : Path, optional
         A folder within them that stays open, or a file that may still be read.
+
+    Raises
+    ------
+    MorBenchError
+        If the kernel has Landlock, but refuses to close the folders.
     """
     if not folders or version() < 1:
-        return False
+        return
     handled = WRITE_FILE | READ_FILE | CHANGE_FOLDERS
     handled |= (REFER if version() >= 2 else 0) | (TRUNCATE if version() >= 3 else 0)
     scoped = SCOPES if version() >= 6 else 0
@@ -61,14 +70,15 @@ def close_folders(folders: Sequence[Path], exempt: Path | None = None) -> bool:
     size = 24 if version() >= 6 else 8
     ruleset = _call(CREATE_RULESET, attributes, size, 0)
     if ruleset < 0:
-        return False
+        raise MorBenchError(_REFUSED)
     try:
         for path in _neighbours([Path(os.path.realpath(folder)) for folder in folders]):
             _allow(ruleset, path, handled)
         if exempt is not None:
             _allow(ruleset, exempt, READ_FILE if exempt.is_file() else handled)
         ctypes.CDLL(None).prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
-        return _call(RESTRICT_SELF, ruleset, 0) == 0
+        if _call(RESTRICT_SELF, ruleset, 0) != 0:
+            raise MorBenchError(_REFUSED)
     finally:
         os.close(ruleset)
 

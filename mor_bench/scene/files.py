@@ -26,7 +26,7 @@ _REFERENCES = {
     ".xmf": _XDMF,
     ".inp": rb"(?im)^\*INCLUDE[^\r\n]*",
 }
-"""What a file of each format holds where it refers to another file."""
+"""Pattern of a reference to another file, by format."""
 
 CELLS = ("hexahedron", "tetra")
 """Supported volume cells, by meshio's names."""

@@ -8,7 +8,6 @@ test and validation samples.
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from mor_bench.errors import SpecError
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.soundness import check_numbers, in_grid, sound_cells
 from mor_bench.specs import SourceFile
+from mor_bench.specs.one_line_errors import nearest_name
 
 STILL = 1e-9
 """Displacement of a fixed node that counts as zero, as a fraction of the largest displacement."""
@@ -108,8 +108,7 @@ def _check_names(names: list[str]) -> None:
     known = (*REQUIRED, *OPTIONAL)
     for name in names:
         if name not in known:
-            close = difflib.get_close_matches(name, known, n=1)
-            hint = f"; did you mean {close[0]!r}?" if close else "."
+            hint = nearest_name(name, known)
             raise SpecError(f"unknown array `{name}`{hint} Allowed: {', '.join(known)}.")
     for name in REQUIRED:
         if name not in names:

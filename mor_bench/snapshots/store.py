@@ -14,8 +14,7 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -89,22 +88,15 @@ def temporary_beside(path: Path) -> Path:
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file so that it is complete or absent, even if the process is killed."""
-    with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary file that replaces another at the end, or is removed after an error."""
     temporary = temporary_beside(path)
     try:
-        yield temporary
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        if error.filename2 or not error.filename:  # a full disk has no name, a copy its source's
-            error.filename = str(path)
+        error.filename = error.filename or str(path)  # a full disk has no name
         raise
     finally:
         temporary.unlink(missing_ok=True)

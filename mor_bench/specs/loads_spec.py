@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -109,33 +109,20 @@ class Split(StrictModel):
     by: SplitBy = "region"
 
     @model_validator(mode="after")
-    def _some_left(self) -> Split:
-        return _checked_fractions(self)
+    def _some_left(self) -> Self:
+        held_out = self.test_fraction + self.validation_fraction
+        if held_out >= 1:
+            raise ValueError(
+                "`test_fraction` and `validation_fraction` must leave samples for training: "
+                f"their sum must be less than 1; got {held_out:g}"
+            )
+        return self
 
 
-class ImportedSplit(StrictModel):
+class ImportedSplit(Split):
     """Choice of imported validation and test samples: as `Split`, or by the arrays of the file."""
 
-    test_fraction: Fraction = 0.2
-    validation_fraction: Fraction = 0.15
-    by: Literal["region", "sample", "direction", "file"] = "region"
-
-    @model_validator(mode="after")
-    def _some_left(self) -> ImportedSplit:
-        return _checked_fractions(self)
-
-
-AnySplit = TypeVar("AnySplit", Split, ImportedSplit)
-
-
-def _checked_fractions(split: AnySplit) -> AnySplit:
-    held_out = split.test_fraction + split.validation_fraction
-    if held_out >= 1:
-        raise ValueError(
-            "`test_fraction` and `validation_fraction` must leave samples for training: "
-            f"their sum must be less than 1; got {held_out:g}"
-        )
-    return split
+    by: Literal["region", "sample", "direction", "file"] = "region"  # type: ignore[assignment]
 
 
 class ExtraTests(StrictModel):

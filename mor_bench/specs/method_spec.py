@@ -16,7 +16,7 @@ from mor_bench.specs.loads_spec import SplitBy
 from mor_bench.specs.parameters import check_parameters, load_class
 
 Told = Literal["input", "linear-response", "equations"]
-"""What a method is told at query time: the input alone, also its linear response, the equations.
+"""Information at query time: the input alone, with its linear response, or with the equations.
 
 The input is the forces; on scenes with observed displacements it is those.
 """
@@ -69,7 +69,7 @@ class MethodSpec(StrictModel):
     surrogate : str
         The class, ``package.module:Class``.
     told : Told, optional
-        What the method is told at query time. A parameter `input` takes precedence.
+        Information that the method gets at query time. A parameter `input` takes precedence.
     snapshots : bool
         Whether the method learns from snapshots with the parameters of the file.
     extra : str, optional

@@ -12,7 +12,7 @@ from pydantic import BaseModel, Discriminator, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from mor_bench.errors import SpecError, printable
+from mor_bench.errors import MorBenchError, SpecError, printable
 from mor_bench.specs.region_spec import REGIONS
 
 _M = TypeVar("_M", bound=BaseModel)
@@ -24,7 +24,11 @@ _EXPECTED = "Input should be "
 
 
 def validated(
-    model: type[_M], content: Mapping[str, Any], where: str, folder: Path | str | None = None
+    model: type[_M],
+    content: Any,
+    where: str,
+    folder: Path | str | None = None,
+    error: type[MorBenchError] = SpecError,
 ) -> _M:
     """Make a model of a table, or raise an error of one line.
 
@@ -36,17 +40,21 @@ def validated(
         Beginning of the message: the file or the class.
     folder : Path or str, optional
         Folder that relative paths of files start from, or `RECORDED` for a stored specification.
+    error : type of MorBenchError
+        Class of the error.
 
     Raises
     ------
-    SpecError
+    SpecError, or the given class of errors
         For the first problem.
     """
+    if not isinstance(content, Mapping):
+        raise error(f"{where}: the content must be a table; got {type(content).__name__}.")
     try:
         return model.model_validate(dict(content), context=folder)
-    except ValidationError as error:
-        message = _message(error.errors(include_url=False), model)
-        raise SpecError(f"{where}: {printable(message, keep='')}") from None
+    except ValidationError as problems:
+        message = _message(problems.errors(include_url=False), model)
+        raise error(f"{where}: {printable(message, keep='')}") from None
 
 
 def nearest_name(name: str, valid: Iterable[str]) -> str:
@@ -108,9 +116,10 @@ def _bad_value(
         ]
         if len(expected) > 1:
             key, message = str(location[0]), " or ".join(expected)
-    given = "" if problem["type"] == "value_error" and not key else f"; got {_shown(problem)}"
+    if not key:
+        return f"{message}."
     verb = " must be" if problem["msg"].startswith("Input should") else ":"
-    return f"`{key}`{verb} {message}{given}."
+    return f"`{key}`{verb} {message}; got {_shown(problem)}."
 
 
 def _shown(problem: ErrorDetails) -> str:
