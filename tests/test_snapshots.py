@@ -66,7 +66,7 @@ def test_the_sample_split_of_the_paper_has_its_counts() -> None:
     }
     for name, expected in counts.items():
         scene = load_scene(name)
-        n, k = n_samples_of(scene), scene.generated.loads.simultaneous
+        n, k = n_samples_of(scene), scene.generated.load_plan.simultaneous
         loads = PatchLoads(np.zeros((n, k), dtype=np.int64), np.zeros((n, k, 3)))
         train, validation, test = split_samples(
             loads, len(scene.patch_nodes), Split(by="sample"), 0
@@ -160,7 +160,7 @@ def test_the_set_of_the_paper_s_amplitude_has_the_stated_forces() -> None:
     paper = spec.model_copy(update={"tests": tests})
     assert "paper-amplitude" in available_sets(paper)
     own, usual = (load_scene(spec_of_set(paper, name)) for name in ("paper-amplitude", "in-range"))
-    assert own.generated.loads.seed == usual.generated.loads.seed
+    assert own.generated.load_plan.seed == usual.generated.load_plan.seed
     larger, drawn = (draw_loads(scene, 0, n_samples_of(scene)) for scene in (own, usual))
     np.testing.assert_allclose(larger.vectors, 5 / 4 * drawn.vectors, rtol=1e-12)
     assert paper.digest() == spec.digest()

@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import mor_bench
@@ -180,6 +181,65 @@ def test_a_mistake_in_a_dataset_is_one_clear_line(line: str) -> None:
 
 
 LOADED_BOX = "[0.2, 0.0, 0.0], [4.0, 0.0, 0.95]"
+
+
+BODY: dict[str, Any] = {
+    "geometry": {"shape": "box", "size_m": [2.0, 1.0, 1.0], "cells": [6, 2, 2]},
+    "material": {"law": "saint-venant-kirchhoff", "young_pa": 500.0, "poisson": 0.4},
+    "supports": [{"region": "x-min"}],
+}
+
+
+def test_a_body_alone_can_be_solved_as_in_its_dataset(tmp_path: Path) -> None:
+    alone = mor_bench.load_scene(BODY)
+    forces = np.zeros((alone.mesh.n_nodes, 3))
+    forces[-1, 2] = 0.3
+    of_dataset = mor_bench.load_scene("beam-tiny")
+    answers = [
+        mor_bench.load_method("fem").fit(scene).predict(forces) for scene in (alone, of_dataset)
+    ]
+    assert np.abs(answers[0]).max() > 0.02
+    np.testing.assert_array_equal(*answers)
+    for load in (mor_bench.load_dataset, lambda body: mor_bench.run([body], ["fem"], out=tmp_path)):
+        with pytest.raises(SpecError, match="`loads` is missing, so no samples can be drawn"):
+            load(BODY)
+
+
+@pytest.mark.parametrize(
+    ("changes", "parts"),
+    [
+        (
+            {
+                "material": {"law": "saint-venant-kirchhoff", "young_pa": -5.0, "poisson": 0.6},
+                "supports": [{"region": "left"}],
+                "loads": {"region": "x-max", "kind": "force"},
+                "sppl": 1,
+            },
+            [
+                "unknown key `sppl`",
+                "`material.young_pa` must be greater than 0; got -5.0",
+                "`material.poisson` must be less than 0.5; got 0.6",
+                "`supports[0].region` must be",
+                "key `loads.patch_area_m2` is missing",
+                "key `loads.magnitude_n` is missing",
+            ],
+        ),
+        (
+            {
+                "needs": {"outputs": {"sphere_m": [[9.0, 9.0, 9.0], 0.1]}},
+                "observed": {"region": {"box_m": [[8.0, 8.0, 8.0], [9.0, 9.0, 9.0]]}},
+            },
+            ["((9.0, 9.0, 9.0), 0.1)", "((8.0, 8.0, 8.0), (9.0, 9.0, 9.0))"],
+        ),
+    ],
+)
+def test_an_invalid_scene_lists_all_its_mistakes(changes: dict[str, Any], parts: list[str]) -> None:
+    with pytest.raises(SpecError) as caught:
+        mor_bench.load_scene({**BODY, **changes})
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in parts:
+        assert message.count(part) == 1, part
 
 
 @pytest.mark.parametrize(

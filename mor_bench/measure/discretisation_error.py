@@ -68,7 +68,7 @@ def chosen_samples(scene: Scene, n_loads: int) -> NDArray[np.int64]:
     The choice is seeded by the dataset. Where patches come in random order, these are the first
     samples.
     """
-    loads, n_patches = scene.generated.loads, len(scene.patch_nodes)
+    loads, n_patches = scene.generated.load_plan, len(scene.patch_nodes)
     if loads.samples_per_patch is None:
         return np.arange(min(n_loads, n_samples_of(scene)))
     generator = np.random.default_rng([loads.seed, 0xD15C])

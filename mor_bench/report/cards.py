@@ -146,9 +146,11 @@ def dataset_card(spec: AnyDatasetSpec, path: Path, cache: Path | None = None) ->
             "geometry": _pairs(spec.geometry.model_dump(mode="json", exclude_none=True)),
             "material": _pairs(spec.material.model_dump(mode="json", exclude_none=True)),
             "loads": f"{loads.simultaneous} at a time, kind {loads.kind}, "
-            f"{loads.magnitude_n[0]:g} to {loads.magnitude_n[1]:g} N, {loads.sampling}",
-            "split": _pairs(spec.split.model_dump(mode="json", exclude_none=True)),
-            "named test sets": ", ".join(available_sets(spec)),
+            f"{loads.magnitude_n[0]:g} to {loads.magnitude_n[1]:g} N, {loads.sampling}"
+            if loads
+            else "",
+            "split": _pairs(spec.split.model_dump(mode="json", exclude_none=True)) if loads else "",
+            "named test sets": ", ".join(available_sets(spec)) if loads else "",
             "discretisation error": _discretisation(spec, cache),
         }
     commands = [f"mor-bench run {spec.name}", f"mor-bench pick {spec.name}"]

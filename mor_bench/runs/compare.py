@@ -99,8 +99,8 @@ def _check_test_seed(test_seed: int | str | None, specs: Sequence[AnyDatasetSpec
                 f"`test_seed`: no fresh test set can be drawn for {spec.name}, "
                 "because its snapshots were imported."
             )
-        if test_seed == spec.loads.seed:
+        if test_seed == spec.load_plan.seed:
             raise InvalidInputError(
-                f"`test_seed` must differ from the seed of {spec.name}, {spec.loads.seed}; "
+                f"`test_seed` must differ from the seed of {spec.name}, {spec.load_plan.seed}; "
                 f"got {test_seed!r}."
             )

@@ -186,6 +186,7 @@ def checked_specs(
     for spec in specs:
         scene = load_scene(spec)
         if isinstance(spec, DatasetSpec):
+            _ = spec.load_plan
             check_supports(scene)
     for method_spec in method_specs:
         _check_method(method_spec, options)

@@ -59,13 +59,15 @@ def _generated(spec: DatasetSpec) -> str:
     missing = missing_library(spec.solver)
     if missing:
         raise MissingDependencyError(f"{missing}.")
-    draw_loads(scene, 0, 1)
-    if spec.tests.unseen_region is not None:
-        check_regions(spec)
-    text = (
-        f"dataset, {scene.mesh.n_cells} cells, {scene.mesh.n_nodes} nodes, "
-        f"{len(scene.patch_nodes)} load patches, {n_samples_of(scene)} samples"
-    )
+    size = f"{scene.mesh.n_cells} cells, {scene.mesh.n_nodes} nodes"
+    if spec.loads is None:
+        text = f"scene, {size}; no table `loads`, so no samples can be drawn"
+    else:
+        draw_loads(scene, 0, 1)
+        if spec.tests.unseen_region is not None:
+            check_regions(spec)
+        samples = f"{len(scene.patch_nodes)} load patches, {n_samples_of(scene)} samples"
+        text = f"dataset, {size}, {samples}"
     risk = locking_risk(scene)
     return f"{text}; warning: {risk}" if risk else text
 

@@ -137,7 +137,7 @@ class Scene:
         on_surface = np.unique(self.surface.facets)
         sets = {} if self.embedded_surface else self.point_sets
         cloud = Cloud(self.surface.points, on_surface, sets)
-        found = np.intersect1d(region_points(cloud, self.generated.loads.region), on_surface)
+        found = np.intersect1d(region_points(cloud, self.generated.load_plan.region), on_surface)
         if not len(found):
             raise SpecError(
                 "the load region holds nodes inside the body only, none on its surface."
@@ -151,7 +151,7 @@ class Scene:
         The index of a patch here is its load-region id. On a mesh's own boundary the points are
         nodes.
         """
-        region, loads = self._loaded_points, self.generated.loads
+        region, loads = self._loaded_points, self.generated.load_plan
         if loads.n_patches is None:
             return region
         points = self.surface.points[region]
@@ -178,7 +178,7 @@ class Scene:
     @cached_property
     def patches(self) -> Patches:
         """The load patches as points of the surface with areas."""
-        area_m2 = self.generated.loads.patch_area_m2
+        area_m2 = self.generated.load_plan.patch_area_m2
         return cut_patches(self.surface, self.loaded_facets, self.patch_nodes, area_m2)
 
     @cached_property
@@ -218,10 +218,16 @@ class Scene:
         return _rows_to_one(sp.csr_array(self.patches.areas @ self.patches.values))
 
     def prepare(self) -> Scene:
-        """Find all regions now, so an empty region raises `SpecError` here; return the scene."""
-        loads = () if self.material is None else ("patch_weights",)
-        for name in (*loads, "output_nodes", "observed_nodes"):
-            getattr(self, name)
+        """Find all regions now, so empty regions raise one `SpecError` here; return the scene."""
+        sampled = isinstance(self.spec, DatasetSpec) and self.spec.loads is not None
+        problems = []
+        for name in (*(("patch_weights",) if sampled else ()), "output_nodes", "observed_nodes"):
+            try:
+                getattr(self, name)
+            except SpecError as problem:
+                problems.append(str(problem))
+        if problems:
+            raise SpecError(" ".join(problems))
         return self
 
 

@@ -219,7 +219,7 @@ def _split(
         )
     valid, n_patches = main.valid, len(main.scene.patch_nodes)
     chosen = spec.split.model_copy(update={"by": by})
-    parts = split_samples(main.loads[valid], n_patches, chosen, spec.loads.seed)
+    parts = split_samples(main.loads[valid], n_patches, chosen, spec.load_plan.seed)
     train, validation, test = main.snapshots([valid[part] for part in parts])
     sets: dict[str, Snapshots] = {n: s.snapshots([s.valid])[0] for n, s in others.items()}
     n_refused, n_unused = len(main.status) - len(valid), len(valid) - sum(map(len, parts))

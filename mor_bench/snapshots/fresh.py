@@ -39,10 +39,10 @@ def fresh_test_set(spec: DatasetSpec, scene: Scene, by: SplitBy, seed: int, n: i
     SolverError
         If none of the loads has a valid equilibrium.
     """
-    other = spec.model_copy(update={"loads": spec.loads.model_copy(update={"seed": seed})})
+    other = spec.model_copy(update={"loads": spec.load_plan.model_copy(update={"seed": seed})})
     drawn = draw_loads(load_scene(other), 0, n_samples_of(scene))
     split = spec.split.model_copy(update={"by": by})
-    held = drawn[split_samples(drawn, len(scene.patch_nodes), split, spec.loads.seed).test]
+    held = drawn[split_samples(drawn, len(scene.patch_nodes), split, spec.load_plan.seed).test]
     held = held[: min(n, MAX_FRESH)]
     forces = held.nodal_forces(scene.patch_weights).reshape(len(held), -1)[:, scene.free_dofs]
     found = FullOrderModel(scene).solve_many(forces)

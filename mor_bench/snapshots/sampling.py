@@ -81,7 +81,7 @@ def n_samples_of(scene: Scene, limit: int | None = None) -> int:
     SpecError
         If the plan has more than `MAX_COUNT` samples.
     """
-    loads = scene.generated.loads
+    loads = scene.generated.load_plan
     whole = loads.samples or 0
     if loads.samples_per_patch:
         whole = len(scene.patch_nodes) * loads.samples_per_patch
@@ -102,7 +102,7 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
     SpecError
         If no patches are as far apart as the plan requires.
     """
-    loads, numbers = scene.generated.loads, np.arange(start, stop)
+    loads, numbers = scene.generated.load_plan, np.arange(start, stop)
     chosen, k = _combinations(scene), loads.simultaneous
     if chosen is None:
         patches = np.stack([_apart(scene, int(i)) for i in numbers])
@@ -125,7 +125,7 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
 
 def _combinations(scene: Scene) -> NDArray[np.int64] | None:
     """Return the jointly loaded patches (n_combinations, k) in order of use; None if too many."""
-    loads = scene.generated.loads
+    loads = scene.generated.load_plan
     if loads.samples_per_patch:
         return np.arange(len(scene.patch_nodes))[:, None]
     distance = loads.min_distance_m or 0.0
@@ -182,7 +182,7 @@ def far_apart(centres: bytes, k: int, distance: float) -> NDArray[np.int64] | No
 
 def _apart(scene: Scene, number: int) -> NDArray[np.int64]:
     """Return the patches (k,) of one sample, each drawn far enough from all before it."""
-    loads, centres = scene.generated.loads, scene.patch_centres
+    loads, centres = scene.generated.load_plan, scene.patch_centres
     generator = np.random.default_rng([loads.seed, 0xC0B1, number])
     for _ in range(MAX_DRAWS):
         chosen, allowed = np.zeros(0, dtype=np.int64), np.arange(len(centres))

@@ -55,12 +55,12 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
         return "its file names no `tests.unseen_region`"
     if name == "paper-amplitude" and spec.tests.paper_magnitude_n is None:
         return "its file names no `tests.paper_magnitude_n`"
-    if name == "unseen-directions" and spec.loads.kind == "force":
+    if name == "unseen-directions" and spec.load_plan.kind == "force":
         return (
             "its directions are all over the sphere; "
             "the split by direction holds some of them out of training"
         )
-    if name == "several-forces" and spec.loads.simultaneous > 1:
+    if name == "several-forces" and spec.load_plan.simultaneous > 1:
         return "its main set has several forces"
     if name == "several-forces":
         scene = load_scene(spec)
@@ -85,7 +85,7 @@ def spec_of_set(spec: DatasetSpec, name: SetName) -> DatasetSpec:
     """
     if reason := why_not(spec, name):
         raise InvalidInputError(f"{spec.name} has no test set {name!r}: {reason}.")
-    loads = spec.loads
+    loads = spec.load_plan
     low, high = loads.magnitude_n
     changed: dict[str, Any] = {
         "samples_per_patch": None,

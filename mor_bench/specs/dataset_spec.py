@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
-from mor_bench.errors import UnsupportedSceneError
+from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.specs.base import Name, Positive, StrictModel, Text
 from mor_bench.specs.geometry_spec import MAX_CELLS, Geometry
 from mor_bench.specs.loads_spec import ExtraTests, ImportedSplit, Loads, Split, Support
@@ -43,12 +43,12 @@ class Needs(StrictModel):
     error : float
         Relative l2 error over the wanted nodes, median over the test set.
     latency_ms : float
-        Median latency of one query, ms.
+        Median latency of one query, ms. The default is a frame of a display with 60 Hz.
     """
 
     outputs: Outputs = "all"
-    error: Positive
-    latency_ms: Positive
+    error: Positive = 0.01
+    latency_ms: Positive = 16.0
 
 
 class Observed(StrictModel):
@@ -79,8 +79,8 @@ class CommonDatasetSpec(StrictModel):
 
     name: Name
     title: Text
-    source: Text
-    needs: Needs
+    source: Text = ""
+    needs: Needs = Needs()
     grid_nodes: GridNodes | None = None
     observed: Observed | None = Field(default=None, exclude_if=lambda value: value is None)
 
@@ -94,16 +94,31 @@ class CommonDatasetSpec(StrictModel):
 
 
 class DatasetSpec(CommonDatasetSpec):
-    """A dataset file whose samples the full-order model generates."""
+    """A dataset file whose samples the full-order model generates.
+
+    Attributes
+    ----------
+    loads : Loads, optional
+        Without it the scene can be solved for given forces, but no samples can be drawn.
+    """
 
     geometry: Geometry
     discretisation: Discretisation = Discretisation()
     solver: SolverName = "auto"
     material: MaterialSpec
     supports: Annotated[tuple[Support, ...], Field(strict=False)] = ()
-    loads: Loads
+    loads: Loads | None = None
     split: Split = Split()
     tests: ExtraTests = ExtraTests()
+
+    @property
+    def load_plan(self) -> Loads:
+        """The table `[loads]`, from which samples are drawn; `SpecError` if there is none."""
+        if self.loads is None:
+            raise SpecError(
+                f"{self.name}: the table `loads` is missing, so no samples can be drawn."
+            )
+        return self.loads
 
     def physics(self) -> dict[str, Any]:
         dumped = self.model_dump(

@@ -20,6 +20,9 @@ _M = TypeVar("_M", bound=BaseModel)
 MAX_SHOWN = 300
 """Most characters of a wrong value that a message quotes."""
 
+MAX_PROBLEMS = 8
+"""Most problems that a message lists."""
+
 _EXPECTED = "Input should be "
 
 
@@ -46,7 +49,7 @@ def validated(
     Raises
     ------
     SpecError, or the given class of errors
-        For the first problem.
+        Names every problem.
     """
     if not isinstance(content, Mapping):
         raise error(f"{where}: the content must be a table; got {type(content).__name__}.")
@@ -64,8 +67,16 @@ def nearest_name(name: str, valid: Iterable[str]) -> str:
 
 
 def _message(problems: Sequence[ErrorDetails], model: type[BaseModel]) -> str:
-    unknown = [problem for problem in problems if problem["type"] == "extra_forbidden"]
-    problem = (unknown or problems)[0]
+    """Return a sentence for each problem; unknown keys come first."""
+    ordered = sorted(problems, key=lambda problem: problem["type"] != "extra_forbidden")
+    sentences = list(dict.fromkeys(_sentence(problem, problems, model) for problem in ordered))
+    more = len(sentences) - MAX_PROBLEMS
+    return " ".join(sentences[:MAX_PROBLEMS]) + (f" And {more} more." if more > 0 else "")
+
+
+def _sentence(
+    problem: ErrorDetails, problems: Sequence[ErrorDetails], model: type[BaseModel]
+) -> str:
     steps, _ = _walk(model, problem["loc"])
     key = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in steps)
     key = key.lstrip(".")

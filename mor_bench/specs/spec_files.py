@@ -39,13 +39,14 @@ def load_dataset_spec(
     """
     if isinstance(source, Mapping):
         content = {"name": "scene", **source}
-        return _validated_dataset({"title": content["name"], "source": "", **content}, "scene")
+        return _validated_dataset({"title": content["name"], **content}, "scene")
     if not isinstance(source, str | Path):
         raise SpecError(
             f"a dataset must be a name, the path of a TOML or a dict; got {type(source).__name__}."
         )
     path = find_file("datasets", source, suite)
-    return _validated_dataset({**read_toml(path), "name": path.stem}, str(path), path.parent)
+    content = {"title": path.stem, **read_toml(path), "name": path.stem}
+    return _validated_dataset(content, str(path), path.parent)
 
 
 def load_recorded_spec(content: Any, where: str) -> AnyDatasetSpec:

@@ -20,7 +20,7 @@ from mor_bench.reduction.basis import pod
 from mor_bench.reduction.separated import Family, Term, separate
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.specs import ImportedDatasetSpec
+from mor_bench.specs import DatasetSpec
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates.monomials import monomial_indices
 
@@ -135,7 +135,7 @@ class SeparatedLoad(Surrogate):
     ridge: Annotated[float, Field(ge=0)] = 1e-4
 
     def supports(self, scene: Scene) -> str | None:
-        if not isinstance(scene.spec, ImportedDatasetSpec) and scene.spec.loads.simultaneous > 1:
+        if isinstance(scene.spec, DatasetSpec) and scene.spec.load_plan.simultaneous > 1:
             return "it handles one load patch, and here several act at once"
         return (
             unknown_equations(scene) if self.base == "linear-response" else super().supports(scene)

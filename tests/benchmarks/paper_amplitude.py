@@ -45,12 +45,14 @@ FURTHER = {"liver-tet": (0.6, 0.8, 1.0, 1.3)}
 def loads_of(spec: DatasetSpec, upper: float, samples: int, *, main: bool) -> PatchLoads:
     """Return the first loads of a plan whose largest force is ``upper``, N."""
     base = spec if main else spec_of_set(spec, "in-range")
-    changed = base.loads.model_copy(update={"magnitude_n": (spec.loads.magnitude_n[0], upper)})
+    changed = base.load_plan.model_copy(
+        update={"magnitude_n": (spec.load_plan.magnitude_n[0], upper)}
+    )
     scene = load_scene(base.model_copy(update={"loads": changed}))
     loads = draw_loads(scene, 0, n_samples_of(scene) if main else samples)
     if main:
         split = Split(test_fraction=spec.split.test_fraction, by="sample")
-        loads = loads[split_samples(loads, len(scene.patch_nodes), split, spec.loads.seed).test]
+        loads = loads[split_samples(loads, len(scene.patch_nodes), split, spec.load_plan.seed).test]
     return loads[:samples]
 
 
@@ -90,13 +92,13 @@ def published(datasets: list[str]) -> Iterator[dict[str, Any]]:
     """Measure the paper's scenes with their own loads and with those at the paper's deformation."""
     for name in datasets:
         spec = load_generated_spec(name)
-        own, paper = spec.loads.magnitude_n[1], spec.tests.paper_magnitude_n
+        own, paper = spec.load_plan.magnitude_n[1], spec.tests.paper_magnitude_n
         yield measured(spec, own, WHOLE, main=True)
         if paper is not None:
             yield measured(spec, paper[1], spec.tests.samples, main=False)
         if name + SAME_AMPLITUDE in list_suite("datasets"):
             larger = load_generated_spec(name + SAME_AMPLITUDE)
-            yield measured(larger, larger.loads.magnitude_n[1], WHOLE, main=True)
+            yield measured(larger, larger.load_plan.magnitude_n[1], WHOLE, main=True)
         for force in FURTHER.get(name, ()):
             yield measured(spec, force, WHOLE, main=True)
 
