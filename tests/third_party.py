@@ -155,8 +155,10 @@ class Poison(Zero):
     needs_snapshots = True
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
-        array: Any = samples.free_displacements
-        np.load(array.filename, mmap_mode="r+")[:] = 1.0
+        mapped: Any = samples.free_displacements
+        while not isinstance(mapped, np.memmap):
+            mapped = mapped.base
+        np.load(str(mapped.filename), mmap_mode="r+")[:] = 1.0
         return {}
 
 
