@@ -18,7 +18,7 @@ from mor_bench.report.entries import entries_of
 from mor_bench.report.error_against_deformation import error_against_deformation
 from mor_bench.report.error_against_time import error_against_time
 from mor_bench.report.error_over_position import error_over_position, median_per_patch
-from mor_bench.report.singular_values import SIGMA, TAIL, singular_values
+from mor_bench.report.singular_values import SIGMA, TAIL, singular_values, spectrum_of
 from mor_bench.report.speed_tables import pairs_at
 from mor_bench.results.comparison import Comparison
 from tests.synthetic import MESH, a_row
@@ -85,6 +85,18 @@ def test_singular_values_are_in_percent_and_ranks_lie_on_their_curve(made: Compa
     assert curves["pod"] == pytest.approx(np.column_stack([[2, 3], left_out[1:]]))
     assert picture is not None
     assert picture.finding.startswith("At least 4 modes are needed for 2 %")
+
+
+def test_leading_singular_values_and_the_norm_give_the_whole_energy() -> None:
+    values = 0.97 ** np.arange(900.0)
+    tail = np.sqrt(1 - np.cumsum(values**2) / (values @ values))
+    norm = np.array(np.linalg.norm(values))
+    found = spectrum_of({"singular_values": values[:100], "snapshots_norm": norm})
+    assert found is not None
+    assert found.tail == pytest.approx(tail[:100])
+    assert found.finding(0.01) == "More than 100 modes are needed for 1 % (training data)"
+    assert found.finding(0.1) == "At least 76 modes are needed for 10 % (training data)"
+    assert spectrum_of({"singular_values": values[:400]}) is None  # of an earlier version
 
 
 def test_the_median_per_patch_counts_a_sample_at_each_of_its_patches() -> None:

@@ -5,11 +5,7 @@ from __future__ import annotations
 from html.parser import HTMLParser
 from pathlib import Path
 
-import numpy as np
 import pytest
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 import mor_bench
 from mor_bench.analysis.analyse import analyse
@@ -26,13 +22,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
     found = synthetic_comparison(tmp_path_factory.mktemp("run"), per_region=4)
     found.analysis = analyse(found, n_resamples=100)
     return Comparison.of(found)
-
-
-@pytest.fixture
-def ax() -> Axes:
-    figure = Figure()
-    FigureCanvasAgg(figure)
-    return figure.subplots()
 
 
 class Tags(HTMLParser):
@@ -73,59 +62,20 @@ def test_a_dataset_shows_its_parts_as_html(tiny: Dataset) -> None:
     ]
 
 
-def test_the_frontier_is_drawn_at_the_measured_places(made: Comparison, ax: Axes) -> None:
-    assert made.plot_frontier(ax) is ax
-    row = next(row for row in made.rows if row.method == "umesh")
-    assert row.error is not None
-    assert row.latency_ms is not None
-    line = next(line for line in ax.lines if line.get_label() == "umesh")
-    assert np.array(line.get_xydata())[0] == pytest.approx(
-        [row.latency_ms.median, 100 * row.error.rel_l2_median]
-    )
-    assert "Pareto front" in [line.get_label() for line in ax.lines]
-    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
-    ax.figure.canvas.draw()
-
-
-def test_all_pictures_return_axes_with_lines(made: Comparison, ax: Axes) -> None:
-    for draw in (
-        made.plot_error_distribution,
-        made.plot_learning_curves,
-        made.plot_singular_values,
-    ):
-        ax.clear()
-        assert draw(ax) is ax
-        assert ax.lines
-        assert all(np.isfinite(line.get_xydata()).all() for line in ax.lines)
-        ax.figure.canvas.draw()
-
-
 def test_new_axes_are_made_if_none_are_given(made: Comparison) -> None:
     from matplotlib import pyplot
 
     pyplot.switch_backend("Agg")
-    drawn = made.plot_frontier(error="mean_dof_m", latency="p95")
-    assert drawn.get_ylabel().endswith("(m)")
-    assert "Pareto front" not in [line.get_label() for line in drawn.lines]
+    drawn = made.plot_frontier()
+    assert drawn.get_ylabel() == "median relative L2 error (%)"
     pyplot.close("all")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            {"error": "rel_l2_medain"},
-            "unknown metric 'rel_l2_medain'; did you mean 'rel_l2_median'",
-        ),
-        ({"latency": "medain"}, "unknown metric 'medain'; did you mean 'median'"),
-        ({"dataset": "beam-coars"}, "did you mean 'beam-coarse'"),
-    ],
-)
-def test_an_unknown_name_gets_the_nearest_one(
-    made: Comparison, ax: Axes, options: dict[str, str], message: str
-) -> None:
-    with pytest.raises(InvalidInputError, match=message):
-        made.plot_frontier(ax, **options)
+def test_what_cannot_be_drawn_is_refused_in_a_line(tmp_path: Path, made: Comparison) -> None:
+    with pytest.raises(InvalidInputError, match="did you mean 'beam-coarse'"):
+        made.plot_frontier(dataset="beam-coars")
+    with pytest.raises(InvalidInputError, match="nothing of this kind to draw for beam-tiny"):
+        Comparison(tmp_path, {}, [a_row("pod")]).plot_learning_curves()
 
 
 def test_the_public_comparison_draws(tmp_path: Path, made: Comparison) -> None:

@@ -14,6 +14,7 @@ import psutil
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from mor_bench.analysis.analyse import analyse
@@ -31,15 +32,14 @@ from mor_bench.report.canvas import (
     uncut,
 )
 from mor_bench.report.entries import entries_of
-from mor_bench.report.error_against_deformation import error_against_deformation
 from mor_bench.report.error_against_time import error_against_time, fastest
-from mor_bench.report.error_over_position import error_over_position
+from mor_bench.report.figures import pictures_of
 from mor_bench.report.labels import Note, annotate
 from mor_bench.report.method_styles import style_of
+from mor_bench.report.notebook import Comparison as Drawing
 from mor_bench.report.projection import View
 from mor_bench.report.rendering import Look, Shot, render_shots
-from mor_bench.report.singular_values import singular_values
-from mor_bench.report.training_curves import learning_curves, loss_curves
+from mor_bench.report.training_curves import loss_curves
 from mor_bench.report.worst_samples import worst_samples
 from mor_bench.results.comparison import Comparison
 from tests.synthetic import MESH, a_row, changed, synthetic_comparison
@@ -56,15 +56,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Comparison:
 
 @pytest.fixture(scope="module")
 def pictures(made: Comparison) -> dict[str, Picture]:
-    found = (
-        error_against_time(made, BEAM, made.analysis or {}),
-        learning_curves(made, BEAM),
-        error_against_deformation(made, BEAM),
-        error_over_position(made, BEAM),
-        worst_samples(made, BEAM),
-        singular_values(made, BEAM),
-    )
-    return {picture.kind: picture for picture in found if picture}
+    found = pictures_of(made, BEAM, made.analysis or {})
+    return {picture.kind: picture for picture in found}
 
 
 def frontier(rows: Comparison) -> Axes:
@@ -90,7 +83,7 @@ def a_frontier(*points: tuple[str, float, float], mesh: float | None = None) -> 
 
 
 def test_every_kind_is_drawn_with_its_finding_as_heading(pictures: dict[str, Picture]) -> None:
-    assert len(pictures) == 6
+    assert len(pictures) == 8
     for picture in pictures.values():
         heading = picture.figure.texts[0].get_text().replace("\n", " ")
         assert heading == picture.finding
@@ -108,6 +101,31 @@ def test_no_text_is_small_or_clipped(pictures: dict[str, Picture]) -> None:
         texts = [text for text in figure.findobj(Text) if isinstance(text, Text)]
         small = [t.get_text() for t in texts if t.get_text() and float(t.get_fontsize()) < NOTE]
         assert not small, kind
+
+
+PLOTS = {
+    "plot_frontier": "error-against-time",
+    "plot_error_distribution": "distributions",
+    "plot_whole_cost": "whole-cost",
+    "plot_learning_curves": "learning-curves",
+    "plot_singular_values": "singular-values",
+}
+"""Each function that draws, and the file that shows the same."""
+
+
+@pytest.mark.parametrize("name", PLOTS)
+def test_the_axes_of_a_notebook_show_what_the_file_shows(
+    made: Comparison, pictures: dict[str, Picture], name: str
+) -> None:
+    ax = Figure().subplots()
+    canvas = ax.figure.canvas
+    assert getattr(Drawing.of(made), name)(ax) is ax
+    assert ax.figure.canvas is canvas
+    file = pictures[PLOTS[name]].figure.axes[0]
+    drawn, written = ([line.get_xydata() for line in axes.lines] for axes in (ax, file))
+    assert drawn
+    for mine, other in zip(drawn, written, strict=True):
+        np.testing.assert_array_equal(mine, other)
 
 
 def test_equal_data_give_equal_files(made: Comparison, pictures: dict[str, Picture]) -> None:

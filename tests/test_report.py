@@ -189,7 +189,8 @@ def test_the_page_lists_every_configuration_once_and_omits_unmeasured_figures(
 def test_figures_are_png_and_svg_files_with_content(
     comparison: Comparison, written: list[Path]
 ) -> None:
-    kinds = ["error-against-time", "error-against-deformation", "worst-samples", "singular-values"]
+    kinds = ["error-against-time", "error-against-deformation", "worst-samples", "distributions"]
+    kinds += ["whole-cost", "singular-values"]
     assert [path.name for path in written] == [
         *(f"beam-tiny--{kind}.png" for kind in kinds),
         "report.html",

@@ -81,6 +81,14 @@ class TableOutput(QuietOutput):
         Field(description="Print every column and every table, in lines as long as they need."),
     ] = False
 
+    pages: Annotated[
+        bool,
+        Field(
+            description="Also write the folder pages: an index, and a page per dataset and method. "
+            "A comparison of several datasets always has it."
+        ),
+    ] = False
+
     @property
     def detail(self) -> Detail:
         """The choice of what is printed.

@@ -26,7 +26,9 @@ from mor_bench.cli.run_progress import show_run
 from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.options import CommandLine, FolderOptions
 from mor_bench.report.console_tables import print_tables
+from mor_bench.report.number_format import explain_short_names
 from mor_bench.report.page import render
+from mor_bench.report.short_names import renamed, short_names
 from mor_bench.runs.plan import plan
 from mor_bench.specs.method_spec import Told
 
@@ -92,7 +94,8 @@ def report(
 ) -> None:
     """Print the tables of a finished run, and draw its figures and report again."""
     detail = output.detail
-    with notice_if_slow("Reading the run and drawing its figures.") as spoken:
+    notice = "Reading the run and drawing its figures."
+    with notice_if_slow(notice, quiet=detail.quiet) as spoken:
         comparison = mor_bench.Comparison.read(out)
         comparison.check_samples()
         if told is not None:
@@ -103,7 +106,7 @@ def report(
         comparison.finish(analysis)
         spoken()
         print_tables(comparison, make_console(), analysis, detail)
-        written = render(comparison, analysis)
+        written = render(comparison, analysis, pages=output.pages)
     for path in written if detail.verbose else written[-1:]:
         print(path)
 
@@ -135,6 +138,9 @@ def pick(
     if as_json:
         print(json.dumps(chosen.as_json(), indent=1, ensure_ascii=False, allow_nan=False))
     else:
-        print(chosen.headline if output.quiet else chosen.text())
+        text = chosen.headline if output.quiet else chosen.text()
+        print(renamed(text, short_names(chosen.rows)))
+        if not output.quiet:
+            print(explain_short_names(row.swept for row in chosen.rows))
     if chosen.choice is None:
         raise typer.Exit(1)

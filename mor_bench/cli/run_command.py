@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -102,10 +101,10 @@ def run(
             names, method or None, out=out, listener=listener, **options.model_dump()
         )
     analysis = comparison.analysis
-    with ExitStack() as stack:
-        if not detail.quiet:
-            stack.enter_context(notice_if_slow("Drawing figures and writing the report."))
-        written = render(comparison, analysis)  # first, since the tables may meet a closed pipe
+    with notice_if_slow("Drawing figures and writing the report.", quiet=detail.quiet):
+        written = render(
+            comparison, analysis, pages=output.pages
+        )  # first, since the tables may meet a closed pipe
     print_tables(comparison, console, analysis, detail)
     for path in written if detail.verbose else written[-1:]:
         console.print(str(path), highlight=False, soft_wrap=True)

@@ -13,7 +13,7 @@ SILENT_S = 1.5
 
 @contextmanager
 def notice_if_slow(
-    text: str, say: Callable[[str], object] | None = None
+    text: str, say: Callable[[str], object] | None = None, *, quiet: bool = False
 ) -> Iterator[Callable[[], None]]:
     """Print a line if the body takes long, unless the body calls the function that it gets.
 
@@ -22,6 +22,8 @@ def notice_if_slow(
     text : str
     say : callable, optional
         Prints the line; by default to standard error.
+    quiet : bool
+        Print nothing.
     """
 
     def print_text() -> None:
@@ -33,7 +35,8 @@ def notice_if_slow(
 
     timer = Timer(SILENT_S, print_text)
     timer.daemon = True
-    timer.start()
+    if not quiet:
+        timer.start()
     try:
         yield timer.cancel
     finally:

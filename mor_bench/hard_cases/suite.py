@@ -10,7 +10,15 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from mor_bench.errors import InvalidInputError, MissingDependencyError, MorBenchError
+from pydantic import TypeAdapter
+
+from mor_bench.checked_files import read_json
+from mor_bench.errors import (
+    InvalidInputError,
+    MissingDependencyError,
+    MorBenchError,
+    StoreError,
+)
 from mor_bench.hard_cases.case import LONGEST, Scenes, Subject, Verdict
 from mor_bench.hard_cases.case_session import CaseSession
 from mor_bench.hard_cases.catalogue import CASE_NAMES, CASES, CaseResult, attempt, cases_for
@@ -59,11 +67,32 @@ class StressResults:
             "rows": [asdict(row) for row in self.rows],
         }
 
+    @classmethod
+    def read(cls, path: Path) -> StressResults:
+        """Read what `write` wrote.
+
+        Raises
+        ------
+        StoreError
+            If the file is damaged or something else.
+        FileNotFoundError
+            If it does not exist.
+        """
+        content = read_json(path)
+        try:
+            rows = _ROWS.validate_python(content["rows"])
+            return cls(rows, str(content["profile"]), dict(content["machine"]))
+        except (KeyError, TypeError, ValueError):
+            raise StoreError(f"{path}: not written by `mor-bench stress --out`.") from None
+
     def write(self, path: Path) -> None:
         """Write `as_dict` as JSON."""
         path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps(self.as_dict(), indent=1, allow_nan=False, ensure_ascii=False)
         write_atomically(path, (text + "\n").encode())
+
+
+_ROWS = TypeAdapter(list[CaseResult])
 
 
 def stress(

@@ -112,9 +112,11 @@ def new_figure(height_in: float, finding: str, subject: str) -> Figure:
 
 def lay_out(figure: Figure) -> Any:
     """Draw a figure, so that its layout is final; return the renderer, which measures artists."""
+    shown = figure.canvas  # of a notebook, perhaps
     # matplotlib's type of a figure's canvas lacks the methods of this class.
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
+    figure.set_canvas(shown)
     return canvas.get_renderer()
 
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
@@ -116,15 +118,7 @@ def draw_frontier(axes: Axes, entries: Sequence[Entry], needs: Requirements) -> 
         for text in axes.texts[:]:
             text.remove()
         named = [_handle(one) for one in series if one.name in in_legend]
-        legend = figure.legend(
-            handles=[*named, *handles],
-            loc="outside lower left",
-            ncols=3 if named else 4,
-            fontsize=NOTE,
-            frameon=False,
-            columnspacing=1.2,
-            handletextpad=0.5,
-        )
+        legend = _legend(axes, [*named, *handles], 3 if named else 4)
         _draw_arrows(axes, shown, plane)
         left_out = annotate(axes, [n for n in notes if n.text not in in_legend], marks, lines)
         missing = {one.name for one in series} & {note.text for note in left_out}
@@ -132,6 +126,17 @@ def draw_frontier(axes: Axes, entries: Sequence[Entry], needs: Requirements) -> 
             return
         in_legend |= missing
         legend.remove()
+
+
+def _legend(axes: Axes, handles: Sequence[Line2D], columns: int) -> Legend:
+    """Put a legend below a figure, or below the axes if the figure has others or no layout."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    look: dict[str, Any] = {"handles": handles, "fontsize": NOTE, "frameon": False}
+    look |= {"columnspacing": 1.2, "handletextpad": 0.5}
+    if len(figure.axes) == 1 and isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
+        return figure.legend(loc="outside lower left", ncols=columns, **look)
+    return axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.16), ncols=2, **look)
 
 
 def _draw_mesh_error(axes: Axes, plane: Plane) -> list[Note]:

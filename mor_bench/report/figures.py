@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from mor_bench.report.canvas import Drawn, save
+from collections.abc import Iterator
+
+from mor_bench.report.canvas import Drawn, Picture, save
+from mor_bench.report.distribution_figure import error_distribution
 from mor_bench.report.entries import Analysis, dataset_names
 from mor_bench.report.error_against_deformation import error_against_deformation
 from mor_bench.report.error_against_time import error_against_time
@@ -10,6 +13,7 @@ from mor_bench.report.error_over_position import error_over_position
 from mor_bench.report.profile_figure import performance_profile
 from mor_bench.report.singular_values import singular_values
 from mor_bench.report.training_curves import learning_curves, loss_curves
+from mor_bench.report.whole_cost import whole_cost
 from mor_bench.report.worst_samples import worst_samples
 from mor_bench.results.comparison import Comparison
 
@@ -17,19 +21,30 @@ ALL = "all datasets"
 """Replaces the dataset's name in figures about all datasets."""
 
 
-def write_figures(comparison: Comparison, analysis: Analysis) -> list[Drawn]:
-    """Draw and write every figure for which there is data, dataset by dataset."""
-    drawn = []
-    for dataset in dataset_names(comparison):
-        for picture in (
+def pictures_of(comparison: Comparison, dataset: str, analysis: Analysis) -> Iterator[Picture]:
+    """Draw every figure of a dataset for which there is data."""
+    yield from filter(
+        None,
+        (
             error_against_time(comparison, dataset, analysis),
             learning_curves(comparison, dataset),
             loss_curves(comparison, dataset),
             error_against_deformation(comparison, dataset),
             error_over_position(comparison, dataset),
             worst_samples(comparison, dataset),
+            error_distribution(comparison, dataset),
+            whole_cost(comparison, dataset, analysis),
             singular_values(comparison, dataset),
-        ):
-            drawn += [save(picture, comparison, dataset)] if picture else []
+        ),
+    )
+
+
+def write_figures(comparison: Comparison, analysis: Analysis) -> list[Drawn]:
+    """Draw and write every figure, dataset by dataset."""
+    drawn = [
+        save(picture, comparison, dataset)
+        for dataset in dataset_names(comparison)
+        for picture in pictures_of(comparison, dataset, analysis)
+    ]
     profile = performance_profile(analysis)
     return drawn + ([save(profile, comparison, ALL)] if profile else [])

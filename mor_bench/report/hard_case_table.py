@@ -1,7 +1,8 @@
-"""The hard cases on the console: a table of verdicts, and their counts."""
+"""The hard cases: a table of verdicts and their counts on the console, and tables of the page."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import groupby
 
 from rich.box import SIMPLE_HEAD
@@ -11,6 +12,7 @@ from rich.text import Text
 
 from mor_bench.hard_cases.catalogue import CASES, CaseResult
 from mor_bench.hard_cases.suite import StressResults
+from mor_bench.report.text_table import TextTable
 
 STYLES = {"pass": "green", "fall short": "bold red", "not applicable": "dim"}
 
@@ -18,7 +20,7 @@ STYLES = {"pass": "green", "fall short": "bold red", "not applicable": "dim"}
 def ordered(found: StressResults) -> list[CaseResult]:
     """Sort the rows by case; within a case they keep the order in which methods were tried."""
     places = {(case.name, case.part): number for number, case in enumerate(CASES)}
-    return sorted(found.rows, key=lambda row: places[row.case, row.part])
+    return sorted(found.rows, key=lambda row: places.get((row.case, row.part), len(places)))
 
 
 def print_stress(found: StressResults, console: Console, quiet: bool = False) -> None:
@@ -32,9 +34,32 @@ def print_stress(found: StressResults, console: Console, quiet: bool = False) ->
     )
     console.print(counts, highlight=False)
     if short:
-        names = (f"{row.case} ({row.part})" if row.part else row.case for row in short)
-        cases = (f"{name} of {row.method}" for name, row in zip(names, short, strict=True))
+        cases = (f"{_name(row)} of {row.method}" for row in short)
         console.print(f"Fall short: {', '.join(cases)}.", highlight=False, markup=False)
+
+
+def stress_table(found: StressResults, methods: Sequence[str]) -> TextTable:
+    """Build a row per method, or a row per case if there is one method."""
+    rows = [row for row in ordered(found) if row.method in methods]
+    if len(methods) == 1:
+        cells = [[_name(row), row.verdict, row.expected, row.happened] for row in rows]
+        headings = ["case", "verdict", "expected", "what happened"]
+        return TextTable(f"Hard cases of {methods[0]}", _NOTE, headings, cells)
+    cells = []
+    for method in methods:
+        mine = [row for row in rows if row.method == method]
+        short = ", ".join(_name(row) for row in mine if row.verdict == "fall short")
+        counts = (str(sum(row.verdict == verdict for row in mine)) for verdict in STYLES)
+        cells += [[method, *counts, short or "none"]] if mine else []
+    headings = ["method", "passed", "fell short", "not applicable", "falls short at"]
+    return TextTable("Hard cases of each method", _NOTE, headings, cells)
+
+
+_NOTE = "Tried on beam-tiny by `mor-bench stress`, with the parameters of the method files."
+
+
+def _name(row: CaseResult) -> str:
+    return f"{row.case}: {row.part}" if row.part else row.case
 
 
 def _table(found: StressResults) -> Table:
@@ -50,8 +75,7 @@ def _table(found: StressResults) -> Table:
         table.add_column(heading, width=width, overflow="fold")
     for _, group in groupby(ordered(found), key=lambda row: (row.case, row.part)):
         for number, row in enumerate(group):
-            name = f"{row.case}: {row.part}" if row.part else row.case
-            first = (name, row.expected) if number == 0 else ("", "")
+            first = (_name(row), row.expected) if number == 0 else ("", "")
             verdict = Text(row.verdict, STYLES[row.verdict])
             table.add_row(
                 Text(first[0]), Text(row.method), Text(first[1]), Text(row.happened), verdict

@@ -15,7 +15,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
-from mor_bench.report.canvas import DPI, GREY, INK, NOTE, lay_out, plain
+from mor_bench.report.canvas import GREY, INK, NOTE, lay_out, plain
 
 Point = tuple[float, float]
 
@@ -95,7 +95,7 @@ def annotate(
     figure = axes.get_figure(root=True)
     assert figure is not None
     renderer = lay_out(figure)
-    half = radius * DPI / 72.0
+    half = radius * figure.dpi / 72.0
     points = axes.transData.transform(np.array([*marks], dtype=float).reshape(-1, 2))
     taken = [Bbox.from_bounds(x - half, y - half, 2 * half, 2 * half) for x, y in points]
     taken += [artist.get_window_extent(renderer) for artist in keep_free]
@@ -123,6 +123,7 @@ def _spots(
 ) -> Iterable[_Spot]:
     """Yield the positions inside the frame, those on free space unless the note is a must."""
     frame, taken, crossing = room
+    scale = renderer.points_to_pixels(1.0)
     font = FontProperties(size=NOTE, weight=note.weight)
     width, height, _ = renderer.get_text_width_height_descent(note.text, font, False)
     # matplotlib gives every line at least the height of these letters.
@@ -130,7 +131,7 @@ def _spots(
     for rank, place in enumerate(note.places):
         px, py = axes.transData.transform(place)
         for far, (dx, dy) in enumerate(note.offsets):
-            x, y = px + dx * DPI / 72, py + dy * DPI / 72
+            x, y = px + scale * dx, py + scale * dy
             left = x - (0.0 if dx > 0 else width if dx < 0 else width / 2)
             low = y - (height / 2 if abs(dy) <= 5 else 0.0 if dy > 0 else height)
             box = Bbox.from_bounds(left, low, width, height).padded(2.0)

@@ -1,100 +1,190 @@
-"""The report as one HTML page that needs no other file and no network."""
+"""The report as one HTML page that needs no other file, and a folder of pages of the same parts."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from mor_bench.analysis.analyse import analyse
-from mor_bench.analysis.selection_text import needs_text
 from mor_bench.analysis.told import LEGEND, classes_of, is_observed, told_text
-from mor_bench.analysis.verdict import needs_of
-from mor_bench.report.canvas import Drawn
-from mor_bench.report.details import dataset_details, hard_cases, overall
-from mor_bench.report.entries import (
-    Analysis,
-    Entry,
-    dataset_names,
-    entries_of,
-    verdict_of,
-)
+from mor_bench.hard_cases.suite import StressResults
+from mor_bench.report.details import overall
+from mor_bench.report.entries import Analysis, dataset_names
 from mor_bench.report.figures import write_figures
-from mor_bench.report.number_format import bytes_text, explain_short_names
-from mor_bench.report.page_data import Shown, cells_of, payload, reading_order
-from mor_bench.report.page_findings import Chart, charts, frontier
-from mor_bench.report.page_scripts import embedded_json, policy, scripts, styles
-from mor_bench.report.page_tables import figure_tables, with_content
-from mor_bench.report.page_verdict import Card, card
-from mor_bench.report.short_names import constants, short_names
-from mor_bench.report.speed_tables import target_table
-from mor_bench.report.summary import (
-    discretisation_error,
-    interval_basis,
-    notes_of,
-    warnings_of,
-)
-from mor_bench.report.text_table import TextTable
+from mor_bench.report.hard_case_table import stress_table
+from mor_bench.report.method_view import method_view
+from mor_bench.report.number_format import bytes_text
+from mor_bench.report.page_index import method_facts, standings
+from mor_bench.report.page_scripts import Assets, beside, embedded_json, inlined
+from mor_bench.report.page_sections import View, flat, section_of
+from mor_bench.report.page_tables import with_content
+from mor_bench.report.short_names import short_names
 from mor_bench.results.comparison import Comparison
 from mor_bench.snapshots.store import write_atomically
 
-UNSTEADY = "timing not stable: "
+PAGES = "pages"
+"""Folder of the index and of the pages of single datasets and methods."""
+
+STRESS = "stress.json"
+"""Name of a file of `mor-bench stress --out` that the report shows."""
+
+BODY_BYTES = 1_800_000
+"""Room for the bodies of all datasets, in letters of the page; on a method's page a quarter."""
 
 
 @dataclass(frozen=True)
-class Event:
-    """A failure, doubt or warning of a configuration."""
+class Frame:
+    """What surrounds the sections of a page.
 
-    label: str
-    text: str
-
-
-@dataclass(frozen=True)
-class Section:
-    """Content of the page about one dataset.
-
-    `rows` are the entries with their short names and cells; `constants` are parameters that do not
-    vary. `events` are failures, doubts and warnings other than unstable timings, which are
-    `unsteady`. `hard` are tables about difficult loads, `targets` and `details` all further tables.
-    `body_picture` replaces the turning bodies on paper. `data` is the content for the scripts.
+    Attributes
+    ----------
+    heading : str
+    links : sequence of (str, str)
+        Address and text of each link to another page.
+    root : str
+        Path from the page to the folder of the run.
+    assets : Assets
+    stressed : StressResults or None
+        Results of the hard cases.
+    facts : sequence of (str, str)
+        What a method's file says of it.
     """
 
-    name: str
-    title: str
-    card: Card
-    needs: str
-    frontier: Chart
-    charts: list[Chart]
-    rows: list[tuple[Entry, str, Mapping[str, list[str]]]]
-    constants: str
-    short_names: str
-    basis: str
-    facts: list[tuple[str, str]]
-    failures: list[Event]
-    events: list[Event]
-    unsteady: list[Event]
-    hard: list[TextTable]
-    details: list[TextTable]
-    body_picture: Drawn | None
-    data: dict[str, Any]
+    heading: str
+    links: Sequence[tuple[str, str]]
+    root: str
+    assets: Assets
+    stressed: StressResults | None = None
+    facts: Sequence[tuple[str, str]] = ()
 
 
-def render(comparison: Comparison, analysis: Analysis | None = None) -> list[Path]:
+def render(
+    comparison: Comparison, analysis: Analysis | None = None, *, pages: bool = False
+) -> list[Path]:
     """Write all figures and the page; `analyse` makes the analysis if it is not given.
+
+    With several datasets, or if `pages` asks for them, also write OUT/pages/: an index, and a page
+    per dataset and per method.
 
     Returns
     -------
     list of Path
-        The figures, and OUT/report.html last.
+        The figures, the pages, and OUT/report.html last.
     """
     analysis = analysis or analyse(comparison)
     drawn = write_figures(comparison, analysis)
+    datasets = dataset_names(comparison)
+    named = {
+        name: short_names(row for row in comparison.rows if row.dataset == name)
+        for name in datasets
+    }
+    room = BODY_BYTES // max(len(datasets), 1)
+    view = View(comparison, analysis, drawn, named, room)
+    frame = Frame("mor-bench report", [], "", inlined(), _stressed(comparison))
+    written = [figure.path for figure in drawn]
+    if pages or len(datasets) > 1:
+        written += _write_pages(view, frame)
+        frame = replace(frame, links=[(f"{PAGES}/index.html", "A page per dataset and method")])
+    path = comparison.out / "report.html"
+    _write(path, view, frame)
+    return [*written, path]
+
+
+def _stressed(comparison: Comparison) -> StressResults | None:
+    try:
+        return StressResults.read(comparison.out / STRESS)
+    except FileNotFoundError:
+        return None
+
+
+def _write_pages(view: View, frame: Frame) -> list[Path]:
+    """Write an index, and a page per dataset and method, with one copy of the scripts."""
+    comparison, folder = view.comparison, view.comparison.out / PAGES
+    methods = list(dict.fromkeys(row.method for row in comparison.rows))
+    files = {
+        "dataset": _files("dataset", dataset_names(comparison)),
+        "method": _files("method", methods),
+    }
+    links = [("index.html", "All pages"), ("../report.html", "Everything on one page")]
+    frame = replace(frame, root="../", assets=beside(folder / "shared"))
+    written = []
+    for name, file in files["dataset"].items():
+        rows = [row for row in comparison.rows if row.dataset == name]
+        part = replace(comparison, rows=rows, datasets={name: comparison.datasets.get(name, {})})
+        mine = [files["method"][row.method] for row in rows]
+        more = [(file, text) for text, file in files["method"].items() if file in mine]
+        about = replace(frame, heading=f"Dataset {name}", links=[*links, *more])
+        written.append(_write(folder / file, replace(view, comparison=part), about))
+    for name, file in files["method"].items():
+        part, analysis = method_view(comparison, view.analysis, name)
+        room = view.body_bytes // 4
+        about = replace(
+            frame,
+            heading=f"Method {name}",
+            links=[
+                *links,
+                *((files["dataset"][d], d) for d in dataset_names(part)),
+            ],
+            facts=method_facts(comparison, name),
+        )
+        shown = replace(view, comparison=part, analysis=analysis, body_bytes=room, method=name)
+        written.append(_write(folder / file, shown, about))
+    index = (
+        _environment()
+        .get_template("index.html.j2")
+        .render(
+            frame=replace(frame, heading="mor-bench: datasets and methods", links=links[1:]),
+            standings=standings(view, files),
+        )
+    )
+    write_atomically(folder / "index.html", index.encode())
+    return [*written, folder / "index.html"]
+
+
+def _files(kind: str, names: Iterable[str]) -> dict[str, str]:
+    """Give each name a file name of its own, also on disks that ignore case."""
+    files: dict[str, str] = {}
+    for name in names:
+        stem = f"{kind}-" + re.sub(r"[^a-zA-Z0-9_.=-]+", "-", name)[:100]
+        while f"{stem}.html".lower() in map(str.lower, files.values()):
+            stem += "-2"
+        files[name] = f"{stem}.html"
+    return files
+
+
+def _write(path: Path, view: View, frame: Frame) -> Path:
+    """Write a page with a section per dataset."""
+    comparison = view.comparison
     names = dataset_names(comparison)
+    sections = [section_of(view, name) for name in names]
     observed = all(is_observed(comparison, name) for name in names)
+    methods = [view.method] if view.method else [row.method for row in comparison.rows]
+    hard = stress_table(frame.stressed, list(dict.fromkeys(methods))) if frame.stressed else None
+    page = (
+        _environment()
+        .get_template("page.html.j2")
+        .render(
+            frame=frame,
+            sections=sections,
+            hard=with_content([hard] if hard else []),
+            overall=[] if view.method else with_content(overall(view.analysis)),
+            machine=[_readable(*pair) for pair in flat(comparison.machine)],
+            told={told or "": told_text(told, observed) for told in classes_of(comparison.rows)},
+            legend=LEGEND,
+            data=embedded_json([section.data for section in sections]),
+        )
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, page.encode())
+    return path
+
+
+def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("mor_bench.report"),
         autoescape=True,
@@ -103,130 +193,14 @@ def render(comparison: Comparison, analysis: Analysis | None = None) -> list[Pat
         lstrip_blocks=True,
     )
     environment.filters["data_uri"] = _data_uri
-    sections = [_section(comparison, name, drawn, analysis) for name in names]
-    included = scripts()
-    page = environment.get_template("page.html.j2").render(
-        sections=sections,
-        overall=with_content(overall(analysis)),
-        machine=[_readable(*pair) for pair in _flat(comparison.machine)],
-        told={told or "": told_text(told, observed) for told in classes_of(comparison.rows)},
-        legend=LEGEND,
-        styles=styles(),
-        scripts=included,
-        policy=policy(included),
-        data=embedded_json([section.data for section in sections]),
-    )
-    path = comparison.out / "report.html"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, page.encode())
-    return [*(figure.path for figure in drawn), path]
+    return environment
 
 
 def _data_uri(path: Path) -> str:
     return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
-def _section(
-    comparison: Comparison, dataset: str, drawn: Sequence[Drawn], analysis: Analysis
-) -> Section:
-    entries = entries_of(comparison, dataset, analysis)
-    rows = [entry.row for entry in entries]
-    names = {label: str(name) for label, name in short_names(rows).items()}
-    verdict = card(verdict_of(analysis, dataset), entries, names) if entries else _EMPTY_CARD
-    data = payload(
-        Shown(comparison, dataset, analysis, entries, names, verdict),
-        len(dataset_names(comparison)),
-    )
-    notes = notes_of(comparison, dataset, analysis)
-    events = [Event(label, doubt) for label, doubt in notes if not doubt.startswith(UNSTEADY)]
-    events += [Event(label, f"warning: {warning}") for label, warning in warnings_of(entries)]
-    tables = [target_table(comparison, dataset, kind, analysis) for kind in _TARGETS]
-    pictures = (d for d in drawn if d.dataset == dataset and "worst-samples" in d.path.name)
-    return Section(
-        name=dataset,
-        title=str(comparison.datasets.get(dataset, {}).get("title") or ""),
-        card=verdict,
-        needs=needs_text(needs_of(comparison, dataset)),
-        frontier=frontier(data, _frontier_title(verdict)),
-        charts=charts(data),
-        rows=[
-            (entry, names[entry.label], cells_of(entry))
-            for entry in sorted(entries, key=reading_order)
-        ],
-        constants=constants(rows),
-        short_names=explain_short_names(entry.swept for entry in entries),
-        basis=interval_basis(dataset, analysis),
-        facts=_facts(comparison, dataset, entries),
-        failures=[Event(e.label, e.trouble) for e in entries if e.trouble],
-        events=events,
-        unsteady=[Event(e.label, "; ".join(e.unstable)) for e in entries if e.unstable],
-        hard=with_content(hard_cases(dataset, entries, analysis)),
-        details=with_content(
-            [*tables, *dataset_details(comparison, dataset, analysis), *figure_tables(entries)]
-        ),
-        body_picture=next(pictures, None),
-        data=data,
-    )
-
-
-_TARGETS = ("time_at_error", "error_at_time")
-
-_EMPTY_CARD = Card([], "No configuration was run.", "No configuration was run.", "", "", "", [], [])
-
-
-def _frontier_title(verdict: Card) -> str:
-    """State who wins, as the title of the chart."""
-    if not verdict.rankings:
-        return "No configuration meets both needs"
-    first = verdict.rankings[0].picks[0]
-    return f"{first.name} answers in {first.latency} ms with an error of {first.error} %"
-
-
-def _facts(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> list[tuple[str, str]]:
-    """List facts about the run: the dataset's description, its split, its needs, counts of rows."""
-    spec, rows = comparison.datasets.get(dataset, {}), [entry.row for entry in entries]
-    unused = _values(row.n_unused for row in rows)
-    split = f"by {_values(row.split for row in rows)}; "
-    split += f"training samples: {_values(row.n_train for row in rows)}; "
-    split += f"validation samples: {_values(row.n_validation for row in rows)}; "
-    split += f"test samples: {_values(row.n_test for row in rows)}"
-    split += f"; in no part: {unused}" if any(row.n_unused for row in rows) else ""
-    counts = (
-        f"{sum(r.status == status for r in rows)} {status}" for status in ("failed", "skipped")
-    )
-    facts = [("source", str(spec["source"]))] if spec.get("source") else []
-    for key in ("geometry", "material", "supports", "loads", "snapshots"):
-        if key in spec:
-            pairs = [f"{k}: {v}" if k else v for k, v in _flat(spec[key]) if v != "None"]
-            facts.append((key, "; ".join(pairs)))
-    return [
-        *facts,
-        ("split", split),
-        ("needs", needs_text(needs_of(comparison, dataset))),
-        ("discretisation error of the dataset's mesh", discretisation_error(entries)),
-        ("threads", _values(row.threads for row in rows)),
-        ("configurations", f"{len(rows)}: {sum(r.ok for r in rows)} ran, {', '.join(counts)}"),
-    ]
-
-
-def _values(found: Iterable[object]) -> str:
-    """Join the different values, in order; a dash if there are none."""
-    return ", ".join(dict.fromkeys(map(str, found))) or "–"
-
-
 def _readable(key: str, text: str) -> tuple[str, str]:
     """Format a size in bytes."""
     name = key.removesuffix("_bytes")
     return (name, bytes_text(float(text))) if name != key and text.isdecimal() else (key, text)
-
-
-def _flat(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
-    """Flatten nested tables to pairs such as ``("versions numpy", "2.4.6")``."""
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield from _flat(item, f"{prefix} {key}".strip())
-    elif isinstance(value, list | tuple) and any(isinstance(item, dict) for item in value):
-        for item in value:
-            yield from _flat(item, prefix)
-    else:
-        yield prefix, ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite, log
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -26,10 +26,8 @@ from mor_bench.report.page_samples import (
 )
 from mor_bench.report.page_tables import details_of
 from mor_bench.report.page_verdict import Card, offline_text
+from mor_bench.report.whole_cost import costs_of
 from mor_bench.results.comparison import Comparison
-
-BODY_BYTES = 1_800_000
-"""Room for the bodies of all datasets, in letters of the page."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +42,12 @@ class Shown:
     card: Card
 
 
-def payload(shown: Shown, n_datasets: int) -> dict[str, Any]:
+def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
     """Return all data of a dataset's charts; a chart without data is None or empty."""
     comparison, dataset, entries = shown.comparison, shown.dataset, shown.entries
     picks = [pick.entry for ranking in shown.card.rankings for pick in ranking.picks]
     found = sampled(comparison, entries, picks)
+    methods = [item for item in found if not item.entry.row.reference]
     arrays = dataset_arrays(comparison, dataset)
     mesh = mesh_of(arrays)
     needs = needs_of(comparison, dataset)
@@ -66,14 +65,14 @@ def payload(shown: Shown, n_datasets: int) -> dict[str, Any]:
         "rows": [_row(comparison, entry, shown.names) for entry in entries],
         "order": [entry.label for entry in sorted(entries, key=reading_order)],
         "distributions": distributions(found),
-        "deformations": deformations(found),
+        "deformations": deformations(methods),
         "positions": positions(found, arrays, mesh),
-        "singular": singular_values(arrays),
+        "singular": singular_values(arrays, needs.error),
         "ranks": _ranks(entries),
         "learning": _learning(comparison, dataset),
         "losses": losses(comparison, entries),
-        "costs": costs(shown),
-        "bodies": bodies(found, mesh, BODY_BYTES // n_datasets),
+        "costs": _costs(shown),
+        "bodies": bodies(found, mesh, body_bytes),
     }
 
 
@@ -197,33 +196,10 @@ def _learning(comparison: Comparison, dataset: str) -> list[dict[str, Any]]:
     ]
 
 
-def costs(shown: Shown) -> dict[str, Any] | None:
+def _costs(shown: Shown) -> dict[str, Any] | None:
     """Return offline and online cost of the methods that reach the required error, in core-s."""
-    records = [r for r in shown.analysis["break_even"] if r["dataset"] == shown.dataset]
-    needed = needs_of(shown.comparison, shown.dataset).error
-    targets = {record["target_rel_l2_median"] for record in records if record["label"]}
-    if not targets:
+    found = costs_of(shown.comparison, shown.dataset, shown.analysis, shown.entries)
+    if found is None:
         return None
-    target = min(targets, key=lambda t: abs(log(t / needed)) if needed else -t)
-    by_label = {entry.label: entry for entry in shown.entries}
-    mine = [r for r in records if r["target_rel_l2_median"] == target and r["label"]]
-    full_order = next((r["fem_label"] for r in mine if r["fem_label"]), None)
-    lines = [_cost(by_label[record["label"]], record["queries"]) for record in mine]
-    if full_order in by_label:
-        lines.insert(0, _cost(by_label[full_order], None))
-    known = [line for line in lines if line is not None]
-    return {"target": 100 * target, "full_order": full_order, "lines": known} if known else None
-
-
-def _cost(entry: Entry, queries: int | None) -> dict[str, Any] | None:
-    offline, latency = entry.row.offline_s, entry.figure("latency_ms", "median")
-    fit = entry.row.fit_core_s
-    if offline is None or latency is None or fit is None or offline.data is None:
-        return None
-    return {
-        "label": entry.label,
-        "data": offline.data,
-        "fit": fit,
-        "query": 1e-3 * latency * entry.row.threads,
-        "break_even": queries,
-    }
+    lines = [vars(line) for line in found.lines]
+    return {**vars(found), "finding": found.finding, "queries": found.queries, "lines": lines}

@@ -87,12 +87,7 @@ def _position(data: Data) -> str:
 
 
 def _singular(data: Data) -> str:
-    tail = data["singular"]["tail"]
-    needed = (data["needs"]["error"] or 0.0) / 100
-    rank = next((i + 1 for i, value in enumerate(tail) if value is not None and value <= needed), 0)
-    if rank > 1:
-        return f"{rank} modes represent the training snapshots to {number(100 * tail[rank - 1])} %"
-    return f"{len(tail)} modes leave out {number(100 * (tail[-1] or 0.0))} %"
+    return str(data["singular"]["finding"])
 
 
 def _learning(data: Data) -> str:
@@ -110,13 +105,7 @@ def _losses(data: Data) -> str:
 
 
 def _costs(data: Data) -> str:
-    lines = data["costs"]["lines"]
-    paid = [line for line in lines if line["break_even"] is not None]
-    target = f"at {number(data['costs']['target'])} %"
-    if not paid:
-        return f"No method pays off against the full-order model {target}"
-    best = min(paid, key=lambda line: line["break_even"])
-    return f"{_name(data, best)} pays off first {target}, after {whole(best['break_even'])} queries"
+    return str(data["costs"]["finding"])
 
 
 def _bodies(data: Data) -> str:

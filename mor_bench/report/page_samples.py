@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mor_bench.report.entries import Entry, best_per_method
 from mor_bench.report.error_over_position import AZIMUTH, ELEVATION, median_per_patch
 from mor_bench.report.projection import View, normals
+from mor_bench.report.singular_values import spectrum_of
 from mor_bench.results.comparison import Comparison
 from mor_bench.scene.mesh import Mesh
 
@@ -80,7 +81,11 @@ def distributions(found: Sequence[Sampled]) -> list[dict[str, Any]]:
     return [
         {
             "label": item.entry.label,
-            "error": distribution(100 * np.asarray(item.arrays.get("relative_l2", ()))),
+            "error": distribution(
+                ()  # a reference has no error of its own
+                if item.entry.row.reference
+                else 100 * np.asarray(item.arrays.get("relative_l2", ()))
+            ),
             "latency": distribution(item.arrays.get("latency_ms", ())),
         }
         for item in found
@@ -177,15 +182,18 @@ def mesh_of(arrays: Mapping[str, NDArray[Any]]) -> Mesh | None:
     return Mesh(np.asarray(arrays["points"]), np.asarray(arrays["cells"]))
 
 
-def singular_values(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any] | None:
-    """Return the decay of the training snapshots' singular values, and the energy left out."""
-    sigma = np.asarray(arrays.get("singular_values", ()), dtype=float)
-    sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
-    if len(sigma) < 2:
+def singular_values(
+    arrays: Mapping[str, NDArray[Any]], error: float | None
+) -> dict[str, Any] | None:
+    """Return the decay of the training snapshots' singular values, and what r modes leave out."""
+    found = spectrum_of(arrays)
+    if found is None or not len(found.tail):
         return None
-    energy = np.cumsum((sigma**2)[::-1])[::-1]
-    tail = np.sqrt(np.append(energy[1:], 0.0) / energy[0])
-    return {"sigma": rounded(sigma / sigma[0]), "tail": rounded(tail[:-1])}
+    return {
+        "sigma": rounded(found.sigma),
+        "tail": rounded(found.tail),
+        "finding": found.finding(error or 0.01),
+    }
 
 
 def losses(comparison: Comparison, entries: Sequence[Entry]) -> list[dict[str, Any]]:

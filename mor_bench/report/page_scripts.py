@@ -6,58 +6,73 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
 from mor_bench.results.json_file import without_nan
+from mor_bench.snapshots.store import write_atomically
 
-VENDORED = ("plotly-gl3d.min.js", "tabulator.min.js")
-"""Libraries in `vendor`; its README names their versions, licences and digests."""
-
-OWN = (
-    "theme.js",
-    "chart_parts.js",
-    "frontier.js",
-    "charts.js",
-    "bodies.js",
-    "tables.js",
-    "page.js",
+SCRIPTS = (
+    "vendor/plotly-gl3d.min.js",
+    "vendor/tabulator.min.js",
+    "static/theme.js",
+    "static/chart_parts.js",
+    "static/frontier.js",
+    "static/charts.js",
+    "static/bodies.js",
+    "static/tables.js",
+    "static/page.js",
 )
-"""Scripts in `static`, in the order in which they run."""
+"""Scripts in the order in which they run; the README in `vendor` names versions and licences."""
 
 STYLES = ("vendor/tabulator.min.css", "static/page.css")
 
 
 @dataclass(frozen=True)
-class Script:
-    """A script and its digest, as the page's policy names it."""
+class Assets:
+    """Style sheets and scripts of a page, as elements, and the policy that lets only them run."""
 
-    text: Markup
-    digest: str
-
-
-def scripts() -> list[Script]:
-    """Read all scripts of the page, the libraries first."""
-    paths = [*(f"vendor/{name}" for name in VENDORED), *(f"static/{name}" for name in OWN)]
-    return [_script(_read(path)) for path in paths]
+    styles: Markup
+    scripts: Markup
+    policy: str
 
 
-def styles() -> Markup:
-    """Read the style sheets of the page."""
-    # The sheets are files of this package.
-    return Markup("\n".join(map(_read, STYLES)).replace("</", r"<\/"))
+def inlined() -> Assets:
+    """Return all style sheets and scripts as text of the page."""
+    # Inside a string, "<\/script" is the same text, and it does not end the element.
+    texts = [re.sub(r"<(?=/script|!--)", r"\\x3c", _read(path), flags=re.I) for path in SCRIPTS]
+    digests = (hashlib.sha256(text.encode()).digest() for text in texts)
+    allowed = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
+    sheets = "\n".join(map(_read, STYLES)).replace("</", r"<\/")
+    return Assets(
+        Markup(f"<style>\n{sheets}</style>"),
+        Markup("\n".join(f"<script>{text}</script>" for text in texts)),
+        _policy(allowed, ""),
+    )
 
 
-def policy(included: Iterable[Script]) -> str:
-    """Return the page's policy: nothing is loaded, and only the given scripts run."""
-    allowed = " ".join(f"'sha256-{script.digest}'" for script in included)
+def beside(folder: Path) -> Assets:
+    """Write all style sheets and scripts to a folder beside the pages, and refer to them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in (*STYLES, *SCRIPTS):
+        write_atomically(folder / Path(path).name, _read(path).encode())
+    hrefs = [f"{folder.name}/{Path(path).name}" for path in (*STYLES, *SCRIPTS)]
+    sheets = (f'<link rel="stylesheet" href="{href}">' for href in hrefs[: len(STYLES)])
+    scripts = (f'<script src="{href}"></script>' for href in hrefs[len(STYLES) :])
+    # On a disk, `'self'` does not hold the files beside the page.
+    own = "'self' file:"
+    return Assets(Markup("\n".join(sheets)), Markup("\n".join(scripts)), _policy(own, own))
+
+
+def _policy(scripts: str, styles: str) -> str:
+    """Return the policy of a page: nothing else is loaded."""
     return (
-        f"default-src 'none'; script-src {allowed}; img-src data: blob:; "
-        "style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; script-src {scripts}; img-src data: blob:; "
+        f"style-src 'unsafe-inline' {styles}; base-uri 'none'; form-action 'none'"
     )
 
 
@@ -75,13 +90,6 @@ def _nulls(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _nulls(item) for key, item in value.items()}
     return [_nulls(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-def _script(text: str) -> Script:
-    # Inside a string, "<\/script" is the same text, and it does not end the element.
-    safe = re.sub(r"<(/script|!--)", lambda found: f"\\x3c{found[1]}", text, flags=re.IGNORECASE)
-    digest = base64.b64encode(hashlib.sha256(safe.encode()).digest()).decode()
-    return Script(Markup(safe), digest)
 
 
 def _read(path: str) -> str:

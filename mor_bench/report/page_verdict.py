@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
 
 from mor_bench.report.entries import Entry
 from mor_bench.report.number_format import DASH, number, percent, span
+from mor_bench.report.short_names import renamed
 
 MOST_NAMES = 4
 """Most names in a sentence; the others are counted."""
@@ -81,16 +82,47 @@ def card(verdict: Mapping[str, Any], entries: Sequence[Entry], names: Mapping[st
             _by_latency(qualified, verdict["runner_up"], undecided, names),
             _by_offline(qualified, verdict["cheapest"], names),
         ]
+    headline = renamed(verdict["headline"], names)
     return Card(
         rankings,
-        rankings[0].title if rankings else verdict["headline"].split(". ", 1)[-1],
-        verdict["headline"],
+        rankings[0].title if rankings else headline.split(". ", 1)[-1],
+        headline,
         mesh,
         stability,
         command,
-        sentences,
-        list(verdict["evidence"]),
+        [renamed(sentence, names) for sentence in sentences],
+        [renamed(line, names) for line in verdict["evidence"]],
     )
+
+
+def method_card(
+    verdict: Mapping[str, Any], entries: Sequence[Entry], names: Mapping[str, str], method: str
+) -> Card:
+    """Build the card of one method on a dataset: its best configuration beside the winner."""
+    by_label = {entry.label: entry for entry in entries}
+    mine = [entry for entry in entries if entry.method == method and entry.ran]
+    qualified = [by_label[label] for label in verdict["qualified"] if label in by_label]
+    own = [entry for entry in qualified if entry.method == method]
+    n = f"{len(own)} of {sum(e.method == method for e in entries)} configurations qualify."
+    picks: list[Pick] = []
+    if own:
+        first, title = own[0], f"{names[own[0].label]} qualifies"
+        picks = [_pick(f"fastest of {method} that qualifies", first, names)]
+    elif mine:
+        first = min(mine, key=lambda e: (e.error, e.latency_ms))
+        title = f"No configuration of {method} qualifies"
+        picks = [_pick("smallest error", first, names)]
+    else:
+        return replace(card(verdict, entries, names), rankings=[], title=f"{method} did not run")
+    sentence = n
+    if qualified and first == qualified[0]:
+        title = f"{names[first.label]} wins"
+    elif qualified:
+        picks.append(_pick("winner of the dataset", qualified[0], names))
+        ratio = first.latency_ms / qualified[0].latency_ms
+        sentence += f" It takes {number(ratio)} times as long as the winner."
+    ranking = Ranking("latency", title, picks, sentence)
+    return replace(card(verdict, entries, names), rankings=[ranking], title=title)
 
 
 def _by_latency(

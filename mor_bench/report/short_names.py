@@ -43,7 +43,7 @@ def short_names(rows: Iterable[Row]) -> dict[str, ShortName]:
     return names
 
 
-def renamed(text: str, names: Mapping[str, ShortName]) -> str:
+def renamed(text: str, names: Mapping[str, ShortName | str]) -> str:
     """Return a text with the short names of configurations instead of their labels."""
     labels = [label for label, name in names.items() if str(name) != label]
     if not labels:

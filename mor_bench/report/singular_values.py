@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.transforms import ScaledTranslation
@@ -26,7 +30,10 @@ from mor_bench.report.number_format import percent
 from mor_bench.results.comparison import Comparison
 
 ROUND_OFF = 1e-12
-"""Smaller relative singular values are not shown: they are round-off of the decomposition."""
+"""Smaller relative values are round-off of the decomposition."""
+
+LEADING = 400
+"""Number of singular values that a run records of a dataset with many samples."""
 
 BELOW_RANKS = 1 / 30
 """Part of the least error at a tested rank that the axis still shows."""
@@ -46,41 +53,75 @@ CAPTION = (
 )
 
 
+@dataclass(frozen=True)
+class Spectrum:
+    """Singular values of the training snapshots, relative to the largest.
+
+    Attributes
+    ----------
+    sigma : (n,) float64
+    tail : (n or n - 1,) float64
+        For r = 1, 2, …: the relative root-mean-square error of the best r modes. All are positive.
+    is_whole : bool
+        All singular values were recorded, so one mode more than `tail` has makes no error.
+    """
+
+    sigma: NDArray[np.float64]
+    tail: NDArray[np.float64]
+    is_whole: bool
+
+    def finding(self, error: float) -> str:
+        """Say how many modes the training snapshots need for an error."""
+        enough = np.flatnonzero(self.tail <= error)
+        rank = int(enough[0]) + 1 if len(enough) else len(self.tail) + self.is_whole
+        words = "At least {} modes are needed"
+        if not len(enough) and not self.is_whole:
+            words = "More than {} modes are needed"
+        elif rank == 1:
+            words = "{} mode suffices"
+        return f"{words.format(rank)} for {percent(error)} % (training data)"
+
+
+def spectrum_of(arrays: Mapping[str, NDArray[Any]]) -> Spectrum | None:
+    """Return the spectrum among a dataset's arrays; None if it is not known.
+
+    Of many samples, a run records the leading singular values only. The norm of all snapshots gives
+    the energy of the others. Runs of earlier versions did not record it.
+    """
+    sigma = np.asarray(arrays.get("singular_values", ()), dtype=float)
+    sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
+    if not len(sigma) or (len(sigma) == LEADING and "snapshots_norm" not in arrays):
+        return None
+    energy = np.cumsum((sigma**2)[::-1])[::-1]
+    others = float(arrays.get("snapshots_norm", 0.0)) ** 2 - energy[0]
+    others = others if others > ROUND_OFF * energy[0] else 0.0
+    tail = np.sqrt((np.append(energy[1:], 0.0) + others) / (energy[0] + others))
+    return Spectrum(sigma / sigma[0], tail[tail > 0], others == 0.0)
+
+
 def singular_values(comparison: Comparison, dataset: str) -> Picture | None:
     """Draw the decay of the snapshots' singular values; None if they were not recorded."""
     try:
-        sigma = np.asarray(comparison.dataset_arrays(dataset)["singular_values"], dtype=float)
+        spectrum = spectrum_of(comparison.dataset_arrays(dataset))
     except (OSError, KeyError):
         return None
-    sigma = sigma[np.isfinite(sigma) & (sigma > 0)]
-    if not len(sigma):
+    if spectrum is None:
         return None
-    energy = np.cumsum((sigma**2)[::-1])[::-1]
-    tail = np.sqrt(np.append(energy[1:], 0.0) / energy[0])
-    finding = _finding(tail, needs_of(comparison, dataset).error or 0.01)
+    finding = spectrum.finding(needs_of(comparison, dataset).error or 0.01)
     subject = f"{dataset}: singular values of the training snapshots"
     figure = new_figure(4.4, finding, subject)
-    axes = figure.subplots()
-    dress(axes)
-    used = _ranks(entries_of(comparison, dataset), len(sigma))
-    _draw(axes, sigma / sigma[0], tail, used)
+    draw_singular_values(figure.subplots(), spectrum, entries_of(comparison, dataset))
     return Picture("singular-values", "Singular values", CAPTION, figure, finding)
 
 
-def _finding(tail: NDArray[np.float64], error: float) -> str:
-    """Say how many modes the training snapshots need for an error."""
-    rank = int(np.argmax(tail <= error)) + 1
-    prefix, modes = ("", "mode suffices") if rank == 1 else ("At least ", "modes are needed")
-    return f"{prefix}{rank} {modes} for {percent(error)} % (training data)"
-
-
-def _draw(
-    axes: Axes, sigma: NDArray[np.float64], tail: NDArray[np.float64], used: dict[str, list[int]]
-) -> None:
+def draw_singular_values(axes: Axes, spectrum: Spectrum, entries: Sequence[Entry]) -> None:
     """Draw both curves in percent, and the markers and values of the tested ranks."""
-    count, tail = np.arange(1, len(sigma) + 1), tail[:-1]
+    dress(axes)
+    sigma, tail = spectrum.sigma, spectrum.tail
+    used = _ranks(entries, len(tail))
+    count = np.arange(1, len(sigma) + 1)
     axes.loglog(count, 100 * sigma, label=SIGMA, color=GREY, linewidth=1.2, marker=".", ms=4)
-    axes.loglog(count[:-1], 100 * tail, label=TAIL, color=INK, linewidth=1.8)
+    axes.loglog(count[: len(tail)], 100 * tail, label=TAIL, color=INK, linewidth=1.8)
     tested = sorted({rank for ranks in used.values() for rank in ranks})
     shown = [float(tail[rank - 1]) for rank in tested] or tail.tolist()
     bottom = max(BELOW_RANKS * min(shown, default=1.0), ROUND_OFF)
@@ -106,16 +147,16 @@ def _draw(
     for text, curve, colour in (("left out by r modes", tail, INK), ("σᵢ / σ₁", sigma, GREY)):
         places = [(float(i), 100 * float(curve[i - 1])) for i in range(2, min(len(curve), last))]
         notes.append(Note(text, places[:: max(1, len(places) // 30)], colour, "bold"))
-    lines = [np.column_stack([count, 100 * sigma]), np.column_stack([count[:-1], 100 * tail])]
+    lines = [np.column_stack([count[: len(y)], 100 * y]) for y in (sigma, tail)]
     annotate(axes, notes, marks, [np.maximum(line, 1e-12) for line in lines], radius=4.0)
 
 
-def _ranks(entries: list[Entry], n_values: int) -> dict[str, list[int]]:
-    """Ranks below the number of singular values that each method swept, ascending."""
+def _ranks(entries: Sequence[Entry], most: int) -> dict[str, list[int]]:
+    """Ranks up to `most` that each method swept, ascending."""
     used: dict[str, set[int]] = {}
     for entry in entries:
         rank = entry.swept.get("n_modes")
-        if isinstance(rank, int) and 1 <= rank < n_values:
+        if isinstance(rank, int) and 1 <= rank <= most:
             used.setdefault(entry.method, set()).add(rank)
     return {method: sorted(ranks) for method, ranks in used.items()}
 

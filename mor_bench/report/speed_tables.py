@@ -117,8 +117,9 @@ def pairs_at(comparison: Comparison, dataset: str, target: float, analysis: Anal
         if r["dataset"] == dataset and r["target_rel_l2_median"] == target
     }
     ran = dict.fromkeys(row.method for row in comparison.rows if row.dataset == dataset)
+    paired = {a for a, _ in records}
     missing = {name for record in records.values() for name in record["by"]}
-    methods = [method for method in ran if records and method not in missing]
+    methods = [method for method in ran if method in paired - missing]
     lines = [[_factor(records[a, b]) if a != b else ("·", "") for b in methods] for a in methods]
     return Pairs(
         methods,

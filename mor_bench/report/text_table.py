@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mor_bench.report.entries import Entry
 from mor_bench.report.number_format import DASH, number
+from mor_bench.report.short_names import ShortName, renamed
 
 Cell = Callable[[Entry], str]
 
@@ -46,6 +47,11 @@ def table_of(
         if set(texts) - {DASH}
     ]
     return TextTable(title, note, ["configuration", *shown], rows) if rows else None
+
+
+def with_short_names(table: TextTable, names: Mapping[str, ShortName]) -> TextTable:
+    """Replace the labels of configurations by their short names."""
+    return replace(table, rows=[[renamed(cell, names) for cell in row] for row in table.rows])
 
 
 def figure_cell(part: str, name: str, shown: Callable[[float | None], str] = number) -> Cell:

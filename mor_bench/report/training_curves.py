@@ -39,14 +39,26 @@ def learning_curves(comparison: Comparison, dataset: str) -> Picture | None:
 
     None if no line has two points.
     """
-    lines, left_out = _learning_lines(comparison, dataset)
+    lines, left_out = learning_lines(comparison, dataset)
     if not any(len(points) > 1 for points in lines.values()):
         return None
     names = short_names([row for row in comparison.rows if row.dataset == dataset])
     finding = _most_gained(lines, names)
     subject = f"{dataset}: learning curves, the error of a configuration over its training samples"
     figure = new_figure(4.6, finding, subject)
-    axes = figure.subplots()
+    draw_learning(figure.subplots(), lines, names)
+    caption = (
+        "Error on the test set of the same configuration, "
+        "fitted to increasing numbers of training samples."
+    )
+    if left_out:
+        fits = "fit" if left_out == 1 else "fits"
+        caption += f" {left_out} {fits} without a finite error cannot be shown."
+    return Picture("learning-curves", "Learning curves", caption, figure, finding)
+
+
+def draw_learning(axes: Axes, lines: Lines, names: dict[str, ShortName]) -> None:
+    """Draw a line per configuration, with its name beside it."""
     dress(axes)
     end = uncut([error for points in lines.values() for error in points[:, 1]])
     notes, marks = [], []
@@ -72,17 +84,9 @@ def learning_curves(comparison: Comparison, dataset: str) -> Picture | None:
     axes.set_xlabel("training samples", fontsize=LABEL)
     axes.set_ylabel("median relative L2 error (%)", fontsize=LABEL)
     annotate(axes, notes, marks, list(lines.values()))
-    caption = (
-        "Error on the test set of the same configuration, "
-        "fitted to increasing numbers of training samples."
-    )
-    if left_out:
-        fits = "fit" if left_out == 1 else "fits"
-        caption += f" {left_out} {fits} without a finite error cannot be shown."
-    return Picture("learning-curves", "Learning curves", caption, figure, finding)
 
 
-def _learning_lines(comparison: Comparison, dataset: str) -> tuple[Lines, int]:
+def learning_lines(comparison: Comparison, dataset: str) -> tuple[Lines, int]:
     """Collect the learning curves of a dataset, and count the points without a finite error."""
     found: dict[tuple[str, str], list[tuple[float, float]]] = {}
     left_out = 0

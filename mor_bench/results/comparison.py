@@ -4,7 +4,7 @@ OUT/results.json       schema version, machine, rows, learning curves
 OUT/results.csv        the same rows, flat
 OUT/comparison.json    conclusions from all rows, see `mor_bench.analysis.analyse.analyse`
 OUT/samples/*.h5       raw latencies and per-sample errors of each row, arrays of each dataset
-OUT/figures/*.png and *.svg, OUT/report.html
+OUT/figures/*.png and *.svg, OUT/report.html, OUT/pages/*.html
 """
 
 from __future__ import annotations
@@ -125,9 +125,10 @@ class Comparison:
     def dataset_arrays(self, name: str) -> dict[str, NDArray[Any]]:
         """Read a dataset's arrays.
 
-        `singular_values`, `points` (n_nodes, 3), `cells` (n_cells, 8), `test_regions` (n_test, k),
-        `validation_regions` (n_validation, k); `patch_centres` (n_patches, 3), m, of generated
-        samples.
+        `singular_values` of the training displacements, perhaps the leading ones only, and
+        `snapshots_norm`, the Frobenius norm of these displacements; `points` (n_nodes, 3), `cells`
+        (n_cells, 8), `test_regions` (n_test, k), `validation_regions` (n_validation, k);
+        `patch_centres` (n_patches, 3), m, of generated samples.
         """
         return read_hdf5(self._samples_path(name))
 

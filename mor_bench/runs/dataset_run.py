@@ -13,6 +13,7 @@ from threading import Lock
 from time import monotonic
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import MorBenchError, SolverError
@@ -342,6 +343,7 @@ def record_dataset(comparison: Comparison, spec: AnyDatasetSpec, data: Dataset) 
     displacements = data.train.free_displacements
     few = min(displacements.shape) <= SINGULAR_VALUES * 5
     arrays: dict[str, NDArray[Any]] = {
+        "snapshots_norm": np.asarray(np.linalg.norm(displacements)),
         "singular_values": pod(displacements, None if few else SINGULAR_VALUES).singular_values,
         "points": data.scene.mesh.points,
         "cells": data.scene.mesh.cells,

@@ -87,7 +87,7 @@ def _other_datasets(kept: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
 
 def _check_no_foreign(folder: Path) -> None:
     """Raise `InvalidInputError` if a folder without a run has files that a run would overwrite."""
-    names = ("results.csv", "comparison.json", "report.html", "samples", "figures")
+    names = ("results.csv", "comparison.json", "report.html", "samples", "figures", "pages")
     if found := [name for name in names if os.path.lexists(folder / name)]:
         raise InvalidInputError(
             f"`out`: {folder} is not the folder of a run, but has a {found[0]!r}, which would be "
@@ -121,8 +121,8 @@ def only_run_in(folder: Path) -> Iterator[None]:
         If another run writes there.
     """
     _check_unused(folder)
-    for part in (folder, folder / "samples", folder / "figures"):
-        remove_leftovers(part)
+    for part in ("", "samples", "figures", "pages", "pages/shared"):
+        remove_leftovers(folder / part)
     lock = folder / LOCK
     lock.write_text(str(identity(os.getpid())), encoding="ascii")
     try:

@@ -44,7 +44,7 @@ LEFT_OUT = (
 PACKED_BYTES = 8192
 """Larger arrays are compressed; for smaller ones the description of the compression is larger."""
 
-KEPT_OF_DATASETS = ("test_regions", "validation_regions", "singular_values")
+KEPT_OF_DATASETS = ("test_regions", "validation_regions", "singular_values", "snapshots_norm")
 
 
 def compact(run: Path, folder: Path) -> None:

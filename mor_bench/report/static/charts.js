@@ -26,7 +26,7 @@ Report.kinds.distributions = (figure, data) => {
     const notes = limit ? [{ x: Math.log10(limit), xanchor: "left", y: 0.02, yref: "paper",
       yanchor: "bottom", text: "needed", showarrow: false, font: { color: R.theme().needInk } }] : [];
     return R.draw(plot, traces, R.layout({
-      xaxis: R.logAxis(named, { range: [Math.log10(low), Math.log10(high)] }),
+      xaxis: R.logAxis(named, all.length ? { range: [Math.log10(low), Math.log10(high)] } : {}),
       yaxis: R.axis("share (%)", { range: [0, 102] }), shapes: lines,
       annotations: [...notes, ...beyond.map((line, i) => ({
         xref: "paper", x: 0.995, xanchor: "right", y: 90 - 7 * i, showarrow: false,
@@ -190,8 +190,8 @@ Report.kinds.costs = (figure, data) => {
   const { lines, full_order: fullOrder } = data.costs;
   const [left, right] = R.pair(figure);
   const pays = lines.map((l) => l.break_even).filter((q) => q > 0);
-  const first = Math.ceil(Math.log10(Math.max(1, ...pays))) + 1;
-  const number = R.slider(figure, "queries on the right", [0, 9, 1, Math.min(first, 9)], () => parts());
+  const first = Math.log10(data.costs.queries);
+  const number = R.slider(figure, "queries on the right", [0, 9, 1, first], () => parts());
 
   const out = document.createElement("output");
   number.after(out);

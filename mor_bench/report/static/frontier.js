@@ -48,7 +48,7 @@ Report.kinds.frontier = (figure, data) => {
       type: "scatter", mode: "lines+markers+text", name: R.plain(rows[0].method),
       legendgroup: R.plain(group), legendgrouptitle: { text: R.plain(group), font: { size: 12 } },
       x: rows.map(x), y: rows.map((row) => inside(y(row))),
-      text: rows.map((row) => (row.front ? R.plain(row.name.split(" · ")[1] ?? row.name) : "")),
+      text: rows.map((row) => (row.front && y(row) === inside(y(row)) ? R.plain(row.name.split(" · ")[1] ?? row.name) : "")),
       textposition: "top right", textfont: { color: colour, size: 12 },
       hovertext: rows.map((row) => R.hover(row.hover)), hoverinfo: "text",
       line: { color: colour, width: 1 },
@@ -103,7 +103,7 @@ Report.kinds.frontier = (figure, data) => {
     return rows.filter((row) => y(row) > TOP || y(row) < FLOOR).map((row, i) => ({
       x: Math.log10(x(row)), y: Math.log10(inside(y(row))), ax: 0,
       ay: (y(row) > TOP ? 1 : -1) * (26 + 16 * (i % 2)),
-      text: `${R.short(y(row))} %`, arrowhead: 2, arrowside: "start", startarrowhead: 0,
+      text: R.plain(`${row.name}: ${R.short(y(row))} %`), arrowhead: 2, arrowside: "start", startarrowhead: 0,
       font: { size: 11, color: R.theme().ink }, arrowcolor: R.theme().quiet,
     }));
   }

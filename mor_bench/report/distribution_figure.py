@@ -1,0 +1,147 @@
+"""The figure of the distributions of error and latency: a staircase per method."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from mor_bench.analysis.verdict import Requirements, needs_of
+from mor_bench.report.canvas import (
+    GREY,
+    LABEL,
+    NOTE,
+    Picture,
+    dress,
+    log_ticks,
+    new_figure,
+    plain,
+    shortened,
+    uncut,
+)
+from mor_bench.report.entries import best_per_method, entries_of
+from mor_bench.report.labels import Note, Point, annotate
+from mor_bench.report.method_styles import readable, style_of
+from mor_bench.report.number_format import number
+from mor_bench.report.short_names import short_names
+from mor_bench.results.comparison import Comparison
+
+MOST_LINES = 14
+"""Most methods; those with the smallest 95th percentile are drawn."""
+
+CAPTION = (
+    "Height: the share of test loads (or of queries) with at most this error (or latency). Each "
+    "method has its configuration with the smallest ē. Full-order solves on the dataset's mesh are "
+    "in the lower panel only, because their error is that of their tolerance. A line that ends "
+    "below 100 % has loads without a prediction. An arrow leads to values beyond the axis. "
+    "Dotted: the dataset's need."
+)
+
+
+@dataclass(frozen=True)
+class Staircase:
+    """A method's name and its values in ascending order; infinite ones have no prediction."""
+
+    method: str
+    name: str
+    values: NDArray[np.float64]
+
+    @property
+    def finite(self) -> NDArray[np.float64]:
+        return self.values[np.isfinite(self.values) & (self.values > 0)]
+
+    def at(self, share: float) -> float:
+        """Return the value that this share of all values does not exceed."""
+        return float(self.values[max(0, int(np.ceil(share * len(self.values))) - 1)])
+
+
+def staircases(comparison: Comparison, dataset: str, key: str) -> list[Staircase]:
+    """Read the errors in % ("relative_l2") or the latencies in ms ("latency_ms") of all methods."""
+    entries = entries_of(comparison, dataset)
+    names, found = short_names(entry.row for entry in entries), []
+    for entry in best_per_method(entries):
+        if key == "relative_l2" and entry.row.reference:
+            continue
+        try:
+            raw = np.sort(np.asarray(comparison.samples(entry.row)[key], dtype=float))
+        except (OSError, KeyError):
+            continue
+        scale = 100.0 if key == "relative_l2" else 1.0
+        found.append(Staircase(entry.method, str(names[entry.label]), scale * raw))
+    found = [stairs for stairs in found if len(stairs.finite)]
+    return sorted(found, key=lambda stairs: stairs.at(0.95))[:MOST_LINES]
+
+
+def error_distribution(comparison: Comparison, dataset: str) -> Picture | None:
+    """Draw the distributions of error and latency; None without raw errors."""
+    errors = staircases(comparison, dataset, "relative_l2")
+    if not errors:
+        return None
+    latencies, needs = staircases(comparison, dataset, "latency_ms"), needs_of(comparison, dataset)
+    finding = f"95 % of the loads: {shortened(errors[0].name, 40)} errs by at most "
+    finding += f"{number(errors[0].at(0.95))} %"
+    if len(errors) > 1:
+        finding += f", {shortened(errors[-1].name, 40)} by {number(errors[-1].at(0.95))} %"
+    subject = f"{dataset}: distribution of errors and latencies, the best configuration per method"
+    figure = new_figure(3.6 * (1 + bool(latencies)), finding, subject)
+    panels = figure.subplots(1 + bool(latencies), 1, squeeze=False).ravel()
+    draw_distribution(panels[0], errors, needs)
+    for axes in panels[1:]:
+        _draw(axes, latencies, needs.latency_ms)
+        axes.set_xlabel("latency of a query, at most (ms)", fontsize=LABEL)
+        axes.set_ylabel("queries (%)", fontsize=LABEL)
+    return Picture(
+        "distributions", "Distribution of errors and latencies", CAPTION, figure, finding
+    )
+
+
+def draw_distribution(axes: Axes, errors: Sequence[Staircase], needs: Requirements) -> None:
+    """Draw the share of test loads with at most an error, a staircase per method."""
+    _draw(axes, errors, None if needs.error is None else 100 * needs.error)
+    axes.set_xlabel("relative L2 error of a test load, at most (%)", fontsize=LABEL)
+    axes.set_ylabel("test loads (%)", fontsize=LABEL)
+
+
+def _draw(axes: Axes, found: Sequence[Staircase], need: float | None) -> None:
+    """Draw the staircases, with their names beside them."""
+    dress(axes)
+    axes.set_xscale("log")
+    low = uncut([float(np.quantile(s.finite, 0.01)) for s in found])[0]
+    high = uncut([float(np.quantile(s.finite, 0.99)) for s in found])[1]
+    axes.set_xlim(0.7 * low, 2 * max(high, need or 0.0))
+    axes.set_ylim(-2, 103)
+    if need is not None:
+        axes.axvline(need, color=GREY, linestyle=":", linewidth=1.2, zorder=1)
+    log_ticks(axes.xaxis, axes.get_xlim())
+    (start, end), notes, lines = axes.get_xlim(), [], []
+    for stairs in found:
+        style, x = style_of(stairs.method), stairs.finite
+        y = 100 * (np.searchsorted(stairs.values, x, side="right") / len(stairs.values))
+        axes.step(x, y, where="post", color=style.colour, linewidth=1.6, label=stairs.method)
+        lines.append(np.column_stack([x, y]))
+        text = shortened(stairs.name, 30)
+        offsets: Sequence[Point] = _BESIDE
+        places = [(float(np.quantile(x, q)), 100 * q) for q in np.linspace(0.5, 0.05, 10)]
+        if x[-1] > end:
+            text = f"{text}: up to {number(float(x[-1]))} →"
+            places, offsets = [(end, float(np.interp(end, x, y)))], _ABOVE_ONE_ANOTHER
+        elif x[-1] < start:
+            text, places = f"← {text}: up to {number(float(x[-1]))}", [(start, 50.0)]
+        must = not start <= x[-1] <= end
+        notes.append(Note(text, places, readable(style.colour), "bold", offsets, must=must))
+    missing = {note.text for note in annotate(axes, notes, [], lines)}
+    handles = [
+        Line2D([], [], color=style_of(stairs.method).colour, label=plain(text))
+        for stairs in found
+        if (text := shortened(stairs.name, 30)) in missing
+    ]
+    if handles:
+        axes.legend(handles=handles, loc="lower right", fontsize=NOTE, frameon=False)
+
+
+_BESIDE = ((8, -4), (-8, 4), (14, -10), (-14, 10), (24, -16), (-24, 16))
+_ABOVE_ONE_ANOTHER = ((-6, -8), (-6, -21), (-6, -34), (-6, -47), (-6, -60))
