@@ -49,10 +49,29 @@ def test_a_report_in_a_pipe_has_the_width_of_columns(run: Comparison, columns: s
 
 def test_wide_tables_show_every_column_in_whole_lines(run: Comparison) -> None:
     shown = mor_bench("report", str(run.out), "--told", "equations", "--wide", columns="80")
+    assert "pod · r80" in shown.stdout
+    assert "[n_modes=" not in shown.stdout
     head = next(line for line in shown.stdout.splitlines() if line.startswith("  configuration"))
     assert len(head) > 150
     for word in ("queries/s", "memory", "model", "σ(e)", "Time at error", "A configuration"):
         assert word in shown.stdout
+
+
+def test_pick_uses_short_names_and_explains_them(run: Comparison) -> None:
+    shown = mor_bench("pick", "beam-coarse", "--run", str(run.out)).stdout
+    assert "pca-regression · k20 wins" in shown
+    assert "[n_input_modes=" not in shown
+    assert shown.splitlines()[-1].endswith("k = n_input_modes")
+
+
+def test_a_quiet_report_prints_the_verdict_alone(
+    run: Comparison, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mor_bench.cli.slow_notice.SILENT_S", 0.0)
+    monkeypatch.setattr("mor_bench.cli.result_commands.render", lambda *_, **__: [Path("page")])
+    shown = mor_bench("report", str(run.out), "--quiet")
+    assert len(shown.stdout.splitlines()) == 2
+    assert shown.stderr == ""
 
 
 @pytest.mark.parametrize("name", [*((name,) for name in COMMANDS if name != "export"), *EXPORTS])

@@ -32,7 +32,7 @@ SIZE_IN, DPI = (6.4, 3.6), 100
 FRAME_MS, LAST_MS = 100, 1200
 """Duration of a frame, and of the last one, which shows the whole load."""
 
-COLOURS = 96
+COLOURS = 256
 """Colours of the GIF."""
 
 

@@ -42,7 +42,7 @@ from mor_bench.report.speed_tables import (
     target_table,
 )
 from mor_bench.report.summary import hidden_doubts, interval_basis, notes_of, warnings_of
-from mor_bench.report.text_table import TextTable
+from mor_bench.report.text_table import TextTable, with_short_names
 from mor_bench.results.comparison import Comparison
 
 if TYPE_CHECKING:
@@ -118,6 +118,7 @@ def _out_of_range_parts(entries: Sequence[Entry]) -> list[RenderableType]:
     found = out_of_range([entry for entry in entries if entry.label in best and entry.row.sets])
     if found is None:
         return []
+    found = with_short_names(found, short_names(entry.row for entry in entries))
     table = _empty_table()
     for i, heading in enumerate(found.headings):
         table.add_column(heading, justify="right" if i else "left", no_wrap=True)
@@ -168,10 +169,11 @@ def _notes(
     if unused:
         text = f"{unused:,} samples have forces on both sides of the split; they are unused"
         yield Text(text, style="yellow")
-    for label, doubt in notes_of(comparison, dataset, analysis):
-        yield Text(f"{label}: {doubt}", style="yellow")
-    for label, warning in warnings_of(entries):
-        yield Text(f"{label}: warning: {warning}", style="yellow")
+    names = short_names(entry.row for entry in entries)
+    notes = notes_of(comparison, dataset, analysis)
+    notes += [(label, f"warning: {warning}") for label, warning in warnings_of(entries)]
+    for label, text in notes:
+        yield Text(f"{renamed(label, names)}: {text}", style="yellow")
 
 
 def _short_notes(
@@ -222,7 +224,9 @@ def _wide_parts(
     """Yield what the six columns leave out: the rule, the winner's figures, further tables."""
     yield Text(f"{RULE} {LEGEND}", style="dim")
     yield from _titled("Figures of the winner, or of the nearest without a winner")
-    yield from map(Text, verdict_of(analysis, dataset)["evidence"])
+    names = short_names(entry.row for entry in entries)
+    for line in verdict_of(analysis, dataset)["evidence"]:
+        yield Text(renamed(line, names), no_wrap=True)
     for kind in ("time_at_error", "error_at_time"):
         yield from _target_parts(target_table(comparison, dataset, kind, analysis))
     basis = [interval_basis(dataset, analysis), "Nothing is extrapolated."]

@@ -30,6 +30,7 @@ def dataset_details(comparison: Comparison, dataset: str, analysis: Analysis) ->
         indicated(entries),
         named_sets(entries),
         out_of_range(entries),
+        hidden_table(dataset, entries, analysis),
         training(entries),
         seeds(entries),
         tuning_table(dataset, analysis),
@@ -49,7 +50,7 @@ def hard_cases(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> li
     tables = (
         named_sets(best),
         out_of_range([entry for entry in best if entry.row.sets]),
-        hidden_table(dataset, entries, analysis),
+        hidden_table(dataset, best, analysis),
     )
     return [table for table in tables if table is not None]
 

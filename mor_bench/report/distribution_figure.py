@@ -125,7 +125,7 @@ def _draw(axes: Axes, found: Sequence[Staircase], need: float | None) -> None:
         lines.append(np.column_stack([x, y]))
         text = shortened(stairs.name, 30)
         offsets: Sequence[Point] = _BESIDE
-        places = [(float(np.quantile(x, q)), 100 * q) for q in np.linspace(0.5, 0.05, 10)]
+        places = [(float(np.quantile(x, q)), 100 * q) for q in np.linspace(0.6, 0.05, 12)]
         if x[-1] > end:
             text = f"{text}: up to {number(float(x[-1]))} →"
             places, offsets = [(end, float(np.interp(end, x, y)))], _ABOVE_ONE_ANOTHER
@@ -143,5 +143,5 @@ def _draw(axes: Axes, found: Sequence[Staircase], need: float | None) -> None:
         axes.legend(handles=handles, loc="lower right", fontsize=NOTE, frameon=False)
 
 
-_BESIDE = ((8, -4), (-8, 4), (14, -10), (-14, 10), (24, -16), (-24, 16))
+_BESIDE = ((8, -4), (-8, 4), (10, -9), (-10, 9))
 _ABOVE_ONE_ANOTHER = ((-6, -8), (-6, -21), (-6, -34), (-6, -47), (-6, -60))

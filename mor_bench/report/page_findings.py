@@ -149,8 +149,9 @@ _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
         "costs",
         _costs,
         "Core-seconds of training data, fit and queries, for the fastest configuration of each "
-        "method that is accurate enough. Left: total over the number of queries; a diamond marks "
-        "the break-even with the full-order model. Right: its parts for one number of queries.",
+        "method that is accurate enough. First chart: total over the number of queries; a "
+        "diamond marks the break-even with the full-order model. Second: its parts for one number "
+        "of queries.",
     ),
     "singular": (
         "Singular values of the training snapshots",

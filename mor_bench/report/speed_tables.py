@@ -15,9 +15,9 @@ from mor_bench.report.number_format import (
     bytes_text,
     number,
     percent,
-    short_swept,
     whole,
 )
+from mor_bench.report.short_names import short_names
 from mor_bench.report.text_table import TextTable
 from mor_bench.results.comparison import Comparison
 
@@ -44,7 +44,7 @@ def target_table(comparison: Comparison, dataset: str, kind: str, analysis: Anal
     selects, and the 95 % interval. `kind` is "time_at_error" or "error_at_time".
     """
     told = told_by_method(entries_of(comparison, dataset))
-    swept = {row.label: short_swept(row.swept) for row in comparison.rows if row.dataset == dataset}
+    names = short_names(row for row in comparison.rows if row.dataset == dataset)
     of_time = kind == "time_at_error"
     key, shown, unit = ("latency_ms", number, "ms") if of_time else ("error", percent, "%")
     headings: dict[str, None] = {"method": None}
@@ -55,7 +55,7 @@ def target_table(comparison: Comparison, dataset: str, kind: str, analysis: Anal
         best, cell = record["best"], NOT_REACHED
         if best is not None or record[key] is not None:
             value = NOT_REACHED if record[key] is None else f"{shown(record[key])} {unit}"
-            lines = [f"{value} ({shown(best and best[key])})", best and swept[best["label"]]]
+            lines = [f"{value} ({shown(best and best[key])})", best and names[best["label"]].values]
             if of_time and best and best["error"] > record["target_rel_l2_median"]:
                 lines.append(f"test error {percent(best['error'])} %")
             cell = "\n".join(filter(None, [*lines, _target_interval(record, shown)]))

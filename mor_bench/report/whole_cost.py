@@ -143,10 +143,10 @@ def draw_totals(axes: Axes, costs: Costs) -> None:
             marks.append(where)
             (mark,) = axes.plot(*where, "D", color=style.colour, markersize=8, zorder=5)
             mark.set_markeredgecolor(INK)
-        places = [(float(counts[i]), float(y[i])) for i in (57, 50, 43, 36, 29)]
-        beside = ((-8, 5), (-8, -7), (-14, 14), (-14, -16), (-24, 22), (-24, -24))
+        places = [(float(counts[i]), float(y[i])) for i in range(57, 0, -4)]
+        beside = ((-8, 6), (-8, -6), (8, 6), (8, -6), (0, 7), (0, -7))
         name = shortened(line.name, 30)
-        notes.append(Note(name, places, readable(style.colour), "bold", beside, must=True))
+        notes.append(Note(name, places, readable(style.colour), "bold", beside))
     powers = range(round(log10(costs.queries)) + 1)
     axes.set_xticks([10**n for n in powers], [_power(n) for n in powers])
     axes.set_xticks([], minor=True)
@@ -185,6 +185,8 @@ def draw_parts(axes: Axes, costs: Costs) -> None:
         if beyond:
             note.set(ha="right", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0})
     axes.set_yticks(range(len(lines)), [plain(shortened(line.name, 30)) for line in lines])
+    for line, tick in zip(lines, axes.get_yticklabels(), strict=True):
+        tick.set(color=readable(style_of(line.method).colour), fontweight="bold")
     axes.set_ylim(len(lines) - 0.4, -0.6)
     axes.set_xlim(0, end)
     axes.set_xlabel(f"core-seconds for {n:,} queries", fontsize=LABEL)

@@ -29,7 +29,7 @@ Report.kinds.bodies = (figure, data) => {
     rest: R.tick(figure, "at rest", true, redraw),
   };
   const far = R.isNarrow() ? 1.5 : 1;
-  let camera = { eye: { x: 0.5 * far, y: -2.05 * far, z: 0.8 * far } };
+  let camera = { eye: { x: 0.45 * far, y: -1.9 * far, z: 0.75 * far } };
   let turning = false;
   const SCALE = [[0, "#fff3d6"], [0.35, "#fdae61"], [0.7, "#d7301f"], [1, "#67000d"]];
 
@@ -99,14 +99,22 @@ Report.kinds.bodies = (figure, data) => {
     return sample.force ? [...out, ...arrow(sample.force)] : out;
   }
 
-  function one(view, select, largest) {
+  // One box around both bodies, so that they have the same size.
+  function boxOf(all) {
+    return Object.fromEntries(["x", "y", "z"].map((key) => {
+      const values = all.flatMap((trace) => trace[key] ?? []).filter((v) => v !== null);
+      return [`${key}axis`, { visible: false, showspikes: false,
+        range: [values.reduce((a, b) => Math.min(a, b)), values.reduce((a, b) => Math.max(a, b))] }];
+    }));
+  }
+
+  function one(view, select, drawn, box) {
     const sample = sampleOf(select);
-    const bare = { visible: false, showspikes: false };
     const text = sample ? sample.text : "no finite prediction of this load";
     view.previousElementSibling.textContent = `${R.nameOf(data, select.value)}: ${text}`;
-    return R.draw(view, sample ? traces(sample, largest) : [], R.layout({
+    return R.draw(view, drawn, R.layout({
       height: R.isNarrow() ? 300 : 400, margin: { l: 0, r: 0, t: 8, b: 0 },
-      scene: { xaxis: bare, yaxis: bare, zaxis: bare, aspectmode: "data", camera,
+      scene: { ...box, aspectmode: "data", camera,
         bgcolor: R.theme().paper },
     }));
   }
@@ -130,7 +138,9 @@ Report.kinds.bodies = (figure, data) => {
     // One colour scale for both, so that equal colours are equal errors.
     const shown = chosen.map(sampleOf).filter(Boolean);
     const largest = Math.max(...shown.flatMap((s) => sizes(unpacked(s.error))));
-    return Promise.all(views.map((view, i) => one(view, chosen[i], largest))).then(() => {
+    const drawn = chosen.map((select) => (sampleOf(select) ? traces(sampleOf(select), largest) : []));
+    const box = shown.length ? boxOf(drawn.flat()) : {};
+    return Promise.all(views.map((view, i) => one(view, chosen[i], drawn[i], box))).then(() => {
       if (linked) return;
       linked = true;
       link(views[0], views[1]);

@@ -29,7 +29,7 @@ Report.kinds.distributions = (figure, data) => {
       xaxis: R.logAxis(named, all.length ? { range: [Math.log10(low), Math.log10(high)] } : {}),
       yaxis: R.axis("share (%)", { range: [0, 102] }), shapes: lines,
       annotations: [...notes, ...beyond.map((line, i) => ({
-        xref: "paper", x: 0.995, xanchor: "right", y: 90 - 7 * i, showarrow: false,
+        xref: "paper", x: 0.995, xanchor: "right", y: 12 + 7 * i, showarrow: false,
         font: { size: 12, color: R.colour(data, line.label) },
         text: R.plain(`${R.nameOf(data, line.label)}: up to ${R.short(line[kind.value].x.at(-1))} ${unit} →`),
       }))], ...R.legend(traces.length, 400),
@@ -140,10 +140,15 @@ Report.kinds.singular = (figure, data) => {
         marker: { symbol: style.symbol, size: 11, color: R.colourOf(style) },
         hovertemplate: "r = %{x}: %{y:.3~g}" });
     }
+    // Modes far beyond those that were tried say nothing; a drag shows them.
+    const tried = data.ranks.flatMap(({ ranks }) => ranks.map((r) => tail[r - 1])).filter((t) => t > 0);
+    const floor = Math.max((tried.length ? Math.min(...tried) : Math.min(...tail)) / 30, 1e-12);
+    const beyond = tail.findIndex((t) => t < floor);
+    const last = beyond > 0 ? beyond : sigma.length;
     return R.draw(plot, traces, R.layout({
-      xaxis: R.logAxis("number of modes r"), ...R.legend(traces.length, 400),
-      yaxis: R.logAxis("relative to all snapshots", {
-        range: [Math.log10(Math.max(Math.min(...tail.filter((t) => t > 0)) / 3, 1e-12)), 0.1] }),
+      xaxis: R.logAxis("number of modes r", { range: [-0.06, Math.log10(last) + 0.06], dtick: "D2" }),
+      yaxis: R.logAxis("relative to all snapshots", { range: [Math.log10(floor), 0.1] }),
+      ...R.legend(traces.length, 400),
     }));
   };
 };
@@ -191,7 +196,7 @@ Report.kinds.costs = (figure, data) => {
   const [left, right] = R.pair(figure);
   const pays = lines.map((l) => l.break_even).filter((q) => q > 0);
   const first = Math.log10(data.costs.queries);
-  const number = R.slider(figure, "queries on the right", [0, 9, 1, first], () => parts());
+  const number = R.slider(figure, "number of queries", [0, 9, 1, first], () => parts());
 
   const out = document.createElement("output");
   number.after(out);

@@ -39,7 +39,22 @@ Report.kinds.frontier = (figure, data) => {
     };
   }
 
-  function trace(rows, group) {
+  // Labels of the front that do not cover each other, at the usual size of the chart.
+  function labelled(rows, range) {
+    const taken = [], found = new Set();
+    const at = (value, [low, high], size) => (size * (Math.log10(value) - low)) / (high - low);
+    for (const row of rows.filter((r) => r.front && y(r) === inside(y(r)))) {
+      const box = [at(x(row), range.x, 500), at(y(row), range.y, 450), 8 * labelOf(row).length + 14];
+      const apart = ([px, py, width]) => Math.abs(py - box[1]) > 15
+        || px > box[0] + box[2] || box[0] > px + width;
+      if (taken.every(apart)) { taken.push(box); found.add(row); }
+    }
+    return found;
+  }
+
+  const labelOf = (row) => row.name.split(" · ")[1] ?? row.name;
+
+  function trace(rows, group, named) {
     const style = R.styleOf(data, rows[0]);
     const colour = R.colourOf(style);
     const medians = error.value === "median" && time.value === "median";
@@ -48,7 +63,7 @@ Report.kinds.frontier = (figure, data) => {
       type: "scatter", mode: "lines+markers+text", name: R.plain(rows[0].method),
       legendgroup: R.plain(group), legendgrouptitle: { text: R.plain(group), font: { size: 12 } },
       x: rows.map(x), y: rows.map((row) => inside(y(row))),
-      text: rows.map((row) => (row.front && y(row) === inside(y(row)) ? R.plain(row.name.split(" · ")[1] ?? row.name) : "")),
+      text: rows.map((row) => (named.has(row) ? R.plain(labelOf(row)) : "")),
       textposition: "top right", textfont: { color: colour, size: 12 },
       hovertext: rows.map((row) => R.hover(row.hover)), hoverinfo: "text",
       line: { color: colour, width: 1 },
@@ -121,11 +136,11 @@ Report.kinds.frontier = (figure, data) => {
       x: rangeOf(rows.map(x), wanted),
       y: rangeOf(rows.map((row) => inside(y(row))), [data.needs.error]),
     };
-    const traces = [];
+    const traces = [], named = labelled(rows, range);
     for (const group of data.groups) {
       const mine = rows.filter((row) => row.group === group);
       for (const method of new Set(mine.map((row) => row.method))) {
-        traces.push(trace(mine.filter((row) => row.method === method), group));
+        traces.push(trace(mine.filter((row) => row.method === method), group, named));
       }
     }
     traces.push(front(rows));
