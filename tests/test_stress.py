@@ -362,6 +362,7 @@ def test_the_command_prints_and_writes_the_same_results(tmp_path: Path, cache: P
     ]
     assert json.loads(out.read_text(encoding="utf-8")) == printed
     assert "4 tried: 4 pass, 0 fall short" in done.stderr
+    assert "1 of 4: zero-force, pod" in done.stderr
 
 
 def test_training_loads_of_the_unseen_directions_are_normal_forces(scenes: Scenes) -> None:

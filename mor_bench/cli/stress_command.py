@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from math import inf
 from pathlib import Path
+from time import perf_counter
 from typing import Annotated, ClassVar
 
 import typer
@@ -13,6 +16,7 @@ from rich.status import Status
 from mor_bench.cli.console import make_console
 from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import Json, QuietOutput, complete_methods, with_options
+from mor_bench.cli.progress_bars import PRINT_EVERY_S, print_plain
 from mor_bench.errors import InvalidInputError
 from mor_bench.hard_cases.suite import stress as run_cases
 from mor_bench.options import FolderOptions, Profile
@@ -71,12 +75,7 @@ def stress(
     console = make_console(stderr=as_json)
     with Status("", console=make_console(True, output.quiet)) as status:
         found = run_cases(
-            method or None,
-            case or None,
-            starting=lambda name, tried, number, total: status.update(
-                f"{number} of {total}: {name}, {tried}"
-            ),
-            **options.model_dump(),
+            method or None, case or None, starting=_shown_in(status), **options.model_dump()
         )
     print_stress(found, console, output.quiet)
     if out is not None:
@@ -84,3 +83,19 @@ def stress(
         console.print(str(out), highlight=False, soft_wrap=True)
     if as_json:
         print(json.dumps(found.as_dict(), indent=1, allow_nan=False, ensure_ascii=False))
+
+
+def _shown_in(status: Status) -> Callable[[str, str, int, int], None]:
+    """Return a function that shows the present case, or prints one now and then in a pipe."""
+    printed_at = -inf
+
+    def show(name: str, tried: str, number: int, total: int) -> None:
+        nonlocal printed_at
+        text = f"{number} of {total}: {name}, {tried}"
+        if status.console.is_terminal:
+            status.update(text)
+        elif perf_counter() - printed_at >= PRINT_EVERY_S:
+            printed_at = perf_counter()
+            print_plain(status.console, text)
+
+    return show
