@@ -15,6 +15,7 @@ from mor_bench.results.row import Row
 from mor_bench.runs.cached_fit import RunEnvironment
 from mor_bench.runs.code_digest import bare_code
 from mor_bench.runs.configurations import configurations_of
+from mor_bench.runs.plan import plan
 from mor_bench.runs.shipped_models import Binding, SampleSketch, shipped_models
 from mor_bench.runs.training_data import TrainingData, digest_of_file
 from mor_bench.snapshots.dataset import Snapshots, load_dataset
@@ -90,6 +91,11 @@ def _row(tmp_path: Path, out: str, **options: Any) -> Row:
     return comparison.rows[0]
 
 
+def _planned_as_shipped(tmp_path: Path) -> bool:
+    planned = plan(["beam-tiny"], ["umesh-linear"], cache=tmp_path / "cache")
+    return any("trained elsewhere" in step.label for step in planned.steps)
+
+
 @pytest.mark.slow
 def test_a_run_uses_shipped_weights_unless_it_shall_train(trained: Path, tmp_path: Path) -> None:
     row = _row(tmp_path, "out")
@@ -111,8 +117,10 @@ def test_a_run_uses_shipped_weights_unless_it_shall_train(trained: Path, tmp_pat
 def test_damaged_and_forged_weights_are_refused_with_a_warning(
     trained: Path, tmp_path: Path
 ) -> None:
+    assert _planned_as_shipped(tmp_path)
     whole = trained.read_bytes()
     trained.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    assert not _planned_as_shipped(tmp_path)
     row = _row(tmp_path, "damaged")
     assert row.trained_elsewhere is None
     [warning] = row.warnings

@@ -110,12 +110,12 @@ def test_the_fastest_wins_and_the_cheapest_offline_stands_beside_it() -> None:
     assert chosen.best_told == {"equations": cheap, None: quick}
     assert "Cheapest offline: cheap (reference), 1 ms at 0.5 %, 0.4 core-seconds" in chosen.text()
     assert choose([quick, again], Requirements(0.01)).runner_up is None
-    costs = [{"data": 0.0, "fit": 0.4}, {"data": 0.0, "fit": 0.01}]
     rows = [
-        a_row(n, latency_ms={"median": m}, offline_s=c)
-        for n, m, c in zip("ab", (1, 2), costs, strict=True)
+        a_row(name, latency_ms={"median": ms}, offline_s={"data": 0.0, "fit": fit_s})
+        for name, ms, fit_s in (("a", 1.0, 0.404), ("b", 2.0, 0.401), ("c", 3.0, 0.3))
     ]
-    assert choose(rows, ASKED).cheapest == rows[0]  # a tie to the second goes to the faster
+    assert choose(rows[:2], ASKED).cheapest == rows[0]  # a tie in two digits goes to the faster
+    assert choose(rows, ASKED).cheapest == rows[2]
 
 
 def test_validation_selects_and_the_test_set_confirms() -> None:
@@ -293,7 +293,7 @@ def test_a_choice_comes_with_its_evidence() -> None:
         "on 20 freshly drawn loads",
         "1 ms median [0.9, 1.1], 1.2 p95, 1 thread; unstable: processes differ by 9 %",
         "150 MB to predict",
-        "data 50 s of 80 samples, fit 1 s",
+        "data 50 core-s of 80 samples, fit 1 core-s",
         "4 % median, inf % p95, inf % max on 60 loads, 3 without an answer",
         "The discretisation error of the mesh is 5 % (median).",
         "No other method qualifies.",

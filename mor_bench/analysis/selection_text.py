@@ -277,13 +277,12 @@ def _latency(row: Row) -> str:
 
 def _offline(row: Row) -> str:
     data = row.offline_s.data if row.offline_s else None
-    fit = row.offline_s.fit if row.offline_s else None
     samples = f" of {row.n_train} samples" if data else ""
-    return f"data {_seconds(data)}{samples}, fit {_seconds(fit)}"
+    return f"data {_core_s(data)}{samples}, fit {_core_s(row.fit_core_s)}"
 
 
-def _seconds(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.3g} s"
+def _core_s(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3g} core-s"
 
 
 def _size(value: float | None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from math import inf, isfinite
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -211,13 +211,12 @@ class Verdict:
 
 
 def offline_rank(row: Row) -> tuple[Any, ...]:
-    """Rank by offline cost in whole seconds and two digits, then by speed.
+    """Rank by offline cost in core-seconds, to two digits, then by speed.
 
     Repeated trainings differ by less than the rounding. Rows with an unknown cost come last.
     """
     seconds = number_or_inf(row.offline_core_s)
-    rounded = float(f"{round(seconds):.1e}") if isfinite(seconds) else inf
-    return rounded, *speed_rank(row)
+    return float(f"{seconds:.1e}"), *speed_rank(row)
 
 
 def speed_rank(row: Row) -> tuple[float, float, str]:

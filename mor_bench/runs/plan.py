@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from mor_bench.errors import StoreError
 from mor_bench.options import RunOptions
 from mor_bench.runs.cached_fit import CachedFit, RunEnvironment
 from mor_bench.runs.configurations import (
@@ -30,7 +31,7 @@ from mor_bench.runs.durations import (
 )
 from mor_bench.runs.extra_stages import LEARNING_STEP
 from mor_bench.runs.run_context import RunContext
-from mor_bench.runs.shipped_models import find_shipped
+from mor_bench.runs.shipped_models import check_weights, find_shipped
 from mor_bench.runs.training_data import TrainingData
 from mor_bench.scene.scene import load_scene
 from mor_bench.scratch import scratch_folder
@@ -224,7 +225,13 @@ def _steps(
 def _is_shipped(configuration: Configuration, spec: AnyDatasetSpec, context: RunContext) -> bool:
     if configuration.training is None or not context.uses_shipped_weights:
         return False
-    return find_shipped(configuration, spec, context.options.split) is not None
+    try:
+        found = find_shipped(configuration, spec, context.options.split)
+        if found is not None:
+            check_weights(*found)
+    except StoreError:
+        return False
+    return found is not None
 
 
 def _within_budget(

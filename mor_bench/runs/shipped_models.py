@@ -187,6 +187,17 @@ def find_shipped(
     return next((item for item in models.items() if item[1].binding == binding), None)
 
 
+def check_weights(weights: Path, shipped: ShippedModel) -> None:
+    """Raise `StoreError` unless weights are readable and those of their record."""
+    checksum = shipped.fit.model_sha256
+    try:
+        intact = checksum is not None and digest_of_file(weights) == checksum
+    except OSError as error:
+        raise StoreError(f"{weights}: cannot be read: {error.strerror}.") from None
+    if not intact:
+        raise StoreError(f"{weights}: the checksum differs from the one in its record.")
+
+
 def adopt(
     weights: Path,
     shipped: ShippedModel,
@@ -205,13 +216,8 @@ def adopt(
     MorBenchError
         If they cannot be loaded.
     """
+    check_weights(weights, shipped)
     checksum = shipped.fit.model_sha256
-    try:
-        intact = checksum is not None and digest_of_file(weights) == checksum
-    except OSError as error:
-        raise StoreError(f"{weights}: cannot be read: {error.strerror}.") from None
-    if not intact:
-        raise StoreError(f"{weights}: the checksum differs from the one in its record.")
     iterations = {"iterations": shipped.fit.parameters["iterations"]}
     parameters = {**configuration.parameters, **iterations}
     chosen = replace(configuration, parameters=parameters, shipped=checksum)

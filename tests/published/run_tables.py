@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 from math import inf, isfinite, isnan
 from typing import Any
 
+from mor_bench.analysis.break_even import FULL_ORDER, break_even
+from mor_bench.analysis.draws import VALIDATION
 from mor_bench.analysis.frontier import median_error, median_latency_ms, selecting_error
 from mor_bench.analysis.told import class_text, is_observed
 from mor_bench.report.entries import entries_of
@@ -108,39 +110,48 @@ def _offline(row: Row) -> str:
     return f"{number(row.offline_s.data)} + {number(row.offline_s.fit_core_s)}"
 
 
-def _queries(run: Comparison, row: Row, target: float) -> str:
-    """Return the break-even number of queries of a row's method against `fem` at an error."""
-    for record in (run.analysis or {})["break_even"]:
-        key = (record["dataset"], record["method"], record["target_rel_l2_median"])
-        if key == (row.dataset, row.method, target):
-            return f"{record['queries']:,}" if record["queries"] is not None else record["verdict"]
-    return DASH
+def _queries(run: Comparison, row: Row, need: float) -> str:
+    """Return the break-even number of queries of a row against `fem` at its error."""
+    if row.method == FULL_ORDER:
+        return DASH
+    best = {"label": row.label, "latency_ms": median_latency_ms(row), "error": median_error(row)}
+    record = {"dataset": row.dataset, "method": row.method, "target_rel_l2_median": need}
+    reached = best if error_bound(run, row) <= need else None
+    (found,) = break_even(run.rows, [{**record, "best": reached}])
+    return f"{found['queries']:,}" if found["queries"] is not None else str(found["verdict"])
 
 
-def sufficient(rows: Sequence[Row], need: float) -> Row:
-    """Return the fastest configuration that meets an error on the validation samples.
+def error_bound(run: Comparison, row: Row) -> float:
+    """Return the error that the verdict compares with a limit; see `selection.RULE`."""
+    fresh = row.hidden.rel_l2_median if row.hidden else 0.0
+    for stored in (run.analysis or {})["rows"]:
+        if (stored["dataset"], stored["label"]) == (row.dataset, row.label):
+            high = stored.get(VALIDATION, stored["rel_l2_median"])["high"]
+            return max(selecting_error(row), fresh, inf if high is None else high)
+    return inf
 
-    If there is none, return the most accurate one.
-    """
-    within = [row for row in rows if selecting_error(row) <= need]
-    return min(within, key=median_latency_ms) if within else chosen(rows)
+
+def sufficient(run: Comparison, rows: Sequence[Row], need: float) -> Row | None:
+    """Return the fastest configuration whose error meets a limit by the rule of the verdict."""
+    within = [row for row in rows if error_bound(run, row) <= need]
+    return min(within, key=median_latency_ms, default=None)
 
 
 def selected(source: str, dataset: str = "", methods: str = "", by: str = "need") -> str:
     """Show the configuration of each method that validation selects, scored on the test.
 
-    By "need", it is the fastest that meets the dataset's required error on the validation samples,
+    By "need", it is the fastest that meets the dataset's required error by the rule of the verdict,
     or the most accurate if none does. By "error", it is the most accurate.
     """
     run = run_of(source)
     name = dataset or next(iter(run.datasets))
     need = float((run.datasets[name].get("needs") or {}).get("error", 0.01))
     rows = [
-        sufficient(own, need) if by == "need" else chosen(own)
+        (sufficient(run, own, need) if by == "need" else None) or chosen(own)
         for own in _by_method(_rows(run, dataset, methods)).values()
     ]
     headings = ["method", "is given", "selected", *ERRORS_SHOWN, "fresh test: median %", "ms"]
-    headings += ["data + fit, core-s", f"break-even at {100 * need:g} %, queries"]
+    headings += ["data + fit, core-s", "break-even, queries"]
     return markdown(
         headings,
         [
@@ -162,7 +173,7 @@ def selected(source: str, dataset: str = "", methods: str = "", by: str = "need"
 def fastest(source: str, dataset: str = "", methods: str = "") -> str:
     """Show the latency of the fastest configuration below each error, method by method.
 
-    The errors on the validation samples decide. A dagger marks a larger error on the test samples.
+    The rule of the verdict decides. A dagger marks a larger error on the test samples.
     """
     run = run_of(source)
     headings = ["method", *(f"≤ {number(100 * level)} %" for level in LEVELS)]
@@ -170,8 +181,7 @@ def fastest(source: str, dataset: str = "", methods: str = "") -> str:
     for method, rows in _by_method(_rows(run, dataset, methods)).items():
         cells = [f"`{method}`"]
         for level in LEVELS:
-            within = [row for row in rows if selecting_error(row) <= level]
-            best = min(within, key=median_latency_ms, default=None)
+            best = sufficient(run, rows, level)
             missed = best is not None and median_error(best) > level
             cells.append((DASH if best is None else _latency(run, best)) + " †" * missed)
         least = chosen(rows)
