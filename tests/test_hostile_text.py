@@ -9,6 +9,7 @@ import json
 import re
 import shutil
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -16,8 +17,10 @@ import pytest
 from rich.console import Console
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.hard_cases.catalogue import CaseResult
+from mor_bench.hard_cases.suite import StressResults
 from mor_bench.report.console_tables import print_tables
-from mor_bench.report.page import render
+from mor_bench.report.page import STRESS, render
 from mor_bench.results.comparison import Comparison
 from mor_bench.specs import list_suite
 from tests.commands import invoke
@@ -29,12 +32,12 @@ TAGS = {
     *("div", "table", "thead", "tbody", "tr", "th", "td", "figure", "img", "figcaption", "dl"),
     *("dt", "dd", "a", "fieldset", "legend", "label", "input", "details", "summary", "code"),
     *("ul", "li", "pre", "header", "nav", "main", "section", "footer", "noscript", "caption"),
-    *("button", "dialog", "form", "script", "span"),
+    *("button", "dialog", "form", "script", "span", "link"),
 }
 ATTRIBUTES = {
     *("charset", "name", "content", "http-equiv", "lang", "class", "colspan", "rowspan", "alt"),
     *("src", "href", "id", "type", "checked", "data-told", "value", "scope", "tabindex", "role"),
-    *("aria-label", "aria-labelledby", "data-chart", "data-index", "method"),
+    *("aria-label", "aria-labelledby", "data-chart", "data-index", "method", "rel"),
 }
 
 
@@ -79,13 +82,21 @@ def run(tmp_path: Path) -> Comparison:
 def test_no_text_of_a_file_becomes_markup_or_leads_out_of_the_folder(
     run: Comparison, tmp_path: Path
 ) -> None:
-    text = render(run)[-1].read_text(encoding="utf-8")
-    page = Page(text)
-    assert page.tags <= TAGS
-    assert page.attributes <= ATTRIBUTES
-    assert all(not source.startswith(("http", "//", "java")) for source in page.sources)
-    assert "&lt;script&gt;alert(1)" in text
-    assert "{{ 7*7 }}" in text
+    bad = HOSTILE
+    tried = CaseResult(bad, bad, bad, bad, bad, "fall short", {}, 1.0)
+    methods = dict.fromkeys(row.method for row in run.rows)
+    rows = [replace(tried, method=method) for method in methods]
+    StressResults(rows, "quick", {}).write(run.out / STRESS)
+    pages = [path for path in render(run, pages=True) if path.suffix == ".html"]
+    assert len(pages) == 2 + 1 + len(methods)
+    for path in pages:
+        text = path.read_text(encoding="utf-8")
+        page = Page(text)
+        assert page.tags <= TAGS
+        assert page.attributes <= ATTRIBUTES
+        assert all(not source.startswith(("http", "//", "java")) for source in page.sources)
+        assert "&lt;script&gt;alert(1)" in text
+        assert "{{ 7*7 }}" in text
     assert [path.name for path in tmp_path.iterdir()] == ["outer"]
     assert [path.name for path in (tmp_path / "outer").iterdir()] == ["run"]
 

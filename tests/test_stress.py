@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 from mor_bench import surrogate
-from mor_bench.errors import InvalidInputError, MissingDependencyError, SpecError
+from mor_bench.errors import InvalidInputError, MissingDependencyError, SpecError, StoreError
 from mor_bench.hard_cases import mechanics_cases, reduction_cases, setups
 from mor_bench.hard_cases.case import LONGEST, Scenes, Subject
 from mor_bench.hard_cases.catalogue import CASES, CaseResult, attempt, cases_for
@@ -371,3 +371,13 @@ def test_training_loads_of_the_unseen_directions_are_normal_forces(scenes: Scene
         vectors = snapshots.loads.vectors[:, 0]
         share = np.abs(vectors[:, 2]) / np.linalg.norm(vectors, axis=1)
         np.testing.assert_allclose(share, along, atol=1e-12)
+
+
+def test_results_are_read_back_and_damaged_ones_refused(tmp_path: Path) -> None:
+    row = CaseResult("zero-force", "", "pod", "zero", "zero", "pass", {"largest": 0.0}, 0.1)
+    found, path = StressResults([row], "quick", {"cores": 2}), tmp_path / "stress.json"
+    found.write(path)
+    assert StressResults.read(path) == found
+    path.write_text(path.read_text().replace('"pass"', '"perhaps"'))
+    with pytest.raises(StoreError, match="not written by `mor-bench stress --out`"):
+        StressResults.read(path)

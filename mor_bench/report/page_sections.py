@@ -177,6 +177,7 @@ def _facts(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> li
         *facts,
         ("split", split),
         ("needs", needs_text(needs_of(comparison, dataset))),
+        ("degrees of freedom", _values(f"{row.n_dofs:,}" for row in rows if row.n_dofs)),
         ("discretisation error of the dataset's mesh", discretisation_error(entries)),
         ("threads", _values(row.threads for row in rows)),
         ("configurations", f"{len(rows)}: {sum(r.ok for r in rows)} ran, {', '.join(counts)}"),
