@@ -20,9 +20,10 @@ from typing import Any
 
 from mor_bench.errors import MorBenchError, StoreError, printable
 
-MOST_TOML_BYTES = 2**20
-MOST_JSON_BYTES = 2**24
-MOST_BYTES = 2**34
+MIB = 2**20
+MOST_TOML_BYTES = 1 * MIB
+MOST_JSON_BYTES = 16 * MIB
+MOST_BYTES = 16 * 1024 * MIB
 """Size limits of a TOML, a JSON, and any other file."""
 
 MOST_LEVELS = 64

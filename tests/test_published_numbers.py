@@ -5,7 +5,13 @@ from __future__ import annotations
 import pytest
 
 from tests.published.blocks import pages, with_blocks
-from tests.published.claims import EVERY_PAGE, statements, without_evidence, wrong_numbers
+from tests.published.claims import (
+    EVERY_PAGE,
+    measured_in_specification,
+    statements,
+    without_evidence,
+    wrong_numbers,
+)
 from tests.published.compact import ERRORS, wrong_summaries
 from tests.published.pictures import stale_pictures
 from tests.published.stored import REPORTS, ROOT
@@ -16,6 +22,11 @@ RUNS = sorted(
     for path in REPORTS.rglob(ERRORS)
     if "runs" not in path.relative_to(REPORTS).parts
 )
+FILES = [
+    path.relative_to(ROOT).as_posix()
+    for folder in ("methods", "datasets")
+    for path in sorted((ROOT / folder).glob("*.toml"))
+]
 MOST_BYTES = 50e6
 
 
@@ -46,8 +57,14 @@ def test_every_picture_is_drawn_from_the_evidence(page: str) -> None:
     assert not stale, "\n".join(stale)
 
 
+@pytest.mark.parametrize("file", FILES)
+def test_no_method_or_dataset_file_states_a_measurement(file: str) -> None:
+    found = list(measured_in_specification(file, statements()))
+    assert not found, "\n".join(["measurements belong into reports/:", *found])
+
+
 def test_every_entry_of_the_ledger_belongs_to_a_page() -> None:
-    assert {statement.page for statement in statements()} <= {EVERY_PAGE, *NAMES}
+    assert {statement.page for statement in statements()} <= {EVERY_PAGE, *NAMES, *FILES}
     texts = [_read(page) for page in NAMES]
     general = [statement for statement in statements() if statement.page == EVERY_PAGE]
     unused = [s.text for s in general if not any(map(s.pattern().search, texts))]

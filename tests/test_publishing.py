@@ -14,8 +14,9 @@ from matplotlib import image
 from mor_bench.analysis.analyse import analyse
 from tests.published.blocks import with_blocks
 from tests.published.claims import (
-    MEASURED,
+    NUMBER,
     Statement,
+    measured_in_specification,
     prose,
     with_numbers,
     without_evidence,
@@ -116,7 +117,7 @@ def test_a_wrong_number_is_found_and_corrected(claim: Statement) -> None:
 def test_a_number_that_no_entry_covers_is_found(claim: Statement) -> None:
     text = "It takes 12.5 ms, and b 4 times as long.\n\nA query takes 3 µs.\n"
     (found,) = without_evidence(PAGE, text, [claim])
-    assert found.startswith("docs/page.md:3: '3 µs'")
+    assert found.startswith("docs/page.md:3: '3'")
 
 
 def test_an_entry_whose_text_left_the_page_is_found(claim: Statement) -> None:
@@ -125,24 +126,52 @@ def test_an_entry_whose_text_left_the_page_is_found(claim: Statement) -> None:
 
 SEEN = (
     "0.38 ms; 5 µs; 20 times; a factor of two; 1e-4 m; 18 of 25; 8,000 s; .037; 3×; 75 %; 22 MB; "
-    "five times; 10⁸; 33 core-minutes; two minutes; 1.6–1.8"
+    "five times; 10⁸; 33 core-minutes; two minutes; 1.6–1.8; 135 H8; 64 patches; Section 3"
 )
 
 
 @pytest.mark.parametrize("text", SEEN.split("; "))
-def test_a_number_that_looks_like_a_measurement_is_seen(text: str) -> None:
-    assert MEASURED.search(f"It has {text} here.")
+def test_a_number_is_seen(text: str) -> None:
+    assert NUMBER.search(f"It has {text} here.")
 
 
-@pytest.mark.parametrize("text", ["135 H8", "64 patches", "Section 3", "two methods", "T4 and H8"])
-def test_a_count_is_not_taken_for_a_measurement(text: str) -> None:
-    assert not MEASURED.search(f"It has {text} here.")
+@pytest.mark.parametrize("text", ["two methods", "T4 and H8", "float32"])
+def test_a_name_is_not_taken_for_a_number(text: str) -> None:
+    assert not NUMBER.search(f"It has {text} here.")
+
+
+def test_a_measurement_in_the_file_of_a_method_is_found(tmp_path: Path) -> None:
+    file = tmp_path / "method.toml"
+    file.write_text('title = "POD, 135 H8"\nsource = "Barbič 2005"\nn_modes = 3\n')
+    assert list(measured_in_specification(str(file), [])) == []
+    file = tmp_path / "other.toml"
+    file.write_text(
+        'title = "Errs by 3 %"\nsource = "A text"\nlimits = "It takes 430 steps, and a tenth of '
+        'the time of pod."\nleast = 2.0  # measured 31\n'
+    )
+    assert len(list(measured_in_specification(str(file), []))) == 4
+
+
+def test_a_number_of_the_code_is_looked_up_in_its_text() -> None:
+    assert look_up("LEAST, MOST = 0.9, 12_360  # cores", "LEAST, MOST = 0.9, {}") == 12360
+    for key in ("ST = {}", "LEAST = {}"):
+        with pytest.raises(EvidenceError, match="0 different numbers"):
+            look_up("LEAST, MOST = 0.9, 1.2", key)
+
+
+def test_a_number_in_words_is_compared(tmp_path: Path) -> None:
+    (tmp_path / "code.py").write_text("EVERY_S = 10.0")
+    value = {"file": str(tmp_path / "code.py"), "key": "EVERY_S = {}", "format": "word"}
+    claim = Statement(PAGE, "every {} seconds", [value])
+    assert list(wrong_numbers(PAGE, "It prints every ten seconds.", [claim])) == []
+    assert len(list(wrong_numbers(PAGE, "It prints every five seconds.", [claim]))) == 1
+    assert list(without_evidence(PAGE, "It prints every ten seconds.", [claim])) == []
 
 
 def test_code_tables_and_links_are_no_prose() -> None:
     text = "a `5 ms` [b](c-3.5.md)\n```\n5 ms\n```\n<!-- from: x y -->\n5 ms\n<!-- end -->\n6 ms\n"
     assert len(prose(text)) == len(text)
-    assert MEASURED.findall(prose(text)) == ["6 ms"]
+    assert NUMBER.findall(prose(text)) == ["6"]
 
 
 def test_a_key_must_lead_to_one_item(claim: Statement) -> None:

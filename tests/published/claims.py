@@ -1,16 +1,16 @@
-"""Numbers in sentences: each is looked up in the evidence, or stated to be no measurement.
+"""Numbers in sentences: each has a source with which it is compared, or a reason to have none.
 
 `reports/claims.toml` has two kinds of entries. A `[[claim]]` has the text of a page, with `{}` for
 each number, and `values` that say where the numbers come from:
 
-    file, key       the evidence, see `stored.look_up`
+    file, key       evidence or TOML file, see `stored.look_up`; or a Python file and its text with
+                    `{}` for the number, such as "MAX_CELLS = {}"
     over            key of a divisor in the same file
-    reduce          "median", "min", "max", "len" or "sum" of a list
+    reduce          "median", "min", "max", "len", "sum" or "prod" of a list
     scale           factor
-    format          Python's format of the number, such as ".2g"
+    format          Python's format of the number, such as ".2g"; "word" for "ten". Default: ",g"
 
-A `[[stated]]` has texts with numbers that are not measured, and the reason `why`. If a test asserts
-the numbers, `by` names its file.
+A `[[stated]]` has texts whose numbers need no source here, and the reason `why`.
 """
 
 from __future__ import annotations
@@ -36,31 +36,38 @@ REDUCE: dict[str, Callable[[Any], float]] = {
     "max": np.max,
     "len": len,
     "sum": np.sum,
+    "prod": np.prod,
 }
 
-WHYS = ("definition", "setting", "paper", "hardware", "tested")
-"""Reasons why a number needs no measurement; `tested` needs `by`."""
+WHYS = ("paper", "equation", "format", "name", "version", "year", "tested")
+"""Reasons why a number needs no source here.
 
-_NUMBER = r"[-−]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?|[-−]?\.\d+"
+It is a number of the paper, an equation's, or one that a file format or protocol fixes; it is part
+of a name, of a version or of a citation; or the test `by`, FILE::FUNCTION, compares it.
+"""
 
-_UNITS = (
-    r"core-\w+|ms|µs|s|min|h|seconds?|minutes?|hours?|times|×|%|per cent|[kMG]i?B|bytes|m|cm|mm|"
-    r"samples/s|samples per second"
-)
+_NUMBER = r"[-−]?\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?|[-−]?\.\d+"
 
 _WORDS = (
-    "two|three|four|five|six|seven|eight|nine|ten|twelve|fifteen|twenty|thirty|forty|fifty|sixty|"
-    "hundred|thousand|half|a third|a quarter|a fifth|a tenth|two thirds|three quarters"
+    "two|three|four|five|six|seven|eight|nine|ten|twelve|fifteen|sixteen|twenty|thirty|forty|fifty|"
+    "sixty|hundred|thousand|half|a third|a quarter|a fifth|a tenth|two thirds|three quarters"
 )
 
-MEASURED = re.compile(
-    rf"(?<![\w.])(?:(?:{_NUMBER})(?:[-–](?:{_NUMBER}))? ?(?:{_UNITS})(?![\w²³])"
-    rf"|[-−]?\d*\.\d+(?:e[-+]?\d+)?|[-−]?\d+e[-+]?\d+|10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+"
-    rf"|\d[\d,]* of (?:the )?\d[\d,]*"
-    rf"|(?:{_WORDS})(?: \w+)? (?:times|seconds|minutes|hours|per cent)\b"
-    rf"|factor of (?:about )?(?:{_WORDS}|\d+))"
+NUMBER = re.compile(
+    rf"(?<![\w.,])(?:{_NUMBER})(?!\w)|10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+"
+    rf"|\b(?:{_WORDS})(?: \w+)? (?:times|seconds|minutes|hours|per cent|million)\b"
+    rf"|\b(?:{_WORDS}) (?:of )?(?:the|all|a) (?:time|error|samples|memory|core|cores)\b"
+    rf"|factor of (?:about )?(?:{_WORDS})"
 )
-"""A number that looks like a measurement."""
+"""A number, and words that look like a measurement."""
+
+_DIGITS = re.compile(_NUMBER)
+
+MEASURED = re.compile(
+    rf"(?:{_NUMBER}) ?(?:ms|µs|s|min|h|seconds|minutes|hours|times|×|%|per cent|[kMG]i?B)(?!\w)"
+    rf"|(?<![\w.])\d*\.\d+|\d+e[-+]?\d+|twice as"
+)
+"""A number with the unit of an error, a time or a ratio, or with decimals."""
 
 _NOT_PROSE = (
     re.compile(r"^ *```.*?^ *```", re.DOTALL | re.MULTILINE),
@@ -71,6 +78,10 @@ _NOT_PROSE = (
     re.compile(r"\]\([^)]*\)"),
     re.compile(r"https?://\S+|arXiv \d+\.\d+"),
 )
+
+
+IN_WORDS = {2: "two", 5: "five", 10: "ten", 16: "sixteen", 50: "fifty", 0.75: "three quarters"}
+IN_WORDS |= {0.1: "a tenth", 0.2: "a fifth"}
 
 
 @dataclass(frozen=True)
@@ -86,7 +97,9 @@ class Statement:
 
     def pattern(self) -> re.Pattern[str]:
         """Match the text, with any line breaks and with a group for each number."""
-        words = [re.escape(word).replace(r"\{\}", f"({_NUMBER})") for word in self.text.split()]
+        words = [
+            re.escape(word).replace(r"\{\}", f"({_NUMBER}|{_WORDS})") for word in self.text.split()
+        ]
         return re.compile(r"\s+(?:> )?".join(words))
 
 
@@ -107,8 +120,10 @@ def statements() -> list[Statement]:
     for entry in content.get("stated", ()):
         if entry["why"] not in WHYS or (entry["why"] == "tested") != ("by" in entry):
             raise EvidenceError(f"{entry['texts'][0]}: `why` must be one of {WHYS}.")
-        if "by" in entry and not (ROOT / entry["by"]).is_file():
-            raise EvidenceError(f"{entry['texts'][0]}: there is no {entry['by']}.")
+        if "by" in entry:
+            file, _, test = entry["by"].partition("::")
+            if f"def {test}(" not in content_of(file):
+                raise EvidenceError(f"{entry['texts'][0]}: there is no test {entry['by']}.")
         found += [Statement(entry["page"], text, ()) for text in entry["texts"]]
     return found
 
@@ -124,7 +139,11 @@ def formatted(value: Mapping[str, Any]) -> str:
     number = measured(value["key"]) * value.get("scale", 1.0)
     if "over" in value:
         number /= measured(value["over"])
-    return format(number, value["format"]).replace("e-0", "e-")
+    if value.get("format") == "word":
+        return IN_WORDS[number]
+    return re.sub(r"e([-+])0?", r"e\1", format(number, value.get("format", ",g"))).replace(
+        "e+", "e"
+    )
 
 
 def prose(text: str) -> str:
@@ -135,26 +154,56 @@ def prose(text: str) -> str:
 
 
 def without_evidence(page: str, text: str, known: Sequence[Statement]) -> Iterator[str]:
-    """Yield each number of a page that no statement covers."""
+    """Yield each number of a page that no gap of a claim and no stated text covers."""
     covered = np.zeros(len(text), dtype=bool)
     for statement in known:
         if statement.page in (page, EVERY_PAGE):
             for match in statement.pattern().finditer(text):
-                covered[match.start() : match.end()] = True
+                gaps = range(1, len(statement.values) + 1) if statement.values else [0]
+                for gap in gaps:
+                    covered[match.start(gap) : match.end(gap)] = True
     plain = prose(text)
-    for match in MEASURED.finditer(plain):
-        if not covered[match.start() : match.end()].all():
+    for match in NUMBER.finditer(plain):
+        named = _DIGITS.search(match.group()) or re.match(_WORDS, match.group())
+        start, end = match.span() if named is None else np.add(match.start(), named.span())
+        if not covered[start:end].all():
             line = plain.count("\n", 0, match.start())
             yield f"{page}:{line + 1}: {match.group()!r} in: {text.splitlines()[line].strip()}"
+
+
+def measured_in_specification(page: str, known: Sequence[Statement]) -> Iterator[str]:
+    """Yield the numbers in the texts and comments of a method's or dataset's file.
+
+    A title or source may have numbers, but no measurement. The values of keys are settings.
+    """
+    content = dict(content_of(page))
+    cited = f"{content.pop('title')}. {content.pop('source')}"
+    for statement in known:
+        if statement.page == page:
+            cited = statement.pattern().sub("", cited)
+    comments = re.findall(r"#.*", (ROOT / page).read_text(encoding="utf-8"))
+    found = [(MEASURED, cited), *((NUMBER, text) for text in (*_texts(content), *comments))]
+    for kind, text in found:
+        yield from (f"{page}: {match.group()!r} in: {text}" for match in kind.finditer(text))
+
+
+def _texts(content: Any) -> Iterator[str]:
+    if isinstance(content, dict):
+        content = list(content.values())
+    if isinstance(content, list):
+        for value in content:
+            yield from _texts(value)
+    elif isinstance(content, str):
+        yield content
 
 
 def wrong_numbers(page: str, text: str, known: Sequence[Statement]) -> Iterator[str]:
     """Yield each statement that is not in its page, and each number that the evidence refutes."""
     for statement in known:
-        if statement.page != page:
+        if statement.page not in (page, EVERY_PAGE):
             continue
         matches = list(statement.pattern().finditer(text))
-        if not matches:
+        if not matches and statement.page == page:
             yield f"{page}: does not contain: {statement.text}"
         expected = tuple(map(formatted, statement.values))
         for match in matches:
@@ -165,7 +214,7 @@ def wrong_numbers(page: str, text: str, known: Sequence[Statement]) -> Iterator[
 def with_numbers(page: str, text: str, known: Sequence[Statement]) -> str:
     """Return a page whose sentences have the numbers of the evidence."""
     for statement in known:
-        if statement.page == page and statement.values:
+        if statement.page in (page, EVERY_PAGE) and statement.values:
             numbers = [formatted(value) for value in statement.values]
             text = statement.pattern().sub(partial(_filled, numbers=numbers), text)
     return text

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.report.number_format import DASH, number
+from mor_bench.scene.scene import load_scene
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
 from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of, look_up
@@ -226,6 +227,37 @@ def refinement(source: str) -> str:
     return markdown(headings, body)
 
 
+LAWS = {"saint-venant-kirchhoff": "SVK", "neo-hookean": "neo-Hookean"}
+
+
+def scenes(source: str) -> str:
+    """Show mesh, material and loads of every dataset; SOURCE is the folder of the datasets."""
+    body = []
+    for path in sorted((ROOT / source).glob("*.toml")):
+        spec = content_of(f"{source}/{path.name}")
+        measured = content_of(f"{source}/{path.stem.removesuffix('-observed')}.refine.json")
+        mesh, loads, law = measured["meshes"][0], spec["loads"], spec["material"]
+        element = {"hexahedron": "H8", "tetrahedron": "T4"}[
+            spec.get("discretisation", {}).get("element", "hexahedron")
+        ]
+        patches = loads.get("n_patches") or len(load_scene(path).patch_nodes)
+        samples = loads.get("samples") or patches * loads["samples_per_patch"]
+        low, high = loads["magnitude_n"]
+        size = "×".join(f"{side:g}" for side in spec["geometry"].get("size_m", ()))
+        body.append(
+            [
+                f"`{path.stem}`",
+                f"{size} m, " * bool(size)
+                + f"{mesh['n_cells']:,} {element}, {mesh['n_dofs'] // 3:,} nodes",
+                f"{LAWS[law['law']]}, {law['young_pa']:,g} Pa, ν = {law['poisson']:g}",
+                f"{loads.get('simultaneous', 1)} × {loads['kind']}, {low:g}–{high:g} N",
+                f"{patches} of {loads['patch_area_m2']:g} m²",
+                f"{samples:,}",
+            ]
+        )
+    return markdown(["dataset", "mesh", "material", "loads", "patches", "samples"], body)
+
+
 def _outcomes(source: str) -> list[dict[str, Any]]:
     return [row for row in content_of(source)["rows"] if row["verdict"] != "not applicable"]
 
@@ -304,6 +336,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "optimism": optimism,
     "leaves": leaves,
     "refinement": refinement,
+    "scenes": scenes,
     "hard-cases": hard_cases,
     "hard-loads": hard_loads,
     "evidence": evidence,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -23,7 +24,7 @@ class EvidenceError(MorBenchError):
 
 @cache
 def content_of(name: str, root: Path = ROOT) -> Any:
-    """Read a JSON or TOML file, by its path in the repository.
+    """Read a JSON or TOML file, or the text of another, by its path in the repository.
 
     Raises
     ------
@@ -34,20 +35,24 @@ def content_of(name: str, root: Path = ROOT) -> Any:
     if not path.is_file():
         raise EvidenceError(f"{name}: there is no such file; is the experiment recorded?")
     text = path.read_text(encoding="utf-8")
-    return tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+    read = {".toml": tomllib.loads, ".json": json.loads}.get(path.suffix, str)
+    return read(text)
 
 
 def look_up(content: Any, key: str) -> Any:
     """Follow a key such as ``rows/label=pod [n_modes=20]/error/rel_l2_median``.
 
     A part is a name, the number of an item, or conditions ``name=value`` joined by ``&``. These
-    select the only item of a list that meets them.
+    select the only item of a list that meets them. In a text, the key is a part of it, with ``{}``
+    for the number.
 
     Raises
     ------
     EvidenceError
         If a part of the key leads nowhere, or to several items.
     """
+    if isinstance(content, str):
+        return _number_in(content, key)
     found = content
     for part in key.split("/"):
         if isinstance(found, dict) and part in found:
@@ -67,6 +72,14 @@ def look_up(content: Any, key: str) -> Any:
         else:
             raise EvidenceError(f"{key}: there is no `{part}`.")
     return found
+
+
+def _number_in(text: str, key: str) -> float:
+    pattern = r"\s+".join(map(re.escape, key.split())).replace(r"\{\}", r"(-?[\d._]+(?:e-?\d+)?)")
+    found = {float(number) for number in re.findall(rf"(?<!\w){pattern}(?![\w.])", text)}
+    if len(found) != 1:
+        raise EvidenceError(f"{key}: {len(found)} different numbers in the text.")
+    return found.pop()
 
 
 @cache
