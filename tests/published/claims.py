@@ -54,10 +54,10 @@ _WORDS = (
 )
 
 NUMBER = re.compile(
-    rf"(?<![\w.,])(?:{_NUMBER})(?!\w)|10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+"
+    rf"10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+|(?<![\w.,])(?:{_NUMBER})"
     rf"|\b(?:{_WORDS})(?: \w+)? (?:times|seconds|minutes|hours|per cent|million)\b"
     rf"|\b(?:{_WORDS}) (?:of )?(?:the|all|a) (?:time|error|samples|memory|core|cores)\b"
-    rf"|factor of (?:about )?(?:{_WORDS})"
+    rf"|factor of (?:about )?(?:{_WORDS})|twice as"
 )
 """A number, and words that look like a measurement."""
 
@@ -80,8 +80,7 @@ _NOT_PROSE = (
 )
 
 
-IN_WORDS = {2: "two", 5: "five", 10: "ten", 16: "sixteen", 50: "fifty", 0.75: "three quarters"}
-IN_WORDS |= {0.1: "a tenth", 0.2: "a fifth"}
+IN_WORDS = {2: "two", 3: "three", 5: "five", 10: "ten"}
 
 
 @dataclass(frozen=True)
