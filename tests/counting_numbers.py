@@ -12,7 +12,7 @@ import numpy as np
 
 
 class Counted:
-    """A number that counts its multiplications, divisions, powers, roots and logarithms."""
+    """A number that counts its products, quotients, powers, roots, logarithms, exponentials."""
 
     total = 0
 
@@ -77,6 +77,9 @@ class Counted:
     def __gt__(self, other: Any) -> bool:
         return self.value > float(other)
 
+    def __ge__(self, other: Any) -> bool:
+        return self.value >= float(other)
+
     def sqrt(self) -> Counted:
         return self._times(math.sqrt(self.value))
 
@@ -89,17 +92,9 @@ class CountingNumpy:
     """The part of numpy that the kernels use, with arrays of `Counted`."""
 
     inf = math.inf
-    array, outer, sqrt = staticmethod(np.array), staticmethod(np.outer), staticmethod(np.sqrt)
-
-    class linalg:  # noqa: N801
-        @staticmethod
-        def eigh(matrix: Any) -> tuple[np.ndarray, np.ndarray]:
-            values, vectors = np.linalg.eigh(matrix.astype(float))
-            return counted_array(values), counted_array(vectors)
-
+    array, uint64 = staticmethod(np.array), int
     zeros = empty = staticmethod(lambda shape: counted_array(np.zeros(shape)))
     full = staticmethod(lambda shape, value: counted_array(np.full(shape, value)))
-    eye = staticmethod(lambda n: counted_array(np.eye(n)))
 
 
 def interpreted(module: Any) -> dict[str, Any]:
@@ -114,8 +109,11 @@ def interpreted(module: Any) -> dict[str, Any]:
     names = {
         "np": CountingNumpy,
         "njit": njit,
+        "cache": lambda function: function,
+        "intrinsic": lambda function: function,
         "sqrt": Counted.sqrt,
-        "log": lambda x: x._times(math.log(x.value)),
     }
     exec(compile(source, module.__file__, "exec"), names)
+    names["_log"] = lambda x: x._times(math.log(x.value))
+    names["_exp"] = lambda x: x._times(math.exp(x.value))
     return names

@@ -168,20 +168,20 @@ class Assembler:
         self.extent_m = float(np.ptp(body.points, axis=0).max())
         self.material = material
         self._n_values = len(self.pattern.indices) + 1
-        self._vectorised = isinstance(material, SaintVenantKirchhoff) and n_nodes == H8.n_nodes
-        if self._vectorised:
-            self._gradients = _batched(
-                quadrature.gradients.reshape(n_cells, n_points, 24), 0.0
-            ).reshape(-1, n_points, 24 * LANES)
+        self._gradients = _batched(
+            quadrature.gradients.reshape(n_cells, n_points, 3 * n_nodes), 0.0
+        ).reshape(-1, n_points, 3 * n_nodes * LANES)
+        self._dofs = _batched(dofs.astype(np.int32), n_dofs)
+        self._slots = _batched(slots, len(self.pattern.indices))
+        self._has_own_kernel = isinstance(material, SaintVenantKirchhoff) and n_nodes == H8.n_nodes
+        if self._has_own_kernel:
             self._w_lam = _batched(weights * quadrature.parameters[:, 0], 0.0)
             self._w_mu = _batched(weights * quadrature.parameters[:, 1], 0.0)
-            self._dofs = _batched(dofs.astype(np.int32), n_dofs)
-            self._slots = _batched(slots, len(self.pattern.indices))
             per_point = FORCE_MULTIPLY_ADDS, FORCE_MULTIPLY_ADDS + TANGENT_MULTIPLY_ADDS
         else:
-            self._gradients, self._weights = quadrature.gradients, weights
-            self._parameters = quadrature.parameters
-            self._dofs, self._slots = dofs.astype(np.int32), slots
+            self._kernel = general_force(material.law, n_nodes)
+            self._weights = _batched(weights, 0.0)
+            self._parameters = np.repeat(quadrature.parameters, LANES, axis=1)
             per_point = general_multiply_adds(material.law, quadrature.parameters.shape[1], n_nodes)
         self._multiply_adds = n_cells * n_points * per_point[0], n_cells * n_points * per_point[1]
 
@@ -194,11 +194,9 @@ class Assembler:
             count(element_evaluations=self.n_cells, multiply_adds=work)
         gradients = self._gradients
         out: tuple[float, float]
-        if not self._vectorised:
-            law, parameters, weights = self.material.law, self._parameters, self._weights
-            out = general_force(
-                u, dofs, gradients, weights, law, parameters, self._slots, force, values
-            )
+        if not self._has_own_kernel:
+            tangent = (self._slots, force, values) if len(values) else (None, force, None)
+            out = self._kernel(u, dofs, gradients, self._weights, self._parameters, *tangent)
         elif len(values) == 0:
             out = internal_force(u, dofs, gradients, self._w_lam, self._w_mu, force)
         else:
@@ -224,7 +222,7 @@ class Assembler:
         force = np.zeros(local.size + 1)
         self._sum(np.append(np.append(u, 0.0)[self._dofs].ravel(), 0.0), local, force, np.zeros(0))
         own = force[:-1].reshape(self._dofs.shape)
-        return np.moveaxis(own, 2, 1).reshape(-1, 24)[: self.n_cells] if self._vectorised else own
+        return np.moveaxis(own, 2, 1).reshape(-1, self._dofs.shape[1])[: self.n_cells]
 
     def relax(
         self, u: Array, load: Array, mass: Array, control: Array, n_steps: int
@@ -235,7 +233,7 @@ class Assembler:
         """
         padded, v, before = np.append(u, 0.0), np.zeros(self.n_dofs), np.zeros(self.n_dofs)
         done, status, min_det = 0, RUNNING, np.inf
-        if self._vectorised:
+        if self._has_own_kernel:
             cells = self._dofs, self._gradients, self._w_lam, self._w_mu
             done, status, min_det = relax(padded, v, before, load, mass, control, n_steps, *cells)
             count(

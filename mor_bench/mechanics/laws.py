@@ -1,14 +1,21 @@
 """Hyperelastic laws at a quadrature point, and kernels that sum them over cells of any element.
 
-A law is one function ``law(C, parameters, S, D) -> W``. Its input is the right Cauchy-Green
-tensor C (3, 3) and the law's parameters. It writes S = 2 dW/dC (3, 3) and D = dS/dE (6, 6), and
-returns the energy density W. S and D are zero on entry. D has the Voigt order 00 11 22 01 02 12
-with engineering shear strains. To add a law, write the function, give it a number in `evaluate`,
-and write a parameter class in `mor_bench.scene.materials`.
+Layout: as in `mor_bench.mechanics.kernels`, every array ends in ``LANES`` elements or points, and
+component ``i`` of lane ``l`` is at ``i * LANES + l``. A kernel takes each batch through stages:
+gradient H = du/dX, strain, law, stress P, forces and blocks. Each stage is a loop over the lanes
+that LLVM vectorises. The factories `general_force` and `point_stresses` compile the kernels of one
+law and one element; a scene compiles only its own.
 
-`general_force` takes one cell after the other: K_ab = w [ B_aᵀ D B_b + (g_a · S g_b) I ], with B_a
-the strain-displacement matrix at F (Bonet & Wood, section 9.4). Saint Venant-Kirchhoff on H8 has
-its own, vectorised kernel.
+A law is one function ``law(E, p, S, D)`` on a batch. Its input is the Green-Lagrange strain E (6
+components, then J = det F > 0) and the law's parameters p. It writes S = dW/dE (6 components, then
+the energy density W) and D = dS/dE (21, the upper triangle row by row). D is None if only forces
+are asked for. The order of the 6 components is 00 11 22 01 02 12, with engineering shear strains
+in D. LLVM vectorises a loop only if it uses few arrays, so those belong together. To add a law,
+write the function, give it a number, call it in the two kernels, and write a parameter class in
+`mor_bench.scene.materials`.
+
+Tangent block of nodes a and b: K_ab = w g_a · A · g_b, with A = dP/dF. Saint Venant-Kirchhoff on
+H8 has a kernel of its own, which uses the structure of that law.
 
 Longer than 400 lines because numba recompiles a function only after a change in its own file. Laws
 and the kernels that call them hence stay together.
@@ -16,227 +23,707 @@ and the kernels that call them hence stay together.
 
 from __future__ import annotations
 
-from math import log, sqrt
+from functools import cache
+from math import sqrt
 
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import float64, njit, uint64
+from numba.extending import intrinsic
 
 SAINT_VENANT_KIRCHHOFF, NEO_HOOKEAN, MOONEY_RIVLIN, OGDEN = range(4)
 
-_LAW_MULTIPLY_ADDS = {
-    SAINT_VENANT_KIRCHHOFF: 55,
-    NEO_HOOKEAN: 340,
-    MOONEY_RIVLIN: 1563,
-    OGDEN: 3313 + 122,
-}
-"""Multiply-adds per point for stress and tangent; Ogden's eigenvectors count as 9/2 n³ = 122."""
+LANES = 32
+"""Elements or points per batch."""
 
-_OGDEN_TERM_MULTIPLY_ADDS = 44
+SWEEPS = 6
+"""Largest number of Jacobi sweeps; 3 x 3 matrices need at most 5 for all digits."""
 
-_I = np.array([0, 1, 2, 0, 0, 1])
-_J = np.array([0, 1, 2, 1, 2, 2])
-_VOIGT = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
+VECTORS, SQUARES, LOGS, BETA, SLOPES, GAMMA = (k * LANES for k in (6, 15, 18, 21, 24, 27))
+"""Places of the principal values of `_ogden` in its work array."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _inverse(C, out):
-    """Write the inverse of a symmetric (3, 3) matrix to ``out``; return the determinant."""
-    out[0, 0] = C[1, 1] * C[2, 2] - C[1, 2] * C[1, 2]
-    out[0, 1] = out[1, 0] = C[0, 2] * C[1, 2] - C[0, 1] * C[2, 2]
-    out[0, 2] = out[2, 0] = C[0, 1] * C[1, 2] - C[0, 2] * C[1, 1]
-    out[1, 1] = C[0, 0] * C[2, 2] - C[0, 2] * C[0, 2]
-    out[1, 2] = out[2, 1] = C[0, 1] * C[0, 2] - C[0, 0] * C[1, 2]
-    out[2, 2] = C[0, 0] * C[1, 1] - C[0, 1] * C[0, 1]
-    det = C[0, 0] * out[0, 0] + C[0, 1] * out[0, 1] + C[0, 2] * out[0, 2]
-    out /= det
-    return det
+@intrinsic
+def _bits(typing_context, x):
+    """Return the bits of a float64 as uint64."""
+    return uint64(float64), lambda _, builder, __, given: builder.bitcast(given[0], ir.IntType(64))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_dyad(D, factor, A, B):
-    """Add factor (A ⊗ B + B ⊗ A) / 2 to D, for symmetric A and B."""
-    for m in range(6):
-        for n in range(6):
-            both = A[_I[m], _J[m]] * B[_I[n], _J[n]] + B[_I[m], _J[m]] * A[_I[n], _J[n]]
-            D[m, n] += 0.5 * factor * both
+@intrinsic
+def _from_bits(typing_context, bits):
+    """Return the float64 with the given bits."""
+    return float64(uint64), lambda _, builder, __, given: builder.bitcast(given[0], ir.DoubleType())
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_product(D, factor, A):
-    """Add factor A ⊙ A to D, with (A ⊙ A)_ijkl = (A_ik A_jl + A_il A_jk) / 2.
+_ROOT_HALF, _BIAS = np.uint64(0x3FE6A09E667F3BCD), np.uint64(1023)
+_MANTISSA, _INTEGER = np.uint64(52), np.uint64(0x4330000000000000)
 
-    For A = C⁻¹ the product is minus the derivative of C⁻¹ by C.
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _log(x):
+    """Return ln x for a normal x > 0, below 1 ulp (fdlibm); LLVM vectorises it, unlike libm's."""
+    bits = _bits(x)  # type: ignore[call-arg, var-annotated]
+    biased = (bits - _ROOT_HALF + (_BIAS << _MANTISSA)) >> _MANTISSA
+    exponent = _from_bits(biased | _INTEGER) - (4503599627370496.0 + 1023.0)
+    f = _from_bits(bits - ((biased - _BIAS) << _MANTISSA)) - 1.0
+    s = f / (2.0 + f)
+    z = s * s
+    r = 0.1531383769920937332 + z * 0.1479819860511658591
+    r = 0.2222219843214978396 + z * (0.1818357216161805012 + z * r)
+    r = z * (
+        0.6666666666666735130 + z * (0.3999999999940941908 + z * (0.2857142874366239149 + z * r))
+    )
+    half = 0.5 * f * f
+    low = s * (half + r) + exponent * 1.90821492927058770002e-10
+    return exponent * 0.693147180369123816490 - ((half - low) - f)
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _exp(x):
+    """Return eˣ below 1 ulp (fdlibm); beyond |x| = 700 return the value there."""
+    x = min(max(x, -700.0), 700.0)
+    shifted = x * 1.44269504088896338700 + 6755399441055744.0
+    n = shifted - 6755399441055744.0
+    high, low = x - n * 0.693147180369123816490, n * 1.90821492927058770002e-10
+    r = high - low
+    t = r * r
+    c = -2.77777777770155933842e-03 + t * (
+        6.61375632143793436117e-05
+        + t * (-1.65339022054652515390e-06 + t * 4.13813679705723846039e-08)
+    )
+    c = r - t * (0.166666666666666019037 + t * c)
+    y = 1.0 - ((low - (r * c) / (2.0 - c)) - high)
+    bits = _bits(y) + (_bits(shifted) << _MANTISSA)  # type: ignore[call-arg]
+    return _from_bits(bits)
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _inverse(E, l):
+    """Return the six components of C⁻¹ = (I + 2E)⁻¹, with det C = J²."""
+    a, b, c = 1.0 + 2.0 * E[l], 1.0 + 2.0 * E[LANES + l], 1.0 + 2.0 * E[2 * LANES + l]
+    d, e, f = 2.0 * E[3 * LANES + l], 2.0 * E[4 * LANES + l], 2.0 * E[5 * LANES + l]
+    k = 1.0 / (E[6 * LANES + l] * E[6 * LANES + l])
+    return (
+        k * (b * c - f * f),
+        k * (a * c - e * e),
+        k * (a * b - d * d),
+        k * (e * f - d * c),
+        k * (d * f - e * b),
+        k * (d * e - a * f),
+    )
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _write(D, l, y, i, q):
+    """Write D = (y ⊗ i + i ⊗ y) / 2 + 2q i ⊙ i, for symmetric tensors y and i of 6 components.
+
+    (i ⊙ i)_klmn = (i_km i_ln + i_kn i_lm) / 2; for i = C⁻¹ it is minus the derivative of C⁻¹ by C.
     """
-    for m in range(6):
-        i, j = _I[m], _J[m]
-        for n in range(6):
-            k, q = _I[n], _J[n]
-            D[m, n] += 0.5 * factor * (A[i, k] * A[j, q] + A[i, q] * A[j, k])
+    a, b, c, d, e, f = i
+    p0, p1, p2, p3, p4, p5 = 0.5 * a, 0.5 * b, 0.5 * c, 0.5 * d, 0.5 * e, 0.5 * f
+    y0, y1, y2, y3, y4, y5 = y
+    r = 2.0 * q
+    ra, rb, rc, rd, re, rf = r * a, r * b, r * c, r * d, r * e, r * f
+    qa, qb, qd, qe = q * a, q * b, q * d, q * e
+    D[l] = y0 * a + ra * a
+    D[LANES + l] = y0 * p1 + p0 * y1 + rd * d
+    D[2 * LANES + l] = y0 * p2 + p0 * y2 + re * e
+    D[3 * LANES + l] = y0 * p3 + p0 * y3 + ra * d
+    D[4 * LANES + l] = y0 * p4 + p0 * y4 + ra * e
+    D[5 * LANES + l] = y0 * p5 + p0 * y5 + rd * e
+    D[6 * LANES + l] = y1 * b + rb * b
+    D[7 * LANES + l] = y1 * p2 + p1 * y2 + rf * f
+    D[8 * LANES + l] = y1 * p3 + p1 * y3 + rd * b
+    D[9 * LANES + l] = y1 * p4 + p1 * y4 + rd * f
+    D[10 * LANES + l] = y1 * p5 + p1 * y5 + rb * f
+    D[11 * LANES + l] = y2 * c + rc * c
+    D[12 * LANES + l] = y2 * p3 + p2 * y3 + re * f
+    D[13 * LANES + l] = y2 * p4 + p2 * y4 + re * c
+    D[14 * LANES + l] = y2 * p5 + p2 * y5 + rf * c
+    D[15 * LANES + l] = y3 * d + qa * b + qd * d
+    D[16 * LANES + l] = y3 * p4 + p3 * y4 + qa * f + qd * e
+    D[17 * LANES + l] = y3 * p5 + p3 * y5 + qd * f + qe * b
+    D[18 * LANES + l] = y4 * e + qa * c + qe * e
+    D[19 * LANES + l] = y4 * p5 + p4 * y5 + qd * c + qe * f
+    D[20 * LANES + l] = y5 * f + qb * c + q * f * f
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _saint_venant_kirchhoff(C, p, S, D):
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _saint_venant_kirchhoff(E, p, S, D):
     """Saint Venant-Kirchhoff, W = λ/2 tr(E)² + μ tr(E²); p = (λ, μ)."""
-    lam, mu = p[0], p[1]
-    trace = 0.5 * (C[0, 0] + C[1, 1] + C[2, 2] - 3.0)
-    W = 0.5 * lam * trace * trace
-    for i in range(3):
-        for j in range(3):
-            e = 0.5 * (C[i, j] - (1.0 if i == j else 0.0))
-            W += mu * e * e
-            S[i, j] = 2.0 * mu * e
-        S[i, i] += lam * trace
-        for j in range(3):
-            D[i, j] = lam
-        D[i, i] += 2.0 * mu
-        D[3 + i, 3 + i] = mu
-    return W
+    L = LANES
+    for l in range(LANES):
+        lam, mu = p[l], p[L + l]
+        e00, e11, e22, e01, e02, e12 = (
+            E[l],
+            E[L + l],
+            E[2 * L + l],
+            E[3 * L + l],
+            E[4 * L + l],
+            E[5 * L + l],
+        )
+        pressure, twice = lam * (e00 + e11 + e22), 2.0 * mu
+        s00, s11, s22 = pressure + twice * e00, pressure + twice * e11, pressure + twice * e22
+        s01, s02, s12 = twice * e01, twice * e02, twice * e12
+        S[l], S[L + l], S[2 * L + l] = s00, s11, s22
+        S[3 * L + l], S[4 * L + l], S[5 * L + l] = s01, s02, s12
+        S[6 * L + l] = 0.5 * (s00 * e00 + s11 * e11 + s22 * e22) + s01 * e01 + s02 * e02 + s12 * e12
+    if D is not None:
+        D[:] = 0.0
+        for l in range(LANES):
+            lam, mu = p[l], p[L + l]
+            D[L + l], D[2 * L + l], D[7 * L + l] = lam, lam, lam
+            normal = lam + 2.0 * mu
+            D[l], D[6 * L + l], D[11 * L + l] = normal, normal, normal
+            D[15 * L + l], D[18 * L + l], D[20 * L + l] = mu, mu, mu
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _neo_hookean(C, p, S, D):
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _neo_hookean(E, p, S, D):
     """Neo-Hooke, W = μ/2 (tr C - 3) - μ ln J + λ/2 (ln J)²; p = (λ, μ).
 
     Bonet & Wood, section 6.4.3.
     """
-    lam, mu = p[0], p[1]
-    inverse = np.empty((3, 3))
-    log_j = 0.5 * log(_inverse(C, inverse))
-    for i in range(3):
-        for j in range(3):
-            S[i, j] = (lam * log_j - mu) * inverse[i, j]
-        S[i, i] += mu
-    _add_dyad(D, lam, inverse, inverse)
-    _add_product(D, 2.0 * (mu - lam * log_j), inverse)
-    return 0.5 * mu * (C[0, 0] + C[1, 1] + C[2, 2] - 3.0) - mu * log_j + 0.5 * lam * log_j * log_j
+    L = LANES
+    for l in range(LANES):
+        lam, mu, J = p[l], p[L + l], E[6 * L + l]
+        inverse = _inverse(E, l)
+        i0, i1, i2, i3, i4, i5 = inverse
+        log_j = _log(J)
+        s = lam * log_j - mu
+        S[l], S[L + l], S[2 * L + l] = mu + s * i0, mu + s * i1, mu + s * i2
+        S[3 * L + l], S[4 * L + l], S[5 * L + l] = s * i3, s * i4, s * i5
+        trace = E[l] + E[L + l] + E[2 * L + l]
+        S[6 * L + l] = mu * trace + (0.5 * lam * log_j - mu) * log_j
+        if D is not None:
+            y = lam * i0, lam * i1, lam * i2, lam * i3, lam * i4, lam * i5
+            _write(D, l, y, inverse, -s)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_volumetric(J, inverse, bulk, S, D):
-    """Add stress and tangent of U = κ/2 (J - 1)²; return its energy."""
-    d_u = bulk * (J - 1.0)
-    S += (J * d_u) * inverse
-    _add_dyad(D, J * (d_u + J * bulk), inverse, inverse)
-    _add_product(D, -2.0 * J * d_u, inverse)
-    return 0.5 * bulk * (J - 1.0) ** 2
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _mooney_rivlin(C, p, S, D):
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _mooney_rivlin(E, p, S, D):
     """Mooney-Rivlin, W = c10 (J^(-2/3) I₁ - 3) + c01 (J^(-4/3) I₂ - 3) + κ/2 (J - 1)².
 
     p = (c10, c01, κ). Holzapfel, section 6.5.
     """
-    c10, c01, bulk = p[0], p[1], p[2]
-    inverse, identity = np.empty((3, 3)), np.eye(3)
-    J = sqrt(_inverse(C, inverse))
-    first = C[0, 0] + C[1, 1] + C[2, 2]
-    second = 0.5 * (first * first - (C * C).sum())
-    a, b = c10 * J ** (-2.0 / 3.0), c01 * J ** (-4.0 / 3.0)
-    d_second = first * identity - C
-    S += 2.0 * a * (identity - first / 3.0 * inverse) + 2.0 * b * (
-        d_second - 2.0 / 3.0 * second * inverse
-    )
-    # dS/dE = 2 dS/dC, term by term.
-    _add_dyad(D, -8.0 / 3.0 * a, identity, inverse)
-    _add_dyad(D, 4.0 / 9.0 * a * first, inverse, inverse)
-    _add_product(D, 4.0 / 3.0 * a * first, inverse)
-    _add_dyad(D, -16.0 / 3.0 * b, d_second, inverse)
-    _add_dyad(D, 16.0 / 9.0 * b * second, inverse, inverse)
-    _add_product(D, 8.0 / 3.0 * b * second, inverse)
-    _add_dyad(D, 4.0 * b, identity, identity)
-    _add_product(D, -4.0 * b, identity)
-    return a * first - 3.0 * c10 + b * second - 3.0 * c01 + _add_volumetric(J, inverse, bulk, S, D)
+    L = LANES
+    for l in range(LANES):
+        c10, c01, bulk = p[l], p[L + l], p[2 * L + l]
+        e00, e11, e22, e01, e02, e12 = (
+            E[l],
+            E[L + l],
+            E[2 * L + l],
+            E[3 * L + l],
+            E[4 * L + l],
+            E[5 * L + l],
+        )
+        J, inverse = E[6 * L + l], _inverse(E, l)
+        i0, i1, i2, i3, i4, i5 = inverse
+        root = _exp(-2.0 / 3.0 * _log(J))
+        a, b, d_u = 2.0 * c10 * root, 2.0 * c01 * root * root, bulk * (J - 1.0)
+        c00, c11, c22 = 1.0 + 2.0 * e00, 1.0 + 2.0 * e11, 1.0 + 2.0 * e22
+        first, shears = c00 + c11 + c22, e01 * e01 + e02 * e02 + e12 * e12
+        second = c00 * c11 + c11 * c22 + c22 * c00 - 4.0 * shears
+        # d = dI₂/dC = I₁ I - C.
+        d0, d1, d2 = c11 + c22, c22 + c00, c00 + c11
+        d3, d4, d5 = -2.0 * e01, -2.0 * e02, -2.0 * e12
+        third_a, third_b = a * first / 3.0, b * second / 1.5
+        s = J * d_u - third_a - third_b
+        S[l], S[L + l], S[2 * L + l] = a + b * d0 + s * i0, a + b * d1 + s * i1, a + b * d2 + s * i2
+        S[3 * L + l], S[4 * L + l], S[5 * L + l] = b * d3 + s * i3, b * d4 + s * i4, b * d5 + s * i5
+        energy = 0.5 * (a * first + b * second) - 3.0 * (c10 + c01)
+        S[6 * L + l] = energy + 0.5 * d_u * (J - 1.0)
+        if D is not None:
+            # dS/dE = 2 dS/dC; terms with C⁻¹ first.
+            x, v = -4.0 / 3.0 * a, -8.0 / 3.0 * b
+            t = J * (d_u + J * bulk) + (third_a + 2.0 * third_b) / 1.5
+            y = (
+                x + v * d0 + t * i0,
+                x + v * d1 + t * i1,
+                x + v * d2 + t * i2,
+                v * d3 + t * i3,
+                v * d4 + t * i4,
+                v * d5 + t * i5,
+            )
+            _write(D, l, y, inverse, -s)
+            # 2b (I ⊗ I - I ⊙ I).
+            D[L + l] += 2.0 * b
+            D[2 * L + l] += 2.0 * b
+            D[7 * L + l] += 2.0 * b
+            D[15 * L + l] -= b
+            D[18 * L + l] -= b
+            D[20 * L + l] -= b
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_shear(D, factor, a, b):
-    """Add factor/2 (a ⊗ b + b ⊗ a) ⊗ (a ⊗ b + b ⊗ a) to D, for vectors a and b."""
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _sweep(A, V):
+    """Rotate A (6, symmetric) by one cyclic Jacobi sweep, and the columns of V (9) with it."""
+    L = LANES
+    for axis in range(3):  # rotate the plane p, q; the third axis is r
+        p, q, r = axis // 2, min(axis + 1, 2), 2 - axis
+        pq, rp, rq = 3 + axis, (2 + p + r) * L, (2 + q + r) * L
+        for l in range(LANES):
+            app, aqq, apq = A[p * L + l], A[q * L + l], A[pq * L + l]
+            d = aqq - app
+            root = sqrt(d * d + 4.0 * apq * apq) + 1e-300
+            t = 2.0 * apq / (d - root if d < 0.0 else d + root)
+            c = 1.0 / sqrt(1.0 + t * t)
+            s = t * c
+            A[p * L + l], A[q * L + l], A[pq * L + l] = app - t * apq, aqq + t * apq, 0.0
+            arp, arq = A[rp + l], A[rq + l]
+            A[rp + l], A[rq + l] = c * arp - s * arq, s * arp + c * arq
+            v0, v1, v2 = V[p * L + l], V[(3 + p) * L + l], V[(6 + p) * L + l]
+            w0, w1, w2 = V[q * L + l], V[(3 + q) * L + l], V[(6 + q) * L + l]
+            V[p * L + l], V[q * L + l] = c * v0 - s * w0, s * v0 + c * w0
+            V[(3 + p) * L + l], V[(3 + q) * L + l] = c * v1 - s * w1, s * v1 + c * w1
+            V[(6 + p) * L + l], V[(6 + q) * L + l] = c * v2 - s * w2, s * v2 + c * w2
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
+def _is_diagonal(A):
+    """Return whether no entry off the diagonals matters beside C = I + 2A."""
+    off = 0.0
+    for l in range(3 * LANES, 6 * LANES):
+        off += A[l] * A[l]
+    return off < 1e-34
+
+
+@njit(error_model="numpy")
+def _diagonalise(A, V):
+    """Write eigenvalues and eigenvectors of A (6): the diagonal of A, and the columns of V (9).
+
+    Jacobi rotations keep all digits where eigenvalues are equal, unlike the closed form.
+    """
+    V[:] = 0.0
+    V[:LANES] = 1.0
+    V[4 * LANES : 5 * LANES] = 1.0
+    V[8 * LANES :] = 1.0
+    for _ in range(SWEEPS):
+        if _is_diagonal(A):
+            break
+        _sweep(A, V)
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _series(t):
+    """Return sinh(√t)/√t for 0 <= t <= 1/4."""
+    series = 1.0 + t * (1.0 / 110.0) * (1.0 + t * (1.0 / 156.0))
+    series = 1.0 + t * (1.0 / 42.0) * (1.0 + t * (1.0 / 72.0) * series)
+    return 1.0 + t * (1.0 / 6.0) * (1.0 + t * (1.0 / 20.0) * series)
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _slope(p_a, p_b, v_a, v_b, half, z):
+    """Return (p_a - p_b) / (v_a - v_b) with p = vᵏ, k = ``half``, z = ln(v_a / v_b) / 2.
+
+    p_a - p_b = 2 sqrt(p_a p_b) sinh(kz), with the series of sinh(t)/t for small t. Then z cancels.
+    """
+    t, y = half * half * z * z, z * z
+    rise = 2.0 * half * sqrt(p_a * p_b) * _series(min(t, 0.25))
+    run = 2.0 * sqrt(v_a * v_b) * _series(min(y, 0.25))
+    unit = z if max(t, y) >= 0.25 else 1.0
+    rise *= unit
+    run *= unit
+    return (rise if t < 0.25 else p_a - p_b) / (run if y < 0.25 else v_a - v_b)
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _add_term(work, mu, alpha, S, D):
+    """Add a term of Ogden's law to the energy and to the principal values of `_ogden`."""
+    L = LANES
+    for l in range(LANES):
+        x0, x1, x2, m, a = (
+            work[LOGS + l],
+            work[LOGS + L + l],
+            work[LOGS + 2 * L + l],
+            mu[l],
+            alpha[l],
+        )
+        middle, half = (x0 + x1 + x2) / 3.0, 0.5 * a
+        p0 = _exp(half * (x0 - middle))
+        p1 = _exp(half * (x1 - middle))
+        p2 = _exp(half * (x2 - middle))
+        mean = (p0 + p1 + p2) / 3.0
+        S[6 * L + l] += 3.0 * (m / a) * (mean - 1.0)
+        work[BETA + l] += m * (p0 - mean)
+        work[BETA + L + l] += m * (p1 - mean)
+        work[BETA + 2 * L + l] += m * (p2 - mean)
+        if D is not None:
+            f = m * a / 3.0
+            work[GAMMA + l] += f * (mean + p0)
+            work[GAMMA + L + l] += f * (mean + p1)
+            work[GAMMA + 2 * L + l] += f * (mean + p2)
+            work[GAMMA + 3 * L + l] += f * (mean - p0 - p1)
+            work[GAMMA + 4 * L + l] += f * (mean - p0 - p2)
+            work[GAMMA + 5 * L + l] += f * (mean - p1 - p2)
+            v0, v1, v2 = work[SQUARES + l], work[SQUARES + L + l], work[SQUARES + 2 * L + l]
+            z01, z02, z12 = 0.5 * (x0 - x1), 0.5 * (x0 - x2), 0.5 * (x1 - x2)
+            work[SLOPES + l] += m * _slope(p0, p1, v0, v1, half, z01)
+            work[SLOPES + L + l] += m * _slope(p0, p2, v0, v2, half, z02)
+            work[SLOPES + 2 * L + l] += m * _slope(p1, p2, v1, v2, half, z12)
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _add_volumetric(work, E, bulk, S, D):
+    """Add U = κ/2 (J - 1)² to the energy and to the principal values of `_ogden`."""
+    L = LANES
+    for l in range(LANES):
+        J = E[6 * L + l]
+        d_u = bulk[l] * (J - 1.0)
+        S[6 * L + l] += 0.5 * d_u * (J - 1.0)
+        stress = J * d_u
+        work[BETA + l] += stress
+        work[BETA + L + l] += stress
+        work[BETA + 2 * L + l] += stress
+        if D is not None:
+            slope = J * (d_u + J * bulk[l])
+            work[GAMMA + l] += slope
+            work[GAMMA + L + l] += slope
+            work[GAMMA + 2 * L + l] += slope
+            work[GAMMA + 3 * L + l] += slope
+            work[GAMMA + 4 * L + l] += slope
+            work[GAMMA + 5 * L + l] += slope
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _principal_tangent(work, D):
+    """Write D = Σ_ab n_ab N_a ⊗ N_b + Σ_a<b s_ab M_ab ⊗ M_ab; Holzapfel, section 6.6.
+
+    N_a = a ⊗ a, M_ab = a ⊗ b + b ⊗ a, n_ab = (γ_ab - 2 β_a δ_ab) / (v_a v_b) and
+    s_ab = (S_a - S_b) / (v_a - v_b). Overwrites the principal values.
+    """
+    L = LANES
+    V, v, beta = work[VECTORS:SQUARES], work[SQUARES:LOGS], work[BETA:SLOPES]
+    slopes, gamma = work[SLOPES:GAMMA], work[GAMMA:]
+    for l in range(LANES):
+        r0, r1, r2 = 1.0 / v[l], 1.0 / v[L + l], 1.0 / v[2 * L + l]
+        b0, b1, b2 = beta[l], beta[L + l], beta[2 * L + l]
+        s01 = slopes[l] * (v[l] + v[L + l]) - b0 - b1
+        s02 = slopes[L + l] * (v[l] + v[2 * L + l]) - b0 - b2
+        s12 = slopes[2 * L + l] * (v[L + l] + v[2 * L + l]) - b1 - b2
+        slopes[l], slopes[L + l] = 0.5 * s01 * r0 * r1, 0.5 * s02 * r0 * r2
+        slopes[2 * L + l] = 0.5 * s12 * r1 * r2
+        gamma[l] = (gamma[l] - 2.0 * b0) * r0 * r0
+        gamma[L + l] = (gamma[L + l] - 2.0 * b1) * r1 * r1
+        gamma[2 * L + l] = (gamma[2 * L + l] - 2.0 * b2) * r2 * r2
+        gamma[3 * L + l] *= r0 * r1
+        gamma[4 * L + l] *= r0 * r2
+        gamma[5 * L + l] *= r1 * r2
+    pairs = np.empty(72 * L)
     for m in range(6):
-        i, j = _I[m], _J[m]
-        for n in range(6):
-            k, q = _I[n], _J[n]
-            D[m, n] += factor * 0.5 * (a[i] * b[j] + a[j] * b[i]) * (a[k] * b[q] + a[q] * b[k])
+        i, j, pair = V[3 * _I[m] * L :], V[3 * _J[m] * L :], pairs[12 * m * L :]
+        for l in range(LANES):
+            n0, n1, n2 = i[l] * j[l], i[L + l] * j[L + l], i[2 * L + l] * j[2 * L + l]
+            m0 = i[l] * j[L + l] + i[L + l] * j[l]
+            m1 = i[l] * j[2 * L + l] + i[2 * L + l] * j[l]
+            m2 = i[L + l] * j[2 * L + l] + i[2 * L + l] * j[L + l]
+            g01, g02, g12 = gamma[3 * L + l], gamma[4 * L + l], gamma[5 * L + l]
+            pair[l], pair[L + l], pair[2 * L + l] = n0, n1, n2
+            pair[3 * L + l], pair[4 * L + l], pair[5 * L + l] = m0, m1, m2
+            pair[6 * L + l] = gamma[l] * n0 + g01 * n1 + g02 * n2
+            pair[7 * L + l] = g01 * n0 + gamma[L + l] * n1 + g12 * n2
+            pair[8 * L + l] = g02 * n0 + g12 * n1 + gamma[2 * L + l] * n2
+            pair[9 * L + l] = slopes[l] * m0
+            pair[10 * L + l] = slopes[L + l] * m1
+            pair[11 * L + l] = slopes[2 * L + l] * m2
+    c = 0
+    for m in range(6):
+        for n in range(m, 6):
+            x, y, out = pairs[12 * m * L :], pairs[(12 * n + 6) * L :], D[c * L :]
+            for l in range(LANES):
+                normal = x[l] * y[l] + x[L + l] * y[L + l] + x[2 * L + l] * y[2 * L + l]
+                shear = x[3 * L + l] * y[3 * L + l] + x[4 * L + l] * y[4 * L + l]
+                out[l] = normal + (shear + x[5 * L + l] * y[5 * L + l])
+            c += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _ogden(C, p, S, D):
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _ogden(E, p, S, D):
     """Ogden, W = Σ μ_p/α_p (λ̄₁^α_p + λ̄₂^α_p + λ̄₃^α_p - 3) + κ/2 (J - 1)².
 
-    λ̄ = J^(-1/3) λ; p = (κ, μ₁, α₁, μ₂, α₂, …). Principal form with the limit of equal stretches:
-    Holzapfel, sections 6.5 and 6.6.
+    λ̄ = J^(-1/3) λ; p = (κ, μ₁, α₁, μ₂, α₂, …). Holzapfel, sections 6.5 and 6.6. Principal values
+    in ``work``: eigenvectors of C, squared stretches v_a and their logarithms, β_a = v_a S_a, and
+    for the tangent (β_a - β_b) / (v_a - v_b) and γ_ab = dβ_a/dlnλ_b.
     """
-    values, vectors = np.linalg.eigh(C)
-    inverse = np.empty((3, 3))
-    J = sqrt(_inverse(C, inverse))
-    stretch = np.sqrt(values)
-    energy = 0.0
-    beta, gamma = np.zeros(3), np.zeros((3, 3))
-    for term in range(1, len(p), 2):
-        mu, alpha = p[term], p[term + 1]
-        powers = (stretch * J ** (-1.0 / 3.0)) ** alpha
-        mean = powers.sum() / 3.0
-        energy += mu / alpha * (3.0 * mean - 3.0)
-        for a in range(3):
-            beta[a] += mu * (powers[a] - mean)
-            for b in range(3):
-                own = powers[a] * 3.0 if a == b else 0.0
-                gamma[a, b] += mu * alpha / 3.0 * (own - powers[a] - powers[b] + mean)
-    # S_a = β_a / λ_a²; dS_a/dlnλ_b gives the normal block, differences of S the shear block.
-    principal = beta / values
-    for a in range(3):
-        Na = np.outer(vectors[:, a], vectors[:, a])
-        S += principal[a] * Na
-        for b in range(3):
-            Nb = np.outer(vectors[:, b], vectors[:, b])
-            normal = (gamma[a, b] - (2.0 * beta[a] if a == b else 0.0)) / (values[a] * values[b])
-            _add_dyad(D, normal, Na, Nb)
-            if b != a:
-                if abs(values[a] - values[b]) > 1e-6 * values[a]:
-                    shear = (principal[a] - principal[b]) / (values[a] - values[b])
-                else:
-                    middle = 0.5 * (values[a] + values[b])
-                    shear = 0.5 * (gamma[a, a] - gamma[a, b] - 2.0 * beta[a]) / (middle * middle)
-                _add_shear(D, shear, vectors[:, a], vectors[:, b])
-    return energy + _add_volumetric(J, inverse, p[0], S, D)
+    L = LANES
+    work = np.zeros(33 * LANES)
+    A, V, v = work[:VECTORS], work[VECTORS:SQUARES], work[SQUARES:LOGS]
+    logs, beta = work[LOGS:BETA], work[BETA:SLOPES]
+    A[:] = E[: 6 * L]
+    _diagonalise(A, V)
+    for l in range(3 * LANES):
+        v[l] = max(1.0 + 2.0 * A[l], 1e-300)
+        logs[l] = _log(v[l])
+    S[6 * L :] = 0.0
+    for k in range(1, len(p) // LANES, 2):
+        _add_term(work, p[k * L : (k + 1) * L], p[(k + 1) * L : (k + 2) * L], S, D)
+    _add_volumetric(work, E, p[:L], S, D)
+    for m in range(6):
+        i, j, s = V[3 * _I[m] * L :], V[3 * _J[m] * L :], S[m * L :]
+        for l in range(LANES):
+            s[l] = (
+                beta[l] / v[l] * (i[l] * j[l])
+                + beta[L + l] / v[L + l] * (i[L + l] * j[L + l])
+                + beta[2 * L + l] / v[2 * L + l] * (i[2 * L + l] * j[2 * L + l])
+            )
+    if D is not None:
+        _principal_tangent(work, D)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def evaluate(law, C, parameters, S, D):
-    """Evaluate the law with the given number; S and D are overwritten."""
-    S[:] = 0.0
-    D[:] = 0.0
-    if law == SAINT_VENANT_KIRCHHOFF:
-        return _saint_venant_kirchhoff(C, parameters, S, D)
-    if law == NEO_HOOKEAN:
-        return _neo_hookean(C, parameters, S, D)
-    if law == MOONEY_RIVLIN:
-        return _mooney_rivlin(C, parameters, S, D)
-    return _ogden(C, parameters, S, D)
+_I = np.array([0, 1, 2, 0, 0, 1])
+_J = np.array([0, 1, 2, 1, 2, 2])
 
 
-# Longer than 60 lines because splitting it into compiled functions, even inlined ones, made it 6 to
-# 44 % slower.
-@njit(cache=True, nogil=True, error_model="numpy")
-def general_force(u, dofs, gradients, weights, law, parameters, slots, force, values):
-    """Add the internal force to ``force`` and, if not empty, the tangent to ``values``.
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _component(u, g, i, j, l, n):
+    """Return H_ij = Σ_a u_a,i g_a,j of 4 or 8 nodes; loops over nodes would not be vectorised."""
+    L = LANES
+    h = u[i * L + l] * g[j * L + l] + u[(3 + i) * L + l] * g[(3 + j) * L + l]
+    h += u[(6 + i) * L + l] * g[(6 + j) * L + l] + u[(9 + i) * L + l] * g[(9 + j) * L + l]
+    if n == 8:
+        h += u[(12 + i) * L + l] * g[(12 + j) * L + l] + u[(15 + i) * L + l] * g[(15 + j) * L + l]
+        h += u[(18 + i) * L + l] * g[(18 + j) * L + l] + u[(21 + i) * L + l] * g[(21 + j) * L + l]
+    return h
 
-    Parameters
-    ----------
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _displacement_gradient(u, g, H, n):
+    """Write H_ij = Σ_a u_a,i g_a,j of a batch of cells with n nodes."""
+    L = LANES
+    for l in range(LANES):
+        H[l] = _component(u, g, 0, 0, l, n)
+        H[L + l] = _component(u, g, 0, 1, l, n)
+        H[2 * L + l] = _component(u, g, 0, 2, l, n)
+        H[3 * L + l] = _component(u, g, 1, 0, l, n)
+        H[4 * L + l] = _component(u, g, 1, 1, l, n)
+        H[5 * L + l] = _component(u, g, 1, 2, l, n)
+        H[6 * L + l] = _component(u, g, 2, 0, l, n)
+        H[7 * L + l] = _component(u, g, 2, 1, l, n)
+        H[8 * L + l] = _component(u, g, 2, 2, l, n)
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _strain(H, w, F, totals):
+    """Write F (9), E (6), det F and the weights to ``F`` (17) of a batch; update min det F.
+
+    E is formed from H, because FᵀF - I would lose the digits of a small strain. Laws have no
+    meaning where det F <= 0: such a point is taken at rest with no weight and infinite energy.
+    """
+    L = LANES
+    for l in range(LANES):
+        h00, h01, h02 = H[l], H[L + l], H[2 * L + l]
+        h10, h11, h12 = H[3 * L + l], H[4 * L + l], H[5 * L + l]
+        h20, h21, h22 = H[6 * L + l], H[7 * L + l], H[8 * L + l]
+        f00, f11, f22 = 1.0 + h00, 1.0 + h11, 1.0 + h22
+        det = (
+            f00 * (f11 * f22 - h12 * h21)
+            - h01 * (h10 * f22 - h12 * h20)
+            + h02 * (h10 * h21 - f11 * h20)
+        )
+        is_valid = det > 0.0
+        k = 0.5 if is_valid else 0.0
+        F[l], F[L + l], F[2 * L + l] = f00, h01, h02
+        F[3 * L + l], F[4 * L + l], F[5 * L + l] = h10, f11, h12
+        F[6 * L + l], F[7 * L + l], F[8 * L + l] = h20, h21, f22
+        F[9 * L + l] = k * (h00 + h00 + h00 * h00 + h10 * h10 + h20 * h20)
+        F[10 * L + l] = k * (h11 + h11 + h01 * h01 + h11 * h11 + h21 * h21)
+        F[11 * L + l] = k * (h22 + h22 + h02 * h02 + h12 * h12 + h22 * h22)
+        F[12 * L + l] = k * (h01 + h10 + h00 * h01 + h10 * h11 + h20 * h21)
+        F[13 * L + l] = k * (h02 + h20 + h00 * h02 + h10 * h12 + h20 * h22)
+        F[14 * L + l] = k * (h12 + h21 + h01 * h02 + h11 * h12 + h21 * h22)
+        F[15 * L + l] = det if is_valid else 1.0
+        F[16 * L + l] = w[l] if is_valid else 0.0
+        totals[l] = totals[l] if is_valid else np.inf
+        totals[L + l] = min(totals[L + l], det if w[l] != 0.0 else np.inf)
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _weigh(F, S, P, totals):
+    """Multiply S by the weights, write P = F S, and add the energy."""
+    L = LANES
+    for l in range(LANES):
+        w = F[16 * L + l]
+        totals[l] += w * S[6 * L + l]
+        s00, s11, s22 = w * S[l], w * S[L + l], w * S[2 * L + l]
+        s01, s02, s12 = w * S[3 * L + l], w * S[4 * L + l], w * S[5 * L + l]
+        S[l], S[L + l], S[2 * L + l] = s00, s11, s22
+        S[3 * L + l], S[4 * L + l], S[5 * L + l] = s01, s02, s12
+        f0, f1, f2 = F[l], F[L + l], F[2 * L + l]
+        P[l] = f0 * s00 + f1 * s01 + f2 * s02
+        P[L + l] = f0 * s01 + f1 * s11 + f2 * s12
+        P[2 * L + l] = f0 * s02 + f1 * s12 + f2 * s22
+        f0, f1, f2 = F[3 * L + l], F[4 * L + l], F[5 * L + l]
+        P[3 * L + l] = f0 * s00 + f1 * s01 + f2 * s02
+        P[4 * L + l] = f0 * s01 + f1 * s11 + f2 * s12
+        P[5 * L + l] = f0 * s02 + f1 * s12 + f2 * s22
+        f0, f1, f2 = F[6 * L + l], F[7 * L + l], F[8 * L + l]
+        P[6 * L + l] = f0 * s00 + f1 * s01 + f2 * s02
+        P[7 * L + l] = f0 * s01 + f1 * s11 + f2 * s12
+        P[8 * L + l] = f0 * s02 + f1 * s12 + f2 * s22
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _turned(x, f0, f1, f2):
+    """Return the symmetric matrix of 6 components times a vector."""
+    x0, x1, x2, x3, x4, x5 = x
+    return (
+        x0 * f0 + x3 * f1 + x4 * f2,
+        x3 * f0 + x1 * f1 + x5 * f2,
+        x4 * f0 + x5 * f1 + x2 * f2,
+    )
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _derivative(F, S, D, X, A):
+    """Write A_iJkL = w F_iM D_MJNL F_kN + δ_ik S_JL, with the weighted S; X (18) is work."""
+    L = LANES
+    for k in range(3):
+        f = F[3 * k * L : (3 * k + 3) * L]
+        for l in range(LANES):
+            w = F[16 * L + l]
+            f0, f1, f2 = w * f[l], w * f[L + l], w * f[2 * L + l]
+            d01, d02, d03, d04, d05 = (
+                D[L + l],
+                D[2 * L + l],
+                D[3 * L + l],
+                D[4 * L + l],
+                D[5 * L + l],
+            )
+            d12, d13, d14, d15 = D[7 * L + l], D[8 * L + l], D[9 * L + l], D[10 * L + l]
+            d23, d24, d25 = D[12 * L + l], D[13 * L + l], D[14 * L + l]
+            d34, d35, d45 = D[16 * L + l], D[17 * L + l], D[19 * L + l]
+            x = _turned((D[l], d01, d02, d03, d04, d05), f0, f1, f2)
+            X[l], X[L + l], X[2 * L + l] = x
+            x = _turned((d01, D[6 * L + l], d12, d13, d14, d15), f0, f1, f2)
+            X[3 * L + l], X[4 * L + l], X[5 * L + l] = x
+            x = _turned((d02, d12, D[11 * L + l], d23, d24, d25), f0, f1, f2)
+            X[6 * L + l], X[7 * L + l], X[8 * L + l] = x
+            x = _turned((d03, d13, d23, D[15 * L + l], d34, d35), f0, f1, f2)
+            X[9 * L + l], X[10 * L + l], X[11 * L + l] = x
+            x = _turned((d04, d14, d24, d34, D[18 * L + l], d45), f0, f1, f2)
+            X[12 * L + l], X[13 * L + l], X[14 * L + l] = x
+            x = _turned((d05, d15, d25, d35, d45, D[20 * L + l]), f0, f1, f2)
+            X[15 * L + l], X[16 * L + l], X[17 * L + l] = x
+        for i in range(k + 1):
+            for n in range(3):
+                y = X[n * L :]
+                for l in range(LANES):
+                    f0, f1, f2 = F[3 * i * L + l], F[(3 * i + 1) * L + l], F[(3 * i + 2) * L + l]
+                    x = y[l], y[3 * L + l], y[6 * L + l], y[9 * L + l], y[12 * L + l], y[15 * L + l]
+                    a0, a1, a2 = _turned(x, f0, f1, f2)
+                    o = (27 * i + 3 * k + n) * L + l
+                    A[o], A[o + 9 * L], A[o + 18 * L] = a0, a1, a2
+        for i in range(k):
+            for j in range(3):
+                for n in range(3):
+                    here, there = (27 * k + 9 * n + 3 * i + j) * L, (27 * i + 9 * j + 3 * k + n) * L
+                    for l in range(LANES):
+                        A[here + l] = A[there + l]
+        o = 30 * k * L
+        for l in range(LANES):
+            A[o + l] += S[l]
+            A[o + L + l] += S[3 * L + l]
+            A[o + 2 * L + l] += S[4 * L + l]
+            A[o + 9 * L + l] += S[3 * L + l]
+            A[o + 10 * L + l] += S[L + l]
+            A[o + 11 * L + l] += S[5 * L + l]
+            A[o + 18 * L + l] += S[4 * L + l]
+            A[o + 19 * L + l] += S[5 * L + l]
+            A[o + 20 * L + l] += S[2 * L + l]
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _add_row(f, g, a, p, i, l):
+    """Add f_a,i += P_i · g_a for one node."""
+    L = LANES
+    f[(3 * a + i) * L + l] += (
+        p[0] * g[3 * a * L + l] + p[1] * g[(3 * a + 1) * L + l] + p[2] * g[(3 * a + 2) * L + l]
+    )
+
+
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _add_forces(P, g, f, n):
+    """Add f_a,i += P_iJ g_a,J of a batch."""
+    L = LANES
+    for i in range(3):
+        rows = P[3 * i * L :]
+        for l in range(LANES):
+            p = rows[l], rows[L + l], rows[2 * L + l]
+            _add_row(f, g, 0, p, i, l)
+            _add_row(f, g, 1, p, i, l)
+            _add_row(f, g, 2, p, i, l)
+            _add_row(f, g, 3, p, i, l)
+            if n == 8:
+                _add_row(f, g, 4, p, i, l)
+                _add_row(f, g, 5, p, i, l)
+                _add_row(f, g, 6, p, i, l)
+                _add_row(f, g, 7, p, i, l)
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _add_blocks(g, A, T, k_e, n):
+    """Add g_a · A · g_b of a batch to the upper entries k_e; T (27) is work for g_a · A."""
+    L = LANES
+    o = 0
+    for a in range(n):
+        ga = g[3 * a * L : (3 * a + 3) * L]
+        for i in range(3):
+            for k in range(3):
+                x, t = A[(27 * i + 3 * k) * L :], T[(9 * i + 3 * k) * L :]
+                for l in range(LANES):
+                    g0, g1, g2 = ga[l], ga[L + l], ga[2 * L + l]
+                    t[l] = g0 * x[l] + g1 * x[9 * L + l] + g2 * x[18 * L + l]
+                    t[L + l] = g0 * x[L + l] + g1 * x[10 * L + l] + g2 * x[19 * L + l]
+                    t[2 * L + l] = g0 * x[2 * L + l] + g1 * x[11 * L + l] + g2 * x[20 * L + l]
+        block = k_e[o * L : (o + 6) * L]
+        for l in range(LANES):
+            g0, g1, g2 = ga[l], ga[L + l], ga[2 * L + l]
+            block[l] += T[l] * g0 + T[L + l] * g1 + T[2 * L + l] * g2
+            block[L + l] += T[3 * L + l] * g0 + T[4 * L + l] * g1 + T[5 * L + l] * g2
+            block[2 * L + l] += T[6 * L + l] * g0 + T[7 * L + l] * g1 + T[8 * L + l] * g2
+            block[3 * L + l] += T[12 * L + l] * g0 + T[13 * L + l] * g1 + T[14 * L + l] * g2
+            block[4 * L + l] += T[15 * L + l] * g0 + T[16 * L + l] * g1 + T[17 * L + l] * g2
+            block[5 * L + l] += T[24 * L + l] * g0 + T[25 * L + l] * g1 + T[26 * L + l] * g2
+        o += 6
+        for b in range(a + 1, n):
+            gb, block = g[3 * b * L : (3 * b + 3) * L], k_e[o * L : (o + 9) * L]
+            for l in range(LANES):
+                g0, g1, g2 = gb[l], gb[L + l], gb[2 * L + l]
+                block[l] += T[l] * g0 + T[L + l] * g1 + T[2 * L + l] * g2
+                block[L + l] += T[3 * L + l] * g0 + T[4 * L + l] * g1 + T[5 * L + l] * g2
+                block[2 * L + l] += T[6 * L + l] * g0 + T[7 * L + l] * g1 + T[8 * L + l] * g2
+                block[3 * L + l] += T[9 * L + l] * g0 + T[10 * L + l] * g1 + T[11 * L + l] * g2
+                block[4 * L + l] += T[12 * L + l] * g0 + T[13 * L + l] * g1 + T[14 * L + l] * g2
+                block[5 * L + l] += T[15 * L + l] * g0 + T[16 * L + l] * g1 + T[17 * L + l] * g2
+                block[6 * L + l] += T[18 * L + l] * g0 + T[19 * L + l] * g1 + T[20 * L + l] * g2
+                block[7 * L + l] += T[21 * L + l] * g0 + T[22 * L + l] * g1 + T[23 * L + l] * g2
+                block[8 * L + l] += T[24 * L + l] * g0 + T[25 * L + l] * g1 + T[26 * L + l] * g2
+            o += 9
+
+
+# Longer than 60 lines because numba knows the constants of a kernel only where it is defined.
+@cache
+def general_force(law: int, n_nodes: int):
+    """Return the kernel ``force(u, dofs, gradients, weights, parameters, slots, force, values)``.
+
+    It adds the internal force of batches of cells to ``force`` and, if it is not None, the tangent
+    to ``values``. numba prunes the other laws, because ``law`` is a constant for it.
+
+    Parameters of the kernel
+    ------------------------
     u : (n_dofs + 1,) float64
         Displacements, m; the last entry, of the dummy dof, is zero.
-    dofs : (n_cells, 3 n_nodes) int32
-    gradients : (n_cells, n_points, n_nodes, 3) float64
-        dN_a/dX, 1/m.
-    weights : (n_cells, n_points) float64
-        Quadrature weight times det J, m³.
-    law : int
-    parameters : (n_points, n_parameters) float64
+    dofs : (n_batches, 3 n_nodes, LANES) int32
+    gradients : (n_batches, n_points, 3 n_nodes * LANES) float64
+        dN_a/dX_j at entry (3a + j) * LANES + lane, 1/m.
+    weights : (n_batches, n_points, LANES) float64
+        Quadrature weight times det J, m³; zero for padding.
+    parameters : (n_points, n_parameters * LANES) float64
         Law parameters of each quadrature point. A point may carry only the volumetric part, or
         only the rest.
-    slots : (n_cells, n_upper) int32
+    slots : (n_batches, n_upper, LANES) int32 or None
     force : (n_dofs + 1,) float64
-    values : (n_upper_nonzeros + 1,) or (0,) float64
+    values : (n_upper_nonzeros + 1,) float64 or None
 
     Returns
     -------
@@ -244,183 +731,131 @@ def general_force(u, dofs, gradients, weights, law, parameters, slots, force, va
         Stored energy, J, and the smallest det F over all quadrature points. The energy is infinite
         where det F <= 0, because the laws have no meaning there.
     """
-    n = gradients.shape[2]
-    H, F, C, S, D = (
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((6, 6)),
-    )
-    B, DB, Sg = np.empty((n, 6, 3)), np.empty((6, 3)), np.empty((n, 3))
-    u_e, f_e, k_e = np.empty((n, 3)), np.empty((n, 3)), np.empty(slots.shape[1])
-    energy, min_det = 0.0, np.inf
-    for e in range(dofs.shape[0]):
-        for a in range(n):
-            for i in range(3):
-                u_e[a, i] = u[dofs[e, 3 * a + i]]
-        f_e[:] = 0.0
-        k_e[:] = 0.0
-        for q in range(gradients.shape[1]):
-            g, w = gradients[e, q], weights[e, q]
-            for i in range(3):
-                for j in range(3):
-                    H[i, j] = 0.0
-                    for a in range(n):
-                        H[i, j] += u_e[a, i] * g[a, j]
-                    F[i, j] = H[i, j] + (1.0 if i == j else 0.0)
-            det = (
-                F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
-                - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
-                + F[0, 2] * (F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0])
-            )
-            min_det = min(min_det, det)
-            if not det > 0.0:
-                energy = np.inf
-                continue
-            for i in range(3):
-                for j in range(3):
-                    C[i, j] = H[i, j] + H[j, i] + (1.0 if i == j else 0.0)
-                    for k in range(3):
-                        C[i, j] += H[k, i] * H[k, j]
-            energy += w * evaluate(law, C, parameters[q], S, D)
-            for a in range(n):
-                for i in range(3):
-                    Sg[a, i] = w * (S[i, 0] * g[a, 0] + S[i, 1] * g[a, 1] + S[i, 2] * g[a, 2])
-                for i in range(3):
-                    f_e[a, i] += F[i, 0] * Sg[a, 0] + F[i, 1] * Sg[a, 1] + F[i, 2] * Sg[a, 2]
-                    B[a, 0, i] = F[i, 0] * g[a, 0]
-                    B[a, 1, i] = F[i, 1] * g[a, 1]
-                    B[a, 2, i] = F[i, 2] * g[a, 2]
-                    B[a, 3, i] = F[i, 0] * g[a, 1] + F[i, 1] * g[a, 0]
-                    B[a, 4, i] = F[i, 0] * g[a, 2] + F[i, 2] * g[a, 0]
-                    B[a, 5, i] = F[i, 1] * g[a, 2] + F[i, 2] * g[a, 1]
-            if len(values) == 0:
-                continue
-            p = 0
-            for a in range(n):
-                for m in range(6):
-                    for i in range(3):
-                        DB[m, i] = 0.0
-                        for k in range(6):
-                            DB[m, i] += w * D[m, k] * B[a, k, i]
-                for b in range(a, n):
-                    geometric = g[b, 0] * Sg[a, 0] + g[b, 1] * Sg[a, 1] + g[b, 2] * Sg[a, 2]
-                    for i in range(3):
-                        for j in range(i if a == b else 0, 3):
-                            k_ab = geometric if i == j else 0.0
-                            for m in range(6):
-                                k_ab += DB[m, i] * B[b, m, j]
-                            k_e[p] += k_ab
-                            p += 1
-        for a in range(n):
-            for i in range(3):
-                force[dofs[e, 3 * a + i]] += f_e[a, i]
-        if len(values) > 0:
-            for p in range(slots.shape[1]):
-                values[slots[e, p]] += k_e[p]
-    return energy, min_det
+
+    @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+    def kernel(u, dofs, gradients, weights, parameters, slots, force, values):
+        L = LANES
+        u_e, f_e = np.empty(3 * n_nodes * L), np.empty(3 * n_nodes * L)
+        H, F, S, P = np.empty(9 * L), np.empty(17 * L), np.empty(7 * L), np.empty(9 * L)
+        E, D = F[9 * L : 16 * L], None if values is None else np.empty(21 * L)
+        totals = np.zeros(2 * L)
+        totals[L:] = np.inf
+        if values is not None:
+            X, A, T = np.empty(18 * L), np.empty(81 * L), np.empty(27 * L)
+            k_e = np.empty(slots.shape[1] * L)
+        for b in range(dofs.shape[0]):
+            for i in range(3 * n_nodes):
+                for l in range(LANES):
+                    u_e[i * L + l] = u[dofs[b, i, l]]
+            f_e[:] = 0.0
+            if values is not None:
+                k_e[:] = 0.0
+            for q in range(gradients.shape[1]):
+                g = gradients[b, q]
+                _displacement_gradient(u_e, g, H, n_nodes)
+                _strain(H, weights[b, q], F, totals)
+                if law == SAINT_VENANT_KIRCHHOFF:
+                    _saint_venant_kirchhoff(E, parameters[q], S, D)
+                elif law == NEO_HOOKEAN:
+                    _neo_hookean(E, parameters[q], S, D)
+                elif law == MOONEY_RIVLIN:
+                    _mooney_rivlin(E, parameters[q], S, D)
+                else:
+                    _ogden(E, parameters[q], S, D)
+                _weigh(F, S, P, totals)
+                _add_forces(P, g, f_e, n_nodes)
+                if values is not None:
+                    _derivative(F, S, D, X, A)
+                    _add_blocks(g, A, T, k_e, n_nodes)
+            for i in range(3 * n_nodes):
+                for l in range(LANES):
+                    force[dofs[b, i, l]] += f_e[i * L + l]
+            if values is not None:
+                for o in range(slots.shape[1]):
+                    for l in range(LANES):
+                        values[slots[b, o, l]] += k_e[o * L + l]
+        return totals[:L].sum(), totals[L:].min()
+
+    return kernel
 
 
-# Longer than 60 lines because splitting the similar `general_force` into compiled functions made it
-# 6 to 44 % slower.
-@njit(cache=True, nogil=True, error_model="numpy")
-def point_stresses(H, weights, law, parameters, P, A):
-    """Write the weighted first Piola-Kirchhoff stress P and, if not empty, A = dP/dF.
+@cache
+def point_stresses(law: int):
+    """Return the kernel ``stresses(H, weights, parameters, P, A)`` of the law with this number.
 
-    Parameters
-    ----------
-    H : (n_batches, 9 * n_lanes) float64
-        du/dX; point l of a batch has component (i, J) at (3i + J) * n_lanes + l.
-    weights : (n_batches, n_lanes) float64
-    law : int
-    parameters : (n_points, n_parameters) float64
-        Law parameters of each point; the last batch may have fewer points than lanes.
-    P : (n_batches, 9 * n_lanes) float64
-    A : (n_batches, 81 * n_lanes) or (0, 81 * n_lanes) float64
-        Component (i, J, k, L) at (9 (3i + J) + 3k + L) * n_lanes + l.
+    It writes the weighted first Piola-Kirchhoff stress P and, if A is not None, A = dP/dF.
+
+    Parameters of the kernel
+    ------------------------
+    H : (n_batches, 9 * LANES) float64
+        du/dX; point l of a batch has component (i, J) at (3i + J) * LANES + l.
+    weights : (n_batches, LANES) float64
+        Zero for padding.
+    parameters : (n_batches, n_parameters * LANES) float64
+        Law parameters of each point, valid ones for padding too.
+    P : (n_batches, 9 * LANES) float64
+    A : (n_batches, 81 * LANES) float64 or None
+        Component (i, J, k, L) at (9 (3i + J) + 3k + L) * LANES + l.
 
     Returns
     -------
     (float, float)
         Stored energy and the smallest det F; the energy is infinite where det F <= 0.
     """
-    n_lanes = weights.shape[1]
-    F, C, S, D, DL = (
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((3, 3)),
-        np.empty((6, 6)),
-        np.empty((6, 9)),
-    )
-    energy, min_det = 0.0, np.inf
-    P[:] = 0.0
-    A[:] = 0.0
-    for point in range(len(parameters)):
-        b, l = point // n_lanes, point % n_lanes
-        h, w = H[b], weights[b, l]
-        for i in range(3):
-            for j in range(3):
-                F[i, j] = h[(3 * i + j) * n_lanes + l] + (1.0 if i == j else 0.0)
-        det = (
-            F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
-            - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
-            + F[0, 2] * (F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0])
-        )
-        min_det = min(min_det, det)
-        if not det > 0.0:
-            energy = np.inf
-            continue
-        for i in range(3):
-            for j in range(3):
-                C[i, j] = (
-                    h[(3 * i + j) * n_lanes + l]
-                    + h[(3 * j + i) * n_lanes + l]
-                    + (1.0 if i == j else 0.0)
-                )
-                for k in range(3):
-                    C[i, j] += h[(3 * k + i) * n_lanes + l] * h[(3 * k + j) * n_lanes + l]
-        energy += w * evaluate(law, C, parameters[point], S, D)
-        for i in range(3):
-            for j in range(3):
-                P[b, (3 * i + j) * n_lanes + l] = w * (
-                    F[i, 0] * S[0, j] + F[i, 1] * S[1, j] + F[i, 2] * S[2, j]
-                )
-        if len(A) == 0:
-            continue
-        # dE = sym(Fᵀ dH): dH_iJ changes the strains with index J, each by a component of row i.
-        for m in range(6):
-            for i in range(3):
-                for j in range(3):
-                    DL[m, 3 * i + j] = w * (
-                        D[m, _VOIGT[0, j]] * F[i, 0]
-                        + D[m, _VOIGT[1, j]] * F[i, 1]
-                        + D[m, _VOIGT[2, j]] * F[i, 2]
-                    )
-        for i in range(3):
-            for j in range(3):
-                for d in range(9):
-                    a = (
-                        F[i, 0] * DL[_VOIGT[0, j], d]
-                        + F[i, 1] * DL[_VOIGT[1, j], d]
-                        + F[i, 2] * DL[_VOIGT[2, j], d]
-                    )
-                    if d // 3 == i:
-                        a += w * S[j, d % 3]
-                    A[b, (9 * (3 * i + j) + d) * n_lanes + l] = a
-    return energy, min_det
+
+    @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+    def kernel(H, weights, parameters, P, A):
+        L = LANES
+        F, S, X = np.empty(17 * L), np.empty(7 * L), np.empty(18 * L)
+        E, D = F[9 * L : 16 * L], None if A is None else np.empty(21 * L)
+        totals = np.zeros(2 * L)
+        totals[L:] = np.inf
+        for b in range(len(weights)):
+            _strain(H[b], weights[b], F, totals)
+            if law == SAINT_VENANT_KIRCHHOFF:
+                _saint_venant_kirchhoff(E, parameters[b], S, D)
+            elif law == NEO_HOOKEAN:
+                _neo_hookean(E, parameters[b], S, D)
+            elif law == MOONEY_RIVLIN:
+                _mooney_rivlin(E, parameters[b], S, D)
+            else:
+                _ogden(E, parameters[b], S, D)
+            _weigh(F, S, P[b], totals)
+            if A is not None:
+                _derivative(F, S, D, X, A[b])
+        return totals[:L].sum(), totals[L:].min()
+
+    return kernel
+
+
+SWEEP_MULTIPLY_ADDS = 87
+"""Multiply-adds of a Jacobi sweep and of the check before it, per point."""
+
+_LAW_MULTIPLY_ADDS = {
+    SAINT_VENANT_KIRCHHOFF: (15, 1),
+    NEO_HOOKEAN: (38, 87),
+    MOONEY_RIVLIN: (71, 102),
+    OGDEN: (64 + 4 * SWEEP_MULTIPLY_ADDS, 284),
+}
+"""Multiply-adds per point for energy and stress, and for the tangent; 4 sweeps are usual."""
+
+_OGDEN_TERM_MULTIPLY_ADDS = 15, 128
+
+_STRAIN_MULTIPLY_ADDS, _WEIGH_MULTIPLY_ADDS, _DERIVATIVE_MULTIPLY_ADDS = 33, 34, 333
 
 
 def point_multiply_adds(law: int, n_parameters: int) -> tuple[int, int]:
     """Return multiply-adds of `point_stresses` per point: without A, and the addition for A."""
     terms = n_parameters // 2 if law == OGDEN else 0
-    stress = 27 + 9 + 37 + _LAW_MULTIPLY_ADDS[law] + terms * _OGDEN_TERM_MULTIPLY_ADDS
-    return stress, 9 * 6 * 4 + 81 * 3 + 27
+    by_stress, by_tangent = _LAW_MULTIPLY_ADDS[law]
+    term_stress, term_tangent = _OGDEN_TERM_MULTIPLY_ADDS
+    stress = _STRAIN_MULTIPLY_ADDS + by_stress + terms * term_stress + _WEIGH_MULTIPLY_ADDS
+    return stress, by_tangent + terms * term_tangent + _DERIVATIVE_MULTIPLY_ADDS
 
 
 def general_multiply_adds(law: int, n_parameters: int, n_nodes: int) -> tuple[int, int]:
     """Return multiply-adds of `general_force` per point: the force alone, and with tangent."""
-    terms = n_parameters // 2 if law == OGDEN else 0
-    force = 57 * n_nodes + 37 + _LAW_MULTIPLY_ADDS[law] + terms * _OGDEN_TERM_MULTIPLY_ADDS
-    tangent = n_nodes * (216 + 39) + n_nodes * (n_nodes - 1) // 2 * 57
-    return force, force + tangent
+    stress, derivative = point_multiply_adds(law, n_parameters)
+    force = 18 * n_nodes + stress
+    blocks = n_nodes * (81 + 18) + n_nodes * (n_nodes - 1) // 2 * 27
+    return force, force + derivative + blocks

@@ -44,6 +44,13 @@ def _batched(values: Array) -> Array:
     return np.ascontiguousarray(np.moveaxis(padded.reshape(-1, LANES, *values.shape[1:]), 1, -1))
 
 
+def _parameters_of_lanes(parameters: Array) -> Array:
+    """Return law parameters (n_points, n) as (n_batches, n * LANES); the last fill the padding."""
+    padding = -len(parameters) % LANES
+    padded = np.pad(parameters, ((0, padding), (0, 0)), mode="edge")
+    return _batched(padded).reshape(-1, parameters.shape[1] * LANES)
+
+
 def _mode_gradients(shape_gradients: Array, cell_modes: Array, kept: NDArray[np.int64]) -> Array:
     """Return gradients of modes (n_batches, r, 9 * LANES) at the kept points.
 
@@ -91,14 +98,13 @@ class ReducedPoints:
         if test_modes is not None:
             self.test = _mode_gradients(rule.gradients, test_modes[cells], kept)
         self.weights = _batched(weights[kept])
-        self.law, self.parameters = (
-            body.material.law,
-            np.tile(rule.parameters, (len(cells), 1))[kept],
-        )
-        self._lame = _batched(self.parameters) if self.law == SAINT_VENANT_KIRCHHOFF else None
+        law, parameters = body.material.law, np.tile(rule.parameters, (len(cells), 1))[kept]
+        self._stresses = point_stresses(law)
+        self._parameters = _parameters_of_lanes(parameters)
+        self._lame = _batched(parameters) if law == SAINT_VENANT_KIRCHHOFF else None
         force, tangent = SVK_MULTIPLY_ADDS
         if self._lame is None:
-            force, tangent = point_multiply_adds(self.law, rule.parameters.shape[1])
+            force, tangent = point_multiply_adds(law, rule.parameters.shape[1])
         force += 18 * self.n_unknowns
         tangent += force + tangent_multiply_adds(self.n_unknowns, self.symmetric)
         self._multiply_adds = self.n_points * force, self.n_points * tangent
@@ -117,7 +123,9 @@ class ReducedPoints:
         H, P = np.empty((2, len(self.weights), 9 * LANES))
         A = np.empty((len(self.weights) if len(tangent) else 0, 81 * LANES))
         gradients(self.trial, q, H)
-        energy, min_det = point_stresses(H, self.weights, self.law, self.parameters, P, A)
+        energy, min_det = self._stresses(
+            H, self.weights, self._parameters, P, A if len(tangent) else None
+        )
         project(P, A, self.trial, self.test, self.symmetric, force, tangent)
         return State(force, energy, min_det)
 
@@ -134,7 +142,7 @@ class ReducedPoints:
         """Return each point's part of the reduced force, (n_points, r); to train cubatures."""
         H, P = np.empty((2, len(self.weights), 9 * LANES))
         gradients(self.trial, q, H)
-        point_stresses(H, self.weights, self.law, self.parameters, P, np.empty((0, 81 * LANES)))
+        self._stresses(H, self.weights, self._parameters, P, None)
         test, stress = self.test.reshape(len(P), -1, 9, LANES), P.reshape(len(P), 9, LANES)
         own = np.einsum("bmcl,bcl->blm", test, stress)
         return np.asarray(own.reshape(-1, self.n_unknowns)[: self.n_points])
