@@ -115,7 +115,7 @@ def lay_out(figure: Figure) -> Any:
     shown = figure.canvas  # of a notebook, perhaps
     # matplotlib's type of a figure's canvas lacks the methods of this class.
     canvas: Any = FigureCanvasAgg(figure)
-    canvas.draw()
+    figure.draw_without_rendering()
     figure.set_canvas(shown)
     return canvas.get_renderer()
 

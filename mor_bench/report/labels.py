@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -168,5 +167,9 @@ def _write(axes: Axes, note: Note, spot: _Spot) -> None:
 
 def _dense(line: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points along a polyline, about every three pixels."""
-    pieces = [np.linspace(a, b, max(2, int(np.hypot(*(b - a)) / 3))) for a, b in pairwise(line)]
-    return np.concatenate(pieces) if pieces else line
+    steps = np.hypot(*np.diff(line, axis=0).T)
+    along = np.append(0.0, np.cumsum(steps))
+    if not along[-1] > 0:
+        return line
+    at = np.linspace(0.0, along[-1], max(2, int(along[-1] / 3)))
+    return np.column_stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)])
