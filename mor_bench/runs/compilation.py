@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 
 from llvmlite import binding
 
@@ -26,7 +27,7 @@ from mor_bench.runs.configurations import OWN, Configuration, may_train
 from mor_bench.runs.run_context import RunContext
 from mor_bench.runs.training_data import TrainingData
 from mor_bench.sandbox.fork_server import ForkServer
-from mor_bench.sandbox.process import SandboxedProcess
+from mor_bench.sandbox.process import SandboxedProcess, stoppable_threads
 from mor_bench.sandbox.seal import Restrictions
 from mor_bench.snapshots.dataset import load_dataset
 from mor_bench.specs import AnyDatasetSpec, MethodSpec
@@ -61,31 +62,44 @@ def compile_kernels(
     fork_server: ForkServer | None,
     scratch: Path,
 ) -> None:
-    """Compile what is not yet compiled, one method after the other; report it to the listener.
+    """Compile what is not yet compiled; report it to the listener.
 
-    An error ends the compilation of one method only. It comes again in the method's own fit, whose
-    row reports it.
+    The first method compiles the shared kernels, then one method per core compiles its own. An
+    error ends the compilation of one method only. It comes again in the method's own fit, whose row
+    reports it.
     """
     waiting = uncompiled(spec, configurations)
+    if not waiting:
+        return
     restrictions = Restrictions(memory_bytes=context.memory_limit_bytes)
     problem: TrainingData | None = None
-    with tempfile.TemporaryDirectory(dir=scratch) as folder:
-        for number, group in enumerate(waiting):
-            context.listener.compiling(group.method.name, number, len(waiting))
-            with suppress(MorBenchError):
+    done, lock = 0, Lock()
+
+    def compile_group(group: Uncompiled) -> None:
+        nonlocal problem, done
+        with lock:
+            context.listener.compiling(group.method.name, done, len(waiting))
+        with suppress(MorBenchError):
+            with lock:
                 if problem is None:
                     # A fork server compiles while it starts; two processes would compile twice.
                     SandboxedProcess(MethodSession, restrictions, fork_server).end()
                     problem = _small_problem(spec, context, Path(folder))
-                for configuration in _ends(group.configurations):
-                    with SandboxedProcess(
-                        MethodSession, restrictions, fork_server, scene=problem.scene
-                    ) as worker:
-                        _fit_and_query(configuration, problem, worker)
-                with suppress(OSError):
-                    group.marker.touch()
-        if waiting:
-            context.listener.compiling(waiting[-1].method.name, len(waiting), len(waiting))
+            for configuration in _ends(group.configurations):
+                with SandboxedProcess(
+                    MethodSession, restrictions, fork_server, scene=problem.scene
+                ) as worker:
+                    _fit_and_query(configuration, problem, worker)
+            with suppress(OSError):
+                group.marker.touch()
+        with lock:
+            done += 1
+
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
+        compile_group(waiting[0])
+        with stoppable_threads(os.cpu_count() or 1) as threads:
+            list(threads.map(compile_group, waiting[1:]))
+        context.listener.compiling(waiting[-1].method.name, len(waiting), len(waiting))
 
 
 def uncompiled(spec: AnyDatasetSpec, configurations: Sequence[Configuration]) -> list[Uncompiled]:
