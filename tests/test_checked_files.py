@@ -252,6 +252,15 @@ def test_formats_of_several_or_packed_files_are_refused(name: str, tmp_path: Pat
     refused(lambda p: read_mesh(p, 1.0), path, "a mesh must be one file, not packed")
 
 
+def test_a_grid_that_lists_no_cells_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.vtk"
+    path.write_text(
+        "# vtk DataFile Version 3.0\n\nASCII\nDATASET STRUCTURED_POINTS\n"
+        "DIMENSIONS 100 100 100\nORIGIN 0 0 0\nSPACING 1 1 1\n"
+    )
+    refused(lambda p: read_mesh(p, 1.0), path, "a grid of type STRUCTURED_POINTS lists no cells")
+
+
 def test_an_included_abaqus_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.inp"
     body(path)

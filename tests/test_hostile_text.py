@@ -17,6 +17,7 @@ import pytest
 from rich.console import Console
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.errors import StoreError
 from mor_bench.hard_cases.catalogue import CaseResult
 from mor_bench.hard_cases.suite import StressResults
 from mor_bench.report.console_tables import print_tables
@@ -99,6 +100,15 @@ def test_no_text_of_a_file_becomes_markup_or_leads_out_of_the_folder(
         assert "{{ 7*7 }}" in text
     assert [path.name for path in tmp_path.iterdir()] == ["outer"]
     assert [path.name for path in (tmp_path / "outer").iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("name", ["figures", "pages"])
+def test_a_report_is_not_written_through_a_link(name: str, run: Comparison, tmp_path: Path) -> None:
+    (tmp_path / "victim").mkdir()
+    (run.out / name).symlink_to(tmp_path / "victim")
+    with pytest.raises(StoreError, match=f"{name}: is a link to another folder"):
+        render(run, pages=True)
+    assert not list((tmp_path / "victim").iterdir())
 
 
 def test_only_the_packages_own_scripts_may_run(run: Comparison) -> None:

@@ -17,8 +17,11 @@ from mor_bench.results.row import Row
 from mor_bench.runs import dataset_run
 from mor_bench.runs.configurations import CORE_METHODS, checked_specs
 from mor_bench.runs.plan import plan
+from mor_bench.runs.run_folder import only_run_in
 from mor_bench.scratch import identity
 from mor_bench.snapshots.dataset import Dataset
+from mor_bench.snapshots.generate import dataset_folder, generation_seconds
+from mor_bench.specs import load_generated_spec
 from tests.commands import mor_bench_command
 from tests.small_runs import PLAIN, method_file, run_small
 from tests.third_party import Peeker
@@ -145,6 +148,19 @@ def test_two_runs_cannot_write_to_the_same_folder(cache: Path, tmp_path: Path) -
     with pytest.raises(InvalidInputError, match=r"another run \(process"):
         run_small(["linear-fem"], tmp_path, cache)
     assert [path.name for path in tmp_path.iterdir()] == [".running"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_in_the_place_of_a_small_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / ".running")
+    with only_run_in(tmp_path):
+        assert (tmp_path / ".running").is_file()
+    spec = load_generated_spec("beam-tiny")
+    folder = dataset_folder(spec, tmp_path)
+    folder.mkdir(parents=True)
+    os.mkfifo(folder / "seconds-00000.txt")
+    (folder / "seconds-00001.txt").write_text("-1e300")
+    assert generation_seconds(spec, tmp_path, 100) is None
 
 
 @pytest.mark.slow

@@ -28,6 +28,7 @@ from mor_bench.sandbox.seal import Restrictions
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from tests.intruder import WAYS
+from tests.small_runs import method_file
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +154,28 @@ def test_a_process_ends_if_its_parent_is_killed() -> None:
     parent.send_signal(signal.SIGKILL)
     parent.wait()
     assert is_gone(pid)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux ends such a process, others do not")
+def test_a_process_that_never_releases_the_interpreter_ends_with_its_parent(tmp_path: Path) -> None:
+    (tmp_path / "endless.py").write_text(
+        "import os, re\n"
+        f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()) + ' ')\n"
+        "re.match('(a+)+$', 60 * 'a' + 'b')\n"
+    )
+    path = method_file(tmp_path, "endless", "endless:Mine")
+    command = [sys.executable, "-m", "mor_bench", "check", str(path)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([os.getcwd(), str(tmp_path)])}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as parent:
+        written = tmp_path / "pid"
+        until = time.monotonic() + 60.0
+        while time.monotonic() < until and not (written.exists() and written.read_text()):
+            time.sleep(0.05)
+        pid = int(written.read_text())
+        assert not is_gone(pid, 0.5)
+        parent.kill()
+    assert is_gone(pid, 2.0)
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from mor_bench.results.comparison import Comparison
-from mor_bench.snapshots.store import write_atomically
+from mor_bench.snapshots.store import make_own_folder, write_atomically
 
 DPI = 200
 WIDTH_IN = 7.05
@@ -191,7 +191,7 @@ def length_unit(largest_m: float) -> tuple[str, float]:
 def save(picture: Picture, comparison: Comparison, dataset: str) -> Drawn:
     """Write a figure as PNG and SVG to OUT/figures/, each atomically."""
     folder = comparison.out / "figures"
-    folder.mkdir(parents=True, exist_ok=True)
+    make_own_folder(folder)
     name = re.sub(r"[^\w.=-]+", "-", dataset).strip("-")
     drawn = Drawn(
         dataset,

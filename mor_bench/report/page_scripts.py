@@ -14,7 +14,7 @@ from typing import Any
 from markupsafe import Markup
 
 from mor_bench.results.json_file import without_nan
-from mor_bench.snapshots.store import write_atomically
+from mor_bench.snapshots.store import make_own_folder, write_atomically
 
 SCRIPTS = (
     "vendor/plotly-gl3d.min.js",
@@ -57,7 +57,8 @@ def inlined() -> Assets:
 
 def beside(folder: Path) -> Assets:
     """Write all style sheets and scripts to a folder beside the pages, and refer to them."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_own_folder(folder.parent)
+    make_own_folder(folder)
     for path in (*STYLES, *SCRIPTS):
         write_atomically(folder / Path(path).name, _read(path).encode())
     hrefs = [f"{folder.name}/{Path(path).name}" for path in (*STYLES, *SCRIPTS)]

@@ -9,17 +9,20 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from mor_bench.errors import InvalidInputError
+from mor_bench.checked_files import read_bytes
+from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.machine import describe_machine, gpu_name
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.run_context import RunContext
 from mor_bench.sandbox.seal import isolation
 from mor_bench.scratch import identity, is_running
-from mor_bench.snapshots.store import remove_leftovers
+from mor_bench.snapshots.store import remove_leftovers, write_atomically
 from mor_bench.specs import AnyDatasetSpec, MethodSpec
 
 LOCK = ".running"
 """File that names the process of a live run."""
+
+MOST_LOCK_BYTES = 1000
 
 
 def open_run(
@@ -98,8 +101,8 @@ def _check_no_foreign(folder: Path) -> None:
 def _check_unused(folder: Path) -> None:
     """Raise `InvalidInputError` if another live run writes to a folder."""
     other = ""
-    with suppress(OSError, ValueError):
-        other = (folder / LOCK).read_text(encoding="ascii")
+    with suppress(OSError, ValueError, StoreError):
+        other = read_bytes(folder / LOCK, MOST_LOCK_BYTES).decode("ascii")
     if other != identity(os.getpid()) and is_running(other):
         raise InvalidInputError(
             f"{folder}: another run (process {other.partition('-')[0]}) writes to this folder; "
@@ -124,7 +127,7 @@ def only_run_in(folder: Path) -> Iterator[None]:
     for part in ("", "samples", "figures", "pages", "pages/shared"):
         remove_leftovers(folder / part)
     lock = folder / LOCK
-    lock.write_text(str(identity(os.getpid())), encoding="ascii")
+    write_atomically(lock, str(identity(os.getpid())).encode())  # opening a pipe would wait
     try:
         yield
     finally:

@@ -22,6 +22,7 @@ from traceback import walk_tb
 from typing import Any, BinaryIO
 
 from mor_bench.errors import MorBenchError, printable
+from mor_bench.parent_death import end_with_pipe
 from mor_bench.sandbox.seal import Restrictions, seal
 from mor_bench.sandbox.session import Session, session_class
 
@@ -121,7 +122,8 @@ def answer_requests(requests: BinaryIO, answers: BinaryIO) -> None:
 def main() -> None:
     """Answer requests on standard input.
 
-    With a socket's descriptor and a session class as arguments, serve forks instead.
+    With the descriptor of a pipe as argument, end when its other end closes. With a socket's
+    descriptor and a session class as arguments, serve forks instead.
     """
     if len(sys.argv) == 3:
         from mor_bench.sandbox.fork_server import serve
@@ -130,6 +132,8 @@ def main() -> None:
         # Importing the class takes seconds, in which the parent may die.
         serve(control, lambda: session_class(sys.argv[2]).preload(), answer_requests)
     else:
+        if len(sys.argv) == 2:
+            end_with_pipe(int(sys.argv[1]))
         answer_requests(os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb"))
 
 

@@ -249,14 +249,19 @@ class _Spawned:
     """A new interpreter."""
 
     def __init__(self, stderr: BinaryIO) -> None:
+        # It closes when this process ends, however it ends.
+        reading, self._life = os.pipe()
+        inherited = (reading,) if sys.platform == "linux" else ()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", CHILD_MODULE],
+            [sys.executable, "-m", CHILD_MODULE, *map(str, inherited)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=stderr,
             env=environment(),
             start_new_session=True,
+            pass_fds=inherited,
         )
+        os.close(reading)
         assert self._process.stdin
         assert self._process.stdout
         self.pid = self._process.pid
@@ -267,6 +272,7 @@ class _Spawned:
 
     def close(self) -> None:
         self._process.wait()
+        os.close(self._life)
         for stream in (self.requests, self.answers):
             with suppress(OSError):
                 stream.close()

@@ -28,6 +28,9 @@ _REFERENCES = {
 }
 """Pattern of a reference to another file, by format."""
 
+_IMPLICIT_CELLS = rb"(?im)^DATASET\s+(STRUCTURED_POINTS|STRUCTURED_GRID|RECTILINEAR_GRID)"
+"""Type of a VTK file of a few bytes that may stand for millions of cells."""
+
 CELLS = ("hexahedron", "tetra")
 """Supported volume cells, by meshio's names."""
 
@@ -159,6 +162,12 @@ def _check_alone(path: Path) -> None:
         raise SpecError(
             f"{path}: refers to another file ({words[:80]!r}); a mesh must be one file. "
             "Convert it to .vtu or .msh."
+        )
+    if suffix == ".vtk" and (
+        found := re.search(_IMPLICIT_CELLS, read_bytes(path, error=SpecError))
+    ):
+        raise SpecError(
+            f"{path}: a grid of type {found[1].decode()} lists no cells; convert it to .vtu."
         )
     if is_hdf5(path):
         with open_hdf5(path, SpecError):

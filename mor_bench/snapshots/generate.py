@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
+from math import inf
 from pathlib import Path
 from typing import TypedDict
 
 import numpy as np
 import platformdirs
 
+from mor_bench.checked_files import read_bytes
 from mor_bench.errors import DamagedFileWarning, NewerSchemaError, StoreError
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.executors import KEPT, check_pool, open_pool
@@ -32,6 +34,9 @@ from mor_bench.specs import DatasetSpec
 
 SHARD_SIZE = 100
 """Samples per shard."""
+
+MOST_TIME_BYTES = 100
+"""Largest file with the time of a shard."""
 
 ROUND_OFF = 1e-9
 """Relative difference of loads that is accepted as round-off of another processor."""
@@ -292,8 +297,10 @@ def generation_seconds(spec: DatasetSpec, cache: Path | None, n_samples: int) ->
     """
     times = []
     for path in sorted(dataset_folder(spec, cache).glob("seconds-*.txt")):
-        with suppress(ValueError, OSError):  # a missing timing does no harm
-            times.append(float(path.read_text()))
+        with suppress(ValueError, OSError, StoreError):  # a missing timing does no harm
+            seconds = float(read_bytes(path, MOST_TIME_BYTES))
+            if 0.0 <= seconds < inf:
+                times.append(seconds)
     if not times:
         return None
     return sum(times) * n_samples / n_samples_to_generate(spec, len(times) * SHARD_SIZE)

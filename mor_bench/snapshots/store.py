@@ -77,6 +77,19 @@ _FIELDS = {
 }
 
 
+def make_own_folder(folder: Path) -> None:
+    """Create a folder in a run's folder; refuse a link, which may lead to files of others.
+
+    Raises
+    ------
+    StoreError
+        If the folder is a link.
+    """
+    if folder.is_symlink():
+        raise StoreError(f"{folder}: is a link to another folder; remove it.")
+    folder.mkdir(parents=True, exist_ok=True)
+
+
 def temporary_beside(path: Path) -> Path:
     """Return the name of a temporary file that `remove_leftovers` removes if its writer is killed.
 

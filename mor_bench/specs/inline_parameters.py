@@ -48,9 +48,12 @@ def parse_value(text: str) -> Any:
 
     >>> parse_value("1e-4"), parse_value("[1, 2]"), parse_value("constant")
     (0.0001, [1, 2], 'constant')
+    >>> parse_value("3\\nother = 4")
+    '3\\nother = 4'
     """
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        content = tomllib.loads(f"value = {text}")
+        return content["value"] if len(content) == 1 else text.strip()
     except (tomllib.TOMLDecodeError, RecursionError):
         return text.strip()
 

@@ -78,7 +78,7 @@ class Loads(StrictModel):
     samples: Count | None = None
     magnitude_n: Magnitude
     sampling: Sampling = "random"
-    seed: Annotated[int, Field(ge=0, lt=2**64)] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
 
     @model_validator(mode="after")
     def _consistent(self) -> Loads:
