@@ -301,6 +301,7 @@ def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis
         "Timing",
         "Memory and cost",
         "Named test sets",
+        "Hidden test set",
         "Tuning budget",
         "Error measures of the networks",
         "Against the paper, by slope and relative error",
