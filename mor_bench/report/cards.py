@@ -172,10 +172,10 @@ def _given(facts: Mapping[str, str]) -> dict[str, str]:
 def _pairs(content: Mapping[str, Any]) -> str:
     """Format a table of a file in one line, without nested tables."""
     shown = {k: v for k, v in content.items() if not isinstance(v, dict) and v is not None}
-    return ", ".join(_pair(key, value) for key, value in shown.items())
+    return ", ".join(pair_text(key, value) for key, value in shown.items())
 
 
-def _pair(key: str, value: Any) -> str:
+def pair_text(key: str, value: Any) -> str:
     """Format a key and its value; the end of the key is the unit."""
     words, _, last = key.rpartition("_")
     unit = UNITS.get(last) if words else None

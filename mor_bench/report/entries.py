@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any
 
-from mor_bench.analysis.draws import Interval
+from mor_bench.analysis.draws import VALIDATION, Interval
 from mor_bench.analysis.frontier import (
     Point,
     is_point,
@@ -39,7 +39,8 @@ class Entry:
     group : str
         What it is told at query time, and whether it learned from snapshots, in words.
     intervals : dict
-        95 % intervals, as far as known, of `rel_l2_median`, `mean_dof_m` and `latency_ms`.
+        95 % intervals, as far as known, of `rel_l2_median`, `mean_dof_m`, `latency_ms` and
+        `validation_rel_l2_median`.
     """
 
     row: Row
@@ -203,7 +204,8 @@ def told_by_method(entries: Sequence[Entry]) -> dict[str, str]:
 
 def _intervals(record: Mapping[str, Any]) -> dict[str, Interval]:
     """Intervals of an analysis record that have a lower end; a missing upper end is infinite."""
-    figures = {name: record[name] for name in ("rel_l2_median", "mean_dof_m", "latency_ms")}
+    names = ("rel_l2_median", "mean_dof_m", "latency_ms", VALIDATION)
+    figures = {name: record[name] for name in names if record.get(name)}
     return {
         name: (f["low"], inf if f["high"] is None else f["high"])
         for name, f in figures.items()

@@ -120,7 +120,8 @@ _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
         _bodies,
         "Coloured: the prediction, by its error in mm. Blue lines: the full-order reference. "
         "Grey lines: the body at rest. The arrow shows place and direction of the force. "
-        "Worst: the test load with the largest mean error e. Typical: with the median one. "
+        "Worst: the test load with the largest mean error e of that method. Typical: with the "
+        "median one. Two methods can thus show different loads. "
         "Drag to turn; both views turn together. Errors beyond half the body's size are cut.",
     ),
     "positions": (

@@ -9,6 +9,7 @@ from typing import Any
 from mor_bench.analysis.selection_text import needs_text
 from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.canvas import Drawn
+from mor_bench.report.cards import pair_text
 from mor_bench.report.details import dataset_details, hard_cases
 from mor_bench.report.entries import Analysis, Entry, entries_of, verdict_of
 from mor_bench.report.number_format import explain_short_names
@@ -171,7 +172,7 @@ def _facts(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> li
     facts = [("source", str(spec["source"]))] if spec.get("source") else []
     for key in ("geometry", "material", "supports", "loads", "snapshots"):
         if key in spec:
-            pairs = [f"{k}: {v}" if k else v for k, v in flat(spec[key]) if v != "None"]
+            pairs = [pair_text(k, v) if k else v for k, v in flat(spec[key]) if v != "None"]
             facts.append((key, "; ".join(pairs)))
     return [
         *facts,

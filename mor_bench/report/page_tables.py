@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from mor_bench.analysis.draws import VALIDATION
 from mor_bench.report.entries import Entry
 from mor_bench.report.number_format import DASH, bytes_text, metres, percent, span
 from mor_bench.report.speed_tables import NOT_REACHED
@@ -28,6 +29,7 @@ GROUPS: dict[str, dict[str, Cell]] = {
         "p95": figure_cell("error", "rel_l2_p95", percent),
         "max": figure_cell("error", "rel_l2_max", percent),
         "validation median": figure_cell("validation", "rel_l2_median", percent),
+        "validation 95 %": lambda e: span(e.intervals.get(VALIDATION), percent),
     },
     "Latency of one query (ms)": {
         "median": marked_latency,
