@@ -25,6 +25,7 @@ import mor_bench
 from mor_bench.errors import MissingDependencyError, SolverError
 from mor_bench.runs.configurations import CORE_METHODS
 from mor_bench.snapshots.dataset import Dataset, load_dataset
+from mor_bench.specs import load_method_spec
 from mor_bench.surrogate import Surrogate
 
 PREDICTIONS = 1_000_000
@@ -36,8 +37,8 @@ PARTS, FIXED = 100, 5
 MOST_GROWTH_BYTES = 5e6
 """Largest growth of the resident memory after the first tenth of the predictions."""
 
-BRIEF = {"umesh": {"iterations": 20}, "umesh-linear": {"iterations": 20}}
-"""Parameters of trained methods: short trainings, whose predictions cost the same."""
+ITERATIONS = 20
+"""Iterations of trainings: the predictions of a network cost the same after a long one."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +94,9 @@ def predict_often(method: Surrogate, data: Dataset, n: int, limit_s: float = inf
 
 
 def loaded(name: str, data: Dataset) -> Surrogate:
-    """Fit a default method."""
-    spec = mor_bench.load_method(name).parameters
-    brief = {key: value for key, value in BRIEF.get(name, {}).items() if key in spec}
+    """Fit a default method: a network in the size of the quick profile, with a short training."""
+    quick = load_method_spec(name).configurations("quick")[0]
+    brief = {**quick, "iterations": ITERATIONS} if "iterations" in quick else {}
     return mor_bench.load_method(name, **brief).fit(data.scene, data.train)
 
 
