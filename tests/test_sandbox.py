@@ -86,6 +86,18 @@ def test_a_failure_is_reported_and_leaves_no_process(
     assert is_gone(process.pid)
 
 
+def test_an_interpreter_of_its_own_is_ended_once_only(tiny_scene: Scene, tmp_path: Path) -> None:
+    """Its pipe must be closed once: its number may belong to another file by then."""
+    with SandboxedProcess(MethodSession, scene=tiny_scene) as process:
+        with pytest.raises(MethodFailedError, match="longer than the limit"):
+            ask_fit(process, "Broken", tmp_path, 1.0, how="hang")
+        (tmp_path / "bystander").touch()
+        with (tmp_path / "bystander").open("rb") as bystander:
+            process.end()
+            assert bystander.read() == b""
+    assert is_gone(process.pid)
+
+
 @pytest.mark.parametrize("how", ["print", "fork"])
 def test_prints_and_forks_of_a_method_are_not_taken_for_results(
     how: str, server: ForkServer | None, tiny_scene: Scene, tmp_path: Path

@@ -250,7 +250,8 @@ class _Spawned:
 
     def __init__(self, stderr: BinaryIO) -> None:
         # It closes when this process ends, however it ends.
-        reading, self._life = os.pipe()
+        reading, life = os.pipe()
+        self._life = os.fdopen(life, "wb")
         inherited = (reading,) if sys.platform == "linux" else ()
         self._process = subprocess.Popen(
             [sys.executable, "-m", CHILD_MODULE, *map(str, inherited)],
@@ -272,8 +273,7 @@ class _Spawned:
 
     def close(self) -> None:
         self._process.wait()
-        os.close(self._life)
-        for stream in (self.requests, self.answers):
+        for stream in (self._life, self.requests, self.answers):
             with suppress(OSError):
                 stream.close()
 
