@@ -36,7 +36,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("published")
     made = synthetic_comparison(folder / "run")
     made.finish(analyse(made, n_resamples=50))
-    compact(folder / "run", folder / "stored")
+    compact(folder / "run", folder / "stored", "shown/stored")
     return folder / "stored"
 
 

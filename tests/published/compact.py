@@ -47,13 +47,14 @@ PACKED_BYTES = 8192
 KEPT_OF_DATASETS = ("test_regions", "validation_regions", "singular_values", "snapshots_norm")
 
 
-def compact(run: Path, folder: Path) -> None:
-    """Write a finished run in compact form."""
+def compact(run: Path, folder: Path, shown: str) -> None:
+    """Write a finished run in compact form; where its texts name its folder, they say `shown`."""
     comparison = Comparison.read(run)
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("results.json", "comparison.json"):
         content = json.loads((run / name).read_text(encoding="utf-8"))
         text = json.dumps(content, indent=None, separators=(",", ":"), allow_nan=False)
+        text = text.replace(json.dumps(str(run))[1:-1], shown)
         write_atomically(folder / name, (text + "\n").encode())
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="latest") as file:

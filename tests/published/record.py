@@ -89,7 +89,7 @@ def record(name: str, allow_changes: bool = False) -> None:
         _run(command, out, Path(folder) / "cache")
         seconds = perf_counter() - begun
         if out.is_dir():
-            compact(out, REPORTS / name)
+            compact(out, REPORTS / name, f"reports/{name}")
             shutil.rmtree(REPORTS / RAW / name, ignore_errors=True)
             shutil.copytree(out, REPORTS / RAW / name)
         else:
