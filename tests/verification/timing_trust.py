@@ -3,11 +3,11 @@
     python -m tests.verification.timing_trust [--only reruns|pairs|busy] [--out FILE]
 
 `reruns` repeats the measurement of some methods and counts the medians inside the interval of the
-measurement before, for the quick and the full protocol. `pairs` times identical code under two
-names, and code slowed by 10 %. `busy` times a method beside a busy process. It prints every count
-out of its total and exits with 1 if one misses its goal. Together they take about half an hour on two
-cores. With `--out`, each part is stored as soon as it ends, and a later call with the same file
-skips the parts that were stored at the same commit.
+measurement before. `pairs` times identical code under two names, and code slowed by 10 %. `busy`
+times a method beside a busy process. The first two do so for the quick and the full protocol. It
+prints every count out of its total and exits with 1 if one misses its goal. Together they take
+about half an hour on two cores. With `--out`, each part is stored as soon as it ends, and a later
+call with the same file skips the parts that were stored at the same commit.
 """
 
 from __future__ import annotations
