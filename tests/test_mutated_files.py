@@ -19,15 +19,26 @@ import pytest
 
 import mor_bench
 from mor_bench.array_files import read_npy
-from mor_bench.export.asv_files import COLUMNS, Figure, Figures, to_columns, write_file
+from mor_bench.export.asv_files import (
+    COLUMNS,
+    Figure,
+    Figures,
+    is_own_project,
+    to_columns,
+    write_file,
+)
 from mor_bench.export.asv_results import describe
+from mor_bench.hard_cases.catalogue import CaseResult
+from mor_bench.hard_cases.suite import StressResults
 from mor_bench.measure.discretisation_error import measured
-from mor_bench.runs.cached_fit import read_fit_record
+from mor_bench.report.hard_case_table import stress_table
+from mor_bench.runs.cached_fit import read_fit_record, training_seconds
 from mor_bench.runs.shipped_models import shipped_models
 from mor_bench.scene.files import read_mesh
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.scene.snapshot_file import read_arrays
 from mor_bench.scene.surfaces import read_surface
+from mor_bench.snapshots.generate import shard_seconds
 from mor_bench.snapshots.manifest import Manifest, read_manifest
 from mor_bench.snapshots.solve import GENERATOR_VERSION
 from mor_bench.snapshots.store import (
@@ -228,6 +239,16 @@ def asv(path: Path) -> None:
     write_file(path, content, "results")
 
 
+def stress_results(path: Path) -> None:
+    row = CaseResult("zero-force", "", "pod", "zero", "zero", "pass", {"size": 0.0}, 0.1)
+    StressResults([row], "quick", {"cores": 2}).write(path)
+
+
+def stressed(path: Path) -> None:
+    found = StressResults.read(path)
+    stress_table(found, [row.method for row in found.rows])
+
+
 def gmsh1(path: Path) -> None:
     points, cells = mesh_of().points, mesh_of().cells[0].data
     nodes = [f"{i + 1} {x} {y} {z}" for i, (x, y, z) in enumerate(points)]
@@ -264,6 +285,15 @@ READERS = [
     Reader("shard.h5", a_shard, read_shard, [mutated_bytes, forged_shard]),
     Reader("manifest.json", a_manifest, manifest_of, [*JSON, forged_manifest]),
     Reader("fit.json", a_fit, read_fit_record, JSON),
+    Reader(
+        "training.json",
+        lambda path: path.write_text('{"taken_s": 12.5}'),
+        training_seconds,
+        JSON,
+    ),
+    Reader("seconds-00000.txt", lambda path: path.write_text("1.25\n"), shard_seconds, TEXT),
+    Reader("stress.json", stress_results, stressed, JSON),
+    Reader("pyproject.toml", of_suite(".", "pyproject.toml"), is_own_project, TEXT),
     Reader("0-mor-bench-py3.11.json", asv, lambda path: describe(path.parents[1]), JSON),
     Reader(
         "umesh-beam-coarse.json",

@@ -206,6 +206,18 @@ def _memory() -> str:
         return ""
 
 
+def is_own_project(path: Path) -> bool:
+    """Return whether a `pyproject.toml` exists and is that of mor-bench.
+
+    Raises
+    ------
+    StoreError
+        If the file is damaged.
+    """
+    project = read_toml(path).get("project") if path.is_file() else None
+    return isinstance(project, dict) and project.get("name") == "mor-bench"
+
+
 def commit_and_date(commit: str | None) -> tuple[str, int]:
     """Look up the hash of a commit in the working folder's checkout, and its date, ms since 1970.
 
@@ -215,9 +227,7 @@ def commit_and_date(commit: str | None) -> tuple[str, int]:
         If the working folder is not in a checkout of mor-bench, or the commit does not exist.
     """
     top = _git("rev-parse", "--show-toplevel")
-    project = Path(top) / "pyproject.toml" if top else None
-    content = read_toml(project) if project and project.is_file() else {}
-    if content.get("project", {}).get("name") != "mor-bench":
+    if not top or not is_own_project(Path(top) / "pyproject.toml"):
         raise InvalidInputError(
             f"{Path().resolve()} is not in a git checkout of mor-bench; use the checkout "
             "with the commit that ran the comparison."

@@ -27,6 +27,15 @@ SHORT_NAMES = {
 """Names of swept parameters where space is short; others use the initials of their words."""
 
 
+MEANINGS = {
+    "n_modes": "number of modes",
+    "n_input_modes": "number of input modes",
+    "n_output_modes": "number of output modes",
+    "cubature_tolerance": "accepted error of the cubature",
+}
+"""Meanings of some parameters with short names."""
+
+
 def number(value: float | None) -> str:
     """Format a number in at most seven characters; a dash if there is none."""
     if value is None:
@@ -105,4 +114,8 @@ def short_swept(swept: Mapping[str, Any]) -> str:
 def explain_short_names(all_swept: Iterable[Mapping[str, Any]]) -> str:
     """Explain the short names in one line; empty if there are none."""
     keys = dict.fromkeys(key for swept in all_swept for key in swept)
-    return ", ".join(f"{short_name(key)} = {key}" for key in keys if short_name(key) != key)
+    return ", ".join(
+        f"{short_name(key)} = {key}" + (f" ({MEANINGS[key]})" if key in MEANINGS else "")
+        for key in keys
+        if short_name(key) != key
+    )

@@ -11,10 +11,12 @@ from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.canvas import Drawn
 from mor_bench.report.cards import pair_text
 from mor_bench.report.details import dataset_details, hard_cases
-from mor_bench.report.entries import Analysis, Entry, entries_of, verdict_of
+from mor_bench.report.entries import Analysis, Entry, best_per_method, entries_of, verdict_of
+from mor_bench.report.hardest_loads import hardest_loads
 from mor_bench.report.number_format import explain_short_names
-from mor_bench.report.page_data import Shown, cells_of, payload, reading_order
+from mor_bench.report.page_data import Shown, cells_of, dataset_arrays, payload, reading_order
 from mor_bench.report.page_findings import Chart, charts, frontier
+from mor_bench.report.page_samples import sampled
 from mor_bench.report.page_tables import figure_tables, with_content
 from mor_bench.report.page_verdict import Card, card, method_card
 from mor_bench.report.short_names import ShortName, constants, renamed
@@ -117,7 +119,11 @@ def section_of(view: View, dataset: str) -> Section:
     events += [Event(label, f"warning: {warning}") for label, warning in warnings_of(entries)]
     tables = [target_table(comparison, dataset, kind, analysis) for kind in _TARGETS]
     tables += [*dataset_details(comparison, dataset, analysis), *figure_tables(entries)]
-    hard = hard_cases(dataset, entries, analysis)
+    samples = sampled(comparison, entries, best_per_method(entries))
+    hard = [
+        *hard_cases(dataset, entries, analysis),
+        *hardest_loads(samples, dataset_arrays(comparison, dataset)),
+    ]
     pictures = (d for d in view.drawn if d.dataset == dataset and "worst-samples" in d.path.name)
     return Section(
         name=dataset,
@@ -170,10 +176,10 @@ def _facts(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> li
         f"{sum(r.status == status for r in rows)} {status}" for status in ("failed", "skipped")
     )
     facts = [("source", str(spec["source"]))] if spec.get("source") else []
-    for key in ("geometry", "material", "supports", "loads", "snapshots"):
-        if key in spec:
-            pairs = [pair_text(k, v) if k else v for k, v in flat(spec[key]) if v != "None"]
-            facts.append((key, "; ".join(pairs)))
+    for key, heading in _SCENE.items():
+        if spec.get(key):
+            pairs = [(k, _WORDS.get((key, k, v), v)) for k, v in flat(spec[key]) if v != "None"]
+            facts.append((heading, "; ".join(pair_text(k, v) if k else v for k, v in pairs)))
     return [
         *facts,
         ("split", split),
@@ -183,6 +189,26 @@ def _facts(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> li
         ("threads", _values(row.threads for row in rows)),
         ("configurations", f"{len(rows)}: {sum(r.ok for r in rows)} ran, {', '.join(counts)}"),
     ]
+
+
+_SCENE = {
+    "geometry": "geometry",
+    "discretisation": "discretisation",
+    "material": "material",
+    "supports": "supports (clamped: no displacement)",
+    "loads": "loads",
+    "snapshots": "snapshots",
+}
+"""Parts of a dataset's description, and their headings."""
+
+_WORDS = {
+    ("discretisation", "element", "hexahedron"): "hexahedron with 8 nodes (H8)",
+    ("discretisation", "element", "tetrahedron"): "tetrahedron with 4 nodes (T4)",
+    ("loads", "kind", "force"): "force, its direction uniform on the sphere",
+    ("loads", "kind", "normal"): "force along the normal, pressing or pulling",
+    ("loads", "kind", "tangential"): "force along the surface, its direction uniform",
+}
+"""What some values mean, by part, key and value."""
 
 
 def _values(found: Iterable[object]) -> str:

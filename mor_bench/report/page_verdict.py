@@ -141,6 +141,13 @@ def _by_latency(
         sentence = "It is faster than every other configuration that qualifies."
     else:
         sentence = "No other configuration qualifies."
+    full_order = [e for e in qualified if e.row.reference]
+    if full_order and not first.row.reference:
+        fastest = min(full_order, key=lambda e: e.latency_ms)
+        ratio = number(fastest.latency_ms / first.latency_ms)
+        sentence += (
+            f" It is {ratio} times as fast as the full-order model ({names[fastest.label]})."
+        )
     return Ranking("latency", f"Take {names[first.label]}", picks, sentence)
 
 

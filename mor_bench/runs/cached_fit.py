@@ -19,6 +19,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import inf
 from pathlib import Path
 from threading import Event, Thread
 from time import monotonic
@@ -156,6 +157,15 @@ def read_fit_record(path: Path) -> FitRecord:
     return validated(FitRecord, read_json(path), str(path), error=StoreError)
 
 
+def training_seconds(path: Path) -> float:
+    """Return the seconds that a training.json states; 0 if it is missing or damaged."""
+    with suppress(OSError, StoreError, ValueError, KeyError, TypeError, OverflowError):
+        seconds = float(read_json(path)["taken_s"])
+        if 0.0 <= seconds < inf:
+            return seconds
+    return 0.0
+
+
 class CachedFit:
     """A configuration and its cache folder; also its process if the method cannot be saved.
 
@@ -260,10 +270,7 @@ class CachedFit:
         """Create the folder of a checkpoint; read the training time up to an existing one."""
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(self.checkpoint.parent)
-        self.taken_s = 0.0
-        if self.checkpoint.exists():
-            with suppress(OSError, StoreError, ValueError, KeyError, TypeError):
-                self.taken_s = max(0.0, float(read_json(self._training_record)["taken_s"]))
+        self.taken_s = training_seconds(self._training_record) if self.checkpoint.exists() else 0.0
 
     @property
     def _training_record(self) -> Path:

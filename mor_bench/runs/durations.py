@@ -103,13 +103,16 @@ def sample_seconds(spec: DatasetSpec) -> float:
 def compile_seconds(
     spec: AnyDatasetSpec, configurations: Sequence[Configuration], pace: Pace
 ) -> float:
-    """Estimate the seconds of compiling what is not compiled yet."""
-    waiting = uncompiled(spec, configurations)
+    """Estimate the seconds of compiling what is not compiled yet, as `compile_kernels` does it."""
     each = [
         (group.method.compile_s or METHOD_S) + (TORCH_S if may_train(group.method) else START_S)
-        for group in waiting
+        for group in uncompiled(spec, configurations)
     ]
-    return pace.interpreter * (sum(each) + (KERNELS_S if waiting else 0.0))
+    if not each:
+        return 0.0
+    first, *others = each
+    side_by_side = max(sum(others) / (os.cpu_count() or 1), max(others, default=0.0))
+    return pace.interpreter * (KERNELS_S + first + side_by_side)
 
 
 def fit_seconds(

@@ -290,6 +290,15 @@ def _commit(folder: Path, number: int, solved: Solved) -> None:
         write_atomically(folder / f"seconds-{number:05d}.txt", f"{solved.seconds:.6f}\n".encode())
 
 
+def shard_seconds(path: Path) -> float | None:
+    """Return the seconds that a timing of a shard states; None if it is missing or damaged."""
+    with suppress(ValueError, OSError, StoreError):
+        seconds = float(read_bytes(path, MOST_TIME_BYTES))
+        if 0.0 <= seconds < inf:
+            return seconds
+    return None
+
+
 def generation_seconds(spec: DatasetSpec, cache: Path | None, n_samples: int) -> float | None:
     """Return the core-seconds for a number of samples, from the timings of shards; None if unknown.
 
@@ -297,10 +306,9 @@ def generation_seconds(spec: DatasetSpec, cache: Path | None, n_samples: int) ->
     """
     times = []
     for path in sorted(dataset_folder(spec, cache).glob("seconds-*.txt")):
-        with suppress(ValueError, OSError, StoreError):  # a missing timing does no harm
-            seconds = float(read_bytes(path, MOST_TIME_BYTES))
-            if 0.0 <= seconds < inf:
-                times.append(seconds)
+        seconds = shard_seconds(path)
+        if seconds is not None:
+            times.append(seconds)
     if not times:
         return None
     return sum(times) * n_samples / n_samples_to_generate(spec, len(times) * SHARD_SIZE)

@@ -1,6 +1,6 @@
 """Compare the work of timed queries with the work of the scored loads.
 
-    python -m tests.verification.timed_work beam-coarse [METHOD ...] [--queries 2600]
+    python -m tests.verification.timed_work beam-coarse [METHOD ...] [--out FILE]
 
 For every configuration it prints the mean counted work per query of the timed loads, relative to
 that of the scored test loads. A training is cut to two iterations, because a network's work does
@@ -10,6 +10,8 @@ not depend on its weights. It exits with 1 if a ratio differs from one by more t
 from __future__ import annotations
 
 import argparse
+import json
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +20,17 @@ import mor_bench
 from mor_bench.errors import SpecError
 from mor_bench.measure.query_cost import cost_of
 from mor_bench.measure.timed_loads import TimedLoads
+from mor_bench.results.row import label_of
 from mor_bench.runs.configurations import CORE_METHODS
 from mor_bench.runs.timing_stage import timed_numbers
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.given import given_of
 from mor_bench.specs import load_dataset_spec, load_method_spec
 from mor_bench.surrogate import Surrogate
+from tests.verification.trust_record import trust_record
+
+QUERIES = 1000
+"""Least number of timed loads, about as many as the timing of a fast method takes."""
 
 MOST_DIFFERENCE = 0.01
 """Largest accepted relative difference of the mean work."""
@@ -53,11 +60,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("dataset")
     parser.add_argument("methods", nargs="*", default=CORE_METHODS)
-    parser.add_argument("--queries", type=int, help="default: two orders of the test loads")
+    parser.add_argument("--out", type=Path, help="JSON file for the differences")
     options = parser.parse_args()
     dataset = load_dataset(load_dataset_spec(options.dataset))
-    timed = timed_loads(dataset, options.queries or 2 * len(dataset.test))
-    bad = 0
+    timed = timed_loads(dataset, max(QUERIES, 2 * len(dataset.test)))
+    found: dict[str, float] = {}
     for name in options.methods:
         for parameters in load_method_spec(name).configurations("quick"):
             try:
@@ -66,10 +73,21 @@ def main() -> None:
                 method = mor_bench.load_method(name, **parameters)
             ratio = work_ratio(method.fit(dataset.scene, dataset.train), dataset, timed)
             text = "counts nothing" if ratio is None else f"{100 * (ratio - 1):+.2f} %"
-            bad += ratio is not None and abs(ratio - 1) > MOST_DIFFERENCE
-            print(f"{name} {parameters}: {text}", flush=True)
-    if bad:
-        raise SystemExit(f"{bad} configurations differ by more than {MOST_DIFFERENCE:.0%}")
+            print(f"{label_of(name, parameters)}: {text}", flush=True)
+            if ratio is not None:
+                found[label_of(name, parameters)] = round(100 * (ratio - 1), 3)
+    largest = max((abs(percent) for percent in found.values()), default=0.0)
+    record = {
+        **trust_record(),
+        "dataset": options.dataset,
+        "queries": len(timed),
+        "largest_difference_percent": largest,
+        "difference_percent": found,
+    }
+    if options.out:
+        options.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    if largest > 100 * MOST_DIFFERENCE:
+        raise SystemExit(f"the work differs by up to {largest:.2g} %")
 
 
 if __name__ == "__main__":

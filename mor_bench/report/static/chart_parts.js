@@ -10,7 +10,7 @@ Object.assign(Report, (() => {
     const { ink, grid } = Report.theme();
     return {
       title: { text: title, standoff: 8, font: { size: isNarrow() ? 12 : 14 } }, gridcolor: grid, linecolor: ink, zeroline: false,
-      automargin: true, tickformat: "~g", color: ink, ...more,
+      automargin: true, tickformat: "~g", color: ink, ...(isNarrow() ? { nticks: 5 } : {}), ...more,
     };
   }
 

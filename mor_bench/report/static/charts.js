@@ -146,7 +146,7 @@ Report.kinds.singular = (figure, data) => {
     const beyond = tail.findIndex((t) => t < floor);
     const last = beyond > 0 ? beyond : sigma.length;
     return R.draw(plot, traces, R.layout({
-      xaxis: R.logAxis("number of modes r", { range: [-0.06, Math.log10(last) + 0.06], dtick: "D2" }),
+      xaxis: R.logAxis("number of modes r", { range: [-0.06, Math.log10(last) + 0.06], ...(R.isNarrow() ? {} : { dtick: "D2" }) }),
       yaxis: R.logAxis("relative to all snapshots", { range: [Math.log10(floor), 0.1] }),
       ...R.legend(traces.length, 400),
     }));
@@ -221,7 +221,7 @@ Report.kinds.costs = (figure, data) => {
         hoverinfo: "text" });
     }
     return R.draw(left, traces, R.layout({
-      xaxis: R.logAxis("number of queries", { tickformat: "~e", dtick: 1 }),
+      xaxis: R.logAxis("number of queries", { tickformat: "~e", dtick: R.isNarrow() ? 2 : 1 }),
       yaxis: R.logAxis("core-seconds"), height: 440,
       legend: { orientation: "h", y: -0.2, font: { size: 12 } },
     }));
