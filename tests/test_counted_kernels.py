@@ -74,6 +74,8 @@ LAWS = {
     "saint-venant-kirchhoff": (laws.SAINT_VENANT_KIRCHHOFF, [1.0, 2.0]),
     "neo-hookean": (laws.NEO_HOOKEAN, [1.0, 2.0]),
     "mooney-rivlin": (laws.MOONEY_RIVLIN, [1.0, 2.0, 3.0]),
+    "yeoh": (laws.YEOH, [1.0, 2.0, 3.0, 4.0]),
+    "corotational": (laws.COROTATIONAL, [1.0, 2.0]),
     "ogden, one term": (laws.OGDEN, [3.0, 1.0, 2.0]),
     "ogden, two terms": (laws.OGDEN, [3.0, 1.0, 2.0, -1.0, -2.0]),
 }

@@ -25,6 +25,8 @@ LAWS: dict[str, dict[str, Any]] = {
     "neo-hookean": {"young_pa": 500.0, "poisson": 0.4},
     "mooney-rivlin": {"c10_pa": 60.0, "c01_pa": 29.0, "bulk_pa": 833.0},
     "ogden": {"mu_pa": [178.0], "alpha": [2.5], "bulk_pa": 833.0},
+    "corotational": {"young_pa": 500.0, "poisson": 0.4},
+    "yeoh": {"c10_pa": 89.0, "c20_pa": -20.0, "c30_pa": 15.0, "bulk_pa": 833.0},
 }
 ELEMENTS = {
     "H8": ("hexahedron", "full"),

@@ -133,6 +133,7 @@ material = { law = "mooney-rivlin", c10_pa = 1.0, c01_pa = 0.1 } -> `material.bu
 material = { law = "mooney-rivlin", c10_pa = -1.0, c01_pa = 0.1, bulk_pa = 9.0 } -> than 0; got -1
 material = { law = "ogden", mu_pa = [1.0], alpha = [2.0, 3.0], bulk_pa = 9.0 } -> equal lengths
 material = { law = "ogden", mu_pa = [1.0], alpha = [-2.0], bulk_pa = 9.0 } -> must be > 0
+material = { law = "yeoh", c10_pa = 1.0, c20_pa = -2.0, c30_pa = 0.5, bulk_pa = 9.0 } -> 3 c10 c30
 discretisation = { element = "wedge" } -> must be 'hexahedron' or 'tetrahedron'; got 'wedge'.
 discretisation = { element = "tetrahedron", integration = "selective" } -> must be 'full'
 loads.region = { sphere_m = [[0.0, 0.0, 9.0], 0.5] } -> holds no node of the mesh

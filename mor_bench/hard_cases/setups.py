@@ -213,6 +213,9 @@ def material_table(law: str, young: float, poisson: float) -> dict[str, Any]:
     shear, bulk = young / (2 * (1 + poisson)), young / (3 * (1 - 2 * poisson))
     if law == "mooney-rivlin":
         return {"law": law, "c10_pa": 0.4 * shear, "c01_pa": 0.1 * shear, "bulk_pa": bulk}
+    if law == "yeoh":
+        coefficients = {"c10_pa": 0.5 * shear, "c20_pa": -0.1 * shear, "c30_pa": 0.05 * shear}
+        return {"law": law, **coefficients, "bulk_pa": bulk}
     if law == "ogden":
         return {
             "law": law,

@@ -31,7 +31,7 @@ from llvmlite import ir
 from numba import float64, njit, uint64
 from numba.extending import intrinsic
 
-SAINT_VENANT_KIRCHHOFF, NEO_HOOKEAN, MOONEY_RIVLIN, OGDEN = range(4)
+SAINT_VENANT_KIRCHHOFF, NEO_HOOKEAN, MOONEY_RIVLIN, OGDEN, YEOH, COROTATIONAL = range(6)
 
 LANES = 32
 """Elements or points per batch."""
@@ -40,7 +40,11 @@ SWEEPS = 6
 """Largest number of Jacobi sweeps; 3 x 3 matrices need at most 5 for all digits."""
 
 VECTORS, SQUARES, LOGS, BETA, SLOPES, GAMMA = (k * LANES for k in (6, 15, 18, 21, 24, 27))
-"""Places of the principal values of `_ogden` in its work array."""
+"""Places of the principal values in the work array of a law of principal stretches.
+
+These are the eigenvectors of C, the squared stretches v_a and their logarithms, β_a = dW/dlnλ_a,
+and for the tangent (β_a - β_b) / (v_a - v_b) and γ_ab = dβ_a/dlnλ_b.
+"""
 
 
 @intrinsic
@@ -256,6 +260,43 @@ def _mooney_rivlin(E, p, S, D):
 
 
 @njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _yeoh(E, p, S, D):
+    """Yeoh, W = c10 x + c20 x² + c30 x³ + κ/2 (J - 1)², with x = J^(-2/3) I₁ - 3.
+
+    p = (c10, c20, c30, κ). Yeoh, Rubber Chemistry and Technology 66 (1993), 754-771.
+    """
+    L = LANES
+    for l in range(LANES):
+        c10, c20, c30, bulk = p[l], p[L + l], p[2 * L + l], p[3 * L + l]
+        J, inverse = E[6 * L + l], _inverse(E, l)
+        i0, i1, i2, i3, i4, i5 = inverse
+        root = _exp(-2.0 / 3.0 * _log(J))
+        first = 3.0 + 2.0 * (E[l] + E[L + l] + E[2 * L + l])
+        x, d_u = root * first - 3.0, bulk * (J - 1.0)
+        # S = a I + s C⁻¹, with a = 2 J^(-2/3) dW/dx.
+        a = 2.0 * root * (c10 + x * (2.0 * c20 + 3.0 * c30 * x))
+        third = a * first / 3.0
+        s = J * d_u - third
+        S[l], S[L + l], S[2 * L + l] = a + s * i0, a + s * i1, a + s * i2
+        S[3 * L + l], S[4 * L + l], S[5 * L + l] = s * i3, s * i4, s * i5
+        S[6 * L + l] = x * (c10 + x * (c20 + x * c30)) + 0.5 * d_u * (J - 1.0)
+        if D is not None:
+            # dx/dC = J^(-2/3) (I - I₁/3 C⁻¹); 4 d²W/dx² dx/dC ⊗ dx/dC, with I ⊗ I last.
+            w = 4.0 * root * root * (2.0 * c20 + 6.0 * c30 * x)
+            wide = w * first / 3.0
+            v = -4.0 / 3.0 * a - 2.0 * wide
+            t = J * (d_u + J * bulk) + third / 1.5 + wide * first / 3.0
+            y = v + t * i0, v + t * i1, v + t * i2, t * i3, t * i4, t * i5
+            _write(D, l, y, inverse, -s)
+            D[l] += w
+            D[L + l] += w
+            D[2 * L + l] += w
+            D[6 * L + l] += w
+            D[7 * L + l] += w
+            D[11 * L + l] += w
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
 def _sweep(A, V):
     """Rotate A (6, symmetric) by one cyclic Jacobi sweep, and the columns of V (9) with it."""
     L = LANES
@@ -329,7 +370,7 @@ def _slope(p_a, p_b, v_a, v_b, half, z):
 
 @njit(error_model="numpy", fastmath={"contract", "nsz"})
 def _add_term(work, mu, alpha, S, D):
-    """Add a term of Ogden's law to the energy and to the principal values of `_ogden`."""
+    """Add a term of Ogden's law to the energy and to the principal values."""
     L = LANES
     for l in range(LANES):
         x0, x1, x2, m, a = (
@@ -365,7 +406,7 @@ def _add_term(work, mu, alpha, S, D):
 
 @njit(error_model="numpy", fastmath={"contract", "nsz"})
 def _add_volumetric(work, E, bulk, S, D):
-    """Add U = κ/2 (J - 1)² to the energy and to the principal values of `_ogden`."""
+    """Add U = κ/2 (J - 1)² to the energy and to the principal values."""
     L = LANES
     for l in range(LANES):
         J = E[6 * L + l]
@@ -438,26 +479,10 @@ def _principal_tangent(work, D):
 
 
 @njit(error_model="numpy", fastmath={"contract", "nsz"})
-def _ogden(E, p, S, D):
-    """Ogden, W = Σ μ_p/α_p (λ̄₁^α_p + λ̄₂^α_p + λ̄₃^α_p - 3) + κ/2 (J - 1)².
-
-    λ̄ = J^(-1/3) λ; p = (κ, μ₁, α₁, μ₂, α₂, …). Holzapfel, sections 6.5 and 6.6. Principal values
-    in ``work``: eigenvectors of C, squared stretches v_a and their logarithms, β_a = v_a S_a, and
-    for the tangent (β_a - β_b) / (v_a - v_b) and γ_ab = dβ_a/dlnλ_b.
-    """
+def _principal_stress(work, S, D):
+    """Write S = Σ_a β_a / v_a a ⊗ a from the principal values, and D if it is not None."""
     L = LANES
-    work = np.zeros(33 * LANES)
-    A, V, v = work[:VECTORS], work[VECTORS:SQUARES], work[SQUARES:LOGS]
-    logs, beta = work[LOGS:BETA], work[BETA:SLOPES]
-    A[:] = E[: 6 * L]
-    _diagonalise(A, V)
-    for l in range(3 * LANES):
-        v[l] = max(1.0 + 2.0 * A[l], 1e-300)
-        logs[l] = _log(v[l])
-    S[6 * L :] = 0.0
-    for k in range(1, len(p) // LANES, 2):
-        _add_term(work, p[k * L : (k + 1) * L], p[(k + 1) * L : (k + 2) * L], S, D)
-    _add_volumetric(work, E, p[:L], S, D)
+    V, v, beta = work[VECTORS:SQUARES], work[SQUARES:LOGS], work[BETA:SLOPES]
     for m in range(6):
         i, j, s = V[3 * _I[m] * L :], V[3 * _J[m] * L :], S[m * L :]
         for l in range(LANES):
@@ -468,6 +493,67 @@ def _ogden(E, p, S, D):
             )
     if D is not None:
         _principal_tangent(work, D)
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _ogden(E, p, S, D):
+    """Ogden, W = Σ μ_p/α_p (λ̄₁^α_p + λ̄₂^α_p + λ̄₃^α_p - 3) + κ/2 (J - 1)².
+
+    λ̄ = J^(-1/3) λ; p = (κ, μ₁, α₁, μ₂, α₂, …). Holzapfel, sections 6.5 and 6.6.
+    """
+    L = LANES
+    work = np.zeros(33 * LANES)
+    A, v, logs = work[:VECTORS], work[SQUARES:LOGS], work[LOGS:BETA]
+    A[:] = E[: 6 * L]
+    _diagonalise(A, work[VECTORS:SQUARES])
+    for l in range(3 * LANES):
+        v[l] = max(1.0 + 2.0 * A[l], 1e-300)
+        logs[l] = _log(v[l])
+    S[6 * L :] = 0.0
+    for k in range(1, len(p) // LANES, 2):
+        _add_term(work, p[k * L : (k + 1) * L], p[(k + 1) * L : (k + 2) * L], S, D)
+    _add_volumetric(work, E, p[:L], S, D)
+    _principal_stress(work, S, D)
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _corotational(E, p, S, D):
+    """Corotational linear elasticity, W = μ Σ (λ_a - 1)² + λ/2 (Σ (λ_a - 1))²; p = (λ, μ).
+
+    This is Hooke's law of U - I, with F = R U. Its β_a - β_b has the factor λ_a - λ_b, so that the
+    division by v_a - v_b is exact.
+    """
+    L = LANES
+    work = np.zeros(33 * LANES)
+    A, v = work[:VECTORS], work[SQUARES:LOGS]
+    A[:] = E[: 6 * L]
+    _diagonalise(A, work[VECTORS:SQUARES])
+    for l in range(3 * LANES):
+        v[l] = max(1.0 + 2.0 * A[l], 1e-300)
+    for l in range(LANES):
+        lam, twice = p[l], 2.0 * p[L + l]
+        s0, s1, s2 = sqrt(v[l]), sqrt(v[L + l]), sqrt(v[2 * L + l])
+        # λ_a - 1 without the loss of digits at small strains.
+        e0, e1 = 2.0 * A[l] / (1.0 + s0), 2.0 * A[L + l] / (1.0 + s1)
+        e2 = 2.0 * A[2 * L + l] / (1.0 + s2)
+        trace = e0 + e1 + e2
+        pressure = lam * trace
+        S[6 * L + l] = 0.5 * (twice * (e0 * e0 + e1 * e1 + e2 * e2) + pressure * trace)
+        b0, b1 = s0 * (twice * e0 + pressure), s1 * (twice * e1 + pressure)
+        b2 = s2 * (twice * e2 + pressure)
+        work[BETA + l], work[BETA + L + l], work[BETA + 2 * L + l] = b0, b1, b2
+        if D is not None:
+            stiff, rest = twice + lam, pressure - twice
+            work[GAMMA + l] = b0 + stiff * v[l]
+            work[GAMMA + L + l] = b1 + stiff * v[L + l]
+            work[GAMMA + 2 * L + l] = b2 + stiff * v[2 * L + l]
+            work[GAMMA + 3 * L + l] = lam * (s0 * s1)
+            work[GAMMA + 4 * L + l] = lam * (s0 * s2)
+            work[GAMMA + 5 * L + l] = lam * (s1 * s2)
+            work[SLOPES + l] = twice + rest / (s0 + s1)
+            work[SLOPES + L + l] = twice + rest / (s0 + s2)
+            work[SLOPES + 2 * L + l] = twice + rest / (s1 + s2)
+    _principal_stress(work, S, D)
 
 
 _I = np.array([0, 1, 2, 0, 0, 1])
@@ -760,6 +846,10 @@ def general_force(law: int, n_nodes: int):
                     _neo_hookean(E, parameters[q], S, D)
                 elif law == MOONEY_RIVLIN:
                     _mooney_rivlin(E, parameters[q], S, D)
+                elif law == YEOH:
+                    _yeoh(E, parameters[q], S, D)
+                elif law == COROTATIONAL:
+                    _corotational(E, parameters[q], S, D)
                 else:
                     _ogden(E, parameters[q], S, D)
                 _weigh(F, S, P, totals)
@@ -818,6 +908,10 @@ def point_stresses(law: int):
                 _neo_hookean(E, parameters[b], S, D)
             elif law == MOONEY_RIVLIN:
                 _mooney_rivlin(E, parameters[b], S, D)
+            elif law == YEOH:
+                _yeoh(E, parameters[b], S, D)
+            elif law == COROTATIONAL:
+                _corotational(E, parameters[b], S, D)
             else:
                 _ogden(E, parameters[b], S, D)
             _weigh(F, S, P[b], totals)
@@ -835,6 +929,8 @@ _LAW_MULTIPLY_ADDS = {
     SAINT_VENANT_KIRCHHOFF: (15, 1),
     NEO_HOOKEAN: (38, 87),
     MOONEY_RIVLIN: (71, 102),
+    YEOH: (52, 102),
+    COROTATIONAL: (80 + 4 * SWEEP_MULTIPLY_ADDS, 294),
     OGDEN: (64 + 4 * SWEEP_MULTIPLY_ADDS, 284),
 }
 """Multiply-adds per point for energy and stress, and for the tangent; 4 sweeps are usual."""

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
-from mor_bench.specs import MooneyRivlinMaterial, OgdenMaterial, TwoLameMaterial
+from mor_bench.specs import MooneyRivlinMaterial, OgdenMaterial, TwoLameMaterial, YeohMaterial
 
 
 class Material(ABC):
@@ -92,6 +92,16 @@ class NeoHookean(_TwoLame):
     law = 1
 
 
+class Corotational(_TwoLame):
+    """W = μ Σ (λ_a - 1)² + λ/2 (Σ (λ_a - 1))²: Hooke's law of U - I, with F = R U.
+
+    λ_a are the principal stretches. Real-time simulators use it, since it is exact for large
+    rotations and linear in the stretches. It does not stiffen towards J = 0.
+    """
+
+    law = 5
+
+
 @dataclass(frozen=True)
 class MooneyRivlin(Material):
     """W = c10 (J^(-2/3) I₁ - 3) + c01 (J^(-4/3) I₂ - 3) + κ/2 (J - 1)².
@@ -147,11 +157,48 @@ class Ogden(Material):
         return poisson_of(self.bulk_pa, 0.5 * twice_shear)
 
 
-def make_material(spec: TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial) -> Material:
+@dataclass(frozen=True)
+class Yeoh(Material):
+    """W = c10 x + c20 x² + c30 x³ + κ/2 (J - 1)², with x = J^(-2/3) I₁ - 3.
+
+    Parameters
+    ----------
+    c10_pa, c20_pa, c30_pa : float
+        Pa; the shear modulus at rest is 2 c10.
+    bulk_pa : float
+        κ, Pa.
+    """
+
+    c10_pa: float
+    c20_pa: float
+    c30_pa: float
+    bulk_pa: float
+    law: ClassVar[int] = 4
+
+    def _scaled(self, volume: float, shape: float) -> tuple[float, ...]:
+        shear = (shape * c for c in (self.c10_pa, self.c20_pa, self.c30_pa))
+        return (*shear, volume * self.bulk_pa)
+
+    @property
+    def poisson_at_rest(self) -> float:
+        return poisson_of(self.bulk_pa, 2 * self.c10_pa)
+
+
+def make_material(
+    spec: TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial | YeohMaterial,
+) -> Material:
     """Return the law that a dataset file names."""
     if isinstance(spec, MooneyRivlinMaterial):
         return MooneyRivlin(spec.c10_pa, spec.c01_pa, spec.bulk_pa)
     if isinstance(spec, OgdenMaterial):
         return Ogden(spec.mu_pa, spec.alpha, spec.bulk_pa)
-    law = SaintVenantKirchhoff if spec.law == "saint-venant-kirchhoff" else NeoHookean
-    return law(spec.young_pa, spec.poisson)
+    if isinstance(spec, YeohMaterial):
+        return Yeoh(spec.c10_pa, spec.c20_pa, spec.c30_pa, spec.bulk_pa)
+    return _TWO_LAME[spec.law](spec.young_pa, spec.poisson)
+
+
+_TWO_LAME: dict[str, type[_TwoLame]] = {
+    "saint-venant-kirchhoff": SaintVenantKirchhoff,
+    "neo-hookean": NeoHookean,
+    "corotational": Corotational,
+}

@@ -30,6 +30,7 @@ from mor_bench.specs.material_spec import (
     OgdenMaterial,
     SolverName,
     TwoLameMaterial,
+    YeohMaterial,
 )
 from mor_bench.specs.method_spec import MethodSpec, all_configurations, check_method
 from mor_bench.specs.parameters import check_parameters, load_class
@@ -82,6 +83,7 @@ __all__ = [
     "TetrahedraGeometry",
     "TwoLameMaterial",
     "VoxelsGeometry",
+    "YeohMaterial",
     "all_configurations",
     "check_method",
     "check_parameters",

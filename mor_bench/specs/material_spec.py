@@ -32,9 +32,9 @@ class Discretisation(StrictModel):
 
 
 class TwoLameMaterial(StrictModel):
-    """Saint Venant-Kirchhoff or neo-Hookean, from Young's modulus and Poisson's ratio."""
+    """A law of Young's modulus and Poisson's ratio."""
 
-    law: Literal["saint-venant-kirchhoff", "neo-hookean"]
+    law: Literal["saint-venant-kirchhoff", "neo-hookean", "corotational"]
     young_pa: Modulus
     poisson: Annotated[float, Field(gt=-1, lt=0.5), in_range(-0.999999, 0.499999, "")]
 
@@ -75,6 +75,27 @@ class OgdenMaterial(StrictModel):
         return self
 
 
+class YeohMaterial(StrictModel):
+    """Yeoh with a quadratic volumetric energy; shear must always raise the energy."""
+
+    law: Literal["yeoh"]
+    c10_pa: Modulus
+    c20_pa: _Shear
+    c30_pa: Annotated[float, Field(ge=0, le=1e15)]
+    bulk_pa: Modulus
+
+    @model_validator(mode="after")
+    def _grows(self) -> YeohMaterial:
+        # c10 + 2 c20 x + 3 c30 x² > 0 for all x >= 0.
+        if self.c20_pa < 0 and self.c20_pa**2 >= 3 * self.c10_pa * self.c30_pa:
+            raise ValueError(
+                "a negative `c20_pa` needs c20² < 3 c10 c30, so that the energy grows with the "
+                f"strain; got {self.c10_pa}, {self.c20_pa} and {self.c30_pa}"
+            )
+        return self
+
+
 MaterialSpec = Annotated[
-    TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial, Field(discriminator="law")
+    TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial | YeohMaterial,
+    Field(discriminator="law"),
 ]

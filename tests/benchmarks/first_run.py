@@ -33,22 +33,44 @@ AVX2 = {
 }
 """Environment in which oneDNN, PyTorch, Numba, NumPy and OpenBLAS use AVX2 at most."""
 
-RUN = """
-import json, sys, time
+RUN = r"""
+import io, json, re, sys, time
 import mor_bench
+from rich.console import Console
+from mor_bench.cli.run_progress import show_run
 from mor_bench.runs.listener import Listener
+from mor_bench.runs.plan import plan
 
-last = {}
-def noting(stage):
-    return lambda *_: last.update({stage: time.perf_counter() - begun})
+ended, said = {}, []
+
+class Lines(io.StringIO):
+    def write(self, text):
+        for left, unit in re.findall(r"; (\d+) (s|min) left", text):
+            said.append([time.perf_counter() - begun, int(left) * {"s": 1, "min": 60}[unit]])
+        return len(text)
+
+def noting(stage, shown):
+    def note(*what):
+        getattr(shown, stage)(*what)
+        ended[stage] = time.perf_counter() - begun
+    return note
 
 begun = time.perf_counter()
-stages = ("compiling", "generating", "fitted", "timing")
-mor_bench.run(out=sys.argv[1], listener=Listener(**{stage: noting(stage) for stage in stages}))
-last["all"] = time.perf_counter() - begun
-print(json.dumps(last))
+with show_run(Console(file=Lines(), width=200), plan) as shown:
+    stages = ("compiling", "generating", "starting", "fitted", "timing")
+    listener = Listener(**{stage: noting(stage, shown) for stage in stages})
+    mor_bench.run(out=sys.argv[1], listener=listener)
+ended["all"] = time.perf_counter() - begun
+print(json.dumps({"ended": ended, "said": said}))
 """
-"""Program that runs the default comparison; it prints when each stage ended, s."""
+"""Program that runs the default comparison with the progress that the terminal shows.
+
+It prints when each stage ended, s, and what time left was stated when, s.
+"""
+
+FAIR_AFTER_S, FAIR_UNTIL_S = 60.0, 10.0
+"""Statements of the time left are compared with the truth from the one time on, s, until the other
+time before the end, s."""
 
 
 def first_run(torch: str | None, environment: Mapping[str, str]) -> dict[str, Any]:
@@ -58,7 +80,8 @@ def first_run(torch: str | None, environment: Mapping[str, str]) -> dict[str, An
     -------
     dict
         Seconds of the installation and of each stage, `total_s` of the run, and `estimated_s` and
-        `estimate_s`: what the dry run says, and the seconds that it takes.
+        `estimate_s`: what the dry run says, and the seconds that it takes. `time_left` holds pairs
+        of the time, s, and the time left that the progress stated then, s.
     """
     with tempfile.TemporaryDirectory() as folder:
         clone, home = Path(folder) / "clone", Path(folder) / "home"
@@ -79,7 +102,8 @@ def first_run(torch: str | None, environment: Mapping[str, str]) -> dict[str, An
         drawn = perf_counter()
         _call([".venv/bin/mor-bench", "report", "out"], clone, env)
         report_s = perf_counter() - drawn
-    ended = json.loads(printed.splitlines()[-1])
+    found = json.loads(printed.splitlines()[-1])
+    ended, total_s = found["ended"], found["ended"]["all"] + report_s
     return {
         "install_s": installed - begun,
         "estimated_s": _minutes(said) * 60,
@@ -89,8 +113,20 @@ def first_run(torch: str | None, environment: Mapping[str, str]) -> dict[str, An
         "fits_and_scores_s": ended["fitted"] - ended["generating"],
         "timing_s": ended["timing"] - ended["fitted"],
         "report_s": ended["all"] - ended["timing"] + report_s,
-        "total_s": ended["all"] + report_s,
+        "total_s": total_s,
+        "time_left": found["said"],
+        "time_left_off_percent": _worst_time_left(found["said"], total_s),
     }
+
+
+def _worst_time_left(said: list[tuple[float, float]], total_s: float) -> float:
+    """Return the largest difference between the stated and the true time left, %."""
+    off = [
+        100 * abs(left / (total_s - at) - 1)
+        for at, left in said
+        if at >= FAIR_AFTER_S and total_s - at >= FAIR_UNTIL_S
+    ]
+    return max(off)
 
 
 def _call(command: list[str], folder: Path, environment: Mapping[str, str]) -> str:

@@ -12,11 +12,13 @@ from mor_bench.mechanics.banded import BandedCholesky
 from mor_bench.mechanics.elements import T4, shape_gradients
 from mor_bench.scene.interpolation import trilinear
 from mor_bench.scene.materials import (
+    Corotational,
     Material,
     MooneyRivlin,
     NeoHookean,
     Ogden,
     SaintVenantKirchhoff,
+    Yeoh,
 )
 from mor_bench.scene.mesh import box_mesh
 
@@ -26,12 +28,16 @@ LAWS: dict[str, Material] = {
     "neo-hookean": NeoHookean(500.0, 0.4),
     "mooney-rivlin": MooneyRivlin(70.0, 20.0, 800.0),
     "ogden": Ogden((100.0, -20.0), (2.1, -1.7), 800.0),
+    "yeoh": Yeoh(90.0, -30.0, 20.0, 800.0),
+    "corotational": Corotational(500.0, 0.4),
 }
 COMPRESSIBLE: dict[str, Material] = {
     "saint-venant-kirchhoff": SaintVenantKirchhoff(1.0, 0.3),
     "neo-hookean": NeoHookean(1.0, 0.3),
     "mooney-rivlin": MooneyRivlin(0.15, 0.04, 0.8),
     "ogden": Ogden((0.3, -0.08), (2.1, -1.7), 0.8),
+    "yeoh": Yeoh(0.19, -0.05, 0.03, 0.8),
+    "corotational": Corotational(1.0, 0.3),
 }
 ELEMENTS = [("hexahedron", False), ("hexahedron", True), ("tetrahedron", False)]
 EVERY = list(itertools.product(LAWS, ELEMENTS))
@@ -57,10 +63,20 @@ def piola(law: Material, gradient: Array) -> Array:
         return np.asarray(
             (law.lame_mu * (left - eye) + law.lame_lambda * np.log(j) * eye) @ inverse
         )
+    if isinstance(law, Corotational):  # P = R (2μ (U - I) + λ tr(U - I) I)
+        values, vectors = np.linalg.eigh(np.swapaxes(gradient, -1, -2) @ gradient)
+        stretch = np.einsum("...ia,...a,...ja->...ij", vectors, np.sqrt(values), vectors)
+        trace = np.trace(stretch - eye, axis1=-2, axis2=-1)[..., None, None]
+        biot = 2 * law.lame_mu * (stretch - eye) + law.lame_lambda * trace * eye
+        return np.asarray(gradient @ np.linalg.inv(stretch) @ biot)
     if isinstance(law, MooneyRivlin):
         bar = j ** (-2 / 3) * left
         first = np.trace(bar, axis1=-2, axis2=-1)[..., None, None]
         tau = deviator(2 * law.c10_pa * bar + 2 * law.c01_pa * (first * bar - bar @ bar))
+    elif isinstance(law, Yeoh):
+        bar = j ** (-2 / 3) * left
+        x = np.trace(bar, axis1=-2, axis2=-1)[..., None, None] - 3
+        tau = deviator(2 * (law.c10_pa + 2 * law.c20_pa * x + 3 * law.c30_pa * x**2) * bar)
     else:
         assert isinstance(law, Ogden)
         values, vectors = np.linalg.eigh(left)

@@ -10,7 +10,7 @@ import pytest
 from felupe.constitution import tensortrax
 from numpy.typing import NDArray
 from tensortrax.math import log, sqrt, trace
-from tensortrax.math.linalg import det
+from tensortrax.math.linalg import det, inv
 
 import mor_bench
 from mor_bench.hard_cases.setups import material_table
@@ -21,6 +21,14 @@ from mor_bench.scene.scene import Scene
 from .laws_and_elements import LAWS
 
 Array = NDArray[np.float64]
+
+
+def root(c: Any) -> Any:
+    """Return U with U² = C, by Denman and Beavers' iteration; eigenvalues would lose digits."""
+    y, z = c, inv(c) @ c
+    for _ in range(6):
+        y, z = 0.5 * (y + inv(z)), 0.5 * (z + inv(y))
+    return y
 
 
 def felupe_law(scene: Scene) -> Any:
@@ -37,6 +45,11 @@ def felupe_law(scene: Scene) -> Any:
             return p[1] / 2 * (trace(c) - 3) - p[1] * log(j) + p[0] / 2 * log(j) ** 2
         if name == "mooney-rivlin":
             return models.mooney_rivlin(c, C10=p[0], C01=p[1]) + p[2] / 2 * (j - 1) ** 2
+        if name == "corotational":
+            stretch = trace(root(c))
+            return p[1] * (trace(c) - 2 * stretch + 3) + p[0] / 2 * (stretch - 3) ** 2
+        if name == "yeoh":
+            return models.yeoh(c, C10=p[0], C20=p[1], C30=p[2]) + p[3] / 2 * (j - 1) ** 2
         # With exponents 2 and -2 the invariants suffice; automatic eigenvalues lose digits.
         return models.mooney_rivlin(c, C10=p[1] / p[2], C01=p[3] / p[4]) + p[0] / 2 * (j - 1) ** 2
 

@@ -10,13 +10,15 @@ import pytest
 from numpy.typing import NDArray
 
 from mor_bench.mechanics.laws import LANES, point_stresses
-from mor_bench.scene.materials import Material, MooneyRivlin, NeoHookean, Ogden
+from mor_bench.scene.materials import Corotational, Material, MooneyRivlin, NeoHookean, Ogden, Yeoh
 
 Array = NDArray[np.float64]
 
 OGDEN = Ogden((100.0, -20.0), (2.5, -2.0), 800.0)
+YEOH = Yeoh(80.0, -20.0, 15.0, 800.0)
 
-LAWS = [NeoHookean(500.0, 0.4), MooneyRivlin(60.0, 20.0, 800.0), OGDEN]
+LAWS = [NeoHookean(500.0, 0.4), MooneyRivlin(60.0, 20.0, 800.0), OGDEN, YEOH]
+EVERY = [*LAWS, Corotational(500.0, 0.4)]
 
 
 def at_points(law: Material, gradients: Array) -> tuple[Array, Array, float, float]:
@@ -83,7 +85,7 @@ def test_energies_of_wide_dilatations_match_the_closed_forms(stretch: float) -> 
         assert found[3] == pytest.approx(J)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", EVERY)
 def test_stress_and_its_derivative_are_those_of_the_energy(law: Material) -> None:
     """Central differences of the fourth order at random deformations."""
     H = 0.1 * np.random.default_rng(1).normal(size=(5, 3, 3))
@@ -100,7 +102,7 @@ def test_stress_and_its_derivative_are_those_of_the_energy(law: Material) -> Non
             assert rise == pytest.approx(P[point, i, j], abs=1e-8 * np.abs(A).max())
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", EVERY)
 def test_an_inverted_point_has_infinite_energy_and_leaves_the_others_alone(law: Material) -> None:
     H = 0.1 * np.random.default_rng(1).normal(size=(4, 3, 3))
     alone, _, energy, _ = at_points(law, H[:3])
