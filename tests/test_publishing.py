@@ -22,7 +22,7 @@ from tests.published.claims import (
     without_evidence,
     wrong_numbers,
 )
-from tests.published.compact import ERRORS, compact, wrong_summaries
+from tests.published.compact import ERRORS, compact, wrong_summaries, wrong_verdicts
 from tests.published.pictures import draw_pictures, stale_pictures
 from tests.published.stored import EvidenceError, content_of, look_up, run_of
 from tests.synthetic import synthetic_comparison
@@ -57,6 +57,19 @@ def test_an_error_that_its_samples_do_not_give_is_found(stored: Path, tmp_path: 
     path.write_text(json.dumps(content))
     (found,) = wrong_summaries(tmp_path / "copy")
     assert "linear-fem: rel_l2_median" in found
+
+
+def test_a_verdict_that_its_rows_do_not_give_is_found(stored: Path, tmp_path: Path) -> None:
+    assert list(wrong_verdicts(stored)) == []
+    shutil.copytree(stored, tmp_path / "copy")
+    path = tmp_path / "copy" / "comparison.json"
+    content = json.loads(path.read_text())
+    content["verdicts"][0]["qualified"].reverse()
+    content["rows"][0]["rel_l2_median"]["high"] = 0.0
+    path.write_text(json.dumps(content))
+    outside, order = wrong_verdicts(tmp_path / "copy")
+    assert "rel_l2_median lies outside its interval" in outside
+    assert "qualify, stated are" in order
 
 
 @pytest.mark.parametrize("table", ["selected", "verdict", "fastest", "facts"])

@@ -119,7 +119,7 @@ supports.0.region = { box_m = 1, sphere_m = 1 } -> sphere_m` cannot stand beside
 supports.0.region = { box_m = 1, sphere_m = 1 } -> of a region. Allowed here: box_m.
 material = - -> key `material` is missing.
 material.law = - -> key `material.law` is missing.
-material.law = "neo" -> `material.law` must be 'saint-venant-kirchhoff', 'neo-hookean', 'mooney-
+material.law = "neo" -> `material.law` must be 'saint-venant-kirchhoff', 'neo-hookean', 'coro
 material.poisson = 0.5 -> `material.poisson` must be less than 0.5; got 0.5.
 material.poisson = -1.0 -> `material.poisson` must be greater than -1; got -1.0.
 material.poisson = "0.4" -> `material.poisson` must be a valid number; got '0.4'.

@@ -53,7 +53,14 @@ def test_wide_tables_show_every_column_in_whole_lines(run: Comparison) -> None:
     assert "[n_modes=" not in shown.stdout
     head = next(line for line in shown.stdout.splitlines() if line.startswith("  configuration"))
     assert len(head) > 150
-    for word in ("queries/s", "memory", "model", "σ(e)", "Time at error", "A configuration"):
+    for word in (
+        "queries/s",
+        "memory",
+        "model",
+        "σ(e)",
+        "Time at error",
+        "The fastest configuration",
+    ):
         assert word in shown.stdout
 
 
@@ -61,7 +68,7 @@ def test_pick_uses_short_names_and_explains_them(run: Comparison) -> None:
     shown = mor_bench("pick", "beam-coarse", "--run", str(run.out)).stdout
     assert "pca-regression · k20 wins" in shown
     assert "[n_input_modes=" not in shown
-    assert shown.splitlines()[-1].endswith("k = n_input_modes")
+    assert shown.splitlines()[-1].endswith("k = n_input_modes (number of input modes)")
 
 
 def test_a_quiet_report_prints_the_verdict_alone(

@@ -277,7 +277,7 @@ def _latency(row: Row) -> str:
 
 def _offline(row: Row) -> str:
     data = row.offline_s.data if row.offline_s else None
-    samples = f" of {row.n_train} samples" if data else ""
+    samples = f" of {row.n_train + (row.n_validation or 0)} samples" if data else ""
     return f"data {_core_s(data)}{samples}, fit {_core_s(row.fit_core_s)}"
 
 

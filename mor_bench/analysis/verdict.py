@@ -18,8 +18,9 @@ from mor_bench.results.row import Row
 from mor_bench.specs.method_spec import Told
 
 RULE = (
-    "A configuration qualifies if it answers every load and its 95 % upper bounds meet the limits. "
-    "The error is that on the validation part. The fastest qualified configuration wins."
+    "The fastest configuration wins that answers every load and whose 95 % upper bounds of latency "
+    "and of error on the validation part, and whose median error on a fresh test set if there is "
+    "one, meet the limits."
 )
 
 Figures = Mapping[str, Mapping[str, float]]

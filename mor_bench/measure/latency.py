@@ -38,6 +38,9 @@ LEAST_TURN_S, MOST_TURN_S = 0.03, 1.0
 BATCH_S, MOST_BATCH_S = 0.25, 5.0
 """Time for repeating batches of one size, and time limit of one batch, s."""
 
+SERVER_S, OPEN_S, TURN_S = 4.0, 0.1, 0.05
+"""Typical times to start a replicate, to open a method in it and of a turn, s: for progress."""
+
 ANSWER_LIMIT_S = 300.0
 """Time limit of a request that should take seconds, s; a hanging method is then ended."""
 
@@ -139,7 +142,7 @@ def measure_latencies(
     threads : int
         Threads of a single query.
     progress : callable
-        Called with (finished turns, all turns).
+        Called with (typical time of what is done, that of all), ms.
     seed : int
         Seed of the order in which configurations take turns, and of their queries.
 
@@ -151,8 +154,18 @@ def measure_latencies(
     timings = {label: Timing() for label in methods}
     order = np.random.default_rng(seed)
     groups = groups_that_fit(methods)
-    turns_of_one = protocol.rounds + 1
-    total, done = protocol.processes * turns_of_one * len(methods), 0
+    batches_s = len(BATCHES) * BATCH_S
+    turns_of_one = protocol.rounds + protocol.all_cores
+    total_s = protocol.processes * (
+        len(groups) * SERVER_S + len(methods) * (OPEN_S + turns_of_one * TURN_S)
+    ) + len(methods) * (batches_s if protocol.all_cores else 0.0)
+    done_s = 0.0
+
+    def note(seconds: float) -> None:
+        nonlocal done_s
+        done_s += seconds
+        progress(round(1e3 * done_s), round(1e3 * total_s))
+
     for process in range(protocol.processes if methods else 0):
         for group in groups:
             with ExitStack() as stack:
@@ -166,15 +179,14 @@ def measure_latencies(
                     for label in group
                 }
                 opened = _open_all(stack, turns, server, seed + process)
+                note(SERVER_S + len(group) * OPEN_S)
                 for number in range(protocol.rounds):
                     for label in order.permutation(list(opened)):
                         opened[label].attempt(opened[label].single_queries, number)
-                        done += 1
-                        progress(done, total)
+                        note(TURN_S)
                 for turn in opened.values() if protocol.all_cores else ():
                     turn.attempt(turn.on_all_cores, process == 0)
-                    done += 1
-                    progress(done, total)
+                    note(TURN_S + (batches_s if process == 0 else 0.0))
     return timings
 
 

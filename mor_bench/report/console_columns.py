@@ -23,7 +23,7 @@ from mor_bench.report.text_table import Cell, figure_cell
 
 NOTE = (
     "*: on the Pareto front of the medians. ~: timing not stable. "
-    "offline: core-seconds of data and fit."
+    "offline: core-seconds of data and fit; °: trained elsewhere."
 )
 """Explanation of the marks and of the one column that needs it."""
 
@@ -51,7 +51,7 @@ MAIN: dict[str, Cell] = {
     "error\nmedian": figure_cell("error", "rel_l2_median", _percent),
     "error\np95": figure_cell("error", "rel_l2_p95", _percent),
     "latency\nmedian": _latency,
-    "offline": lambda e: seconds_text(e.row.offline_core_s),
+    "offline": lambda e: seconds_text(e.row.offline_core_s) + "°" * bool(e.row.trained_elsewhere),
     "qualifies": _qualifies,
 }
 """The columns beside the name that are always shown."""

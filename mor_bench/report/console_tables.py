@@ -15,7 +15,7 @@ from rich.text import Text
 
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.told import LEGEND
-from mor_bench.analysis.verdict import RULE, needs_of
+from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.caveat_tables import out_of_range
 from mor_bench.report.console_columns import NOTE, configuration_lines
 from mor_bench.report.entries import (
@@ -135,8 +135,6 @@ def _verdict_lines(
     needs, _, finding = renamed(verdict["headline"], names).partition(". ")
     yield from _wrapped(finding, width, "bold")
     for sentence in (f"{needs}.", *verdict["beside"]):
-        if sentence == RULE:
-            continue
         text, again, command = renamed(sentence, names).partition(AGAIN)
         yield from _wrapped(f"- {text}{' Time again:' if again else ''}", width, "", "  ")
         if again:
@@ -221,8 +219,8 @@ def _dataset_parts(
 def _wide_parts(
     comparison: Comparison, dataset: str, entries: Sequence[Entry], analysis: Analysis
 ) -> Iterator[RenderableType]:
-    """Yield what the six columns leave out: the rule, the winner's figures, further tables."""
-    yield Text(f"{RULE} {LEGEND}", style="dim")
+    """Yield what the six columns leave out: the winner's figures, further tables."""
+    yield Text(LEGEND, style="dim")
     yield from _titled("Figures of the winner, or of the nearest without a winner")
     names = short_names(entry.row for entry in entries)
     for line in verdict_of(analysis, dataset)["evidence"]:

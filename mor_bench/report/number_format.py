@@ -29,6 +29,7 @@ SHORT_NAMES = {
 
 MEANINGS = {
     "n_modes": "number of modes",
+    "tolerance": "relative residual at which iterations stop",
     "n_input_modes": "number of input modes",
     "n_output_modes": "number of output modes",
     "cubature_tolerance": "accepted error of the cubature",

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.entries import Analysis, Entry, by_group
-from mor_bench.report.method_styles import style_of
+from mor_bench.report.method_styles import DARK, readable, style_of
 from mor_bench.report.number_format import number, percent, span
 from mor_bench.report.page_bodies import bodies
 from mor_bench.report.page_samples import (
@@ -60,7 +60,7 @@ def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
         },
         "mesh_error": next((100 * value for value in mesh_error if value is not None), None),
         "winner": shown.card.rankings[0].picks[0].entry.label if shown.card.rankings else None,
-        "styles": {entry.method: vars(style_of(entry.method)) for entry in entries},
+        "styles": {entry.method: _style(entry.method) for entry in entries},
         "groups": list(by_group(entries)),
         "rows": [_row(comparison, entry, shown.names) for entry in entries],
         "order": [entry.label for entry in sorted(entries, key=reading_order)],
@@ -73,6 +73,19 @@ def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
         "losses": losses(comparison, entries),
         "costs": _costs(shown),
         "bodies": bodies(found, mesh, body_bytes),
+    }
+
+
+TEXT_CONTRAST = 5.5
+"""Contrast of direct labels on white and on the dark page; in a chart's grey band it is lower."""
+
+
+def _style(method: str) -> dict[str, Any]:
+    style = style_of(method)
+    return {
+        **vars(style),
+        "text": readable(style.colour, least=TEXT_CONTRAST),
+        "dark_text": readable(style.dark_colour, DARK, TEXT_CONTRAST),
     }
 
 

@@ -57,7 +57,9 @@ def _name(data: Data, line: Data) -> str:
 
 
 def _ecdf(data: Data) -> str:
-    line = _first(data, data["distributions"])
+    line = _first(data, [d for d in data["distributions"] if d["error"]["x"]] or [{"label": None}])
+    if line["label"] is None:
+        return "Latencies of single queries"
     error = _row(data, line["label"])["error"]
     return (
         f"{_name(data, line)}: 95 % of the test loads have an error below "

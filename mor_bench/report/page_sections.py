@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mor_bench.analysis.selection_text import needs_text
+from mor_bench.analysis.told import is_observed
 from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.canvas import Drawn
 from mor_bench.report.cards import pair_text
@@ -46,14 +47,16 @@ class Section:
     """Content of the page about one dataset.
 
     `rows` are the entries with their short names and cells; `constants` are parameters that do not
-    vary. `events` are failures, doubts and warnings other than unstable timings, which are
-    `unsteady`. `hard` are tables about difficult loads, `targets` and `details` all further tables.
+    vary. `given` is what every method gets. `events` are failures, doubts and warnings other than
+    unstable timings, which are `unsteady`. `hard` are tables about difficult loads, `targets` and
+    `details` all further tables.
     `body_picture` replaces the turning bodies on paper. `data` is the content for the scripts.
     """
 
     name: str
     title: str
     card: Card
+    given: str
     needs: str
     frontier: Chart
     charts: list[Chart]
@@ -129,6 +132,7 @@ def section_of(view: View, dataset: str) -> Section:
         name=dataset,
         title=str(comparison.datasets.get(dataset, {}).get("title") or ""),
         card=verdict,
+        given="observed displacements" if is_observed(comparison, dataset) else "nodal forces (N)",
         needs=needs_text(needs_of(comparison, dataset)),
         frontier=frontier(data, _frontier_title(verdict)),
         charts=charts(data),

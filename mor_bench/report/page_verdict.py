@@ -79,7 +79,7 @@ def card(verdict: Mapping[str, Any], entries: Sequence[Entry], names: Mapping[st
     if qualified:
         undecided = [names[label] for label in verdict["undecided"] if label in names]
         rankings = [
-            _by_latency(qualified, verdict["runner_up"], undecided, names),
+            _by_latency(qualified, verdict["runner_up"], undecided, names, entries),
             _by_offline(qualified, verdict["cheapest"], names),
         ]
     headline = renamed(verdict["headline"], names)
@@ -130,6 +130,7 @@ def _by_latency(
     runner_up: str | None,
     undecided: Sequence[str],
     names: Mapping[str, str],
+    entries: Sequence[Entry],
 ) -> Ranking:
     first = qualified[0]
     second = next((e for e in qualified if e.label == runner_up), None)
@@ -142,6 +143,7 @@ def _by_latency(
     else:
         sentence = "No other configuration qualifies."
     full_order = [e for e in qualified if e.row.reference]
+    full_order = full_order or [e for e in entries if e.row.reference and e.ran]
     if full_order and not first.row.reference:
         fastest = min(full_order, key=lambda e: e.latency_ms)
         ratio = number(fastest.latency_ms / first.latency_ms)

@@ -30,7 +30,7 @@ class Listener:
         Called with (dataset, label, stage) before each further fit of a configuration, in the stage
         "other seeds" or "learning curve".
     timing : callable
-        Called with (dataset, turns done, all turns).
+        Called with (dataset, typical time of what is done, that of all), ms.
     finished : callable
         Called with a complete row.
     training : callable

@@ -1,6 +1,7 @@
 """A run in compact form: results, conclusions, and the errors of every test sample.
 
-FOLDER/results.json, FOLDER/comparison.json    as the run wrote them
+FOLDER/results.json       as the run wrote it
+FOLDER/comparison.json    the same; wordings of sentences follow the code, numbers never change
 FOLDER/errors.h5                               per-sample errors in single precision
 
 Latencies of single queries, predictions and loss curves are left out.
@@ -11,6 +12,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Mapping
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +20,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.analysis.draws import Draws, Interval
+from mor_bench.analysis.selection import decide
+from mor_bench.analysis.verdict import RULE, needs_of
 from mor_bench.results.comparison import Comparison
 from mor_bench.snapshots.store import write_atomically
+from tests.published.stored import content_of
 
 ERRORS = "errors.h5"
 
@@ -78,6 +84,39 @@ def _write(group: h5py.Group, arrays: Mapping[str, NDArray[Any]]) -> None:
         group.create_dataset(name, data=stored, track_times=False, **packed)
 
 
+def wrong_verdicts(folder: Path) -> Iterator[str]:
+    """Reach the verdicts again from the stored rows and intervals; yield each difference.
+
+    Resampled latencies are not stored, so what cannot be told apart is not compared.
+    """
+    comparison = Comparison.read(folder)
+    analysis = content_of("comparison.json", folder)
+    for stored in analysis["verdicts"]:
+        name = stored["dataset"]
+        intervals: dict[str, dict[str, Interval]] = {}
+        for record in analysis["rows"]:
+            if record["dataset"] == name:
+                found = {k: v for k, v in record.items() if isinstance(v, dict)}
+                intervals[record["label"]] = {
+                    k: (v["low"], inf if v["high"] is None else v["high"]) for k, v in found.items()
+                }
+                for figure, v in found.items():
+                    low, high = intervals[record["label"]][figure]
+                    if not low <= (inf if v["value"] is None else v["value"]) <= high:
+                        yield f"{record['label']}: {figure} lies outside its interval"
+        none = np.zeros((0, 1))
+        again = decide(
+            comparison, name, needs_of(comparison, name), Draws([], none, none, intervals)
+        )
+        qualified = [row.label for row in again.qualified]
+        if qualified != stored["qualified"]:
+            yield f"{name}: {qualified} qualify, stated are {stored['qualified']}"
+        if again.headline != stored["headline"]:
+            yield f"{name}: {again.headline!r} is stated as {stored['headline']!r}"
+        if RULE not in stored["beside"]:
+            yield f"{name}: the rule is not stated as {RULE!r}"
+
+
 def wrong_summaries(folder: Path) -> Iterator[str]:
     """Compare the errors in results.json with those of the samples; yield each difference."""
     comparison = Comparison.read(folder)
@@ -89,6 +128,7 @@ def wrong_summaries(folder: Path) -> Iterator[str]:
             relative = np.asarray(samples["relative_l2"][()], dtype=float)
             computed = {
                 "rel_l2_median": float(np.median(relative)),
+                "rel_l2_p95": float(np.percentile(relative, 95, method="higher")),
                 "rel_l2_max": float(np.max(relative)),
                 "mean_dof_m": float(np.mean(samples["mean_dof_m"][()], dtype=float)),
             }

@@ -107,7 +107,8 @@ def _latency(run: Comparison, row: Row) -> str:
 def _offline(row: Row) -> str:
     if row.offline_s is None:
         return DASH
-    return f"{number(row.offline_s.data)} + {number(row.offline_s.fit_core_s)}"
+    origin = " (trained elsewhere)" if row.trained_elsewhere else ""
+    return f"{number(row.offline_s.data)} + {number(row.offline_s.fit_core_s)}{origin}"
 
 
 def _queries(run: Comparison, row: Row, need: float) -> str:
@@ -151,7 +152,7 @@ def selected(source: str, dataset: str = "", methods: str = "", by: str = "need"
         for own in _by_method(_rows(run, dataset, methods)).values()
     ]
     headings = ["method", "is given", "selected", *ERRORS_SHOWN, "fresh test: median %", "ms"]
-    headings += ["data + fit, core-s", "break-even, queries"]
+    headings += ["data + fit, core-s", "break-even without tuning, queries"]
     return markdown(
         headings,
         [
@@ -176,10 +177,11 @@ def fastest(source: str, dataset: str = "", methods: str = "") -> str:
     The rule of the verdict decides. A dagger marks a larger error on the test samples.
     """
     run = run_of(source)
-    headings = ["method", *(f"≤ {number(100 * level)} %" for level in LEVELS)]
+    name = dataset or next(iter(run.datasets))
+    headings = ["method", "is given", *(f"≤ {number(100 * level)} %" for level in LEVELS)]
     body = []
     for method, rows in _by_method(_rows(run, dataset, methods)).items():
-        cells = [f"`{method}`"]
+        cells = [f"`{method}`", class_text(rows[0], is_observed(run, name))]
         for level in LEVELS:
             best = sufficient(run, rows, level)
             missed = best is not None and median_error(best) > level
@@ -242,8 +244,9 @@ def paper(source: str, methods: str = "") -> str:
         if table is None:
             raise EvidenceError(f"{folder}: {name} is no scene of the paper, or nothing ran.")
         headings = table.headings
-        body += [[name, *row] for row in table.rows]
-    return markdown(["scene", *headings], body)
+        told = {e.label: class_text(e.row, is_observed(run, name)) for e in entries}
+        body += [[name, row[0], told.get(row[0], "force only"), *row[1:]] for row in table.rows]
+    return markdown(["scene", headings[0], "is given", *headings[1:]], body)
 
 
 def facts(source: str, dataset: str = "") -> str:

@@ -14,7 +14,12 @@ Object.assign(Report, (() => {
     };
   }
 
-  const logAxis = (title, more = {}) => axis(title, { type: "log", ...more });
+  // Between powers of ten there is no room for numbers on a phone, unless the axis is short.
+  function logAxis(title, more = {}) {
+    const [low, high] = more.range ?? [0, 0];
+    const decades = isNarrow() && Math.floor(high) > Math.ceil(low) ? { dtick: 1 } : {};
+    return axis(title, { type: "log", ...decades, ...more });
+  }
 
   function layout(more = {}) {
     const { ink, paper } = Report.theme();
@@ -81,6 +86,11 @@ Object.assign(Report, (() => {
     const row = rowOf(data, label);
     return row ? Report.colourOf(styleOf(data, row)) : Report.theme().ink;
   };
+  // Darker or lighter than the marks, so that small letters have enough contrast.
+  const textColour = (data, label) => {
+    const row = rowOf(data, label);
+    return row ? Report.textColourOf(styleOf(data, row)) : Report.theme().ink;
+  };
   const symbol = (data, label) => {
     const row = rowOf(data, label);
     return row ? styleOf(data, row).symbol : "circle";
@@ -97,7 +107,7 @@ Object.assign(Report, (() => {
   const short = (value) => (value === null ? "–" : Number(value.toPrecision(3)).toString());
 
   return {
-    axis, logAxis, layout, legend, draw, choice, slider, tick, rowOf, styleOf, colour, symbol,
+    axis, logAxis, layout, legend, draw, choice, slider, tick, rowOf, styleOf, colour, textColour, symbol,
     nameOf, hover, options, short, isNarrow,
   };
 })());

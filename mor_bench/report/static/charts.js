@@ -30,7 +30,7 @@ Report.kinds.distributions = (figure, data) => {
       yaxis: R.axis("share (%)", { range: [0, 102] }), shapes: lines,
       annotations: [...notes, ...beyond.map((line, i) => ({
         xref: "paper", x: 0.995, xanchor: "right", y: 12 + 7 * i, showarrow: false,
-        font: { size: 12, color: R.colour(data, line.label) },
+        font: { size: 12, color: R.textColour(data, line.label) },
         text: R.plain(`${R.nameOf(data, line.label)}: up to ${R.short(line[kind.value].x.at(-1))} ${unit} →`),
       }))], ...R.legend(traces.length, 400),
     }));

@@ -64,7 +64,7 @@ Report.kinds.frontier = (figure, data) => {
       legendgroup: R.plain(group), legendgrouptitle: { text: R.plain(group), font: { size: 12 } },
       x: rows.map(x), y: rows.map((row) => inside(y(row))),
       text: rows.map((row) => (named.has(row) ? R.plain(labelOf(row)) : "")),
-      textposition: "top right", textfont: { color: colour, size: 12 },
+      textposition: "top right", textfont: { color: R.textColourOf(style), size: 12 },
       hovertext: rows.map((row) => R.hover(row.hover)), hoverinfo: "text",
       line: { color: colour, width: 1 },
       marker: {
@@ -77,7 +77,7 @@ Report.kinds.frontier = (figure, data) => {
   }
 
   function front(rows) {
-    const sorted = rows.filter((row) => !row.reference).sort((a, b) => x(a) - x(b) || y(a) - y(b));
+    const sorted = [...rows].sort((a, b) => x(a) - x(b) || y(a) - y(b));
     const best = [];
     for (const row of sorted) {
       if (y(row) < 100 && (!best.length || y(row) < y(best.at(-1)))) best.push(row);
@@ -117,7 +117,7 @@ Report.kinds.frontier = (figure, data) => {
   function cuts(rows) {
     return rows.filter((row) => y(row) > TOP || y(row) < FLOOR).map((row, i) => ({
       x: Math.log10(x(row)), y: Math.log10(inside(y(row))), ax: 0,
-      ay: (y(row) > TOP ? 1 : -1) * (26 + 16 * (i % 2)),
+      ay: (y(row) > TOP ? 1 : -1) * (26 + 16 * (i % 4)),
       text: R.plain(`${row.name}: ${R.short(y(row))} %`), arrowhead: 2, arrowside: "start", startarrowhead: 0,
       font: { size: 11, color: R.theme().ink }, arrowcolor: R.theme().quiet,
     }));

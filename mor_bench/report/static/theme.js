@@ -23,6 +23,7 @@ const Report = (() => {
     dark,
     kinds: {},
     theme: () => (isDark() ? DARK : LIGHT),
+    textColourOf: (style) => (isDark() ? style.dark_text : style.text),
     colourOf: (style) => (isDark() ? style.dark_colour : style.colour),
     // Plotly reads some tags in texts; here every text stays text.
     plain: (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;"),
