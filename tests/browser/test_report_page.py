@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.report.method_styles import DARK, WHITE, contrast
 from mor_bench.report.number_format import number, percent
 from mor_bench.report.page import render
 from tests.browser.chromium import Visit, chromium, visit
@@ -38,6 +39,9 @@ def browser() -> Iterator[Browser]:
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of a run with everything that a run can measure."""
     made = synthetic_comparison(tmp_path_factory.mktemp("rich"), per_region=8)
+    for row in list(made.rows):
+        if row.method == "fem":
+            made.put(row.with_parts(reference=True))
     return render(made, analyse(made, n_resamples=200))[-1]
 
 
@@ -152,6 +156,37 @@ def test_hover_texts_equal_the_results(open_page: Visit, path: Path) -> None:
     assert lines[2].startswith(f"latency {number(row['latency_ms']['median'])} ms [")
     for key, value in row["parameters"].items():
         assert f"{key} = {value}" in lines
+
+
+def test_the_dashed_line_joins_what_nothing_beats(open_page: Visit) -> None:
+    """A full-order reference beats others, too."""
+    front = open_page.page.evaluate(
+        """() => Array.from(document.querySelector(".frontier .plot")._fullData
+            .find((t) => t.name === "Pareto front").x)"""
+    )
+    rows = [r for r in open_page.data()[0]["rows"] if r["error"]["median"] is not None]
+    figures = [(r["latency"]["median"], r["error"]["median"]) for r in rows]
+    best = [
+        (time, error)
+        for time, error in figures
+        if error < 100 and not any(t < time and e <= error for t, e in figures)
+    ]
+    assert front == pytest.approx(sorted(time for time, _ in best))
+    assert any(r["reference"] and r["latency"]["median"] in front for r in rows)
+
+
+def test_direct_labels_do_not_overlap_and_have_enough_contrast(open_page: Visit) -> None:
+    boxes = open_page.page.evaluate(
+        """() => [...document.querySelectorAll(".frontier .annotation-text")]
+            .filter((e) => e.textContent.includes("%"))
+            .map((e) => e.getBoundingClientRect()).map((b) => [b.x, b.y, b.right, b.bottom])"""
+    )
+    for i, a in enumerate(boxes):
+        for b in boxes[:i]:
+            assert a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1]
+    for style in open_page.data()[0]["styles"].values():
+        assert contrast(style["text"], WHITE) >= 4.5
+        assert contrast(style["dark_text"], DARK) >= 4.5
 
 
 def test_the_legend_hides_and_isolates_a_trace(open_page: Visit) -> None:
