@@ -71,6 +71,33 @@ def test_a_body_keeps_its_shape_and_its_error(comparison: Comparison, page: str)
     np.testing.assert_array_equal(nodes[facets], MESH.boundary_facets)
 
 
+def test_pages_of_an_earlier_report_do_not_stay_old(tmp_path: Path) -> None:
+    made = tiny(tmp_path)
+    add_row(made, "pod", {}, 0.005, 1.0)
+    render(made, pages=True)
+    (old,) = (tmp_path / "pages").glob("*pod*.html")
+    old.write_text("old")
+    render(made)
+    assert old.read_text() != "old"
+
+
+def test_the_finding_above_a_distribution_is_that_of_a_drawn_curve(tmp_path: Path) -> None:
+    made = tiny(tmp_path)
+    add_row(made, "fem", {}, 0.001, 0.5, reference=True)
+    add_row(made, "pod", {}, 0.02, 1.0)
+    text = text_of(render(made)[-1].read_text(encoding="utf-8"))
+    assert "pod: 95 % of the test loads" in text
+    assert "fem: 95 % of the test loads" not in text
+
+
+def test_the_speed_up_over_a_full_order_model_that_is_too_slow_is_stated(tmp_path: Path) -> None:
+    made = tiny(tmp_path)
+    add_row(made, "fem", {}, 0.001, 40.0, reference=True)
+    add_row(made, "pod", {}, 0.002, 1.0)
+    text = text_of(render(made)[-1].read_text(encoding="utf-8"))
+    assert "It is 40 times as fast as the full-order model (fem)." in text
+
+
 def test_many_unstable_timings_become_one_line(tmp_path: Path) -> None:
     made = tiny(tmp_path)
     for i in range(5):

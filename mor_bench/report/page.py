@@ -68,8 +68,8 @@ def render(
 ) -> list[Path]:
     """Write all figures and the page; `analyse` makes the analysis if it is not given.
 
-    With several datasets, or if `pages` asks for them, also write OUT/pages/: an index, and a page
-    per dataset and per method.
+    With several datasets, if `pages` asks for it, or if it exists, also write OUT/pages/: an index,
+    and a page per dataset and per method.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def render(
     view = View(comparison, analysis, drawn, named, room)
     frame = Frame("mor-bench report", [], "", inlined(), _stressed(comparison))
     written = [figure.path for figure in drawn]
-    if pages or len(datasets) > 1:
+    if pages or len(datasets) > 1 or (comparison.out / PAGES).is_dir():  # never leave old ones
         written += _write_pages(view, frame)
         frame = replace(frame, links=[(f"{PAGES}/index.html", "A page per dataset and method")])
     path = comparison.out / "report.html"

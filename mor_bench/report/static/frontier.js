@@ -118,7 +118,7 @@ Report.kinds.frontier = (figure, data) => {
     return rows.filter((row) => y(row) > TOP || y(row) < FLOOR).map((row, i) => ({
       x: Math.log10(x(row)), y: Math.log10(inside(y(row))), ax: 0,
       ay: (y(row) > TOP ? 1 : -1) * (26 + 16 * (i % 4)),
-      text: R.plain(`${row.name}: ${R.short(y(row))} %`), arrowhead: 2, arrowside: "start", startarrowhead: 0,
+      text: R.plain(`${row.name}: ${R.short(y(row))} %`), bgcolor: R.theme().paper, arrowhead: 2, arrowside: "start", startarrowhead: 0,
       font: { size: 11, color: R.theme().ink }, arrowcolor: R.theme().quiet,
     }));
   }
