@@ -70,7 +70,7 @@ class Costs:
         paid = [line for line in self.lines if line.break_even is not None]
         target = f"at {number(self.target)} %"
         if not paid:
-            return f"No method pays off against the full-order model {target}"
+            return f"No method is cheaper in the long run than the full-order model {target}"
         best = min(paid, key=lambda line: line.break_even or 0)
         return f"{best.name} pays off first {target}, after {whole(best.break_even)} queries"
 

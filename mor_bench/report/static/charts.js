@@ -229,7 +229,7 @@ Report.kinds.costs = (figure, data) => {
 
   function parts() {
     const n = 10 ** Number(number.value);
-    const count = `1e${number.value}`;
+    const count = (10 ** Number(number.value)).toLocaleString("en-US");
     out.value = count;
     const named = lines.map((line) => R.plain(R.nameOf(data, line.label)));
     const sums = lines.map((line) => total(line, n)).sort((a, b) => a - b);
