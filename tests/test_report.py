@@ -295,6 +295,8 @@ def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis
         "Configurations of beam-coarse",
         "Named test sets",
         "Hidden test set",
+        "Worst test loads of each method",
+        "Test loads that are hard for most methods",
         "Time at error: median latency at a median relative L2 error",
         "Error at time: median relative L2 error within a median latency",
         "Whole cost",

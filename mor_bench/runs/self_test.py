@@ -166,11 +166,12 @@ def _killed_process(folder: Path) -> tuple[bool | None, str]:
         child, _, left = parent.stdout.readline().strip().partition(" ")
         parent.send_signal(signal.SIGKILL)
     began = time.monotonic()
-    while identity(int(child)) and time.monotonic() < began + GRACE_S:
+    while (alive := identity(int(child))) and time.monotonic() < began + GRACE_S:
         time.sleep(0.01)
     lived_s = time.monotonic() - began
-    with suppress(psutil.Error):
-        psutil.Process(int(child)).kill()
+    if alive:
+        with suppress(psutil.Error):
+            psutil.Process(int(child)).kill()
         return False, f"its child lives on after {GRACE_S:g} s"
     with scratch_folder():  # as the next run does
         removed = not Path(left).exists()
