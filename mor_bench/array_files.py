@@ -69,13 +69,13 @@ def read_npz(path: Path, error: type[MorBenchError] = StoreError) -> Arrays:
 
 
 def _check_members(members: list[zipfile.ZipInfo], file_bytes: int) -> None:
-    names = [member.filename for member in members]
+    names = [member.filename.removesuffix(".npy") for member in members]
     if len(names) > MOST_OBJECTS:
         raise _RefusedError(
             f"it holds {len(names):,} arrays; at most {MOST_OBJECTS:,} are allowed."
         )
     if doubled := sorted({name for name in names if names.count(name) > 1}):
-        raise _RefusedError(f"the array `{doubled[0].removesuffix('.npy')}` occurs more than once.")
+        raise _RefusedError(f"the array `{doubled[0]}` occurs more than once.")
     if any(member.flag_bits & 1 for member in members):
         raise _RefusedError("it is encrypted.")
     if any(m.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for m in members):

@@ -20,8 +20,8 @@ from typing import Any
 
 from mor_bench.errors import MorBenchError, StoreError, printable
 
-MIB = 2**20
-MOST_TOML_BYTES = 1 * MIB
+KIB, MIB = 2**10, 2**20
+MOST_TOML_BYTES = 256 * KIB
 MOST_JSON_BYTES = 16 * MIB
 MOST_BYTES = 16 * 1024 * MIB
 """Size limits of a TOML, a JSON, and any other file."""
@@ -32,8 +32,8 @@ MOST_LEVELS = 64
 ROOM_BYTES, ROOM_PER_BYTE = 400_000_000, 100
 """Memory that reading a file may take: a fixed part, and a part per byte of the file."""
 
-_LONG_KEY = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]+[ \t]*\.[ \t]*){{{MOST_LEVELS}}}""")
-"""A key with many dots. The TOML reader's time grows with the square of their number."""
+_TOKEN = re.compile(r""""(?:[^"\\]|\\.)*"?|'[^']*'?|[\w-]+|\S""")
+"""A token of a line of TOML: a string, even an unclosed one, a bare name, or one character."""
 
 _memory_lock = threading.RLock()
 
@@ -109,13 +109,30 @@ def read_toml(path: Path, error: type[MorBenchError] = StoreError) -> dict[str, 
     """Read a TOML file, with or without a byte order mark; errors as in `read_json`."""
 
     def load(text: str) -> dict[str, Any]:
-        if _LONG_KEY.search(text):
+        if any(map(_has_long_key, text.split("\n"))):
             raise RecursionError
         return tomllib.loads(text)
 
     content = read_bytes(path, MOST_TOML_BYTES, error)
     table: dict[str, Any] = _parsed(load, content, str(path), "TOML", error)
     return table
+
+
+def _has_long_key(line: str) -> bool:
+    """Return whether a key may have many dots; the TOML reader takes their number squared."""
+    if line.count(".") < MOST_LEVELS:
+        return False
+    dots, after_name = 0, False
+    for token in _TOKEN.findall(line):
+        is_name = token[0] in "\"'_-" or token[0].isalnum()
+        if token != "." or not after_name:
+            dots = dots if is_name and not after_name else 0
+        else:
+            dots += 1
+        after_name = is_name
+        if dots >= MOST_LEVELS:
+            return True
+    return False
 
 
 def _parsed(

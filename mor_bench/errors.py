@@ -6,6 +6,8 @@ wrong value, the allowed values and the given value.
 
 from __future__ import annotations
 
+from numbers import Integral
+
 
 class MorBenchError(Exception):
     """Base class of the errors of mor-bench."""
@@ -18,6 +20,14 @@ def printable(text: str, most: int = 2000, keep: str = "\n\t") -> str:
         letter if letter.isprintable() or letter in keep else ascii(letter)[1:-1]
         for letter in shown
     )
+
+
+def text_of(error: BaseException) -> str:
+    """Return an error's text; foreign errors may fail to form theirs."""
+    try:
+        return str(error)
+    except Exception:  # foreign code runs here
+        return "its text cannot be formed"
 
 
 class SpecError(MorBenchError, ValueError):
@@ -33,6 +43,14 @@ class UnusableClassError(SpecError):
 
 class InvalidInputError(MorBenchError, ValueError):
     """An argument is out of range, or an array has a wrong shape or dtype or is not finite."""
+
+
+def check_count(name: str, value: object) -> None:
+    """Raise `InvalidInputError` unless an argument is None or an integer >= 1, also of NumPy."""
+    if value is not None and (
+        isinstance(value, bool) or not isinstance(value, Integral) or value < 1
+    ):
+        raise InvalidInputError(f"`{name}` must be an integer >= 1; got {value!r}.")
 
 
 class OutsideMeshError(MorBenchError, ValueError):

@@ -15,7 +15,7 @@ from mor_bench.checked_files import check_file, parse_json
 from mor_bench.digests import digest_of_arrays
 from mor_bench.errors import InvalidInputError, MorBenchError, StoreError
 from mor_bench.model_arrays import has_shape
-from mor_bench.snapshots.store import write_atomically
+from mor_bench.snapshots.store import check_replaceable, write_atomically
 from mor_bench.specs import check_parameters
 
 FORMAT = "mor-bench surrogate"
@@ -89,6 +89,7 @@ def write_model(path: str | Path, model: StoredModel) -> None:
         "scene": model.scene,
     }
     header["sha256"] = model_digest(header, arrays)
+    check_replaceable(Path(path))
     write_atomically(Path(path), _in_order(serialise(arrays, metadata=header)))
 
 

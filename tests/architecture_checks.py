@@ -27,6 +27,7 @@ FLOORS = (
         "scratch",
         "version",
         "checked_files",
+        "checkout",
         "array_files",
     ),
     ("specs", "options"),

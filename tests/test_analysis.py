@@ -12,8 +12,6 @@ import pytest
 from numpy.typing import NDArray
 
 from mor_bench.analysis.analyse import analyse
-from mor_bench.analysis.break_even import break_even
-from mor_bench.analysis.caveats import hidden, regimes, tuning
 from mor_bench.analysis.frontier import (
     EXACT,
     TARGET_ERRORS,
@@ -24,10 +22,8 @@ from mor_bench.analysis.frontier import (
     frontier_draws,
     time_at_error,
 )
-from mor_bench.analysis.performance_profile import profile, share_within
 from mor_bench.results.comparison import Comparison
-from mor_bench.results.parts import TrainingRecord
-from mor_bench.results.row import Row, SetErrors
+from tests.report_runs import add_row, tiny
 from tests.synthetic import (
     METHODS,
     N_PROCESSES,
@@ -77,23 +73,49 @@ def at_error(analysis: Record, method: str, target: float) -> Record:
     return next(r for r in records if (r["method"], r["target_rel_l2_median"]) == wanted)
 
 
+@pytest.mark.parametrize("held_out", [False, True])
 @pytest.mark.parametrize("n_configurations", [1, 2, 5, 12])
-def test_frontier_draws_are_the_frontier_points_of_each_resample(n_configurations: int) -> None:
+def test_frontier_draws_are_the_frontier_points_of_each_resample(
+    n_configurations: int, held_out: bool
+) -> None:
     generator = np.random.default_rng(n_configurations)
     shape = (n_configurations, 60)
     latencies = generator.normal(0, 1.5, shape).round(1)  # rounded, so that there are ties
     errors = generator.normal(-3, 3, shape).round(1)  # some are worse than answering zero
     errors[generator.random(shape) < 0.1] = np.inf
     errors[generator.random(shape) < 0.05] = np.log(EXACT)
-    found_times, found_errors = frontier_draws(latencies, errors, TARGET_ERRORS, TARGET_TIMES_MS)
+    selecting = errors + generator.normal(0, 1, shape).round(1) if held_out else errors
+    found_times, found_errors = frontier_draws(
+        latencies, errors, TARGET_ERRORS, TARGET_TIMES_MS, selecting if held_out else None
+    )
     for i in range(60):
-        both = zip(np.exp(latencies[:, i]), np.exp(errors[:, i]), strict=True)
-        points = [Point(float(time), float(error), "") for time, error in both]
+        figures = (np.exp(values[:, i]).tolist() for values in (latencies, errors, selecting))
+        points = [
+            Point(time, error, "", selects) for time, error, selects in zip(*figures, strict=True)
+        ]
         times = [time_at_error(points, target)["latency_ms"] for target in TARGET_ERRORS]
         reached = [error_at_time(points, target)["error"] for target in TARGET_TIMES_MS]
         for found, expected in ((found_times, times), (found_errors, reached)):
             plain = [np.inf if x is None else x for x in expected]
             assert np.exp(found[:, i]) == pytest.approx(plain)
+
+
+def test_pairs_follow_the_frontier_that_validation_selects(tmp_path: Path) -> None:
+    made = tiny(tmp_path)
+    for number, error, validation, latency in ((1, 0.008, 0.03, 1.0), (2, 0.009, 0.007, 2.0)):
+        held_out = {"validation": {"rel_l2_median": validation}}
+        add_row(made, "swept", {"k": number}, error, latency, **held_out)
+    add_row(made, "lucky", {"k": 1}, 0.005, 0.5, validation={"rel_l2_median": 0.009})
+    add_row(made, "lucky", {"k": 2}, 0.05, 0.4, validation={"rel_l2_median": 0.008})
+    analysis = analyse(made, n_resamples=50)
+    assert at_error(analysis, "swept", 0.01)["latency_ms"] == 1.0
+    missed = at_error(analysis, "lucky", 0.01)
+    assert (missed["latency_ms"], missed["best"]["label"]) == (None, "lucky [k=2]")
+    assert pair(analysis, "swept", "lucky", 0.01)["by"] == ["lucky"]
+    assert pair(analysis, "swept", "lucky", 0.1)["ratio"] == pytest.approx(2.5)
+    assert (
+        at_error(analysis, "lucky", 0.1)["low"] <= 0.4 <= at_error(analysis, "lucky", 0.1)["high"]
+    )
 
 
 def test_the_analysis_is_valid_json_and_repeatable_and_keeps_the_frontier(
@@ -250,141 +272,3 @@ def test_rows_without_samples_or_figures_have_no_interval(tmp_path: Path) -> Non
     assert by_label["plain"]["latency_ms"]["high"] > 1.05
     assert pair(found, "plain", "broken", 0.1)["by"] == ["broken"]
     assert pair(found, "plain", "lost", 0.1)["verdict"] == "undecided"
-
-
-def scored(
-    method: str, label: str, error: float, latency_ms: float, data: float | None = 30.0
-) -> Row:
-    """Return a row with only the figures that hand-computed checks need."""
-    return a_row(
-        method,
-        label=label,
-        error={"rel_l2_median": error},
-        latency_ms={"median": latency_ms},
-        offline_s={"data": data, "fit": 5.0, "fit_core_s": 10.0},
-        n_dofs=600,
-        n_train=1000,
-        n_test=100,
-    )
-
-
-def test_break_even_matches_hand_computed_values() -> None:
-    rows = [
-        scored("fem", "loose", 0.005, 1.0, 0.0),
-        scored("fem", "tight", 1e-9, 2.0, 0.0),
-        scored("quick", "quick", 0.008, 0.6),
-        scored("slow", "slow", 0.008, 1.0),
-        scored("exact", "exact", 1e-12, 0.1),
-        scored("bought", "bought", 1e-3, 1.5, None),
-    ]
-    records = compare(rows)["time_at_error"]
-    records += compare([scored("far", "far", 0.5, 1.0)])["time_at_error"]
-    at_one_percent = [r for r in records if r["target_rel_l2_median"] == 0.01]
-    rows += [
-        scored("quick", "other", 0.9, 0.1),
-        a_row("quick", label="failed", status="failed", tuning_s=15.0),
-        a_row("quick", label="skipped", status="skipped"),
-    ]
-    found = {record["method"]: record for record in break_even(rows, at_one_percent)}
-    assert "fem" not in found
-    assert found["quick"]["queries"] == 100_000  # 40 core-seconds over 0.4 ms
-    # Data, two fits, and 15 s of a failed fit on two cores like the others: 80 core-seconds.
-    assert found["quick"]["queries_with_tuning"] == 200_000
-    assert found["quick"]["fem_label"] == "loose"
-    assert found["slow"]["verdict"] == "never"
-    assert found["exact"]["verdict"] == "unknown"  # no full-order configuration is as accurate
-    assert found["bought"]["fem_label"] == "tight"
-    assert found["bought"]["verdict"] == "unknown"  # the cost of its data is unknown
-    assert found["far"]["verdict"] == "not reached"
-
-
-def test_a_break_even_counts_all_threads_and_no_training_on_a_gpu() -> None:
-    rows = [scored("fem", "fem", 0.005, 1.0, 0.0), scored("quick", "quick", 0.008, 0.6)]
-    records = [r for r in compare(rows)["time_at_error"] if r["target_rel_l2_median"] == 0.01]
-    two = [row.with_parts(threads=2) for row in rows]
-    assert break_even(two, records)[0]["queries"] == 50_000
-    on_gpu = [rows[0], rows[1].with_parts(training=TrainingRecord(device="cuda"))]
-    found = break_even(on_gpu, records)[0]
-    assert (found["verdict"], found["queries"]) == ("unknown", None)
-    assert "its fit" in found["reason"]
-
-
-def test_the_performance_profile_matches_hand_computed_values() -> None:
-    times = {
-        ("x", 0.1): (1.0, 2.0),
-        ("x", 0.01): (4.0, None),
-        ("y", 0.1): (3.0, 1.0),
-        ("y", 0.01): (None, None),
-    }
-    records = [
-        {"dataset": dataset, "target_rel_l2_median": target, "method": method, "latency_ms": time}
-        for (dataset, target), both in times.items()
-        for method, time in zip("ab", both, strict=True)
-    ]
-    found = profile(records)
-    assert (found["n_unsolved"], found["n_datasets"], len(found["problems"])) == (1, 2, 3)
-    assert found["factors"] == {"a": [1.0, 1.0, 3.0], "b": [2.0, None, 1.0]}
-    shares = [share_within(found["factors"]["b"], tau) for tau in (1.0, 1.9, 2.0, np.inf)]
-    assert shares == pytest.approx([1 / 3, 1 / 3, 2 / 3, 2 / 3])
-    assert share_within([], 1.0) == 0.0
-
-
-def test_tuning_reports_the_used_and_the_allowed_budget(tmp_path: Path) -> None:
-    made = Comparison(tmp_path, {}, settings={"budget": {"configurations": 2, "seconds": 15.0}})
-    made.rows = [scored("a", f"a{i}", 0.1, 1.0) for i in range(2)]
-    made.rows.append(a_row("a", label="a2", status="skipped"))
-    assert tuning(made) == [
-        {
-            "dataset": "beam-tiny",
-            "method": "a",
-            "configurations": 2,
-            "seconds": 10.0,
-            "configurations_allowed": 2,
-            "seconds_allowed": 15.0,
-        }
-    ]
-
-
-@pytest.mark.parametrize(
-    ("regime", "device", "lacks"),
-    [
-        ({"min_dofs": 600}, "cpu", ""),
-        ({"min_dofs": 601}, "cpu", "600 of 601 degrees of freedom"),
-        ({"min_train": 1001}, "cpu", "1,000 of 1,001 training samples"),
-        ({"min_iterations": 5}, "cpu", "0 of 5 iterations"),
-        ({"split": "sample"}, "cpu", "split by region"),
-        ({"gpu": True}, "cpu", "no graphics processor"),
-        ({"gpu": True}, "cuda", "trained on a graphics processor, but queried on the CPU"),
-    ],
-)
-def test_a_method_is_in_its_regime_only_if_all_its_conditions_hold(
-    tmp_path: Path, regime: Record, device: str, lacks: str
-) -> None:
-    made = Comparison(tmp_path, {}, settings={"device": device})
-    made.rows = [scored(name, name, 0.1, 1.0) for name in "ab"]
-    made.methods = {"a": {"regime": {"says": "large meshes", **regime}}, "b": {"regime": None}}
-    verdict = f"not tested in its regime ({lacks}): large meshes" if lacks else "in its regime"
-    assert [(record["in_regime"], record["verdict"]) for record in regimes(made)] == [
-        (not lacks, verdict),
-        (None, "its file names no regime"),
-    ]
-
-
-@pytest.mark.parametrize(
-    ("shipped", "fresh", "interval", "expected"),
-    [
-        (0.01, 0.0135, (0.009, 0.011), {"worse": True, "ratio": 1.35}),
-        (0.01, 0.0135, (0.008, 0.0125), {"worse": False, "limit": 1.25**2**0.5}),
-        (0.01, 0.0115, None, {"worse": False, "limit": 1.2}),
-        (0.01, np.inf, (0.009, 0.011), {"worse": True, "ratio": None, "limit": 1.2}),
-        (0.0, 0.0, (0.0, 0.0), {"worse": False}),
-    ],
-)
-def test_a_hidden_set_is_called_worse_only_beyond_its_sampling_error(
-    shipped: float, fresh: float, interval: tuple[float, float] | None, expected: Record
-) -> None:
-    plain = scored("a", "a", shipped, 1.0)
-    row = plain.with_parts(hidden=SetErrors(n=100, rel_l2_median=fresh))
-    intervals = {"a": {"rel_l2_median": interval}} if interval else {}
-    (record,) = hidden([row, plain], "beam-tiny", intervals)
-    assert {key: record[key] for key in expected} == pytest.approx(expected)

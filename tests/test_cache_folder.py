@@ -10,6 +10,7 @@ import pytest
 from typer.testing import Result
 
 from mor_bench.snapshots.dataset import Dataset, load_dataset
+from mor_bench.snapshots.generate import dataset_folder
 from tests.commands import invoke
 
 
@@ -20,7 +21,7 @@ def cache_command(*arguments: object) -> Result:
 @pytest.fixture
 def filled(tiny: Dataset, cache: Path, tmp_path: Path) -> Path:
     """A cache with beam-tiny, two fits of one method and one of another."""
-    folder = next((cache / "datasets").glob("beam-tiny-*"))
+    folder = dataset_folder(tiny.scene.generated, cache)
     shutil.copytree(folder, tmp_path / "datasets" / folder.name)
     for name in ("pca-regression-force-0a1b", "pca-regression-force-2c3d", "pod-4e5f"):
         (tmp_path / "fits" / name).mkdir(parents=True)

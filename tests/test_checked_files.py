@@ -60,6 +60,21 @@ def refused(read: Callable[[Path], Any], path: Path, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+@pytest.mark.parametrize("thing", ["pipe", "device"])
+def test_only_regular_files_are_replaced(thing: str, tmp_path: Path) -> None:
+    path = tmp_path / "model.safetensors"
+    if thing == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    fitted = mor_bench.load_method("linear-fem").fit(mor_bench.load_scene("beam-tiny"), None)
+    before = path.lstat()
+    refused(fitted.save, path, "is a device or pipe")
+    assert path.lstat() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
 @pytest.mark.parametrize("kind", READERS)
 @pytest.mark.parametrize("thing", ["pipe", "device", "folder"])
 def test_only_regular_files_are_read(kind: str, thing: str, tmp_path: Path) -> None:
@@ -90,7 +105,13 @@ def test_the_size_of_a_file_is_limited(tmp_path: Path) -> None:
 
 
 DEEP = {
-    "a.toml": ["a = " + "[" * 400 + "]" * 400, "a = " + "[" * 100_000, ".".join("a" * 90) + "=1"],
+    "a.toml": [
+        "a = " + "[" * 400 + "]" * 400,
+        "a = " + "[" * 100_000,
+        ".".join("a" * 90) + "=1",
+        r'"\"".' * 30_000 + "a = 1",
+        "'\u2028' . " * 30_000 + "a = 1",
+    ],
     "a.json": ["[" * 65 + "]" * 65, "[" * 100_000, '{"a":' * 70 + "1" + "}" * 70],
 }
 
@@ -157,6 +178,7 @@ BAD_NPZ = {
     "pickle": (b"\x80\x04cos\nsystem\n.", "File is not a zip file"),
     "object": (npz({"a.npy": npy(np.array([None, 1], object))}), "holds Python objects"),
     "doubled": (TWICE, "`a` occurs more than once"),
+    "with and without ending": (npz({"a.npy": ONE, "a": ONE}), "`a` occurs more than once"),
     "encrypted": (bytes(ENCRYPTED), "encrypted"),
     "compression": (npz({"a.npy": ONE}, compression=zipfile.ZIP_LZMA), "compression is unknown"),
     "huge header": (npz({"a.npy": b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**31)}), "readable"),

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ import pytest
 import mor_bench
 from mor_bench.cli.app import COMMANDS
 from mor_bench.cli.suite_commands import BUSY
+from mor_bench.machine import describe_machine
 from mor_bench.options import FitOptions, Options, RunOptions, command_line
 from mor_bench.specs import list_suite
 from tests.commands import invoke
+from tests.verification.trust_record import git
 
 
 def printed(code: str) -> str:
@@ -140,7 +143,11 @@ def test_refine_prints_and_keeps_its_record(tmp_path: Path) -> None:
     done = invoke("refine", "beam-tiny", *options)
     assert done.exit_code == 0
     (path,) = tmp_path.rglob("discretisation.json")
-    assert json.loads(done.stdout) == json.loads(path.read_text(encoding="utf-8"))
+    record = json.loads(done.stdout)
+    assert record == json.loads(path.read_text(encoding="utf-8"))
+    assert record["commit"].removesuffix("-dirty") == git("rev-parse", "HEAD")
+    assert record["date"].startswith(f"{datetime.now(UTC):%Y-%m-}")
+    assert record["machine"]["processor"] == describe_machine()["processor"]
 
 
 def test_generate_prints_the_folder_of_the_dataset_and_of_its_test_sets(tmp_path: Path) -> None:

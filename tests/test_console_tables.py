@@ -16,6 +16,8 @@ from mor_bench.report.console_tables import Detail, print_tables
 from mor_bench.report.number_format import milliseconds_text, seconds_text
 from mor_bench.report.short_names import renamed, short_names
 from mor_bench.results.comparison import Comparison
+from mor_bench.results.parts import TrainedElsewhere
+from tests.report_runs import add_row, tiny
 from tests.synthetic import a_row, synthetic_comparison
 
 LONG = "a-method-of-somebody-else-whose-name-is-longer-than-the-whole-first-column"
@@ -48,6 +50,33 @@ def shown(made: Comparison, analysis: dict[str, Any]) -> Any:
         return stream.getvalue()
 
     return text
+
+
+def test_the_iterations_of_a_training_elsewhere_stand_beside_those_of_the_file(
+    tmp_path: Path,
+) -> None:
+    made = tiny(tmp_path)
+    made.settings = {"profile": "quick"}
+    quick = {"parameters": {"iterations": 45}}
+    made.methods = {"net": {"parameters": {"iterations": 1000}, "profiles": {"quick": quick}}}
+    training = TrainedElsewhere(
+        machine="M x 2",
+        core_s=5.0,
+        wall_s=9.0,
+        threads=1,
+        iterations=200,
+        seed=0,
+        commit="0123456789",
+        date="2026-01-01",
+        versions={},
+    )
+    add_row(made, "net", {}, 0.01, 1.0, trained_elsewhere=training)
+    stream = io.StringIO()
+    print_tables(made, Console(file=stream, width=300), analyse(made, n_resamples=20))
+    assert "trained elsewhere for 200 iterations, not the 1,000 of its method file" in (
+        stream.getvalue()
+    )
+    assert "`--train` trains here for 45 iterations" in stream.getvalue()
 
 
 @pytest.mark.parametrize("width", [80, 100, 120])

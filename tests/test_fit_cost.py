@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 from threading import Thread
-from time import sleep, thread_time
+from time import perf_counter, sleep, thread_time
+from typing import Any
 
+import numpy as np
 import pytest
 from numba import njit
+from numpy.typing import NDArray
 
 from mor_bench.measure.fit_clock import fit_clock
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.snapshots.generate import generate, generation_seconds, n_samples_to_generate
+from mor_bench.specs import load_generated_spec
 from tests.synthetic import a_row
 
 BUSY_S = 0.1
@@ -53,6 +60,30 @@ def test_compilation_is_part_of_neither_time() -> None:
         assert summed(4) == 14
     assert cost.compile_s > 0
     assert max(cost.wall_s, cost.core_s) < 0.5 * cost.compile_s
+
+
+def test_compilation_is_no_part_of_the_cost_of_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solve_many, took = FullOrderModel.solve_many, list[float]()
+
+    def compile_and_solve(self: FullOrderModel, *arguments: Any) -> Any:
+        @njit(cache=False)
+        def summed(values: NDArray[np.float64]) -> float:
+            return float(np.sort(np.linalg.inv(values.reshape(2, 2)).ravel())[0])
+
+        begun = perf_counter()
+        summed(np.array([1.0, 0.0, 0.0, 1.0]))
+        took.append(perf_counter() - begun)
+        return solve_many(self, *arguments)
+
+    monkeypatch.setattr(FullOrderModel, "solve_many", compile_and_solve)
+    spec = load_generated_spec("beam-tiny")
+    generate(spec, workers=1, cache=tmp_path)
+    seconds = generation_seconds(spec, tmp_path, n_samples_to_generate(spec))
+    assert seconds is not None
+    assert took
+    assert seconds < sum(took)  # by far, without other work on the machine
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,8 @@ def test_hyper_reduction_works_for_every_law_and_element(law: str, kind: tuple[s
     fewer = HyperReducedPOD(5, 1e-3, sampling="points").fit(scene, train)
     assert fewer.problem_.points.n_points < few.problem_.points.n_points or kind[0] == "tetrahedron"
     greedy = EmpiricalCubaturePOD(5, 1e-2).fit(scene, train)
-    sampled = InterpolatedPOD(5, 8).fit(scene, train)
+    # Fibres carry load in tension alone: forces with such a kink take more modes.
+    sampled = InterpolatedPOD(5, 16 if law == "holzapfel-gasser-ogden" else 8).fit(scene, train)
     for method in (few, fewer, greedy, sampled):
         assert len(method.cells_) < scene.mesh.n_cells
         assert np.abs(method.predict(train.forces) - plain).max() <= 0.03 * size

@@ -108,23 +108,34 @@ def test_answers_worse_than_zero_are_on_no_front() -> None:
     assert error_at_time(useless, 1.0) == {"error": None, "best": None}
 
 
-def test_validation_selects_and_the_whole_sweep_stays_that_of_the_test() -> None:
+def test_validation_selects_the_frontier_and_its_errors_are_those_of_the_test() -> None:
     points = [
-        Point(1.0, 0.009, "lucky on the test", 0.02),
+        Point(1.0, 0.04, "fast", 0.02),
         Point(2.0, 0.012, "selected", 0.008),
-        Point(3.0, 0.004, "slow", 0.009),
+        Point(2.5, 0.004, "lucky on the test", 0.009),
+        Point(8.0, 0.003, "slow", 0.002),
     ]
+    assert [p.label for p in non_dominated(points)] == ["fast", "selected", "slow"]
+    found = time_at_error(points, 0.006)
+    assert found["latency_ms"] == pytest.approx(4.0)
     found = time_at_error(points, 0.01)
-    assert found["latency_ms"] == 1.0
     assert found["best"] == {
         "label": "selected",
         "latency_ms": 2.0,
         "error": 0.012,
         "validation": 0.008,
     }
-    within = error_at_time(points, 5.0)
-    assert (within["error"], within["best"]["error"]) == (0.004, 0.012)
+    within = error_at_time(points, 4.0)
+    assert within["error"] == pytest.approx(0.006)
+    assert within["best"]["error"] == 0.012
     assert time_at_error([points[1]], 0.01)["latency_ms"] is None
+
+
+def test_a_frontier_that_errs_on_the_test_set_is_followed_from_the_first_configuration() -> None:
+    points = [Point(1.0, 0.02, "a", 0.03), Point(4.0, 0.08, "b", 0.01), Point(16.0, 2.0, "c", 1e-3)]
+    assert [p.label for p in non_dominated(points)] == ["a", "b"]
+    assert time_at_error(points, 0.05)["latency_ms"] == 1.0
+    assert error_at_time(points, 2.0)["error"] == pytest.approx(0.04)
 
 
 @example([(1.0, 1.0000000000000002e-06), (2.0, 1e-06)], 1e-06, 1.0)

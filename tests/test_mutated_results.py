@@ -19,10 +19,11 @@ from safetensors.numpy import load as load_arrays
 
 import mor_bench
 from mor_bench.analysis.analyse import analyse
-from mor_bench.errors import StoreError
+from mor_bench.errors import MorBenchError, StoreError
 from mor_bench.method_loading import load_fitted
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.page import render
+from mor_bench.results.arrays import write_arrays
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.pick import pick
 from mor_bench.scene.scene import Scene
@@ -162,11 +163,42 @@ def test_without_raw_samples_nothing_is_picked_or_reported(tmp_path: Path) -> No
     assert pick(DATASET, comparison=tmp_path).text() == chosen
 
 
+def test_raw_samples_of_another_configuration_are_noticed(tmp_path: Path) -> None:
+    a_run(tmp_path / "results.json")
+    comparison = Comparison.read(tmp_path)
+    first, second = (comparison.samples_path(row) for row in comparison.rows[:2])
+    kept = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    with pytest.raises(StoreError, match="belongs to another configuration or run") as caught:
+        pick(DATASET, comparison=tmp_path)
+    assert str(first) in str(caught.value)
+    answer = invoke("report", str(tmp_path))
+    assert answer.exit_code == 2
+    assert "belongs to another configuration" in answer.output
+    first.write_bytes(kept)
+    write_arrays(first, {"relative_l2": np.ones(1)})
+    with pytest.raises(StoreError, match="`relative_l2` must have the shape"):
+        pick(DATASET, comparison=tmp_path)
+
+
 @pytest.fixture(scope="module")
 def model(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("sound") / "model.safetensors"
     mor_bench.load_method("pod", n_modes=3).fit(tiny.scene, tiny.train).save(path)
     return path
+
+
+@pytest.mark.parametrize("path", [".", "", "..", "no/such/model.safetensors"])
+def test_a_model_is_not_saved_where_no_file_can_be(
+    path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fitted = mor_bench.load_method("linear-fem").fit(mor_bench.load_scene("beam-tiny"), None)
+    with pytest.raises((MorBenchError, OSError)) as caught:
+        fitted.save(path)
+    assert str(Path(path)) in str(caught.value)
+    assert ".tmp" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
 
 
 def model_reader(model: Path, read: Callable[[Path], object]) -> Reader:

@@ -237,7 +237,7 @@ def test_the_cache_does_not_return_a_model_of_other_observed_nodes(
 @pytest.mark.slow
 def test_all_supported_methods_run_by_default(tmp_path: Path) -> None:
     path = written(tmp_path, TOP)
-    chosen = [method.name for method in checked_specs([path], None, RunOptions())[1]]
+    chosen = [method.name for method in checked_specs([path], None, RunOptions()).methods]
     assert chosen == list(OBSERVATION_METHODS)
 
 

@@ -162,7 +162,7 @@ def test_every_method_runs_or_gives_its_reason(name: str, arrays: Arrays, tmp_pa
     with pytest.raises(StoreError, match=changed):
         mor_bench.load_surrogate(path)
     source.unlink()
-    with pytest.raises(StoreError, match=r"model.safetensors: .*mine.npz: no such file"):
+    with pytest.raises(StoreError, match=changed):
         mor_bench.load_surrogate(path)
 
 
@@ -216,9 +216,9 @@ def test_only_methods_that_learn_from_samples_run_by_default(
     arrays: Arrays, tmp_path: Path
 ) -> None:
     path = written(tmp_path, arrays)
-    _, alone = checked_specs([path], None, RunOptions())
+    alone = checked_specs([path], None, RunOptions()).methods
     assert [spec.name for spec in alone] == list(DATA_METHODS)
-    _, both = checked_specs(["beam-tiny", path], None, RunOptions())
+    both = checked_specs(["beam-tiny", path], None, RunOptions()).methods
     assert [spec.name for spec in both] == list(dict.fromkeys([*CORE_METHODS, *DATA_METHODS]))
 
 

@@ -12,8 +12,13 @@ import numpy as np
 import pytest
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.report.entries import entries_of, verdict_of
 from mor_bench.report.number_format import percent
 from mor_bench.report.page import render
+from mor_bench.report.page_index import standings
+from mor_bench.report.page_sections import View
+from mor_bench.report.page_verdict import method_card
+from mor_bench.report.short_names import short_names
 from mor_bench.results.comparison import Comparison
 from tests.report_runs import N_TEST, add_row, data_of, markup_of, text_of, tiny
 from tests.synthetic import MESH, changed
@@ -79,6 +84,27 @@ def test_pages_of_an_earlier_report_do_not_stay_old(tmp_path: Path) -> None:
     old.write_text("old")
     render(made)
     assert old.read_text() != "old"
+
+
+def test_pages_show_the_test_error_of_what_validation_selects(tmp_path: Path) -> None:
+    made = tiny(tmp_path)
+    add_row(made, "lucky", {"k": 1}, 0.023, 1.0, validation={"rel_l2_median": 0.08})
+    add_row(made, "lucky", {"k": 2}, 0.047, 1.0, validation={"rel_l2_median": 0.05})
+    add_row(made, "old", {"k": 1}, 0.061, 1.0)
+    add_row(made, "old", {"k": 2}, 0.033, 1.0)
+    analysis = analyse(made, n_resamples=50)
+    names = short_names(made.rows)
+    view = View(made, analysis, [], {"beam-tiny": names}, 0)
+    files = {"dataset": {"beam-tiny": ""}, "method": {"lucky": "", "old": ""}}
+    lucky, old = (found[0].small for _, found in standings(view, files).methods)
+    assert lucky == "test error 4.7 % (most accurate on the validation part)"
+    assert old == "test error 3.3 % (smallest error, selected on the test set: optimistic)"
+    entries = entries_of(made, "beam-tiny", analysis)
+    shown = {label: str(name) for label, name in names.items()}
+    found = method_card(verdict_of(analysis, "beam-tiny"), entries, shown, "lucky")
+    (pick,) = found.rankings[0].picks
+    assert (pick.name, pick.error) == ("lucky · k2", "4.7")
+    assert pick.part == "most accurate on the validation part"
 
 
 def test_the_finding_above_a_distribution_is_that_of_a_drawn_curve(tmp_path: Path) -> None:

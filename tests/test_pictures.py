@@ -33,7 +33,7 @@ from mor_bench.report.canvas import (
 )
 from mor_bench.report.entries import entries_of
 from mor_bench.report.error_against_time import error_against_time, fastest
-from mor_bench.report.figures import pictures_of
+from mor_bench.report.figures import explain_names, pictures_of
 from mor_bench.report.labels import Note, annotate
 from mor_bench.report.method_styles import style_of
 from mor_bench.report.notebook import Comparison as Drawing
@@ -103,6 +103,23 @@ def test_no_text_is_small_or_clipped(pictures: dict[str, Picture]) -> None:
         assert not small, kind
 
 
+def test_short_names_are_explained_in_the_picture(pictures: dict[str, Picture]) -> None:
+    for kind in ("error-against-time", "distributions", "error-against-deformation"):
+        figure = pictures[kind].figure
+        renderer = lay_out(figure)
+        *others, note = figure.texts
+        assert "r: number of modes" in note.get_text(), kind
+        assert float(note.get_fontsize()) >= NOTE
+        place = note.get_window_extent(renderer)
+        for text in (*others, *figure.legends):
+            assert not place.overlaps(text.get_window_extent(renderer)), kind
+        for axes in figure.axes:
+            box = axes.get_tightbbox(renderer)
+            assert box is None or not place.overlaps(box), kind
+    learning = pictures["learning-curves"].figure
+    assert not any("r: number" in text.get_text() for text in learning.texts)
+
+
 PLOTS = {
     "plot_frontier": "error-against-time",
     "plot_error_distribution": "distributions",
@@ -131,6 +148,7 @@ def test_the_axes_of_a_notebook_show_what_the_file_shows(
 def test_equal_data_give_equal_files(made: Comparison, pictures: dict[str, Picture]) -> None:
     again = error_against_time(made, BEAM, made.analysis or {})
     assert again is not None
+    explain_names(again, made, BEAM)
     first = pictures["error-against-time"]
     assert as_svg(again) == as_svg(first)
     assert as_png(again.figure, {}) == as_png(first.figure, {})

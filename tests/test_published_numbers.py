@@ -12,7 +12,7 @@ from tests.published.claims import (
     without_evidence,
     wrong_numbers,
 )
-from tests.published.compact import ERRORS, wrong_summaries, wrong_verdicts
+from tests.published.compact import ERRORS, wrong_intervals, wrong_summaries, wrong_verdicts
 from tests.published.pictures import stale_pictures
 from tests.published.stored import REPORTS, ROOT
 
@@ -74,6 +74,13 @@ def test_every_entry_of_the_ledger_belongs_to_a_page() -> None:
 @pytest.mark.parametrize("run", RUNS)
 def test_the_errors_of_a_run_are_those_of_its_samples(run: str) -> None:
     wrong = list(wrong_summaries(REPORTS / run))
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", RUNS)
+def test_the_intervals_of_a_run_are_those_of_its_samples(run: str) -> None:
+    wrong = list(wrong_intervals(REPORTS / run))
     assert not wrong, "\n".join(wrong)
 
 

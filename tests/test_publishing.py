@@ -12,6 +12,8 @@ import pytest
 from matplotlib import image
 
 from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.draws import VALIDATION
+from mor_bench.results.comparison import Comparison
 from tests.published.blocks import with_blocks
 from tests.published.claims import (
     NUMBER,
@@ -22,9 +24,16 @@ from tests.published.claims import (
     without_evidence,
     wrong_numbers,
 )
-from tests.published.compact import ERRORS, compact, wrong_summaries, wrong_verdicts
+from tests.published.compact import (
+    ERRORS,
+    compact,
+    verdict_again,
+    wrong_intervals,
+    wrong_summaries,
+    wrong_verdicts,
+)
 from tests.published.pictures import draw_pictures, stale_pictures
-from tests.published.stored import EvidenceError, content_of, look_up, run_of
+from tests.published.stored import REPORTS, EvidenceError, content_of, look_up, run_of
 from tests.synthetic import synthetic_comparison
 
 PAGE = "docs/page.md"
@@ -35,6 +44,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A synthetic run in compact form."""
     folder = tmp_path_factory.mktemp("published")
     made = synthetic_comparison(folder / "run")
+    made.rows = [row.with_parts(hidden=None) for row in made.rows]
     made.finish(analyse(made, n_resamples=50))
     compact(folder / "run", folder / "stored", "shown/stored")
     return folder / "stored"
@@ -70,6 +80,55 @@ def test_a_verdict_that_its_rows_do_not_give_is_found(stored: Path, tmp_path: Pa
     outside, order = wrong_verdicts(tmp_path / "copy")
     assert "rel_l2_median lies outside its interval" in outside
     assert "qualify, stated are" in order
+
+
+def forged(stored: Path, folder: Path, part: str, factor: float) -> Path:
+    """Copy a run whose relative errors of a part are scaled in all texts, but not in its samples.
+
+    Figures, intervals, and the verdicts that follow from them agree with each other.
+    """
+    shutil.copytree(stored, folder)
+    figure = {"error": "rel_l2_median", "validation": VALIDATION}.get(part)
+    content = json.loads((folder / "results.json").read_text())
+    for row in content["rows"]:
+        if row[part]:
+            for name in ("rel_l2_median", "rel_l2_p95", "rel_l2_max"):
+                row[part][name] *= factor
+    (folder / "results.json").write_text(json.dumps(content))
+    content = json.loads((folder / "comparison.json").read_text())
+    for record in content["rows"]:
+        if figure:
+            record[figure] = {end: x and factor * x for end, x in record[figure].items()}
+    for record in content["verdicts"]:
+        again = verdict_again(Comparison.read(folder), content, record["dataset"]).summary()
+        record.update({key: again[key] for key in ("qualified", "headline", "beside")})
+    (folder / "comparison.json").write_text(json.dumps(content))
+    content_of.cache_clear()
+    return folder
+
+
+@pytest.mark.parametrize("part", ["error", "validation", "hidden"])
+def test_texts_that_agree_with_each_other_but_not_with_the_samples_are_found(
+    part: str, tmp_path: Path
+) -> None:
+    folder = forged(REPORTS / "quick-start", tmp_path / "copy", part, 0.5)
+    assert list(wrong_verdicts(folder)) == []
+    found = list(wrong_summaries(folder))
+    named = "rel_l2_median" + f" of {part}" * (part != "error")
+    assert any(f"pod [n_modes=80]: {named} is" in line for line in found)
+
+
+@pytest.mark.slow
+def test_an_interval_that_the_samples_do_not_give_is_found(stored: Path, tmp_path: Path) -> None:
+    assert list(wrong_intervals(stored)) == []
+    shutil.copytree(stored, tmp_path / "copy")
+    path = tmp_path / "copy" / "comparison.json"
+    content = json.loads(path.read_text())
+    figure = look_up(content, "rows/label=linear-fem/rel_l2_median")
+    figure["high"] = figure["value"] * 1.0001
+    path.write_text(json.dumps(content))
+    (found,) = wrong_intervals(tmp_path / "copy")
+    assert "linear-fem: rel_l2_median is" in found
 
 
 @pytest.mark.parametrize("table", ["selected", "verdict", "fastest", "facts"])

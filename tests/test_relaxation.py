@@ -26,6 +26,14 @@ LAWS: dict[str, dict[str, Any]] = {
     "mooney-rivlin": {"c10_pa": 60.0, "c01_pa": 29.0, "bulk_pa": 833.0},
     "ogden": {"mu_pa": [178.0], "alpha": [2.5], "bulk_pa": 833.0},
     "corotational": {"young_pa": 500.0, "poisson": 0.4},
+    "holzapfel-gasser-ogden": {
+        "c10_pa": 89.0,
+        "k1_pa": 50.0,
+        "k2": 0.8,
+        "dispersion": 0.1,
+        "fibres": [[1.0, 0.0, 0.0], [1.0, 1.0, 0.0]],
+        "bulk_pa": 833.0,
+    },
     "yeoh": {"c10_pa": 89.0, "c20_pa": -20.0, "c30_pa": 15.0, "bulk_pa": 833.0},
 }
 ELEMENTS = {

@@ -328,6 +328,7 @@ def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis
         "6 of 5 (over)",
         "flagged 41.7 % of 60",
         "Who is faster at 1 %, the required error",
+        "configuration told processes queries",
     ):
         assert said in text
 

@@ -18,6 +18,7 @@ import numpy as np
 import psutil
 import pytest
 
+import mor_bench
 from mor_bench.errors import MorBenchError, SpecError
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.results.comparison import Comparison
@@ -173,14 +174,14 @@ def test_a_process_ends_if_its_parent_is_killed() -> None:
 def test_a_process_that_never_releases_the_interpreter_ends_with_its_parent(tmp_path: Path) -> None:
     (tmp_path / "endless.py").write_text(
         "import os, re\n"
-        f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid()) + ' ')\n"
+        f"open({str(tmp_path / '__pycache__' / 'pid')!r}, 'w').write(str(os.getpid()) + ' ')\n"
         "re.match('(a+)+$', 60 * 'a' + 'b')\n"
     )
     path = method_file(tmp_path, "endless", "endless:Mine")
     command = [sys.executable, "-m", "mor_bench", "check", str(path)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([os.getcwd(), str(tmp_path)])}
     with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as parent:
-        written = tmp_path / "pid"
+        written = tmp_path / "__pycache__" / "pid"  # a method can write here
         until = time.monotonic() + 60.0
         while time.monotonic() < until and not (written.exists() and written.read_text()):
             time.sleep(0.05)
@@ -224,6 +225,30 @@ def test_a_kernel_that_refuses_to_close_folders_is_an_error(
     monkeypatch.setattr(landlock, "CREATE_RULESET", 9999)
     with pytest.raises(MorBenchError, match="refuses to close folders"):
         landlock.close_folders([tmp_path])
+
+
+@pytest.mark.skipif(not landlock.version(), reason="needs a kernel with Landlock")
+def test_a_third_partys_method_changes_no_file_of_others(
+    server: ForkServer | None, tiny_scene: Scene, tmp_path: Path
+) -> None:
+    theirs, own, installed = tmp_path / "theirs", tmp_path / "own", tmp_path / "installed"
+    for folder in (theirs, own, installed):
+        folder.mkdir()
+    code = [theirs / "method.py", installed / "page.py"]
+    for path in code:
+        path.write_text("")
+    compiled = theirs / "__pycache__" / "method.pyc"
+    package = Path(mor_bench.__file__).parent / "new_module.py"
+    paths = [str(p) for p in (*code, installed / "new.pth", package, own / "notes", compiled)]
+    restrictions = Restrictions((tmp_path / "cache",), import_from=theirs, scratch=own)
+    with SandboxedProcess(MethodSession, restrictions, server, scene=tiny_scene) as process:
+        said = ask_fit(process, "Vandal", own, paths=paths)["warnings"]
+    assert [text for text in said if text.startswith("wrote")] == [
+        f"wrote {own / 'notes'}",
+        f"wrote {compiled}",
+    ]
+    assert not any(path.read_text() for path in code)
+    assert not package.exists()
 
 
 def test_the_kind_of_isolation_is_recorded(small_run: Comparison) -> None:

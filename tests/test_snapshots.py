@@ -125,8 +125,12 @@ def test_other_splits_reach_load_dataset(cache: Path) -> None:
 def test_wrong_options_are_refused(cache: Path) -> None:
     with pytest.raises(InvalidInputError, match="cannot be split"):
         load_dataset("beam-tiny", limit=1, cache=cache)
-    with pytest.raises(InvalidInputError, match=r"`limit` must be an integer >= 1; got 0"):
-        load_dataset("beam-tiny", limit=0, cache=cache)
+    for wrong in (0, 1.5, "3", float("nan"), True):
+        options: Any = {"limit": wrong}
+        with pytest.raises(InvalidInputError, match=rf"`limit` must be .* >= 1; got {wrong!r}"):
+            load_dataset("beam-tiny", cache=cache, **options)
+        with pytest.raises(InvalidInputError, match=rf"`workers` must be .* >= 1; got {wrong!r}"):
+            load_dataset("beam-tiny", cache=cache, workers=options["limit"])
     with pytest.raises(TypeError, match="unexpected keyword argument 'wrokers'"):
         load_dataset("beam-tiny", wrokers=2)  # type: ignore[call-arg]
 

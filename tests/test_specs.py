@@ -101,7 +101,7 @@ geometry.cells = - -> key `geometry.cells` is missing.
 geometry.cells = [6, 2] -> key `geometry.cells[2]` is missing.
 geometry.cells = [6, 2, 0] -> `geometry.cells[2]` must be greater than or equal to 1; got 0.
 geometry.cells = [6, 2, 2.5] -> `geometry.cells[2]` must be a valid integer; got 2.5.
-geometry.cells = [2000000, 2000, 2000] -> there must be at most 1,000,000 cells in all
+geometry.cells = [2000000, 2000, 2000] -> there must be at most 400,000 cells in all
 geometry.size_m = [1.0, -1.0, 1.0] -> `geometry.size_m[1]` must be greater than 0; got -1.0.
 geometry = { shape = "file", file = 3 } -> `geometry.file`: it must be the path of a file; got 3.
 geometry = { shape = "file", file = "none.vtu" } -> `geometry.file`: … no such file

@@ -135,6 +135,46 @@ def test_a_signal_while_a_command_is_looked_up_ends_it_in_the_same_way(name: str
     assert done.stderr.startswith(f"mor-bench: stopped by {name}. Finished samples and rows")
 
 
+def test_a_signal_while_the_command_ends_is_one_line() -> None:
+    code = (
+        "import contextlib, os, signal\n"
+        "from mor_bench.cli import app\n"
+        "signal.signal(signal.SIGTERM, signal.SIG_DFL)\n"
+        "known = contextlib._GeneratorContextManager.__exit__\n"
+        "def ending(self, *raised):\n"
+        "    if self.gen.gi_code is app.clear_errors.__wrapped__.__code__ and "
+        "raised[0] is SystemExit:\n"
+        "        os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    return known(self, *raised)\n"
+        "contextlib._GeneratorContextManager.__exit__ = ending\n"
+        "app.app(['--version'])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 128 + signal.SIGTERM
+    assert done.stderr.startswith("mor-bench: stopped by SIGTERM. Finished samples and rows")
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_signal_in_a_finaliser_ends_a_command_all_the_same(name: str) -> None:
+    code = (
+        "import os, signal, time\n"
+        "from mor_bench.cli.clear_errors import clear_errors\n"
+        "class Held:\n"
+        "    def __del__(self):\n"
+        f"        os.kill(os.getpid(), signal.{name})\n"
+        "        time.sleep(0.01)\n"
+        f"signal.signal(signal.{name}, signal.SIG_DFL)\n"
+        "with clear_errors():\n"
+        "    Held()\n"
+        "    time.sleep(30)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 128 + getattr(signal, name)
+    assert done.stderr.startswith(f"mor-bench: stopped by {name}. Finished samples and rows")
+    assert len(done.stderr.splitlines()) == 1
+
+
 def test_a_library_that_cannot_be_loaded_is_one_line() -> None:
     code = (
         "import sys\n"
@@ -161,10 +201,10 @@ def test_nohup_is_respected(tmp_path: Path) -> None:
 
 
 LARGE = {
-    "cells": ("cells  = [6, 2, 2]", "cells  = [100, 100, 100]"),
+    "cells": ("cells  = [6, 2, 2]", "cells  = [100, 100, 40]"),
     "samples": ("samples_per_patch = 10", "samples_per_patch = 476_190"),
 }
-"""Changes of beam-tiny that lie just below the limits: a million cells, ten million samples."""
+"""Changes of beam-tiny that lie just below the limits: 400,000 cells, ten million samples."""
 
 SILENT_S = 2.0
 """Time after which a command must have said something, s, beside its start."""
@@ -210,4 +250,7 @@ def test_large_inputs_are_not_met_with_silence(what: str, line: str, tmp_path: P
         first_word_s(f"{line.split()[0]} --help", tmp_path, file),
         first_word_s("check $FILE", tmp_path, ROOT / "methods" / "pod.toml"),
     )
-    assert first_word_s(line, tmp_path, file) < SILENT_S + 1.5 * start_s
+    # The shortest of three: other work of the machine may delay one of them, silence delays each.
+    tries = (first_word_s(line, tmp_path, file) for _ in range(3))
+    limit_s = SILENT_S + 1.5 * start_s
+    assert any(seconds < limit_s for seconds in tries), f"silent for {limit_s:.3g} s, three times"

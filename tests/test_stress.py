@@ -21,7 +21,7 @@ from mor_bench.hard_cases.case import LONGEST, Scenes, Subject
 from mor_bench.hard_cases.catalogue import CASES, CaseResult, attempt, cases_for
 from mor_bench.hard_cases.suite import StressResults, stress
 from mor_bench.mechanics import model as model_module
-from mor_bench.report.hard_case_table import print_stress
+from mor_bench.report.hard_case_table import print_stress, stress_table
 from mor_bench.scene import soundness
 from mor_bench.specs import MethodSpec
 from mor_bench.surrogates import pod as pod_module
@@ -152,8 +152,9 @@ def test_errors_out_of_distribution_are_published_and_flagged(
 def test_the_table_has_every_row_and_the_counts(scenes: Scenes) -> None:
     rows = [*tried(scenes, flawed("bad"), ["zero-force"]), *tried(scenes, flawed("good"))]
     console = Console(width=160, record=True, file=StringIO())
-    print_stress(StressResults(rows, "quick", {}), console)
+    print_stress(StressResults(rows, "quick", {}, {"good": "force only"}), console)
     text = console.export_text()
+    assert "Told (force only): good." in text
     skipped = sum(row.verdict == "not applicable" for row in rows)
     counts = f"{len(rows) - 1 - skipped} pass, 1 fall short, {skipped} not applicable"
     assert f"{len(rows)} tried: {counts}" in text
@@ -361,6 +362,8 @@ def test_the_command_prints_and_writes_the_same_results(tmp_path: Path, cache: P
         (m, c) for m in ("pod", "linear-fem") for c in ("zero-force", "symmetry")
     ]
     assert json.loads(out.read_text(encoding="utf-8")) == printed
+    told = {"pod": "equations, snapshots", "linear-fem": "force and linear response, no snapshots"}
+    assert printed["told"] == told
     assert "4 tried: 4 pass, 0 fall short" in done.stderr
     assert "1 of 4: zero-force, pod" in done.stderr
 
@@ -375,9 +378,16 @@ def test_training_loads_of_the_unseen_directions_are_normal_forces(scenes: Scene
 
 def test_results_are_read_back_and_damaged_ones_refused(tmp_path: Path) -> None:
     row = CaseResult("zero-force", "", "pod", "zero", "zero", "pass", {"largest": 0.0}, 0.1)
-    found, path = StressResults([row], "quick", {"cores": 2}), tmp_path / "stress.json"
+    told = {"pod": "equations, snapshots"}
+    found, path = StressResults([row], "quick", {"cores": 2}, told), tmp_path / "stress.json"
     found.write(path)
     assert StressResults.read(path) == found
+    assert stress_table(found, ["pod", "fem"]).rows[0][:2] == ["pod", "equations, snapshots"]
+    assert "The method is told: equations, snapshots." in stress_table(found, ["pod"]).note
+    content = json.loads(path.read_text())
+    del content["told"]
+    path.write_text(json.dumps(content))
+    assert StressResults.read(path).told == {}
     path.write_text(path.read_text().replace('"pass"', '"perhaps"'))
     with pytest.raises(StoreError, match="not written by `mor-bench stress --out`"):
         StressResults.read(path)

@@ -130,7 +130,7 @@ def test_the_shell_completes_commands_names_and_options(words: str, expected: li
 
 
 def test_lists_group_by_family_and_fit_the_width() -> None:
-    for columns in ("80", "120"):
+    for columns in ("60", "80", "120"):
         shown = mor_bench("list", columns=columns).stdout.splitlines()
         assert max(map(len, shown)) <= int(columns)
         assert "Methods: hyper-reduction" in shown

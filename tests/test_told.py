@@ -15,10 +15,12 @@ from mor_bench.analysis.told import told_at_most
 from mor_bench.report.console_tables import print_tables
 from mor_bench.report.entries import by_group, entries_of
 from mor_bench.report.page import render
+from mor_bench.report.text_table import TextTable, with_information
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 from mor_bench.specs import load_dataset_spec
 from tests.commands import invoke
+from tests.report_runs import add_row, tiny
 from tests.synthetic import a_row
 
 
@@ -106,3 +108,21 @@ def test_told_keeps_methods_that_are_told_no_more(made: Comparison) -> None:
         assert json.loads(found.stdout)["choice"]["label"] == winner
     none = invoke("pick", "beam-tiny", "--told", "input", *options[:2])
     assert none.exit_code == 1
+
+
+def test_tables_of_configurations_and_methods_state_the_class(tmp_path: Path) -> None:
+    made = tiny(tmp_path)
+    add_row(made, "pod", {"n_modes": 5}, 0.01, 1.0, told="equations", snapshots=True)
+    add_row(made, "old", {}, 0.01, 1.0)
+    entries = entries_of(made, "beam-tiny")
+    by_label = TextTable("t", "n", ["configuration", "x"], [["pod [n_modes=5]", "1"], ["?", "2"]])
+    found = with_information(by_label, entries)
+    assert found.headings == ["configuration", "told", "x"]
+    assert found.rows == [["pod [n_modes=5]", "equations, snapshots", "1"], ["?", "–", "2"]]
+    by_method = TextTable("t", "n", ["method", "x"], [["pod", "1"], ["old", "2"]])
+    assert [row[1] for row in with_information(by_method, entries).rows] == [
+        "equations, snapshots",
+        "–",
+    ]
+    other = TextTable("t", "n", ["load", "x"], [["pod", "1"]])
+    assert with_information(other, entries) == other

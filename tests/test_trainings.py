@@ -266,10 +266,10 @@ def test_a_training_can_open_only_its_own_checkpoint_folder_in_a_sealed_cache(
     (own / "link").symlink_to(own.parent / "score.h5")
     code = f"""
 from pathlib import Path
-from mor_bench.sandbox.seal import seal
+from mor_bench.sandbox.seal import Restrictions, seal
 from mor_bench.snapshots.store import write_atomically
 own = Path({str(own)!r})
-seal([Path({str(tmp_path / "fits")!r})], own)
+seal(Restrictions((Path({str(tmp_path / "fits")!r}),), own))
 write_atomically(own / "checkpoint", b"weights")
 print((own / "checkpoint").read_bytes())
 others = "../score.h5", "../../mine/score.h5", "link", "../training-of-another"

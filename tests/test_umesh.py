@@ -11,6 +11,7 @@ import pytest
 
 import mor_bench
 from mor_bench.errors import InvalidInputError
+from mor_bench.hard_cases.setups import material_table
 from mor_bench.method_loading import load_fitted
 from mor_bench.scene.grid import grid_map
 from mor_bench.scene.mesh import box_mesh
@@ -313,6 +314,10 @@ def test_a_mirrored_solution_is_a_solution(data: Dataset) -> None:
     found = fem.predict(mirror(force))
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
     assert mirrors(load_scene("liver-hex")) == []
+    spec = data.scene.spec.model_dump(mode="json", exclude_none=True)
+    for fibres, n in (([[1, 1, 0]], 0), ([[1, 1, 0], [1, -1, 0]], 1), ([[1, 0, 0]], 1)):
+        material = material_table("holzapfel-gasser-ogden", 500.0, 0.4) | {"fibres": fibres}
+        assert len(mirrors(load_scene({**spec, "material": material}))) == n
 
 
 @pytest.mark.slow

@@ -129,6 +129,12 @@ class Broken(Zero):
             np.linalg.inv(np.zeros((1, 1)))
         return self
 
+    def save(self, path: str | Path) -> None:
+        if self.how == "save-pipe":
+            os.mkfifo(path)
+        else:
+            super().save(path)
+
     def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
         batch = np.asarray(forces, dtype=float).reshape(-1, *np.shape(forces)[-2:])
         if self.how == "crash":
@@ -147,6 +153,25 @@ class Broken(Zero):
         if self.how == "nan":
             out[batch[:, :, 0].sum(axis=1) > 0] = np.nan
         return out.reshape(np.shape(forces))
+
+
+class Vandal(Zero):
+    """Tries to write to files and folders, says where it could, and solves with the equations."""
+
+    def __init__(self, paths: list[str]) -> None:
+        self.paths = paths
+
+    def fit(self, scene: Scene, snapshots: Snapshots | None = None) -> Vandal:
+        super().fit(scene, snapshots)
+        for path in self.paths:
+            try:
+                with open(path, "a") as file:
+                    file.write("# spoilt")
+            except PermissionError:
+                continue
+            warnings.warn(f"wrote {path}", stacklevel=1)
+        FullFEM().fit(scene).predict(np.zeros((scene.mesh.n_nodes, 3)))
+        return self
 
 
 class Poison(Zero):

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from mor_bench.analysis.bootstrap import LEVEL
-from mor_bench.analysis.break_even import break_even
+from mor_bench.analysis.break_even import at_error_of_the_verdict, break_even
 from mor_bench.analysis.caveats import hidden, regimes, tuning
 from mor_bench.analysis.draws import draws_of, headlines
 from mor_bench.analysis.frontier import compare
 from mor_bench.analysis.pairs import add_intervals
 from mor_bench.analysis.performance_profile import profile
-from mor_bench.analysis.selection import decide
+from mor_bench.analysis.selection import decide, error_bounds
 from mor_bench.analysis.verdict import Requirements, Verdict, needs_of
 from mor_bench.results.comparison import Comparison
 
@@ -72,7 +72,9 @@ def analyse(
         requirements = needs_of(comparison, dataset)
         analysis["verdicts"].append(decide(comparison, dataset, requirements, draws).summary())
         analysis["pairwise"] += add_intervals(targets, draws, requirements.error)
-        analysis["break_even"] += break_even(comparison.rows, targets["time_at_error"])
+        bounds = error_bounds([row for row in comparison.rows if row.dataset == dataset], draws)
+        reached = at_error_of_the_verdict(comparison.rows, targets["time_at_error"], bounds)
+        analysis["break_even"] += break_even(comparison.rows, reached)
         analysis["hidden"] += hidden(comparison.rows, dataset, draws.intervals)
         for name, facts in (("clusters", draws.clusters), ("timing", draws.timing)):
             analysis[name] += [{"dataset": dataset, **facts}] if facts else []

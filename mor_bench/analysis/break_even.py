@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import ceil
+from collections.abc import Mapping, Sequence
+from math import ceil, inf
 from typing import Any
 
-from mor_bench.analysis.frontier import median_error, median_latency_ms
+from mor_bench.analysis.frontier import is_point, median_error, median_latency_ms
 from mor_bench.results.row import Row
+
+Record = dict[str, Any]
 
 FULL_ORDER = "fem"
 """Method against which speed-ups and break-even counts are computed."""
 
 
-def break_even(rows: Sequence[Row], at_error: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def break_even(rows: Sequence[Row], at_error: Sequence[Record]) -> list[Record]:
     """Count the queries after which the offline cost of a method pays off, at each error.
 
     The count is the offline cost (data and fit) divided by what a query saves, both in
     core-seconds. A query uses its latency times its threads. The count compares two configurations:
-    the method's fastest at that error, and the fastest full-order one that is at least as accurate.
+    the selected one, and the fastest full-order one that is at least as accurate.
 
     Parameters
     ----------
     rows : sequence of Row
     at_error : sequence of dict
-        Records of time at error.
+        Records of time at error; `best` is the selected configuration of the method.
 
     Returns
     -------
@@ -37,7 +39,34 @@ def break_even(rows: Sequence[Row], at_error: Sequence[dict[str, Any]]) -> list[
     return [_break_even(rows, record) for record in at_error if record["method"] != FULL_ORDER]
 
 
-def _break_even(rows: Sequence[Row], record: dict[str, Any]) -> dict[str, Any]:
+def sufficient(rows: Sequence[Row], bounds: Mapping[str, float], limit: float) -> Row | None:
+    """Return the fastest row whose error meets a limit by the rule of the verdict.
+
+    `bounds` holds the rows' errors as the verdict compares them, by label.
+    """
+    within = [row for row in rows if bounds.get(row.label, inf) <= limit]
+    return min(within, key=median_latency_ms, default=None)
+
+
+def at_error_of_the_verdict(
+    rows: Sequence[Row], records: Sequence[Record], bounds: Mapping[str, float]
+) -> list[Record]:
+    """Replace the selected configuration of records of time at error by the verdict's choice."""
+    out = []
+    for record in records:
+        key = record["dataset"], record["method"]
+        mine = [row for row in rows if (row.dataset, row.method) == key and is_point(row)]
+        row = sufficient(mine, bounds, record["target_rel_l2_median"])
+        out.append({**record, "best": row and best_of(row)})
+    return out
+
+
+def best_of(row: Row) -> Record:
+    """Return the figures of a selected row that `break_even` needs."""
+    return {"label": row.label, "latency_ms": median_latency_ms(row), "error": median_error(row)}
+
+
+def _break_even(rows: Sequence[Row], record: Record) -> Record:
     mine = [row for row in rows if row.dataset == record["dataset"]]
     ran, best = [row for row in mine if row.ok], record["best"]
     out = {key: record[key] for key in ("dataset", "method", "target_rel_l2_median")}

@@ -12,7 +12,11 @@ from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
 
 QUERIES_ON_CPU = "trained on a graphics processor, but queried on the CPU"
-"""Unmet condition of every row in a GPU regime: queries are timed on the CPU only."""
+"""Unmet condition of every row in a GPU regime.
+
+Such a regime needs queries on the GPU, timed after the device is synchronised. Queries are timed on
+the CPU only.
+"""
 
 HIDDEN_WORSE = 1.2
 """Largest ratio of hidden to shipped test error that is never called worse."""

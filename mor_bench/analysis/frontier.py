@@ -1,7 +1,8 @@
 """Time at error and error at time, from the swept configurations of each method.
 
-The frontier is that of the whole sweep on the test set. Between two adjacent non-dominated
-configurations it is a straight line in log-log. Nothing is extrapolated beyond them. Each
+The validation errors select the configurations of the frontier; its errors are those of the test
+set. Old results without a validation part select by test errors. Between two adjacent
+configurations the frontier is a straight line in log-log. Nothing is extrapolated beyond them. Each
 interpolated figure comes with the real configuration that the validation errors select.
 """
 
@@ -48,10 +49,11 @@ class Point:
 
 
 def non_dominated(points: Sequence[Point]) -> list[Point]:
-    """Return the Pareto front of latency and error, fastest first."""
+    """Return the Pareto front of latency and the error that selects, fastest first."""
     front: list[Point] = []
-    for point in sorted(points, key=lambda p: (p.latency_ms, p.error)):
-        if point.error < USELESS and (not front or point.error < front[-1].error):
+    useful = [p for p in points if max(p.error, p.selecting) < USELESS]
+    for point in sorted(useful, key=lambda p: (p.latency_ms, p.selecting)):
+        if not front or point.selecting < front[-1].selecting:
             front.append(point)
     return front
 
@@ -68,7 +70,7 @@ def time_at_error(points: Sequence[Point], target: float) -> dict[str, Any]:
     """Return the interpolated latency at an error, and the configuration to select for it.
 
     Selected is the fastest one whose validation error meets the target. The interpolated latency is
-    that of the whole sweep on the test set. None: not reached.
+    that at which the test error of the frontier first meets it. None: not reached.
     """
     able = [p for p in points if p.selecting <= target and p.selecting < USELESS]
     best = _selected(min(able, key=lambda p: (p.latency_ms, p.selecting), default=None))
@@ -101,8 +103,8 @@ def _selected(point: Point | None) -> dict[str, Any] | None:
 def error_at_time(points: Sequence[Point], target_ms: float) -> dict[str, Any]:
     """Return the interpolated error at a latency, and the configuration to select within it.
 
-    Selected is the one with the least validation error. The interpolated error is that of the whole
-    sweep on the test set. None: not reached.
+    Selected is the one with the least validation error. The interpolated error is the test error of
+    the frontier. None: not reached.
     """
     able = [p for p in points if p.latency_ms <= target_ms and p.selecting < USELESS]
     best = _selected(min(able, key=lambda p: (p.selecting, p.latency_ms), default=None))
@@ -125,6 +127,7 @@ def frontier_draws(
     log_errors: NDArray[np.float64],
     errors: Sequence[float],
     times_ms: Sequence[float],
+    log_selecting: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Compute `time_at_error` and `error_at_time` for many resamples at once.
 
@@ -134,6 +137,8 @@ def frontier_draws(
         Natural logarithms of latencies in ms and of relative L2 errors; no error is below `EXACT`.
     errors, times_ms : sequence of float
         Targets.
+    log_selecting : (n_configurations, n) float64, optional
+        Natural logarithms of the errors that select the frontier; `log_errors` without them.
 
     Returns
     -------
@@ -142,21 +147,23 @@ def frontier_draws(
     (n_times, n) float64
         Logarithms of the errors at the latencies; infinite where not reached.
     """
-    log_errors = np.where(log_errors < log(USELESS), log_errors, inf)
-    order = np.lexsort((log_errors, log_latencies), axis=0)
-    latency, error = (
-        np.take_along_axis(log_latencies, order, 0),
-        np.take_along_axis(log_errors, order, 0),
+    log_selecting = log_errors if log_selecting is None else log_selecting
+    useful = np.maximum(log_errors, log_selecting) < log(USELESS)
+    log_selecting = np.where(useful, log_selecting, inf)
+    order = np.lexsort((log_selecting, log_latencies), axis=0)
+    latency, error, selecting = (
+        np.take_along_axis(values, order, 0)
+        for values in (log_latencies, log_errors, log_selecting)
     )
     n_configurations, n = latency.shape
     numbers, columns = np.arange(n_configurations)[:, None], np.arange(n)
-    least = np.minimum.accumulate(error, axis=0)
-    on_front = np.vstack([np.isfinite(error[:1]), (error[1:] < least[:-1])])
+    least = np.minimum.accumulate(selecting, axis=0)
+    on_front = np.vstack([np.isfinite(selecting[:1]), (selecting[1:] < least[:-1])])
     # The last point of the front up to each configuration.
     last = np.maximum.accumulate(np.where(on_front, numbers, -1), axis=0)
     at_error, at_time = np.full((len(errors), n), np.inf), np.full((len(times_ms), n), np.inf)
     for out, target in zip(at_error, np.log(np.maximum(errors, EXACT)), strict=True):
-        meets = error <= target
+        meets = on_front & (error <= target)
         real = meets.argmax(axis=0)
         before = np.where(real > 0, last[real - 1, columns], -1)
         here = latency[real, columns]

@@ -18,6 +18,7 @@ from mor_bench.analysis.frontier import (
     frontier_draws,
     median_error,
     median_latency_ms,
+    selecting_error,
 )
 from mor_bench.analysis.latency_intervals import verdict_of
 from mor_bench.results.row import Row
@@ -77,9 +78,18 @@ def _method_draws(
     if not mine:
         n = draws.log_latencies.shape[1]
         return np.full((len(targets), n), inf), np.full((len(TARGET_TIMES_MS), n), inf)
-    return frontier_draws(
-        draws.log_latencies[mine], draws.log_errors[mine], targets, TARGET_TIMES_MS
-    )
+    errors = draws.log_errors[mine]
+    selecting = _log_selecting([draws.rows[i] for i in mine], errors)
+    return frontier_draws(draws.log_latencies[mine], errors, targets, TARGET_TIMES_MS, selecting)
+
+
+def _log_selecting(rows: Sequence[Row], log_errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the errors that select the frontier: measured on validation, or else resampled."""
+    out = log_errors.copy()
+    for i, row in enumerate(rows):
+        if row.validation:
+            out[i] = np.log(max(selecting_error(row), EXACT))
+    return out
 
 
 def _add_interval(record: Record, key: str, draws: NDArray[np.float64]) -> None:
@@ -102,7 +112,7 @@ def _measured_times(
         mine = [row for row in rows if row.method == method]
         latencies = np.log([[median_latency_ms(row)] for row in mine])
         errors = np.log(np.maximum([[median_error(row)] for row in mine], EXACT))
-        at_error, _ = frontier_draws(latencies, errors, targets, ())
+        at_error, _ = frontier_draws(latencies, errors, targets, (), _log_selecting(mine, errors))
         for target, value in zip(targets, at_error[:, 0], strict=True):
             out[method, target] = float(value)
     return out

@@ -91,6 +91,16 @@ def _figures(row: Row, intervals: Mapping[str, Interval]) -> dict[str, float]:
     }
 
 
+def error_bounds(rows: Sequence[Row], draws: Draws) -> dict[str, float]:
+    """Return, by label, the error that the verdict compares with a limit; infinite if unusable."""
+    return {
+        row.label: _figures(row, draws.intervals.get(row.label, {}))["error"]
+        if _answers_all(row)
+        else inf
+        for row in rows
+    }
+
+
 def _answers_all(row: Row) -> bool:
     others = (row.hidden, row.validation)
     return row.ok and row.n_failed == 0 and not any(o and o.rel_l2_max == inf for o in others)

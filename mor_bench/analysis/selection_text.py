@@ -181,8 +181,9 @@ def _stability(verdict: Verdict) -> list[str]:
     if not unstable:
         return ["All timings were stable."]
     winners = ", the winner among them" if verdict.choice in unstable else ""
+    were = "was" if len(unstable) == 1 else "were"
     return [
-        f"{len(unstable)} of {len(timed)} timings were not stable{winners}. "
+        f"{len(unstable)} of {len(timed)} timings {were} not stable{winners}. "
         f"Time again: {retime_command(verdict)}"
     ]
 

@@ -8,7 +8,7 @@ from typing import get_args
 
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
-from mor_bench.specs.method_spec import Told
+from mor_bench.specs.method_spec import MethodSpec, Told
 
 CLASSES: tuple[Told, ...] = get_args(Told)
 """All classes, the one with the least information first."""
@@ -32,9 +32,19 @@ def told_text(told: Told | None, observed: bool) -> str:
 
 def class_text(row: Row, observed: bool) -> str:
     """Describe a row's information, such as "equations, snapshots, reference"."""
-    learned = {True: "snapshots", False: "no snapshots", None: ""}[row.snapshots]
-    parts = (told_text(row.told, observed), learned, "reference" if row.reference else "")
-    return ", ".join(filter(None, parts))
+    return class_words(told_text(row.told, observed), row.snapshots, row.reference)
+
+
+def class_words(told: str, snapshots: bool | None, reference: bool) -> str:
+    """Join the words of a class of information."""
+    learned = {True: "snapshots", False: "no snapshots", None: ""}[snapshots]
+    return ", ".join(filter(None, (told, learned, "reference" if reference else "")))
+
+
+def class_of_method(spec: MethodSpec, profile: str) -> str:
+    """Describe the information of a method of forces with the parameters of its file."""
+    told = spec.told_with(spec.parameters_of(profile))
+    return class_words(told_text(told, observed=False), spec.snapshots, spec.reference)
 
 
 def is_observed(comparison: Comparison, dataset: str) -> bool:

@@ -8,7 +8,12 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from mor_bench.cli.clear_errors import clear_errors, open_streams
+from mor_bench.cli.clear_errors import (
+    StoppedBySignal,
+    clear_errors,
+    exit_by_signal,
+    open_streams,
+)
 from mor_bench.cli.windows_job import end_children_with_this_process
 
 COMMANDS = {
@@ -105,8 +110,11 @@ class LazyCommands(TyperGroup):
     def main(self, *args: Any, **extra: Any) -> Any:
         open_streams()
         end_children_with_this_process()
-        with clear_errors():
-            return super().main(*args, **extra)
+        try:
+            with clear_errors():
+                return super().main(*args, **extra)
+        except StoppedBySignal as stop:  # it came while the context ended
+            exit_by_signal(stop)
 
     def invoke(self, ctx: Any) -> Any:
         with clear_errors():  # before Typer catches interrupts

@@ -7,12 +7,16 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from threading import current_thread, main_thread
+from threading import Timer, current_thread, main_thread
 from types import FrameType
+from typing import TYPE_CHECKING
 
 import typer
 
 from mor_bench.errors import MorBenchError, printable
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
 
 KEPT = (
     "Finished samples and rows are kept. "
@@ -23,6 +27,8 @@ KEPT = (
 ENDING = ("SIGTERM", "SIGHUP")
 """Signals that stop a command as an interrupt does."""
 
+LATER_S = 0.05
+"""Time after which a signal is sent again whose exception was dropped, s."""
 
 NO_THREAD = "can't start new thread"
 """Message of the `RuntimeError` by which Python reports that there is no memory for a thread."""
@@ -64,20 +70,37 @@ def clear_errors() -> Iterator[None]:
             raise
         _exit(f"memory is short{f': {error}' if str(error) else ''}. {KEPT}", "red", 2)
     except StoppedBySignal as stop:
-        by = f" by {signal.Signals(stop.number).name}"
-        _exit(f"stopped{by}. {KEPT}", "yellow", 128 + stop.number)
+        exit_by_signal(stop)
     except KeyboardInterrupt:
         _exit(f"stopped. {KEPT}", "yellow", 130)
 
 
+def exit_by_signal(stop: StoppedBySignal) -> None:
+    """Say which signal ended the command, and exit with 128 + its number."""
+    by = f" by {signal.Signals(stop.number).name}"
+    _exit(f"stopped{by}. {KEPT}", "yellow", 128 + stop.number)
+
+
 @contextmanager
 def _signals_as_interrupts() -> Iterator[None]:
-    """Raise `StoppedBySignal` at the first signal; ignored signals, as under nohup, stay so."""
+    """Raise `StoppedBySignal` at the first signal; ignored signals, as under nohup, stay so.
+
+    Python drops an exception that arises in a finaliser, and says so. A signal may come just then,
+    since each import runs a finaliser: it is sent again.
+    """
 
     def stop(number: int, _: FrameType | None) -> None:
         for other in caught:
             signal.signal(other, signal.SIG_IGN)  # the clean-up takes a moment
         raise StoppedBySignal(number)
+
+    def send_again(dropped: UnraisableHookArgs, /) -> None:
+        if isinstance(dropped.exc_value, StoppedBySignal):
+            number = dropped.exc_value.number
+            signal.signal(number, stop)
+            Timer(LATER_S, os.kill, (os.getpid(), number)).start()
+        else:
+            known(dropped)
 
     present = [getattr(signal, name) for name in ENDING if hasattr(signal, name)]
     caught = [number for number in present if signal.getsignal(number) == signal.SIG_DFL]
@@ -85,11 +108,15 @@ def _signals_as_interrupts() -> Iterator[None]:
         caught = []
     for number in caught:
         signal.signal(number, stop)
+    known = sys.unraisablehook
+    if caught:
+        sys.unraisablehook = send_again
     try:
         yield
     finally:
         for number in caught:
             signal.signal(number, signal.SIG_DFL)
+        sys.unraisablehook = known
 
 
 def open_streams() -> None:

@@ -27,7 +27,7 @@ from mor_bench.runs.listener import Listener
 PRINT_EVERY_S = 10.0
 """Interval between printed lines of progress if there is no terminal for a bar, s."""
 
-PREPARING = "Preparing; large meshes and datasets take a minute."
+PREPARING = "Preparing; large meshes, large datasets and a first compilation take a minute."
 
 
 @contextmanager

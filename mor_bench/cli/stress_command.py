@@ -21,6 +21,7 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.hard_cases.suite import stress as run_cases
 from mor_bench.options import FolderOptions, Profile
 from mor_bench.report.hard_case_table import print_stress
+from mor_bench.snapshots.store import check_replaceable
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -72,6 +73,8 @@ def stress(
     """
     if out is not None and not out.resolve().parent.is_dir():
         raise InvalidInputError(f"`--out`: there is no folder {out.resolve().parent}.")
+    if out is not None:
+        check_replaceable(out)
     console = make_console(stderr=as_json)
     with Status("", console=make_console(True, output.quiet)) as status:
         found = run_cases(

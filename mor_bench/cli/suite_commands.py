@@ -56,16 +56,22 @@ def list_suite_command(
 
 
 def _lines(kind: str, items: list[Item], width: int) -> Iterator[str]:
-    """Yield the items of a kind by family; long titles continue in their column."""
+    """Yield the items of a kind by family; long titles continue in their column.
+
+    Where there is no room for this column, titles stand below.
+    """
     for family, members in by_family(items).items():
         yield f"{kind.capitalize()}: {family}"
         name, needs = (max(len(getattr(m, part)) for m in members) for part in ("name", "needs"))
-        room = max(width - name - needs - 6, LEAST_TITLE)
+        column = name + needs + 6
+        below = width - column < LEAST_TITLE
+        room = max(width - 4 if below else width - column, LEAST_TITLE)
         for item in members:
-            first, *others = wrap(item.title, room, break_on_hyphens=False) or [""]
+            titles = wrap(item.title, room, break_on_hyphens=False) or [""]
+            first = "" if below else titles.pop(0)
             yield f"  {item.name:<{name}}  {item.needs:<{needs}}  {first}".rstrip()
-            for line in others:
-                yield " " * (name + needs + 6) + line
+            for line in titles:
+                yield " " * (4 if below else column) + line
         yield ""
 
 

@@ -216,6 +216,9 @@ def material_table(law: str, young: float, poisson: float) -> dict[str, Any]:
     if law == "yeoh":
         coefficients = {"c10_pa": 0.5 * shear, "c20_pa": -0.1 * shear, "c30_pa": 0.05 * shear}
         return {"law": law, **coefficients, "bulk_pa": bulk}
+    if law == "holzapfel-gasser-ogden":
+        fibres = {"k1_pa": shear, "k2": 1.0, "dispersion": 0.1, "fibres": [[1, 1, 0], [1, -1, 0]]}
+        return {"law": law, "c10_pa": 0.5 * shear, "bulk_pa": bulk, **fibres}
     if law == "ogden":
         return {
             "law": law,

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from pydantic import TypeAdapter
 
+from mor_bench.analysis.told import class_of_method
 from mor_bench.checked_files import read_json
 from mor_bench.errors import (
     InvalidInputError,
@@ -46,11 +47,14 @@ class StressResults:
     rows : list of CaseResult
     profile : str
     machine : dict
+    told : dict
+        The information that each method is given, in words; empty in files of earlier versions.
     """
 
     rows: list[CaseResult]
     profile: str
     machine: dict[str, Any]
+    told: dict[str, str] = field(default_factory=dict)
 
     def count(self, verdict: Verdict) -> int:
         """Count the rows with a verdict."""
@@ -64,6 +68,7 @@ class StressResults:
             "version": __version__,
             "profile": self.profile,
             "machine": self.machine,
+            "told": self.told,
             "rows": [asdict(row) for row in self.rows],
         }
 
@@ -81,7 +86,8 @@ class StressResults:
         content = read_json(path)
         try:
             rows = _ROWS.validate_python(content["rows"])
-            return cls(rows, str(content["profile"]), dict(content["machine"]))
+            told = _TOLD.validate_python(content.get("told", {}))
+            return cls(rows, str(content["profile"]), dict(content["machine"]), told)
         except (KeyError, TypeError, ValueError):
             raise StoreError(f"{path}: not written by `mor-bench stress --out`.") from None
 
@@ -93,6 +99,7 @@ class StressResults:
 
 
 _ROWS = TypeAdapter(list[CaseResult])
+_TOLD = TypeAdapter(dict[str, str])
 
 
 def stress(
@@ -161,7 +168,8 @@ def stress(
                 starting(label, trial.name, len(rows) + 1, total)
                 rows.append(trial.result(number))
             trial.end()
-    return StressResults(rows, profile, describe_machine())
+    told = {spec.name: class_of_method(spec, profile) for spec in specs}
+    return StressResults(rows, profile, describe_machine(), told)
 
 
 def _check_arguments(

@@ -11,6 +11,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from math import inf, log2
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.checked_files import read_json
+from mor_bench.checkout import source_commit
 from mor_bench.errors import InvalidInputError, SolverError, SpecError, StoreError
+from mor_bench.machine import describe_machine
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.interpolation import interpolation_matrix
@@ -254,6 +257,7 @@ def refine(
         `error_m` and `relative_l2`: means over the loads of the mean absolute error per degree of
         freedom, m, and of the relative l2 error, both against the limit; `relative_l2_median`;
         `meshes` and `left_out`: cells and degrees of freedom; `digest`, `version`, `command`;
+        `commit` of the code, None outside a checkout; `date`; `machine`;
         `loads`: each with `sample`, `patches`, `vectors_n`, `error_m`, `relative_l2`, `order` and
         `limit`, which is ``extrapolated``, ``finest``, or ``none`` with a `reason` if a mesh has no
         equilibrium. The means leave out such a load.
@@ -315,6 +319,9 @@ def _record(
         "digest": spec.digest(),
         "version": __version__,
         "command": f"mor-bench refine {spec.name} {options}",
+        "commit": source_commit(),
+        "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+        "machine": describe_machine(),
         "error_m": float(np.mean([record["error_m"] for record in solved])),
         "relative_l2": float(np.mean([record["relative_l2"] for record in solved])),
         "relative_l2_median": float(np.median([record["relative_l2"] for record in solved])),

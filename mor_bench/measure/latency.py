@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from mor_bench.array_files import read_npy
 from mor_bench.errors import MorBenchError, StoreError
 from mor_bench.machine import free_memory_bytes, pinned_threads
+from mor_bench.measure.course import Course
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.measure.method_session import MethodSession
 from mor_bench.measure.timing import BATCHES, Timing
@@ -39,7 +40,7 @@ BATCH_S, MOST_BATCH_S = 0.25, 5.0
 """Time for repeating batches of one size, and time limit of one batch, s."""
 
 SERVER_S, OPEN_S, TURN_S = 4.0, 0.1, 0.05
-"""Typical times to start a replicate, to open a method in it and of a turn, s: for progress."""
+"""Typical times to start a replicate, to open a method in it and of a turn, s: for estimates."""
 
 ANSWER_LIMIT_S = 300.0
 """Time limit of a request that should take seconds, s; a hanging method is then ended."""
@@ -142,7 +143,7 @@ def measure_latencies(
     threads : int
         Threads of a single query.
     progress : callable
-        Called with (typical time of what is done, that of all), ms.
+        Called with the time that has passed and the time expected in all, ms.
     seed : int
         Seed of the order in which configurations take turns, and of their queries.
 
@@ -154,20 +155,9 @@ def measure_latencies(
     timings = {label: Timing() for label in methods}
     order = np.random.default_rng(seed)
     groups = groups_that_fit(methods)
-    batches_s = len(BATCHES) * BATCH_S
-    turns_of_one = protocol.rounds + protocol.all_cores
-    total_s = protocol.processes * (
-        len(groups) * SERVER_S + len(methods) * (OPEN_S + turns_of_one * TURN_S)
-    ) + len(methods) * (batches_s if protocol.all_cores else 0.0)
-    done_s = 0.0
-
-    def note(seconds: float) -> None:
-        nonlocal done_s
-        done_s += seconds
-        progress(round(1e3 * done_s), round(1e3 * total_s))
-
+    course = Course(_parts(groups, protocol), progress)
     for process in range(protocol.processes if methods else 0):
-        for group in groups:
+        for place, group in enumerate(groups):
             with ExitStack() as stack:
                 server = ForkServer(MethodSession) if CAN_FORK else None
                 if server:
@@ -179,15 +169,32 @@ def measure_latencies(
                     for label in group
                 }
                 opened = _open_all(stack, turns, server, seed + process)
-                note(SERVER_S + len(group) * OPEN_S)
+                course.done(f"open {place}")
+                for label in group:
+                    if label not in opened:
+                        course.skip(label)
                 for number in range(protocol.rounds):
                     for label in order.permutation(list(opened)):
                         opened[label].attempt(opened[label].single_queries, number)
-                        note(TURN_S)
-                for turn in opened.values() if protocol.all_cores else ():
+                        course.done(f"turn {label}")
+                for label, turn in opened.items() if protocol.all_cores else ():
                     turn.attempt(turn.on_all_cores, process == 0)
-                    note(TURN_S + (batches_s if process == 0 else 0.0))
+                    course.done(f"{'cores' if process else 'batches'} {label}")
     return timings
+
+
+def _parts(groups: list[list[str]], protocol: Protocol) -> dict[str, tuple[int, float]]:
+    """Return the number and typical seconds of the parts of a measurement, see `Course`."""
+    n = protocol.processes
+    parts = {
+        f"open {place}": (n, SERVER_S + len(group) * OPEN_S) for place, group in enumerate(groups)
+    }
+    for label in (label for group in groups for label in group):
+        parts[f"turn {label}"] = n * protocol.rounds, TURN_S
+        if protocol.all_cores:
+            parts[f"batches {label}"] = 1, TURN_S + len(BATCHES) * BATCH_S
+            parts[f"cores {label}"] = n - 1, TURN_S
+    return parts
 
 
 def groups_that_fit(methods: Mapping[str, TimedMethod]) -> list[list[str]]:

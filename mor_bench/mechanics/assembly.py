@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.counting import count, is_counting
@@ -23,7 +24,7 @@ from mor_bench.mechanics.kernels import (
     relax,
 )
 from mor_bench.mechanics.laws import general_force, general_multiply_adds
-from mor_bench.mechanics.pattern import build_pattern
+from mor_bench.mechanics.pattern import Pattern, build_pattern
 from mor_bench.scene.materials import Material, SaintVenantKirchhoff
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import NO_EQUATIONS
@@ -64,12 +65,19 @@ class Discretisation:
     selective : bool
         Whether the volumetric energy is integrated with mean gradients, which cures volumetric
         locking of H8.
+    springs : (n_dofs, n_dofs) sparse float64, optional
+        Stiffness of springs on the surface, N/m.
+    rest : (n_nodes, 3) float64, optional
+        Displacements of a rest state under a constant pre-load, m. Displacements and forces are
+        then measured from it.
     """
 
     points: Array
     cells: NDArray[np.int64]
     material: Material
     selective: bool = False
+    springs: sp.csr_array | None = None
+    rest: Array | None = None
 
 
 def discretisation_of(
@@ -85,7 +93,18 @@ def discretisation_of(
     if scene.material is None:
         raise UnsupportedSceneError(f"{scene.name}: {NO_EQUATIONS}.")
     mesh = scene.mesh
-    return Discretisation(mesh.points, mesh.cells[chosen], scene.material, scene.selective)
+    return Discretisation(
+        mesh.points, mesh.cells[chosen], scene.material, scene.selective, scene.spring_matrix
+    )
+
+
+def body_force(body: Discretisation, density: Array) -> Array:
+    """Return the nodal forces (n_nodes, 3), N, of a uniform force density (3,), N/m³."""
+    element = element_of(body.cells)
+    det_j = shape_gradients(body.points, body.cells, element.derivatives)[1]
+    shares = (det_j * element.weights) @ element.values
+    volumes = np.bincount(body.cells.ravel(), shares.ravel(), len(body.points))
+    return np.asarray(volumes[:, None] * density)
 
 
 @dataclass(frozen=True)
@@ -128,6 +147,24 @@ def quadrature_of(body: Discretisation) -> Quadrature:
         np.hstack([weights, volume[:, None]]),
         np.array(parameters),
     )
+
+
+def _placed(
+    springs: sp.csr_array, dofs: NDArray[np.int64], pattern: Pattern
+) -> tuple[sp.csr_array, NDArray[np.int64], Array]:
+    """Return the springs over the rows of a pattern, and their upper entries' places and values.
+
+    The nodes of a spring share a cell, so that the pattern has all entries if it has all cells.
+    """
+    found = springs.tocoo()
+    rows, columns = dofs[found.row], dofs[found.col]
+    free = (rows < pattern.n) & (columns < pattern.n)
+    rows, columns, entries = rows[free], columns[free], found.data[free]
+    matrix = sp.csr_array((entries, (rows, columns)), shape=(pattern.n, pattern.n))
+    upper = rows <= columns
+    keys = pattern.rows * pattern.n + pattern.indices
+    slots = np.searchsorted(keys, rows[upper] * pattern.n + columns[upper])
+    return matrix, slots, entries[upper]
 
 
 class Assembler:
@@ -184,6 +221,27 @@ class Assembler:
             self._parameters = np.repeat(quadrature.parameters, LANES, axis=1)
             per_point = general_multiply_adds(material.law, quadrature.parameters.shape[1], n_nodes)
         self._multiply_adds = n_cells * n_points * per_point[0], n_cells * n_points * per_point[1]
+        self._springs: tuple[sp.csr_array, NDArray[np.int64], Array] | None = None
+        if body.springs is not None:
+            self._springs = _placed(body.springs, dof_of_node.ravel(), self.pattern)
+        self._rest: tuple[Array, Array] | None = None
+        if body.rest is not None:
+            rest = np.zeros(n_dofs + 1)
+            rest[dof_of_node] = body.rest
+            rest[n_dofs] = 0.0
+            self._rest = rest, self.force(rest[:-1]).force
+
+    def _total(self, u: Array) -> Array:
+        """Return total displacements, with a zero for the supports."""
+        padded = np.append(u, 0.0)
+        return padded if self._rest is None else padded + self._rest[0]
+
+    def _from_rest(self, u: Array, force: Array, energy: float, min_det_f: float) -> State:
+        """Return the state without the force of the pre-load, whose work is stored energy."""
+        if self._rest is None:
+            return State(force, energy, min_det_f)
+        held = self._rest[1]
+        return State(force - held, energy - float(held @ u), min_det_f)
 
     def _sum(
         self, u: Array, dofs: NDArray[np.int32], force: Array, values: Array
@@ -205,24 +263,45 @@ class Assembler:
             )
         return out
 
+    def _sum_all(self, total: Array, force: Array, values: Array) -> tuple[float, float]:
+        """Add forces and tangents of cells and springs; return energy and min det F."""
+        energy, min_det_f = self._sum(total, self._dofs, force, values)
+        if self._springs is None:
+            return energy, min_det_f
+        matrix, slots, entries = self._springs
+        own = matrix @ total[:-1]
+        count(multiply_adds=matrix.nnz)
+        force[:-1] += own
+        if len(values):
+            values[slots] += entries
+        return energy + 0.5 * float(own @ total[:-1]), min_det_f
+
     def force(self, u: Array) -> State:
         """Return the state at displacements ``u`` (n_dofs,), m."""
         force = np.zeros(self.n_dofs + 1)
-        return State(force[:-1], *self._sum(np.append(u, 0.0), self._dofs, force, np.zeros(0)))
+        if self._springs is None and self._rest is None:  # three calls fewer
+            return State(force[:-1], *self._sum(np.append(u, 0.0), self._dofs, force, np.zeros(0)))
+        found = self._sum_all(self._total(u), force, np.zeros(0))
+        return self._from_rest(u, force[:-1], *found)
 
     def force_and_tangent(self, u: Array) -> tuple[State, Array]:
         """Return the state and the values of the tangent stiffness, N/m, in ``pattern``."""
         force, values = np.zeros(self.n_dofs + 1), np.zeros(self._n_values)
-        state = State(force[:-1], *self._sum(np.append(u, 0.0), self._dofs, force, values))
-        return state, values[:-1]
+        found = self._sum_all(self._total(u), force, values)
+        return self._from_rest(u, force[:-1], *found), values[:-1]
 
     def cell_forces(self, u: Array) -> Array:
         """Return each cell's own internal force, (n_cells, 3 n_nodes), N, to train cubatures."""
+        own = self._cell_forces(self._total(u))
+        if self._rest is not None:
+            own = own - self._cell_forces(self._rest[0])
+        return np.moveaxis(own, 2, 1).reshape(-1, self._dofs.shape[1])[: self.n_cells]
+
+    def _cell_forces(self, total: Array) -> Array:
         local = np.arange(self._dofs.size, dtype=np.int32).reshape(self._dofs.shape)
         force = np.zeros(local.size + 1)
-        self._sum(np.append(np.append(u, 0.0)[self._dofs].ravel(), 0.0), local, force, np.zeros(0))
-        own = force[:-1].reshape(self._dofs.shape)
-        return np.moveaxis(own, 2, 1).reshape(-1, self._dofs.shape[1])[: self.n_cells]
+        self._sum(np.append(total[self._dofs].ravel(), 0.0), local, force, np.zeros(0))
+        return force[:-1].reshape(self._dofs.shape)
 
     def relax(
         self, u: Array, load: Array, mass: Array, control: Array, n_steps: int
@@ -231,9 +310,10 @@ class Assembler:
 
         Overwrites ``u``. Returns the number of steps, how the last one ended, and min det F there.
         """
-        padded, v, before = np.append(u, 0.0), np.zeros(self.n_dofs), np.zeros(self.n_dofs)
+        padded, v, before = self._total(u), np.zeros(self.n_dofs), np.zeros(self.n_dofs)
+        load = load if self._rest is None else load + self._rest[1]
         done, status, min_det = 0, RUNNING, np.inf
-        if self._has_own_kernel:
+        if self._has_own_kernel and self._springs is None:
             cells = self._dofs, self._gradients, self._w_lam, self._w_mu
             done, status, min_det = relax(padded, v, before, load, mass, control, n_steps, *cells)
             count(
@@ -243,9 +323,9 @@ class Assembler:
         else:
             force, none = np.zeros(self.n_dofs + 1), np.zeros(0)
             while done < n_steps and status == RUNNING:
-                min_det = self._sum(padded, self._dofs, force, none)[1]
+                min_det = self._sum_all(padded, force, none)[1]
                 status = advance(padded, v, force, before, load, mass, control)
                 done += 1
         count(multiply_adds=done * ADVANCE_MULTIPLY_ADDS * self.n_dofs)
-        u[:] = padded[:-1]
+        u[:] = (padded if self._rest is None else padded - self._rest[0])[:-1]
         return done, status, min_det

@@ -116,19 +116,21 @@ def banded_solve(band, right_hand_sides):
 class BandedFactor:
     """A banded Cholesky factor in LAPACK's upper storage."""
 
-    def __init__(self, band: NDArray[np.float64], order: NDArray[np.int64] | None) -> None:
-        self._band, self._order = band, order
+    def __init__(
+        self, band: NDArray[np.float64], order: NDArray[np.int64] | None, pattern: Pattern
+    ) -> None:
+        self._band, self._order, self._pattern = band, order, pattern
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
-        (width, n), m = self._band.shape, n_columns(rhs)
+        rhs, (width, n), m = self._pattern.pad(rhs), self._band.shape, n_columns(rhs)
         count(back_solves=m, multiply_adds=m * triangular_multiply_adds(n, width - 1))
         by_blocks = n_columns(rhs) >= MANY and len(self._band) >= WIDE
         solve = self._solve_many if by_blocks else self._solve_few
         if self._order is None:
-            return solve(rhs)
+            return self._pattern.cut(solve(rhs))
         solution = np.empty_like(rhs)
         solution[self._order] = solve(rhs[self._order])
-        return solution
+        return self._pattern.cut(solution)
 
     def _solve_few(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(dpbtrs(self._band, rhs)[0]).reshape(rhs.shape)
@@ -210,7 +212,7 @@ class BandedCholesky:
     """
 
     def __init__(self, pattern: Pattern) -> None:
-        graph = pattern.node_graph
+        graph = pattern.whole.node_graph
         order = reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
         place = np.empty(len(order), dtype=np.int64)
         place[order] = np.arange(len(order))
@@ -224,21 +226,21 @@ class BandedCholesky:
     @property
     def entries(self) -> int:
         """Number of stored entries of the band."""
-        return self._pattern.n * (self.bandwidth + 1)
+        return self._pattern.whole.n * (self.bandwidth + 1)
 
     def factor(self, values: NDArray[np.float64]) -> BandedFactor:
-        count(
-            factorisations=1,
-            multiply_adds=cholesky_multiply_adds(self._pattern.n, self.bandwidth),
-        )
-        rows: NDArray[np.integer] = self._pattern.rows
-        columns: NDArray[np.integer] = self._pattern.indices
+        whole = self._pattern.whole
+        count(factorisations=1, multiply_adds=cholesky_multiply_adds(whole.n, self.bandwidth))
+        rows: NDArray[np.integer] = whole.rows
+        columns: NDArray[np.integer] = whole.indices
         if self._place is not None:
             rows, columns = self._place[rows], self._place[columns]
         low, high = np.minimum(rows, columns), np.maximum(rows, columns)
         flat = np.zeros(self.entries)
-        flat[high * np.int64(self.bandwidth) + self.bandwidth + low] = values
-        band, info = dpbtrf(flat.reshape(self._pattern.n, self.bandwidth + 1).T, overwrite_ab=1)
+        flat[high * np.int64(self.bandwidth) + self.bandwidth + low] = self._pattern.complete(
+            values
+        )
+        band, info = dpbtrf(flat.reshape(whole.n, self.bandwidth + 1).T, overwrite_ab=1)
         if info != 0:
             raise NotPositiveDefiniteError
-        return BandedFactor(band, self._order)
+        return BandedFactor(band, self._order, self._pattern)

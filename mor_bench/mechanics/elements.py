@@ -27,12 +27,15 @@ class Element:
         Quadrature weights; their sum is the reference cell's volume.
     centre : (n_nodes, 3) float64
         Derivatives of the shape functions at the centroid.
+    values : (n_points, n_nodes) float64
+        Shape functions at the quadrature points.
     """
 
     name: str
     derivatives: Array
     weights: Array
     centre: Array
+    values: Array
 
     @property
     def n_nodes(self) -> int:
@@ -43,8 +46,9 @@ _LINEAR = np.array([[-1.0, -1.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 
 
 _GAUSS = (2.0 * HEX_CORNERS - 1.0) / np.sqrt(3.0)
 
-H8 = Element("H8", trilinear(_GAUSS)[1], np.ones(8), trilinear(np.zeros((1, 3)))[1][0])
-T4 = Element("T4", _LINEAR[None], np.array([1.0 / 6.0]), _LINEAR)
+_VALUES, _DERIVATIVES = trilinear(_GAUSS)
+H8 = Element("H8", _DERIVATIVES, np.ones(8), trilinear(np.zeros((1, 3)))[1][0], _VALUES)
+T4 = Element("T4", _LINEAR[None], np.array([1.0 / 6.0]), _LINEAR, np.full((1, 4), 0.25))
 
 
 def element_of(cells: NDArray[np.int64]) -> Element:

@@ -32,6 +32,7 @@ from numba import float64, njit, uint64
 from numba.extending import intrinsic
 
 SAINT_VENANT_KIRCHHOFF, NEO_HOOKEAN, MOONEY_RIVLIN, OGDEN, YEOH, COROTATIONAL = range(6)
+HOLZAPFEL_GASSER_OGDEN = 6
 
 LANES = 32
 """Elements or points per batch."""
@@ -294,6 +295,92 @@ def _yeoh(E, p, S, D):
             D[6 * L + l] += w
             D[7 * L + l] += w
             D[11 * L + l] += w
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _add_fibres(work, E, stiffness, N, S, D):
+    """Add a family of fibres, k1/(2 k2) (exp(k2 x²) - 1) with x = J^(-2/3) N:C - 1 >= 0.
+
+    ``work`` holds C⁻¹ (6), J^(-2/3), and places for d²W/dx² and a part of D (21).
+    """
+    L = LANES
+    I, T = work[: 8 * L], work[8 * L :]
+    for l in range(LANES):
+        inverse = I[l], I[L + l], I[2 * L + l], I[3 * L + l], I[4 * L + l], I[5 * L + l]
+        i0, i1, i2, i3, i4, i5 = inverse
+        n0, n1, n2 = N[l], N[L + l], N[2 * L + l]
+        n3, n4, n5 = N[3 * L + l], N[4 * L + l], N[5 * L + l]
+        root, k2 = I[6 * L + l], stiffness[L + l]
+        normal = n0 * E[l] + n1 * E[L + l] + n2 * E[2 * L + l]
+        shear = n3 * E[3 * L + l] + n4 * E[4 * L + l] + n5 * E[5 * L + l]
+        length = 1.0 + 2.0 * (normal + 2.0 * shear)
+        x = root * length - 1.0
+        growth, k1 = _exp(k2 * x * x), stiffness[l] if x >= 0.0 else 0.0
+        # S = a N + s C⁻¹, with a = 2 J^(-2/3) dW/dx.
+        a = 2.0 * root * k1 * x * growth
+        third = a * length / 3.0
+        S[l] += a * n0 - third * i0
+        S[L + l] += a * n1 - third * i1
+        S[2 * L + l] += a * n2 - third * i2
+        S[3 * L + l] += a * n3 - third * i3
+        S[4 * L + l] += a * n4 - third * i4
+        S[5 * L + l] += a * n5 - third * i5
+        S[6 * L + l] += 0.5 * k1 / k2 * (growth - 1.0)
+        if D is not None:
+            # dx/dC = J^(-2/3) (N - N:C/3 C⁻¹); 4 d²W/dx² dx/dC ⊗ dx/dC, with N ⊗ N last.
+            w = 4.0 * root * root * k1 * (1.0 + 2.0 * k2 * x * x) * growth
+            wide = w * length / 3.0
+            v, t = -4.0 / 3.0 * a - 2.0 * wide, third / 1.5 + wide * length / 3.0
+            y = (
+                v * n0 + t * i0,
+                v * n1 + t * i1,
+                v * n2 + t * i2,
+                v * n3 + t * i3,
+                v * n4 + t * i4,
+                v * n5 + t * i5,
+            )
+            _write(T, l, y, inverse, third)
+            I[7 * L + l] = w
+    if D is not None:
+        w, c = I[7 * L :], 0
+        for m in range(6):
+            for n in range(m, 6):
+                x, y, out, part = N[m * L :], N[n * L :], D[c * L :], T[c * L :]
+                for l in range(LANES):
+                    out[l] += part[l] + w[l] * x[l] * y[l]
+                c += 1
+
+
+@njit(error_model="numpy", fastmath={"contract", "nsz"})
+def _holzapfel_gasser_ogden(E, p, S, D):
+    """Neo-Hooke with families of fibres, W = c10 (J^(-2/3) I₁ - 3) + κ/2 (J - 1)² + `_add_fibres`.
+
+    p = (c10, κ, k1, k2, then N of each family); N = d I + (1 - 3d) a ⊗ a for fibres along a with
+    dispersion d. Gasser, Ogden & Holzapfel, Journal of the Royal Society Interface 3 (2006), 15-35.
+    """
+    L = LANES
+    work = np.empty(29 * L)
+    for l in range(LANES):
+        c10, bulk, J = p[l], p[L + l], E[6 * L + l]
+        inverse = _inverse(E, l)
+        i0, i1, i2, i3, i4, i5 = inverse
+        root = _exp(-2.0 / 3.0 * _log(J))
+        work[l], work[L + l], work[2 * L + l] = i0, i1, i2
+        work[3 * L + l], work[4 * L + l], work[5 * L + l] = i3, i4, i5
+        work[6 * L + l] = root
+        first, d_u = 3.0 + 2.0 * (E[l] + E[L + l] + E[2 * L + l]), bulk * (J - 1.0)
+        a = 2.0 * c10 * root
+        third = a * first / 3.0
+        s = J * d_u - third
+        S[l], S[L + l], S[2 * L + l] = a + s * i0, a + s * i1, a + s * i2
+        S[3 * L + l], S[4 * L + l], S[5 * L + l] = s * i3, s * i4, s * i5
+        S[6 * L + l] = c10 * (root * first - 3.0) + 0.5 * d_u * (J - 1.0)
+        if D is not None:
+            x, t = -4.0 / 3.0 * a, J * (d_u + J * bulk) + third / 1.5
+            y = x + t * i0, x + t * i1, x + t * i2, t * i3, t * i4, t * i5
+            _write(D, l, y, inverse, -s)
+    for k in range(4, len(p) // LANES, 6):
+        _add_fibres(work, E, p[2 * L : 4 * L], p[k * L : (k + 6) * L], S, D)
 
 
 @njit(error_model="numpy", fastmath={"contract", "nsz"})
@@ -850,6 +937,8 @@ def general_force(law: int, n_nodes: int):
                     _yeoh(E, parameters[q], S, D)
                 elif law == COROTATIONAL:
                     _corotational(E, parameters[q], S, D)
+                elif law == HOLZAPFEL_GASSER_OGDEN:
+                    _holzapfel_gasser_ogden(E, parameters[q], S, D)
                 else:
                     _ogden(E, parameters[q], S, D)
                 _weigh(F, S, P, totals)
@@ -912,6 +1001,8 @@ def point_stresses(law: int):
                 _yeoh(E, parameters[b], S, D)
             elif law == COROTATIONAL:
                 _corotational(E, parameters[b], S, D)
+            elif law == HOLZAPFEL_GASSER_OGDEN:
+                _holzapfel_gasser_ogden(E, parameters[b], S, D)
             else:
                 _ogden(E, parameters[b], S, D)
             _weigh(F, S, P[b], totals)
@@ -932,19 +1023,24 @@ _LAW_MULTIPLY_ADDS = {
     YEOH: (52, 102),
     COROTATIONAL: (80 + 4 * SWEEP_MULTIPLY_ADDS, 294),
     OGDEN: (64 + 4 * SWEEP_MULTIPLY_ADDS, 284),
+    HOLZAPFEL_GASSER_OGDEN: (46, 91),
 }
 """Multiply-adds per point for energy and stress, and for the tangent; 4 sweeps are usual."""
 
-_OGDEN_TERM_MULTIPLY_ADDS = 15, 128
+_OGDEN_TERM_MULTIPLY_ADDS, _FIBRE_MULTIPLY_ADDS = (15, 128), (33, 150)
+"""Those of a term of Ogden's law, and of a family of fibres."""
 
 _STRAIN_MULTIPLY_ADDS, _WEIGH_MULTIPLY_ADDS, _DERIVATIVE_MULTIPLY_ADDS = 33, 34, 333
 
 
 def point_multiply_adds(law: int, n_parameters: int) -> tuple[int, int]:
     """Return multiply-adds of `point_stresses` per point: without A, and the addition for A."""
-    terms = n_parameters // 2 if law == OGDEN else 0
+    terms, (term_stress, term_tangent) = 0, _OGDEN_TERM_MULTIPLY_ADDS
+    if law == OGDEN:
+        terms = n_parameters // 2
+    elif law == HOLZAPFEL_GASSER_OGDEN:
+        terms, (term_stress, term_tangent) = (n_parameters - 4) // 6, _FIBRE_MULTIPLY_ADDS
     by_stress, by_tangent = _LAW_MULTIPLY_ADDS[law]
-    term_stress, term_tangent = _OGDEN_TERM_MULTIPLY_ADDS
     stress = _STRAIN_MULTIPLY_ADDS + by_stress + terms * term_stress + _WEIGH_MULTIPLY_ADDS
     return stress, by_tangent + terms * term_tangent + _DERIVATIVE_MULTIPLY_ADDS
 

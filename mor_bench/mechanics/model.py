@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import cached_property
 from importlib.util import find_spec
 from typing import get_args
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.errors import (
     IllConditionedWarning,
+    LockingWarning,
     MissingDependencyError,
     SolverError,
     SpecError,
     UnconstrainedBodyError,
 )
-from mor_bench.mechanics.assembly import Assembler, State, discretisation_of
+from mor_bench.mechanics.assembly import (
+    Assembler,
+    Discretisation,
+    State,
+    body_force,
+    discretisation_of,
+)
 from mor_bench.mechanics.banded import BandedCholesky, BandedFactor
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.linear import (
@@ -67,6 +76,8 @@ PCG_FROM = 3000
 """Number of unknowns above which conjugate gradients beat a banded factor per Newton step."""
 JACOBI_ITERATIONS = 20_000
 CERTIFY_TOLERANCE = 1e-2
+REST_TOLERANCE = 1e-12
+"""Residual of the rest state under gravity, relative to the weight."""
 ILL_CONDITIONED = 1e10
 """Condition number above which solutions miss the default tolerance."""
 
@@ -103,15 +114,18 @@ def unknown_equations(scene: Scene, *, observed: bool = False) -> str | None:
 
 def free_rigid_modes(scene: Scene) -> list[str]:
     """Return the rigid motions that the supports leave free, named by their largest component."""
-    x = scene.mesh.points[scene.fixed_nodes] - scene.mesh.points.mean(axis=0)
-    x = x / np.abs(scene.mesh.points - scene.mesh.points.mean(axis=0)).max()
+    x = scene.mesh.points - scene.mesh.points.mean(axis=0)
+    x = x / np.abs(x).max()
     modes = np.zeros((len(x), 3, 6))
     modes[:, :, :3] = np.eye(3)
     for axis in range(3):
         modes[:, :, 3 + axis] = np.cross(np.eye(3)[axis], x)
-    if len(x) == 0:
+    held = modes.reshape(-1, 6)[scene.fixed_dofs]
+    if (springs := scene.spring_matrix) is not None:
+        held = np.concatenate([held, springs @ modes.reshape(-1, 6) / springs.max()])
+    if len(held) == 0:
         return list(RIGID_MODES)
-    _, s, vt = np.linalg.svd(modes.reshape(-1, 6), full_matrices=True)
+    _, s, vt = np.linalg.svd(held, full_matrices=True)
     free = vt[np.append(s, np.zeros(6 - len(s))) <= 1e-9 * s[0]]
     return [RIGID_MODES[int(np.abs(mode).argmax())] for mode in free]
 
@@ -122,13 +136,51 @@ def check_supports(scene: Scene) -> None:
     if free:
         raise UnconstrainedBodyError(
             f"the supports of {scene.name} leave rigid motions free: {', '.join(free)}; "
-            "fix at least three nodes not in line.",
+            "fix at least three nodes not in line, or as many components elsewhere.",
             free_motions=tuple(free),
         )
 
 
+def rest_displacement(scene: Scene) -> NDArray[np.float64] | None:
+    """Return the displacements (n_nodes, 3) of the rest state under gravity, m.
+
+    It is solved for once. Returns None for a scene without gravity.
+
+    Raises
+    ------
+    SolverError
+        If the body has no stable equilibrium under its own weight.
+    """
+    gravity = scene.generated.gravity
+    if gravity is None:
+        return None
+    if "rest" not in scene.memo:
+        density = gravity.density_kg_m3 * np.array(gravity.acceleration_m_s2)
+        weight = body_force(discretisation_of(scene), density).ravel()[scene.free_dofs]
+        spec, found = scene.generated.model_copy(update={"gravity": None}), np.zeros(0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LockingWarning)  # the model under gravity warns
+            light = FullOrderModel(replace(scene, spec=spec), "auto")
+        try:
+            found = light.solve(weight, options=NewtonOptions(REST_TOLERANCE)).displacement
+        except SolverError as error:
+            raise SolverError(f"{scene.name}: no rest state under gravity: {error}") from None
+        scene.memo["rest"] = np.zeros(scene.mesh.n_dofs)
+        scene.memo["rest"][scene.free_dofs] = found
+    return scene.memo["rest"].reshape(-1, 3)
+
+
+def body_of(scene: Scene, chosen: NDArray[np.int64] | slice = slice(None)) -> Discretisation:
+    """Return the discretisation of a scene's cells, measured from its rest state under gravity."""
+    body = discretisation_of(scene, chosen)
+    return replace(body, rest=rest_displacement(scene))
+
+
 class FullOrderModel:
     """Finite-element model of a scene under dead loads; its unknowns are the free dofs.
+
+    Under gravity, displacements and forces are measured from the rest state, so that no load
+    causes no displacement.
 
     Parameters
     ----------
@@ -147,8 +199,8 @@ class FullOrderModel:
     """
 
     def __init__(self, scene: Scene, solver: SolverName | None = None) -> None:
-        body = discretisation_of(scene)
         check_supports(scene)
+        body = body_of(scene)
         warn_of_locking(scene)
         self.solver = solver or scene.generated.solver
         if self.solver not in SOLVERS:
@@ -163,6 +215,11 @@ class FullOrderModel:
         number[scene.free_dofs] = np.arange(self.n_unknowns)
         dof_of_node = number.reshape(-1, 3)
         self.cell_dofs = dof_of_node[mesh.cells].reshape(mesh.n_cells, -1)
+        self.rest = None if body.rest is None else body.rest.ravel()[scene.free_dofs]
+        self.springs: sp.csr_array | None = None
+        if body.springs is not None:
+            self.springs = body.springs[scene.free_dofs][:, scene.free_dofs]
+        self._points = mesh.points if body.rest is None else mesh.points + body.rest
         self.assembler = Assembler(body, dof_of_node, self.n_unknowns)
         self.extent = self.assembler.extent_m
         self._direct = self._direct_solver()
@@ -178,7 +235,7 @@ class FullOrderModel:
         banded = BandedCholesky(pattern)
         if banded.entries <= MAX_BAND_ENTRIES:
             return banded
-        return Multigrid(pattern, self.scene.mesh.points[self.scene.free_dofs[::3] // 3])
+        return Multigrid(pattern, self.scene.mesh.points[self.moving_nodes])
 
     @cached_property
     def rest_tangent(self) -> NDArray[np.float64]:
@@ -240,16 +297,22 @@ class FullOrderModel:
         """An approximate inverse of all tangents, R K₀⁻¹ Rᵀ; needs a banded or multigrid factor."""
         factor = self.rest_factor
         assert isinstance(factor, BandedFactor | MultigridFactor)
-        return RotatedRest(factor.single_precision(), *self.turning_cells)
+        return RotatedRest(factor.single_precision(), self.assembler.pattern, self.turning_cells)
+
+    @property
+    def moving_nodes(self) -> NDArray[np.int64]:
+        """Nodes with a free dof, (n_moving,), sorted."""
+        return np.unique(self.scene.free_dofs // 3)
 
     @property
     def turning_cells(self) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
-        """The cells' free nodes, and gradients and volumes at the centres; see `RotatedRest`."""
+        """The cells' moving nodes, and gradients and volumes at the centres; see `RotatedRest`."""
         mesh = self.scene.mesh
         element = element_of(mesh.cells)
-        gradients, det_j = shape_gradients(mesh.points, mesh.cells, element.centre[None])
-        cell_nodes = (self.cell_dofs[:, ::3] // 3).astype(np.int32)
-        return cell_nodes, gradients[:, 0], det_j[:, 0] * element.weights.sum()
+        gradients, det_j = shape_gradients(self._points, mesh.cells, element.centre[None])
+        number = np.full(mesh.n_nodes, len(self.moving_nodes), dtype=np.int32)
+        number[self.moving_nodes] = np.arange(len(self.moving_nodes))
+        return number[mesh.cells], gradients[:, 0], det_j[:, 0] * element.weights.sum()
 
     @cached_property
     def _jacobi(self) -> BlockJacobi:

@@ -28,8 +28,8 @@ class Multigrid:
     Parameters
     ----------
     pattern : Pattern
-    points : (n / 3, 3) float64
-        Reference positions of the free nodes, m.
+    points : (n_nodes, 3) float64
+        Reference positions of the nodes with a free dof, m.
     """
 
     def __init__(self, pattern: Pattern, points: NDArray[np.float64]) -> None:
@@ -55,12 +55,14 @@ class MultigridFactor:
     ) -> None:
         from pyamg import smoothed_aggregation_solver
 
-        self._matrix = sp.csr_matrix(pattern.symmetric(values)).tobsr(blocksize=(3, 3))
+        self._pattern, matrix = pattern, pattern.whole.symmetric(pattern.complete(values))
+        self._matrix = sp.csr_matrix(matrix).tobsr(blocksize=(3, 3))
         x = points - points.mean(axis=0)
         motions = np.zeros((len(points), 3, 6))
         motions[:, :, :3] = np.eye(3)
         for axis in range(3):
             motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], x / np.abs(x).max())
+        near_null = pattern.pad(pattern.cut(motions.reshape(-1, 6)))
         # The coarsest matrix of plates and other ill-conditioned bodies may be indefinite
         # in single precision, or even in double precision.
         for dtype, coarse in (
@@ -70,7 +72,7 @@ class MultigridFactor:
         ):
             levels: Any = smoothed_aggregation_solver(
                 self._matrix.astype(dtype),
-                B=motions.reshape(-1, 6).astype(dtype),
+                B=near_null.astype(dtype),
                 strength=None,
                 improve_candidates=None,
                 max_coarse=500,
@@ -86,12 +88,12 @@ class MultigridFactor:
             )
             self._cycle_multiply_adds = int(transfers + levels.levels[-1].A.shape[0] ** 2)
             try:
-                response = self._cycle @ np.ones(pattern.n, dtype)
+                response = self._cycle @ np.ones(pattern.whole.n, dtype)
             except np.linalg.LinAlgError:
                 continue
             if np.isfinite(response).all() and response.sum() > 0:
                 break
-        self.place = np.arange(pattern.n)
+        self.place = np.arange(pattern.whole.n)
 
     def single_precision(self) -> MultigridFactor:
         return self
@@ -104,7 +106,7 @@ class MultigridFactor:
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         if rhs.ndim == 2:
             return np.stack([self.solve(column) for column in rhs.T], axis=1)
-        scale = float(np.abs(rhs).max()) or 1.0
+        rhs, scale = self._pattern.pad(rhs), float(np.abs(rhs).max()) or 1.0
 
         def one_cycle(residual: NDArray[np.float64]) -> NDArray[Any]:
             # A cycle, a product with the matrix, and six with vectors.
@@ -128,4 +130,4 @@ class MultigridFactor:
                 f"{missed:.1e} of the load after {MAX_CYCLES} cycles. The body may be too "
                 'slender; try `solver = "superlu"`.'
             )
-        return np.asarray(solution * scale)
+        return self._pattern.cut(np.asarray(solution * scale))

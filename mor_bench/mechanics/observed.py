@@ -26,6 +26,7 @@ from mor_bench.mechanics.load_steps import LoadSteps
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.multigrid import MultigridFactor
 from mor_bench.mechanics.newton import NewtonOptions, Solution
+from mor_bench.mechanics.pattern import Pattern
 from mor_bench.mechanics.rotated import RotatedRest, SingleFactor, nodal_rotations
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import SolverName
@@ -40,16 +41,25 @@ class _HiddenRest(RotatedRest):
     ----------
     factor : SingleFactor
         Factor of the hidden nodes' stiffness at rest.
+    pattern : Pattern
+        Pattern of that stiffness.
     whole : FullOrderModel
     hidden : (n_hidden,) int64
         Indices of the hidden dofs among the free ones.
     """
 
     def __init__(
-        self, factor: SingleFactor, whole: FullOrderModel, hidden: NDArray[np.int64]
+        self,
+        factor: SingleFactor,
+        pattern: Pattern,
+        whole: FullOrderModel,
+        hidden: NDArray[np.int64],
     ) -> None:
-        super().__init__(factor, *whole.turning_cells)
-        self._hidden, self._rows = hidden, np.append(hidden[::3] // 3, whole.n_unknowns // 3)
+        super().__init__(factor, pattern, whole.turning_cells)
+        self._whole, self._hidden = whole.assembler.pattern, hidden
+        moving = whole.moving_nodes
+        rows = np.searchsorted(moving, np.unique(whole.scene.free_dofs[hidden] // 3))
+        self._rows = np.append(rows, len(moving))
         self._base = np.zeros(whole.n_unknowns)
         self.soft(self.turned(None))  # computes what copies share
 
@@ -60,11 +70,12 @@ class _HiddenRest(RotatedRest):
         return found
 
     def turned(self, q: Array | None) -> Array:
-        u = np.append(self._base, np.zeros(3))
+        base = self._base.copy()
         if q is not None:
-            u[self._hidden] += q
-        rotations = np.empty((len(u) // 3, 3, 3))
-        iterations = nodal_rotations(u.reshape(-1, 3), *self.cells, rotations)
+            base[self._hidden] += q
+        u = np.append(self._whole.pad(base), np.zeros(3)).reshape(-1, 3)
+        rotations = np.empty((len(u), 3, 3))
+        iterations = nodal_rotations(u, *self.cells, rotations)
         count(multiply_adds=4 * self.cells[1].size + 20 * len(rotations) + 40 * int(iterations))
         return np.asarray(rotations[self._rows])
 
@@ -88,6 +99,10 @@ class _HiddenModel(FullOrderModel):
         self._kept = np.flatnonzero(inside[pattern.rows] & inside[pattern.indices])
         self.beside_force = np.zeros(whole.n_unknowns)
 
+    @cached_property
+    def rest_tangent(self) -> Array:
+        return self._whole.rest_tangent[self._kept]
+
     def beside(self, base: Array) -> Self:
         """Return the model relative to another state of the whole body, (n_free,), m."""
         found = copy(self)
@@ -101,7 +116,8 @@ class _HiddenModel(FullOrderModel):
     def turned_rest(self) -> _HiddenRest:
         factor = self.rest_factor
         assert isinstance(factor, BandedFactor | MultigridFactor)
-        return _HiddenRest(factor.single_precision(), self._whole, self.hidden)
+        pattern = self.assembler.pattern
+        return _HiddenRest(factor.single_precision(), pattern, self._whole, self.hidden)
 
     def at(self, q: Array) -> Array:
         """Return displacements of the whole body, (n_free,), m."""
@@ -150,7 +166,12 @@ class ObservedModel:
             raise UnsupportedSceneError(f"{scene.name}: no displacements are observed.")
         self.scene = scene
         whole = FullOrderModel(scene, solver)
-        held = replace(scene, fixed_nodes=np.union1d(scene.fixed_nodes, scene.observed_nodes))
+        held = replace(
+            scene,
+            # The whole model has the rest state under gravity.
+            spec=scene.generated.model_copy(update={"gravity": None}),
+            fixed_nodes=np.union1d(scene.fixed_nodes, scene.observed_nodes),
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", LockingWarning)  # the whole model warned
             self._model = _HiddenModel(whole, held, solver)

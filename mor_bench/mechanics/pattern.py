@@ -13,12 +13,40 @@ from numpy.typing import NDArray
 class Pattern:
     """Upper triangle, diagonal included, of a symmetric sparse matrix in CSR form, without values.
 
-    The three dofs of a node are neighbours.
+    The dofs of a node are neighbours. Where a node has one or two free dofs, `completion` adds its
+    held ones, so that solvers by blocks see three dofs of every node.
     """
 
     n: int
     indptr: NDArray[np.int64]
     indices: NDArray[np.int32]
+    completion: Completion | None = None
+
+    @property
+    def whole(self) -> Pattern:
+        """The pattern with three dofs of every node."""
+        return self if self.completion is None else self.completion.pattern
+
+    def complete(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return values in the whole pattern; an added dof is coupled to itself alone."""
+        if self.completion is None:
+            return values
+        whole, kept = self.completion.pattern, self.completion.kept
+        full = np.where(whole.rows == whole.indices, np.abs(values).max(), 0.0)
+        full[kept] = values
+        return full
+
+    def pad(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return vectors (n,) or (n, m) with zeros at the added dofs."""
+        if self.completion is None:
+            return x
+        padded = np.zeros((self.completion.pattern.n, *x.shape[1:]))
+        padded[self.completion.dofs] = x
+        return padded
+
+    def cut(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return vectors without the added dofs."""
+        return x if self.completion is None else x[self.completion.dofs]
 
     @property
     def rows(self) -> NDArray[np.int64]:
@@ -42,6 +70,24 @@ class Pattern:
         """Return the whole symmetric matrix with these values of its upper triangle."""
         upper = sp.csr_array((values, self.indices, self.indptr), shape=(self.n, self.n))
         return sp.csr_array(upper + sp.triu(upper, 1).T)
+
+
+@dataclass(frozen=True)
+class Completion:
+    """A pattern with three dofs of every node, of a pattern that lacks some of them.
+
+    Attributes
+    ----------
+    pattern : Pattern
+    dofs : (n,) int64
+        Number of each dof in it.
+    kept : (n_nonzeros,) int64
+        Number of each entry in it.
+    """
+
+    pattern: Pattern
+    dofs: NDArray[np.int64]
+    kept: NDArray[np.int64]
 
 
 def build_pattern(
@@ -94,6 +140,12 @@ def build_pattern(
     kept = (dofs < n_dofs)[indices] & np.repeat(dofs < n_dofs, np.diff(indptr))
     place = np.append(np.where(kept, np.cumsum(kept) - 1, kept.sum()), kept.sum()).astype(np.int32)
     ends = np.append(0, np.cumsum(kept))[indptr]
+    completion = Completion(
+        Pattern(len(dofs), indptr, indices), np.flatnonzero(dofs < n_dofs), np.flatnonzero(kept)
+    )
     return Pattern(
-        n_dofs, np.append(0, ends[1:][dofs < n_dofs]), dofs[indices[kept]].astype(np.int32)
+        n_dofs,
+        np.append(0, ends[1:][dofs < n_dofs]),
+        dofs[indices[kept]].astype(np.int32),
+        completion,
     ), place[slots]

@@ -17,7 +17,7 @@ from mor_bench.errors import InvertedElementError, NoEquilibriumError
 from mor_bench.mechanics.kernels import MET
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import Solution
-from mor_bench.mechanics.rotated import multiply
+from mor_bench.mechanics.rotated import product
 
 Array = NDArray[np.float64]
 
@@ -31,13 +31,6 @@ GROWN = 1e6
 
 SECOND_STEP = 0.25
 """Squared step of the second attempt, relative to the first."""
-
-
-def _symmetric_product(model: FullOrderModel, x: Array) -> Array:
-    """Return K₀x with the stiffness at rest K₀."""
-    y, pattern = np.empty_like(x), model.assembler.pattern
-    multiply(pattern.indptr, pattern.indices, model.rest_tangent, x, y)
-    return y
 
 
 def _row_sums(model: FullOrderModel) -> Array:
@@ -73,7 +66,7 @@ class DynamicRelaxation:
         mass = most[node]
         x = np.random.default_rng(0).normal(size=model.n_unknowns)
         for _ in range(POWER_ITERATIONS):
-            y = _symmetric_product(model, x) / mass
+            y = product(model.assembler.pattern, model.rest_tangent, x) / mass
             highest = float((mass * y) @ y / ((mass * x) @ y))
             x = y / np.linalg.norm(y)
         self.mass = highest * mass

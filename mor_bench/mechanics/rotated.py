@@ -196,25 +196,28 @@ class RotatedRest:
     ----------
     factor : SingleFactor
         Factor of the stiffness at rest, with the three dofs of a node as neighbours.
-    cell_nodes : (n_cells, n_cell_nodes) int32
-        Index of each cell's nodes among the free nodes; fixed nodes have the index n_free_nodes.
-    centre_gradients : (n_cells, n_cell_nodes, 3) float64
-        dN_a/dX at the cells' centres, 1/m.
-    volumes : (n_cells,) float64
-        Volumes of the cells, m³.
+    pattern : Pattern
+        Pattern of the stiffness.
+    cells : tuple of arrays
+        (n_cells, n_cell_nodes) int32: index of each cell's nodes among the nodes with a free dof;
+        fixed nodes have the index n_free_nodes. (n_cells, n_cell_nodes, 3) float64: dN_a/dX at the
+        cells' centres, 1/m. (n_cells,) float64: volumes of the cells, m³.
     """
 
     def __init__(
         self,
         factor: SingleFactor,
-        cell_nodes: NDArray[np.int32],
-        centre_gradients: Array,
-        volumes: Array,
+        pattern: Pattern,
+        cells: tuple[NDArray[np.int32], Array, Array],
     ) -> None:
-        self._factor = factor
+        self._factor, self._pattern = factor, pattern
         self._place = np.ascontiguousarray(factor.place[::3] // 3)
-        self.cells = cell_nodes, centre_gradients, volumes
+        self.cells = cells
         self._identity = np.tile(np.eye(3), (len(self._place) + 1, 1, 1))
+
+    def at_nodes(self, q: Array) -> Array:
+        """Return displacements (n_free_nodes + 1, 3), m; the last row, of fixed nodes, is zero."""
+        return np.append(self._pattern.pad(q), np.zeros(3)).reshape(-1, 3)
 
     def turned(self, q: Array | None) -> Array:
         """Return nodal rotations (n_nodes + 1, 3, 3) at displacements q (n,), m.
@@ -224,9 +227,7 @@ class RotatedRest:
         if q is None:
             return self._identity
         rotations = np.empty_like(self._identity)
-        iterations = nodal_rotations(
-            np.append(q, np.zeros(3)).reshape(-1, 3), *self.cells, rotations
-        )
+        iterations = nodal_rotations(self.at_nodes(q), *self.cells, rotations)
         # The terms count components of the cells' nodes, nodes, and iterations.
         count(multiply_adds=4 * self.cells[1].size + 20 * len(self._place) + 40 * int(iterations))
         return rotations
@@ -241,14 +242,14 @@ class RotatedRest:
         scales = [1.0 / (float(np.abs(residual).max()) or 1.0) for residual in residuals]
         work = np.empty((len(residuals), 3 * len(self._place)), dtype=np.float32)
         for row, residual, Q, scale in zip(work, residuals, rotations, scales, strict=True):
-            _turn_back(self._place, Q, scale, residual, row)
+            _turn_back(self._place, Q, scale, self._pattern.pad(residual), row)
         self._factor.solve_in_place(work)
         if is_counting():
             count(multiply_adds=8 * work.size)
         z = np.empty(work.shape)
         for out, row, Q, scale in zip(z, work, rotations, scales, strict=True):
             _turn(self._place, Q, scale, row, out)
-        return z
+        return z if self._pattern.completion is None else self._pattern.cut(z.T).T.copy()
 
     @cached_property
     def _soft(self) -> NDArray[np.float32]:
@@ -263,7 +264,7 @@ class RotatedRest:
         count(multiply_adds=4 * len(self._soft))
         z = np.empty(len(self._soft))
         _turn(self._place, rotations, 1.0, self._soft, z)
-        return z
+        return self._pattern.cut(z)
 
     def at(self, q: Array | None) -> Turned:
         """Return the preconditioner of a tangent at displacements q (n,), m."""
@@ -285,7 +286,8 @@ class BlockJacobi:
     """The plain preconditioner: the inverse of each node's 3x3 block of the tangent itself."""
 
     def __init__(self, pattern: Pattern) -> None:
-        first, second, third = pattern.indptr[:-1:3], pattern.indptr[1::3], pattern.indptr[2::3]
+        self._pattern, indptr = pattern, pattern.whole.indptr
+        first, second, third = indptr[:-1:3], indptr[1::3], indptr[2::3]
         top, middle = (first, first + 1, first + 2), (first + 1, second, second + 1)
         bottom = (first + 2, second + 1, third)
         self._places = np.stack([*top, *middle, *bottom], axis=1)
@@ -294,13 +296,15 @@ class BlockJacobi:
         """Invert the diagonal blocks of a tangent."""
         count(multiply_adds=27 * len(self._places))
         try:
-            self._inverse = np.linalg.inv(values[self._places].reshape(-1, 3, 3))
+            blocks = self._pattern.complete(values)[self._places].reshape(-1, 3, 3)
+            self._inverse = np.linalg.inv(blocks)
         except np.linalg.LinAlgError as error:
             raise NotPositiveDefiniteError from error
 
     def solve(self, residual: Array) -> Array:
         count(multiply_adds=9 * len(self._places))
-        return np.asarray((self._inverse @ residual.reshape(-1, 3, 1)).ravel())
+        blocks = self._pattern.pad(residual).reshape(-1, 3, 1)
+        return self._pattern.cut(np.asarray((self._inverse @ blocks).ravel()))
 
 
 class Preconditioner(Protocol):
@@ -309,17 +313,24 @@ class Preconditioner(Protocol):
     def solve(self, residual: Array) -> Array: ...
 
 
+def product(pattern: Pattern, values: Array, x: Array) -> Array:
+    """Return K x for the symmetric K whose upper triangle has these values."""
+    whole, y = pattern.whole, np.empty(pattern.whole.n)
+    multiply(whole.indptr, whole.indices, pattern.complete(values), pattern.pad(x), y)
+    return pattern.cut(y)
+
+
 def condition_number(pattern: Pattern, values: Array, factor: Factor, iterations: int = 4) -> float:
     """Estimate a symmetric positive definite matrix' condition number, from below.
 
     Power iterations with the matrix and with its inverse give the extreme eigenvalues.
     """
     x = np.random.default_rng(0).normal(size=pattern.n)
-    y, z = x / np.linalg.norm(x), np.empty(pattern.n)
+    y = x / np.linalg.norm(x)
     largest = smallest = 1.0
     for _ in range(iterations):
-        multiply(pattern.indptr, pattern.indices, values, x / np.linalg.norm(x), z)
-        x, largest = z.copy(), float(np.linalg.norm(z))
+        x = product(pattern, values, x / np.linalg.norm(x))
+        largest = float(np.linalg.norm(x))
         y = factor.solve(y)
         smallest = 1.0 / float(np.linalg.norm(y))
         y = y * smallest
@@ -341,15 +352,16 @@ def conjugate_gradients(
     NotPositiveDefiniteError
         If a direction of negative curvature is met, or the iterations do not suffice.
     """
-    x, r, p, q = np.zeros_like(rhs), rhs.copy(), np.zeros_like(rhs), np.empty_like(rhs)
+    whole, values, r = pattern.whole, pattern.complete(values), pattern.pad(rhs).copy()
+    x, p, q = np.zeros_like(r), np.zeros_like(r), np.empty_like(r)
     target, rz = tolerance * float(np.linalg.norm(rhs)), 1.0
     for iteration in range(max_iterations):
         if float(np.linalg.norm(r)) <= target:
-            return x, iteration
-        z = preconditioner.solve(r)
+            return pattern.cut(x), iteration
+        z = pattern.pad(preconditioner.solve(pattern.cut(r)))
         rz, before = float(r @ z), rz
         p = z + (rz / before) * p
-        multiply(pattern.indptr, pattern.indices, values, p, q)
+        multiply(whole.indptr, whole.indices, values, p, q)
         # One product with K, whose upper triangle is stored, and six with vectors.
         count(multiply_adds=2 * len(values) + 5 * len(p))
         curvature = float(p @ q)

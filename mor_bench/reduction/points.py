@@ -108,6 +108,24 @@ class ReducedPoints:
         force += 18 * self.n_unknowns
         tangent += force + tangent_multiply_adds(self.n_unknowns, self.symmetric)
         self._multiply_adds = self.n_points * force, self.n_points * tangent
+        self._springs: Array | None = None
+        if body.springs is not None:
+            self._lame = None  # its kernels have no springs
+            tested = modes if test_modes is None else test_modes
+            moved = body.springs @ modes.reshape(-1, self.n_unknowns)
+            self._springs = tested.reshape(-1, self.n_unknowns).T @ moved
+        self._rest: tuple[Array, Array] | None = None
+        if body.rest is not None:
+            self._lame = None  # its kernels start from an undeformed body
+            rest = _mode_gradients(rule.gradients, body.rest[cells][..., None], kept)[:, 0]
+            self._rest = rest, np.zeros(self.n_unknowns)
+            self._rest = rest, self.force(np.zeros(self.n_unknowns)).force
+
+    def _gradients(self, q: Array) -> Array:
+        """Return du/dX (n_batches, 9 * LANES) of the total displacement."""
+        H = np.empty((len(self.weights), 9 * LANES))
+        gradients(self.trial, q, H)
+        return H if self._rest is None else H + self._rest[0]
 
     def count(self, forces: int, tangents: int) -> None:
         """Count evaluations of the force alone, and of force and tangent."""
@@ -120,14 +138,21 @@ class ReducedPoints:
         if self._lame is not None:
             bases, material = (self.trial, self.test, self.symmetric), (self.weights, self._lame)
             return State(force, *integrate(q, *bases, *material, force, tangent))
-        H, P = np.empty((2, len(self.weights), 9 * LANES))
+        H, P = self._gradients(q), np.empty((len(self.weights), 9 * LANES))
         A = np.empty((len(self.weights) if len(tangent) else 0, 81 * LANES))
-        gradients(self.trial, q, H)
         energy, min_det = self._stresses(
             H, self.weights, self._parameters, P, A if len(tangent) else None
         )
         project(P, A, self.trial, self.test, self.symmetric, force, tangent)
-        return State(force, energy, min_det)
+        if self._springs is not None:
+            own = self._springs @ q
+            force, energy = force + own, energy + 0.5 * float(own @ q)
+            if len(tangent):
+                tangent += self._springs
+        if self._rest is None:
+            return State(force, energy, min_det)
+        held = self._rest[1]
+        return State(force - held, energy - float(held @ q), min_det)
 
     def force(self, q: Array) -> State:
         """Return the state at coordinates ``q`` (r,): reduced force, energy and min det F."""
@@ -140,9 +165,12 @@ class ReducedPoints:
 
     def point_forces(self, q: Array) -> Array:
         """Return each point's part of the reduced force, (n_points, r); to train cubatures."""
-        H, P = np.empty((2, len(self.weights), 9 * LANES))
-        gradients(self.trial, q, H)
-        self._stresses(H, self.weights, self._parameters, P, None)
+        P = np.empty((len(self.weights), 9 * LANES))
+        self._stresses(self._gradients(q), self.weights, self._parameters, P, None)
+        if self._rest is not None:
+            held = np.empty_like(P)
+            self._stresses(self._rest[0], self.weights, self._parameters, held, None)
+            P -= held
         test, stress = self.test.reshape(len(P), -1, 9, LANES), P.reshape(len(P), 9, LANES)
         own = np.einsum("bmcl,bcl->blm", test, stress)
         return np.asarray(own.reshape(-1, self.n_unknowns)[: self.n_points])

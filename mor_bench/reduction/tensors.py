@@ -13,7 +13,7 @@ leading part of each array.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -132,6 +132,23 @@ def reduce_energy(model: FullOrderModel, modes: Array) -> ReducedTensors:
     return _symmetric(gram, r)
 
 
+def _about_rest(tensors: ReducedTensors) -> ReducedTensors:
+    """Return the polynomial of modes 1, 2, … about the state where mode 0 has the coordinate 1.
+
+    The Taylor series of a quartic polynomial ends, so nothing is neglected. Its linear term is
+    balanced by the pre-load.
+    """
+    i, j = triangular_pairs(tensors.n_modes)
+    kept, with_rest = np.flatnonzero(i > 0), np.flatnonzero((i == 0) & (j > 0))
+    cubic, quartic = tensors.cubic[kept], tensors.quartic[kept]
+    quadratic = tensors.quadratic[1:, 1:].copy()
+    change = cubic[:, 0] + 0.5 * quartic[:, 0]
+    rows, columns = i[kept] - 1, j[kept] - 1
+    quadratic[rows, columns] += change
+    quadratic[columns, rows] += np.where(rows == columns, 0.0, change)
+    return ReducedTensors(quadratic, cubic[:, 1:] + quartic[:, with_rest], quartic[:, kept])
+
+
 def sentinels_of(model: FullOrderModel, modes: Array, samples: Array) -> Array:
     """Return the modes' gradients (n, 9, r) where typical states have their smallest det F.
 
@@ -207,8 +224,9 @@ class TensorProblem(DenseProblem):
     Parameters
     ----------
     tensors : ReducedTensors
-    sentinels : (n, 9, r) float64
-        Gradients of the modes where det F is watched.
+    sentinels : (n, 9, r) or (n, 9, r + 1) float64
+        Gradients of the modes where det F is watched. Under gravity, those of the rest state come
+        first.
     usual : (1,) float64
         Smallest det F of typical states there.
     extent : float
@@ -228,7 +246,7 @@ class TensorProblem(DenseProblem):
             "quadratic": (r, r),
             "cubic": (n_pairs(r), r),
             "quartic": (n_pairs(r), n_pairs(r)),
-            "sentinels": (len(sentinels), 9, r),
+            "sentinels": (len(sentinels), 9, r + (sentinels.shape[-1] == r + 1)),
             "usual": (1,),
         }
         arrays = {**vars(tensors), "sentinels": sentinels, "usual": usual}
@@ -256,11 +274,18 @@ class TensorProblem(DenseProblem):
     @classmethod
     def of_modes(cls, model: FullOrderModel, modes: Array, samples: Array) -> TensorProblem:
         """Make the problem from modes (n_free, r) and coordinates (n, r) of typical states."""
+        if model.rest is not None:
+            modes = np.column_stack([model.rest, modes])
+            samples = np.column_stack([np.ones(len(samples)), samples])
+        tensors = reduce_energy(model, modes)
         sentinels = np.ascontiguousarray(sentinels_of(model, modes, samples))
         usual = min((float(min_det_f(sentinels, q)) for q in samples), default=1.0)
-        return cls(
-            reduce_energy(model, modes), sentinels, np.array([usual]), extent_of(model.scene)
-        )
+        if model.rest is not None:
+            tensors, modes = _about_rest(tensors), modes[:, 1:]
+        if model.springs is not None:
+            stiffness = tensors.quadratic + modes.T @ (model.springs @ modes)
+            tensors = replace(tensors, quadratic=stiffness)
+        return cls(tensors, sentinels, np.array([usual]), extent_of(model.scene))
 
     @property
     def arrays(self) -> dict[str, Array]:
@@ -314,6 +339,8 @@ class TensorProblem(DenseProblem):
         """Return the smallest det F at the watched points."""
         if is_counting():
             count(multiply_adds=self.sentinels.size)
+        if self.sentinels.shape[2] > len(q):
+            q = np.append(1.0, q)
         return float(min_det_f(self.sentinels, q))
 
     def linearise(self, q: Array) -> tuple[State, Array]:

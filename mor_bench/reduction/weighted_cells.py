@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.assembly import Assembler, discretisation_of
+from mor_bench.mechanics.assembly import Assembler
+from mor_bench.mechanics.model import body_of
 from mor_bench.scene.scene import Scene
 
 
@@ -47,7 +48,5 @@ def weighted_cells(
     rows = np.flatnonzero(touched.reshape(-1)[scene.free_dofs])
     dof_of_node = np.full(scene.mesh.n_dofs, len(rows), dtype=np.int64)
     dof_of_node[scene.free_dofs[rows]] = np.arange(len(rows))
-    assembler = Assembler(
-        discretisation_of(scene, cells), dof_of_node.reshape(-1, 3), len(rows), weights
-    )
+    assembler = Assembler(body_of(scene, cells), dof_of_node.reshape(-1, 3), len(rows), weights)
     return assembler, rows

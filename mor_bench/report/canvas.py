@@ -110,6 +110,34 @@ def new_figure(height_in: float, finding: str, subject: str) -> Figure:
     return figure
 
 
+def add_note(figure: Figure, note: str) -> None:
+    """Make a figure of `new_figure` higher, and write a note in small letters below its heading."""
+    renderer = lay_out(figure)
+    font = FontProperties(size=NOTE)
+
+    def width(words: str) -> float:
+        return float(renderer.get_text_width_height_descent(words, font, False)[0])
+
+    lines = wrapped(note, 0.98 * WIDTH_IN * DPI, width)
+    before = float(figure.get_size_inches()[1])
+    more = 1.3 * NOTE * len(lines) / 72
+    whole = before + more
+    for text in figure.texts:
+        if (
+            text.get_verticalalignment() == "top"
+        ):  # a line of the heading; the layout places all others
+            text.set_y((text.get_position()[1] * before + more) / whole)
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    left, bottom, wide, tall = engine.get()["rect"]
+    figure.set_size_inches(WIDTH_IN, whole)
+    below = (left, bottom * before / whole, wide, tall * before / whole)
+    figure.set_layout_engine(ConstrainedLayoutEngine(rect=below))
+    top = ((bottom + tall) * before + more + 0.05) / whole
+    where = {"x": 0.01, "y": top, "ha": "left", "va": "top", "linespacing": 1.2}
+    figure.text(s=plain("\n".join(lines)), fontsize=NOTE, color=GREY, **where)
+
+
 def lay_out(figure: Figure) -> Any:
     """Draw a figure, so that its layout is final; return the renderer, which measures artists."""
     shown = figure.canvas  # of a notebook, perhaps

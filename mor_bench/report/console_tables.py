@@ -41,8 +41,8 @@ from mor_bench.report.speed_tables import (
     pairs_at,
     target_table,
 )
-from mor_bench.report.summary import hidden_doubts, interval_basis, notes_of, warnings_of
-from mor_bench.report.text_table import TextTable, with_short_names
+from mor_bench.report.summary import hidden_doubts, interval_basis, notes_of, origins, warnings_of
+from mor_bench.report.text_table import TextTable, with_information, with_short_names
 from mor_bench.results.comparison import Comparison
 
 if TYPE_CHECKING:
@@ -118,7 +118,8 @@ def _out_of_range_parts(entries: Sequence[Entry]) -> list[RenderableType]:
     found = out_of_range([entry for entry in entries if entry.label in best and entry.row.sets])
     if found is None:
         return []
-    found = with_short_names(found, short_names(entry.row for entry in entries))
+    names = short_names(entry.row for entry in entries)
+    found = with_short_names(with_information(found, entries), names)
     table = _empty_table()
     for i, heading in enumerate(found.headings):
         table.add_column(heading, justify="right" if i else "left", no_wrap=True)
@@ -178,7 +179,7 @@ def _short_notes(
     comparison: Comparison, dataset: str, entries: Sequence[Entry], analysis: Analysis
 ) -> Iterator[Text]:
     """Yield the doubts that bear on the choice, and the number of the other notes."""
-    doubts = hidden_doubts(dataset, analysis)
+    doubts = [*hidden_doubts(dataset, analysis), *origins(comparison, dataset)]
     names = short_names(entry.row for entry in entries)
     for label, doubt in doubts:
         yield Text(f"{names[label]}: {doubt}", style="yellow")

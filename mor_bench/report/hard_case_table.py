@@ -12,6 +12,7 @@ from rich.text import Text
 
 from mor_bench.hard_cases.catalogue import CASES, CaseResult
 from mor_bench.hard_cases.suite import StressResults
+from mor_bench.report.number_format import DASH
 from mor_bench.report.text_table import TextTable
 
 STYLES = {"pass": "green", "fall short": "bold red", "not applicable": "dim"}
@@ -33,6 +34,8 @@ def print_stress(found: StressResults, console: Console, quiet: bool = False) ->
         f"{found.count('not applicable')} not applicable."
     )
     console.print(counts, highlight=False)
+    for told, methods in _by_told(found).items():
+        console.print(f"Told ({told}): {', '.join(methods)}.", highlight=False, markup=False)
     if short:
         cases = (f"{_name(row)} of {row.method}" for row in short)
         console.print(f"Fall short: {', '.join(cases)}.", highlight=False, markup=False)
@@ -44,18 +47,29 @@ def stress_table(found: StressResults, methods: Sequence[str]) -> TextTable:
     if len(methods) == 1:
         cells = [[_name(row), row.verdict, row.expected, row.happened] for row in rows]
         headings = ["case", "verdict", "expected", "what happened"]
-        return TextTable(f"Hard cases of {methods[0]}", _NOTE, headings, cells)
+        told = found.told.get(methods[0])
+        note = f"{_NOTE} The method is told: {told}." if told else _NOTE
+        return TextTable(f"Hard cases of {methods[0]}", note, headings, cells)
     cells = []
     for method in methods:
         mine = [row for row in rows if row.method == method]
         short = ", ".join(_name(row) for row in mine if row.verdict == "fall short")
         counts = (str(sum(row.verdict == verdict for row in mine)) for verdict in STYLES)
-        cells += [[method, *counts, short or "none"]] if mine else []
-    headings = ["method", "passed", "fell short", "not applicable", "falls short at"]
+        told = found.told.get(method, DASH)
+        cells += [[method, told, *counts, short or "none"]] if mine else []
+    headings = ["method", "told", "passed", "fell short", "not applicable", "falls short at"]
     return TextTable("Hard cases of each method", _NOTE, headings, cells)
 
 
 _NOTE = "Tried on beam-tiny by `mor-bench stress`, with the parameters of the method files."
+
+
+def _by_told(found: StressResults) -> dict[str, list[str]]:
+    """Group the methods by the information that they are given."""
+    groups: dict[str, list[str]] = {}
+    for method, told in sorted(found.told.items()):
+        groups.setdefault(told, []).append(method)
+    return groups
 
 
 def _name(row: CaseResult) -> str:

@@ -69,7 +69,7 @@ def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
         "positions": positions(found, arrays, mesh),
         "singular": singular_values(arrays, needs.error),
         "ranks": _ranks(entries),
-        "learning": _learning(comparison, dataset),
+        "learning": _learning(comparison, dataset, shown.names),
         "losses": losses(comparison, entries),
         "costs": _costs(shown),
         "bodies": bodies(found, mesh, body_bytes),
@@ -194,8 +194,13 @@ def _ranks(entries: Sequence[Entry]) -> list[dict[str, Any]]:
     return [{"method": method, "ranks": sorted(ranks)} for method, ranks in used.items()]
 
 
-def _learning(comparison: Comparison, dataset: str) -> list[dict[str, Any]]:
-    """List learning curves with at least two points: samples against median error in %."""
+def _learning(
+    comparison: Comparison, dataset: str, names: Mapping[str, str]
+) -> list[dict[str, Any]]:
+    """List learning curves with at least two points: samples against median error in %.
+
+    A curve may belong to a configuration that is not compared; its full label names it.
+    """
     lines: dict[tuple[str, str], list[tuple[int, float]]] = {}
     for point in comparison.learning:
         if point.dataset == dataset and point.error and point.error.rel_l2_median > 0:
@@ -203,7 +208,12 @@ def _learning(comparison: Comparison, dataset: str) -> list[dict[str, Any]]:
             if isfinite(value):
                 lines.setdefault((point.method, point.label), []).append((point.n_train, value))
     return [
-        {"method": method, "label": label, "points": sorted(points)}
+        {
+            "method": method,
+            "label": label,
+            "name": names.get(label, label),
+            "points": sorted(points),
+        }
         for (method, label), points in lines.items()
         if len(points) > 1
     ]

@@ -36,7 +36,8 @@ def frontier(data: Data, title: str) -> Chart:
         "Left and down is better. Lines join the configurations of a method. Bars are 95 % "
         "intervals. Open markers: the timing was not stable. The dashed steps are the Pareto "
         "front. References solve the full equations on the dataset's own mesh. "
-        "Click on the legend to hide a method, double-click to isolate it."
+        "Click on the legend to hide a method, double-click to isolate it. By keyboard: Tab to an "
+        "entry, then Enter or Shift+Enter."
     )
     return Chart("frontier", "Error against time", title, reading)
 
@@ -57,9 +58,10 @@ def _name(data: Data, line: Data) -> str:
 
 
 def _ecdf(data: Data) -> str:
-    line = _first(data, [d for d in data["distributions"] if d["error"]["x"]] or [{"label": None}])
-    if line["label"] is None:
+    drawn = [line for line in data["distributions"] if line["error"]["x"]]
+    if not drawn:
         return "Latencies of single queries"
+    line = _first(data, drawn)
     error = _row(data, line["label"])["error"]
     return (
         f"{_name(data, line)}: 95 % of the test loads have an error below "
@@ -96,7 +98,7 @@ def _learning(data: Data) -> str:
     line = data["learning"][0]
     (n0, e0), (n1, e1) = line["points"][0], line["points"][-1]
     return (
-        f"{line['label']}: {number(e0)} % with {whole(n0)} training samples, "
+        f"{line['name']}: {number(e0)} % with {whole(n0)} training samples, "
         f"{number(e1)} % with {whole(n1)}"
     )
 
@@ -124,7 +126,8 @@ _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
         "Grey lines: the body at rest. The arrow shows place and direction of the force. "
         "Worst: the test load with the largest mean error e of that method. Typical: with the "
         "median one. Two methods can thus show different loads. "
-        "Drag to turn; both views turn together. Errors beyond half the body's size are cut.",
+        "Drag to turn, scroll to zoom; both views turn together. By keyboard: Tab to a view, then "
+        "arrow keys, + and −, or Home. Errors beyond half the body's size are cut.",
     ),
     "positions": (
         "Error over the position of the load",

@@ -8,7 +8,7 @@ from math import inf
 
 from mor_bench.analysis.selection_text import needs_text
 from mor_bench.analysis.verdict import needs_of
-from mor_bench.report.entries import Entry, dataset_names, entries_of, verdict_of
+from mor_bench.report.entries import Entry, dataset_names, entries_of, most_accurate, verdict_of
 from mor_bench.report.method_styles import style_of
 from mor_bench.report.number_format import number, percent
 from mor_bench.report.page_sections import View
@@ -78,9 +78,8 @@ def _standing(entries: Sequence[Entry], view: View) -> Standing:
         return Standing(entries[0].row.status)
     qualified = [entry for entry in ran if entry.qualified]
     if not qualified:
-        return Standing(
-            "does not qualify", f"smallest error {percent(min(e.error for e in ran))} %"
-        )
+        found, how = most_accurate(ran)
+        return Standing("does not qualify", f"test error {percent(found.error)} % ({how})")
     best = min(qualified, key=lambda entry: entry.latency_ms)
     values = view.names[best.row.dataset][best.label].values
     small = [f"at {percent(best.error)} %", values]

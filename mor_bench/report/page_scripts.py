@@ -20,6 +20,7 @@ SCRIPTS = (
     "vendor/plotly-gl3d.min.js",
     "vendor/tabulator.min.js",
     "static/theme.js",
+    "static/keyboard.js",
     "static/chart_parts.js",
     "static/frontier.js",
     "static/charts.js",

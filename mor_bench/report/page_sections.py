@@ -28,7 +28,7 @@ from mor_bench.report.summary import (
     notes_of,
     warnings_of,
 )
-from mor_bench.report.text_table import TextTable, with_short_names
+from mor_bench.report.text_table import TextTable, with_information, with_short_names
 from mor_bench.results.comparison import Comparison
 
 UNSTEADY = "timing not stable: "
@@ -147,8 +147,8 @@ def section_of(view: View, dataset: str) -> Section:
         failures=[Event(names[e.label], e.trouble) for e in entries if e.trouble],
         events=[Event(renamed(e.label, named), e.text) for e in events],
         unsteady=[Event(names[e.label], "; ".join(e.unstable)) for e in entries if e.unstable],
-        hard=[with_short_names(table, named) for table in with_content(hard)],
-        details=[with_short_names(table, named) for table in with_content(tables)],
+        hard=_complete(hard, entries, named),
+        details=_complete(tables, entries, named),
         body_picture=next(pictures, None),
         data=data,
     )
@@ -165,6 +165,15 @@ def _frontier_title(verdict: Card) -> str:
         return "No configuration meets both needs"
     first = verdict.rankings[0].picks[0]
     return f"{first.name} answers in {first.latency} ms with an error of {first.error} %"
+
+
+def _complete(
+    tables: Sequence[TextTable], entries: Sequence[Entry], names: Mapping[str, ShortName]
+) -> list[TextTable]:
+    """Drop empty tables; add what the methods are told, and short names."""
+    return [
+        with_short_names(with_information(table, entries), names) for table in with_content(tables)
+    ]
 
 
 def _facts(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> list[tuple[str, str]]:

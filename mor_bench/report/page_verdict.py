@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
 
-from mor_bench.report.entries import Entry
+from mor_bench.report.entries import Entry, most_accurate
 from mor_bench.report.number_format import DASH, number, percent, span
 from mor_bench.report.short_names import renamed
 
@@ -109,9 +109,9 @@ def method_card(
         first, title = own[0], f"{names[own[0].label]} qualifies"
         picks = [_pick(f"fastest of {method} that qualifies", first, names)]
     elif mine:
-        first = min(mine, key=lambda e: (e.error, e.latency_ms))
+        first, how = most_accurate(mine)
         title = f"No configuration of {method} qualifies"
-        picks = [_pick("smallest error", first, names)]
+        picks = [_pick(how, first, names)]
     else:
         return replace(card(verdict, entries, names), rankings=[], title=f"{method} did not run")
     sentence = n

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mor_bench.report.number_format import short_name
+from mor_bench.report.number_format import MEANINGS, short_name
 from mor_bench.results.row import Row
 
 
@@ -76,6 +76,19 @@ def value_text(values: Mapping[str, Any]) -> str:
         for key, name, value in zip(values, names, values.values(), strict=True)
         if value is not None
     )
+
+
+def explained_values(rows: Iterable[Row], text: str) -> str:
+    """Explain the names of values that a text uses, such as ``r5: number of modes``."""
+    found: dict[str, str] = {}
+    for mine in _by_method(rows).values():
+        for key in varied_keys(mine):
+            name = short_name(key)
+            values = {value_text({key: row.swept[key]}) for row in mine if key in row.swept}
+            used = [v for v in values if re.search(rf"(?<![\w.]){re.escape(v)}(?![\w.])", text)]
+            if name != key and used:
+                found[name] = MEANINGS.get(key, key)
+    return " · ".join(f"{name}: {meaning}" for name, meaning in found.items())
 
 
 def _one(name: str, value: Any) -> str:

@@ -29,8 +29,9 @@ PAIRWISE_LEGEND = (
 )
 
 TARGETS_NOTE = (
-    "Interpolated in the whole sweep, on the test set. In brackets: the configuration that the "
-    "validation part selects (without one: the test set), with its figure on the test set."
+    "Test errors, interpolated along the frontier of a method. The validation part (without one: "
+    "the test set) selects its configurations: no other one is both faster and more accurate. "
+    "In brackets: the configuration selected for the target, with its figure on the test set."
 )
 
 FACTORS = (1.0, 1.5, 2.0, 5.0, 10.0, 100.0)
@@ -40,8 +41,8 @@ FACTORS = (1.0, 1.5, 2.0, 5.0, 10.0, 100.0)
 def target_table(comparison: Comparison, dataset: str, kind: str, analysis: Analysis) -> TextTable:
     """Build the table of time at error or error at time, a row per method.
 
-    A cell has the value of the whole sweep on the test set, the configuration that validation
-    selects, and the 95 % interval. `kind` is "time_at_error" or "error_at_time".
+    A cell has the interpolated value on the test set, the configuration that validation selects
+    for the target, and the 95 % interval. `kind` is "time_at_error" or "error_at_time".
     """
     told = told_by_method(entries_of(comparison, dataset))
     names = short_names(row for row in comparison.rows if row.dataset == dataset)
@@ -189,12 +190,13 @@ def break_even_table(
                 bytes_text(entry.row.model_bytes),
             ]
         )
-    headings = ["method", "error", "configuration", "break-even queries", "with tuning"]
+    headings = ["method", "error", "configuration", "break-even without tuning", "with tuning"]
     headings += ["latency (ms)", "full-order (ms)", "data (core-s)", "fit (core-s)"]
     headings += ["all fits (core-s)", "memory", "model"]
     note = (
-        "Each row is the fastest configuration of a method with at most this error. "
-        "Break-even queries: core-seconds of data and fit, divided by those that a query saves. "
+        "Each row is the fastest configuration of a method that meets this error by the verdict's "
+        "rule: the 95 % upper bound on the validation part. "
+        "Break-even, queries: core-seconds of data and fit, divided by those that a query saves. "
         "With tuning: all fits of the method count, failed ones too. "
         "The saving is against the fastest full-order configuration that is at least as accurate. "
         "Never: the full-order model is as fast. Errors that a method does not reach are left out."

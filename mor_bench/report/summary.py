@@ -35,11 +35,7 @@ def notes_of(comparison: Comparison, dataset: str, analysis: Analysis) -> list[t
     notes = [
         (_first_of(labels), f"timing not stable: {reason}") for reason, labels in unstable.items()
     ]
-    notes += [
-        (entry.label, _origin(entry.row.trained_elsewhere))
-        for entry in entries
-        if entry.row.trained_elsewhere
-    ]
+    notes += origins(comparison, dataset)
     notes += hidden_doubts(dataset, analysis)
     methods = {entry.method for entry in entries}
     notes += [
@@ -61,11 +57,27 @@ def hidden_doubts(dataset: str, analysis: Analysis) -> list[tuple[str, str]]:
     return doubts
 
 
-def _origin(training: TrainedElsewhere) -> str:
+def origins(comparison: Comparison, dataset: str) -> list[tuple[str, str]]:
+    """Describe each training that was done elsewhere, after the label of its configuration."""
+    return [
+        (row.label, _origin(row.trained_elsewhere, comparison, row.method))
+        for row in comparison.rows
+        if row.dataset == dataset and row.trained_elsewhere
+    ]
+
+
+def _origin(training: TrainedElsewhere, comparison: Comparison, method: str) -> str:
+    """State the iterations beside those of the method's file and of a training here."""
+    spec = comparison.methods.get(method, {})
+    published = spec.get("parameters", {}).get("iterations", 0)
+    profile = spec.get("profiles", {}).get(comparison.settings.get("profile")) or {}
+    here = profile.get("parameters", {}).get("iterations", published)
+    fewer = f", not the {published:,} of its method file" if published > training.iterations else ""
     return (
-        f"trained elsewhere: {training.iterations:,} iterations with seed {training.seed}, "
+        f"trained elsewhere for {training.iterations:,} iterations{fewer}; seed {training.seed}, "
         f"{number(training.core_s)} core-seconds on {training.machine} cores, {training.date}, "
         f"commit {training.commit[:7]}; `--train` trains here"
+        + (f" for {here:,} iterations" if here else "")
     )
 
 

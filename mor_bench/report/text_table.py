@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from mor_bench.report.entries import Entry
+from mor_bench.report.entries import Entry, told_by_method
 from mor_bench.report.number_format import DASH, number
 from mor_bench.report.short_names import ShortName, renamed
 
@@ -52,6 +52,19 @@ def table_of(
 def with_short_names(table: TextTable, names: Mapping[str, ShortName]) -> TextTable:
     """Replace the labels of configurations by their short names."""
     return replace(table, rows=[[renamed(cell, names) for cell in row] for row in table.rows])
+
+
+def with_information(table: TextTable, entries: Sequence[Entry]) -> TextTable:
+    """Add what each row's method is told, if the rows are configurations or methods."""
+    known = {
+        "configuration": {entry.label: entry.group for entry in entries},
+        "method": told_by_method(entries),
+    }.get(table.headings[0] if table.headings else "", {})
+    if not any(row[0] in known for row in table.rows):
+        return table
+    first, *others = table.headings
+    rows = [[row[0], known.get(row[0], DASH), *row[1:]] for row in table.rows]
+    return replace(table, headings=[first, "told", *others], rows=rows)
 
 
 def figure_cell(part: str, name: str, shown: Callable[[float | None], str] = number) -> Cell:

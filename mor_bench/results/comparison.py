@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.array_files import read_hdf5
@@ -133,12 +134,13 @@ class Comparison:
         return read_hdf5(self._samples_path(name))
 
     def check_samples(self, dataset: str | None = None) -> None:
-        """Check that the raw samples of all rows that ran exist, of one dataset or of all.
+        """Check that the raw samples of the rows that ran exist and give the errors of these rows.
 
         Raises
         ------
         StoreError
-            If some are missing: without them there are no intervals, and verdicts would differ.
+            If some are missing or belong to another configuration: intervals and verdicts would be
+            unknown or wrong.
         """
         ran = [row for row in self.rows if row.ok and dataset in (None, row.dataset)]
         missing = [path for path in map(self.samples_path, ran) if not path.exists()]
@@ -148,6 +150,28 @@ class Comparison:
                 "configurations are missing, so their intervals are not known. Restore the "
                 "folder `samples`, or run the comparison again."
             )
+        for row in ran:
+            self._check_samples_of(row)
+
+    def _check_samples_of(self, row: Row) -> None:
+        stated = row.error
+        errors = self.samples(row).get("relative_l2", np.zeros(0))
+        path = self.samples_path(row)
+        if errors.shape != (row.n_test,):
+            raise StoreError(
+                f"{path}: `relative_l2` must have the shape ({row.n_test},), as {row.label} has "
+                f"{row.n_test} test samples; got {errors.shape}."
+            )
+        if stated is None or not row.n_test:
+            return
+        figures = {"median": np.median(errors), "maximum": errors.max()}
+        said = {"median": stated.rel_l2_median, "maximum": stated.rel_l2_max}
+        for name, value in figures.items():
+            if not np.isclose(value, said[name], rtol=1e-9, equal_nan=True):
+                raise StoreError(
+                    f"{path}: the {name} of `relative_l2` is {value:.6g}, but results.json says "
+                    f"{said[name]:.6g}. The file belongs to another configuration or run."
+                )
 
     def samples_path(self, row: Row) -> Path:
         """Return the file of a row's raw samples."""

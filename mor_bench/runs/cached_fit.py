@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from mor_bench.array_files import read_hdf5
-from mor_bench.checked_files import read_json
+from mor_bench.checked_files import read_bytes, read_json
 from mor_bench.digests import digest_of_arrays
 from mor_bench.errors import StoreError
 from mor_bench.machine import describe_machine, gpu_name
@@ -159,7 +159,7 @@ def read_fit_record(path: Path) -> FitRecord:
 
 def training_seconds(path: Path) -> float:
     """Return the seconds that a training.json states; 0 if it is missing or damaged."""
-    with suppress(OSError, StoreError, ValueError, KeyError, TypeError, OverflowError):
+    with suppress(OSError, StoreError, ValueError, KeyError, TypeError):
         seconds = float(read_json(path)["taken_s"])
         if 0.0 <= seconds < inf:
             return seconds
@@ -246,7 +246,7 @@ class CachedFit:
         self.folder.mkdir(parents=True, exist_ok=True)
         if model is not None:
             remove_leftovers(self.folder)
-            write_atomically(self.model, model.read_bytes())
+            write_atomically(self.model, read_bytes(model))
             checksum = {"model_sha256": digest_of_file(self.model)}
             record = record.model_copy(update=checksum)
         write_atomically(self.folder / "fit.json", record.model_dump_json(indent=1).encode())

@@ -13,6 +13,8 @@ from importlib.machinery import PathFinder
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from mor_bench.checked_files import read_bytes
+
 OWN = "mor_bench"
 SOURCES = Path(__file__).parents[2]
 
@@ -160,7 +162,7 @@ def _installed_file(name: str) -> Path | None:
 
 @cache
 def _source_digest(path: Path, changed: int) -> bytes:
-    return hashlib.sha256(path.read_bytes()).digest()
+    return hashlib.sha256(read_bytes(path)).digest()
 
 
 @cache
@@ -168,7 +170,7 @@ def _imports_of(path: Path, changed: int, package: str) -> tuple[str, ...]:
     """Return the names that a source file imports; ``from a import b`` gives a and a.b."""
     names: list[str] = []
     try:
-        tree = ast.parse(path.read_bytes())
+        tree = ast.parse(read_bytes(path))
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         return ()  # nothing can import it either, and the method's row says so
     for node in _nodes(tree):

@@ -70,7 +70,7 @@ def run(
         If the record of a discretisation error is damaged.
     """
     context = RunContext.of(RunOptions(profile=profile, **options), listener)
-    specs, methods_found = checked_specs(datasets, methods, context.options)
+    specs, methods_found, _ = checked_specs(datasets, methods, context.options)
     _check_test_seed(context.options.test_seed, specs)
     comparison = open_run(out, specs, methods_found, context)
     configurations = configurations_of(methods_found, profile, context.training)

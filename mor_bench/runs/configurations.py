@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from inspect import signature
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mor_bench.errors import InvalidInputError, MissingDependencyError, UnusableClassError
 from mor_bench.measure.method_session import MethodSession
@@ -121,17 +121,6 @@ def may_train(method: MethodSpec) -> bool:
     return _ask_class(method, lambda surrogate: bool(surrogate.trains()), of_others=True)
 
 
-def missing_library(method: MethodSpec) -> str | None:
-    """Return why a class of this package cannot be used here; None if it can."""
-    if not method.surrogate.startswith(OWN):
-        return None
-    try:
-        method.load_class()
-    except MissingDependencyError as error:
-        return str(error)
-    return None
-
-
 def draws_randomly(configuration: Configuration) -> bool:
     """Return whether a fit draws random numbers.
 
@@ -154,11 +143,27 @@ def _ask_class(method: MethodSpec, question: Callable[[type[Any]], bool], of_oth
         return False
 
 
+class CheckedSpecs(NamedTuple):
+    """The specifications of a run.
+
+    Attributes
+    ----------
+    datasets : list of DatasetSpec or ImportedDatasetSpec
+    methods : list of MethodSpec
+    unusable : dict of str to str
+        Why the class of a method cannot be imported here, by the method's name.
+    """
+
+    datasets: list[AnyDatasetSpec]
+    methods: list[MethodSpec]
+    unusable: dict[str, str]
+
+
 def checked_specs(
     datasets: Sequence[str | Path | Mapping[str, Any]],
     methods: Sequence[str | Path] | None,
     options: RunOptions,
-) -> tuple[list[AnyDatasetSpec], list[MethodSpec]]:
+) -> CheckedSpecs:
     """Read and check all specifications, so that no run fails half-way because of one.
 
     Raises
@@ -188,9 +193,9 @@ def checked_specs(
         if isinstance(spec, DatasetSpec):
             _ = spec.load_plan
             check_supports(scene)
-    for method_spec in method_specs:
-        _check_method(method_spec, options)
-    return specs, method_specs
+    found = {method.name: _unusable(method, options) for method in method_specs}
+    unusable = {name: reason for name, reason in found.items() if reason is not None}
+    return CheckedSpecs(specs, method_specs, unusable)
 
 
 def _check_names(kind: str, names: list[str]) -> None:
@@ -214,19 +219,21 @@ def _defaults_of(spec: AnyDatasetSpec) -> tuple[str, ...]:
     return ("gappy-pod", *DATA_METHODS) if imported else OBSERVATION_METHODS
 
 
-def _check_method(spec: MethodSpec, options: RunOptions) -> None:
-    """Check parameters against the class.
+def _unusable(spec: MethodSpec, options: RunOptions) -> str | None:
+    """Check parameters against the class; return why the class cannot be imported, if so.
 
     A third party's class is imported in a worker process, because its import may crash or hang.
     A class that cannot be imported is not an error here: its row gives the reason.
     """
-    if spec.surrogate.startswith(OWN):
-        with suppress(MissingDependencyError):
-            check_method(spec)
-        return
     memory_bytes = options.memory_limit_bytes or default_memory_limit_bytes()
-    with suppress(MethodFailedError, MissingDependencyError, UnusableClassError):
-        check_foreign_method(spec, options.cache or default_cache(), memory_bytes)
+    try:
+        if spec.surrogate.startswith(OWN):
+            check_method(spec)
+        else:
+            check_foreign_method(spec, options.cache or default_cache(), memory_bytes)
+    except (MethodFailedError, MissingDependencyError, UnusableClassError) as error:
+        return str(error)
+    return None
 
 
 def check_foreign_method(spec: MethodSpec, cache: Path, memory_bytes: float) -> None:
@@ -260,4 +267,5 @@ def check_foreign_method(spec: MethodSpec, cache: Path, memory_bytes: float) -> 
 def sealed_folders(cache: Path, out: Path | None = None) -> list[Path]:
     """Return the folders that no method may open: datasets and results, here and by default."""
     caches = [folder / part for folder in (cache, default_cache()) for part in ("datasets", "fits")]
-    return [*caches, Path("reports") / "runs", *([out / "samples"] if out else [])]
+    written = ("samples", "results.json", "comparison.json") if out else ()
+    return [*caches, Path("reports") / "runs", *(Path(out or ".") / name for name in written)]

@@ -14,10 +14,11 @@ from time import perf_counter
 from mor_bench.errors import StoreError
 from mor_bench.measure.latency import (
     BATCH_S,
-    LEAST_TURN_S,
     MOST_BATCH_S,
     MOST_TURN_S,
     PROTOCOLS,
+    SERVER_S,
+    TURN_S,
 )
 from mor_bench.measure.machine_speed import MachineSpeed, recorded_machines
 from mor_bench.measure.method_session import SETTLE_QUERIES
@@ -37,9 +38,9 @@ REFERENCE_DOFS, REFERENCE_TRAINING = 768, 5120
 QUERY_S = 3e-4
 """Typical time of a query on the reference machine and problem, s."""
 
-START_S, TORCH_S, SERVER_S, REPORT_S = 0.3, 2.0, 3.0, 8.0
-"""Times on the reference machine: to start a process, to import PyTorch, to start a fork server,
-and to write tables, figures and report, s."""
+START_S, TORCH_S, REPORT_S = 0.3, 2.0, 8.0
+"""Times on the reference machine: to start a process, to import PyTorch, and to write tables,
+figures and report, s."""
 
 KERNELS_S, METHOD_S = 12.0, 1.0
 """Times to compile the full-order model, and a method that states no `compile_s`, s."""
@@ -169,7 +170,7 @@ def timing_seconds(
 ) -> float:
     """Estimate the seconds of timing configurations, each as fast as a typical query."""
     protocol, cores = PROTOCOLS[context.options.profile], os.cpu_count() or 1
-    turn = min(MOST_TURN_S, max(LEAST_TURN_S, (protocol.queries + SETTLE_QUERIES) * query_s))
+    turn = min(MOST_TURN_S, max(TURN_S, (protocol.queries + SETTLE_QUERIES) * query_s))
     batches = [max(BATCH_S, n * query_s) for n in BATCHES if n * query_s <= MOST_BATCH_S]
     turns = protocol.processes * (protocol.rounds + 1) * turn + sum(batches)
     starts = [START_S + (TORCH_S if needs_torch(item) else 0.0) for item in configurations]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mor_bench.errors import MissingDependencyError
 from mor_bench.mechanics.locking import locking_risk
-from mor_bench.mechanics.model import check_supports, missing_library
+from mor_bench.mechanics.model import check_supports, missing_library, rest_displacement
 from mor_bench.runs.configurations import OWN, check_foreign_method
 from mor_bench.sandbox.process import default_memory_limit_bytes
 from mor_bench.scene.scene import load_scene
@@ -56,6 +56,7 @@ def check_file(path: Path) -> str:
 def _generated(spec: DatasetSpec) -> str:
     scene = load_scene(spec)
     check_supports(scene)
+    rest_displacement(scene)
     missing = missing_library(spec.solver)
     if missing:
         raise MissingDependencyError(f"{missing}.")

@@ -12,6 +12,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from mor_bench.checked_files import read_bytes
 from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, StoreError
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.runs.cached_fit import CachedFit, FitRecord
@@ -174,4 +175,4 @@ def fit_on_cluster(task: ClusterFit) -> tuple[dict[str, Any], bytes | None]:
         restrictions = Restrictions(memory_bytes=task.memory_limit_bytes)
         with SandboxedProcess(MethodSession, restrictions, scene=task.scene) as worker:
             answer = worker.ask("fit", task.limit_s, request=request)
-        return answer, model.read_bytes() if model.exists() else None
+        return answer, read_bytes(model) if model.exists() else None

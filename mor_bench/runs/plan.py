@@ -16,7 +16,6 @@ from mor_bench.runs.configurations import (
     checked_specs,
     configurations_of,
     draws_randomly,
-    missing_library,
 )
 from mor_bench.runs.durations import (
     REPORT_S,
@@ -142,7 +141,7 @@ def plan(
         As `mor_bench.run`.
     """
     context = RunContext.of(RunOptions(profile=profile, **options))
-    specs, methods_found = checked_specs(datasets, methods, context.options)
+    specs, methods_found, unusable = checked_specs(datasets, methods, context.options)
     configurations = [
         configuration
         for method in methods_found
@@ -150,12 +149,12 @@ def plan(
             : context.budget.configurations
         ]
     ]
-    usable = [item for item in configurations if missing_library(item.method) is None]
+    usable = [item for item in configurations if item.method.name not in unusable]
     pace = Pace.measured(any(map(needs_torch, usable)))
     steps: list[Step] = []
     stages: list[Step] = []
     for spec in specs:
-        own = _steps(spec, configurations, context, pace)
+        own = _steps(spec, configurations, unusable, context, pace)
         steps += own
         undone = [
             item
@@ -195,6 +194,7 @@ def _stages(
 def _steps(
     spec: AnyDatasetSpec,
     configurations: Sequence[Configuration],
+    unusable: Mapping[str, str],
     context: RunContext,
     pace: Pace,
 ) -> list[Step]:
@@ -206,8 +206,8 @@ def _steps(
     fits = []
     for configuration in configurations:
         method, label = configuration.method.name, configuration.label
-        if missing := missing_library(configuration.method):
-            title = f"{label} (left out: {missing})"
+        if reason := unusable.get(method):
+            title = f"{label} (left out: {reason})"
             fits.append(Step(spec.name, title, False, 0.0, method=method))
             continue
         if _is_shipped(configuration, spec, context):

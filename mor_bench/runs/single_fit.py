@@ -20,11 +20,14 @@ from mor_bench.measure.predictions import predict_all
 from mor_bench.method_loading import check_predicts, make_surrogate
 from mor_bench.model_file import weights_to_start_from
 from mor_bench.options import FitOptions
+from mor_bench.runs.configurations import OWN, check_foreign_method
 from mor_bench.runs.listener import Listener
 from mor_bench.runs.run_context import training_options
 from mor_bench.runs.scoring import SCORE_CHUNK
+from mor_bench.sandbox.process import default_memory_limit_bytes
 from mor_bench.snapshots.dataset import Dataset, Snapshots, load_dataset
-from mor_bench.snapshots.store import remove_leftovers, temporary_beside
+from mor_bench.snapshots.generate import default_cache
+from mor_bench.snapshots.store import check_replaceable, remove_leftovers, temporary_beside
 from mor_bench.specs import MethodSpec, check_parameters, load_dataset_spec, load_method_spec
 from mor_bench.surrogate import Surrogate
 from mor_bench.training_options import TrainingOptions
@@ -110,6 +113,10 @@ def fit(
     out = Path(out)
     spec = load_dataset_spec(dataset, chosen.suite)
     method_spec = load_method_spec(method, chosen.suite)
+    if not method_spec.surrogate.startswith(OWN):
+        # The import of a third party's module may end Python, or hang.
+        cache = chosen.cache or default_cache()
+        check_foreign_method(method_spec, cache, default_memory_limit_bytes())
     unfitted = _unfitted(method_spec, parameters or {})
     checkpoint = chosen.checkpoint or out.parent / f".{out.name}.checkpoint"
     training = _training(unfitted, chosen)
@@ -183,6 +190,7 @@ def _check_writable(name: str, path: Path) -> None:
     """Check that a file can be written before a long fit begins."""
     if path.is_dir():
         raise InvalidInputError(f"`{name}`: {path} is a folder.")
+    check_replaceable(path)
     remove_leftovers(path.parent, path.name)
     temporary = temporary_beside(path)
     try:

@@ -27,6 +27,12 @@ PRIOR_S = 15.0
 MOST_CORRECTION = 5.0
 """Largest factor by which the pace of a stage corrects the plan."""
 
+MEASURED: tuple[StageName, ...] = ("timing",)
+"""Stages whose share of what is done comes from measured durations of their parts."""
+
+FITTED: tuple[StageName, ...] = ("fit", "other seeds", "learning curve")
+"""Stages of fits."""
+
 OVERTIME = 0.1
 """Share of its duration so far that a task which takes longer than planned is expected to take."""
 
@@ -82,7 +88,8 @@ class TimeLeft:
 
     def share(self, task: Task, n: int) -> float:
         """Return the planned share of the first steps of a task."""
-        steps = self.steps.get(task, [])
+        more = self._excess(task.stage)
+        steps = [seconds + more for seconds in self.steps.get(task, [])]
         return sum(steps[:n]) / sum(steps) if sum(steps) else 0.0
 
     def enter(self, task: Task, now: float, fraction: float = 0.0) -> None:
@@ -99,12 +106,31 @@ class TimeLeft:
         """Estimate the seconds from now to the end of the run."""
         order = list(self.steps)
         first = 0 if self._current is None else order.index(self._current) + 1
-        ahead = sum(sum(self.steps[task]) * self._pace(task.stage) for task in order[first:])
+        ahead = sum(map(self._expected, order[first:]))
         return ahead + self._left_in_current(now)
 
+    def _expected(self, task: Task) -> float:
+        """Return the expected seconds of a task that is not finished.
+
+        Fits that exceed their plan do so by about the same time each, for processes and scores,
+        however long they train. All else is slower or faster by a factor.
+        """
+        planned, more = sum(self.steps[task]), self._excess(task.stage)
+        if more > 0:
+            return planned + len(self.steps[task]) * more
+        return planned * self._pace(task.stage)
+
+    def _excess(self, stage: StageName) -> float:
+        """Return by how much a step of a stage of fits exceeds its plan, s; 0 if it does not."""
+        done = [task for task in self.spent if task.stage == stage and self.steps[task]]
+        if stage not in FITTED or not done:
+            return 0.0
+        more = sum(self.spent[task] - sum(self.steps[task]) for task in done)
+        return max(0.0, more / sum(len(self.steps[task]) for task in done))
+
     def _pace(self, stage: StageName) -> float:
-        """Return measured over planned seconds: of the stage, or of all while it is short."""
-        common = self._ratio(list(self.spent), 1.0)
+        """Return measured over planned seconds of the stage, or of all but fits at first."""
+        common = self._ratio([task for task in self.spent if task.stage not in FITTED], 1.0)
         pace = self._ratio([task for task in self.spent if task.stage == stage], common)
         return min(max(pace, 1 / MOST_CORRECTION), MOST_CORRECTION)
 
@@ -116,10 +142,10 @@ class TimeLeft:
     def _left_in_current(self, now: float) -> float:
         if self._current is None:
             return 0.0
-        total = sum(self.steps[self._current]) * self._pace(self._current.stage)
+        total = self._expected(self._current)
         fraction, at_s = self._seen
         if fraction > 0:
-            trust = min(1.0, 2 * fraction)
+            trust = 1.0 if self._current.stage in MEASURED else min(1.0, 2 * fraction)
             total = (1 - trust) * total + trust * at_s / fraction
         elapsed = now - self._since
         return max(total - elapsed, OVERTIME * elapsed * (1 - fraction))

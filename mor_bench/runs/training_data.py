@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.checked_files import check_file
 from mor_bench.digests import digest_of_arrays
 from mor_bench.mechanics.indicator import ErrorIndicator
 from mor_bench.sandbox.handover import arrays_of, write_snapshots
@@ -26,7 +27,8 @@ from mor_bench.snapshots.dataset import Dataset, Snapshots
 
 
 def digest_of_file(path: Path) -> str:
-    """Return the SHA-256 of a file."""
+    """Return the SHA-256 of a file; errors as in `check_file`."""
+    check_file(path)
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

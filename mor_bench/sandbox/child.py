@@ -21,7 +21,7 @@ from threading import Thread
 from traceback import walk_tb
 from typing import Any, BinaryIO
 
-from mor_bench.errors import MorBenchError, printable
+from mor_bench.errors import MorBenchError, printable, text_of
 from mor_bench.parent_death import end_with_pipe
 from mor_bench.sandbox.seal import Restrictions, seal
 from mor_bench.sandbox.session import Session, session_class
@@ -46,7 +46,7 @@ class _Child:
     ) -> dict[str, Any]:
         """Import the session class, seal the process, and make the session."""
         made_by = session_class(session)
-        seal(restrictions.sealed, restrictions.exempt)
+        seal(restrictions)
         if restrictions.scratch is not None:
             os.environ["TMPDIR"] = tempfile.tempdir = str(restrictions.scratch)
         sys.path[:] = import_path
@@ -74,7 +74,7 @@ def _crash(error: BaseException) -> str:
     own = [place for place in places if not place[0].startswith(("<", *LIBRARIES))]
     file, line = (own or places)[-1]
     where = f"{Path(file).name}, line {line}"
-    return _shown(f"crashed with {type(error).__name__}: {error} ({where})")
+    return _shown(f"crashed with {type(error).__name__}: {text_of(error)} ({where})")
 
 
 def _shown(error: object) -> str:

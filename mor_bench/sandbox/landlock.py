@@ -46,7 +46,11 @@ def version() -> int:
     return max(0, _call(CREATE_RULESET, None, 0, VERSION_FLAG))
 
 
-def close_folders(folders: Sequence[Path], exempt: Path | None = None) -> None:
+def close_folders(
+    folders: Sequence[Path],
+    exempt: Path | None = None,
+    writable: Sequence[Path] | None = None,
+) -> None:
     """Close folders to this thread and to all that it starts, if the kernel has Landlock.
 
     Parameters
@@ -55,6 +59,8 @@ def close_folders(folders: Sequence[Path], exempt: Path | None = None) -> None:
         Folders or files, which need not exist yet.
     exempt : Path, optional
         A folder within them that stays open, or a file that may still be read.
+    writable : sequence of Path, optional
+        The only other folders in which files may be written; by default all that are not closed.
 
     Raises
     ------
@@ -73,6 +79,8 @@ def close_folders(folders: Sequence[Path], exempt: Path | None = None) -> None:
         raise MorBenchError(_REFUSED)
     try:
         for path in _neighbours([Path(os.path.realpath(folder)) for folder in folders]):
+            _allow(ruleset, path, handled if writable is None else READ_FILE)
+        for path in writable or ():
             _allow(ruleset, path, handled)
         if exempt is not None:
             _allow(ruleset, exempt, READ_FILE if exempt.is_file() else handled)

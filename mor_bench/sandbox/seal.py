@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -61,21 +62,18 @@ class Restrictions:
     memory_bytes: float = float("inf")
 
 
-def seal(folders: Sequence[Path], exempt: Path | None = None) -> None:
-    """Close some folders to this process for the rest of its life.
+def seal(restrictions: Restrictions) -> None:
+    """Close the sealed folders to this process for the rest of its life.
 
     Where the kernel has Landlock, it refuses every access to their contents, also to libraries in
     other languages and to processes that this one starts. Everywhere, Python's usual ways to a file
     and the start of programs raise `PermissionError`; there alone, that catches mistakes only.
 
-    Parameters
-    ----------
-    folders : sequence of Path
-        Folders to seal, with all their contents.
-    exempt : Path, optional
-        A folder within them that stays accessible, such as the folder of a training's checkpoint,
-        or a file that may be read.
+    With Landlock, a third party's method can write to its scratch folder and to devices only, and
+    where Python and numba keep what they compiled from its modules. So it cannot change code that
+    runs later without a seal.
     """
+    folders, exempt = restrictions.sealed, restrictions.exempt
     exempt_prefix = None if exempt is None else _prefix(exempt)
     prefixes = tuple(_prefix(folder) for folder in folders)
 
@@ -97,9 +95,43 @@ def seal(folders: Sequence[Path], exempt: Path | None = None) -> None:
         elif event in PROGRAM_EVENTS:
             raise PermissionError(f"{event}: a method must not start programs during a comparison.")
 
-    landlock.close_folders(folders, exempt)
+    landlock.close_folders(folders, exempt, _writable(restrictions))
     sys.addaudithook(refuse)
     _guard_hdf5(check)
+
+
+def _writable(restrictions: Restrictions) -> list[Path] | None:
+    """Return the folders in which a third party's method may write; None for own methods."""
+    if restrictions.import_from is None or restrictions.scratch is None:
+        return None
+    compiled = restrictions.import_from / "__pycache__"
+    with suppress(OSError):
+        if any(restrictions.import_from.glob("*.py")):
+            compiled.mkdir(exist_ok=True)
+    _only_read_compiled_code()
+    return [restrictions.scratch, compiled, Path("/dev")]
+
+
+def _only_read_compiled_code() -> None:
+    """Let numba read its caches in folders in which it cannot write."""
+    from numba.core import caching
+
+    save: Callable[..., None] = caching.Cache.save_overload
+
+    def save_if_possible(*arguments: Any) -> None:
+        with suppress(OSError):
+            save(*arguments)
+
+    def check(locator: Any) -> None:
+        path = locator.get_cache_path()
+        if os.path.exists(path) and not os.access(path, os.W_OK):
+            raise PermissionError(path)
+
+    # Before numba reads a cache, it tries to write beside it, which Landlock would refuse.
+    names: Any = caching
+    names.Cache.save_overload = save_if_possible
+    for name in ("UserProvidedCacheLocator", "InTreeCacheLocator", "UserWideCacheLocator"):
+        getattr(names, name).ensure_cache_path = check
 
 
 def isolation() -> dict[str, str]:

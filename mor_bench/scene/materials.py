@@ -7,9 +7,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from math import hypot
 from typing import ClassVar
 
-from mor_bench.specs import MooneyRivlinMaterial, OgdenMaterial, TwoLameMaterial, YeohMaterial
+from mor_bench.specs import (
+    FibreMaterial,
+    MooneyRivlinMaterial,
+    OgdenMaterial,
+    TwoLameMaterial,
+    YeohMaterial,
+)
 
 
 class Material(ABC):
@@ -184,8 +191,54 @@ class Yeoh(Material):
         return poisson_of(self.bulk_pa, 2 * self.c10_pa)
 
 
+@dataclass(frozen=True)
+class HolzapfelGasserOgden(Material):
+    """W = c10 (Ī₁ - 3) + κ/2 (J - 1)² + Σ k1/(2 k2) (exp(k2 ⟨x⟩²) - 1), x = N:C̄ - 1.
+
+    The sum is over families of fibres, C̄ = J^(-2/3) C, and ⟨x⟩ = max(x, 0), because fibres carry
+    no compression. Fibres along a with dispersion d have N = d I + (1 - 3d) a ⊗ a. Gasser, Ogden &
+    Holzapfel, Journal of the Royal Society Interface 3 (2006), 15-35. Displacements below 1e-10 of
+    the body are inexact, because round-off then decides which fibres are slack.
+
+    Parameters
+    ----------
+    c10_pa, k1_pa, bulk_pa : float
+        Pa; the shear modulus of the matrix at rest is 2 c10.
+    k2 : float
+        How fast the fibres stiffen.
+    dispersion : float
+        d, from 0 for aligned fibres to 1/3 for fibres in all directions.
+    fibres : tuple of tuple of float
+        Direction of each family at rest, of any length.
+    """
+
+    c10_pa: float
+    k1_pa: float
+    k2: float
+    dispersion: float
+    fibres: tuple[tuple[float, float, float], ...]
+    bulk_pa: float
+    law: ClassVar[int] = 6
+
+    def _scaled(self, volume: float, shape: float) -> tuple[float, ...]:
+        stiffnesses = shape * self.c10_pa, volume * self.bulk_pa, shape * self.k1_pa, self.k2
+        return (*stiffnesses, *(n for fibre in self.fibres for n in self._structure(fibre)))
+
+    def _structure(self, fibre: tuple[float, float, float]) -> list[float]:
+        """Return the 6 components of N, in the order 00 11 22 01 02 12."""
+        length, d = hypot(*fibre), self.dispersion
+        a = [component / length for component in fibre]
+        pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+        return [(1 - 3 * d) * a[i] * a[j] + (d if i == j else 0.0) for i, j in pairs]
+
+    @property
+    def poisson_at_rest(self) -> float:
+        """Poisson's ratio of the matrix at small strains."""
+        return poisson_of(self.bulk_pa, 2 * self.c10_pa)
+
+
 def make_material(
-    spec: TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial | YeohMaterial,
+    spec: TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial | YeohMaterial | FibreMaterial,
 ) -> Material:
     """Return the law that a dataset file names."""
     if isinstance(spec, MooneyRivlinMaterial):
@@ -194,6 +247,8 @@ def make_material(
         return Ogden(spec.mu_pa, spec.alpha, spec.bulk_pa)
     if isinstance(spec, YeohMaterial):
         return Yeoh(spec.c10_pa, spec.c20_pa, spec.c30_pa, spec.bulk_pa)
+    if isinstance(spec, FibreMaterial):
+        return HolzapfelGasserOgden(**spec.model_dump(exclude={"law"}))
     return _TWO_LAME[spec.law](spec.young_pa, spec.poisson)
 
 

@@ -16,22 +16,23 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
+from mor_bench.scene.body import build_body
 from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets, Patches, cut_patches, spread_out
 from mor_bench.scene.materials import Material, make_material
-from mor_bench.scene.mesh import Mesh, box_mesh, l_mesh
+from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.regions import Cloud, region_points
 from mor_bench.scene.snapshot_file import ImportedArrays, read_arrays
+from mor_bench.scene.springs import Springs, foundations
 from mor_bench.scene.subdivision import subdivide
 from mor_bench.specs import (
+    AXES,
     AnyDatasetSpec,
     BoxGeometry,
     DatasetSpec,
     ImportedDatasetSpec,
     LShapeGeometry,
-    TetrahedraGeometry,
-    VoxelsGeometry,
     generated,
     load_dataset_spec,
 )
@@ -50,18 +51,30 @@ class Scene:
         None for imported snapshots, whose equations are unknown. Such a scene has no patches.
     fixed_nodes : (n_fixed,) int64
         Nodes with u = 0.
+    held_dofs : (n_held,) int64
+        Components of other nodes with u = 0, as on rollers and planes of symmetry.
     embedded_surface : Facets or None
         The smooth surface from which a mesh of voxels was made. Loads act on it.
     point_sets : mapping of str to (n,) int64
         Named sets of nodes from a mesh file.
+    springs : tuple of Springs
+        Foundations.
+    memo : dict of str to float64
+        Arrays that are computed once for a scene, such as its rest state under gravity.
     """
 
     spec: AnyDatasetSpec
     mesh: Mesh
     material: Material | None
     fixed_nodes: NDArray[np.int64]
+    held_dofs: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     embedded_surface: Facets | None = field(default=None, repr=False)
     point_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict, repr=False)
+
+    springs: tuple[Springs, ...] = field(default=(), repr=False)
+    memo: dict[str, NDArray[np.float64]] = field(
+        init=False, default_factory=dict, repr=False, compare=False
+    )
 
     @property
     def name(self) -> str:
@@ -79,8 +92,19 @@ class Scene:
 
     @cached_property
     def free_dofs(self) -> NDArray[np.int64]:
-        """(n_free,) dofs, 3 * node + axis, of the nodes that are not fixed."""
-        return np.setdiff1d(np.arange(self.mesh.n_dofs), dofs_of_nodes(self.fixed_nodes))
+        """(n_free,) dofs, 3 * node + axis, that no support holds."""
+        return np.setdiff1d(np.arange(self.mesh.n_dofs), self.fixed_dofs)
+
+    @property
+    def fixed_dofs(self) -> NDArray[np.int64]:
+        """Sorted dofs with u = 0: those of the fixed nodes, and the held ones."""
+        return np.union1d(dofs_of_nodes(self.fixed_nodes), self.held_dofs)
+
+    @cached_property
+    def spring_matrix(self) -> sp.csr_array | None:
+        """(n_dofs, n_dofs) stiffness of the springs, N/m; None without springs."""
+        matrices = [springs.matrix(self.mesh) for springs in self.springs]
+        return sp.csr_array(sum(matrices[1:], matrices[0])) if matrices else None
 
     @cached_property
     def _cloud(self) -> Cloud:
@@ -317,13 +341,15 @@ def refined(scene: Scene) -> Scene:
         nx, ny, nz = (2 * n for n in geometry.cells)
         return with_cells(scene, (nx, ny, nz))
     mesh, parents = subdivide(scene.mesh)
-    fixed = np.isin(parents, scene.fixed_nodes).all(axis=1)
-    return replace(scene, mesh=mesh, fixed_nodes=np.flatnonzero(fixed), point_sets={})
+    still = np.zeros(scene.mesh.n_dofs, dtype=bool)
+    still[scene.fixed_dofs] = True
+    fixed, held = _by_node(np.all(still.reshape(-1, 3)[parents], axis=1))
+    return replace(scene, mesh=mesh, fixed_nodes=fixed, held_dofs=held, point_sets={})
 
 
 def _without_patches(spec: DatasetSpec) -> Scene:
     """Build a scene without searching its load region."""
-    mesh, surface, point_sets = _body(spec)
+    mesh, surface, point_sets = build_body(spec)
     element = "tetrahedron" if mesh.cells.shape[1] == 4 else "hexahedron"
     if element != spec.discretisation.element:
         raise SpecError(
@@ -331,41 +357,18 @@ def _without_patches(spec: DatasetSpec) -> Scene:
             f"got {spec.discretisation.element!r}."
         )
     cloud = Cloud(mesh.points, np.unique(mesh.boundary_facets), point_sets)
-    held = [region_points(cloud, support.region) for support in spec.supports]
-    fixed = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *held]))
-    if len(fixed) == mesh.n_nodes:
+    still = np.zeros((mesh.n_nodes, 3), dtype=bool)
+    for support in spec.supports:
+        nodes = region_points(cloud, support.region)
+        still[nodes[:, None], [AXES.index(axis) for axis in support.components]] = True
+    if still.all():
         raise SpecError("the supports fix every node of the mesh: nothing can move.")
-    return Scene(spec, mesh, make_material(spec.material), fixed, surface, point_sets)
+    material, held = make_material(spec.material), _by_node(still)
+    springs = foundations(spec, surface or Facets(mesh.points, mesh.boundary_facets), point_sets)
+    return Scene(spec, mesh, material, *held, surface, point_sets, springs)
 
 
-def _body(
-    spec: DatasetSpec,
-) -> tuple[Mesh, Facets | None, Mapping[str, NDArray[np.int64]]]:
-    """Return mesh, embedded surface and named sets of nodes of a geometry.
-
-    Readers and mesh generators are imported on demand, because their import is slow.
-    """
-    geometry, tetrahedra = spec.geometry, spec.discretisation.element == "tetrahedron"
-    if isinstance(geometry, LShapeGeometry):
-        return l_mesh(geometry.size_m, geometry.cells, geometry.cut_cells, tetrahedra), None, {}
-    if isinstance(geometry, BoxGeometry):
-        return box_mesh(geometry.size_m, geometry.cells, tetrahedra), None, {}
-    if isinstance(geometry, VoxelsGeometry):
-        from mor_bench.scene.liver import liver_surface
-        from mor_bench.scene.surfaces import read_surface
-        from mor_bench.scene.voxels import voxel_mesh
-
-        if geometry.surface == "liver":
-            surface = liver_surface()
-        else:
-            surface = read_surface(geometry.surface.checked(), geometry.unit_m)
-        mesh = voxel_mesh(surface, geometry.cells)
-        return mesh, Facets(surface.points, surface.triangles), {}
-    if isinstance(geometry, TetrahedraGeometry):
-        from mor_bench.scene.liver import liver_tetrahedra
-
-        return liver_tetrahedra(), None, {}
-    from mor_bench.scene.files import read_mesh
-
-    mesh, point_sets = read_mesh(geometry.file.checked(), geometry.unit_m)
-    return mesh, None, point_sets
+def _by_node(still: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return nodes without a free component, and held dofs of the others, from (n_nodes, 3)."""
+    fixed = np.all(still, axis=1, keepdims=True)
+    return np.flatnonzero(fixed), np.flatnonzero(still & ~fixed)

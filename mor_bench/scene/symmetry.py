@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mor_bench.scene.materials import HolzapfelGasserOgden, Material
 from mor_bench.scene.scene import Scene
 
 SAME_PLACE = 1e-6
@@ -35,29 +36,47 @@ class Mirror:
 
 
 def mirrors(scene: Scene) -> list[Mirror]:
-    """Return the mirror planes of mesh, supports and loaded nodes, at most one per axis.
+    """Return the mirror planes of a scene with its loaded nodes, at most one per axis.
 
-    All materials are isotropic, so the image of a solution solves the image of its load.
+    The image of a solution solves the image of its load, because laws are isotropic or their fibres
+    have an image too.
     """
     points, cells = scene.mesh.points, scene.mesh.cells
     low, high = points.min(axis=0), points.max(axis=0)
     near = SAME_PLACE * np.linalg.norm(high - low)
     tree = cKDTree(points)
     own_cells = _rows(cells)
-    kept = scene.fixed_nodes, np.unique(scene.patch_weights.indices)
+    held = [scene.fixed_dofs[scene.fixed_dofs % 3 == i] // 3 for i in range(3)]
+    kept = *held, np.unique(scene.patch_weights.indices)
+    gravity, springs = scene.generated.gravity, np.zeros((len(points), 3))
+    if scene.spring_matrix is not None:
+        springs = scene.spring_matrix.diagonal().reshape(-1, 3)
     found = []
     for axis in range(3):
         images = points.copy()
         images[:, axis] = low[axis] + high[axis] - points[:, axis]
         distance, nodes = (np.asarray(part) for part in tree.query(images))
         if (
-            distance.max() <= near
+            not (gravity and gravity.acceleration_m_s2[axis])
+            and _has_fibres_as_image(scene.material, axis)
+            and distance.max() <= near
             and len(np.unique(nodes)) == len(nodes)
             and np.array_equal(_rows(nodes[cells]), own_cells)
+            and np.allclose(springs[nodes], springs, atol=1e-6 * springs.max())
             and all(np.array_equal(np.sort(nodes[part]), np.sort(part)) for part in kept)
         ):
             found.append(Mirror(axis, nodes.astype(np.int64)))
     return found
+
+
+def _has_fibres_as_image(material: Material | None, axis: int) -> bool:
+    """Return whether the image of every family of fibres is a family of fibres."""
+    if not isinstance(material, HolzapfelGasserOgden):
+        return True
+    fibres = np.array(material.fibres) / np.linalg.norm(material.fibres, axis=1)[:, None]
+    images = fibres * np.where(np.arange(3) == axis, -1.0, 1.0)
+    parallel: NDArray[np.float64] = np.abs(images @ fibres.T).max(axis=1)
+    return bool((parallel >= 1.0 - 1e-9).all())
 
 
 def _rows(cells: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -12,7 +12,7 @@ from typing import Any, Unpack, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import InvalidInputError
+from mor_bench.errors import InvalidInputError, check_count
 from mor_bench.scene.scene import Scene, as_spec, imported_scene, load_scene
 from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import GenerationOptions, generate, read_shards
@@ -191,8 +191,7 @@ def load_dataset(
     """
     if unknown := sorted(generation.keys() - GenerationOptions.__annotations__.keys()):
         raise TypeError(f"load_dataset() got an unexpected keyword argument {unknown[0]!r}")
-    if limit is not None and limit < 1:
-        raise InvalidInputError(f"`limit` must be an integer >= 1; got {limit}.")
+    check_count("limit", limit)
     check_pool(generation.get("workers"), generation.get("cluster"))
     if split not in (None, *get_args(SplitBy)):
         raise InvalidInputError(

@@ -23,7 +23,7 @@ from threading import Thread
 from time import sleep
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from mor_bench.errors import InvalidInputError, MissingDependencyError, WorkerError
+from mor_bench.errors import InvalidInputError, MissingDependencyError, WorkerError, check_count
 from mor_bench.parent_death import end_with_parent
 
 if TYPE_CHECKING:
@@ -79,8 +79,7 @@ def check_pool(workers: int | None, cluster: str | None) -> None:
     InvalidInputError
         If ``workers`` is less than 1, both are given, or the address is not ``tcp://host:port``.
     """
-    if workers is not None and workers < 1:
-        raise InvalidInputError(f"`workers` must be an integer >= 1; got {workers}.")
+    check_count("workers", workers)
     if cluster is not None and workers is not None:
         raise InvalidInputError(
             "`workers` and `cluster` cannot be used together: a cluster uses all its workers."

@@ -163,5 +163,5 @@ def update_manifest(folder: Path, manifest: Manifest, *, solves: bool) -> None:
         environments = (*environments, this_environment())
     content = replace(manifest, environments=environments).to_json()
     path = folder / NAME
-    if not path.is_file() or path.read_bytes() != content:
+    if not path.is_file() or read_bytes(path) != content:
         write_atomically(path, content)

@@ -99,6 +99,20 @@ def temporary_beside(path: Path) -> Path:
     return path.with_name(f".{path.name}.{owner}.{secrets.token_hex(4)}.tmp")
 
 
+def check_replaceable(path: Path) -> None:
+    """Refuse a folder, and a device or a pipe, which a file would replace.
+
+    Raises
+    ------
+    StoreError
+        If something other than a file is there.
+    """
+    if path.is_dir():
+        raise StoreError(f"{path}: is a folder, so no file can be written there.")
+    if path.exists() and not path.is_file():
+        raise StoreError(f"{path}: is a device or pipe, so no file can be written there.")
+
+
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file so that it is complete or absent, even if the process is killed."""
     temporary = temporary_beside(path)
@@ -109,10 +123,11 @@ def write_atomically(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        error.filename = error.filename or str(path)  # a full disk has no name
+        error.filename, error.filename2 = str(path), None  # the user knows no temporary file
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(NotADirectoryError):
+            temporary.unlink(missing_ok=True)
 
 
 def remove_leftovers(folder: Path, of: str = "*") -> None:

@@ -24,8 +24,9 @@ from mor_bench.specs.geometry_spec import (
     TetrahedraGeometry,
     VoxelsGeometry,
 )
-from mor_bench.specs.loads_spec import Loads, Sampling, Split, SplitBy
+from mor_bench.specs.loads_spec import AXES, Loads, Sampling, Split, SplitBy
 from mor_bench.specs.material_spec import (
+    FibreMaterial,
     MooneyRivlinMaterial,
     OgdenMaterial,
     SolverName,
@@ -53,6 +54,7 @@ from mor_bench.specs.spec_files import (
 from mor_bench.specs.suite_folder import find_suite, list_suite
 
 __all__ = [
+    "AXES",
     "MAX_COUNT",
     "NO_EQUATIONS",
     "NO_FORCES",
@@ -62,6 +64,7 @@ __all__ = [
     "BoxGeometry",
     "BoxRegion",
     "DatasetSpec",
+    "FibreMaterial",
     "FileGeometry",
     "ImportedDatasetSpec",
     "LShapeGeometry",

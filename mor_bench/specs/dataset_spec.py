@@ -11,11 +11,22 @@ from pydantic import AfterValidator, Field
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.specs.base import Name, Positive, StrictModel, Text
-from mor_bench.specs.geometry_spec import MAX_CELLS, Geometry
-from mor_bench.specs.loads_spec import ExtraTests, ImportedSplit, Loads, Split, Support
+from mor_bench.specs.geometry_spec import Geometry
+from mor_bench.specs.loads_spec import (
+    ExtraTests,
+    Gravity,
+    ImportedSplit,
+    Loads,
+    Split,
+    Spring,
+    Support,
+)
 from mor_bench.specs.material_spec import Discretisation, MaterialSpec, SolverName
 from mor_bench.specs.region_spec import Outputs, Region
 from mor_bench.specs.source_file import File, without_paths
+
+MAX_NODES = 1_000_000
+"""Largest number of nodes of the grid to which samples are interpolated."""
 
 NO_EQUATIONS = "its snapshots were imported, so its equations are not known"
 NO_FORCES = "its forces are not known, only the displacements of a part of its surface"
@@ -24,8 +35,8 @@ Side = Annotated[int, Field(ge=2, le=1024)]
 
 
 def _few_enough(value: tuple[int, int, int]) -> tuple[int, int, int]:
-    if prod(value) > MAX_CELLS:
-        raise ValueError(f"there must be at most {MAX_CELLS:,} nodes in all")
+    if prod(value) > MAX_NODES:
+        raise ValueError(f"there must be at most {MAX_NODES:,} nodes in all")
     return value
 
 
@@ -98,6 +109,10 @@ class DatasetSpec(CommonDatasetSpec):
 
     Attributes
     ----------
+    springs : tuple of Spring
+        Foundations, none by default.
+    gravity : Gravity, optional
+        A constant pre-load: displacements are measured from the rest state under it.
     loads : Loads, optional
         Without it the scene can be solved for given forces, but no samples can be drawn.
     """
@@ -107,6 +122,10 @@ class DatasetSpec(CommonDatasetSpec):
     solver: SolverName = "auto"
     material: MaterialSpec
     supports: Annotated[tuple[Support, ...], Field(strict=False)] = ()
+    springs: Annotated[
+        tuple[Spring, ...], Field(strict=False, exclude_if=lambda value: not value)
+    ] = ()
+    gravity: Gravity | None = None
     loads: Loads | None = None
     split: Split = Split()
     tests: ExtraTests = ExtraTests()
@@ -123,7 +142,15 @@ class DatasetSpec(CommonDatasetSpec):
     def physics(self) -> dict[str, Any]:
         dumped = self.model_dump(
             mode="json",
-            include={"geometry", "discretisation", "material", "supports", "loads"},
+            include={
+                "geometry",
+                "discretisation",
+                "material",
+                "supports",
+                "springs",
+                "gravity",
+                "loads",
+            },
             exclude_none=True,
         )
         physics: dict[str, Any] = without_paths(dumped)

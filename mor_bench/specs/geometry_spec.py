@@ -9,8 +9,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, mod
 from mor_bench.specs.base import Count, Length, StrictModel
 from mor_bench.specs.source_file import File, SourceFile, read_source_file
 
-MAX_CELLS = 1_000_000
-"""Largest number of cells of a grid. A larger model takes minutes to build."""
+MAX_CELLS = 400_000
+"""Largest number of cells of a grid, with 1.2 million unknowns."""
 
 
 def _fits_in_memory(value: tuple[int, int, int]) -> tuple[int, int, int]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, get_args
 
 from pydantic import AfterValidator, Field, model_validator
 
-from mor_bench.specs.base import Area, Count, Length, StrictModel
+from mor_bench.specs.base import Area, Count, Finite, Length, Positive, StrictModel, in_range
 from mor_bench.specs.region_spec import Region
 
 LoadKind = Literal["force", "normal", "tangential"]
@@ -32,10 +32,73 @@ Magnitude = Annotated[
 """Lower and upper end of a range of forces, N."""
 
 
+Axis = Literal["x", "y", "z"]
+AXES: tuple[Axis, ...] = get_args(Axis)
+
+
+def _different(value: tuple[Axis, ...]) -> tuple[Axis, ...]:
+    if not value or len(set(value)) < len(value):
+        raise ValueError("one to three different components must be given")
+    return value
+
+
+Components = Annotated[
+    tuple[Axis, ...],
+    Field(strict=False, exclude_if=lambda value: set(value) == set(AXES)),
+    AfterValidator(_different),
+]
+
+
 class Support(StrictModel):
-    """A region whose nodes do not move."""
+    """A region whose nodes do not move, or move only perpendicular to some axes.
+
+    Attributes
+    ----------
+    region : Region
+    components : tuple of str
+        The components of the displacement that are zero: all three by default. One component is a
+        roller; on a plane across its axis, it is a plane of symmetry.
+    """
 
     region: Region
+    components: Components = AXES
+
+
+class Spring(StrictModel):
+    """A Winkler foundation: springs without mass on the surface of a region.
+
+    Attributes
+    ----------
+    region : Region
+        The facets with all corners in it rest on springs.
+    stiffness_n_m3 : float
+        Traction per displacement from the undeformed body.
+    components : tuple of str
+        The components of the displacement that the springs resist: all three by default.
+    """
+
+    region: Region
+    stiffness_n_m3: Annotated[Positive, in_range(1e-12, 1e18, "N/m³")]
+    components: Components = AXES
+
+
+class Gravity(StrictModel):
+    """A uniform body force that acts before and during every load.
+
+    Attributes
+    ----------
+    density_kg_m3 : float
+        Density of the undeformed body.
+    acceleration_m_s2 : three floats
+        Along x, y and z; (0, 0, -9.81) by default.
+    """
+
+    density_kg_m3: Positive
+    acceleration_m_s2: Annotated[tuple[Finite, Finite, Finite], Field(strict=False)] = (
+        0.0,
+        0.0,
+        -9.81,
+    )
 
 
 class Loads(StrictModel):

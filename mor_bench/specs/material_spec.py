@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import hypot
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -95,7 +96,32 @@ class YeohMaterial(StrictModel):
         return self
 
 
+_Component = Annotated[float, Field(ge=-1e6, le=1e6)]
+_Direction = Annotated[tuple[_Component, _Component, _Component], Field(strict=False)]
+
+
+class FibreMaterial(StrictModel):
+    """Holzapfel-Gasser-Ogden: a neo-Hookean matrix with families of fibres that carry tension."""
+
+    law: Literal["holzapfel-gasser-ogden"]
+    c10_pa: Modulus
+    k1_pa: Modulus
+    k2: Annotated[float, Field(ge=1e-6, le=1e3)]
+    dispersion: Annotated[float, Field(ge=0, le=1 / 3)] = 0.0
+    fibres: Annotated[tuple[_Direction, ...], Field(strict=False, min_length=1, max_length=8)]
+    bulk_pa: Modulus
+
+    @model_validator(mode="after")
+    def _has_directions(self) -> FibreMaterial:
+        short = [fibre for fibre in self.fibres if hypot(*fibre) < 1e-6]
+        if short:
+            raise ValueError(
+                f"every direction in `fibres` must be at least 1e-06 long; got {short[0]}"
+            )
+        return self
+
+
 MaterialSpec = Annotated[
-    TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial | YeohMaterial,
+    TwoLameMaterial | MooneyRivlinMaterial | OgdenMaterial | YeohMaterial | FibreMaterial,
     Field(discriminator="law"),
 ]

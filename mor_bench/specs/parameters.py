@@ -15,7 +15,7 @@ from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, create_model
 
-from mor_bench.errors import MissingDependencyError, SpecError, UnusableClassError
+from mor_bench.errors import MissingDependencyError, SpecError, UnusableClassError, text_of
 from mor_bench.specs.one_line_errors import nearest_name, validated
 
 
@@ -44,7 +44,7 @@ def load_class(target: str, folder: Path | None = None) -> type[Any]:
         raise SpecError(f"surrogate {target!r} cannot be imported: {error}") from error
     except (Exception, SystemExit) as error:  # foreign code runs here
         raise UnusableClassError(
-            f"surrogate {target!r} cannot be imported: {type(error).__name__}: {error}"
+            f"surrogate {target!r} cannot be imported: {type(error).__name__}: {text_of(error)}"
             f"{_line_in(folder, error)}"
         ) from error
     if not hasattr(loaded, name):

@@ -36,10 +36,17 @@ class SourceFile(StrictModel):
         Raises
         ------
         SpecError
-            If the file is missing, is a device or pipe, or has changed.
+            If the file is missing, is a device or pipe, or has changed. The message is the same
+            for all, so that a forged specification does not find out which files exist.
         """
-        if _sha256(Path(self.path)) != self.sha256:
-            raise SpecError(f"{self.path}: the file has changed since the dataset was read.")
+        try:
+            same = _sha256(Path(self.path)) == self.sha256
+        except SpecError:
+            same = False
+        if not same:
+            raise SpecError(
+                f"{self.path}: the file has changed since the dataset was read, or is missing."
+            )
         return Path(self.path)
 
 

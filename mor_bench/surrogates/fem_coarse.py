@@ -67,7 +67,7 @@ class CoarseFEM(Surrogate):
                 (self.restriction_ @ load).ravel()[coarse.free_dofs], options=options
             ).displacement
             row[:] = self.interpolation_ @ displacement.reshape(-1, 3)
-        out[:, self.scene_.fixed_nodes] = 0
+        out.reshape(len(out), self.scene_.mesh.n_dofs)[:, self.scene_.fixed_dofs] = 0
         return out
 
     def _coarse(self, scene: Scene) -> Scene:

@@ -67,8 +67,8 @@ class OperatorSurrogate(FieldSurrogate):
         self, network: FieldNetwork, data: dict[str, Tensor], generator: torch.Generator
     ) -> Loss:
         features, targets = data["features"], data["targets"]
-        free = torch.ones(targets.shape[1], 1)
-        free[torch.from_numpy(self.scene_.fixed_nodes)] = 0.0
+        free = torch.ones(targets.shape[1:])
+        free.view(-1)[torch.from_numpy(self.scene_.fixed_dofs)] = 0.0
         free = free.to(targets.device)
 
         def loss(rows: Tensor) -> Tensor:

@@ -81,4 +81,4 @@ class GappyPOD(Surrogate):
 def _observed_places(scene: Scene) -> NDArray[np.int64]:
     nodes = scene.observed_nodes
     assert nodes is not None
-    return np.searchsorted(scene.free_dofs, dofs_of_nodes(nodes))
+    return np.flatnonzero(np.isin(scene.free_dofs, dofs_of_nodes(nodes)))

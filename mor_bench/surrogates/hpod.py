@@ -48,6 +48,8 @@ class HyperReducedPOD(CubatureSurrogate):
         target = np.concatenate(
             [modes.T @ model.force(modes @ coordinates).force for coordinates in q]
         )
+        if model.springs is not None:  # they are no part of the cubature
+            target -= (q @ (modes.T @ (model.springs @ modes))).ravel()
         both = triangle(np.column_stack([own, target]))
         factors = sparse_nnls(
             np.ascontiguousarray(both[:, :-1]), both[:, -1], tolerance

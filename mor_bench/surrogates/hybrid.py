@@ -145,8 +145,7 @@ class Hybrid(Surrogate):
             correction = inverse.solve_many([residual], [inverse.turned(u)])[0]
             u = u + memory.advance(u, correction, residual)
         near = float(np.linalg.norm(u - guess)) <= NEAR * float(np.linalg.norm(u))
-        at_nodes = np.append(u, np.zeros(3)).reshape(-1, 3)
-        if near and _least_det_f(at_nodes, *inverse.cells[:2]) >= SURE:
+        if near and _least_det_f(inverse.at_nodes(u), *inverse.cells[:2]) >= SURE:
             return u
         state = self.model_.force(u)
         better = float(np.linalg.norm(load - state.force)) <= WORSE * float(np.linalg.norm(load))

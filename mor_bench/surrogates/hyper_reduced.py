@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.assembly import discretisation_of
-from mor_bench.mechanics.model import FullOrderModel, unknown_equations
+from mor_bench.mechanics.model import FullOrderModel, body_of, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.model_arrays import take_array, take_indices
 from mor_bench.reduction.basis import pod
@@ -53,7 +52,7 @@ def reduced_points(
     test_modes: Array | None = None,
 ) -> ReducedPoints:
     """Return the scene's law over some cells, with nodal modes and test modes (n_nodes, 3, r)."""
-    return ReducedPoints(discretisation_of(scene, cells), weights, modes, test_modes)
+    return ReducedPoints(body_of(scene, cells), weights, modes, test_modes)
 
 
 CUBATURE_TOLERANCES = (3e-2, 1e-2, 3e-3, 1e-3)

@@ -62,6 +62,8 @@ class QuadraticManifoldGalerkin(Surrogate):
     needs_snapshots: ClassVar[bool] = False
 
     def supports(self, scene: Scene) -> str | None:
+        if scene.springs:
+            return "its cubature has no springs, and the scene rests on some"
         return unknown_equations(scene)
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:

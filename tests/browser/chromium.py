@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,10 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Locator, Page
 
 ARGUMENTS = [
     "--no-sandbox",  # containers run tests as root
@@ -79,6 +82,11 @@ def visit(browser: Browser, path: Path, width: int = 1400, **options: Any) -> It
     page.locator('.chart [data-drawn="yes"]').first.wait_for(state="attached", timeout=120_000)
     yield found
     context.close()
+
+
+def pixels_of(element: Locator) -> Any:
+    """Return the pixels of an element as it is shown."""
+    return np.asarray(Image.open(io.BytesIO(element.screenshot())).convert("RGB"))
 
 
 def _note(requests: list[str], url: str, path: Path) -> None:

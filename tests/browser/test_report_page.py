@@ -2,53 +2,29 @@
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from mor_bench.analysis.analyse import analyse
 from mor_bench.report.method_styles import DARK, WHITE, contrast
 from mor_bench.report.number_format import number, percent
 from mor_bench.report.page import render
-from tests.browser.chromium import Visit, chromium, visit
+from tests.browser.chromium import Visit, pixels_of, visit
 from tests.hostile_runs import hostile_run
 from tests.synthetic import synthetic_comparison
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Locator
+    from playwright.sync_api import Browser
 
+pytest_plugins = ("tests.browser.rich_page",)
 pytestmark = pytest.mark.slow
 
 MOST_BYTES = 6_000_000
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as started:
-        yield started
-
-
-@pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The page of a run with everything that a run can measure."""
-    made = synthetic_comparison(tmp_path_factory.mktemp("rich"), per_region=8)
-    for row in list(made.rows):
-        if row.method == "fem":
-            made.put(row.with_parts(reference=True))
-    return render(made, analyse(made, n_resamples=200))[-1]
-
-
-@pytest.fixture
-def open_page(browser: Browser, path: Path) -> Iterator[Visit]:
-    with visit(browser, path) as found:
-        yield found
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -293,11 +269,6 @@ def test_the_bodies_are_drawn_and_turn_together(open_page: Visit) -> None:
     for i, old in enumerate(before):
         new = pixels_of(views.nth(i).locator("canvas").first)
         assert (np.abs(new.astype(int) - old).max(axis=2) > 20).mean() > 0.005
-
-
-def pixels_of(element: Locator) -> Any:
-    """Return the pixels of an element as it is shown."""
-    return np.asarray(Image.open(io.BytesIO(element.screenshot())).convert("RGB"))
 
 
 def test_a_phone_shows_the_first_number_of_every_table(browser: Browser, path: Path) -> None:

@@ -20,10 +20,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.analysis.draws import Draws, Interval
+from mor_bench.analysis.draws import Draws, Interval, draws_of, headlines
 from mor_bench.analysis.selection import decide
-from mor_bench.analysis.verdict import RULE, needs_of
+from mor_bench.analysis.verdict import RULE, Verdict, needs_of
+from mor_bench.measure.error_metrics import ERRORS as FIGURES
+from mor_bench.measure.error_metrics import SampleErrors, summary
 from mor_bench.results.comparison import Comparison
+from mor_bench.results.row import Row
 from mor_bench.snapshots.store import write_atomically
 from tests.published.stored import content_of
 
@@ -84,6 +87,19 @@ def _write(group: h5py.Group, arrays: Mapping[str, NDArray[Any]]) -> None:
         group.create_dataset(name, data=stored, track_times=False, **packed)
 
 
+def _intervals(record: Mapping[str, Any]) -> dict[str, Interval]:
+    """Return the intervals of a row of comparison.json."""
+    found = {k: v for k, v in record.items() if isinstance(v, dict)}
+    return {k: (v["low"], inf if v["high"] is None else v["high"]) for k, v in found.items()}
+
+
+def verdict_again(comparison: Comparison, analysis: Mapping[str, Any], name: str) -> Verdict:
+    """Reach the verdict on a dataset from the rows and the stored intervals."""
+    intervals = {r["label"]: _intervals(r) for r in analysis["rows"] if r["dataset"] == name}
+    none = np.zeros((0, 1))
+    return decide(comparison, name, needs_of(comparison, name), Draws([], none, none, intervals))
+
+
 def wrong_verdicts(folder: Path) -> Iterator[str]:
     """Reach the verdicts again from the stored rows and intervals; yield each difference.
 
@@ -93,21 +109,12 @@ def wrong_verdicts(folder: Path) -> Iterator[str]:
     analysis = content_of("comparison.json", folder)
     for stored in analysis["verdicts"]:
         name = stored["dataset"]
-        intervals: dict[str, dict[str, Interval]] = {}
         for record in analysis["rows"]:
-            if record["dataset"] == name:
-                found = {k: v for k, v in record.items() if isinstance(v, dict)}
-                intervals[record["label"]] = {
-                    k: (v["low"], inf if v["high"] is None else v["high"]) for k, v in found.items()
-                }
-                for figure, v in found.items():
-                    low, high = intervals[record["label"]][figure]
-                    if not low <= (inf if v["value"] is None else v["value"]) <= high:
-                        yield f"{record['label']}: {figure} lies outside its interval"
-        none = np.zeros((0, 1))
-        again = decide(
-            comparison, name, needs_of(comparison, name), Draws([], none, none, intervals)
-        )
+            for figure, (low, high) in _intervals(record).items():
+                value = inf if record[figure]["value"] is None else record[figure]["value"]
+                if record["dataset"] == name and not low <= value <= high:
+                    yield f"{record['label']}: {figure} lies outside its interval"
+        again = verdict_again(comparison, analysis, name)
         qualified = [row.label for row in again.qualified]
         if qualified != stored["qualified"]:
             yield f"{name}: {qualified} qualify, stated are {stored['qualified']}"
@@ -117,24 +124,88 @@ def wrong_verdicts(folder: Path) -> Iterator[str]:
             yield f"{name}: the rule is not stated as {RULE!r}"
 
 
+class StoredRun(Comparison):
+    """A run in compact form, with the errors of its samples."""
+
+    def samples(self, row: Row) -> dict[str, NDArray[Any]]:
+        """Read the errors of a row that ran."""
+        return self._arrays(f"{row.dataset}/{row.label}")
+
+    def dataset_arrays(self, name: str) -> dict[str, NDArray[Any]]:
+        """Read the arrays of a dataset."""
+        return self._arrays(name)
+
+    def _arrays(self, name: str) -> dict[str, NDArray[Any]]:
+        with h5py.File(self.out / ERRORS, "r") as file:
+            found = {k: v[()] for k, v in file[name].items() if isinstance(v, h5py.Dataset)}
+        return {k: v.astype(float) if v.dtype == np.float32 else v for k, v in found.items()}
+
+
+PARTS = {"validation": "validation_relative_l2", "hidden": "hidden_relative_l2"}
+"""Arrays of the relative errors on other samples than those of the test set, by part of a row."""
+
+
 def wrong_summaries(folder: Path) -> Iterator[str]:
     """Compare the errors in results.json with those of the samples; yield each difference."""
-    comparison = Comparison.read(folder)
-    with h5py.File(folder / ERRORS, "r") as file:
-        for row in comparison.rows:
-            if not row.ok or row.error is None:
-                continue
-            samples = file[row.dataset][row.label]
-            relative = np.asarray(samples["relative_l2"][()], dtype=float)
-            computed = {
-                "rel_l2_median": float(np.median(relative)),
-                "rel_l2_p95": float(np.percentile(relative, 95, method="higher")),
-                "rel_l2_max": float(np.max(relative)),
-                "mean_dof_m": float(np.mean(samples["mean_dof_m"][()], dtype=float)),
-            }
-            if len(relative) != row.n_test:
-                yield f"{row.label}: {len(relative)} samples of {row.n_test}"
-            for name, value in computed.items():
-                said = float(getattr(row.error, name))
-                if not np.isclose(value, said, rtol=1e-5, atol=1e-12, equal_nan=True):
-                    yield f"{row.dataset}, {row.label}: {name} is {value:g}, stated as {said:g}"
+    run = StoredRun.read(folder)
+    for row in run.rows:
+        if not row.ok or row.error is None:
+            continue
+        samples = run.samples(row)
+        if len(samples["relative_l2"]) != row.n_test:
+            yield f"{row.label}: {len(samples['relative_l2'])} samples of {row.n_test}"
+        computed = {"error": summary(SampleErrors(**{name: samples[name] for name in FIGURES}))}
+        for part, name in PARTS.items():
+            if getattr(row, part) is not None and name not in samples:
+                yield f"{row.label}: there are no samples of {part}"
+            elif getattr(row, part) is not None:
+                computed[part] = _relative(samples[name])
+        for part, figures in computed.items():
+            for name, value in figures.items():
+                said = float(getattr(getattr(row, part), name))
+                if not _close(value, said):
+                    where = f"{row.dataset}, {row.label}: {name}" + f" of {part}" * (part in PARTS)
+                    yield f"{where} is {value:g}, stated as {said:g}"
+
+
+def _relative(errors: NDArray[Any]) -> dict[str, float]:
+    return {
+        "rel_l2_median": float(np.median(errors)),
+        "rel_l2_p95": float(np.percentile(errors, 95, method="higher")),
+        "rel_l2_max": float(np.max(errors)),
+    }
+
+
+def wrong_intervals(folder: Path) -> Iterator[str]:
+    """Resample the errors of the samples again; yield each figure of comparison.json that differs.
+
+    Latencies of single queries are not stored, so their intervals are those of results.json.
+    """
+    run, analysis = StoredRun.read(folder), content_of("comparison.json", folder)
+    settings = analysis["settings"]
+    for name in run.datasets:
+        generator = np.random.default_rng(settings["seed"])
+        draws = draws_of(run, name, settings["n_resamples"], generator)
+        stated = {r["label"]: r for r in analysis["rows"] if r["dataset"] == name}
+        rows = [row for row in run.rows if row.dataset == name and row.ok]
+        if set(stated) != {row.label for row in rows}:
+            yield f"{name}: the rows of results.json and comparison.json differ"
+        for row in rows:
+            again, said = headlines(row, draws), stated.get(row.label, {})
+            if row.latency_ms is None or row.latency_ms.low is None:
+                again.pop("latency_ms")
+            for figure, ends in again.items():
+                if isinstance(ends, dict) and not _same(ends, said.get(figure)):
+                    yield f"{name}, {row.label}: {figure} is {ends}, stated as {said.get(figure)}"
+
+
+def _same(computed: Mapping[str, float | None], said: Mapping[str, float | None] | None) -> bool:
+    return said is not None and all(
+        _close(*(inf if x is None else x for x in (value, said[end])))
+        for end, value in computed.items()
+    )
+
+
+def _close(value: float, said: float) -> bool:
+    """Return whether two numbers agree up to the single precision of the stored samples."""
+    return bool(np.isclose(value, said, rtol=1e-5, atol=1e-12, equal_nan=True))

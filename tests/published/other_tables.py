@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.analysis.told import class_of_method
 from mor_bench.report.number_format import DASH, number
 from mor_bench.scene.scene import load_scene
+from mor_bench.specs import load_method_spec
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
 from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of, look_up
@@ -140,8 +142,8 @@ def random_loads(source: str) -> str:
     return markdown(headings, body)
 
 
-def umesh_choices(source: str, group: str = "open") -> str:
-    """Show errors of U-Mesh's variants on validation and test samples."""
+def choices(source: str, group: str = "open") -> str:
+    """Show errors of variants of methods: medians of the trainings, and the range of e."""
     body = []
     for row in content_of(source)["rows"]:
         if row["group"] != group:
@@ -149,14 +151,23 @@ def umesh_choices(source: str, group: str = "open") -> str:
         cells = [f"{row['choice']} {row['value']}".strip()]
         for part in ("validation", "test"):
             errors = [training[part] for training in row["trainings"]]
-            e = float(np.median([error["mean_dof_m"] for error in errors]))
+            sizes = [error["mean_dof_m"] for error in errors]
+            e = f"{float(np.median(sizes)):.2e}"
+            if len(sizes) > 1:
+                e += f" ({min(sizes):.2e} to {max(sizes):.2e})"
             median, p95 = (
                 100 * float(np.median([error[name] for error in errors]))
                 for name in ("rel_l2_median", "rel_l2_p95")
             )
-            cells.append(f"{e:.2e}; {number(median)}; {number(p95)}".replace("e-0", "e-"))
-        body.append(cells)
-    headings = ["", "validation: e, m; median %; p95 %", "test: e, m; median %; p95 %"]
+            cells.append(f"{e}; {number(median)}; {number(p95)}".replace("e-0", "e-"))
+        core_s = float(np.median([training["core_s"] for training in row["trainings"]]))
+        body.append([*cells, number(core_s)])
+    headings = [
+        "",
+        "validation: e, m; median %; p95 %",
+        "test: e, m; median %; p95 %",
+        "core-s of a fit",
+    ]
     return markdown(headings, body)
 
 
@@ -183,10 +194,24 @@ def optimism(source: str) -> str:
             found = record.get(way) or {"n": 0}
             if found["n"]:
                 figures = (100 * found["missed"], found["ratio"], found["ratio_p90"])
-                cells = [f"`{record['method']}`", way, str(found["n"])]
+                told = record.get("told") or _told(record["method"])
+                cells = [f"`{record['method']}`", told, way, str(found["n"])]
                 body.append([*cells, *map(number, figures)])
-    headings = ["method", "selected by", "selections", "missed %", "error ratio: mean", "p90"]
+    headings = [
+        "method",
+        "is given",
+        "selected by",
+        "selections",
+        "missed %",
+        "error ratio: mean",
+        "p90",
+    ]
     return markdown(headings, body)
+
+
+def _told(method: str) -> str:
+    """State the information that a method of the suite is given, for evidence without it."""
+    return class_of_method(load_method_spec(method), "quick")
 
 
 def leaves(source: str, key: str = "") -> str:
@@ -221,10 +246,12 @@ def refinement(source: str) -> str:
                 f"{len(found['loads'])}",
                 f"{found['error_m']:.1e}",
                 f"{100 * found['relative_l2_median']:.2g}",
+                (found.get("commit") or DASH)[:7],
+                found.get("date", DASH).partition(" ")[0],
             ]
         )
     headings = ["mesh", "cells", "cells of the finest mesh", "loads", "e, m", "median %"]
-    return markdown(headings, body)
+    return markdown([*headings, "commit", "date"], body)
 
 
 LAWS = {"saint-venant-kirchhoff": "SVK", "neo-hookean": "neo-Hookean"}
@@ -286,8 +313,12 @@ def hard_loads(source: str) -> str:
     parts = list(dict.fromkeys(row["part"] for row in rows))
     cells = {(row["method"], row["part"]): _spread(row["measured"]) for row in rows}
     methods = dict.fromkeys(row["method"] for row in rows)
-    headings = ["median / p95 / max, %", *parts]
-    body = [[f"`{m}`", *(cells.get((m, part), DASH) for part in parts)] for m in methods]
+    known: dict[str, str] = content_of(source).get("told", {})
+    headings = ["median / p95 / max, %", "is given", *parts]
+    body = [
+        [f"`{m}`", known.get(m) or _told(m), *(cells.get((m, part), DASH) for part in parts)]
+        for m in methods
+    ]
     return markdown(headings, body)
 
 
@@ -330,7 +361,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "scaling": scaling,
     "generation": generation,
     "random-loads": random_loads,
-    "umesh-choices": umesh_choices,
+    "choices": choices,
     "paper-amplitude": paper_amplitude,
     "records": records,
     "optimism": optimism,

@@ -22,6 +22,7 @@ from PIL import Image
 
 from mor_bench.report.canvas import as_png
 from mor_bench.report.error_against_time import error_against_time
+from mor_bench.report.figures import explain_names
 from mor_bench.snapshots.store import write_atomically
 from tests.published.stored import ROOT, EvidenceError, run_of
 
@@ -40,6 +41,7 @@ def drawn(source: str, kind: str, dataset: str) -> bytes:
     picture = error_against_time(run, dataset, run.analysis or {})
     if picture is None:
         raise EvidenceError(f"{source}: no configuration of {dataset} can be drawn.")
+    explain_names(picture, run, dataset)
     digests: dict[str, str | None] = {
         "Software": f"matplotlib {matplotlib.__version__}",
         "Source": f"{source} {kind} {dataset} {source_digest(source)}",

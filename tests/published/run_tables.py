@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from math import inf, isfinite, isnan
 from typing import Any
 
-from mor_bench.analysis.break_even import FULL_ORDER, break_even
+from mor_bench.analysis.break_even import FULL_ORDER, best_of, break_even, sufficient
 from mor_bench.analysis.draws import VALIDATION
 from mor_bench.analysis.frontier import median_error, median_latency_ms, selecting_error
 from mor_bench.analysis.told import class_text, is_observed
@@ -107,7 +107,8 @@ def _latency(run: Comparison, row: Row) -> str:
 def _offline(row: Row) -> str:
     if row.offline_s is None:
         return DASH
-    origin = " (trained elsewhere)" if row.trained_elsewhere else ""
+    found = row.trained_elsewhere
+    origin = f" (trained elsewhere, {found.iterations:,} iterations)" if found else ""
     return f"{number(row.offline_s.data)} + {number(row.offline_s.fit_core_s)}{origin}"
 
 
@@ -115,9 +116,8 @@ def _queries(run: Comparison, row: Row, need: float) -> str:
     """Return the break-even number of queries of a row against `fem` at its error."""
     if row.method == FULL_ORDER:
         return DASH
-    best = {"label": row.label, "latency_ms": median_latency_ms(row), "error": median_error(row)}
     record = {"dataset": row.dataset, "method": row.method, "target_rel_l2_median": need}
-    reached = best if error_bound(run, row) <= need else None
+    reached = best_of(row) if error_bound(run, row) <= need else None
     (found,) = break_even(run.rows, [{**record, "best": reached}])
     return f"{found['queries']:,}" if found["queries"] is not None else str(found["verdict"])
 
@@ -125,6 +125,8 @@ def _queries(run: Comparison, row: Row, need: float) -> str:
 def error_bound(run: Comparison, row: Row) -> float:
     """Return the error that the verdict compares with a limit; see `selection.RULE`."""
     fresh = row.hidden.rel_l2_median if row.hidden else 0.0
+    if row.n_failed:
+        return inf
     for stored in (run.analysis or {})["rows"]:
         if (stored["dataset"], stored["label"]) == (row.dataset, row.label):
             high = stored.get(VALIDATION, stored["rel_l2_median"])["high"]
@@ -132,10 +134,8 @@ def error_bound(run: Comparison, row: Row) -> float:
     return inf
 
 
-def sufficient(run: Comparison, rows: Sequence[Row], need: float) -> Row | None:
-    """Return the fastest configuration whose error meets a limit by the rule of the verdict."""
-    within = [row for row in rows if error_bound(run, row) <= need]
-    return min(within, key=median_latency_ms, default=None)
+def _bounds(run: Comparison, rows: Sequence[Row]) -> dict[str, float]:
+    return {row.label: error_bound(run, row) for row in rows}
 
 
 def selected(source: str, dataset: str = "", methods: str = "", by: str = "need") -> str:
@@ -148,7 +148,7 @@ def selected(source: str, dataset: str = "", methods: str = "", by: str = "need"
     name = dataset or next(iter(run.datasets))
     need = float((run.datasets[name].get("needs") or {}).get("error", 0.01))
     rows = [
-        (sufficient(run, own, need) if by == "need" else None) or chosen(own)
+        (sufficient(own, _bounds(run, own), need) if by == "need" else None) or chosen(own)
         for own in _by_method(_rows(run, dataset, methods)).values()
     ]
     headings = ["method", "is given", "selected", *ERRORS_SHOWN, "fresh test: median %", "ms"]
@@ -183,7 +183,7 @@ def fastest(source: str, dataset: str = "", methods: str = "") -> str:
     for method, rows in _by_method(_rows(run, dataset, methods)).items():
         cells = [f"`{method}`", class_text(rows[0], is_observed(run, name))]
         for level in LEVELS:
-            best = sufficient(run, rows, level)
+            best = sufficient(rows, _bounds(run, rows), level)
             missed = best is not None and median_error(best) > level
             cells.append((DASH if best is None else _latency(run, best)) + " †" * missed)
         least = chosen(rows)
@@ -212,7 +212,7 @@ def indicated(source: str, methods: str = "") -> str:
     ]
     body = []
     for method in columns[0]:
-        cells = [f"`{method}`"]
+        cells = [f"`{method}`", class_text(columns[0][method], is_observed(runs[0], names[0]))]
         for column in columns:
             found = column[method].indicator if method in column else None
             if found is None:
@@ -224,7 +224,7 @@ def indicated(source: str, methods: str = "") -> str:
             plain = f"{found.residual_rank_correlation:.2f}".replace("-", "−")
             cells.append(f"{ratios}; {found.rank_correlation:.3f} ({plain})")
         body.append(cells)
-    return markdown(["", *names], body)
+    return markdown(["method", "is given", *names], body)
 
 
 def paper(source: str, methods: str = "") -> str:

@@ -5,7 +5,8 @@
 kills each command 50 times with each of SIGKILL, SIGTERM and SIGHUP, in about an hour. The command
 is repeated until it ends, killed or not, and then starts over in an empty folder. It must give the
 same bytes as an undisturbed one. One second after a kill no process of it may be left. After a
-repetition that ended no temporary file or folder may be left; after SIGTERM and SIGHUP never.
+repetition that ended there must be the same files and folders as after an undisturbed one; after
+SIGTERM and SIGHUP no temporary ones may be left.
 """
 
 from __future__ import annotations
@@ -24,8 +25,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import psutil
-
-from mor_bench.scratch import remove_abandoned
 
 ROOT = Path(__file__).parents[2]
 
@@ -54,10 +53,11 @@ EXACT = ("*.safetensors", "shard-*.h5")
 
 @dataclass(frozen=True)
 class Undisturbed:
-    """Results and seconds of a command that nothing disturbed."""
+    """Results, files and seconds of a command that nothing disturbed."""
 
     command: str
     results: dict[str, str]
+    files: set[str]
     seconds: float
 
 
@@ -86,6 +86,11 @@ def result(folder: Path) -> dict[str, str]:
             [[row[key] for key in ("label", "status", "error", "sizes", "cost")] for row in rows]
         )
     return found
+
+
+def everything(folder: Path) -> set[str]:
+    """Return all files and folders below a folder."""
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
 
 
 def leftovers(folder: Path) -> list[str]:
@@ -130,7 +135,8 @@ def undisturbed(command: str, folder: Path) -> Undisturbed:
     begun = time.monotonic()
     code = start(command, folder).wait()
     assert code == 0, (folder / "log.txt").read_text(encoding="utf-8")
-    return Undisturbed(command, result(folder), time.monotonic() - begun)
+    seconds = time.monotonic() - begun
+    return Undisturbed(command, result(folder), everything(folder), seconds)
 
 
 def kill_often(
@@ -148,7 +154,7 @@ def kill_often(
             code = process.wait()
         outcome.wrong += outliving(folder)
         if code == 0:
-            _check_end(folder, expected.results, outcome)
+            _check_end(folder, expected, outcome)
             folder = folder.with_name(f"{command}-{number.name}-{outcome.finished}")
             continue
         outcome.kills += 1
@@ -159,7 +165,7 @@ def kill_often(
     code = start(command, folder).wait()
     if code:
         outcome.wrong.append(f"exit code {code} of the repetition")
-    _check_end(folder, expected.results, outcome)
+    _check_end(folder, expected, outcome)
     return outcome
 
 
@@ -168,15 +174,13 @@ def leftovers_of_stopped(folder: Path) -> list[str]:
     return [f"left {path}" for path in leftovers(folder) if not path.endswith(".checkpoint")]
 
 
-def _check_end(folder: Path, expected: dict[str, str], outcome: Outcome) -> None:
+def _check_end(folder: Path, expected: Undisturbed, outcome: Outcome) -> None:
     outcome.finished += 1
-    if result(folder) != expected:
+    if result(folder) != expected.results:
         outcome.wrong.append(f"{folder.name}: another result than undisturbed")
-    before = tempfile.tempdir
-    tempfile.tempdir = str(folder / "tmp")  # as the next run there would
-    remove_abandoned()
-    tempfile.tempdir = before
-    outcome.wrong += [f"left {path}" for path in leftovers(folder)]
+    found = everything(folder)
+    outcome.wrong += [f"left {folder.name}/{path}" for path in sorted(found - expected.files)]
+    outcome.wrong += [f"lacks {folder.name}/{path}" for path in sorted(expected.files - found)]
 
 
 def main() -> None:

@@ -13,6 +13,7 @@ from mor_bench.mechanics.elements import T4, shape_gradients
 from mor_bench.scene.interpolation import trilinear
 from mor_bench.scene.materials import (
     Corotational,
+    HolzapfelGasserOgden,
     Material,
     MooneyRivlin,
     NeoHookean,
@@ -23,6 +24,7 @@ from mor_bench.scene.materials import (
 from mor_bench.scene.mesh import box_mesh
 
 Array = NDArray[np.float64]
+FIBRES = ((1.0, 1.0, 0.0), (1.0, -1.0, 0.5))
 LAWS: dict[str, Material] = {
     "saint-venant-kirchhoff": SaintVenantKirchhoff(500.0, 0.4),
     "neo-hookean": NeoHookean(500.0, 0.4),
@@ -30,6 +32,7 @@ LAWS: dict[str, Material] = {
     "ogden": Ogden((100.0, -20.0), (2.1, -1.7), 800.0),
     "yeoh": Yeoh(90.0, -30.0, 20.0, 800.0),
     "corotational": Corotational(500.0, 0.4),
+    "holzapfel-gasser-ogden": HolzapfelGasserOgden(90.0, 60.0, 0.9, 0.1, FIBRES, 800.0),
 }
 COMPRESSIBLE: dict[str, Material] = {
     "saint-venant-kirchhoff": SaintVenantKirchhoff(1.0, 0.3),
@@ -38,8 +41,10 @@ COMPRESSIBLE: dict[str, Material] = {
     "ogden": Ogden((0.3, -0.08), (2.1, -1.7), 0.8),
     "yeoh": Yeoh(0.19, -0.05, 0.03, 0.8),
     "corotational": Corotational(1.0, 0.3),
+    "holzapfel-gasser-ogden": HolzapfelGasserOgden(0.19, 0.1, 0.9, 0.1, FIBRES, 0.8),
 }
 ELEMENTS = [("hexahedron", False), ("hexahedron", True), ("tetrahedron", False)]
+ISOTROPIC = [name for name in LAWS if name != "holzapfel-gasser-ogden"]
 EVERY = list(itertools.product(LAWS, ELEMENTS))
 
 
@@ -77,6 +82,16 @@ def piola(law: Material, gradient: Array) -> Array:
         bar = j ** (-2 / 3) * left
         x = np.trace(bar, axis1=-2, axis2=-1)[..., None, None] - 3
         tau = deviator(2 * (law.c10_pa + 2 * law.c20_pa * x + 3 * law.c30_pa * x**2) * bar)
+    elif isinstance(law, HolzapfelGasserOgden):
+        bar = j ** (-2 / 3) * left
+        tau = deviator(2 * law.c10_pa * bar)
+        turned = j ** (-1 / 3) * gradient
+        for fibre in np.array(law.fibres):
+            along = np.outer(fibre, fibre) / (fibre @ fibre)
+            structure = law.dispersion * eye + (1 - 3 * law.dispersion) * along
+            tensor = turned @ structure @ np.swapaxes(turned, -1, -2)
+            x = np.maximum(np.trace(tensor, axis1=-2, axis2=-1) - 1, 0)[..., None, None]
+            tau = tau + deviator(2 * law.k1_pa * x * np.exp(law.k2 * x**2) * tensor)
     else:
         assert isinstance(law, Ogden)
         values, vectors = np.linalg.eigh(left)

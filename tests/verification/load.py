@@ -53,12 +53,15 @@ class Load:
         Growth of the resident memory after the first tenth.
     drifted : int
         Number of checks whose answers differed from those at the start.
+    refused : int
+        Number of loads without an answer, because the solver found no equilibrium.
     seconds : float
     """
 
     n: int
     growth_bytes: float
     drifted: int
+    refused: int
     seconds: float
 
     @property
@@ -72,7 +75,7 @@ def predict_often(method: Surrogate, data: Dataset, n: int, limit_s: float = inf
     draw, forces = np.random.default_rng(0), data.test.forces
     fixed = forces[:: max(1, len(forces) // FIXED)][:FIXED]
     before = [method.predict(force) for force in fixed]
-    process, memory, drifted = psutil.Process(), [], 0
+    process, memory, drifted, refused = psutil.Process(), [], 0, 0
     begun = perf_counter()
     for _ in range(PARTS):
         for _ in range(n // PARTS):
@@ -80,7 +83,7 @@ def predict_often(method: Surrogate, data: Dataset, n: int, limit_s: float = inf
             try:
                 method.predict(force)
             except SolverError:
-                continue
+                refused += 1
         drifted += any(
             not np.array_equal(method.predict(force), answer)
             for force, answer in zip(fixed, before, strict=True)
@@ -90,7 +93,8 @@ def predict_often(method: Surrogate, data: Dataset, n: int, limit_s: float = inf
             break
     settled = memory[len(memory) // 10 :]
     growth = float(max(settled) - settled[0])
-    return Load(n // PARTS * len(memory), growth, drifted, perf_counter() - begun)
+    n_asked = n // PARTS * len(memory)
+    return Load(n_asked, growth, drifted, refused, perf_counter() - begun)
 
 
 def loaded(name: str, data: Dataset) -> Surrogate:
@@ -101,7 +105,7 @@ def loaded(name: str, data: Dataset) -> Surrogate:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print a line per method; exit with 1 if any grew or drifted."""
+    """Print a line per method; exit with 1 if any grew, drifted or could not be asked."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--predictions", type=int, default=PREDICTIONS)
     parser.add_argument("--seconds", type=float, default=inf, help="time limit of each method")
@@ -116,11 +120,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 found = predict_often(loaded(name, data), data, given.predictions, given.seconds)
             except MissingDependencyError as error:
                 print(f"{name}: {error}")
+                failed = True
                 continue
             failed |= not found.ok
             print(
                 f"{name}: {found.n:,} predictions in {found.seconds:,.0f} s, memory "
-                f"{found.growth_bytes / 1e6:+.1f} MB, {found.drifted} drifts",
+                f"{found.growth_bytes / 1e6:+.1f} MB, {found.drifted} drifts, "
+                f"{found.refused:,} without an answer",
                 flush=True,
             )
     sys.exit(failed)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.hard_cases.setups import material_table
+from mor_bench.mechanics.assembly import Assembler, discretisation_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import Scene, load_scene
 
@@ -28,6 +29,13 @@ def patch_load(scene: Scene, patch: int, force: list[float]) -> Array:
     """Return a force, N, on a patch, over the free dofs."""
     on_nodes = scene.patch_weights.toarray()[patch][:, None] * np.array(force)
     return np.asarray(on_nodes.ravel()[scene.free_dofs])
+
+
+def reactions(scene: Scene, forces: Array, u: Array) -> Array:
+    """Return the supports' forces on the body, (n_nodes, 3) N, under forces and displacements."""
+    n_dofs = scene.mesh.n_dofs
+    body = Assembler(discretisation_of(scene), np.arange(n_dofs).reshape(-1, 3), n_dofs)
+    return np.asarray(body.force(u.ravel()).force.reshape(-1, 3) - forces)
 
 
 def relative_residual(model: FullOrderModel, load: Array, u: Array) -> float:

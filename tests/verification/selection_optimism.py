@@ -38,6 +38,7 @@ from mor_bench.analysis.frontier import (
     median_latency_ms,
     selecting_error,
 )
+from mor_bench.report.entries import entries_of, told_by_method
 from mor_bench.results.comparison import Comparison
 
 WAYS = ("test", "validation", "bound")
@@ -147,10 +148,12 @@ def measure(comparison: Comparison, n_splits: int) -> list[dict[str, Any]]:
     records = []
     for dataset in dict.fromkeys(row.dataset for row in comparison.rows):
         regions = comparison.dataset_arrays(dataset).get("test_regions")
+        told = told_by_method(entries_of(comparison, dataset))
         for sweep in sweeps_of(comparison, dataset):
             first = halves(regions, sweep.errors.shape[1], n_splits)
             found = optimism(sweep, first)
-            records.append({"dataset": dataset, "method": sweep.method, **found})
+            record = {"dataset": dataset, "method": sweep.method, "told": told.get(sweep.method)}
+            records.append({**record, **found})
     return records
 
 

@@ -24,7 +24,15 @@ from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.materials import Material, NeoHookean, SaintVenantKirchhoff
 from mor_bench.scene.mesh import Mesh, box_mesh
 
-from .laws_and_elements import COMPRESSIBLE, ELEMENTS, EVERY, LAWS, manufactured_error, piola
+from .laws_and_elements import (
+    COMPRESSIBLE,
+    ELEMENTS,
+    EVERY,
+    ISOTROPIC,
+    LAWS,
+    manufactured_error,
+    piola,
+)
 from .scenes import scene_of
 
 Array = NDArray[np.float64]
@@ -192,10 +200,12 @@ def test_stress_of_saint_venant_kirchhoff_is_least_at_one_over_root_three(
 @pytest.mark.parametrize(("law", "kind"), EVERY)
 def test_the_derivative_of_the_force_is_symmetric(law: str, kind: tuple[str, bool]) -> None:
     """Reciprocity follows from forces alone; the tangent's matrix is symmetric too."""
-    model = free_assembler(warped(kind[0]), LAWS[law], kind[1])
+    mesh = warped(kind[0])
+    model = free_assembler(mesh, LAWS[law], kind[1])
     rng = np.random.default_rng(0)
+    stretched = mesh.points * (0.4, 0.0, -0.2)  # far from the kink where fibres become slack
     u, one, other = (
-        0.02 * rng.normal(size=model.n_dofs),
+        stretched.ravel() + 0.02 * rng.normal(size=model.n_dofs),
         rng.normal(size=model.n_dofs),
         rng.normal(size=model.n_dofs),
     )
@@ -211,7 +221,7 @@ def test_the_derivative_of_the_force_is_symmetric(law: str, kind: tuple[str, boo
     assert np.abs(stiffness - stiffness.T).max() <= 1e-14 * np.abs(stiffness).max()
 
 
-@pytest.mark.parametrize("law", list(LAWS))
+@pytest.mark.parametrize("law", ISOTROPIC)
 def test_every_law_is_hookes_at_small_strains(law: str) -> None:
     """At rest the tangent is that of linear elasticity with the law's Poisson ratio."""
     material = LAWS[law]
@@ -295,7 +305,7 @@ def test_slender_beams_follow_the_elastica(slender: FullOrderModel, load: float)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("law", "kind"), [c for c in EVERY if c[1][0] == "hexahedron"])
+@pytest.mark.parametrize(("law", "kind"), list(itertools.product(ISOTROPIC, ELEMENTS[:2])))
 def test_every_law_follows_the_elastica(law: str, kind: tuple[str, bool]) -> None:
     """Strains of a slender beam are small, so PL²/EI = 1 bends all laws alike."""
     model = cantilever([20.0, 1.0, 1.0], [160, 1, 6], 0.0, "selective" if kind[1] else "full", law)

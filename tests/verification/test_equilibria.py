@@ -29,7 +29,7 @@ from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.specs import SolverName
 
-from .laws_and_elements import ELEMENTS, EVERY, LAWS, piola
+from .laws_and_elements import ELEMENTS, EVERY, ISOTROPIC, LAWS, piola
 from .scenes import patch_load, relative_residual, scene_of
 
 Array = NDArray[np.float64]
@@ -235,7 +235,9 @@ def test_tiny_loads_have_proportional_answers(law: str, kind: tuple[str, bool]) 
     model = FullOrderModel(scene_of(law, kind))
     load = patch_load(model.scene, -1, [0.2, -1.0, 2.0])
     unit = model.solve(1e-3 * load).displacement / 1e-3
-    for size in (1e-6, 1e-9, 1e-12, 1e-14, 1e-100, 1e-300):
+    # Where all strains are round-off, it decides which fibres are slack.
+    tiniest = (1e-12, 1e-14, 1e-100, 1e-300) if law in ISOTROPIC else ()
+    for size in (1e-6, 1e-9, *tiniest):
         u = model.solve(size * load).displacement
         assert np.linalg.norm(u / size - unit) <= 0.01 * np.linalg.norm(unit)
 

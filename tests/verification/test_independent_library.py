@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from felupe.constitution import tensortrax
 from numpy.typing import NDArray
-from tensortrax.math import log, sqrt, trace
+from tensortrax.math import exp, if_else, log, sqrt, trace
 from tensortrax.math.linalg import det, inv
 
 import mor_bench
 from mor_bench.hard_cases.setups import material_table
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.model import FullOrderModel, rest_displacement
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.scene import Scene
 
@@ -29,6 +29,15 @@ def root(c: Any) -> Any:
     for _ in range(6):
         y, z = 0.5 * (y + inv(z)), 0.5 * (z + inv(y))
     return y
+
+
+def fibres(c: Any, k1: float, k2: float, n: Array) -> Any:
+    """Return the energy of a family of fibres with the 6 components n of N."""
+    length = n[0] * c[0, 0] + n[1] * c[1, 1] + n[2] * c[2, 2]
+    length = length + 2 * (n[3] * c[0, 1] + n[4] * c[0, 2] + n[5] * c[1, 2])
+    x = det(c) ** (-1 / 3) * length - 1
+    energy = k1 / (2 * k2) * (exp(k2 * x**2) - 1)
+    return if_else(x >= 0, energy, 0 * energy)
 
 
 def felupe_law(scene: Scene) -> Any:
@@ -50,6 +59,9 @@ def felupe_law(scene: Scene) -> Any:
             return p[1] * (trace(c) - 2 * stretch + 3) + p[0] / 2 * (stretch - 3) ** 2
         if name == "yeoh":
             return models.yeoh(c, C10=p[0], C20=p[1], C30=p[2]) + p[3] / 2 * (j - 1) ** 2
+        if name == "holzapfel-gasser-ogden":
+            matrix = models.yeoh(c, C10=p[0], C20=0.0, C30=0.0) + p[1] / 2 * (j - 1) ** 2
+            return matrix + sum(fibres(c, p[2], p[3], n) for n in np.reshape(p[4:], (-1, 6)))
         # With exponents 2 and -2 the invariants suffice; automatic eigenvalues lose digits.
         return models.mooney_rivlin(c, C10=p[1] / p[2], C01=p[3] / p[4]) + p[0] / 2 * (j - 1) ** 2
 
@@ -63,15 +75,21 @@ def felupe_solution(scene: Scene, forces: Array) -> Array:
     field = felupe.FieldContainer(
         [felupe.Field((felupe.RegionTetra if tetrahedra else felupe.RegionHexahedron)(mesh), dim=3)]
     )
+    still = np.isin(np.arange(scene.mesh.n_dofs), scene.fixed_dofs).reshape(-1, 3)
     fixed = {
-        "support": felupe.Boundary(
-            field[0], mask=np.isin(np.arange(scene.mesh.n_nodes), scene.fixed_nodes)
+        f"support {axis}": felupe.Boundary(
+            field[0], mask=still[:, axis], skip=tuple(axis != other for other in range(3))
         )
+        for axis in range(3)
     }
     dof0, dof1 = felupe.dof.partition(field, fixed)
     load = felupe.PointLoad(field, np.arange(scene.mesh.n_nodes), forces)
+    items = [felupe.SolidBody(felupe_law(scene), field), load]
+    if gravity := scene.generated.gravity:
+        density, acceleration = gravity.density_kg_m3, np.array(gravity.acceleration_m_s2)
+        items.append(felupe.SolidBodyForce(field, values=acceleration, scale=density))
     result = felupe.newtonraphson(
-        items=[felupe.SolidBody(felupe_law(scene), field), load],
+        items=items,
         dof0=dof0,
         dof1=dof1,
         tol=1e-11,
@@ -96,6 +114,8 @@ def compare(scene: Scene, n_loads: int) -> None:
         ours[scene.free_dofs] = model.solve(
             load, options=NewtonOptions(tolerance=1e-10)
         ).displacement
+        if (rest := rest_displacement(scene)) is not None:
+            ours += rest.ravel()
         theirs = felupe_solution(scene, forces).ravel()
         assert np.linalg.norm(ours - theirs) <= 1e-8 * np.linalg.norm(theirs)
 

@@ -10,14 +10,24 @@ import pytest
 from numpy.typing import NDArray
 
 from mor_bench.mechanics.laws import LANES, point_stresses
-from mor_bench.scene.materials import Corotational, Material, MooneyRivlin, NeoHookean, Ogden, Yeoh
+from mor_bench.scene.materials import (
+    Corotational,
+    HolzapfelGasserOgden,
+    Material,
+    MooneyRivlin,
+    NeoHookean,
+    Ogden,
+    Yeoh,
+)
 
 Array = NDArray[np.float64]
 
 OGDEN = Ogden((100.0, -20.0), (2.5, -2.0), 800.0)
 YEOH = Yeoh(80.0, -20.0, 15.0, 800.0)
 
-LAWS = [NeoHookean(500.0, 0.4), MooneyRivlin(60.0, 20.0, 800.0), OGDEN, YEOH]
+FIBRES = HolzapfelGasserOgden(80.0, 90.0, 1.2, 0.1, ((1.0, 2.0, 0.0), (0.0, -1.0, 3.0)), 800.0)
+
+LAWS = [NeoHookean(500.0, 0.4), MooneyRivlin(60.0, 20.0, 800.0), OGDEN, YEOH, FIBRES]
 EVERY = [*LAWS, Corotational(500.0, 0.4)]
 
 

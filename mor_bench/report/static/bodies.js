@@ -29,7 +29,8 @@ Report.kinds.bodies = (figure, data) => {
     rest: R.tick(figure, "at rest", true, redraw),
   };
   const far = R.isNarrow() ? 1.5 : 1;
-  let camera = { eye: { x: 0.45 * far, y: -1.9 * far, z: 0.75 * far } };
+  const home = { eye: { x: 0.45 * far, y: -1.9 * far, z: 0.75 * far } };
+  let camera = home;
   let turning = false;
   const SCALE = [[0, "#fff3d6"], [0.35, "#fdae61"], [0.7, "#d7301f"], [1, "#67000d"]];
 
@@ -145,6 +146,7 @@ Report.kinds.bodies = (figure, data) => {
       linked = true;
       link(views[0], views[1]);
       link(views[1], views[0]);
+      views.forEach((view, i) => R.keyboard.scene(view, ["left view", "right view"][i], () => camera, home));
     });
   }
   return show;

@@ -47,6 +47,7 @@ Object.assign(Report, (() => {
   function draw(plot, traces, its) {
     const drawn = Plotly.react(plot, traces, its, CONFIG);
     plot.dataset.drawn = "yes";
+    Report.keyboard.legend(plot);
     return drawn;
   }
 

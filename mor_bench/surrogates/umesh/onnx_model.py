@@ -84,9 +84,9 @@ def umesh_graph(parts: UMeshParts) -> onnx.ModelProto:
     if parts.at_rest is not None:  # other runtimes round the network at rest differently
         largest = graph.add("ReduceMax", graph.add("Abs", loads), axes=[1, 2], keepdims=1)
         x = graph.add("Mul", x, graph.add("Sign", largest))
-    free_nodes = np.full((n_nodes, 1), output_scale if response is None else 1.0, dtype=np.float32)
-    free_nodes[scene.fixed_nodes] = 0.0
-    graph.add("Mul", x, graph.constant(free_nodes), name="displacements")
+    free = np.full((n_nodes, 3), output_scale if response is None else 1.0, dtype=np.float32)
+    free.ravel()[scene.fixed_dofs] = 0.0
+    graph.add("Mul", x, graph.constant(free), name="displacements")
     shape = ["n", n_nodes, 3]
     return graph.model(
         f"U-Mesh of {scene.name}", ("forces", shape), ("displacements", shape), _described(scene)

@@ -1,0 +1,51 @@
+"""The mesh of a geometry, with its embedded surface and named sets of nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.scene.loads import Facets
+from mor_bench.scene.mesh import Mesh, box_mesh, l_mesh
+from mor_bench.specs import (
+    BoxGeometry,
+    DatasetSpec,
+    LShapeGeometry,
+    TetrahedraGeometry,
+    VoxelsGeometry,
+)
+
+
+def build_body(
+    spec: DatasetSpec,
+) -> tuple[Mesh, Facets | None, Mapping[str, NDArray[np.int64]]]:
+    """Return mesh, embedded surface and named sets of nodes of a geometry.
+
+    Readers and mesh generators are imported on demand, because their import is slow.
+    """
+    geometry, tetrahedra = spec.geometry, spec.discretisation.element == "tetrahedron"
+    if isinstance(geometry, LShapeGeometry):
+        return l_mesh(geometry.size_m, geometry.cells, geometry.cut_cells, tetrahedra), None, {}
+    if isinstance(geometry, BoxGeometry):
+        return box_mesh(geometry.size_m, geometry.cells, tetrahedra), None, {}
+    if isinstance(geometry, VoxelsGeometry):
+        from mor_bench.scene.liver import liver_surface
+        from mor_bench.scene.surfaces import read_surface
+        from mor_bench.scene.voxels import voxel_mesh
+
+        if geometry.surface == "liver":
+            surface = liver_surface()
+        else:
+            surface = read_surface(geometry.surface.checked(), geometry.unit_m)
+        mesh = voxel_mesh(surface, geometry.cells)
+        return mesh, Facets(surface.points, surface.triangles), {}
+    if isinstance(geometry, TetrahedraGeometry):
+        from mor_bench.scene.liver import liver_tetrahedra
+
+        return liver_tetrahedra(), None, {}
+    from mor_bench.scene.files import read_mesh
+
+    mesh, point_sets = read_mesh(geometry.file.checked(), geometry.unit_m)
+    return mesh, None, point_sets

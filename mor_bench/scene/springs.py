@@ -1,0 +1,83 @@
+"""Winkler foundations: linear springs on parts of the surface, as points with stiffnesses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from mor_bench.errors import SpecError
+from mor_bench.scene.interpolation import interpolation_matrix
+from mor_bench.scene.loads import Facets
+from mor_bench.scene.mesh import Mesh
+from mor_bench.scene.regions import Cloud, region_points
+from mor_bench.specs import AXES, DatasetSpec
+
+_X, _W = np.polynomial.legendre.leggauss(3)
+_SIXTHS = np.full((3, 3), 1.0 / 6.0) + 0.5 * np.eye(3)
+"""Points of a rule for triangles that is exact for quadratic polynomials."""
+
+
+@dataclass(frozen=True)
+class Springs:
+    """Springs at the quadrature points of a surface, which do not depend on the mesh.
+
+    Attributes
+    ----------
+    points : (n, 3) float64
+        Positions, m.
+    stiffness : (n, 3) float64
+        Stiffness along each axis, N/m.
+    """
+
+    points: NDArray[np.float64]
+    stiffness: NDArray[np.float64]
+
+    def matrix(self, mesh: Mesh) -> sp.csr_array:
+        """Return the stiffness over the nodal dofs of a mesh, (n_dofs, n_dofs), N/m."""
+        shape = sp.kron(interpolation_matrix(mesh, self.points), sp.eye_array(3), format="csr")
+        weighted = shape.multiply(self.stiffness.ravel()[:, None])
+        return sp.csr_array(shape.T @ weighted)
+
+
+def foundations(
+    spec: DatasetSpec, surface: Facets, point_sets: Mapping[str, NDArray[np.int64]]
+) -> tuple[Springs, ...]:
+    """Return the springs of a dataset file on a surface.
+
+    Raises
+    ------
+    SpecError
+        If no facet has all corners in a region.
+    """
+    cloud, found = Cloud(surface.points, np.unique(surface.facets), point_sets), []
+    for spring in spec.springs:
+        facets = surface.within(region_points(cloud, spring.region))
+        if len(facets) == 0:
+            raise SpecError("a region of `springs` holds no facet of the surface.")
+        stiffness = [spring.stiffness_n_m3 * (axis in spring.components) for axis in AXES]
+        found.append(_springs_on(surface, facets, np.array(stiffness)))
+    return tuple(found)
+
+
+def _springs_on(
+    surface: Facets, facets: NDArray[np.int64], stiffness_n_m3: NDArray[np.float64]
+) -> Springs:
+    """Return springs on facets, with stiffnesses (3,) per area along the axes."""
+    corners = surface.points[facets]
+    if facets.shape[1] == 3:
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        points = np.einsum("pa,fai->fpi", _SIXTHS, corners)
+        areas = np.repeat(np.linalg.norm(normals, axis=1)[:, None] / 6.0, 3, axis=1)
+    else:
+        s, t = (a.ravel() for a in np.meshgrid(_X, _X))
+        signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        u, v = 1 + np.outer(s, signs[:, 0]), 1 + np.outer(t, signs[:, 1])
+        along_s = np.einsum("pa,fai->fpi", signs[:, 0] * v / 4, corners)
+        along_t = np.einsum("pa,fai->fpi", signs[:, 1] * u / 4, corners)
+        points = np.einsum("pa,fai->fpi", u * v / 4, corners)
+        areas = np.linalg.norm(np.cross(along_s, along_t), axis=2) * np.outer(_W, _W).ravel()
+    return Springs(points.reshape(-1, 3), areas.reshape(-1, 1) * stiffness_n_m3)
