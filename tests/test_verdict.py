@@ -297,7 +297,7 @@ def test_a_choice_comes_with_its_evidence() -> None:
         "4 % median, inf % p95, inf % max on 60 loads, 3 without an answer",
         "The discretisation error of the mesh is 5 % (median).",
         "No other method qualifies.",
-        "1 of 1 timings were not stable, the winner among them. Time again: mor-bench run d",
+        "1 of 1 timings was not stable, the winner among them. Time again: mor-bench run d",
     ):
         assert line in chosen.text()
     content = json.loads(json.dumps(chosen.as_json(), allow_nan=False))
