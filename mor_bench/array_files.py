@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import math
 import zipfile
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,18 +36,25 @@ class _RefusedError(Exception):
 
 
 @contextmanager
-def _reading(path: Path, kind: str, error: type[MorBenchError]) -> Iterator[None]:
-    """Check a file; turn the errors of its reader into one line that names the file."""
-    check_file(path, error=error)
+def reading(where: str, kind: str, error: type[MorBenchError]) -> Iterator[None]:
+    """Turn the errors of a reader into one line that names the file."""
     try:
         yield
     except _RefusedError as reason:
-        raise error(f"{path}: {reason}") from None
+        raise error(f"{where}: {reason}") from None
     except (MorBenchError, MemoryError):
         raise
     except Exception as reason:  # damaged files raise errors of many kinds
         words = printable(" ".join(str(reason).split()), 300) or type(reason).__name__
-        raise error(f"{path}: not a readable {kind}: {words}") from None
+        raise error(f"{where}: not a readable {kind}: {words}") from None
+
+
+@contextmanager
+def _reading(path: Path, kind: str, error: type[MorBenchError]) -> Iterator[None]:
+    """Check a file; errors as in `reading`."""
+    check_file(path, error=error)
+    with reading(str(path), kind, error):
+        yield
 
 
 def read_npz(path: Path, error: type[MorBenchError] = StoreError) -> Arrays:
@@ -74,7 +82,7 @@ def _check_members(members: list[zipfile.ZipInfo], file_bytes: int) -> None:
         raise _RefusedError(
             f"it holds {len(names):,} arrays; at most {MOST_OBJECTS:,} are allowed."
         )
-    if doubled := sorted({name for name in names if names.count(name) > 1}):
+    if doubled := sorted(name for name, n in Counter(names).items() if n > 1):
         raise _RefusedError(f"the array `{doubled[0]}` occurs more than once.")
     if any(member.flag_bits & 1 for member in members):
         raise _RefusedError("it is encrypted.")
@@ -105,6 +113,12 @@ def _array(content: bytes) -> NDArray[Any]:
         raise _RefusedError("it is truncated: an array is shorter than its header says.")
     file.seek(0)
     return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+
+
+def parse_npy(content: bytes, where: str, error: type[MorBenchError] = StoreError) -> NDArray[Any]:
+    """Return the array in the content of an NPY file; errors begin with ``where``."""
+    with reading(where, ".npy file", error):
+        return _array(content)
 
 
 def read_npy(path: Path, error: type[MorBenchError] = StoreError) -> NDArray[Any]:

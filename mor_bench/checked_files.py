@@ -62,8 +62,35 @@ def read_bytes(
     path: Path, most_bytes: int = MOST_BYTES, error: type[MorBenchError] = StoreError
 ) -> bytes:
     """Read a regular file; errors as in `check_file`."""
+    return _read(path, 0, most_bytes, error)
+
+
+def read_written(path: Path, folder: Path, error: type[MorBenchError] = StoreError) -> bytes:
+    """Read a file that an untrusted process wrote somewhere in a folder.
+
+    Such a process may not open every file, so it could leave a link that this process follows.
+
+    Raises
+    ------
+    StoreError, or the given class of errors
+        As `read_bytes`; also for links, and for a path that leads outside the folder.
+    FileNotFoundError
+        If the file does not exist.
+    """
+    if not path.parent.resolve().is_relative_to(folder.resolve()):
+        raise error(f"{path}: leads outside {folder}.")
+    try:
+        linked = path.is_symlink() or path.lstat().st_nlink > 1
+    except OSError as reason:
+        linked = not isinstance(reason, FileNotFoundError)
+    if linked:
+        raise error(f"{path}: a link to another file.")
+    return _read(path, getattr(os, "O_NOFOLLOW", 0), MOST_BYTES, error)
+
+
+def _read(path: Path, more_flags: int, most_bytes: int, error: type[MorBenchError]) -> bytes:
     # Opening a named pipe would wait for a writer.
-    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0) | more_flags
     try:
         with open(os.open(path, flags), "rb") as file:
             status = os.fstat(file.fileno())

@@ -1,14 +1,30 @@
-"""Digests of arrays, which identify equal content."""
+"""Digests of arrays and files, which identify equal content."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mor_bench.checked_files import check_file
+from mor_bench.errors import MorBenchError, StoreError
+
+
+def digest_of_file(path: Path, error: type[MorBenchError] = StoreError) -> str:
+    """Return the SHA-256 of a file, read in blocks; errors as in `check_file`."""
+    check_file(path, error=error)
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except FileNotFoundError:
+        raise
+    except OSError as reason:
+        raise error(f"{path}: cannot be read: {reason.strerror}.") from None
 
 
 def digest_of_arrays(

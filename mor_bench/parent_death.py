@@ -55,10 +55,12 @@ def end_with_pipe(reading: int) -> None:
     """Let the kernel end this process when the other end of a pipe closes; Linux only.
 
     It needs no thread of this process, so foreign code that holds Python's lock does not delay it.
+    If this process leads a process group, the whole group ends.
     """
     if sys.platform != "linux":
         return
-    fcntl.fcntl(reading, fcntl.F_SETOWN, os.getpid())
+    process = os.getpid()
+    fcntl.fcntl(reading, fcntl.F_SETOWN, -process if os.getpgrp() == process else process)
     fcntl.fcntl(reading, fcntl.F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(reading, fcntl.F_SETFL, fcntl.fcntl(reading, fcntl.F_GETFL) | os.O_ASYNC)
     if select.select([reading], [], [], 0.0)[0]:  # nothing is ever written: it has closed already

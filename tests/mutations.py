@@ -23,6 +23,17 @@ QUICK, SLOW = 200, 2000
 LIMIT_S, WAIT_S, LIMIT_BYTES = 2.0, 60.0, 500_000_000
 """Limits for one mutated file: processor time, time on the clock, and memory."""
 
+OF_COMMANDS = {
+    "check d.toml": (20, 400),
+    "check m.toml": (20, 400),
+    "show d.toml": (10, 200),
+    "show results.json": (10, 200),
+    "pick results.json": (6, 100),
+    "report results.json": (2, 20),
+    "export results.json": (10, 200),
+}
+"""Numbers of mutated files that commands read, in the quick and in the slow part."""
+
 PAGE = Path(__file__).parents[1] / "docs" / "attacks.md"
 """The page that gives the counts of all attacks."""
 

@@ -110,7 +110,7 @@ BROKEN: list[tuple[str, str, str]] = [
     ("msh", "nothing of the kind", "meshio cannot read it"),
     ("vtk", "# vtk DataFile Version 4.2\nx\nASCII\n", "meshio cannot read it"),
     ("med", "\0\1", "meshio cannot read it"),
-    ("unknown", "x", "Could not deduce file format"),
+    ("unknown", "x", "a mesh must be one of"),
     ("inp", "*NODE\n1, 0, 0, 0\n*ELEMENT, TYPE=C3D8R5\n1, 1\n", "type not available: C3D8R5"),
     ("inp", FLAT, r"must have three coordinates; got an array of shape \(3, 2\)"),
     ("inp", "*NODE\n1, 0, 0, 0\n*NSET, NSET=a\n1\n*NSET, NSET=a\n1\n", "'a' is defined more than"),

@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,11 @@ import h5py
 import meshio
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 import mor_bench
 from mor_bench.array_files import read_npy
+from mor_bench.digests import digest_of_arrays
 from mor_bench.export.asv_files import (
     COLUMNS,
     Figure,
@@ -31,9 +34,13 @@ from mor_bench.export.asv_results import describe
 from mor_bench.hard_cases.catalogue import CaseResult
 from mor_bench.hard_cases.suite import StressResults
 from mor_bench.measure.discretisation_error import measured
+from mor_bench.measure.method_session import MethodSession
 from mor_bench.report.hard_case_table import stress_table
+from mor_bench.results.arrays import verified_arrays, write_verified
 from mor_bench.runs.cached_fit import read_fit_record, training_seconds
+from mor_bench.runs.scoring import read_cost
 from mor_bench.runs.shipped_models import shipped_models
+from mor_bench.sandbox.process import parsed_answer
 from mor_bench.scene.files import read_mesh
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.scene.snapshot_file import read_arrays
@@ -249,6 +256,34 @@ def stressed(path: Path) -> None:
     stress_table(found, [row.method for row in found.rows])
 
 
+def a_score(path: Path) -> None:
+    write_verified(path, {"mean_dof_m": np.ones(5), "relative_l2": np.ones(5)})
+
+
+def forged_score(content: bytes, generator: np.random.Generator) -> bytes:
+    """Mutate the digest of a score."""
+    at = content.index(
+        digest_of_arrays({"mean_dof_m": np.ones(5), "relative_l2": np.ones(5)}).encode()
+    )
+    changed = bytearray(content)
+    changed[at + int(generator.integers(64))] = int(generator.integers(256))
+    return bytes(changed)
+
+
+def cost(path: Path) -> None:
+    with suppress(ValidationError):  # it is counted again
+        read_cost(path)
+
+
+def an_answer(path: Path) -> None:
+    answer = {"latency_ms": [1.0, 2.0], "gc_ms": [0.0, 0.0], "checked": [1], "warnings": ["w"]}
+    path.write_text(json.dumps({**answer, "cpu_s": 1.0, "wall_s": 1.0, "cpu_all_s": 2.0}))
+
+
+def answered(path: Path) -> None:
+    parsed_answer(path.read_bytes(), MethodSession, "time")
+
+
 def gmsh1(path: Path) -> None:
     points, cells = mesh_of().points, mesh_of().cells[0].data
     nodes = [f"{i + 1} {x} {y} {z}" for i, (x, y, z) in enumerate(points)]
@@ -276,6 +311,14 @@ READERS = [
     Reader("mesh1.msh", gmsh1, body, TEXT),
     Reader("mesh.inp", written_as("abaqus"), body, TEXT),
     Reader("mesh.med", written_as("med"), body, [mutated_bytes]),
+    Reader("mesh.xdmf", written_as("xdmf", data_format="XML"), body, TEXT),
+    Reader("mesh.mesh", written_as("medit"), body, TEXT),
+    Reader("mesh.meshb", written_as("medit"), body, [mutated_bytes]),
+    Reader("mesh.bdf", written_as("nastran"), body, TEXT),
+    Reader("mesh.avs", written_as("avsucd"), body, TEXT),
+    Reader("mesh.su2", written_as("su2"), body, TEXT),
+    Reader("mesh.f3grid", written_as("flac3d"), body, TEXT),
+    Reader("mesh.b8.ugrid", written_as("ugrid"), body, [mutated_bytes]),
     Reader("surface.stl", surface, read_surface, TEXT),
     Reader("surface.obj", surface, read_surface, TEXT),
     Reader("snapshots.npz", snapshots_npz, source, [mutated_bytes]),
@@ -291,6 +334,9 @@ READERS = [
         training_seconds,
         JSON,
     ),
+    Reader("score.h5", a_score, verified_arrays, [mutated_bytes, forged_score]),
+    Reader("cost.json", lambda path: path.write_text('{"cells": 135.0}'), cost, JSON),
+    Reader("answer.json", an_answer, answered, JSON),
     Reader("seconds-00000.txt", lambda path: path.write_text("1.25\n"), shard_seconds, TEXT),
     Reader("stress.json", stress_results, stressed, JSON),
     Reader("pyproject.toml", of_suite(".", "pyproject.toml"), is_own_project, TEXT),

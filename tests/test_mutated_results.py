@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import atexit
 import io
 import json
 import shutil
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -30,6 +28,7 @@ from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.surrogates.pod import PODGalerkin
 from tests.commands import invoke
+from tests.damaged_runs import DATASET, a_run, sound_run
 from tests.model_files import sealed
 from tests.mutations import (
     JSON,
@@ -41,27 +40,9 @@ from tests.mutations import (
     mutated_bytes,
     mutated_json,
 )
-from tests.synthetic import synthetic_comparison
-
-DATASET = "beam-tiny"
 
 DRAWING_S, DRAWN = 60.0, 40
 """Processor time for all figures of a report, and number of reports that are drawn."""
-
-
-@cache
-def sound_run() -> Path:
-    """Write a run with few rows, which are of different methods; return its folder."""
-    folder = Path(mkdtemp())
-    atexit.register(shutil.rmtree, folder)
-    made = synthetic_comparison(folder, DATASET, n_regions=3, per_region=2)
-    made.rows = list({row.method: row for row in made.rows}.values())[:4]
-    made.write()
-    return folder
-
-
-def a_run(path: Path) -> None:
-    shutil.copytree(sound_run(), path.parent, dirs_exist_ok=True)
 
 
 def concluded(path: Path) -> None:

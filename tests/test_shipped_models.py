@@ -11,13 +11,14 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 import mor_bench
+from mor_bench.digests import digest_of_file
 from mor_bench.results.row import Row
 from mor_bench.runs.cached_fit import RunEnvironment
 from mor_bench.runs.code_digest import bare_code
 from mor_bench.runs.configurations import configurations_of
 from mor_bench.runs.plan import plan
 from mor_bench.runs.shipped_models import Binding, SampleSketch, shipped_models
-from mor_bench.runs.training_data import TrainingData, digest_of_file
+from mor_bench.runs.training_data import TrainingData
 from mor_bench.snapshots.dataset import Snapshots, load_dataset
 from mor_bench.specs import DatasetSpec, load_dataset_spec, load_method_spec
 from tests.benchmarks.train_shipped import DATASET, ITERATIONS, ship

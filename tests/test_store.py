@@ -132,7 +132,7 @@ DAMAGE: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "truncated": (lambda content: content[:-9], "truncated"),
     "foreign": (lambda content: b"PK" + content, "not a shard"),
     "foreign HDF5": (lambda content: foreign_hdf5(), "not a shard"),
-    "other fields": (lambda content: with_other_fields(), "the content is not a shard"),
+    "other fields": (lambda content: with_other_fields(), "not a readable shard"),
     "empty": (lambda content: b"", "not a shard"),
     "older": (lambda content: of_schema(content, 1), "version 1.*generate the dataset again"),
 }

@@ -10,6 +10,7 @@ import typer
 
 from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import Json
+from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.report.number_format import bytes_text
 from mor_bench.runs.cache_folder import cache_entries
 from mor_bench.snapshots.generate import default_cache
@@ -43,10 +44,11 @@ def cache(
     Everything in the cache can be computed again.
     """
     folder = cache or default_cache()
-    entries = cache_entries(folder, names or [])
-    if clean:
-        for entry in entries:
-            entry.remove()
+    with notice_if_slow("Deleting." if clean else "Adding up the sizes."):
+        entries = cache_entries(folder, names or [])
+        if clean:
+            for entry in entries:
+                entry.remove()
     total = sum(entry.size_bytes for entry in entries)
     if as_json:
         content = {"folder": str(folder), "cleaned": clean, "size_bytes": total}

@@ -90,7 +90,7 @@ def _signals_as_interrupts() -> Iterator[None]:
     """
 
     def stop(number: int, _: FrameType | None) -> None:
-        for other in caught:
+        for other in (*caught, signal.SIGINT):
             signal.signal(other, signal.SIG_IGN)  # the clean-up takes a moment
         raise StoppedBySignal(number)
 

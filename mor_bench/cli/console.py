@@ -11,6 +11,9 @@ from rich.console import Console
 DEFAULT_WIDTH, LEAST_WIDTH = 80, 40
 """Width without a terminal, and the least width that tables are fitted to, in characters."""
 
+MOST_DIGITS = 5
+"""Digits of a width in COLUMNS; a longer number is ignored."""
+
 
 def make_console(stderr: bool = False, quiet: bool = False) -> Console:
     """Make a console for standard output or standard error; a quiet one prints nothing."""
@@ -20,7 +23,7 @@ def make_console(stderr: bool = False, quiet: bool = False) -> Console:
 def console_width() -> int:
     """Return the environment's COLUMNS, else the width of the terminal, also beside a pipe."""
     given = os.environ.get("COLUMNS", "")
-    if given.isdecimal() and int(given) > 0:
+    if given.isdecimal() and len(given) <= MOST_DIGITS and int(given) > 0:
         return max(int(given), LEAST_WIDTH)
     for stream in (sys.stdout, sys.stderr, sys.stdin):
         with suppress(OSError, ValueError, AttributeError):

@@ -11,6 +11,7 @@ import typer
 
 from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import Json
+from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.measure.machine_speed import MachineSpeed
 from mor_bench.report.number_format import bytes_text, seconds_text
 from mor_bench.runs.installation import Installation
@@ -54,7 +55,8 @@ def doctor(
     if test:
         _self_test(as_json)
         return
-    found, seconds = Installation.inspect(), plan().seconds
+    with notice_if_slow("Measuring the speed of this machine; a few samples are solved."):
+        found, seconds = Installation.inspect(), plan().seconds
     if as_json:
         print(json.dumps({**found.as_dict(), "default_run_s": seconds}, indent=1))
         return
@@ -65,11 +67,13 @@ def doctor(
 def _self_test(as_json: bool) -> None:
     """Print the checks as they end; the exit code is 2 if one fails."""
     done = []
-    for check in self_test():
-        done.append(check)
-        if not as_json:
-            word = {True: "passed", False: "FAILED", None: "not here"}[check.passed]
-            print(f"{check.name:<16}{word:<10}{check.detail}", flush=True)
+    with notice_if_slow("Testing; this takes about a minute.") as spoken:
+        for check in self_test():
+            done.append(check)
+            if not as_json:
+                spoken()
+                word = {True: "passed", False: "FAILED", None: "not here"}[check.passed]
+                print(f"{check.name:<16}{word:<10}{check.detail}", flush=True)
     if as_json:
         print(json.dumps([asdict(check) for check in done], indent=1))
     require(done)

@@ -14,6 +14,7 @@ from mor_bench.cli.console import make_console
 from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import DatasetName, with_options
 from mor_bench.cli.progress_bars import show_progress
+from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.errors import InvalidInputError
 from mor_bench.export.asv_results import export_asv
 from mor_bench.export.load_path import export_load_path
@@ -24,6 +25,8 @@ from mor_bench.options import DataOptions
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.test_sets import SET_NAMES, SetName
 from mor_bench.specs import load_dataset_spec
+
+WRITING = "Writing the files."
 
 app = typer.Typer(rich_markup_mode=None)
 export = typer.Typer(
@@ -62,7 +65,9 @@ def vtu(
     if part not in known:
         raise InvalidInputError(f"`--part` must be {', '.join(known)}; got {part!r}.")
     data = _load(dataset, options, [name for name in SET_NAMES if name == part])
-    for path in export_vtu(data, sample, out, part=known[part], models=model or []):
+    with notice_if_slow(WRITING):
+        paths = export_vtu(data, sample, out, part=known[part], models=model or [])
+    for path in paths:
         print(path)
 
 
@@ -87,7 +92,10 @@ def gif(
 
     The extra `viz` renders the meshes with PyVista; without it, matplotlib draws them.
     """
-    print(export_load_path(_load(dataset, options), sample, out))
+    data = _load(dataset, options)
+    with notice_if_slow(WRITING):
+        path = export_load_path(data, sample, out)
+    print(path)
 
 
 @command(
@@ -111,7 +119,10 @@ def numpy(
     options: DataOptions,
 ) -> None:
     """Write the samples of a dataset as NumPy arrays."""
-    for path in export_numpy(_load(dataset, options), out):
+    data = _load(dataset, options)
+    with notice_if_slow(WRITING):
+        paths = export_numpy(data, out)
+    for path in paths:
         print(path)
 
 
@@ -130,7 +141,8 @@ def onnx(
 
     It maps nodal forces (N) to nodal displacements (m).
     """
-    path, difference = export_onnx(model, out)
+    with notice_if_slow(WRITING):
+        path, difference = export_onnx(model, out)
     print(path)
     compared = (
         "not compared: onnxruntime is not installed"
@@ -177,8 +189,10 @@ def asv(
 
     The dashboard of asv then shows them over commits.
     """
-    comparison = mor_bench.Comparison.read(folder)
-    for path in export_asv(comparison, out, commit=commit, machine=machine):
+    with notice_if_slow(WRITING):
+        comparison = mor_bench.Comparison.read(folder)
+        paths = export_asv(comparison, out, commit=commit, machine=machine)
+    for path in paths:
         print(path)
 
 

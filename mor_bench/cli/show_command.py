@@ -14,6 +14,7 @@ from rich.text import Text
 from mor_bench.cli.console import make_console
 from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import Json, complete_datasets, complete_methods
+from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.errors import InvalidInputError
 from mor_bench.report.cards import Card, dataset_card, method_card, run_card
 from mor_bench.results.comparison import Comparison
@@ -55,7 +56,8 @@ def show(
     as_json: Json = False,
 ) -> None:
     """Show one run, method or dataset in detail."""
-    card = card_of(name, suite)
+    with notice_if_slow("Reading; a large mesh takes some time."):
+        card = card_of(name, suite)
     if as_json:
         print(json.dumps(card.as_dict(), indent=1, ensure_ascii=False))
         return

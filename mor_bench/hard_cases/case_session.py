@@ -8,9 +8,18 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from mor_bench.hard_cases.case import Scenes, Subject
-from mor_bench.hard_cases.catalogue import attempt, cases_for
+from mor_bench.hard_cases.catalogue import CaseResult, attempt, cases_for
 from mor_bench.measure.method_session import MethodSession
+from mor_bench.sandbox.session import Answer
 from mor_bench.specs import MethodSpec
+
+
+class _Chosen(Answer):
+    cases: list[tuple[str, str]]
+
+
+class _Attempted(Answer):
+    result: CaseResult
 
 
 class CaseSession(MethodSession):
@@ -20,6 +29,11 @@ class CaseSession(MethodSession):
         **MethodSession.activities,
         "choose_cases": "importing it",
         "attempt": "the case",
+    }
+    answers: ClassVar[Mapping[str, type[Answer]]] = {
+        **MethodSession.answers,
+        "choose_cases": _Chosen,
+        "attempt": _Attempted,
     }
 
     def choose_cases(

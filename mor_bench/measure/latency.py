@@ -20,7 +20,8 @@ import numpy as np
 import psutil
 from numpy.typing import NDArray
 
-from mor_bench.array_files import read_npy
+from mor_bench.array_files import parse_npy
+from mor_bench.checked_files import read_written
 from mor_bench.errors import MorBenchError, StoreError
 from mor_bench.machine import free_memory_bytes, pinned_threads
 from mor_bench.measure.course import Course
@@ -305,7 +306,7 @@ class _Turns:
             limits = {"floor_s": LEAST_TURN_S, "most_s": MOST_TURN_S}
             found = self._ask("time", out=out, n=n, threads=threads, **limits)
             try:
-                answers = read_npy(out)
+                answers = parse_npy(read_written(out, self.queries.scratch), str(out))
                 references = self.queries.references[found["checked"]]
                 errors = sample_errors(answers, references, self.queries.nodes).relative_l2
             except (OSError, StoreError, ValueError, IndexError, KeyError, TypeError) as error:

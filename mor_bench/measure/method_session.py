@@ -25,12 +25,13 @@ from mor_bench.errors import (
 )
 from mor_bench.machine import peak_memory_bytes, pinned_threads
 from mor_bench.measure.fit_clock import fit_clock
+from mor_bench.measure.method_answers import ANSWERS
 from mor_bench.measure.predictions import predict_all
 from mor_bench.measure.query_cost import cost_of
 from mor_bench.measure.timed_loads import TimedLoads
 from mor_bench.method_loading import check_predicts, load_fitted, make_surrogate
 from mor_bench.sandbox.handover import read_snapshots
-from mor_bench.sandbox.session import Session
+from mor_bench.sandbox.session import Answer, Session
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.given import given_of
 from mor_bench.specs import check_parameters, load_class
@@ -115,6 +116,7 @@ class MethodSession(Session):
         "cost": "counting the cost",
         "flag": "flagging loads out of range",
     }
+    answers: ClassVar[Mapping[str, type[Answer]]] = ANSWERS
 
     def __init__(self, scene: Scene | None = None) -> None:
         if scene is not None:

@@ -9,6 +9,7 @@ OUT/figures/*.png and *.svg, OUT/report.html, OUT/pages/*.html
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Mapping
@@ -35,6 +36,9 @@ SCHEMA_VERSION = 2
 
 MOST_LETTERS = 10_000
 """Most letters of a text with control characters."""
+
+MOST_STEM = 160
+"""Letters of the name of a file with raw samples before it is cut."""
 
 
 @dataclass
@@ -178,7 +182,10 @@ class Comparison:
         return self._samples_path(f"{row.dataset}--{row.label}")
 
     def _samples_path(self, name: str) -> Path:
-        return self.out / "samples" / (re.sub(r"[^\w.=-]+", "-", name).strip("-") + ".h5")
+        stem = re.sub(r"[^\w.=-]+", "-", name).strip("-")
+        if len(stem) > MOST_STEM:  # file systems allow 255 bytes, with the ends of temporary names
+            stem = f"{stem[:MOST_STEM]}-{hashlib.sha256(stem.encode()).hexdigest()[:12]}"
+        return self.out / "samples" / f"{stem}.h5"
 
     def finish(self, analysis: dict[str, Any]) -> None:
         """Write everything; comparison.json with the analysis marks the run as finished."""

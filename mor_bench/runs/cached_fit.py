@@ -25,21 +25,19 @@ from threading import Event, Thread
 from time import monotonic
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from mor_bench.array_files import read_hdf5
-from mor_bench.checked_files import read_bytes, read_json
-from mor_bench.digests import digest_of_arrays
+from mor_bench.checked_files import read_json, read_written
+from mor_bench.digests import digest_of_file
 from mor_bench.errors import StoreError
 from mor_bench.machine import describe_machine, gpu_name
 from mor_bench.measure.method_session import FitRequest, MethodSession
-from mor_bench.results.arrays import write_arrays
+from mor_bench.results.arrays import verified_arrays, write_verified
 from mor_bench.results.parts import TrainedElsewhere
 from mor_bench.runs.code_digest import code_digest
 from mor_bench.runs.configurations import Configuration
-from mor_bench.runs.training_data import TrainingData, digest_of_file
+from mor_bench.runs.training_data import TrainingData
 from mor_bench.sandbox.fork_server import ForkServer
 from mor_bench.sandbox.process import SandboxedProcess
 from mor_bench.sandbox.seal import Restrictions
@@ -246,7 +244,7 @@ class CachedFit:
         self.folder.mkdir(parents=True, exist_ok=True)
         if model is not None:
             remove_leftovers(self.folder)
-            write_atomically(self.model, read_bytes(model))
+            write_atomically(self.model, read_written(model, self.data.scratch))
             checksum = {"model_sha256": digest_of_file(self.model)}
             record = record.model_copy(update=checksum)
         write_atomically(self.folder / "fit.json", record.model_dump_json(indent=1).encode())
@@ -255,16 +253,11 @@ class CachedFit:
 
     def arrays(self, name: str) -> dict[str, NDArray[Any]] | None:
         """Read stored arrays; None if there are none or they are damaged."""
-        with suppress(OSError, KeyError, StoreError):
-            arrays = read_hdf5(self.folder / f"{name}.h5")
-            if str(arrays.pop("digest").astype(str)) == digest_of_arrays(arrays):
-                return arrays
-        return None
+        return verified_arrays(self.folder / f"{name}.h5")
 
     def keep_arrays(self, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Store arrays under a name."""
-        digest = np.array(digest_of_arrays(arrays).encode())
-        write_arrays(self.folder / f"{name}.h5", {**arrays, "digest": digest})
+        write_verified(self.folder / f"{name}.h5", arrays)
 
     def begin_training(self) -> None:
         """Create the folder of a checkpoint; read the training time up to an existing one."""

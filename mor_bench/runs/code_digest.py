@@ -185,9 +185,15 @@ def _imports_of(path: Path, changed: int, package: str) -> tuple[str, ...]:
 
 
 def _nodes(tree: ast.AST) -> Iterator[ast.AST]:
-    """Yield all nodes but those for type checkers only."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
-            continue
-        yield node
-        yield from _nodes(node)
+    """Yield all nodes but those for type checkers only, in the order of the source.
+
+    Expressions may be nested deeper than Python's recursion limit.
+    """
+    waiting = [iter([tree])]
+    while waiting:
+        node = next(waiting[-1], None)
+        if node is None:
+            waiting.pop()
+        elif not (isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"):
+            yield node
+            waiting.append(ast.iter_child_nodes(node))

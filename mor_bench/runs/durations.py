@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from glob import escape
 from math import sqrt
 from pathlib import Path
 from statistics import median
@@ -146,7 +147,7 @@ def fit_seconds(
 def _earlier_fits(cache: Path, configuration: Configuration) -> list[FitRecord]:
     """Return records of earlier fits of a method, with the same parameters if there are any."""
     records, name = [], configuration.method.name
-    for path in (cache / "fits").glob(f"{name}-*/fit.json"):
+    for path in (cache / "fits").glob(f"{escape(name)}-*/fit.json"):
         with suppress(OSError, StoreError):
             record = read_fit_record(path)
             # The pattern for `pod` also matches the folders of `pod-tensor`.

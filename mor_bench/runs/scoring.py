@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
-from mor_bench.array_files import read_npy
-from mor_bench.checked_files import read_json
+from mor_bench.array_files import parse_npy
+from mor_bench.checked_files import read_json, read_written
 from mor_bench.errors import StoreError
 from mor_bench.measure.error_metrics import ERRORS, SampleErrors, sample_errors
 from mor_bench.measure.indicator_quality import Indicated
@@ -124,7 +124,7 @@ class _Scorer:
         threads = self.cached.environment.threads
         self.worker.ask("predict", limit_s, forces=forces, out=out, threads=threads)
         try:
-            predicted = read_npy(out)
+            predicted = parse_npy(read_written(out, self.cached.data.scratch), str(out))
         except (OSError, StoreError) as error:
             raise MethodFailedError(f"the method's predictions cannot be read: {error}") from None
         if predicted.shape != forces.shape or predicted.dtype != np.float64:
@@ -132,21 +132,25 @@ class _Scorer:
                 f"the method's predictions have shape {predicted.shape} and are "
                 f"{predicted.dtype}; expected {forces.shape} and float64"
             )
-        copied = np.array(predicted)
         out.unlink()
-        return copied
+        return predicted
 
     def cost(self) -> dict[str, float] | None:
         """Return the counted work per query, from the cache if it has it."""
         test = self.cached.data.sets["test"]
         path = self.cached.folder / f"cost-{measuring_digest()}-{test.digest[:20]}.json"
         with suppress(OSError, StoreError, ValidationError):
-            return _COST.validate_python(read_json(path))
+            return read_cost(path)
         chosen = np.linspace(0, len(test.forces) - 1, min(N_COUNTED, len(test.forces))).astype(int)
         answer = self.worker.ask("cost", LOAD_LIMIT_S, forces=test.forces[chosen])
         cost: dict[str, float] | None = answer["cost"]
         write_atomically(path, json.dumps(cost).encode())
         return cost
+
+
+def read_cost(path: Path) -> dict[str, float] | None:
+    """Read a counted cost; errors as in `read_json`, and `ValidationError` for odd content."""
+    return _COST.validate_python(read_json(path))
 
 
 _COST: TypeAdapter[dict[str, float] | None] = TypeAdapter(dict[str, float] | None)

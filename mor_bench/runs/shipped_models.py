@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from mor_bench.checked_files import read_json
-from mor_bench.digests import digest_of_arrays
+from mor_bench.digests import digest_of_arrays, digest_of_file
 from mor_bench.errors import StoreError
 from mor_bench.runs.cached_fit import LOAD_LIMIT_S, CachedFit, FitRecord, RunEnvironment
 from mor_bench.runs.code_digest import learning_digest
 from mor_bench.runs.configurations import Configuration
-from mor_bench.runs.training_data import TrainingData, digest_of_file
+from mor_bench.runs.training_data import TrainingData
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.generate import dataset_key
 from mor_bench.snapshots.store import write_atomically

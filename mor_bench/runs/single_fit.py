@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mor_bench.errors import InvalidInputError
+from mor_bench.errors import InvalidInputError, MorBenchError
 from mor_bench.machine import pinned_threads
 from mor_bench.measure.error_metrics import sample_errors, summary
 from mor_bench.measure.predictions import predict_all
@@ -24,7 +25,8 @@ from mor_bench.runs.configurations import OWN, check_foreign_method
 from mor_bench.runs.listener import Listener
 from mor_bench.runs.run_context import training_options
 from mor_bench.runs.scoring import SCORE_CHUNK
-from mor_bench.sandbox.process import default_memory_limit_bytes
+from mor_bench.sandbox.child import crash
+from mor_bench.sandbox.process import MethodFailedError, default_memory_limit_bytes
 from mor_bench.snapshots.dataset import Dataset, Snapshots, load_dataset
 from mor_bench.snapshots.generate import default_cache
 from mor_bench.snapshots.store import check_replaceable, remove_leftovers, temporary_beside
@@ -107,7 +109,7 @@ def fit(
     StoreError
         If ``start_from`` or the checkpoint is damaged.
     MorBenchError
-        Any error of the method's `fit`.
+        Any error of the method's `fit`; `MethodFailedError` if a third party's method crashes.
     """
     chosen = FitOptions(**options)
     out = Path(out)
@@ -133,7 +135,8 @@ def fit(
         progress=partial(listener.generating, spec.name),
     )
     with pinned_threads(chosen.threads or os.cpu_count() or 1):
-        seconds = _fit_and_save(unfitted, data, out)
+        with _one_line(method_spec):
+            seconds = _fit_and_save(unfitted, data, out)
         if unfitted.trains():
             checkpoint.unlink(missing_ok=True)
         iterations = getattr(unfitted, "iterations_", None)
@@ -143,7 +146,8 @@ def fit(
                 "number of its parameter `iterations`.",
                 stacklevel=2,
             )
-        error = _test_error(unfitted, data.test)
+        with _one_line(method_spec):
+            error = _test_error(unfitted, data.test)
     n_train, n_validation, n_test = map(len, (data.train, data.validation, data.test))
     swept = method_spec.sweep_of("full")
     first_of = {name: values for name, values in swept.items() if name not in (parameters or {})}
@@ -198,6 +202,19 @@ def _check_writable(name: str, path: Path) -> None:
         temporary.unlink()
     except OSError as error:
         raise InvalidInputError(f"`{name}`: {path} cannot be written: {error.strerror}.") from None
+
+
+@contextmanager
+def _one_line(spec: MethodSpec) -> Iterator[None]:
+    """Turn an error inside a third party's method into one line that names the place."""
+    try:
+        yield
+    except (MorBenchError, MemoryError):
+        raise
+    except Exception as error:
+        if spec.surrogate.startswith(OWN):
+            raise
+        raise MethodFailedError(f"method {spec.name}: {crash(error)}") from error
 
 
 def _fit_and_save(unfitted: Surrogate, data: Dataset, out: Path) -> float:

@@ -17,20 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.checked_files import check_file
-from mor_bench.digests import digest_of_arrays
+from mor_bench.digests import digest_of_arrays, digest_of_file
+from mor_bench.errors import StoreError
 from mor_bench.mechanics.indicator import ErrorIndicator
 from mor_bench.sandbox.handover import arrays_of, write_snapshots
 from mor_bench.sandbox.process import MethodFailedError
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
-
-
-def digest_of_file(path: Path) -> str:
-    """Return the SHA-256 of a file; errors as in `check_file`."""
-    check_file(path)
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @dataclass(frozen=True)
@@ -124,7 +117,7 @@ class TrainingData:
         """Raise `MethodFailedError` and restore the samples if a method changed them."""
         try:
             unchanged = self._file_digests() == self._written
-        except OSError:
+        except (OSError, StoreError):
             unchanged = False
         if not unchanged:
             for folder in (self.folder, self.validation_folder):

@@ -63,12 +63,12 @@ class _Child:
             except MorBenchError as error:
                 answer = {"error": type(error).__name__, "message": _shown(error)}
             except (Exception, SystemExit) as error:  # foreign code runs here
-                answer = {"error": None, "message": _crash(error)}
+                answer = {"error": None, "message": crash(error)}
         notes = [_shown(w.message) for w in caught if issubclass(w.category, UserWarning)]
         return {**answer, "warnings": list(dict.fromkeys(notes))}
 
 
-def _crash(error: BaseException) -> str:
+def crash(error: BaseException) -> str:
     """Describe an error and its location, if possible outside installed packages."""
     places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
     own = [place for place in places if not place[0].startswith(("<", *LIBRARIES))]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
 import signal
@@ -19,19 +18,27 @@ from time import monotonic
 from typing import Any, BinaryIO, Self
 
 import psutil
+from pydantic import ValidationError
 
 from mor_bench import errors
-from mor_bench.errors import MorBenchError
+from mor_bench.checked_files import parse_json
+from mor_bench.errors import MorBenchError, StoreError
 from mor_bench.machine import memory_limit_bytes
 from mor_bench.sandbox.fork_server import CHILD_MODULE, ForkServer, environment
 from mor_bench.sandbox.seal import Restrictions
-from mor_bench.sandbox.session import Session
+from mor_bench.sandbox.session import Answer, Session
 
 MEMORY_CHECK_S = 0.2
 """Interval between checks of a process's memory, s."""
 
 START_LIMIT_S = 120.0
 """Time limit for a process to start, s."""
+
+MOST_ANSWER_BYTES, MOST_WAITING = 64 * 2**20, 4
+"""Largest answer, and number of unread answers; a process that sends more is not read on."""
+
+MOST_LAST_WORDS = 2**14
+"""Bytes at the end of the standard error output of a dead process that are read."""
 
 MEMORY_SHARE = 0.75
 """Default memory limit of a method, as a share of the memory of the machine or container."""
@@ -78,6 +85,34 @@ def stoppable_threads(n: int) -> Iterator[ThreadPoolExecutor]:
 
 class MethodFailedError(MorBenchError):
     """A method crashed, its process died, or it exceeded its limit of time or memory."""
+
+
+class _Error(Answer):
+    error: str | None
+    message: str
+
+
+def parsed_answer(line: bytes, session: type[Session], do: str) -> dict[str, Any]:
+    """Parse the answer to a request, which foreign code may have forged.
+
+    Raises
+    ------
+    MethodFailedError
+        If it is neither an error nor an answer to this request.
+    """
+    try:
+        answer: dict[str, Any] = parse_json(line, "answer")
+        kind = _Error if "error" in answer else session.answers.get(do, Answer)
+        kind.model_validate(answer)
+    except (StoreError, TypeError, ValidationError):
+        raise MethodFailedError("the method wrote to its result pipe") from None
+    return answer
+
+
+def _signal_name(number: int) -> str:
+    with suppress(ValueError):  # real-time signals have no names
+        return signal.Signals(number).name
+    return f"signal {number}"
 
 
 class SandboxedProcess:
@@ -137,8 +172,10 @@ class SandboxedProcess:
 
     def _read_answers(self) -> None:
         with suppress(ValueError, OSError):
-            for line in self._process.answers:
+            while line := self._process.answers.readline(MOST_ANSWER_BYTES):
                 self._answers.put(line)
+                if not line.endswith(b"\n") or self._answers.qsize() > MOST_WAITING:
+                    break
         self._answers.put(b"")
 
     def ask(self, do: str, within_s: float, /, **request: Any) -> dict[str, Any]:
@@ -167,10 +204,10 @@ class SandboxedProcess:
         if not line:
             raise MethodFailedError(self._cause_of_death())
         try:
-            answer: dict[str, Any] = json.loads(line)
-        except ValueError:
+            answer = parsed_answer(line, self._session, do)
+        except MethodFailedError:
             self.end()
-            raise MethodFailedError("the method wrote to its result pipe") from None
+            raise
         if "error" not in answer:
             return answer
         kind = getattr(errors, answer["error"] or "", None)
@@ -216,11 +253,13 @@ class SandboxedProcess:
 
     def _cause_of_death(self) -> str:
         code = self._process.exit_code()
-        self._stderr.seek(0)
-        lines = self._stderr.read().decode(errors="replace").strip().splitlines()
+        size = self._stderr.seek(0, os.SEEK_END)
+        self._stderr.seek(max(0, size - MOST_LAST_WORDS))
+        words = self._stderr.read(MOST_LAST_WORDS).decode(errors="replace")
+        lines = words.strip().splitlines()
         last = f": {lines[-1]}" if lines else ""
         if code < 0:
-            return f"its process died of {signal.Signals(-code).name}{last}"
+            return f"its process died of {_signal_name(-code)}{last}"
         return f"its process ended with code {code}{last}"
 
     def end(self) -> None:

@@ -6,6 +6,14 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import ClassVar
 
+from pydantic import BaseModel
+
+
+class Answer(BaseModel):
+    """What every answer of a session holds; a session adds the results of each request."""
+
+    warnings: list[str]
+
 
 class Session:
     """The requests that a sandboxed process answers.
@@ -19,9 +27,12 @@ class Session:
     activities : mapping of str to str
         A phrase for each request, for messages such as "fitting took longer than the limit of 60
         s".
+    answers : mapping of str to subclass of Answer
+        Keys and types of the answers to requests that have results.
     """
 
     activities: ClassVar[Mapping[str, str]] = {}
+    answers: ClassVar[Mapping[str, type[Answer]]] = {}
 
     @classmethod
     def preload(cls) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 import warnings
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from io import StringIO
 from pathlib import Path
+from xml.parsers.expat import ExpatError, ParserCreate
 
 import meshio
 import numpy as np
@@ -17,19 +18,42 @@ from mor_bench.checked_files import check_file, limited_memory, read_bytes
 from mor_bench.errors import SpecError, printable
 from mor_bench.scene.gmsh1 import is_gmsh1, read_gmsh1
 from mor_bench.scene.mesh import Mesh
-from mor_bench.scene.point_sets import PointSets, check_abaqus, named_point_sets
+from mor_bench.scene.point_sets import (
+    PointSets,
+    abaqus_keyword,
+    abaqus_lines,
+    check_abaqus,
+    named_point_sets,
+)
 from mor_bench.scene.soundness import FARTHEST_M, tidied
 
-_XDMF = rb"""(?i)Format\s*=\s*["'](?!XML)[^"']*["']|xi:include[^>]*"""
-_REFERENCES = {
-    ".xdmf": _XDMF,
-    ".xmf": _XDMF,
-    ".inp": rb"(?im)^\*INCLUDE[^\r\n]*",
-}
-"""Pattern of a reference to another file, by format."""
+MOST_MESH_BYTES, MOST_CELLS = 1 * 2**30, 4_000_000
+"""Size limits of a mesh or surface file: bytes, and cells of all kinds."""
 
-_IMPLICIT_CELLS = rb"(?im)^DATASET\s+(STRUCTURED_POINTS|STRUCTURED_GRID|RECTILINEAR_GRID)"
+_IMPLICIT_CELLS = rb"(?im)^\s*DATASET\s+(STRUCTURED_POINTS|STRUCTURED_GRID|RECTILINEAR_GRID)"
 """Type of a VTK file of a few bytes that may stand for millions of cells."""
+
+FORMATS = [
+    ".vtu",
+    ".vtk",
+    ".msh",
+    ".inp",
+    ".med",
+    ".xdmf",
+    ".xmf",
+    ".mesh",
+    ".meshb",
+    ".bdf",
+    ".fem",
+    ".nas",
+    ".avs",
+    ".su2",
+    ".f3grid",
+    ".ugrid",
+    ".stl",
+    ".obj",
+]
+"""Formats that are read. meshio has others, but damaged files can keep it busy for ever."""
 
 CELLS = ("hexahedron", "tetra")
 """Supported volume cells, by meshio's names."""
@@ -44,7 +68,7 @@ def read_mesh(path: Path, unit_m: float) -> tuple[Mesh, PointSets]:
     Parameters
     ----------
     path : Path
-        A file in a format of meshio, or in version 1 of Gmsh's format.
+        A file in one of the `FORMATS`, or in version 1 of Gmsh's format.
     unit_m : float
         Length of the file's unit, m.
 
@@ -133,7 +157,7 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
         If the file is missing or unreadable, or its positions are not three-dimensional.
     """
     try:
-        check_file(path, error=SpecError)
+        check_file(path, MOST_MESH_BYTES, SpecError)
         with path.open("rb") as file:
             head = file.read(64)
     except FileNotFoundError:
@@ -143,6 +167,10 @@ def read_with_meshio(path: Path) -> meshio.Mesh:
     _check_alone(path)
     with limited_memory(path, SpecError):
         raw = read_gmsh1(path) if is_gmsh1(head) else _read_by_suffix(path, head)
+    if (n_cells := sum(len(block.data) for block in raw.cells)) > MOST_CELLS:
+        raise SpecError(
+            f"{path}: {n_cells:,} cells; a mesh or surface file may have at most {MOST_CELLS:,}."
+        )
     if raw.points.size and (raw.points.ndim != 2 or raw.points.shape[1] != 3):
         shape = raw.points.shape
         raise SpecError(
@@ -156,15 +184,16 @@ def _check_alone(path: Path) -> None:
     suffix = path.suffix.lower()
     if suffix in (".node", ".ele", ".xml", ".gz"):
         raise SpecError(f"{path}: a mesh must be one file, not packed; convert it to .vtu or .msh.")
-    pattern = _REFERENCES.get(suffix)
-    if pattern and (found := re.search(pattern, read_bytes(path, error=SpecError))):
-        words = " ".join(found[0].decode(errors="replace").split())
+    if suffix not in FORMATS:
+        raise SpecError(f"{path}: a mesh must be one of {', '.join(FORMATS)}; got {suffix!r}.")
+    if reference := _reference(suffix, path):
+        words = printable(" ".join(reference.split())[:80])
         raise SpecError(
-            f"{path}: refers to another file ({words[:80]!r}); a mesh must be one file. "
+            f"{path}: refers to another file ({words!r}); a mesh must be one file. "
             "Convert it to .vtu or .msh."
         )
     if suffix == ".vtk" and (
-        found := re.search(_IMPLICIT_CELLS, read_bytes(path, error=SpecError))
+        found := re.search(_IMPLICIT_CELLS, read_bytes(path, MOST_MESH_BYTES, SpecError))
     ):
         raise SpecError(
             f"{path}: a grid of type {found[1].decode()} lists no cells; convert it to .vtu."
@@ -172,6 +201,37 @@ def _check_alone(path: Path) -> None:
     if is_hdf5(path):
         with open_hdf5(path, SpecError):
             pass
+
+
+def _reference(suffix: str, path: Path) -> str | None:
+    """Return the first reference to another file in a format that allows them."""
+    if suffix == ".inp":
+        return next(
+            (line for line in abaqus_lines(path) if abaqus_keyword(line) == "INCLUDE"), None
+        )
+    if suffix in (".xdmf", ".xmf", ".vtu"):
+        return _xml_reference(read_bytes(path, MOST_MESH_BYTES, SpecError))
+    return None
+
+
+def _xml_reference(content: bytes) -> str | None:
+    """Return the first element of an XML file that names another file, or a document type.
+
+    A document type may define references that no element shows.
+    """
+    found: list[str] = []
+
+    def begin(name: str, attributes: dict[str, str]) -> None:
+        external = name == "DataItem" and attributes.get("Format", "XML") != "XML"
+        if external or name.endswith("include"):
+            found.append(" ".join([name, *(f"{key}={text}" for key, text in attributes.items())]))
+
+    parser = ParserCreate()
+    parser.StartElementHandler = begin
+    parser.StartDoctypeDeclHandler = lambda name, *_: found.append(f"DOCTYPE {name}")
+    with suppress(ExpatError, ValueError, LookupError):  # meshio's message explains the error
+        parser.Parse(content, True)
+    return found[0] if found else None
 
 
 def _read_by_suffix(path: Path, head: bytes) -> meshio.Mesh:

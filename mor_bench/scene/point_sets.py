@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from pathlib import Path
 
 import meshio
@@ -20,6 +21,9 @@ _DIMENSIONS = ("point", "line", "surface", "volume")
 """Gmsh's names of groups, by dimension."""
 
 _NO_ROWS = np.zeros(0, dtype=np.int64)
+
+MOST_GROUPS = 10_000
+"""Largest number of physical groups in a file; each takes a pass over all cells."""
 
 
 def named_point_sets(mesh: meshio.Mesh, path: Path) -> PointSets:
@@ -69,10 +73,14 @@ def _physical_groups(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
     blocks = [(block.dim, np.abs(tags)) for block, tags in zip(mesh.cells, data, strict=True)]
     names = {(int(tag), int(dimension)): name for name, (tag, dimension) in mesh.field_data.items()}
     keys = sorted({(int(tag), dim) for dim, tags in blocks for tag in np.unique(tags) if tag != 0})
-    unnamed = [key[0] for key in keys if key not in names]
+    if len(keys) > MOST_GROUPS:
+        raise SpecError(
+            f"the mesh has {len(keys):,} physical groups; at most {MOST_GROUPS:,} are allowed."
+        )
+    unnamed = Counter(key[0] for key in keys if key not in names)
 
     def name_of(tag: int, dim: int) -> str:
-        number = str(tag) if unnamed.count(tag) == 1 else f"{_DIMENSIONS[dim]} {tag}"
+        number = str(tag) if unnamed[tag] == 1 else f"{_DIMENSIONS[dim]} {tag}"
         return str(names.get((tag, dim), number))
 
     return [
@@ -84,13 +92,22 @@ def _physical_groups(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
     ]
 
 
+def abaqus_lines(path: Path) -> list[str]:
+    """Return the lines of an Abaqus file that may hold a keyword."""
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return re.findall(r"^[^\S\n]*[*A-Za-z].*$", text, re.MULTILINE)
+
+
+def abaqus_keyword(line: str) -> str:
+    """Return the keyword of a line by meshio's rule: blanks and stars do not count."""
+    if line.startswith("**"):
+        return ""
+    return line.partition(",")[0].strip().replace("*", "").upper()
+
+
 def _keywords(path: Path, keyword: str, parameter: str) -> list[str | None]:
     """Return a parameter's value from each line of an Abaqus file with a keyword."""
-    lines = re.findall(
-        rf"^\*{keyword}\s*((?:,.*)?)$",
-        path.read_text(encoding="utf-8", errors="replace"),
-        re.IGNORECASE | re.MULTILINE,
-    )
+    lines = [line for line in abaqus_lines(path) if abaqus_keyword(line) == keyword]
     matches = [re.search(rf",\s*{parameter}\s*=\s*([^,]+)", line, re.IGNORECASE) for line in lines]
     return [match and match[1].strip() for match in matches]
 
@@ -100,8 +117,8 @@ def check_abaqus(path: Path) -> None:
 
     meshio would read only one of them.
     """
-    names = _keywords(path, "NSET", "NSET")
-    repeated = sorted({name for name in names if name is not None and names.count(name) > 1})
+    names = Counter(_keywords(path, "NSET", "NSET"))
+    repeated = sorted(name for name, n in names.items() if name is not None and n > 1)
     if repeated:
         raise SpecError(
             f"{path}: NSET {repeated[0][:100]!r} is defined more than once; "

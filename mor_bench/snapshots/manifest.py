@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -137,7 +138,7 @@ def _sources(value: Any) -> Iterator[dict[str, str]]:
 def _with_kept(spec: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Replace missing files in a specification by the folder's copies, in place; return it."""
     for file in _sources(spec):
-        if not Path(file["path"]).is_file():
+        if not os.path.isfile(file["path"]):  # False also where the path cannot be looked at
             file["path"] = str(_kept(folder, file).resolve())
     return spec
 

@@ -22,6 +22,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.array_files import check_hdf5, reading
 from mor_bench.checked_files import parse_json, read_bytes
 from mor_bench.errors import NewerSchemaError, StoreError, printable
 from mor_bench.scratch import host_name, identity, is_running
@@ -75,6 +76,7 @@ _FIELDS = {
     "min_det_f": "<f8",
     "status": "|u1",
 }
+_RANKS = {"patches": 2, "vectors": 3, "displacements": 2, "min_det_f": 1, "status": 1}
 
 
 def make_own_folder(folder: Path) -> None:
@@ -210,15 +212,16 @@ def parse_shard(content: bytes, where: str) -> Shard:
         )
     if hashlib.sha256(body).hexdigest() != digest:
         raise StoreError(f"{where}: damaged: the checksum does not match.")
-    try:
-        with h5py.File(io.BytesIO(content), "r") as file:
-            return Shard(
-                str(file.attrs["dataset"]),
-                int(file.attrs["start"]),
-                **{name: file[name][()] for name in _FIELDS},
-            )
-    except (OSError, KeyError) as error:
-        raise StoreError(f"{where}: the content is not a shard: {error}") from None
+    with reading(where, "shard", StoreError), h5py.File(io.BytesIO(content), "r") as file:
+        check_hdf5(file, len(content))
+        for name, dtype in _FIELDS.items():
+            if file[name].dtype != dtype or file[name].ndim != _RANKS[name]:
+                raise ValueError(f"`{name}` must be an array of {_RANKS[name]} axes of {dtype}")
+        return Shard(
+            str(file.attrs["dataset"]),
+            int(file.attrs["start"]),
+            **{name: file[name][()] for name in _FIELDS},
+        )
 
 
 def check_version(version: object, where: str) -> None:

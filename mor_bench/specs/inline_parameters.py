@@ -54,7 +54,7 @@ def parse_value(text: str) -> Any:
     try:
         content = tomllib.loads(f"value = {text}")
         return content["value"] if len(content) == 1 else text.strip()
-    except (tomllib.TOMLDecodeError, RecursionError):
+    except (ValueError, RecursionError):  # also an integer of thousands of digits
         return text.strip()
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ValidationInfo
 
-from mor_bench.checked_files import read_bytes
+from mor_bench.digests import digest_of_file
 from mor_bench.errors import SpecError
 from mor_bench.specs.base import StrictModel
 
@@ -52,7 +51,7 @@ class SourceFile(StrictModel):
 
 def _sha256(path: Path) -> str:
     try:
-        return hashlib.sha256(read_bytes(path, error=SpecError)).hexdigest()
+        return digest_of_file(path, SpecError)
     except FileNotFoundError:
         raise SpecError(f"{path}: no such file.") from None
 

@@ -16,6 +16,9 @@ VISIBLE = """() => document.querySelector(".frontier .plot")._fullData
 CAMERAS = """() => [...document.querySelectorAll(".chart.bodies .pair > div > div")]
     .map((view) => view._fullLayout.scene.camera.eye)"""
 
+FIRST_ENTRY = """() => document.querySelector(".frontier .legendtoggle")
+    .getAttribute("aria-label")"""
+
 FOCUSED = "document.activeElement.getAttribute('aria-label') ?? ''"
 
 
@@ -29,12 +32,23 @@ def tab_to(found: Visit, beginning: str) -> str:
     raise AssertionError(f"Tab does not reach {beginning!r}")
 
 
+def arrow_to(found: Visit, beginning: str) -> str:
+    """Press Tab until the legend has the focus, then an arrow until one of its entries has it."""
+    tab_to(found, found.page.evaluate(FIRST_ENTRY))
+    for _ in range(60):
+        name = str(found.page.evaluate(FOCUSED))
+        if name.startswith(beginning):
+            return name
+        found.page.keyboard.press("ArrowDown")
+    raise AssertionError(f"no entry of the legend begins with {beginning!r}")
+
+
 def test_the_legend_hides_and_isolates_by_keyboard(open_page: Visit) -> None:
     page, plot = open_page.page, open_page.page.locator(".frontier .plot")
     before = page.evaluate(VISIBLE)
     plain = pixels_of(plot)
-    assert tab_to(open_page, "umesh:").endswith(
-        "Enter hides or shows it, Shift+Enter shows it alone"
+    assert arrow_to(open_page, "umesh:").endswith(
+        "Enter hides or shows it, Shift+Enter shows it alone, arrow keys go to the others"
     )
     assert (np.abs(pixels_of(plot).astype(int) - plain).max(axis=2) > 60).sum() > 200  # a frame
     page.keyboard.press("Enter")
@@ -55,14 +69,25 @@ def test_the_legend_hides_and_isolates_by_keyboard(open_page: Visit) -> None:
     assert not page.evaluate(FOCUSED).startswith("umesh:")
 
 
-def test_every_legend_is_reached(open_page: Visit) -> None:
+def test_every_legend_is_one_stop_whose_entries_arrows_reach(open_page: Visit) -> None:
     open_page.all_charts()
-    open_page.page.wait_for_timeout(500)
-    toggles = open_page.page.locator(".legend .traces .legendtoggle")
-    assert toggles.count() > 20
-    for toggle in toggles.all():
-        assert toggle.get_attribute("tabindex") == "0"
-        assert toggle.get_attribute("role") == "button"
+    page = open_page.page
+    page.wait_for_timeout(500)
+    legends = [
+        legend.locator(".traces .legendtoggle")
+        for legend in page.locator(".js-plotly-plot:has(.legend .traces)").all()
+    ]
+    assert sum(toggles.count() for toggles in legends) > 20
+    for toggles in legends:
+        n = toggles.count()
+        assert {toggle.get_attribute("role") for toggle in toggles.all()} == {"button"}
+        stops = [toggle.get_attribute("tabindex") for toggle in toggles.all()]
+        assert stops == ["0"] + ["-1"] * (n - 1)
+        names = [str(toggle.get_attribute("aria-label")) for toggle in toggles.all()]
+        toggles.first.focus()
+        for key, i in (("ArrowUp", n - 1), ("Home", 0), ("End", n - 1), ("ArrowRight", 0)):
+            page.keyboard.press(key)
+            assert page.evaluate(FOCUSED) == names[i]
 
 
 def test_the_bodies_turn_zoom_and_deform_by_keyboard(open_page: Visit) -> None:

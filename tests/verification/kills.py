@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import psutil
@@ -189,8 +189,9 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=KILLS)
     parser.add_argument("--seed", type=int, default=int(time.time()))
     parser.add_argument("--commands", nargs="*", default=list(COMMANDS), choices=COMMANDS)
+    parser.add_argument("--json", type=Path, help="file to write the outcomes to")
     given = parser.parse_args()
-    wrong = 0
+    wrong, rows = 0, []
     with tempfile.TemporaryDirectory() as parent:
         for command in given.commands:
             expected = undisturbed(command, Path(parent) / f"{command}-undisturbed")
@@ -201,6 +202,10 @@ def main() -> None:
                 wrong += len(found.wrong)
                 print(f"{command} {name}: {found.kills} kills, {found.finished} finished", end="")
                 print(f", {len(found.wrong)} wrong {found.wrong[:5]}", flush=True)
+                rows.append({"command": command, "signal": name, **asdict(found)})
+    if given.json:
+        counted = [{**row, "wrong": len(row["wrong"])} for row in rows]
+        given.json.write_text(json.dumps({"seed": given.seed, "kills": counted}, indent=1) + "\n")
     sys.exit(wrong > 0)
 
 

@@ -10,9 +10,10 @@ is read. Growth counts from the first tenth on, since libraries fill caches at f
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import inf
 from pathlib import Path
 from time import perf_counter
@@ -111,8 +112,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=inf, help="time limit of each method")
     parser.add_argument("--methods", nargs="*", default=list(CORE_METHODS))
     parser.add_argument("--cache", type=Path, default=None)
+    parser.add_argument("--json", type=Path, help="file to write the results to")
     given = parser.parse_args(arguments)
-    failed = False
+    failed, rows = False, []
     with threadpool_limits(1):
         data = load_dataset("beam-tiny", cache=given.cache)
         for name in given.methods:
@@ -123,12 +125,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 failed = True
                 continue
             failed |= not found.ok
+            rows.append({"method": name, **asdict(found)})
             print(
                 f"{name}: {found.n:,} predictions in {found.seconds:,.0f} s, memory "
                 f"{found.growth_bytes / 1e6:+.1f} MB, {found.drifted} drifts, "
                 f"{found.refused:,} without an answer",
                 flush=True,
             )
+    if given.json:
+        given.json.write_text(json.dumps({"methods": rows}, indent=1) + "\n")
     sys.exit(failed)
 
 

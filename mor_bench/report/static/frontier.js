@@ -39,10 +39,12 @@ Report.kinds.frontier = (figure, data) => {
     };
   }
 
+  // Place in pixels along an axis, at the usual size of the chart.
+  const at = (value, [low, high], size) => (size * (Math.log10(value) - low)) / (high - low);
+
   // Labels of the front that do not cover each other, at the usual size of the chart.
   function labelled(rows, range) {
     const taken = [], found = new Set();
-    const at = (value, [low, high], size) => (size * (Math.log10(value) - low)) / (high - low);
     for (const row of rows.filter((r) => r.front && y(r) === inside(y(r)))) {
       const box = [at(x(row), range.x, 500), at(y(row), range.y, 450), 8 * labelOf(row).length + 14];
       const apart = ([px, py, width]) => Math.abs(py - box[1]) > 15
@@ -113,14 +115,23 @@ Report.kinds.frontier = (figure, data) => {
     return { shapes, annotations };
   }
 
-  // Values beyond the axis stand at its edge, with an arrow and the value.
-  function cuts(rows) {
-    return rows.filter((row) => y(row) > TOP || y(row) < FLOOR).map((row, i) => ({
-      x: Math.log10(x(row)), y: Math.log10(inside(y(row))), ax: 0,
-      ay: (y(row) > TOP ? 1 : -1) * (26 + 16 * (i % 4)),
-      text: R.plain(`${row.name}: ${R.short(y(row))} %`), bgcolor: R.theme().paper, arrowhead: 2, arrowside: "start", startarrowhead: 0,
-      font: { size: 11, color: R.theme().ink }, arrowcolor: R.theme().quiet,
-    }));
+  // Values beyond the axis stand at its edge, with an arrow and the value, over no other marker.
+  function cuts(rows, range) {
+    const pixels = (row) => [at(x(row), range.x, 500), at(inside(y(row)), range.y, 450)];
+    const taken = rows.map((row) => [...pixels(row), 12]);
+    return rows.filter((row) => y(row) > TOP || y(row) < FLOOR).map((row) => {
+      const text = R.plain(`${row.name}: ${R.short(y(row))} %`);
+      const side = y(row) > TOP ? 1 : -1, [px, py] = pixels(row), width = 6.5 * text.length;
+      const free = (away) => taken.every(([qx, qy, other]) =>
+        Math.abs(qy - (py - side * away)) > 13 || Math.abs(qx - px) > (width + other) / 2);
+      const away = [26, 42, 58, 74, 90, 106].find(free) ?? 26;
+      taken.push([px, py - side * away, width]);
+      return {
+        x: Math.log10(x(row)), y: Math.log10(inside(y(row))), ax: 0, ay: side * away, text,
+        bgcolor: R.theme().paper, arrowhead: 2, arrowside: "start", startarrowhead: 0,
+        font: { size: 11, color: R.theme().ink }, arrowcolor: R.theme().quiet,
+      };
+    });
   }
 
   function rangeOf(values, extra) {
@@ -150,7 +161,7 @@ Report.kinds.frontier = (figure, data) => {
     const its = R.layout({
       xaxis: R.logAxis(title, { range: range.x }),
       yaxis: R.logAxis(`relative L2 error, ${error.selectedOptions[0].text} (%)`, { range: range.y }),
-      shapes, annotations: [...annotations, ...cuts(rows)],
+      shapes, annotations: [...annotations, ...cuts(rows, range)],
       ...R.legend(traces.length + data.groups.length, R.isNarrow() ? 400 : 560),
     });
     its.legend.groupclick = "toggleitem";

@@ -1,7 +1,7 @@
 "use strict";
 // Legends and 3D views by keyboard.
 Report.keyboard = (() => {
-  const HINT = "Enter hides or shows it, Shift+Enter shows it alone";
+  const HINT = "Enter hides or shows it, Shift+Enter shows it alone, arrow keys go to the others";
 
   // The library knows clicks only; a second click within its limit is a double-click.
   function click(toggle, times) {
@@ -12,17 +12,26 @@ Report.keyboard = (() => {
     }
   }
 
+  const BESIDE = { ArrowDown: 1, ArrowRight: 1, ArrowUp: -1, ArrowLeft: -1 };
+
+  // A legend is one stop of the Tab key, however many entries it has.
   function decorate(plot) {
-    for (const entry of plot.querySelectorAll(".legend .traces")) {
-      const toggle = entry.querySelector(".legendtoggle");
-      const text = entry.querySelector(".legendtext");
-      if (!toggle || !text) continue;
+    const toggles = [...plot.querySelectorAll(".legend .traces .legendtoggle")];
+    const stop = Math.min(Number(plot.dataset.entry || 0), toggles.length - 1);
+    toggles.forEach((toggle, i) => {
+      const entry = toggle.closest(".traces");
       const shown = Number(entry.style.opacity || 1) === 1;
       for (const [key, value] of Object.entries({
-        tabindex: 0, role: "button", "aria-pressed": shown,
-        "aria-label": `${text.textContent}: ${HINT}`,
+        tabindex: i === stop ? 0 : -1, role: "button", "aria-pressed": shown,
+        "aria-label": `${entry.querySelector(".legendtext").textContent}: ${HINT}`,
       })) toggle.setAttribute(key, value);
-    }
+    });
+    return toggles;
+  }
+
+  function focus(plot, toggles, i) {
+    plot.dataset.entry = (i + toggles.length) % toggles.length;
+    decorate(plot)[plot.dataset.entry].focus();
   }
 
   function legend(plot) {
@@ -30,9 +39,13 @@ Report.keyboard = (() => {
     plot.dataset.keys = "legend";
     plot.on("plotly_afterplot", () => decorate(plot));
     plot.addEventListener("keydown", (event) => {
-      if (!event.target.matches(".legendtoggle") || (event.key !== "Enter" && event.key !== " ")) return;
+      if (!event.target.matches(".legendtoggle")) return;
+      const toggles = decorate(plot), i = toggles.indexOf(event.target);
+      if (event.key === "Enter" || event.key === " ") click(event.target, event.shiftKey ? 2 : 1);
+      else if (event.key in BESIDE) focus(plot, toggles, i + BESIDE[event.key]);
+      else if (event.key === "Home" || event.key === "End") focus(plot, toggles, event.key === "Home" ? 0 : -1);
+      else return;
       event.preventDefault();
-      click(event.target, event.shiftKey ? 2 : 1);
     });
     decorate(plot);
   }
