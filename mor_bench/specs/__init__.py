@@ -24,7 +24,7 @@ from mor_bench.specs.geometry_spec import (
     TetrahedraGeometry,
     VoxelsGeometry,
 )
-from mor_bench.specs.loads_spec import AXES, Loads, Sampling, Split, SplitBy
+from mor_bench.specs.loads_spec import AXES, Loads, Motion, Sampling, Split, SplitBy
 from mor_bench.specs.material_spec import (
     FibreMaterial,
     MooneyRivlinMaterial,
@@ -71,6 +71,7 @@ __all__ = [
     "Loads",
     "MethodSpec",
     "MooneyRivlinMaterial",
+    "Motion",
     "NearSurfaceRegion",
     "NearestRegion",
     "OgdenMaterial",
