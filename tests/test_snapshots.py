@@ -198,7 +198,8 @@ def test_missing_sets_give_their_reason() -> None:
 
 
 QUICK = {"beam-tiny", "beam-nearly-incompressible", "block-compression"}
-SLOW = {*map(scene_of, list_suite("datasets"))} - QUICK - {"liver-hex-observed"}  # as liver-hex
+OTHERS = {"liver-hex-observed", "liver-grasped"}  # the samples of liver-hex, and no forces
+SLOW = {*map(scene_of, list_suite("datasets"))} - QUICK - OTHERS
 
 
 @pytest.mark.parametrize(

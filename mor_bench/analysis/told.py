@@ -48,8 +48,10 @@ def class_of_method(spec: MethodSpec, profile: str) -> str:
 
 
 def is_observed(comparison: Comparison, dataset: str) -> bool:
-    """Return whether a dataset gives observed displacements instead of forces."""
-    return bool(comparison.datasets.get(dataset, {}).get("observed"))
+    """Return whether a dataset gives observed or prescribed displacements instead of forces."""
+    spec = comparison.datasets.get(dataset, {})
+    moved = (spec.get("loads") or {}).get("kind") == "displacement"
+    return moved or bool(spec.get("observed"))
 
 
 def classes_of(rows: Iterable[Row]) -> list[Told | None]:

@@ -22,7 +22,13 @@ from numpy.typing import NDArray
 
 from mor_bench.checked_files import read_json
 from mor_bench.checkout import source_commit
-from mor_bench.errors import InvalidInputError, SolverError, SpecError, StoreError
+from mor_bench.errors import (
+    InvalidInputError,
+    SolverError,
+    SpecError,
+    StoreError,
+    UnsupportedSceneError,
+)
 from mor_bench.machine import describe_machine
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
@@ -273,6 +279,11 @@ def refine(
     """
     spec = dataset if isinstance(dataset, DatasetSpec) else load_generated_spec(dataset, suite)
     scene = load_scene(spec)
+    if scene.motion:
+        raise UnsupportedSceneError(
+            f"{spec.name}: the discretisation error can be measured for forces only, not where "
+            "`loads.kind` is 'displacement'."
+        )
     n_patches = len(scene.patch_nodes)
     if not 1 <= plan.n_loads <= n_patches:
         raise InvalidInputError(

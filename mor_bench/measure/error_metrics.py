@@ -96,6 +96,15 @@ def sample_errors(
     )
 
 
+def percentiles(errors: NDArray[np.float64], name: str) -> dict[str, float]:
+    """Return the median, the 95th percentile and the maximum of relative errors, by name."""
+    return {
+        f"{name}_median": float(np.median(errors)),
+        f"{name}_p95": float(np.percentile(errors, 95, method="higher")),
+        f"{name}_max": float(errors.max()),
+    }
+
+
 def summary(errors: SampleErrors) -> dict[str, float]:
     """Return the error figures of a results row.
 
@@ -117,16 +126,12 @@ def summary(errors: SampleErrors) -> dict[str, float]:
         "std_dof_m": spread,
         "max_dof_m": float(e.max()),
         "mean_free_dof_m": float(errors.mean_free_dof_m.mean()),
-        "rel_l2_median": float(np.median(relative)),
-        "rel_l2_p95": float(np.percentile(relative, 95, method="higher")),
-        "rel_l2_max": float(relative.max()),
+        **percentiles(relative, "rel_l2"),
         "max_nodal_m": float(errors.max_nodal_m.max()),
         "slope": slope,
         "amplitude_m": float(errors.amplitude_m.max()),
         "tip_max_m": float(errors.tip_m.max()),
-        "tip_rel_median": float(np.median(errors.tip_relative)),
-        "tip_rel_p95": float(np.percentile(errors.tip_relative, 95, method="higher")),
-        "tip_rel_max": float(errors.tip_relative.max()),
+        **percentiles(errors.tip_relative, "tip_rel"),
         "tip_rel_at_max_e": float(errors.tip_relative[e.argmax()]),
         "tip_rel_at_largest": float(errors.tip_relative[errors.amplitude_m.argmax()]),
     }

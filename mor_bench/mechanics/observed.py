@@ -1,8 +1,8 @@
-"""Equilibria of a body with known displacements at a part of the surface instead of forces.
+"""Equilibria of a body with given displacements at a part of the surface instead of forces.
 
 The observed nodes are held at their observed displacements and the supports at rest. All other
 nodes are hidden and carry no force: f_int(u) = 0 there. The model is exact if every loaded node is
-observed. Otherwise it neglects the hidden loads.
+observed, as where a tool moves the body. Otherwise it neglects the hidden loads.
 """
 
 from __future__ import annotations
@@ -168,8 +168,8 @@ class ObservedModel:
         whole = FullOrderModel(scene, solver)
         held = replace(
             scene,
-            # The whole model has the rest state under gravity.
-            spec=scene.generated.model_copy(update={"gravity": None}),
+            # The whole model has the rest state under gravity, and moves the tool.
+            spec=scene.generated.model_copy(update={"gravity": None, "loads": None}),
             fixed_nodes=np.union1d(scene.fixed_nodes, scene.observed_nodes),
         )
         with warnings.catch_warnings():
@@ -301,3 +301,40 @@ def forward_model(scene: Scene, solver: SolverName | None = None) -> FullOrderMo
     model = FullOrderModel(scene, solver)
     model.prepare()
     return model
+
+
+def generating_model(scene: Scene) -> FullOrderModel | ObservedModel:
+    """Return the model whose input are the sampled loads: forces, or the motion of a tool."""
+    return ObservedModel(scene) if scene.motion else FullOrderModel(scene)
+
+
+class ToolForces:
+    """Forces of a moved tool on its nodes: the internal forces there.
+
+    Their sum is minus the reaction that the tool feels. Foundations resist, and gravity acts, as
+    part of the internal forces.
+
+    Parameters
+    ----------
+    scene : Scene
+        A scene with a moved tool.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        if scene.motion is None or scene.observed_nodes is None:
+            raise UnsupportedSceneError(f"{scene.name}: no tool moves the body.")
+        self._model, self._nodes = FullOrderModel(scene), scene.observed_nodes
+
+    def __call__(self, displacements: Array) -> Array:
+        """Return the forces (n, n_nodes, 3), N, at displacements (n, n_free) of the free dofs, m.
+
+        They are zero at all other nodes, and NaN where the displacements are not finite.
+        """
+        scene = self._model.scene
+        forces = np.zeros((len(displacements), scene.mesh.n_nodes, 3))
+        for row, u in zip(forces, displacements, strict=True):
+            internal = np.zeros(scene.mesh.n_dofs)
+            finite = bool(np.isfinite(u).all())
+            internal[scene.free_dofs] = self._model.force(u).force if finite else np.nan
+            row[self._nodes] = internal.reshape(-1, 3)[self._nodes]
+        return forces

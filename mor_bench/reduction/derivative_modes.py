@@ -52,7 +52,7 @@ def linear_modes(scene: Scene, model: FullOrderModel, n_modes: int | None = None
     responses = patch_responses(scene, model)
     basis = pod(responses, n_modes)
     # A random direction has a mean square of 1/3 along each axis.
-    size = scene.generated.load_plan.magnitude_n[1] / np.sqrt(len(responses))
+    size = scene.generated.load_plan.magnitude[1] / np.sqrt(len(responses))
     return LinearModes(basis.modes, size * basis.singular_values[: basis.modes.shape[1]])
 
 

@@ -146,7 +146,8 @@ def dataset_card(spec: AnyDatasetSpec, path: Path, cache: Path | None = None) ->
             "geometry": _pairs(spec.geometry.model_dump(mode="json", exclude_none=True)),
             "material": _pairs(spec.material.model_dump(mode="json", exclude_none=True)),
             "loads": f"{loads.simultaneous} at a time, kind {loads.kind}, "
-            f"{loads.magnitude_n[0]:g} to {loads.magnitude_n[1]:g} N, {loads.sampling}"
+            f"{loads.magnitude[0]:g} to {loads.magnitude[1]:g} {'m' if spec.motion else 'N'}, "
+            f"{loads.sampling}"
             if loads
             else "",
             "split": _pairs(spec.split.model_dump(mode="json", exclude_none=True)) if loads else "",

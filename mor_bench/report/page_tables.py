@@ -59,6 +59,11 @@ GROUPS: dict[str, dict[str, Cell]] = {
         "p95": figure_cell("error", "tip_rel_p95", percent),
         "max": figure_cell("error", "tip_rel_max", percent),
     },
+    "Reaction force of the tool (%)": {
+        "median": figure_cell("error", "reaction_rel_median", percent),
+        "p95": figure_cell("error", "reaction_rel_p95", percent),
+        "max": figure_cell("error", "reaction_rel_max", percent),
+    },
     "Size and samples": {
         "model": lambda e: bytes_text(e.row.model_bytes),
         "threads": lambda e: str(e.row.threads),

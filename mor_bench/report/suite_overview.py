@@ -77,6 +77,8 @@ def dataset_family(spec: AnyDatasetSpec) -> str:
     if not isinstance(spec, DatasetSpec):
         return "imported snapshots"
     family = SHAPES[spec.geometry.shape]
+    if spec.motion:
+        return f"{family}, displacements prescribed"
     return f"{family}, displacements observed" if spec.observed else family
 
 

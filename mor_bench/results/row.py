@@ -46,6 +46,9 @@ class ErrorSummary(Part):
         Error at the tip over its displacement, as a fraction: median, 95th percentile and maximum.
     tip_rel_at_max_e, tip_rel_at_largest : float
         The same of the sample with the largest e, and of the sample with the largest displacement.
+    reaction_rel_median, reaction_rel_p95, reaction_rel_max : float
+        Error of the force that a moved tool feels over that force, as a fraction; NaN without a
+        tool.
     """
 
     mean_dof_m: Real = nan
@@ -64,6 +67,9 @@ class ErrorSummary(Part):
     tip_rel_max: Real = nan
     tip_rel_at_max_e: Real = nan
     tip_rel_at_largest: Real = nan
+    reaction_rel_median: Real = nan
+    reaction_rel_p95: Real = nan
+    reaction_rel_max: Real = nan
 
 
 class SetErrors(Part):

@@ -67,7 +67,10 @@ def _generated(spec: DatasetSpec) -> str:
         draw_loads(scene, 0, 1)
         if spec.tests.unseen_region is not None:
             check_regions(spec)
-        samples = f"{len(scene.patch_nodes)} load patches, {n_samples_of(scene)} samples"
+        loaded = f"{len(scene.patch_nodes)} load patches"
+        if scene.motion and scene.observed_nodes is not None:
+            loaded = f"{len(scene.observed_nodes)} moved nodes"
+        samples = f"{loaded}, {n_samples_of(scene)} samples"
         text = f"dataset, {size}, {samples}"
     risk = locking_risk(scene)
     return f"{text}; warning: {risk}" if risk else text

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import MissingDependencyError, MorBenchError, UnsupportedSceneError
-from mor_bench.measure.error_metrics import ERRORS, SampleErrors, summary
+from mor_bench.measure.error_metrics import ERRORS, SampleErrors, percentiles, summary
 from mor_bench.measure.method_session import CURVES
 from mor_bench.measure.range_flags import Flags
 from mor_bench.results.parts import TrainingRecord
@@ -43,7 +43,10 @@ def n_failed(score: Score) -> int:
 
 def error_summary(score: Score) -> ErrorSummary:
     """Summarise the errors on a test set."""
-    return ErrorSummary(**summary(SampleErrors(**{name: score[name] for name in ERRORS})))
+    figures = summary(SampleErrors(**{name: score[name] for name in ERRORS}))
+    if "reaction_relative" in score:
+        figures |= percentiles(score["reaction_relative"], "reaction_rel")
+    return ErrorSummary(**figures)
 
 
 def set_errors(score: Score, flags: Flags | None = None, seed: int | None = None) -> SetErrors:

@@ -78,6 +78,7 @@ class _Scorer:
 
     def _measured(self, test: TestSet) -> Score:
         errors: list[SampleErrors] = []
+        reactions: list[NDArray[np.float64]] = []
         flags: list[bool] | None = []
         data, worst = self.cached.data, _Worst(test)
         is_main = test is data.sets.get("test")
@@ -91,6 +92,8 @@ class _Scorer:
                 predicted = self._predictions(forces, left_s, Path(folder) / "answers.npy")
                 references = test.references[chunk]
                 errors.append(sample_errors(predicted, references, test.nodes, test.fixed_nodes))
+                if data.reaction_errors:
+                    reactions.append(data.reaction_errors(predicted, references))
                 worst.look_at(start, errors[-1].mean_dof_m, predicted)
                 indicated.add(start, forces, predicted)
                 found = self.worker.ask("flag", LOAD_LIMIT_S, forces=forces)["flagged"]
@@ -98,6 +101,8 @@ class _Scorer:
             score: Score = {
                 name: np.concatenate([getattr(part, name) for part in errors]) for name in ERRORS
             }
+            if reactions:
+                score["reaction_relative"] = np.concatenate(reactions)
             typical = _typical(score["mean_dof_m"])
             left_s = max(1.0, until - monotonic())
             again = self._predictions(test.forces[[typical]], left_s, Path(folder) / "answers.npy")[

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from mor_bench.digests import digest_of_arrays, digest_of_file
 from mor_bench.errors import StoreError
+from mor_bench.measure.reaction_errors import ReactionErrors
 from mor_bench.mechanics.indicator import ErrorIndicator
 from mor_bench.sandbox.handover import arrays_of, write_snapshots
 from mor_bench.sandbox.process import MethodFailedError
@@ -151,6 +152,12 @@ class TrainingData:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # methods repeat the scene's warnings
             return ErrorIndicator(self.scene)
+
+    @cached_property
+    def reaction_errors(self) -> ReactionErrors | None:
+        """Errors of a moved tool's reaction; None without one, or if only some nodes are wanted."""
+        whole = len(self.scene.output_nodes) == self.scene.mesh.n_nodes
+        return ReactionErrors(self.scene) if self.scene.motion and whole else None
 
     def first(self, n: int) -> TrainingData:
         """Return the same data with only the first training samples and the main test set."""

@@ -22,6 +22,7 @@ from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets, Patches, cut_patches, spread_out
 from mor_bench.scene.materials import Material, make_material
 from mor_bench.scene.mesh import Mesh
+from mor_bench.scene.observed_regions import moved_nodes, observed_nodes
 from mor_bench.scene.regions import Cloud, region_points
 from mor_bench.scene.snapshot_file import ImportedArrays, read_arrays
 from mor_bench.scene.springs import Springs, foundations
@@ -33,6 +34,7 @@ from mor_bench.specs import (
     DatasetSpec,
     ImportedDatasetSpec,
     LShapeGeometry,
+    Motion,
     generated,
     load_dataset_spec,
 )
@@ -125,23 +127,19 @@ class Scene:
         Raises
         ------
         SpecError
-            If the region has no free node of the surface, or contains every free node.
+            If the region has no free node of the surface, or contains every free node; or if a
+            moved region has a node of a support.
         """
+        if self.motion:
+            return moved_nodes(self._cloud, self.motion, self.fixed_dofs)
         if self.spec.observed is None:
             return None
-        region = region_points(self._cloud, self.spec.observed.region)
-        free = np.setdiff1d(np.arange(self.mesh.n_nodes), self.fixed_nodes)
-        seen = np.intersect1d(np.intersect1d(region, self._cloud.on_surface), free)
-        if not len(seen):
-            raise SpecError(
-                "`observed.region` holds no node that lies on the surface and is free to move."
-            )
-        if len(seen) == len(free):
-            raise SpecError(
-                "`observed.region` holds every node that is free to move: no displacement "
-                "is left to compute."
-            )
-        return seen
+        return observed_nodes(self._cloud, self.spec.observed, self.fixed_nodes)
+
+    @property
+    def motion(self) -> Motion | None:
+        """The plan of prescribed displacements; None if the scene has another or no plan."""
+        return self.spec.motion if isinstance(self.spec, DatasetSpec) else None
 
     @cached_property
     def surface(self) -> Facets:
@@ -173,9 +171,15 @@ class Scene:
         """(n_patches,) surface point at the centre of each load patch.
 
         The index of a patch here is its load-region id. On a mesh's own boundary the points are
-        nodes.
+        nodes. A moved tool counts as one patch, at one of its nodes.
         """
-        region, loads = self._loaded_points, self.generated.load_plan
+        loads = self.generated.load_plan
+        if isinstance(loads, Motion):
+            assert self.observed_nodes is not None
+            points = self.mesh.points[self.observed_nodes]
+            middle = np.linalg.norm(points - points.mean(axis=0), axis=1).argmin()
+            return self._surface_point(points[middle])
+        region = self._loaded_points
         if loads.n_patches is None:
             return region
         points = self.surface.points[region]
@@ -188,6 +192,9 @@ class Scene:
                 f"region away from the supports; got {loads.n_patches}."
             )
         return region[spread_out(self.surface.points[region], loads.n_patches)]
+
+    def _surface_point(self, position: NDArray[np.float64]) -> NDArray[np.int64]:
+        return np.array([np.linalg.norm(self.surface.points - position, axis=1).argmin()])
 
     @property
     def patch_centres(self) -> NDArray[np.float64]:
@@ -202,8 +209,10 @@ class Scene:
     @cached_property
     def patches(self) -> Patches:
         """The load patches as points of the surface with areas."""
-        area_m2 = self.generated.load_plan.patch_area_m2
-        return cut_patches(self.surface, self.loaded_facets, self.patch_nodes, area_m2)
+        plan = self.generated.load_plan
+        if isinstance(plan, Motion):
+            raise UnsupportedSceneError(f"{self.name}: a tool moves the body; it has no patches.")
+        return cut_patches(self.surface, self.loaded_facets, self.patch_nodes, plan.patch_area_m2)
 
     @cached_property
     def patch_normals(self) -> NDArray[np.float64]:
@@ -234,8 +243,13 @@ class Scene:
         """(n_patches, n_nodes) nodal weights of a force on each patch; rows sum to 1.
 
         They are the consistent load of a uniform traction. An embedded surface passes it to the
-        nodes of the surrounding cells.
+        nodes of the surrounding cells. For a moved tool they are 1 at each of its nodes.
         """
+        if self.motion:
+            assert self.observed_nodes is not None
+            columns = self.observed_nodes, np.array([0, len(self.observed_nodes)])
+            moved = np.ones(len(self.observed_nodes)), *columns
+            return sp.csr_array(moved, shape=(1, self.mesh.n_nodes))
         if self.embedded_surface:
             points, shares = self.patch_points(np.arange(len(self.patch_nodes)))
             return _rows_to_one(sp.csr_array(shares @ interpolation_matrix(self.mesh, points)))

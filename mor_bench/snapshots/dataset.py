@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError, check_count
+from mor_bench.mechanics.observed import ToolForces
 from mor_bench.scene.scene import Scene, as_spec, imported_scene, load_scene
 from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import GenerationOptions, generate, read_shards
@@ -68,9 +69,11 @@ class Snapshots:
 
     @cached_property
     def forces(self) -> NDArray[np.float64]:
-        """(n_samples, n_nodes, 3) nodal forces, N."""
+        """(n_samples, n_nodes, 3) nodal forces, N; those of the tool where it moves the body."""
         if isinstance(self.loads, NodalLoads):
             return self.loads.forces
+        if self.scene.motion:
+            return read_only(ToolForces(self.scene)(self.free_displacements))
         return read_only(self.loads.nodal_forces(self.scene.patch_weights))
 
     @cached_property
@@ -214,7 +217,7 @@ def _split(
 ) -> Dataset:
     if n := repeated([(store.scene, store.loads) for store in (main, *others.values())]):
         raise InvalidInputError(
-            f"{spec.name}: {n} samples repeat others; check `seed` and `magnitude_n`."
+            f"{spec.name}: {n} samples repeat others; check `seed` and the range of magnitudes."
         )
     valid, n_patches = main.valid, len(main.scene.patch_nodes)
     chosen = spec.split.model_copy(update={"by": by})

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from mor_bench.errors import SolverError
-from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import Solution
+from mor_bench.mechanics.observed import generating_model
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.sampling import draw_loads, n_samples_of
@@ -44,8 +44,8 @@ def fresh_test_set(spec: DatasetSpec, scene: Scene, by: SplitBy, seed: int, n: i
     split = spec.split.model_copy(update={"by": by})
     held = drawn[split_samples(drawn, len(scene.patch_nodes), split, spec.load_plan.seed).test]
     held = held[: min(n, MAX_FRESH)]
-    forces = held.nodal_forces(scene.patch_weights).reshape(len(held), -1)[:, scene.free_dofs]
-    found = FullOrderModel(scene).solve_many(forces)
+    values = held.nodal_forces(scene.patch_weights).reshape(len(held), -1)[:, scene.free_dofs]
+    found = generating_model(scene).solve_many(values)
     solved = [(i, answer) for i, answer in enumerate(found) if isinstance(answer, Solution)]
     if not solved:
         raise SolverError(f"{spec.name}: no fresh test load has a valid equilibrium.")

@@ -149,7 +149,7 @@ class _Plan:
         )
 
     def _is_loaded(self, shard: Shard, loads: PatchLoads) -> bool:
-        largest = self.scene.generated.load_plan.magnitude_n[1]
+        largest = self.scene.generated.load_plan.magnitude[1]
         return bool(
             shard.patches.shape == loads.patches.shape
             and shard.vectors.shape == loads.vectors.shape

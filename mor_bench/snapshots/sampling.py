@@ -1,4 +1,4 @@
-"""Sampling plans: the forces and patches of sample i.
+"""Sampling plans: the forces and patches of sample i, or the displacement of a tool.
 
 With one patch at a time, sample i acts on patch i modulo the number of patches. So the first n
 samples always cover the load region evenly. With several patches, or a total number of samples, all
@@ -29,7 +29,7 @@ from scipy.spatial.distance import cdist
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.scene import Scene
-from mor_bench.specs import MAX_COUNT, Loads, Sampling
+from mor_bench.specs import MAX_COUNT, Loads, Motion, Sampling
 
 MAX_COMBINATIONS = 5_000_000
 """Largest number of listed combinations of patches. With three patches each, they need 120 MB."""
@@ -40,20 +40,20 @@ MAX_PAIRED = 10_000
 MAX_DRAWS = 1000
 """Tries per sample to draw patches that are far apart."""
 
-N_COORDINATES = {"force": 3, "tangential": 2, "normal": 1}
-"""Coordinates of one force, by kind of load."""
+N_COORDINATES = {"force": 3, "displacement": 3, "tangential": 2, "normal": 1}
+"""Coordinates of one force or displacement, by kind of load."""
 
 
 @dataclass(frozen=True)
 class PatchLoads:
-    """Loads in compact form: k force vectors on k patches per sample.
+    """Loads in compact form: k force vectors on k patches per sample, or the motion of one tool.
 
     Attributes
     ----------
     patches : (n_samples, k) int64
         Patch numbers, which are also the load-region ids, in ascending order.
     vectors : (n_samples, k, 3) float64
-        Forces, N.
+        Forces, N, or displacements, m.
     """
 
     patches: NDArray[np.int64]
@@ -66,7 +66,10 @@ class PatchLoads:
         return PatchLoads(self.patches[index], self.vectors[index])
 
     def nodal_forces(self, weights: sp.csr_array) -> NDArray[np.float64]:
-        """Return nodal forces (n_samples, n_nodes, 3), N, from a scene's patch weights."""
+        """Return nodal forces, N, or displacements, m, of a moved tool, from a scene's weights.
+
+        Their shape is (n_samples, n_nodes, 3).
+        """
         total = np.zeros((len(self), weights.shape[1], 3))
         for patches, vectors in zip(self.patches.T, np.moveaxis(self.vectors, 1, 0), strict=True):
             total += weights[patches].toarray()[:, :, None] * vectors[:, None, :]
@@ -108,7 +111,8 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
         patches = np.stack([_apart(scene, int(i)) for i in numbers])
     else:
         patches = chosen[numbers % len(chosen)]
-    normals = scene.patch_normals[patches]
+    free = N_COORDINATES[loads.kind] == 3  # directions that depend on no normal
+    normals = np.zeros((*patches.shape, 3)) if free else scene.patch_normals[patches]
     if loads.sampling == "random":
         drawn = [_random_forces(loads, int(i), n) for i, n in zip(numbers, normals, strict=True)]
         return PatchLoads(patches, np.stack(drawn))
@@ -198,16 +202,18 @@ def _apart(scene: Scene, number: int) -> NDArray[np.int64]:
     )
 
 
-def _random_forces(loads: Loads, number: int, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+def _random_forces(
+    loads: Loads | Motion, number: int, normals: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the forces (k, 3) of one sample on patches with normals (k, 3)."""
     generator = np.random.default_rng([loads.seed, number])
-    if loads.kind != "force":
+    if N_COORDINATES[loads.kind] < 3:
         unit = generator.uniform(size=(1, loads.simultaneous, N_COORDINATES[loads.kind]))
         return np.asarray(_forces(loads, unit, normals[None])[0])
     vectors = np.empty((loads.simultaneous, 3))
     for vector in vectors:
         direction = generator.normal(size=3)
-        vector[:] = direction * (generator.uniform(*loads.magnitude_n) / np.linalg.norm(direction))
+        vector[:] = direction * (generator.uniform(*loads.magnitude) / np.linalg.norm(direction))
     return vectors
 
 
@@ -225,14 +231,14 @@ def _design(sampling: Sampling, seed: tuple[int, ...], n: int, d: int) -> NDArra
 
 
 def _forces(
-    loads: Loads, unit: NDArray[np.float64], normals: NDArray[np.float64]
+    loads: Loads | Motion, unit: NDArray[np.float64], normals: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return forces (n, k, 3), N, for coordinates (n, k, d) in [0, 1] and normals (n, k, 3).
 
     d = 3: height and azimuth on the sphere (Archimedes) and magnitude. d = 2: angle in the tangent
     plane and magnitude. d = 1: the lower half of the interval presses, the upper half pulls.
     """
-    low, high = loads.magnitude_n
+    low, high = loads.magnitude
     if loads.kind == "normal":
         signed = 2 * unit[:, :, 0] - 1
         size = np.sign(signed) * (low + (high - low) * np.abs(signed))

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from mor_bench.errors import InvertedElementError, WorkerError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import Solution
+from mor_bench.mechanics.observed import ObservedModel, generating_model
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.snapshots.store import STATUSES, Shard
@@ -64,22 +65,22 @@ class Solved:
 def pack(scene: Scene) -> bytes:
     """Serialise the input of a worker: mesh, material, supports and patch weights."""
     mesh = replace(scene.mesh)  # a copy without cached properties
-    return pickle.dumps(
-        (replace(scene, mesh=mesh, embedded_surface=None, point_sets={}), scene.patch_weights)
-    )
+    sets = scene.point_sets if scene.motion else {}  # the moved region may be one of them
+    sent = replace(scene, mesh=mesh, embedded_surface=None, point_sets=sets)
+    return pickle.dumps((sent, scene.patch_weights))
 
 
 class _Kept(threading.local):
     """The last model of each thread. Models have buffers, so threads do not share them."""
 
     problem: bytes = b""
-    model: FullOrderModel
+    model: FullOrderModel | ObservedModel
     weights: sp.csr_array
 
-    def of(self, problem: bytes) -> tuple[FullOrderModel, sp.csr_array]:
+    def of(self, problem: bytes) -> tuple[FullOrderModel | ObservedModel, sp.csr_array]:
         if self.problem != problem:
             scene, self.weights = pickle.loads(problem)
-            self.model, self.problem = FullOrderModel(scene), problem
+            self.model, self.problem = generating_model(scene), problem
         return self.model, self.weights
 
 
@@ -125,13 +126,13 @@ def solve_task(task: Task) -> Solved:
         )
     model, weights = _kept.of(task.problem)
     loads = task.loads
-    forces = loads.nodal_forces(weights).reshape(len(loads), -1)[:, model.scene.free_dofs]
-    displacements = np.full((len(loads), model.n_unknowns), np.nan)
+    values = loads.nodal_forces(weights).reshape(len(loads), -1)[:, model.scene.free_dofs]
+    displacements = np.full(values.shape, np.nan)
     min_det_f: NDArray[np.float64] = np.full(len(loads), np.nan)
     status = np.zeros(len(loads), dtype=np.uint8)
     with _single_threaded(), install_listener("numba:compile", TimingListener()) as compilation:  # type: ignore[no-untyped-call]
         begun = perf_counter()
-        for row, found in enumerate(model.solve_many(forces)):
+        for row, found in enumerate(model.solve_many(values)):
             if isinstance(found, Solution):
                 displacements[row], min_det_f[row] = found.displacement, found.min_det_f
             else:

@@ -55,11 +55,13 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
         return "its file names no `tests.unseen_region`"
     if name == "paper-amplitude" and spec.tests.paper_magnitude_n is None:
         return "its file names no `tests.paper_magnitude_n`"
-    if name == "unseen-directions" and spec.load_plan.kind == "force":
+    if name == "unseen-directions" and spec.load_plan.kind in ("force", "displacement"):
         return (
             "its directions are all over the sphere; "
             "the split by direction holds some of them out of training"
         )
+    if name == "several-forces" and spec.motion:
+        return "a tool moves the body"
     if name == "several-forces" and spec.load_plan.simultaneous > 1:
         return "its main set has several forces"
     if name == "several-forces":
@@ -86,15 +88,14 @@ def spec_of_set(spec: DatasetSpec, name: SetName) -> DatasetSpec:
     if reason := why_not(spec, name):
         raise InvalidInputError(f"{spec.name} has no test set {name!r}: {reason}.")
     loads = spec.load_plan
-    low, high = loads.magnitude_n
-    changed: dict[str, Any] = {
-        "samples_per_patch": None,
-        "samples": spec.tests.samples,
-        "seed": loads.seed + SEED_SHIFT,
-    }
+    low, high = loads.magnitude
+    changed: dict[str, Any] = {"samples": spec.tests.samples, "seed": loads.seed + SEED_SHIFT}
+    if spec.motion is None:
+        changed["samples_per_patch"] = None
     if name in ("2x", "4x"):
         times = int(name[0])
-        changed["magnitude_n"] = times * low, times * high
+        unit = "m" if spec.motion else "n"
+        changed[f"magnitude_{unit}"] = times * low, times * high
     elif name == "paper-amplitude":
         changed["magnitude_n"] = spec.tests.paper_magnitude_n
     elif name == "unseen-regions":

@@ -15,6 +15,7 @@ from mor_bench.specs.dataset_spec import (
     AnyDatasetSpec,
     DatasetSpec,
     ImportedDatasetSpec,
+    Observed,
     generated,
 )
 from mor_bench.specs.geometry_spec import (
@@ -24,7 +25,7 @@ from mor_bench.specs.geometry_spec import (
     TetrahedraGeometry,
     VoxelsGeometry,
 )
-from mor_bench.specs.loads_spec import AXES, Loads, Sampling, Split, SplitBy
+from mor_bench.specs.loads_spec import AXES, Loads, Motion, Sampling, Split, SplitBy
 from mor_bench.specs.material_spec import (
     FibreMaterial,
     MooneyRivlinMaterial,
@@ -71,8 +72,10 @@ __all__ = [
     "Loads",
     "MethodSpec",
     "MooneyRivlinMaterial",
+    "Motion",
     "NearSurfaceRegion",
     "NearestRegion",
+    "Observed",
     "OgdenMaterial",
     "PointSetRegion",
     "Race",

@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 from math import prod
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.specs.base import Name, Positive, StrictModel, Text
@@ -16,7 +16,9 @@ from mor_bench.specs.loads_spec import (
     ExtraTests,
     Gravity,
     ImportedSplit,
+    LoadPlan,
     Loads,
+    Motion,
     Split,
     Spring,
     Support,
@@ -113,8 +115,9 @@ class DatasetSpec(CommonDatasetSpec):
         Foundations, none by default.
     gravity : Gravity, optional
         A constant pre-load: displacements are measured from the rest state under it.
-    loads : Loads, optional
-        Without it the scene can be solved for given forces, but no samples can be drawn.
+    loads : Loads or Motion, optional
+        Sampled forces, or sampled displacements of a tool. Without it the scene can be solved for
+        given forces, but no samples can be drawn.
     """
 
     geometry: Geometry
@@ -126,12 +129,38 @@ class DatasetSpec(CommonDatasetSpec):
         tuple[Spring, ...], Field(strict=False, exclude_if=lambda value: not value)
     ] = ()
     gravity: Gravity | None = None
-    loads: Loads | None = None
+    loads: LoadPlan | None = None
     split: Split = Split()
     tests: ExtraTests = ExtraTests()
 
+    @model_validator(mode="after")
+    def _one_tool(self) -> Self:
+        if not isinstance(self.loads, Motion):
+            return self
+        if self.split.by == "region":
+            raise ValueError(
+                "`split.by` must be 'sample' or 'direction' where `loads.kind` is 'displacement', "
+                "since one region is moved; got 'region'"
+            )
+        if self.observed is not None:
+            raise ValueError(
+                "`observed` must be absent where `loads.kind` is 'displacement': the methods get "
+                "the displacements of `loads.region`"
+            )
+        for name in ("unseen_region", "paper_magnitude_n"):
+            if getattr(self.tests, name) is not None:
+                raise ValueError(
+                    f"`tests.{name}` must be absent where `loads.kind` is 'displacement'"
+                )
+        return self
+
     @property
-    def load_plan(self) -> Loads:
+    def motion(self) -> Motion | None:
+        """The table `[loads]` if it prescribes displacements."""
+        return self.loads if isinstance(self.loads, Motion) else None
+
+    @property
+    def load_plan(self) -> Loads | Motion:
         """The table `[loads]`, from which samples are drawn; `SpecError` if there is none."""
         if self.loads is None:
             raise SpecError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self, get_args
+from typing import Annotated, ClassVar, Literal, Self, get_args
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -29,7 +29,7 @@ Magnitude = Annotated[
     Field(strict=False),
     AfterValidator(_ordered),
 ]
-"""Lower and upper end of a range of forces, N."""
+"""Lower and upper end of a range of forces, N, or of displacements, m."""
 
 
 Axis = Literal["x", "y", "z"]
@@ -143,6 +143,11 @@ class Loads(StrictModel):
     sampling: Sampling = "random"
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
 
+    @property
+    def magnitude(self) -> tuple[float, float]:
+        """The range of each force, N."""
+        return self.magnitude_n
+
     @model_validator(mode="after")
     def _consistent(self) -> Loads:
         if (self.samples_per_patch is None) == (self.samples is None):
@@ -162,6 +167,44 @@ class Loads(StrictModel):
                 f"got {self.magnitude_n}"
             )
         return self
+
+
+class Motion(StrictModel):
+    """Prescribed displacements: a rigid tool holds a region of the surface and moves it.
+
+    All nodes of the region move by the same vector, in directions uniform on the sphere.
+
+    Attributes
+    ----------
+    region : Region
+        What the tool holds: its nodes that lie on the surface. It must be apart from all supports.
+    magnitude_m : two floats
+        Range of the displacement, m.
+    samples : int
+        Number of samples.
+    sampling : str
+        Plan for directions and magnitudes.
+    seed : int
+    """
+
+    simultaneous: ClassVar[int] = 1
+    samples_per_patch: ClassVar[int | None] = None
+    min_distance_m: ClassVar[float | None] = None
+
+    region: Region
+    kind: Literal["displacement"]
+    samples: Count
+    magnitude_m: Magnitude
+    sampling: Sampling = "random"
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+
+    @property
+    def magnitude(self) -> tuple[float, float]:
+        """The range of the displacement, m."""
+        return self.magnitude_m
+
+
+LoadPlan = Annotated[Loads | Motion, Field(discriminator="kind")]
 
 
 class Split(StrictModel):

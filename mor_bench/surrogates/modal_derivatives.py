@@ -58,7 +58,7 @@ class ModalDerivatives(Surrogate):
         modes = derivative_basis(scene, full, self.n_linear, self.n_modes)
         if not polynomial_pays(full, modes.shape[1]):
             return {"modes": modes}
-        largest = scene.generated.load_plan.magnitude_n[1] * patch_responses(scene, full) @ modes
+        largest = scene.generated.load_plan.magnitude[1] * patch_responses(scene, full) @ modes
         chosen = np.unique(np.linspace(0, len(largest) - 1, N_WATCHED // 2).astype(int))
         watched = np.vstack([largest[chosen], -largest[chosen]])
         return {"modes": modes, **TensorProblem.of_modes(full, modes, watched).arrays}

@@ -115,7 +115,7 @@ def _states_under_loads(model: FullOrderModel, manifold: QuadraticManifold) -> l
     """Return equilibria q on the manifold, with all cells, under random forces on patches."""
     scene, rng = model.scene, np.random.default_rng(0)
     linear = GalerkinProblem(model.assembler, manifold.modes)
-    on_nodes, largest = scene.patch_weights.toarray(), scene.generated.load_plan.magnitude_n[1]
+    on_nodes, largest = scene.patch_weights.toarray(), scene.generated.load_plan.magnitude[1]
     chosen = np.linspace(0, len(on_nodes) - 1, N_CUBATURE_LOADS).round().astype(int)
     vectors = rng.normal(size=(len(chosen), 3))
     vectors *= (

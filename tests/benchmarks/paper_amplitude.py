@@ -46,7 +46,7 @@ def loads_of(spec: DatasetSpec, upper: float, samples: int, *, main: bool) -> Pa
     """Return the first loads of a plan whose largest force is ``upper``, N."""
     base = spec if main else spec_of_set(spec, "in-range")
     changed = base.load_plan.model_copy(
-        update={"magnitude_n": (spec.load_plan.magnitude_n[0], upper)}
+        update={"magnitude_n": (spec.load_plan.magnitude[0], upper)}
     )
     scene = load_scene(base.model_copy(update={"loads": changed}))
     loads = draw_loads(scene, 0, n_samples_of(scene) if main else samples)
@@ -92,13 +92,13 @@ def published(datasets: list[str]) -> Iterator[dict[str, Any]]:
     """Measure the paper's scenes with their own loads and with those at the paper's deformation."""
     for name in datasets:
         spec = load_generated_spec(name)
-        own, paper = spec.load_plan.magnitude_n[1], spec.tests.paper_magnitude_n
+        own, paper = spec.load_plan.magnitude[1], spec.tests.paper_magnitude_n
         yield measured(spec, own, WHOLE, main=True)
         if paper is not None:
             yield measured(spec, paper[1], spec.tests.samples, main=False)
         if name + SAME_AMPLITUDE in list_suite("datasets"):
             larger = load_generated_spec(name + SAME_AMPLITUDE)
-            yield measured(larger, larger.load_plan.magnitude_n[1], WHOLE, main=True)
+            yield measured(larger, larger.load_plan.magnitude[1], WHOLE, main=True)
         for force in FURTHER.get(name, ()):
             yield measured(spec, force, WHOLE, main=True)
 

@@ -262,23 +262,24 @@ def scenes(source: str) -> str:
     body = []
     for path in sorted((ROOT / source).glob("*.toml")):
         spec = content_of(f"{source}/{path.name}")
-        measured = content_of(f"{source}/{path.stem.removesuffix('-observed')}.refine.json")
-        mesh, loads, law = measured["meshes"][0], spec["loads"], spec["material"]
+        scene, loads, law = load_scene(path), spec["loads"], spec["material"]
         element = {"hexahedron": "H8", "tetrahedron": "T4"}[
             spec.get("discretisation", {}).get("element", "hexahedron")
         ]
-        patches = loads.get("n_patches") or len(load_scene(path).patch_nodes)
+        patches = len(scene.patch_nodes)
         samples = loads.get("samples") or patches * loads["samples_per_patch"]
-        low, high = loads["magnitude_n"]
+        low, high = scene.generated.load_plan.magnitude
+        where = f"{patches} of {loads['patch_area_m2']:g} m²" if scene.motion is None else DASH
         size = "×".join(f"{side:g}" for side in spec["geometry"].get("size_m", ()))
         body.append(
             [
                 f"`{path.stem}`",
                 f"{size} m, " * bool(size)
-                + f"{mesh['n_cells']:,} {element}, {mesh['n_dofs'] // 3:,} nodes",
+                + f"{scene.mesh.n_cells:,} {element}, {scene.mesh.n_nodes:,} nodes",
                 f"{LAWS[law['law']]}, {law['young_pa']:,g} Pa, ν = {law['poisson']:g}",
-                f"{loads.get('simultaneous', 1)} × {loads['kind']}, {low:g}–{high:g} N",
-                f"{patches} of {loads['patch_area_m2']:g} m²",
+                f"{loads.get('simultaneous', 1)} × {loads['kind']}, {low:g}–{high:g} "
+                + ("m" if scene.motion else "N"),
+                where,
                 f"{samples:,}",
             ]
         )
