@@ -285,9 +285,9 @@ def _fill(
 
 
 def _commit(folder: Path, number: int, solved: Solved) -> None:
-    with _writing(folder):
-        write_shard(shard_path(folder, number), solved.shard)
+    with _writing(folder):  # a kill in between must not lose the time of a shard that exists
         write_atomically(folder / f"seconds-{number:05d}.txt", f"{solved.seconds:.6f}\n".encode())
+        write_shard(shard_path(folder, number), solved.shard)
 
 
 def shard_seconds(path: Path) -> float | None:
