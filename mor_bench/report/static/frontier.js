@@ -123,7 +123,7 @@ Report.kinds.frontier = (figure, data) => {
       const text = R.plain(`${row.name}: ${R.short(y(row))} %`);
       const side = y(row) > TOP ? 1 : -1, [px, py] = pixels(row), width = 6.5 * text.length;
       const free = (away) => taken.every(([qx, qy, other]) =>
-        Math.abs(qy - (py - side * away)) > 13 || Math.abs(qx - px) > (width + other) / 2);
+        Math.abs(qy - (py - side * away)) > 18 || Math.abs(qx - px) > (width + other) / 2);
       const away = [26, 42, 58, 74, 90, 106].find(free) ?? 26;
       taken.push([px, py - side * away, width]);
       return {
