@@ -195,6 +195,7 @@ def main() -> None:
     wrong, rows = 0, []
     with tempfile.TemporaryDirectory() as parent:
         for command in given.commands:
+            undisturbed(command, Path(parent) / f"{command}-first")  # compiles the kernels
             expected = undisturbed(command, Path(parent) / f"{command}-undisturbed")
             for name in SIGNALS:
                 folder = Path(parent) / f"{command}-{name}"
