@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
+
 import pytest
 
+from mor_bench.specs import list_suite
 from tests.published.blocks import pages, with_blocks
 from tests.published.claims import (
     EVERY_PAGE,
@@ -93,3 +97,16 @@ def test_the_verdict_of_a_run_is_that_of_its_rows(run: str) -> None:
 def test_the_evidence_is_small() -> None:
     files = [p for p in REPORTS.rglob("*") if p.is_file() and REPORTS / "runs" not in p.parents]
     assert sum(path.stat().st_size for path in files) <= MOST_BYTES
+
+
+COMPARISONS = re.compile(
+    r"\b(faster|slower|slowest|fastest|(more|less) accurate|better|worse|cheaper|expensive)\b|always"
+)
+
+
+@pytest.mark.parametrize("name", list_suite("methods"))
+def test_the_files_of_methods_compare_with_no_other_method(name: str) -> None:
+    """Which method is faster or more accurate is a matter of evidence, and stands in the report."""
+    content = tomllib.loads(list_suite("methods")[name].read_text(encoding="utf-8"))
+    for text in (content.get("limits", ""), content.get("regime", {}).get("says", "")):
+        assert not COMPARISONS.search(text), text
