@@ -100,7 +100,8 @@ def test_the_evidence_is_small() -> None:
 
 
 COMPARISONS = re.compile(
-    r"\b(faster|slower|slowest|fastest|(more|less) accurate|better|worse|cheaper|expensive)\b|always"
+    r"\b(faster|slower|slowest|fastest|always|better|worse|cheaper|expensive)\b"
+    r"|\b(more|less) accurate\b"
 )
 
 
