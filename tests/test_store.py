@@ -268,6 +268,21 @@ def test_a_killed_worker_of_the_pool_is_reported_with_its_likely_cause() -> None
         list(pool.in_any_order(signal.raise_signal, [signal.SIGKILL]))
 
 
+def test_an_interrupt_before_the_pools_thread_starts_keeps_its_type(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def unstarted(**_: bool) -> None:
+        raise RuntimeError("cannot join thread before it is started")
+
+    def stopped() -> None:
+        with worker_pool(1) as pool:
+            monkeypatch.setattr(pool.executor, "shutdown", unstarted)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stopped()
+
+
 ADDRESS = "tcp://127.0.0.1:8786"
 
 

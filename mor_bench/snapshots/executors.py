@@ -15,7 +15,7 @@ from concurrent.futures import (
     Future,
     wait,
 )
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -163,7 +163,8 @@ def worker_pool(workers: int) -> Iterator[Pool]:
             f"{workers}. {KEPT}"
         ) from error
     except BaseException:
-        executor.shutdown(kill_workers=True)
+        with suppress(RuntimeError):  # a signal came before the pool's thread had started
+            executor.shutdown(kill_workers=True)
         raise
     executor.shutdown()
 

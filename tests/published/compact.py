@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,12 @@ def verdict_again(comparison: Comparison, analysis: Mapping[str, Any], name: str
     return decide(comparison, name, needs_of(comparison, name), Draws([], none, none, intervals))
 
 
+def _checked(beside: Sequence[str]) -> list[str]:
+    """Return the sentences beside a headline that follow from rows and intervals alone."""
+    shown = [line.partition(" Time again: ")[0] for line in beside]
+    return [line for line in shown if not line.startswith(("Cannot be told apart", "Evidence: "))]
+
+
 def wrong_verdicts(folder: Path) -> Iterator[str]:
     """Reach the verdicts again from the stored rows and intervals; yield each difference.
 
@@ -122,6 +128,11 @@ def wrong_verdicts(folder: Path) -> Iterator[str]:
             yield f"{name}: {again.headline!r} is stated as {stored['headline']!r}"
         if RULE not in stored["beside"]:
             yield f"{name}: the rule is not stated as {RULE!r}"
+        if again.summary()["cheapest"] != stored["cheapest"]:
+            yield f"{name}: the cheapest is stated as {stored['cheapest']!r}"
+        stated, reached = _checked(stored["beside"]), _checked(again.beside)
+        yield from (f"{name}: states {line!r}" for line in stated if line not in reached)
+        yield from (f"{name}: does not state {line!r}" for line in reached if line not in stated)
 
 
 class StoredRun(Comparison):
