@@ -36,8 +36,8 @@ def frontier(data: Data, title: str) -> Chart:
         "Left and down is better. Lines join the configurations of a method. Bars are 95 % "
         "intervals. Open markers: the timing was not stable. The dashed steps are the Pareto "
         "front. References solve the full equations on the dataset's own mesh. "
-        "Click on the legend to hide a method, double-click to isolate it. By keyboard: Tab to an "
-        "entry, then Enter or Shift+Enter."
+        "Click on the legend to hide a method, double-click to isolate it. By keyboard: Tab to the "
+        "legend, arrow keys to an entry, then Enter or Shift+Enter."
     )
     return Chart("frontier", "Error against time", title, reading)
 
