@@ -43,7 +43,7 @@ def test_the_doctor_names_missing_extras_and_the_speed(monkeypatch: pytest.Monke
     assert "The extra `onnx` is missing" in shown.output
     assert "The extra `learn` is missing" not in shown.output
     assert "residual" in shown.output
-    found = json.loads(invoke("doctor", "--json").output)
+    found = json.loads(invoke("doctor", "--json").stdout)
     assert found["speed"]["residual_us"] > 0
     assert found["default_run_s"] > 0
     assert list(found["missing_extras"]) == ["onnx"]

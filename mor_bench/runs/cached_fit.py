@@ -28,7 +28,7 @@ from typing import Any
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from mor_bench.checked_files import read_json, read_written
+from mor_bench.checked_files import read_json
 from mor_bench.digests import digest_of_file
 from mor_bench.errors import StoreError
 from mor_bench.machine import describe_machine, gpu_name
@@ -239,12 +239,12 @@ class CachedFit:
         assert self.record is not None
         return self.record
 
-    def keep(self, record: FitRecord, model: Path | None) -> FitRecord:
-        """Store a fit and its model; writing the record commits it."""
+    def keep(self, record: FitRecord, model: bytes | None) -> FitRecord:
+        """Store a fit and the content of its model; writing the record commits it."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if model is not None:
             remove_leftovers(self.folder)
-            write_atomically(self.model, read_written(model, self.data.scratch))
+            write_atomically(self.model, model)
             checksum = {"model_sha256": digest_of_file(self.model)}
             record = record.model_copy(update=checksum)
         write_atomically(self.folder / "fit.json", record.model_dump_json(indent=1).encode())

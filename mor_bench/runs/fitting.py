@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from mor_bench.checked_files import read_bytes
+from mor_bench.checked_files import read_written
 from mor_bench.errors import InvalidInputError, MorBenchError, OutOfTimeError, StoreError
 from mor_bench.measure.method_session import FitRequest, MethodSession
 from mor_bench.runs.cached_fit import CachedFit, FitRecord
@@ -50,12 +49,14 @@ def fit_configuration(
     if cached.record is not None:
         return cached.record
     if remote is not None:
-        return _keep_remote(cached, *remote(cached, limit_s))
+        answer, content = remote(cached, limit_s)
+        return cached.keep(_record(cached, answer), content)
     worker, answer, model = _fit_in_worker(cached, limit_s)
     try:
         _add_earlier_processes(answer, cached.taken_s)
         saved = answer["model_bytes"] is not None
-        record = cached.keep(_record(cached, answer), model if saved else None)
+        content = read_written(model, cached.data.scratch) if saved else None
+        record = cached.keep(_record(cached, answer), content)
         shutil.rmtree(model.parent, ignore_errors=True)
         cached.end_training()
     except BaseException:
@@ -125,15 +126,6 @@ def _record(cached: CachedFit, answer: dict[str, Any]) -> FitRecord:
     )
 
 
-def _keep_remote(cached: CachedFit, answer: dict[str, Any], content: bytes | None) -> FitRecord:
-    if content is None:
-        return cached.keep(_record(cached, answer), None)
-    with tempfile.TemporaryDirectory(dir=cached.data.scratch) as folder:
-        model = Path(folder) / "model.safetensors"
-        model.write_bytes(content)
-        return cached.keep(_record(cached, answer), model)
-
-
 @dataclass(frozen=True)
 class ClusterFit:
     """A fit to do on another machine: scene, samples, configuration and limits.
@@ -175,4 +167,5 @@ def fit_on_cluster(task: ClusterFit) -> tuple[dict[str, Any], bytes | None]:
         restrictions = Restrictions(memory_bytes=task.memory_limit_bytes)
         with SandboxedProcess(MethodSession, restrictions, scene=task.scene) as worker:
             answer = worker.ask("fit", task.limit_s, request=request)
-        return answer, read_bytes(model) if model.exists() else None
+        written = answer["model_bytes"] is not None
+        return answer, read_written(model, folder) if written else None

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from mor_bench.checked_files import read_json
+from mor_bench.checked_files import read_bytes, read_json
 from mor_bench.digests import digest_of_arrays, digest_of_file
 from mor_bench.errors import StoreError
 from mor_bench.runs.cached_fit import LOAD_LIMIT_S, CachedFit, FitRecord, RunEnvironment
@@ -227,7 +227,7 @@ def adopt(
         try:
             surrogate = configuration.method.surrogate
             worker.ask("load", LOAD_LIMIT_S, surrogate=surrogate, model=weights)
-            cached.keep(shipped.fit, weights)
+            cached.keep(shipped.fit, read_bytes(weights))
         except BaseException:
             worker.end()
             raise

@@ -238,6 +238,8 @@ def _read_by_suffix(path: Path, head: bytes) -> meshio.Mesh:
     suffix = path.suffix.lower()
     if suffix == ".inp":
         check_abaqus(path)
+    if suffix in (".bdf", ".fem", ".nas"):
+        _check_nastran(path)
     # Ansys and Gmsh both write .msh. With a given format, meshio's message explains the error in
     # the file.
     file_format = "gmsh" if suffix == ".msh" and head.startswith(b"$") else None
@@ -251,6 +253,14 @@ def _read_by_suffix(path: Path, head: bytes) -> meshio.Mesh:
     except (Exception, SystemExit) as error:
         text = printed.getvalue() if isinstance(error, SystemExit) else str(error)
         raise SpecError(f"{path}: {_reason(error, text, suffix)}.") from None
+
+
+def _check_nastran(path: Path) -> None:
+    """Refuse bulk data without an end, in which meshio would read for ever."""
+    with path.open(errors="replace") as lines:
+        begun = any(line.strip().startswith("BEGIN BULK") for line in lines)
+        if begun and not any(line.startswith("ENDDATA") for line in lines):
+            raise SpecError(f"{path}: ENDDATA is missing after BEGIN BULK; the file was cut short.")
 
 
 def _reason(error: BaseException, text: str, suffix: str) -> str:
