@@ -398,7 +398,11 @@ def test_bulk_data_without_an_end_is_refused_and_not_waited_for(folder: Path) ->
     meshio.Mesh(points, cells).write(path, file_format="nastran")
     whole = path.read_text(encoding="utf-8")
     assert len(read_mesh(path, 1.0)[0].cells) == 1
-    for text in (whole.replace("ENDDATA", ""), whole[: whole.index("GRID")], "ENDDATA\nBEGIN BULK\n"):
+    for text in (
+        whole.replace("ENDDATA", ""),
+        whole[: whole.index("GRID")],
+        "ENDDATA\nBEGIN BULK\n",
+    ):
         path.write_text(text, encoding="utf-8")
         with pytest.raises(SpecError, match=r"cut.bdf: ENDDATA is missing after BEGIN BULK"):
             read_mesh(path, 1.0)
