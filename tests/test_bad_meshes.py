@@ -145,3 +145,15 @@ def test_bad_meshes_are_refused_in_one_line(
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
     assert capfd.readouterr() == ("", "")
+
+
+def test_bulk_data_without_an_end_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "cut.bdf"
+    hexes(HEX.cells).write(path, file_format="nastran")
+    whole = path.read_text(encoding="utf-8")
+    assert len(read_mesh(path, 1.0)[0].cells) == 2
+    no_end, no_card = whole.replace("ENDDATA", ""), whole[: whole.index("GRID")]
+    for text in (no_end, no_card, "ENDDATA\nBEGIN BULK\n"):
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(SpecError, match=r"cut.bdf: ENDDATA is missing after BEGIN BULK"):
+            read_mesh(path, 1.0)

@@ -97,6 +97,20 @@ def test_a_break_even_selects_by_the_rule_of_the_verdict() -> None:
     assert found == {"fem": 0.001, "unsure": 0.011, "sure": 0.0095, "partial": np.inf}
 
 
+def test_the_full_order_model_of_a_break_even_is_chosen_on_the_validation_part() -> None:
+    def row(method: str, label: str, test: float, validation: float, latency_ms: float) -> Row:
+        found = scored(method, label, test, latency_ms)
+        return found.with_parts(validation=ErrorSummary(rel_l2_median=validation))
+
+    rows = [
+        row("fem", "loose", 0.005, 0.009, 1.0),
+        row("fem", "tight", 1e-9, 1e-9, 2.0),
+        row("quick", "quick", 0.008, 0.008, 0.6),
+    ]
+    records = [r for r in compare(rows)["time_at_error"] if r["target_rel_l2_median"] == 0.01]
+    assert break_even(rows, records)[0]["fem_label"] == "tight"
+
+
 def test_a_break_even_counts_all_threads_and_no_training_on_a_gpu() -> None:
     rows = [scored("fem", "fem", 0.005, 1.0, 0.0), scored("quick", "quick", 0.008, 0.6)]
     records = [r for r in compare(rows)["time_at_error"] if r["target_rel_l2_median"] == 0.01]

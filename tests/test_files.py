@@ -6,7 +6,6 @@ import gc
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -390,22 +389,6 @@ def test_a_truncated_binary_surface_is_refused_in_one_line(folder: Path) -> None
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(SpecError, match=r"half.stl: cannot be read as STL: it is neither text nor"):
         read_triangles(path, 1.0)
-
-
-def test_bulk_data_without_an_end_is_refused_and_not_waited_for(folder: Path) -> None:
-    path, points = folder / "cut.bdf", np.array(list(product(range(2), repeat=3)), float)
-    cells = [("hexahedron", [[0, 4, 6, 2, 1, 5, 7, 3]])]
-    meshio.Mesh(points, cells).write(path, file_format="nastran")
-    whole = path.read_text(encoding="utf-8")
-    assert len(read_mesh(path, 1.0)[0].cells) == 1
-    for text in (
-        whole.replace("ENDDATA", ""),
-        whole[: whole.index("GRID")],
-        "ENDDATA\nBEGIN BULK\n",
-    ):
-        path.write_text(text, encoding="utf-8")
-        with pytest.raises(SpecError, match=r"cut.bdf: ENDDATA is missing after BEGIN BULK"):
-            read_mesh(path, 1.0)
 
 
 def test_files_are_closed_after_reading(folder: Path) -> None:

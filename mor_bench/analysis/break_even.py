@@ -6,7 +6,12 @@ from collections.abc import Mapping, Sequence
 from math import ceil, inf
 from typing import Any
 
-from mor_bench.analysis.frontier import is_point, median_error, median_latency_ms
+from mor_bench.analysis.frontier import (
+    is_point,
+    median_error,
+    median_latency_ms,
+    selecting_error,
+)
 from mor_bench.results.row import Row
 
 Record = dict[str, Any]
@@ -20,7 +25,8 @@ def break_even(rows: Sequence[Row], at_error: Sequence[Record]) -> list[Record]:
 
     The count is the offline cost (data and fit) divided by what a query saves, both in
     core-seconds. A query uses its latency times its threads. The count compares two configurations:
-    the selected one, and the fastest full-order one that is at least as accurate.
+    the selected one, and the fastest full-order one that is at least as accurate by the errors that
+    select, those of the validation part.
 
     Parameters
     ----------
@@ -82,7 +88,9 @@ def _break_even(rows: Sequence[Row], record: Record) -> Record:
     full_order = [
         other
         for other in ran
-        if other.method == FULL_ORDER and other.latency_ms and median_error(other) <= best["error"]
+        if other.method == FULL_ORDER
+        and other.latency_ms
+        and selecting_error(other) <= selecting_error(row)
     ]
     if not full_order:
         reason = f"no configuration of {FULL_ORDER} is as accurate"

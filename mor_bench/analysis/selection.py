@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import inf
+from typing import Any
 
 import numpy as np
 
@@ -42,7 +43,7 @@ def decide(
     """
     asked = requirements.asked
     rows = [row for row in comparison.rows if row.dataset == dataset]
-    figures = {row.label: _figures(row, draws.intervals.get(row.label, {})) for row in rows}
+    figures = {row.label: bounds_of(row, draws.intervals.get(row.label, {})) for row in rows}
     answering = [row for row in rows if _answers_all(row)]
     qualified = [row for row in answering if _meets(figures[row.label], asked)]
     qualified.sort(key=speed_rank)
@@ -58,11 +59,7 @@ def decide(
         observed=is_observed(comparison, dataset),
         run=comparison.out,
         machine=comparison.machine,
-        settings={
-            **comparison.settings,
-            "datasets": list(comparison.datasets) or [dataset],
-            "methods": [table.get("asked") or name for name, table in comparison.methods.items()],
-        },
+        settings=asked_of(comparison, dataset),
     )
     if qualified:
         return worded(verdict)
@@ -74,7 +71,16 @@ def decide(
     return worded(replace(verdict, relaxations=relaxations, unknown=unknown, nearest=nearest))
 
 
-def _figures(row: Row, intervals: Mapping[str, Interval]) -> dict[str, float]:
+def asked_of(comparison: Comparison, dataset: str) -> dict[str, Any]:
+    """Return the settings of a run with the datasets and methods that it was asked for."""
+    return {
+        **comparison.settings,
+        "datasets": list(comparison.datasets) or [dataset],
+        "methods": [table.get("asked") or name for name, table in comparison.methods.items()],
+    }
+
+
+def bounds_of(row: Row, intervals: Mapping[str, Interval]) -> dict[str, float]:
     """Return the upper bounds of a row by the names of the limits; infinite where unknown."""
     error = selecting_error(row)
     _, error_high = intervals.get(VALIDATION if row.validation else "rel_l2_median", (0.0, error))
@@ -94,7 +100,7 @@ def _figures(row: Row, intervals: Mapping[str, Interval]) -> dict[str, float]:
 def error_bounds(rows: Sequence[Row], draws: Draws) -> dict[str, float]:
     """Return, by label, the error that the verdict compares with a limit; infinite if unusable."""
     return {
-        row.label: _figures(row, draws.intervals.get(row.label, {}))["error"]
+        row.label: bounds_of(row, draws.intervals.get(row.label, {}))["error"]
         if _answers_all(row)
         else inf
         for row in rows

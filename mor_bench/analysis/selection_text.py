@@ -37,6 +37,19 @@ def limit_text(name: str, limit: float, round_up: bool = False) -> str:
     return f"{FIGURE_NAMES[name]} <= {value}{unit}"
 
 
+def limits_missed(bounds: Mapping[str, float], needs: Requirements) -> list[tuple[str, str]]:
+    """Return the name of each limit that upper bounds exceed, and both numbers in words."""
+    out = []
+    for name, limit in needs.asked.items():
+        if bounds[name] > limit:
+            scale, unit = _UNITS[name]
+            said = unit.partition(" (")[0]
+            bound = f"{scale * bounds[name]:.3g}{said}" if bounds[name] < inf else "unknown"
+            text = f"{FIGURE_NAMES[name]}: upper bound {bound}, limit {scale * limit:g}{said}"
+            out.append((FIGURE_NAMES[name], text))
+    return out
+
+
 def _rounded_up(value: float, digits: int = 3) -> str:
     if not 0 < value < inf:
         return f"{value:g}"
@@ -190,17 +203,23 @@ def _stability(verdict: Verdict) -> list[str]:
 
 def retime_command(verdict: Verdict) -> str:
     """Return the command that repeats the timings of the verdict's run."""
-    settings = dict(verdict.settings)
+    settings = {"datasets": [verdict.dataset], **verdict.settings}
+    return f"{run_command(settings)} {shlex.join(['--out', str(verdict.run), '--retime'])}"
+
+
+def run_command(asked: Mapping[str, Any]) -> str:
+    """Return the command of a run with these settings, datasets and methods."""
+    settings = dict(asked)
     budget = settings.pop("budget", None) or {}
     given = {**settings, "time_limit_s": budget.get("seconds")}
-    words = ["mor-bench", "run", *settings.get("datasets", [verdict.dataset])]
+    words = ["mor-bench", "run", *settings["datasets"]]
     words += [word for name in settings.get("methods", ()) for word in ("-m", name)]
     for name, field, line in command_line(RunOptions):
         value = given.get(name)
         if value is not None and value != field.default:
             shown = f"{value:.15g}" if isinstance(value, float) else str(value)
             words += [line.flag] if value is True else [line.flag, shown]
-    return shlex.join([*words, "--out", str(verdict.run), "--retime"])
+    return shlex.join(words)
 
 
 def kind(verdict: Verdict) -> str:

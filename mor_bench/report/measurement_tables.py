@@ -95,12 +95,12 @@ def training(entries: Sequence[Entry]) -> TextTable | None:
                     found.device,
                     whole(found.iterations),
                     number(found.fit_seconds),
-                    number(entry.figure("offline_s", "fit")),
+                    number(entry.row.fit_core_s),
                     number(found.loss),
                     number(found.validation_loss),
                 ]
             )
-    headings = ["configuration", "device", "iterations", "requested (s)", "fit (s)"]
+    headings = ["configuration", "device", "iterations", "requested (s)", "fit (core-s)"]
     headings += ["last loss", "validation loss"]
     note = (
         "Requested: the seconds for which the number of iterations was chosen. The "

@@ -19,9 +19,10 @@ from mor_bench.report.figures import write_figures
 from mor_bench.report.hard_case_table import stress_table
 from mor_bench.report.method_view import method_view
 from mor_bench.report.number_format import bytes_text
-from mor_bench.report.page_index import method_facts, standings
+from mor_bench.report.page_facts import flat, method_facts
+from mor_bench.report.page_index import standings
 from mor_bench.report.page_scripts import Assets, beside, embedded_json, inlined
-from mor_bench.report.page_sections import View, flat, section_of
+from mor_bench.report.page_sections import View, section_of
 from mor_bench.report.page_tables import with_content
 from mor_bench.report.short_names import short_names
 from mor_bench.results.comparison import Comparison

@@ -92,6 +92,8 @@ def _sample(
     relative = float(np.linalg.norm(error)) / norm if norm else None
     text = f"largest error {number(1e3 * largest)} mm"
     text += "" if relative is None else f", relative L2 {percent(relative)} %"
+    force = _arrow(mesh, reference, forces)
+    text = f"load of {number(force['newton'])} N: {text}" if force else text
     return {
         "label": item.entry.label,
         "kind": kind,
@@ -99,7 +101,7 @@ def _sample(
         # A wild prediction would shrink the body to a dot.
         "error": packed(np.clip(error[nodes], -0.5 * size_m, 0.5 * size_m)),
         "text": text,
-        "force": _arrow(mesh, reference, forces),
+        "force": force,
     }
 
 

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.analysis.verdict import needs_of
+from mor_bench.analysis.verdict import Requirements, needs_of
 from mor_bench.report.entries import Analysis, Entry, by_group
 from mor_bench.report.method_styles import DARK, readable, style_of
 from mor_bench.report.number_format import number, percent, span
 from mor_bench.report.page_bodies import bodies
+from mor_bench.report.page_facts import answer_of, method_facts, reason_of
 from mor_bench.report.page_samples import (
     deformations,
     distributions,
@@ -62,7 +63,7 @@ def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
         "winner": shown.card.rankings[0].picks[0].entry.label if shown.card.rankings else None,
         "styles": {entry.method: _style(entry.method) for entry in entries},
         "groups": list(by_group(entries)),
-        "rows": [_row(comparison, entry, shown.names) for entry in entries],
+        "rows": [_row(comparison, entry, shown.names, needs) for entry in entries],
         "order": [entry.label for entry in sorted(entries, key=reading_order)],
         "distributions": distributions(found),
         "deformations": deformations(methods),
@@ -102,7 +103,9 @@ def dataset_arrays(comparison: Comparison, dataset: str) -> Mapping[str, NDArray
         return {}
 
 
-def _row(comparison: Comparison, entry: Entry, names: Mapping[str, str]) -> dict[str, Any]:
+def _row(
+    comparison: Comparison, entry: Entry, names: Mapping[str, str], needs: Requirements
+) -> dict[str, Any]:
     """Return the figures of one configuration: errors in %, latencies in ms, cost in core-s."""
     error, latency = entry.intervals.get("rel_l2_median"), entry.intervals.get("latency_ms")
     return {
@@ -115,6 +118,7 @@ def _row(comparison: Comparison, entry: Entry, names: Mapping[str, str]) -> dict
         "failed": bool(entry.trouble),
         "reference": entry.row.reference,
         "qualified": entry.qualified,
+        "answer": answer_of(entry, needs),
         "front": entry.pareto_mark == "*",
         "unstable": bool(entry.unstable),
         "error": {
@@ -133,7 +137,9 @@ def _row(comparison: Comparison, entry: Entry, names: Mapping[str, str]) -> dict
         "offline": entry.row.offline_core_s,
         "cells": cells_of(entry),
         "hover": hover_of(entry, names),
-        "details": details_of(entry),
+        "details": details_of(
+            entry, method_facts(comparison, entry.method), reason_of(entry, needs)
+        ),
     }
 
 

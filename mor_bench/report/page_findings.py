@@ -34,7 +34,8 @@ def frontier(data: Data, title: str) -> Chart:
     """Return the chart of error against latency."""
     reading = (
         "Left and down is better. Lines join the configurations of a method. Bars are 95 % "
-        "intervals. Open markers: the timing was not stable. The dashed steps are the Pareto "
+        "intervals. Open markers: the timing was not stable. A label with a number belongs to a "
+        "marker beyond the axis, drawn at its edge. The dashed steps are the Pareto "
         "front. References solve the full equations on the dataset's own mesh. "
         "Click on the legend to hide a method, double-click to isolate it. By keyboard: Tab to the "
         "legend, arrow keys to an entry, then Enter or Shift+Enter."

@@ -9,11 +9,9 @@ from math import inf
 from mor_bench.analysis.selection_text import needs_text
 from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.entries import Entry, dataset_names, entries_of, most_accurate, verdict_of
-from mor_bench.report.method_styles import style_of
 from mor_bench.report.number_format import number, percent
 from mor_bench.report.page_sections import View
 from mor_bench.report.short_names import renamed
-from mor_bench.results.comparison import Comparison
 
 Link = tuple[str, str]
 """Address and text."""
@@ -86,17 +84,3 @@ def _standing(entries: Sequence[Entry], view: View) -> Standing:
     return Standing(
         f"{number(best.latency_ms)} ms", ", ".join(filter(None, small)), best.latency_ms
     )
-
-
-def method_facts(comparison: Comparison, method: str) -> list[tuple[str, str]]:
-    """List what a method's file says of it."""
-    spec = comparison.methods.get(method, {})
-    regime = spec.get("regime") or {}
-    facts = {
-        "title": spec.get("title"),
-        "family": style_of(method).family,
-        "origin": spec.get("source"),
-        "built for": regime.get("says") if isinstance(regime, dict) else None,
-        "limits": spec.get("limits"),
-    }
-    return [(name, str(text).strip()) for name, text in facts.items() if text]

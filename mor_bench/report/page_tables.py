@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 from mor_bench.analysis.draws import VALIDATION
 from mor_bench.report.entries import Entry
-from mor_bench.report.number_format import DASH, bytes_text, metres, percent, span
+from mor_bench.report.number_format import DASH, bytes_text, metres, number, percent, span
 from mor_bench.report.speed_tables import NOT_REACHED
 from mor_bench.report.text_table import Cell, TextTable, figure_cell, marked_latency, table_of
 
-INTERVAL = "95 %"
+INTERVAL = "95 % interval"
 """Name of the intervals in each group."""
 
 EMPTY = {DASH, "", "0", "no", "none", NOT_REACHED}
@@ -29,7 +29,7 @@ GROUPS: dict[str, dict[str, Cell]] = {
         "p95": figure_cell("error", "rel_l2_p95", percent),
         "max": figure_cell("error", "rel_l2_max", percent),
         "validation median": figure_cell("validation", "rel_l2_median", percent),
-        "validation 95 %": lambda e: span(e.intervals.get(VALIDATION), percent),
+        "validation 95 % interval": lambda e: span(e.intervals.get(VALIDATION), percent),
     },
     "Latency of one query (ms)": {
         "median": marked_latency,
@@ -46,7 +46,7 @@ GROUPS: dict[str, dict[str, Cell]] = {
     },
     "Offline cost": {
         "data (core-s)": figure_cell("offline_s", "data"),
-        "fit (s)": figure_cell("offline_s", "fit"),
+        "fit (core-s)": lambda e: number(e.row.fit_core_s),
     },
     "Nodal error and error over deformation": {
         "largest nodal (m)": figure_cell("error", "max_nodal_m", metres),
@@ -82,18 +82,24 @@ def figure_tables(entries: Sequence[Entry]) -> list[TextTable]:
     return [table for table in tables if table is not None]
 
 
-def details_of(entry: Entry) -> list[tuple[str, list[tuple[str, str]]]]:
-    """List all known figures of one configuration, by group."""
+def details_of(
+    entry: Entry, about: Sequence[tuple[str, str]], answer: str
+) -> list[tuple[str, list[tuple[str, str]]]]:
+    """List all known figures of one configuration, by group.
+
+    `about` is what the method's file says of it, `answer` whether the configuration qualifies.
+    """
     given = {key: str(value) for key, value in entry.row.parameters.items()}
     sizes = {f"{key} (chosen)": str(value) for key, value in entry.row.sizes.items()}
     found = [("Hyperparameters", [*given.items(), *sizes.items()])]
     for group, cells in GROUPS.items():
         figures = [(name, cell(entry)) for name, cell in cells.items()]
         found.append((group, [(name, text) for name, text in figures if text != DASH]))
-    notes = [("status", entry.trouble or entry.row.status)]
+    notes = [("status", entry.trouble or entry.row.status), ("qualifies", answer)]
     notes += [("timing not stable", reason) for reason in entry.unstable]
     notes += [("warning", warning) for warning in entry.row.warnings]
-    return [(group, figures) for group, figures in [("Notes", notes), *found] if figures]
+    groups = [("Method", list(about)), ("Notes", notes), *found]
+    return [(group, figures) for group, figures in groups if figures]
 
 
 def with_content(tables: Sequence[TextTable]) -> list[TextTable]:

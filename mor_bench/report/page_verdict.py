@@ -8,8 +8,9 @@ from math import inf
 from typing import Any
 
 from mor_bench.report.entries import Entry, most_accurate
-from mor_bench.report.number_format import DASH, number, percent, span
+from mor_bench.report.number_format import DASH, number, percent, span, whole
 from mor_bench.report.short_names import renamed
+from mor_bench.report.whole_cost import Costs
 
 MOST_NAMES = 4
 """Most names in a sentence; the others are counted."""
@@ -24,6 +25,7 @@ class Pick:
     name: str
     error: str
     error_span: str
+    tail: str
     latency: str
     latency_span: str
     offline: str
@@ -67,8 +69,13 @@ class Card:
     evidence: list[str]
 
 
-def card(verdict: Mapping[str, Any], entries: Sequence[Entry], names: Mapping[str, str]) -> Card:
-    """Build the card of a dataset from its verdict."""
+def card(
+    verdict: Mapping[str, Any],
+    entries: Sequence[Entry],
+    names: Mapping[str, str],
+    costs: Costs | None = None,
+) -> Card:
+    """Build the card of a dataset from its verdict; `costs` add when the winner pays off."""
     by_label = {entry.label: entry for entry in entries}
     qualified = [by_label[label] for label in verdict["qualified"] if label in by_label]
     sentences = list(verdict["beside"])
@@ -79,7 +86,7 @@ def card(verdict: Mapping[str, Any], entries: Sequence[Entry], names: Mapping[st
     if qualified:
         undecided = [names[label] for label in verdict["undecided"] if label in names]
         rankings = [
-            _by_latency(qualified, verdict["runner_up"], undecided, names, entries),
+            _by_latency(qualified, verdict["runner_up"], undecided, names, entries, costs),
             _by_offline(qualified, verdict["cheapest"], names),
         ]
     headline = renamed(verdict["headline"], names)
@@ -131,6 +138,7 @@ def _by_latency(
     undecided: Sequence[str],
     names: Mapping[str, str],
     entries: Sequence[Entry],
+    costs: Costs | None,
 ) -> Ranking:
     first = qualified[0]
     second = next((e for e in qualified if e.label == runner_up), None)
@@ -150,6 +158,9 @@ def _by_latency(
         sentence += (
             f" It is {ratio} times as fast as the full-order model ({names[fastest.label]})."
         )
+    paid = [line.break_even for line in costs.lines if line.label == first.label] if costs else []
+    if paid and paid[0] is not None:
+        sentence += f" With data and fit, it costs less than that after {whole(paid[0])} queries."
     return Ranking("latency", f"Take {names[first.label]}", picks, sentence)
 
 
@@ -179,10 +190,19 @@ def _pick(part: str, entry: Entry, names: Mapping[str, str]) -> Pick:
         names[entry.label],
         percent(entry.figure("error", "rel_l2_median")),
         _interval(entry, "rel_l2_median", percent),
+        _tail(entry),
         number(entry.figure("latency_ms", "median")),
         _interval(entry, "latency_ms", number),
         offline_text(entry),
     )
+
+
+def _tail(entry: Entry) -> str:
+    """State the errors of the difficult test loads."""
+    p95, worst = (entry.figure("error", name) for name in ("rel_l2_p95", "rel_l2_max"))
+    if p95 is None or worst is None:
+        return ""
+    return f"19 of 20 test loads: at most {percent(p95)} %; worst: {percent(worst)} %"
 
 
 def _interval(entry: Entry, name: str, shown: Callable[[float | None], str]) -> str:
@@ -191,14 +211,14 @@ def _interval(entry: Entry, name: str, shown: Callable[[float | None], str]) -> 
 
 
 def offline_text(entry: Entry) -> str:
-    """Format the core-seconds of data and fit in seconds, minutes or hours."""
+    """Format the core-seconds of data and fit in core-seconds, -minutes or -hours."""
     seconds = entry.row.offline_core_s
     if seconds is None:
         return DASH
     for size, unit in ((3600.0, "h"), (60.0, "min")):
         if seconds >= 2 * size:
-            return f"{number(seconds / size)} {unit}"
-    return f"{number(seconds)} s"
+            return f"{number(seconds / size)} core-{unit}"
+    return f"{number(seconds)} core-s"
 
 
 def listed(names: Sequence[str]) -> str:

@@ -198,7 +198,8 @@ def break_even_table(
         "rule: the 95 % upper bound on the validation part. "
         "Break-even, queries: core-seconds of data and fit, divided by those that a query saves. "
         "With tuning: all fits of the method count, failed ones too. "
-        "The saving is against the fastest full-order configuration that is at least as accurate. "
+        "The saving is against the fastest full-order configuration that is at least as accurate "
+        "on the validation part. "
         "Never: the full-order model is as fast. Errors that a method does not reach are left out."
     )
     return TextTable("Whole cost", note, headings, rows) if rows else None

@@ -6,15 +6,13 @@
 `reports/sources.toml` gives the command of each experiment. In a command, `{out}` is the folder or
 file that it writes, and `{cache}` a new empty folder. The evidence goes to `reports/`, with the
 command, commit, machine, date and seconds in `run.toml` beside it. Commit all changes before, so
-that the commit tells which code ran. The whole folder of a run stays in `reports/runs/NAME`, for
-experiments that need its raw samples.
+that the commit tells which code ran.
 """
 
 from __future__ import annotations
 
 import os
 import shlex
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -32,9 +30,6 @@ from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of
 from tests.verification.trust_record import CODE, git
 
 SOURCES = "reports/sources.toml"
-
-RAW = "runs"
-"""Folder in `reports/` that keeps the whole folder of a run on this machine; git ignores it."""
 
 
 def experiments() -> dict[str, dict[str, Any]]:
@@ -90,8 +85,6 @@ def record(name: str, allow_changes: bool = False) -> None:
         seconds = perf_counter() - begun
         if out.is_dir():
             compact(out, REPORTS / name, f"reports/{name}")
-            shutil.rmtree(REPORTS / RAW / name, ignore_errors=True)
-            shutil.copytree(out, REPORTS / RAW / name)
         else:
             write_atomically(REPORTS / name, out.read_bytes())
     content_of.cache_clear()

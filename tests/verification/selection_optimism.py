@@ -1,6 +1,6 @@
 """Measure how optimistic a selection is that uses the samples by which it is then judged.
 
-    python -m tests.verification.selection_optimism RUN_DIR [--splits N] [--out FILE]
+    python -m tests.verification.selection_optimism STORED_RUN [--splits N] [--out FILE]
 
 The load regions of the test set are divided into random halves. For each method and target error,
 the fastest configuration that meets the target is selected in three ways:
@@ -28,9 +28,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.analyse import N_RESAMPLES
 from mor_bench.analysis.bootstrap import cluster_numbers
-from mor_bench.analysis.draws import VALIDATION
+from mor_bench.analysis.draws import VALIDATION, draws_of, headlines
 from mor_bench.analysis.frontier import (
     EXACT,
     TARGET_ERRORS,
@@ -40,6 +40,7 @@ from mor_bench.analysis.frontier import (
 )
 from mor_bench.report.entries import entries_of, told_by_method
 from mor_bench.results.comparison import Comparison
+from tests.published.compact import StoredRun
 
 WAYS = ("test", "validation", "bound")
 
@@ -124,8 +125,8 @@ def _figures(pairs: Sequence[tuple[float, float, float]]) -> dict[str, Any]:
 def sweeps_of(comparison: Comparison, dataset: str) -> list[Sweep]:
     """Read the sweeps of the methods with two or more timed configurations."""
     rows = [row for row in comparison.rows if row.dataset == dataset and is_point(row)]
-    records = analyse(comparison)["rows"] if any(row.validation for row in rows) else []
-    bounds = {(r["dataset"], r["label"]): r.get(VALIDATION, {}).get("high") for r in records}
+    draws = draws_of(comparison, dataset, N_RESAMPLES, np.random.default_rng(0))
+    bounds = {row.label: headlines(row, draws).get(VALIDATION, {}).get("high") for row in rows}
     out = []
     for method in dict.fromkeys(row.method for row in rows):
         mine = sorted((row for row in rows if row.method == method), key=median_latency_ms)
@@ -134,7 +135,7 @@ def sweeps_of(comparison: Comparison, dataset: str) -> list[Sweep]:
         errors = np.array([comparison.samples(row)["relative_l2"] for row in mine])
         held_out = {}
         if all(row.validation for row in mine):
-            highs = [bounds[dataset, row.label] for row in mine]
+            highs = [bounds[row.label] for row in mine]
             held_out = {
                 "validation": np.array([selecting_error(row) for row in mine]),
                 "bound": np.array([np.inf if high is None else high for high in highs]),
@@ -160,11 +161,11 @@ def measure(comparison: Comparison, n_splits: int) -> list[dict[str, Any]]:
 def main() -> None:
     """Print a line per method and way of selection."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
-    parser.add_argument("run", type=Path, help="folder of a run")
+    parser.add_argument("run", type=Path, help="folder of a stored run")
     parser.add_argument("--splits", type=int, default=400, help="number of random halves")
     parser.add_argument("--out", type=Path, help="JSON file to write")
     options = parser.parse_args()
-    records = measure(Comparison.read(options.run), options.splits)
+    records = measure(StoredRun.read(options.run), options.splits)
     print(f"{'method':<28} {'selected by':<12} {'n':>6} {'missed':>8} {'ratio':>6} {'p90':>6}")
     for record in records:
         for way in WAYS:

@@ -1,6 +1,6 @@
 """Compare the work of timed queries with the work of the scored loads.
 
-    python -m tests.verification.timed_work beam-coarse [METHOD ...] [--out FILE]
+    python -m tests.verification.timed_work beam-coarse [METHOD ... | --all] [--out FILE]
 
 For every configuration it prints the mean counted work per query of the timed loads, relative to
 that of the scored test loads. A training is cut to two iterations, because a network's work does
@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import mor_bench
-from mor_bench.errors import SpecError
+from mor_bench.errors import MissingDependencyError, SpecError, UnsupportedSceneError
 from mor_bench.measure.query_cost import cost_of
 from mor_bench.measure.timed_loads import TimedLoads
 from mor_bench.results.row import label_of
@@ -25,7 +27,7 @@ from mor_bench.runs.configurations import CORE_METHODS
 from mor_bench.runs.timing_stage import timed_numbers
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.given import given_of
-from mor_bench.specs import load_dataset_spec, load_method_spec
+from mor_bench.specs import list_suite, load_dataset_spec, load_method_spec
 from mor_bench.surrogate import Surrogate
 from tests.verification.trust_record import trust_record
 
@@ -55,23 +57,33 @@ def work_ratio(method: Surrogate, dataset: Dataset, timed: NDArray[np.float64]) 
     return None if scored is None or found is None else found / scored
 
 
+def brief(name: str, parameters: Mapping[str, Any]) -> Surrogate:
+    """Load a method; if it trains, with two iterations."""
+    try:
+        return mor_bench.load_method(name, **{**parameters, "iterations": 2})
+    except SpecError:
+        return mor_bench.load_method(name, **parameters)
+
+
 def main() -> None:
     """Print the ratio of every configuration, and exit with 1 if one is too far from one."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("dataset")
     parser.add_argument("methods", nargs="*", default=CORE_METHODS)
+    parser.add_argument("--all", action="store_true", help="every method of the suite")
     parser.add_argument("--out", type=Path, help="JSON file for the differences")
     options = parser.parse_args()
     dataset = load_dataset(load_dataset_spec(options.dataset))
     timed = timed_loads(dataset, max(QUERIES, 2 * len(dataset.test)))
     found: dict[str, float] = {}
-    for name in options.methods:
+    for name in list_suite("methods") if options.all else options.methods:
         for parameters in load_method_spec(name).configurations("quick"):
             try:
-                method = mor_bench.load_method(name, **{**parameters, "iterations": 2})
-            except SpecError:  # it does not train
-                method = mor_bench.load_method(name, **parameters)
-            ratio = work_ratio(method.fit(dataset.scene, dataset.train), dataset, timed)
+                method = brief(name, parameters).fit(dataset.scene, dataset.train)
+            except (MissingDependencyError, UnsupportedSceneError) as error:
+                print(f"{name}: {error}", flush=True)
+                break
+            ratio = work_ratio(method, dataset, timed)
             text = "counts nothing" if ratio is None else f"{100 * (ratio - 1):+.2f} %"
             print(f"{label_of(name, parameters)}: {text}", flush=True)
             if ratio is not None:

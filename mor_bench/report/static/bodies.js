@@ -28,7 +28,7 @@ Report.kinds.bodies = (figure, data) => {
     reference: R.tick(figure, "reference", true, redraw),
     rest: R.tick(figure, "at rest", true, redraw),
   };
-  const far = R.isNarrow() ? 1.5 : 1;
+  const far = R.isNarrow() ? 1.75 : 1.2;
   const home = { eye: { x: 0.45 * far, y: -1.9 * far, z: 0.75 * far } };
   let camera = home;
   let turning = false;

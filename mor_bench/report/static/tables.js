@@ -46,7 +46,6 @@ Report.table = (grid, data) => {
 
   const rows = data.order.map((label) => R.rowOf(data, label)).map((row, id) => ({
     ...row, id, error_value: row.error.median, latency_value: row.latency.median,
-    answer: row.qualified ? "yes" : row.status === "ok" ? (row.failed ? "no, failed" : "no") : row.status,
   }));
   const table = new Tabulator(grid, {
     data: rows,

@@ -1,0 +1,187 @@
+"""What the files of a dataset and of a method say, and how a configuration qualifies, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from mor_bench.analysis.selection import asked_of, bounds_of
+from mor_bench.analysis.selection_text import limits_missed, needs_text, run_command
+from mor_bench.analysis.verdict import Requirements, needs_of
+from mor_bench.report.cards import pair_text
+from mor_bench.report.entries import Entry
+from mor_bench.report.method_styles import style_of
+from mor_bench.report.number_format import number
+from mor_bench.report.summary import discretisation_error
+from mor_bench.results.comparison import Comparison
+
+
+def answer_of(entry: Entry, needs: Requirements) -> str:
+    """Say whether a configuration qualifies, or which limits it misses: "no: error"."""
+    if entry.qualified or not entry.ran:
+        return "yes" if entry.qualified else entry.row.status
+    missed = [name for name, _ in _missed(entry, needs)]
+    missed += ["loads without an answer"] if entry.n_failed else []
+    return f"no: {', '.join(missed)}" if missed else "no"
+
+
+def reason_of(entry: Entry, needs: Requirements) -> str:
+    """As `answer_of`, with the upper bounds and the limits."""
+    missed = [text for _, text in _missed(entry, needs)]
+    return f"no: {'; '.join(missed)}" if entry.ran and missed else answer_of(entry, needs)
+
+
+def _missed(entry: Entry, needs: Requirements) -> list[tuple[str, str]]:
+    return [] if entry.qualified else limits_missed(bounds_of(entry.row, entry.intervals), needs)
+
+
+def scene_text(spec: Mapping[str, Any]) -> str:
+    """Describe a generated dataset in a sentence; empty if its description is incomplete."""
+    body, material, supports, loads = (
+        spec.get(key) for key in ("geometry", "material", "supports", "loads")
+    )
+    if not (body and material and supports and loads):
+        return ""
+    constants = (
+        f"{_CONSTANTS.get(key, key)} {number(value)}{' Pa' if key.endswith('_pa') else ''}"
+        for key, value in material.items()
+        if isinstance(value, int | float)
+    )
+    parts = [
+        f"{_body(body)}, {_LAWS.get(material.get('law'), material.get('law'))}",
+        f"({', '.join(constants)}),",
+        f"supported at {_regions(supports)}",
+        "under gravity" if spec.get("gravity") else "",
+        "on springs" if spec.get("springs") else "",
+        f"with {_loads(loads)} on {_regions([loads])}.",
+    ]
+    text = " ".join(filter(None, parts))
+    return text[0].upper() + text[1:]
+
+
+_LAWS = {
+    "saint-venant-kirchhoff": "Saint Venant-Kirchhoff",
+    "neo-hookean": "neo-Hooke",
+    "mooney-rivlin": "Mooney-Rivlin",
+    "yeoh": "Yeoh",
+    "ogden": "Ogden",
+    "holzapfel-gasser-ogden": "Holzapfel-Gasser-Ogden",
+}
+"""Names of laws that are names of people."""
+
+_CONSTANTS = {"young_pa": "E", "poisson": "ν"}
+"""Symbols of material constants."""
+
+_DIRECTIONS = {
+    "force": "in any direction",
+    "normal": "along the normal",
+    "tangential": "tangential",
+}
+"""Directions of forces, by the kind of load."""
+
+
+def _body(body: Mapping[str, Any]) -> str:
+    """Name the shape and its size."""
+    size = body.get("size_m")
+    if size:
+        return f"{body['shape']} of {' × '.join(f'{side:g}' for side in size)} m"
+    return str(body.get("surface") or body["shape"])
+
+
+def _regions(parts: Sequence[Mapping[str, Any]]) -> str:
+    """Name regions that have a name."""
+    regions = [part.get("region") for part in parts]
+    return " and ".join(r if isinstance(r, str) else "a part of its surface" for r in regions)
+
+
+def _loads(loads: Mapping[str, Any]) -> str:
+    """State number, size and direction of the loads."""
+    if moved := loads.get("magnitude_m"):
+        return f"a tool that moves by {moved[0]:g} to {moved[1]:g} m"
+    low, high = loads["magnitude_n"]
+    n, how = loads.get("simultaneous", 1), _DIRECTIONS.get(loads["kind"], loads["kind"])
+    return f"{n} force{'s' if n != 1 else ''} of {low:g} to {high:g} N {how}"
+
+
+def method_facts(comparison: Comparison, method: str) -> list[tuple[str, str]]:
+    """List what a method's file says of it."""
+    spec = comparison.methods.get(method, {})
+    regime = spec.get("regime") or {}
+    facts = {
+        "title": spec.get("title"),
+        "family": style_of(method).family,
+        "origin": spec.get("source"),
+        "built for": regime.get("says") if isinstance(regime, dict) else None,
+        "limits": spec.get("limits"),
+    }
+    return [(name, str(text).strip()) for name, text in facts.items() if text]
+
+
+def facts_of(
+    comparison: Comparison, dataset: str, entries: Sequence[Entry]
+) -> list[tuple[str, str]]:
+    """List facts about the run: the dataset's description, its split, its needs, counts of rows."""
+    spec, rows = comparison.datasets.get(dataset, {}), [entry.row for entry in entries]
+    unused = _values(row.n_unused for row in rows)
+    split = f"by {_values(row.split for row in rows)}; "
+    split += f"training samples: {_values(row.n_train for row in rows)}; "
+    split += f"validation samples: {_values(row.n_validation for row in rows)}; "
+    split += f"test samples: {_values(row.n_test for row in rows)}"
+    split += f"; in no part: {unused}" if any(row.n_unused for row in rows) else ""
+    counts = (
+        f"{sum(r.status == status for r in rows)} {status}" for status in ("failed", "skipped")
+    )
+    facts = [("source", str(spec["source"]))] if spec.get("source") else []
+    for key, heading in _SCENE.items():
+        if spec.get(key):
+            pairs = [(k, _WORDS.get((key, k, v), v)) for k, v in flat(spec[key]) if v != "None"]
+            facts.append((heading, "; ".join(pair_text(k, v) if k else v for k, v in pairs)))
+    asked = asked_of(comparison, dataset)
+    command = run_command(asked) if comparison.settings else ""
+    return [
+        *([("command that runs it all again", command)] if command else []),
+        *facts,
+        ("split", split),
+        ("needs", needs_text(needs_of(comparison, dataset))),
+        ("degrees of freedom", _values(f"{row.n_dofs:,}" for row in rows if row.n_dofs)),
+        ("discretisation error of the dataset's mesh", discretisation_error(entries)),
+        ("threads", _values(row.threads for row in rows)),
+        ("configurations", f"{len(rows)}: {sum(r.ok for r in rows)} ran, {', '.join(counts)}"),
+    ]
+
+
+_SCENE = {
+    "geometry": "geometry",
+    "discretisation": "discretisation",
+    "material": "material",
+    "supports": "supports (clamped: no displacement)",
+    "loads": "loads",
+    "snapshots": "snapshots",
+}
+"""Parts of a dataset's description, and their headings."""
+
+_WORDS = {
+    ("discretisation", "element", "hexahedron"): "hexahedron with 8 nodes (H8)",
+    ("discretisation", "element", "tetrahedron"): "tetrahedron with 4 nodes (T4)",
+    ("loads", "kind", "force"): "force, its direction uniform on the sphere",
+    ("loads", "kind", "normal"): "force along the normal, pressing or pulling",
+    ("loads", "kind", "tangential"): "force along the surface, its direction uniform",
+}
+"""What some values mean, by part, key and value."""
+
+
+def _values(found: Iterable[object]) -> str:
+    """Join the different values, in order; a dash if there are none."""
+    return ", ".join(dict.fromkeys(map(str, found))) or "–"
+
+
+def flat(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
+    """Flatten nested tables to pairs such as ``("versions numpy", "2.4.6")``."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from flat(item, f"{prefix} {key}".strip())
+    elif isinstance(value, list | tuple) and any(isinstance(item, dict) for item in value):
+        for item in value:
+            yield from flat(item, prefix)
+    else:
+        yield prefix, ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
