@@ -162,9 +162,9 @@ def test_tuning_reports_the_used_and_the_allowed_budget(tmp_path: Path) -> None:
     ("regime", "device", "lacks"),
     [
         ({"min_dofs": 600}, "cpu", ""),
-        ({"min_dofs": 601}, "cpu", "600 of 601 degrees of freedom"),
-        ({"min_train": 1001}, "cpu", "1,000 of 1,001 training samples"),
-        ({"min_iterations": 5}, "cpu", "0 of 5 iterations"),
+        ({"min_dofs": 601}, "cpu", "600 degrees of freedom; it needs 601"),
+        ({"min_train": 1001}, "cpu", "1,000 training samples; it needs 1,001"),
+        ({"min_iterations": 5}, "cpu", "0 iterations; it needs 5"),
         ({"split": "sample"}, "cpu", "split by region"),
         ({"gpu": True}, "cpu", "no graphics processor"),
         ({"gpu": True}, "cuda", "trained on a graphics processor, but queried on the CPU"),
@@ -176,7 +176,7 @@ def test_a_method_is_in_its_regime_only_if_all_its_conditions_hold(
     made = Comparison(tmp_path, {}, settings={"device": device})
     made.rows = [scored(name, name, 0.1, 1.0) for name in "ab"]
     made.methods = {"a": {"regime": {"says": "large meshes", **regime}}, "b": {"regime": None}}
-    verdict = f"not tested in its regime ({lacks}): large meshes" if lacks else "in its regime"
+    verdict = f"not tested in its regime ({lacks}). It is for: large meshes" if lacks else "in its regime"
     assert [(record["in_regime"], record["verdict"]) for record in regimes(made)] == [
         (not lacks, verdict),
         (None, "its file names no regime"),

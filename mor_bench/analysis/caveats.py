@@ -78,7 +78,7 @@ def regimes(comparison: Comparison) -> list[dict[str, Any]]:
         says = str(regime.get("says") or "")
         verdict = "in its regime"
         if least:
-            verdict = f"not tested in its regime ({', '.join(least)}): {says}"
+            verdict = f"not tested in its regime ({', '.join(least)}). It is for: {says}"
         out.append({"method": method, "says": says, "in_regime": not least, "verdict": verdict})
     return out
 
@@ -92,7 +92,7 @@ def _missing(row: Row, regime: Mapping[str, Any], device: str) -> list[str]:
         "min_iterations": (trained or _number(row.parameters.get("iterations")), "iterations"),
     }
     missing = [
-        f"{n or 0:,} of {regime[name]:,} {what}"
+        f"{n or 0:,} {what}; it needs {regime[name]:,}"
         for name, (n, what) in has.items()
         if regime.get(name) and (n or 0) < regime[name]
     ]

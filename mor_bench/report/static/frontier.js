@@ -117,10 +117,12 @@ Report.kinds.frontier = (figure, data) => {
 
   // Values beyond the axis stand at its edge, with an arrow and the value, over no other marker.
   function cuts(rows, range) {
-    const pixels = (row) => [at(x(row), range.x, 500), at(inside(y(row)), range.y, 450)];
+    const [wide, high] = R.isNarrow() ? [290, 310] : [500, 450];
+    const pixels = (row) => [at(x(row), range.x, wide), at(inside(y(row)), range.y, high)];
     const taken = rows.map((row) => [...pixels(row), 12]);
     return rows.filter((row) => y(row) > TOP || y(row) < FLOOR).map((row) => {
-      const text = R.plain(`${row.name}: ${R.short(y(row))} %`);
+      const value = `${R.short(y(row))} %`;
+      const text = R.plain(R.isNarrow() ? value : `${row.name}: ${value}`);
       const side = y(row) > TOP ? 1 : -1, [px, py] = pixels(row), width = 6.5 * text.length;
       const free = (away) => taken.every(([qx, qy, other]) =>
         Math.abs(qy - (py - side * away)) > 18 || Math.abs(qx - px) > (width + other) / 2);
