@@ -176,7 +176,8 @@ def test_a_method_is_in_its_regime_only_if_all_its_conditions_hold(
     made = Comparison(tmp_path, {}, settings={"device": device})
     made.rows = [scored(name, name, 0.1, 1.0) for name in "ab"]
     made.methods = {"a": {"regime": {"says": "large meshes", **regime}}, "b": {"regime": None}}
-    verdict = f"not tested in its regime ({lacks}). It is for: large meshes" if lacks else "in its regime"
+    lacking = f"not tested in its regime ({lacks}). It is for: large meshes"
+    verdict = lacking if lacks else "in its regime"
     assert [(record["in_regime"], record["verdict"]) for record in regimes(made)] == [
         (not lacks, verdict),
         (None, "its file names no regime"),
