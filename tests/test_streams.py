@@ -108,6 +108,8 @@ def test_a_signal_ends_a_command_with_one_line_and_leaves_nothing(
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        # A shell ignores the interrupt in what it starts in the background.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     training = tmp_path / "c" / "fits"
     while process.poll() is None and not list(training.glob("*/training")):

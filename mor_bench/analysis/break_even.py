@@ -23,10 +23,10 @@ FULL_ORDER = "fem"
 def break_even(rows: Sequence[Row], at_error: Sequence[Record]) -> list[Record]:
     """Count the queries after which the offline cost of a method pays off, at each error.
 
-    The count is the offline cost (data and fit) divided by what a query saves, both in
-    core-seconds. A query uses its latency times its threads. The count compares two configurations:
-    the selected one, and the fastest full-order one that is at least as accurate by the errors that
-    select, those of the validation part.
+    The count is the offline cost (data and fit) beyond the preparation of the full-order model,
+    divided by what a query saves, both in core-seconds. A query uses its latency times its threads.
+    The count compares two configurations: the selected one, and the fastest full-order one that is
+    at least as accurate by the errors that select, those of the validation part.
 
     Parameters
     ----------
@@ -104,9 +104,13 @@ def _break_even(rows: Sequence[Row], record: Record) -> Record:
     if data is None or fit is None:
         missing = "its data" if data is None else "its fit"
         return {**out, "verdict": "unknown", "reason": f"the cost of {missing} is not known"}
-    out |= {"verdict": "pays off", "reason": "", "queries": ceil((data + fit) / saved_s)}
-    if all_fits is not None:
-        out["queries_with_tuning"] = ceil((data + all_fits) / saved_s)
+    prepared = fastest.fit_core_s or 0.0
+    queries = [
+        None if fits is None else max(0, ceil((data + fits - prepared) / saved_s))
+        for fits in (fit, all_fits)
+    ]
+    out |= {"verdict": "pays off", "reason": "", "queries": queries[0]}
+    out["queries_with_tuning"] = queries[1]
     return out
 
 

@@ -73,6 +73,8 @@ def out_of_range(entries: Sequence[Entry]) -> TextTable | None:
         "the recall. Recall: the flagged share of the loads with errors larger than "
         "usual."
     )
+    if not names:
+        note += " No set out of range was tested: `mor-bench run --profile full` adds some."
     return TextTable("Out of range", note, headings, rows) if rows else None
 
 
@@ -107,7 +109,7 @@ def hidden_table(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> 
             ]
         )
     headings = ["configuration", "samples", "median (%)", "p95 (%)", "max (%)"]
-    headings += ["shipped: median (%)", "ratio", "verdict"]
+    headings += ["main test set: median (%)", "ratio", "verdict"]
     note = (
         "Fresh loads of the same distribution that no author of a method has seen. Worse: "
         "the errors differ by more than the numbers of samples explain."

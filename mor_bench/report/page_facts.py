@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from mor_bench.analysis.selection import asked_of, bounds_of
 from mor_bench.analysis.selection_text import limits_missed, needs_text, run_command
 from mor_bench.analysis.verdict import Requirements, needs_of
+from mor_bench.errors import MorBenchError
+from mor_bench.measure.discretisation_error import measured
 from mor_bench.report.cards import pair_text
-from mor_bench.report.entries import Entry
+from mor_bench.report.entries import Analysis, Entry
 from mor_bench.report.method_styles import style_of
 from mor_bench.report.number_format import number
 from mor_bench.report.summary import discretisation_error
 from mor_bench.results.comparison import Comparison
+from mor_bench.specs import DatasetSpec, load_dataset_spec
 
 
 def answer_of(entry: Entry, needs: Requirements) -> str:
@@ -53,10 +58,30 @@ def scene_text(spec: Mapping[str, Any]) -> str:
         f"supported at {_regions(supports)}",
         "under gravity" if spec.get("gravity") else "",
         "on springs" if spec.get("springs") else "",
-        f"with {_loads(loads)} on {_regions([loads])}.",
+        f"with {_loads(loads)} on {_regions([loads])}{_patches(loads)}.",
     ]
     text = " ".join(filter(None, parts))
     return text[0].upper() + text[1:]
+
+
+def deformation(entries: Sequence[Entry]) -> str:
+    """State the largest displacement of the test loads; empty if it is unknown."""
+    known = (entry.figure("error", "amplitude_m") for entry in entries)
+    largest = next((value for value in known if value), None)
+    return f"Largest displacement of the test loads: {number(largest)} m." if largest else ""
+
+
+def limits_of(comparison: Comparison, analysis: Analysis, entries: Sequence[Entry]) -> str:
+    """State what a run does not tell: methods out of their regime, and the number of trainings."""
+    present = {entry.method for entry in entries}
+    outside = [
+        record["method"]
+        for record in analysis["regimes"]
+        if record["in_regime"] is False and record["method"] in present
+    ]
+    said = f"Not tested for what they are built for: {', '.join(outside)}." if outside else ""
+    seeds = comparison.settings.get("seeds")
+    return f"{said} Trainings: one seed each." if seeds == 1 else said
 
 
 _LAWS = {
@@ -94,13 +119,19 @@ def _regions(parts: Sequence[Mapping[str, Any]]) -> str:
     return " and ".join(r if isinstance(r, str) else "a part of its surface" for r in regions)
 
 
+def _patches(loads: Mapping[str, Any]) -> str:
+    """State the area over which a force is spread."""
+    area = loads.get("patch_area_m2")
+    return f", each on a patch of {area:g} m²" if area else ""
+
+
 def _loads(loads: Mapping[str, Any]) -> str:
     """State number, size and direction of the loads."""
     if moved := loads.get("magnitude_m"):
         return f"a tool that moves by {moved[0]:g} to {moved[1]:g} m"
     low, high = loads["magnitude_n"]
     n, how = loads.get("simultaneous", 1), _DIRECTIONS.get(loads["kind"], loads["kind"])
-    return f"{n} force{'s' if n != 1 else ''} of {low:g} to {high:g} N {how}"
+    return f"{n} dead force{'s' if n != 1 else ''} of {low:g} to {high:g} N {how}"
 
 
 def method_facts(comparison: Comparison, method: str) -> list[tuple[str, str]]:
@@ -145,9 +176,29 @@ def facts_of(
         ("needs", needs_text(needs_of(comparison, dataset))),
         ("degrees of freedom", _values(f"{row.n_dofs:,}" for row in rows if row.n_dofs)),
         ("discretisation error of the dataset's mesh", discretisation_error(entries)),
+        *_refinement(spec),
         ("threads", _values(row.threads for row in rows)),
         ("configurations", f"{len(rows)}: {sum(r.ok for r in rows)} ran, {', '.join(counts)}"),
     ]
+
+
+def _refinement(spec: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Say on which meshes the discretisation error was measured; nothing if that is unknown."""
+    try:
+        found = load_dataset_spec(spec)
+        record = measured(found) if isinstance(found, DatasetSpec) else None
+    except MorBenchError:
+        return []
+    if record is None:
+        return []
+    loads = record["loads"]
+    orders = [load["order"] for load in loads if load.get("order") is not None]
+    n = sum(load.get("limit") == "extrapolated" for load in loads)
+    meshes = ", ".join(f"{mesh['n_dofs']:,}" for mesh in record["meshes"])
+    text = f"{len(loads)} loads on meshes with {meshes} degrees of freedom"
+    text += f"; median order {number(float(np.median(orders)))}" if orders else ""
+    text += f"; limit by Richardson extrapolation for {n} loads, else the finest mesh"
+    return [("how it was measured", text)]
 
 
 _SCENE = {
@@ -177,6 +228,8 @@ def _values(found: Iterable[object]) -> str:
 
 def flat(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
     """Flatten nested tables to pairs such as ``("versions numpy", "2.4.6")``."""
+    if prefix in ("magnitude_n", "magnitude_m") and isinstance(value, list | tuple):
+        value = f"uniform from {value[0]:g} to {value[1]:g}"
     if isinstance(value, dict):
         for key, item in value.items():
             yield from flat(item, f"{prefix} {key}".strip())

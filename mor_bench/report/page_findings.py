@@ -115,7 +115,7 @@ def _costs(data: Data) -> str:
 
 def _bodies(data: Data) -> str:
     line = _first(data, data["bodies"]["samples"])
-    return f"{_name(data, line)}, {line['kind']} test load: {line['text']}"
+    return f"{_name(data, line)}, {line['kind']} test load by e: {line['text']}"
 
 
 _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
@@ -126,7 +126,8 @@ _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
         "Coloured: the prediction, by its error in mm. Blue lines: the full-order reference. "
         "Grey lines: the body at rest. The arrow shows place and direction of the force. "
         "Worst: the test load with the largest mean error e of that method. Typical: with the "
-        "median one. Two methods can thus show different loads. "
+        "median one. Two methods can thus show different loads, and the load with the largest "
+        "relative error may be another one. "
         "Drag to turn, scroll to zoom; both views turn together. By keyboard: Tab to a view, then "
         "arrow keys, + and −, or Home. Errors beyond half the body's size are cut.",
     ),

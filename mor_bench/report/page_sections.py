@@ -11,13 +11,21 @@ from mor_bench.analysis.told import is_observed
 from mor_bench.analysis.verdict import needs_of
 from mor_bench.report.canvas import Drawn
 from mor_bench.report.details import dataset_details, hard_cases
-from mor_bench.report.entries import Analysis, Entry, best_per_method, entries_of, verdict_of
+from mor_bench.report.entries import Analysis, Entry, entries_of, verdict_of
 from mor_bench.report.hardest_loads import hardest_loads
 from mor_bench.report.number_format import explain_short_names
 from mor_bench.report.page_data import Shown, cells_of, dataset_arrays, payload, reading_order
-from mor_bench.report.page_facts import answer_of, facts_of, method_facts, scene_text
+from mor_bench.report.page_facts import (
+    answer_of,
+    deformation,
+    facts_of,
+    limits_of,
+    method_facts,
+    scene_text,
+)
 from mor_bench.report.page_findings import Chart, charts, frontier
 from mor_bench.report.page_samples import sampled
+from mor_bench.report.page_strains import strain_facts
 from mor_bench.report.page_tables import figure_tables, with_content
 from mor_bench.report.page_verdict import Card, card, method_card
 from mor_bench.report.short_names import ShortName, constants, renamed
@@ -52,6 +60,7 @@ class Section:
     name: str
     title: str
     scene: str
+    limits: str
     card: Card
     given: str
     needs: str
@@ -105,22 +114,13 @@ def section_of(view: View, dataset: str) -> Section:
     rows = [entry.row for entry in entries]
     named, needs = view.names[dataset], needs_of(comparison, dataset)
     names = {label: str(name) for label, name in named.items()}
-    verdict = _EMPTY_CARD
-    if entries:
-        found = verdict_of(analysis, dataset)
-        verdict = (
-            method_card(found, entries, names, view.method)
-            if view.method
-            else card(found, entries, names, costs_of(comparison, dataset, analysis, entries))
-        )
+    verdict = _card(view, dataset, entries, names)
     shown = Shown(comparison, dataset, analysis, entries, names, verdict)
     data = payload(shown, view.body_bytes)
-    notes = notes_of(comparison, dataset, analysis)
-    events = [Event(label, doubt) for label, doubt in notes if not doubt.startswith(UNSTEADY)]
-    events += [Event(label, f"warning: {warning}") for label, warning in warnings_of(entries)]
     tables = [target_table(comparison, dataset, kind, analysis) for kind in _TARGETS]
     tables += [*dataset_details(comparison, dataset, analysis), *figure_tables(entries)]
-    samples = sampled(comparison, entries, best_per_method(entries))
+    picks = [pick.entry for ranking in verdict.rankings for pick in ranking.picks]
+    samples = sampled(comparison, entries, picks)
     hard = [
         *hard_cases(dataset, entries, analysis),
         *hardest_loads(samples, dataset_arrays(comparison, dataset)),
@@ -129,7 +129,8 @@ def section_of(view: View, dataset: str) -> Section:
     return Section(
         name=dataset,
         title=str(comparison.datasets.get(dataset, {}).get("title") or ""),
-        scene=scene_text(comparison.datasets.get(dataset, {})),
+        scene=" ".join([scene_text(comparison.datasets.get(dataset, {})), deformation(entries)]),
+        limits=limits_of(comparison, analysis, entries),
         card=verdict,
         given="observed displacements" if is_observed(comparison, dataset) else "nodal forces (N)",
         needs=needs_text(needs),
@@ -142,9 +143,12 @@ def section_of(view: View, dataset: str) -> Section:
         constants=constants(rows),
         short_names=explain_short_names(entry.swept for entry in entries),
         basis=interval_basis(dataset, analysis),
-        facts=facts_of(comparison, dataset, entries),
+        facts=[
+            *facts_of(comparison, dataset, entries),
+            *strain_facts(samples, dataset_arrays(comparison, dataset)),
+        ],
         failures=[Event(names[e.label], e.trouble) for e in entries if e.trouble],
-        events=[Event(renamed(e.label, named), e.text) for e in events],
+        events=_events(view, dataset, entries),
         unsteady=[Event(names[e.label], "; ".join(e.unstable)) for e in entries if e.unstable],
         hard=_complete(hard, entries, named),
         details=_complete(tables, entries, named),
@@ -155,6 +159,24 @@ def section_of(view: View, dataset: str) -> Section:
         body_picture=next(pictures, None),
         data=data,
     )
+
+
+def _card(view: View, dataset: str, entries: Sequence[Entry], names: Mapping[str, str]) -> Card:
+    """Return the verdict on all methods, or on the one of the page."""
+    if not entries:
+        return _EMPTY_CARD
+    found = verdict_of(view.analysis, dataset)
+    if view.method:
+        return method_card(found, entries, names, view.method)
+    return card(found, entries, names, costs_of(view.comparison, dataset, view.analysis, entries))
+
+
+def _events(view: View, dataset: str, entries: Sequence[Entry]) -> list[Event]:
+    """List doubts and warnings other than unstable timings."""
+    notes = notes_of(view.comparison, dataset, view.analysis)
+    events = [(label, doubt) for label, doubt in notes if not doubt.startswith(UNSTEADY)]
+    events += [(label, f"warning: {warning}") for label, warning in warnings_of(entries)]
+    return [Event(renamed(label, view.names[dataset]), text) for label, text in events]
 
 
 _TARGETS = ("time_at_error", "error_at_time")

@@ -79,7 +79,7 @@ class Spectrum:
             words = "More than {} modes are needed"
         elif rank == 1:
             words = "{} mode suffices"
-        return f"{words.format(rank)} for {percent(error)} % (training data)"
+        return f"{words.format(rank)} for {percent(error)} % on the training samples themselves"
 
 
 def spectrum_of(arrays: Mapping[str, NDArray[Any]]) -> Spectrum | None:

@@ -156,7 +156,8 @@ def pairwise(comparison: Comparison, dataset: str, analysis: Analysis) -> list[T
             for method, *lines in zip(pairs.methods, pairs.cells, pairs.intervals, strict=True)
         ]
         of_need = ", the required error" if target == needed else ""
-        note = f"{PAIRWISE_LEGEND} Below: the 95 % interval of that factor."
+        note = f"{PAIRWISE_LEGEND} Below: the 95 % interval of that factor. Times are "
+        note += "interpolated at this error, so they differ from those of single configurations."
         note += f" Not reached by {', '.join(pairs.absent)}." if pairs.absent else ""
         title = f"Who is faster at {percent(target)} %{of_need}"
         tables.append(TextTable(title, note, ["", *pairs.methods], rows))
@@ -196,7 +197,8 @@ def break_even_table(
     note = (
         "Each row is the fastest configuration of a method that meets this error by the verdict's "
         "rule: the 95 % upper bound on the validation part. "
-        "Break-even, queries: core-seconds of data and fit, divided by those that a query saves. "
+        "Break-even, queries: core-seconds of data and fit beyond those of the full-order model, "
+        "divided by those that a query saves. "
         "With tuning: all fits of the method count, failed ones too. "
         "The saving is against the fastest full-order configuration that is at least as accurate "
         "on the validation part. "

@@ -67,10 +67,11 @@ Report.kinds.bodies = (figure, data) => {
     const head = { type: "cone", x: [to[0]], y: [to[1]], z: [to[2]], u: [vector[0]], v: [vector[1]],
       w: [vector[2]], anchor: "tip", showscale: false, sizemode: "absolute", hoverinfo: "skip",
       sizeref: 0.035 * found.size_m, colorscale: [[0, ink], [1, ink]] };
+    const up = vector[2] > 0, place = (pushes ? !up : up) ? "top center" : "bottom center";
     const shaft = { type: "scatter3d", mode: "lines+text", showlegend: false, hoverinfo: "skip",
       x: [from[0], to[0]], y: [from[1], to[1]], z: [from[2], to[2]],
       text: pushes ? [`${R.short(newton)} N`, ""] : ["", `${R.short(newton)} N`],
-      textposition: "top center", textfont: { color: ink, size: 12 },
+      textposition: place, textfont: { color: ink, size: 12 },
       line: { color: ink, width: 5 } };
     return [shaft, head];
   }
