@@ -29,7 +29,8 @@ from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.report.page import render
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.mesh import Mesh, box_mesh
-from mor_bench.scene.scene import Scene, load_scene, with_cells
+from mor_bench.scene.other_meshes import with_cells
+from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import DatasetSpec, TetrahedraGeometry, load_generated_spec
 from tests.relative_errors import relative_l2

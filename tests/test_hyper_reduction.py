@@ -25,7 +25,8 @@ from mor_bench.reduction.points import ReducedPoints
 from mor_bench.reduction.subspace import extent_of
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.mesh import box_mesh
-from mor_bench.scene.scene import Scene, with_cells
+from mor_bench.scene.other_meshes import with_cells
+from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.surrogates.deim import InterpolatedPOD

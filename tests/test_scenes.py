@@ -16,7 +16,8 @@ from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.report.published_figures import scene_of
 from mor_bench.scene.loads import cut_patches
 from mor_bench.scene.mesh import box_mesh
-from mor_bench.scene.scene import Scene, load_scene, with_cells
+from mor_bench.scene.other_meshes import with_cells
+from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.test_sets import spec_of_set
 from mor_bench.specs import list_suite, load_generated_spec
 
@@ -177,7 +178,11 @@ def test_a_users_surface_becomes_a_scene_from_any_folder(tmp_path: Path) -> None
 
 
 SLOW = {"beam-fine", "liver-hex", "liver-tet"}
-OTHERS = {"liver-hex-observed", "liver-grasped"}  # the body of liver-hex
+OTHERS = {
+    "liver-hex-observed",
+    "liver-grasped",
+    "artery-pressure",
+}  # of liver-hex; no patches
 QUICK = {*map(scene_of, list_suite("datasets"))} - SLOW - OTHERS
 
 

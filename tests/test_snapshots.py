@@ -198,7 +198,11 @@ def test_missing_sets_give_their_reason() -> None:
 
 
 QUICK = {"beam-tiny", "beam-nearly-incompressible", "block-compression"}
-OTHERS = {"liver-hex-observed", "liver-grasped"}  # the samples of liver-hex, and no forces
+OTHERS = {
+    "liver-hex-observed",
+    "liver-grasped",
+    "artery-pressure",
+}  # of liver-hex; no patches
 SLOW = {*map(scene_of, list_suite("datasets"))} - QUICK - OTHERS
 
 

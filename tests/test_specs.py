@@ -30,9 +30,10 @@ SHIPPED = {
     "liver-hex": (726, 1118, 200, 2000),
     "liver-hex-observed": (726, 1118, 200, 2000),
     "liver-grasped": (726, 1118, 12, 2000),
+    "artery-pressure": (384, 600, 2, 2000),
     "liver-tet": (4567, 1118, 200, 2000),
 }
-"""Cells, nodes, load patches or moved nodes, and samples of each dataset."""
+"""Cells, nodes, load patches, moved nodes or pressed regions, and samples of each dataset."""
 
 LARGE = [name for name in SHIPPED if name.startswith(("beam-fine", "liver"))]
 
@@ -43,7 +44,8 @@ LARGE = [name for name in SHIPPED if name.startswith(("beam-fine", "liver"))]
 def test_every_shipped_dataset_has_its_pinned_counts(name: str) -> None:
     counts, _, warning = check_file(list_suite("datasets")[name]).partition("; warning: ")
     cells, nodes, patches, samples = SHIPPED[name]
-    loaded = "moved nodes" if load_generated_spec(name).motion else "load patches"
+    kinds = {"displacement": "moved nodes", "pressure": "pressed regions"}
+    loaded = kinds.get(load_generated_spec(name).load_plan.kind, "load patches")
     expected = f"{cells} cells, {nodes} nodes, {patches} {loaded}, {samples} samples"
     assert counts == f"dataset, {expected}"
     assert ("lock" in warning) == name.startswith(("liver-hex", "liver-tet"))
@@ -98,7 +100,7 @@ def test_every_shipped_method_states_what_it_is_told(name: str) -> None:
 BAD_DATASETS = """
 geometry.sise_m = [1.0] -> unknown key `geometry.sise_m`; did you mean 'size_m'?
 geometry.sise_m = 1 -> Allowed here: cells, shape, size_m.
-geometry.shape = "sphere" -> must be 'box', 'l-shape', 'voxels', 'tetrahedra' or 'file'; got 'sphe
+geometry.shape = "sphere" -> must be 'box', 'l-shape', 'tube', 'voxels', 'tetrahedra' or 'file'
 geometry.cells = - -> key `geometry.cells` is missing.
 geometry.cells = [6, 2] -> key `geometry.cells[2]` is missing.
 geometry.cells = [6, 2, 0] -> `geometry.cells[2]` must be greater than or equal to 1; got 0.
@@ -150,7 +152,7 @@ loads.magnitude_n = [0.0, 1e-300] -> `loads.magnitude_n[1]` must be greater than
 loads.samples_per_patch = 1000000000000000000 -> must be less than or equal to 10000000
 loads.samples_per_patch = 0 -> `loads.samples_per_patch` must be greater than or equal to 1
 loads.seed = -1 -> `loads.seed` must be greater than or equal to 0; got -1.
-loads.kind = "x" -> `loads.kind` must be 'force', 'normal', 'tangential' or 'displacement'; got 'x'.
+loads.kind = "x" -> `loads.kind` must be 'force', 'normal', 'tangential', 'displacement' or
 split.by = "patch" -> `split.by` must be 'region', 'sample' or 'direction'; got 'patch'.
 split.test_fraction = 1.0 -> `split.test_fraction` must be less than 1; got 1.0.
 needs.error = true -> `needs.error` must be a valid number; got True.

@@ -11,7 +11,8 @@ from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.mesh import Mesh, box_mesh
-from mor_bench.scene.scene import Scene, load_scene, refined, with_cells
+from mor_bench.scene.other_meshes import refined, with_cells
+from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.scene.subdivision import subdivide
 
 

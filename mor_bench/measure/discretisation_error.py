@@ -33,7 +33,8 @@ from mor_bench.machine import describe_machine
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.interpolation import interpolation_matrix
-from mor_bench.scene.scene import Scene, load_scene, refined
+from mor_bench.scene.other_meshes import refined
+from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.generate import dataset_folder
 from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of
 from mor_bench.snapshots.store import write_atomically
@@ -284,7 +285,7 @@ def refine(
             f"{spec.name}: the discretisation error can be measured for forces only, not where "
             "`loads.kind` is 'displacement'."
         )
-    n_patches = len(scene.patch_nodes)
+    n_patches = n_samples_of(scene) if scene.pressure else len(scene.patch_nodes)
     if not 1 <= plan.n_loads <= n_patches:
         raise InvalidInputError(
             f"`loads` must be an integer in [1, {n_patches}], the number of load patches "

@@ -146,7 +146,7 @@ def dataset_card(spec: AnyDatasetSpec, path: Path, cache: Path | None = None) ->
             "geometry": _pairs(spec.geometry.model_dump(mode="json", exclude_none=True)),
             "material": _pairs(spec.material.model_dump(mode="json", exclude_none=True)),
             "loads": f"{loads.simultaneous} at a time, kind {loads.kind}, "
-            f"{loads.magnitude[0]:g} to {loads.magnitude[1]:g} {'m' if spec.motion else 'N'}, "
+            f"{loads.magnitude[0]:g} to {loads.magnitude[1]:g} {loads.unit}, "
             f"{loads.sampling}"
             if loads
             else "",

@@ -10,15 +10,14 @@ import numpy as np
 from mor_bench.analysis.selection import asked_of, bounds_of
 from mor_bench.analysis.selection_text import limits_missed, needs_text, run_command
 from mor_bench.analysis.verdict import Requirements, needs_of
-from mor_bench.errors import MorBenchError
 from mor_bench.measure.discretisation_error import measured
 from mor_bench.report.cards import pair_text
 from mor_bench.report.entries import Analysis, Entry
 from mor_bench.report.method_styles import style_of
 from mor_bench.report.number_format import number
+from mor_bench.report.scene_text import recorded_scene
 from mor_bench.report.summary import discretisation_error
 from mor_bench.results.comparison import Comparison
-from mor_bench.specs import DatasetSpec, load_dataset_spec
 
 
 def answer_of(entry: Entry, needs: Requirements) -> str:
@@ -40,30 +39,6 @@ def _missed(entry: Entry, needs: Requirements) -> list[tuple[str, str]]:
     return [] if entry.qualified else limits_missed(bounds_of(entry.row, entry.intervals), needs)
 
 
-def scene_text(spec: Mapping[str, Any]) -> str:
-    """Describe a generated dataset in a sentence; empty if its description is incomplete."""
-    body, material, supports, loads = (
-        spec.get(key) for key in ("geometry", "material", "supports", "loads")
-    )
-    if not (body and material and supports and loads):
-        return ""
-    constants = (
-        f"{_CONSTANTS.get(key, key)} {number(value)}{' Pa' if key.endswith('_pa') else ''}"
-        for key, value in material.items()
-        if isinstance(value, int | float)
-    )
-    parts = [
-        f"{_body(body)}, {_LAWS.get(material.get('law'), material.get('law'))}",
-        f"({', '.join(constants)}),",
-        f"supported at {_regions(supports)}",
-        "under gravity" if spec.get("gravity") else "",
-        "on springs" if spec.get("springs") else "",
-        f"with {_loads(loads)} on {_regions([loads])}{_patches(loads)}.",
-    ]
-    text = " ".join(filter(None, parts))
-    return text[0].upper() + text[1:]
-
-
 def deformation(entries: Sequence[Entry]) -> str:
     """State the largest displacement of the test loads; empty if it is unknown."""
     known = (entry.figure("error", "amplitude_m") for entry in entries)
@@ -82,56 +57,6 @@ def limits_of(comparison: Comparison, analysis: Analysis, entries: Sequence[Entr
     said = f"Not tested for what they are built for: {', '.join(outside)}." if outside else ""
     seeds = comparison.settings.get("seeds")
     return f"{said} Trainings: one seed each." if seeds == 1 else said
-
-
-_LAWS = {
-    "saint-venant-kirchhoff": "Saint Venant-Kirchhoff",
-    "neo-hookean": "neo-Hooke",
-    "mooney-rivlin": "Mooney-Rivlin",
-    "yeoh": "Yeoh",
-    "ogden": "Ogden",
-    "holzapfel-gasser-ogden": "Holzapfel-Gasser-Ogden",
-}
-"""Names of laws that are names of people."""
-
-_CONSTANTS = {"young_pa": "E", "poisson": "ν"}
-"""Symbols of material constants."""
-
-_DIRECTIONS = {
-    "force": "in any direction",
-    "normal": "along the normal",
-    "tangential": "tangential",
-}
-"""Directions of forces, by the kind of load."""
-
-
-def _body(body: Mapping[str, Any]) -> str:
-    """Name the shape and its size."""
-    size = body.get("size_m")
-    if size:
-        return f"{body['shape']} of {' × '.join(f'{side:g}' for side in size)} m"
-    return str(body.get("surface") or body["shape"])
-
-
-def _regions(parts: Sequence[Mapping[str, Any]]) -> str:
-    """Name regions that have a name."""
-    regions = [part.get("region") for part in parts]
-    return " and ".join(r if isinstance(r, str) else "a part of its surface" for r in regions)
-
-
-def _patches(loads: Mapping[str, Any]) -> str:
-    """State the area over which a force is spread."""
-    area = loads.get("patch_area_m2")
-    return f", each on a patch of {area:g} m²" if area else ""
-
-
-def _loads(loads: Mapping[str, Any]) -> str:
-    """State number, size and direction of the loads."""
-    if moved := loads.get("magnitude_m"):
-        return f"a tool that moves by {moved[0]:g} to {moved[1]:g} m"
-    low, high = loads["magnitude_n"]
-    n, how = loads.get("simultaneous", 1), _DIRECTIONS.get(loads["kind"], loads["kind"])
-    return f"{n} dead force{'s' if n != 1 else ''} of {low:g} to {high:g} N {how}"
 
 
 def method_facts(comparison: Comparison, method: str) -> list[tuple[str, str]]:
@@ -184,11 +109,8 @@ def facts_of(
 
 def _refinement(spec: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Say on which meshes the discretisation error was measured; nothing if that is unknown."""
-    try:
-        found = load_dataset_spec(spec)
-        record = measured(found) if isinstance(found, DatasetSpec) else None
-    except MorBenchError:
-        return []
+    found = recorded_scene(spec)
+    record = measured(found) if found else None
     if record is None:
         return []
     loads = record["loads"]
@@ -228,7 +150,8 @@ def _values(found: Iterable[object]) -> str:
 
 def flat(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
     """Flatten nested tables to pairs such as ``("versions numpy", "2.4.6")``."""
-    if prefix in ("magnitude_n", "magnitude_m") and isinstance(value, list | tuple):
+    ends = value if prefix.startswith("magnitude_") and isinstance(value, list | tuple) else ()
+    if len(ends) == 2 and all(isinstance(end, int | float) for end in ends):
         value = f"uniform from {value[0]:g} to {value[1]:g}"
     if isinstance(value, dict):
         for key, item in value.items():

@@ -21,13 +21,13 @@ from mor_bench.report.page_facts import (
     facts_of,
     limits_of,
     method_facts,
-    scene_text,
 )
 from mor_bench.report.page_findings import Chart, charts, frontier
 from mor_bench.report.page_samples import sampled
 from mor_bench.report.page_strains import strain_facts
 from mor_bench.report.page_tables import figure_tables, with_content
 from mor_bench.report.page_verdict import Card, card, method_card
+from mor_bench.report.scene_text import scene_text
 from mor_bench.report.short_names import ShortName, constants, renamed
 from mor_bench.report.speed_tables import target_table
 from mor_bench.report.summary import interval_basis, notes_of, warnings_of

@@ -21,6 +21,7 @@ from mor_bench.specs import (
 SHAPES = {
     "box": "boxes of hexahedra",
     "l-shape": "L-shapes of hexahedra",
+    "tube": "tubes of hexahedra",
     "voxels": "bodies of voxels",
     "tetrahedra": "bodies of tetrahedra",
     "file": "meshes from files",
@@ -79,6 +80,8 @@ def dataset_family(spec: AnyDatasetSpec) -> str:
     family = SHAPES[spec.geometry.shape]
     if spec.motion:
         return f"{family}, displacements prescribed"
+    if spec.loads and spec.loads.kind == "pressure":
+        return f"{family}, under pressure"
     return f"{family}, displacements observed" if spec.observed else family
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from mor_bench.specs import (
     DatasetSpec,
     LShapeGeometry,
     TetrahedraGeometry,
+    TubeGeometry,
     VoxelsGeometry,
 )
 
@@ -30,6 +32,13 @@ def build_body(
         return l_mesh(geometry.size_m, geometry.cells, geometry.cut_cells, tetrahedra), None, {}
     if isinstance(geometry, BoxGeometry):
         return box_mesh(geometry.size_m, geometry.cells, tetrahedra), None, {}
+    if isinstance(geometry, TubeGeometry):
+        from mor_bench.scene.tube import tube_mesh
+
+        mesh, sets = tube_mesh(
+            geometry.radii_m, geometry.length_m, radians(geometry.angle_deg), geometry.cells
+        )
+        return mesh, None, sets
     if isinstance(geometry, VoxelsGeometry):
         from mor_bench.scene.liver import liver_surface
         from mor_bench.scene.surfaces import read_surface

@@ -6,6 +6,7 @@ elements. A patch of fixed area is the same load on every mesh.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, pi, sqrt
 
@@ -137,6 +138,42 @@ def cut_patches(
     own = np.concatenate([own for _, own in cut])
     shares = sp.csr_array((own, at), shape=(len(centres), len(areas)))
     return Patches(shares, rule.points, rule.values, rule.vectors / areas[:, None])
+
+
+def pressed_patches(surface: Facets, regions: Sequence[NDArray[np.int64]]) -> Patches:
+    """Return three patches for each region of facets: the parts of a pressure along x, y and z.
+
+    The "areas" of patch 3 k + i are the components i of the area vectors of region k. Their sum is
+    that of the closed surface's normal, so it may be zero or negative. A pressure p on the region
+    is the traction -p e_i on each of its patches.
+
+    Raises
+    ------
+    SpecError
+        If a region has no facet.
+    """
+    if any(len(facets) == 0 for facets in regions):
+        raise SpecError(
+            "a region of `loads.regions` holds nodes but no facet of the surface, so no pressure "
+            "can act on it."
+        )
+    rules = [_quadrature(surface, facets, _area(surface, facets)) for facets in regions]
+    vectors = [rule.vectors for rule in rules]
+    areas = np.concatenate([np.linalg.norm(v, axis=1) for v in vectors])
+    return Patches(
+        sp.csr_array(sp.block_diag([v.T for v in vectors])),
+        np.concatenate([rule.points for rule in rules]),
+        sp.csr_array(sp.vstack([rule.values for rule in rules])),
+        np.concatenate(vectors) / areas[:, None],
+    )
+
+
+def _area(surface: Facets, facets: NDArray[np.int64]) -> float:
+    """Return the area of facets, m²; of a warped quadrilateral, that of two triangles."""
+    corners = surface.points[facets]
+    halves = [corners[:, [0, i, i + 1]] for i in range(1, facets.shape[1] - 1)]
+    crosses = [np.cross(h[:, 1] - h[:, 0], h[:, 2] - h[:, 0]) for h in halves]
+    return float(sum(0.5 * np.linalg.norm(cross, axis=1).sum() for cross in crosses))
 
 
 def _shares(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from fractions import Fraction
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import pi, sqrt
 from pathlib import Path
@@ -19,22 +18,21 @@ from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.scene.body import build_body
 from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.interpolation import interpolation_matrix
-from mor_bench.scene.loads import Facets, Patches, cut_patches, spread_out
+from mor_bench.scene.loads import Facets, Patches, cut_patches, pressed_patches, spread_out
 from mor_bench.scene.materials import Material, make_material
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.observed_regions import moved_nodes, observed_nodes
 from mor_bench.scene.regions import Cloud, region_points
 from mor_bench.scene.snapshot_file import ImportedArrays, read_arrays
 from mor_bench.scene.springs import Springs, foundations
-from mor_bench.scene.subdivision import subdivide
 from mor_bench.specs import (
     AXES,
     AnyDatasetSpec,
-    BoxGeometry,
     DatasetSpec,
     ImportedDatasetSpec,
-    LShapeGeometry,
     Motion,
+    Pressure,
+    Region,
     generated,
     load_dataset_spec,
 )
@@ -154,12 +152,23 @@ class Scene:
         """
         return interpolation_matrix(self.mesh, self.surface.points)
 
+    @property
+    def pressure(self) -> Pressure | None:
+        """The plan of pressures; None if the scene has another or no plan."""
+        loads = self.spec.loads if isinstance(self.spec, DatasetSpec) else None
+        return loads if isinstance(loads, Pressure) else None
+
     @cached_property
     def _loaded_points(self) -> NDArray[np.int64]:
+        plan = self.generated.load_plan
+        regions = plan.regions if isinstance(plan, Pressure) else (plan.region,)
+        return np.unique(np.concatenate([self._surface_points(region) for region in regions]))
+
+    def _surface_points(self, region: Region) -> NDArray[np.int64]:
         on_surface = np.unique(self.surface.facets)
         sets = {} if self.embedded_surface else self.point_sets
         cloud = Cloud(self.surface.points, on_surface, sets)
-        found = np.intersect1d(region_points(cloud, self.generated.load_plan.region), on_surface)
+        found = np.intersect1d(region_points(cloud, region), on_surface)
         if not len(found):
             raise SpecError(
                 "the load region holds nodes inside the body only, none on its surface."
@@ -171,9 +180,14 @@ class Scene:
         """(n_patches,) surface point at the centre of each load patch.
 
         The index of a patch here is its load-region id. On a mesh's own boundary the points are
-        nodes. A moved tool counts as one patch, at one of its nodes.
+        nodes. A moved tool counts as one patch, at one of its nodes; a pressure as three, at the
+        middle of its region.
         """
         loads = self.generated.load_plan
+        if isinstance(loads, Pressure):
+            regions = [self._surface_points(region) for region in loads.regions]
+            middles = [self.surface.points[region].mean(axis=0) for region in regions]
+            return np.repeat(np.concatenate([self._surface_point(m) for m in middles]), 3)
         if isinstance(loads, Motion):
             assert self.observed_nodes is not None
             points = self.mesh.points[self.observed_nodes]
@@ -212,6 +226,9 @@ class Scene:
         plan = self.generated.load_plan
         if isinstance(plan, Motion):
             raise UnsupportedSceneError(f"{self.name}: a tool moves the body; it has no patches.")
+        if isinstance(plan, Pressure):
+            regions = [self._surface_points(region) for region in plan.regions]
+            return pressed_patches(self.surface, [self.surface.within(r) for r in regions])
         return cut_patches(self.surface, self.loaded_facets, self.patch_nodes, plan.patch_area_m2)
 
     @cached_property
@@ -232,18 +249,24 @@ class Scene:
         points : (n_points, 3) float64
             Positions, m.
         shares : (n, n_points) sparse float64
-            Share of the patch's force at each point; rows sum to 1.
+            Share of the patch's force at each point; rows sum to 1. Of a pressure: the component
+            of the area vector at each point, m².
         """
         areas = self.patches.areas[patches]
         used = np.unique(areas.indices)
-        return self.patches.points[used], _rows_to_one(areas[:, used])
+        return self.patches.points[used], self._weights(areas[:, used])
+
+    def _weights(self, areas: sp.csr_array) -> sp.csr_array:
+        """Return the weights of patches from their areas: shares, or those of a pressure."""
+        return areas if self.pressure else _rows_to_one(areas)
 
     @cached_property
     def patch_weights(self) -> sp.csr_array:
         """(n_patches, n_nodes) nodal weights of a force on each patch; rows sum to 1.
 
         They are the consistent load of a uniform traction. An embedded surface passes it to the
-        nodes of the surrounding cells. For a moved tool they are 1 at each of its nodes.
+        nodes of the surrounding cells. For a moved tool they are 1 at each of its nodes. For a
+        pressure they are components of area vectors, m².
         """
         if self.motion:
             assert self.observed_nodes is not None
@@ -252,8 +275,8 @@ class Scene:
             return sp.csr_array(moved, shape=(1, self.mesh.n_nodes))
         if self.embedded_surface:
             points, shares = self.patch_points(np.arange(len(self.patch_nodes)))
-            return _rows_to_one(sp.csr_array(shares @ interpolation_matrix(self.mesh, points)))
-        return _rows_to_one(sp.csr_array(self.patches.areas @ self.patches.values))
+            return self._weights(sp.csr_array(shares @ interpolation_matrix(self.mesh, points)))
+        return self._weights(sp.csr_array(self.patches.areas @ self.patches.values))
 
     def prepare(self) -> Scene:
         """Find all regions now, so empty regions raise one `SpecError` here; return the scene."""
@@ -296,7 +319,7 @@ def load_scene(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> Scene
     spec = as_spec(source)
     try:
         if isinstance(spec, DatasetSpec):
-            return _without_patches(spec).prepare()
+            return scene_without_patches(spec).prepare()
         return imported_scene(spec, read_arrays(spec.snapshots.file))
     except SpecError as error:
         raise SpecError(f"{spec.name}: {error}") from None
@@ -307,61 +330,7 @@ def imported_scene(spec: ImportedDatasetSpec, arrays: ImportedArrays) -> Scene:
     return Scene(spec, arrays.mesh, None, arrays.fixed_nodes).prepare()
 
 
-def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
-    """Return the same body and supports on another mesh. Its load patches may not exist.
-
-    Parameters
-    ----------
-    scene : Scene
-        A scene with a box or an L.
-    cells : three ints
-        Cells per axis.
-
-    Raises
-    ------
-    UnsupportedSceneError
-        If the scene is neither, or cannot have such a mesh.
-    """
-    geometry = scene.generated.geometry
-    name = f"{scene.name} with {' x '.join(map(str, cells))} cells"
-    changed: dict[str, Any] = {"cells": cells}
-    if isinstance(geometry, LShapeGeometry):
-        axes = zip(geometry.cut_cells, cells[::2], geometry.cells[::2], strict=True)
-        cut = [Fraction(n * new, old) for n, new, old in axes]
-        if any(n.denominator > 1 for n in cut):
-            raise UnsupportedSceneError(
-                f"{name}: the corner of an L that is cut away must consist of whole cells."
-            )
-        changed["cut_cells"] = tuple(int(n) for n in cut)
-    elif not isinstance(geometry, BoxGeometry):
-        raise UnsupportedSceneError(
-            f"{scene.name}: only the mesh of a box or an L can be made finer or coarser; "
-            f"got `geometry.shape` {geometry.shape!r}."
-        )
-    try:
-        other = geometry.model_copy(update=changed)
-        return _without_patches(scene.generated.model_copy(update={"geometry": other}))
-    except SpecError as error:
-        raise UnsupportedSceneError(f"{name}: {error}") from None
-
-
-def refined(scene: Scene) -> Scene:
-    """Return the same body and supports on a mesh with each cell divided into eight.
-
-    Its load patches may not exist. The steps in the surface of voxels remain.
-    """
-    geometry = scene.generated.geometry
-    if isinstance(geometry, BoxGeometry) and scene.mesh.grid_shape is not None:
-        nx, ny, nz = (2 * n for n in geometry.cells)
-        return with_cells(scene, (nx, ny, nz))
-    mesh, parents = subdivide(scene.mesh)
-    still = np.zeros(scene.mesh.n_dofs, dtype=bool)
-    still[scene.fixed_dofs] = True
-    fixed, held = _by_node(np.all(still.reshape(-1, 3)[parents], axis=1))
-    return replace(scene, mesh=mesh, fixed_nodes=fixed, held_dofs=held, point_sets={})
-
-
-def _without_patches(spec: DatasetSpec) -> Scene:
+def scene_without_patches(spec: DatasetSpec) -> Scene:
     """Build a scene without searching its load region."""
     mesh, surface, point_sets = build_body(spec)
     element = "tetrahedron" if mesh.cells.shape[1] == 4 else "hexahedron"
@@ -377,12 +346,12 @@ def _without_patches(spec: DatasetSpec) -> Scene:
         still[nodes[:, None], [AXES.index(axis) for axis in support.components]] = True
     if still.all():
         raise SpecError("the supports fix every node of the mesh: nothing can move.")
-    material, held = make_material(spec.material), _by_node(still)
+    material, held = make_material(spec.material), by_node(still)
     springs = foundations(spec, surface or Facets(mesh.points, mesh.boundary_facets), point_sets)
     return Scene(spec, mesh, material, *held, surface, point_sets, springs)
 
 
-def _by_node(still: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def by_node(still: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return nodes without a free component, and held dofs of the others, from (n_nodes, 3)."""
     fixed = np.all(still, axis=1, keepdims=True)
     return np.flatnonzero(fixed), np.flatnonzero(still & ~fixed)

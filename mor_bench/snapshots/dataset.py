@@ -103,8 +103,8 @@ class Snapshots:
 
     @property
     def regions(self) -> NDArray[np.int64]:
-        """(n_samples,) load-region id; (n_samples, k) with k forces at once."""
-        patches = self.loads.patches
+        """(n_samples,) load-region id; (n_samples, k) with k forces at once; 0 for pressures."""
+        patches = self.loads.patches[:, :1] if self.scene.pressure else self.loads.patches
         return patches[:, 0] if patches.shape[1] == 1 else patches
 
 

@@ -29,7 +29,7 @@ from scipy.spatial.distance import cdist
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.scene import Scene
-from mor_bench.specs import MAX_COUNT, Loads, Motion, Sampling
+from mor_bench.specs import MAX_COUNT, Loads, Motion, Pressure, Sampling
 
 MAX_COMBINATIONS = 5_000_000
 """Largest number of listed combinations of patches. With three patches each, they need 120 MB."""
@@ -106,6 +106,8 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
         If no patches are as far apart as the plan requires.
     """
     loads, numbers = scene.generated.load_plan, np.arange(start, stop)
+    if isinstance(loads, Pressure):
+        return _pressures(loads, numbers)
     chosen, k = _combinations(scene), loads.simultaneous
     if chosen is None:
         patches = np.stack([_apart(scene, int(i)) for i in numbers])
@@ -125,6 +127,21 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
     else:
         unit = _design(loads.sampling, (loads.seed,), whole, k * d)[numbers]
     return PatchLoads(patches, _forces(loads, unit.reshape(len(numbers), k, d), normals))
+
+
+def _pressures(loads: Pressure, numbers: NDArray[np.int64]) -> PatchLoads:
+    """Return pressures, as the forces -p e_i on three patches of each region."""
+    d = len(loads.regions)
+    if loads.sampling == "random":
+        drawn = [np.random.default_rng([loads.seed, int(i)]).uniform(size=d) for i in numbers]
+        unit = np.reshape(drawn, (len(numbers), d))
+    else:
+        unit = _design(loads.sampling, (loads.seed,), loads.samples, d)[numbers]
+    low, high = loads.magnitude
+    pressures = low + (high - low) * unit
+    vectors = -pressures[:, :, None, None] * np.eye(3)
+    patches = np.tile(np.arange(3 * d), (len(numbers), 1))
+    return PatchLoads(patches, vectors.reshape(len(numbers), 3 * d, 3))
 
 
 def _combinations(scene: Scene) -> NDArray[np.int64] | None:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.specs import DatasetSpec
+from mor_bench.specs import DatasetSpec, Loads
 
 SetName = Literal[
     "in-range",
@@ -55,13 +55,15 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
         return "its file names no `tests.unseen_region`"
     if name == "paper-amplitude" and spec.tests.paper_magnitude_n is None:
         return "its file names no `tests.paper_magnitude_n`"
+    if name == "unseen-directions" and spec.load_plan.kind == "pressure":
+        return "a pressure has one direction"
     if name == "unseen-directions" and spec.load_plan.kind in ("force", "displacement"):
         return (
             "its directions are all over the sphere; "
             "the split by direction holds some of them out of training"
         )
-    if name == "several-forces" and spec.motion:
-        return "a tool moves the body"
+    if name == "several-forces" and not isinstance(spec.load_plan, Loads):
+        return "its loads are no forces on patches"
     if name == "several-forces" and spec.load_plan.simultaneous > 1:
         return "its main set has several forces"
     if name == "several-forces":
@@ -90,12 +92,11 @@ def spec_of_set(spec: DatasetSpec, name: SetName) -> DatasetSpec:
     loads = spec.load_plan
     low, high = loads.magnitude
     changed: dict[str, Any] = {"samples": spec.tests.samples, "seed": loads.seed + SEED_SHIFT}
-    if spec.motion is None:
+    if isinstance(loads, Loads):
         changed["samples_per_patch"] = None
     if name in ("2x", "4x"):
         times = int(name[0])
-        unit = "m" if spec.motion else "n"
-        changed[f"magnitude_{unit}"] = times * low, times * high
+        changed[f"magnitude_{loads.unit.lower()}"] = times * low, times * high
     elif name == "paper-amplitude":
         changed["magnitude_n"] = spec.tests.paper_magnitude_n
     elif name == "unseen-regions":

@@ -23,9 +23,19 @@ from mor_bench.specs.geometry_spec import (
     FileGeometry,
     LShapeGeometry,
     TetrahedraGeometry,
+    TubeGeometry,
     VoxelsGeometry,
 )
-from mor_bench.specs.loads_spec import AXES, Loads, Motion, Sampling, Split, SplitBy
+from mor_bench.specs.loads_spec import (
+    AXES,
+    AnyLoads,
+    Loads,
+    Motion,
+    Pressure,
+    Sampling,
+    Split,
+    SplitBy,
+)
 from mor_bench.specs.material_spec import (
     FibreMaterial,
     MooneyRivlinMaterial,
@@ -61,6 +71,7 @@ __all__ = [
     "NO_FORCES",
     "RECORDED",
     "AnyDatasetSpec",
+    "AnyLoads",
     "Battery",
     "BoxGeometry",
     "BoxRegion",
@@ -78,6 +89,7 @@ __all__ = [
     "Observed",
     "OgdenMaterial",
     "PointSetRegion",
+    "Pressure",
     "Race",
     "Region",
     "Sampling",
@@ -87,6 +99,7 @@ __all__ = [
     "Split",
     "SplitBy",
     "TetrahedraGeometry",
+    "TubeGeometry",
     "TwoLameMaterial",
     "VoxelsGeometry",
     "YeohMaterial",

@@ -13,12 +13,13 @@ from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.specs.base import Name, Positive, StrictModel, Text
 from mor_bench.specs.geometry_spec import Geometry
 from mor_bench.specs.loads_spec import (
+    AnyLoads,
     ExtraTests,
     Gravity,
     ImportedSplit,
     LoadPlan,
-    Loads,
     Motion,
+    Pressure,
     Split,
     Spring,
     Support,
@@ -115,9 +116,9 @@ class DatasetSpec(CommonDatasetSpec):
         Foundations, none by default.
     gravity : Gravity, optional
         A constant pre-load: displacements are measured from the rest state under it.
-    loads : Loads or Motion, optional
-        Sampled forces, or sampled displacements of a tool. Without it the scene can be solved for
-        given forces, but no samples can be drawn.
+    loads : Loads, Motion or Pressure, optional
+        Sampled forces, displacements of a tool, or pressures. Without it the scene can be solved
+        for given forces, but no samples can be drawn.
     """
 
     geometry: Geometry
@@ -134,24 +135,25 @@ class DatasetSpec(CommonDatasetSpec):
     tests: ExtraTests = ExtraTests()
 
     @model_validator(mode="after")
-    def _one_tool(self) -> Self:
-        if not isinstance(self.loads, Motion):
+    def _fixed_regions(self) -> Self:
+        """Check what a plan excludes whose samples all act on the same regions."""
+        if not isinstance(self.loads, Motion | Pressure):
             return self
-        if self.split.by == "region":
+        where = f"where `loads.kind` is {self.loads.kind!r}"
+        possible = ("sample", "direction") if isinstance(self.loads, Motion) else ("sample",)
+        if self.split.by not in possible:
             raise ValueError(
-                "`split.by` must be 'sample' or 'direction' where `loads.kind` is 'displacement', "
-                "since one region is moved; got 'region'"
+                f"`split.by` must be {' or '.join(map(repr, possible))} {where}, since all samples "
+                f"act on the same regions; got {self.split.by!r}"
             )
-        if self.observed is not None:
+        if self.observed is not None and isinstance(self.loads, Motion):
             raise ValueError(
-                "`observed` must be absent where `loads.kind` is 'displacement': the methods get "
-                "the displacements of `loads.region`"
+                f"`observed` must be absent {where}: the methods get the displacements of "
+                "`loads.region`"
             )
         for name in ("unseen_region", "paper_magnitude_n"):
             if getattr(self.tests, name) is not None:
-                raise ValueError(
-                    f"`tests.{name}` must be absent where `loads.kind` is 'displacement'"
-                )
+                raise ValueError(f"`tests.{name}` must be absent {where}")
         return self
 
     @property
@@ -160,7 +162,7 @@ class DatasetSpec(CommonDatasetSpec):
         return self.loads if isinstance(self.loads, Motion) else None
 
     @property
-    def load_plan(self) -> Loads | Motion:
+    def load_plan(self) -> AnyLoads:
         """The table `[loads]`, from which samples are drawn; `SpecError` if there is none."""
         if self.loads is None:
             raise SpecError(

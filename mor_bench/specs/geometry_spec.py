@@ -47,6 +47,43 @@ class LShapeGeometry(BoxGeometry):
         return self
 
 
+class TubeGeometry(StrictModel):
+    """A tube of H8 cells along the z axis, or a sector of one that begins at the x axis.
+
+    Its sets of nodes `inner` and `outer` are regions.
+
+    Attributes
+    ----------
+    radii_m : two floats
+        Inner and outer radius.
+    length_m : float
+    angle_deg : float
+        Angle of the sector, in (0, 360]; the whole tube by default.
+    cells : three ints
+        Cells across the wall, around and along the axis. A whole tube has at least 3 around.
+    """
+
+    shape: Literal["tube"]
+    radii_m: Annotated[tuple[Length, Length], Field(strict=False)]
+    length_m: Length
+    angle_deg: Annotated[float, Field(gt=0, le=360)] = 360.0
+    cells: Cells
+
+    @model_validator(mode="after")
+    def _has_a_wall(self) -> TubeGeometry:
+        inner, outer = self.radii_m
+        if inner >= outer:
+            raise ValueError(
+                f"the inner radius of `radii_m` must be less than the outer one; got {self.radii_m}"
+            )
+        if self.angle_deg / self.cells[1] > 120:
+            raise ValueError(
+                "`cells` around the axis must cover at most 120 degrees each; "
+                f"got {self.cells[1]} for {self.angle_deg:g} degrees"
+            )
+        return self
+
+
 def _surface(value: Any, info: ValidationInfo) -> Any:
     return value if value == "liver" else read_source_file(value, info)
 
@@ -93,6 +130,11 @@ class FileGeometry(StrictModel):
 
 
 Geometry = Annotated[
-    BoxGeometry | LShapeGeometry | VoxelsGeometry | TetrahedraGeometry | FileGeometry,
+    BoxGeometry
+    | LShapeGeometry
+    | TubeGeometry
+    | VoxelsGeometry
+    | TetrahedraGeometry
+    | FileGeometry,
     Field(discriminator="shape"),
 ]

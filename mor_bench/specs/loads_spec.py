@@ -29,7 +29,7 @@ Magnitude = Annotated[
     Field(strict=False),
     AfterValidator(_ordered),
 ]
-"""Lower and upper end of a range of forces, N, or of displacements, m."""
+"""Lower and upper end of a range of forces, N, displacements, m, or pressures, Pa."""
 
 
 Axis = Literal["x", "y", "z"]
@@ -143,6 +143,8 @@ class Loads(StrictModel):
     sampling: Sampling = "random"
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
 
+    unit: ClassVar[str] = "N"
+
     @property
     def magnitude(self) -> tuple[float, float]:
         """The range of each force, N."""
@@ -190,6 +192,7 @@ class Motion(StrictModel):
     simultaneous: ClassVar[int] = 1
     samples_per_patch: ClassVar[int | None] = None
     min_distance_m: ClassVar[float | None] = None
+    unit: ClassVar[str] = "m"
 
     region: Region
     kind: Literal["displacement"]
@@ -204,7 +207,48 @@ class Motion(StrictModel):
         return self.magnitude_m
 
 
-LoadPlan = Annotated[Loads | Motion, Field(discriminator="kind")]
+class Pressure(StrictModel):
+    """Uniform pressures on regions of the surface, each drawn independently.
+
+    They are dead loads: they act along the normals of the undeformed body.
+
+    Attributes
+    ----------
+    regions : list of Region
+        The facets with all corners in a region are pressed.
+    magnitude_pa : two floats
+        Range of each pressure, Pa. It pushes into the body.
+    samples : int
+        Number of samples.
+    sampling : str
+        Plan for the pressures.
+    seed : int
+    """
+
+    samples_per_patch: ClassVar[int | None] = None
+    min_distance_m: ClassVar[float | None] = None
+    unit: ClassVar[str] = "Pa"
+
+    regions: Annotated[tuple[Region, ...], Field(strict=False, min_length=1, max_length=8)]
+    kind: Literal["pressure"]
+    samples: Count
+    magnitude_pa: Magnitude
+    sampling: Sampling = "random"
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+
+    @property
+    def simultaneous(self) -> int:
+        """Number of loads of a sample: three components of a force per region."""
+        return 3 * len(self.regions)
+
+    @property
+    def magnitude(self) -> tuple[float, float]:
+        """The range of each pressure, Pa."""
+        return self.magnitude_pa
+
+
+AnyLoads = Loads | Motion | Pressure
+LoadPlan = Annotated[AnyLoads, Field(discriminator="kind")]
 
 
 class Split(StrictModel):

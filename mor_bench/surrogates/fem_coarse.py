@@ -16,7 +16,8 @@ from mor_bench.errors import UnconstrainedBodyError, UnsupportedSceneError
 from mor_bench.mechanics.model import FullOrderModel, check_supports, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.interpolation import interpolation_matrix
-from mor_bench.scene.scene import Scene, with_cells
+from mor_bench.scene.other_meshes import with_cells
+from mor_bench.scene.scene import Scene
 from mor_bench.surrogate import Surrogate
 
 

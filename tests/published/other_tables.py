@@ -268,8 +268,11 @@ def scenes(source: str) -> str:
         ]
         patches = len(scene.patch_nodes)
         samples = loads.get("samples") or patches * loads["samples_per_patch"]
-        low, high = scene.generated.load_plan.magnitude
-        where = f"{patches} of {loads['patch_area_m2']:g} m²" if scene.motion is None else DASH
+        plan = scene.generated.load_plan
+        low, high = plan.magnitude
+        area = loads.get("patch_area_m2")
+        where = f"{patches} of {area:g} m²" if area else DASH
+        n_loads = len(loads["regions"]) if scene.pressure else plan.simultaneous
         size = "×".join(f"{side:g}" for side in spec["geometry"].get("size_m", ()))
         body.append(
             [
@@ -277,8 +280,7 @@ def scenes(source: str) -> str:
                 f"{size} m, " * bool(size)
                 + f"{scene.mesh.n_cells:,} {element}, {scene.mesh.n_nodes:,} nodes",
                 f"{LAWS[law['law']]}, {law['young_pa']:,g} Pa, ν = {law['poisson']:g}",
-                f"{loads.get('simultaneous', 1)} × {loads['kind']}, {low:g}–{high:g} "
-                + ("m" if scene.motion else "N"),
+                f"{n_loads} × {loads['kind']}, {low:g}–{high:g} {plan.unit}",
                 where,
                 f"{samples:,}",
             ]

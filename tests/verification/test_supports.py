@@ -19,7 +19,8 @@ from mor_bench.mechanics.multigrid import MultigridFactor
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.mechanics.observed import ObservedModel
 from mor_bench.scene.mesh import Mesh
-from mor_bench.scene.scene import Scene, load_scene, refined
+from mor_bench.scene.other_meshes import refined
+from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.scene.symmetry import mirrors
 from mor_bench.specs import load_generated_spec
 

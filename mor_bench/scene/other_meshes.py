@@ -1,0 +1,68 @@
+"""The body of a scene on other meshes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from mor_bench.errors import SpecError, UnsupportedSceneError
+from mor_bench.scene.scene import Scene, by_node, scene_without_patches
+from mor_bench.scene.subdivision import subdivide
+from mor_bench.specs import BoxGeometry, LShapeGeometry
+
+
+def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
+    """Return the same body and supports on another mesh. Its load patches may not exist.
+
+    Parameters
+    ----------
+    scene : Scene
+        A scene with a box or an L.
+    cells : three ints
+        Cells per axis.
+
+    Raises
+    ------
+    UnsupportedSceneError
+        If the scene is neither, or cannot have such a mesh.
+    """
+    geometry = scene.generated.geometry
+    name = f"{scene.name} with {' x '.join(map(str, cells))} cells"
+    changed: dict[str, Any] = {"cells": cells}
+    if isinstance(geometry, LShapeGeometry):
+        axes = zip(geometry.cut_cells, cells[::2], geometry.cells[::2], strict=True)
+        cut = [Fraction(n * new, old) for n, new, old in axes]
+        if any(n.denominator > 1 for n in cut):
+            raise UnsupportedSceneError(
+                f"{name}: the corner of an L that is cut away must consist of whole cells."
+            )
+        changed["cut_cells"] = tuple(int(n) for n in cut)
+    elif not isinstance(geometry, BoxGeometry):
+        raise UnsupportedSceneError(
+            f"{scene.name}: only the mesh of a box or an L can be made finer or coarser; "
+            f"got `geometry.shape` {geometry.shape!r}."
+        )
+    try:
+        other = geometry.model_copy(update=changed)
+        return scene_without_patches(scene.generated.model_copy(update={"geometry": other}))
+    except SpecError as error:
+        raise UnsupportedSceneError(f"{name}: {error}") from None
+
+
+def refined(scene: Scene) -> Scene:
+    """Return the same body and supports on a mesh with each cell divided into eight.
+
+    Its load patches may not exist. The steps in the surface of voxels remain.
+    """
+    geometry = scene.generated.geometry
+    if isinstance(geometry, BoxGeometry) and scene.mesh.grid_shape is not None:
+        nx, ny, nz = (2 * n for n in geometry.cells)
+        return with_cells(scene, (nx, ny, nz))
+    mesh, parents = subdivide(scene.mesh)
+    still = np.zeros(scene.mesh.n_dofs, dtype=bool)
+    still[scene.fixed_dofs] = True
+    fixed, held = by_node(np.all(still.reshape(-1, 3)[parents], axis=1))
+    return replace(scene, mesh=mesh, fixed_nodes=fixed, held_dofs=held, point_sets={})

@@ -1,0 +1,100 @@
+"""What the page says of scenes, methods and configurations, in words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.verdict import Requirements
+from mor_bench.report.entries import Entry, entries_of
+from mor_bench.report.page_facts import answer_of, facts_of, limits_of, method_facts, reason_of
+from mor_bench.report.page_samples import Sampled
+from mor_bench.report.page_strains import strain_facts
+from mor_bench.report.scene_text import scene_text
+from mor_bench.results.row import ErrorSummary
+from mor_bench.scene.mesh import box_mesh
+from mor_bench.specs import list_suite, load_dataset_spec
+from tests.report_runs import add_row, tiny
+from tests.synthetic import a_row
+
+NEEDS = Requirements(error=0.01, latency_ms=3.0)
+
+
+def entry(error: float, latency_ms: float, n_failed: int = 0) -> Entry:
+    return Entry(
+        a_row(
+            "pod",
+            error={"rel_l2_median": error},
+            latency_ms={"median": latency_ms},
+            n_failed=n_failed,
+        )
+    )
+
+
+def test_a_configuration_that_does_not_qualify_names_the_limits_that_it_misses() -> None:
+    assert answer_of(replace(entry(0.001, 1.0), qualified=True), NEEDS) == "yes"
+    assert answer_of(entry(0.02, 1.0), NEEDS) == "no: error"
+    assert answer_of(entry(0.02, 4.0), NEEDS) == "no: error, latency"
+    assert answer_of(entry(0.001, 1.0, n_failed=2), NEEDS) == "no: loads without an answer"
+    assert answer_of(Entry(a_row("pod", status="failed", reason="x")), NEEDS) == "failed"
+    text = reason_of(entry(0.02, 4.0), NEEDS)
+    assert text == "no: error: upper bound 2 %, limit 1 %; latency: upper bound 4 ms, limit 3 ms"
+
+
+def test_the_validation_part_and_its_interval_give_the_reason() -> None:
+    row = entry(0.001, 1.0).row.with_parts(validation=ErrorSummary(rel_l2_median=0.004))
+    sure = Entry(row, intervals={"validation_rel_l2_median": (0.002, 0.009)})
+    unsure = Entry(row, intervals={"validation_rel_l2_median": (0.002, 0.0118)})
+    assert answer_of(sure, NEEDS) == "no"
+    assert reason_of(unsure, NEEDS) == "no: error: upper bound 1.18 %, limit 1 %"
+
+
+@pytest.mark.parametrize("name", list_suite("datasets"))
+def test_every_scene_of_the_suite_has_a_sentence(name: str) -> None:
+    text = scene_text(load_dataset_spec(name).model_dump(mode="json"))
+    assert text.endswith(".")
+    assert "None" not in text
+    assert any(unit in text for unit in (" N ", " m.", " Pa "))
+
+
+def test_the_sentence_of_a_scene() -> None:
+    text = scene_text(load_dataset_spec("beam-coarse").model_dump(mode="json"))
+    assert text == (
+        "Box of 4 × 1 × 1 m, Saint Venant-Kirchhoff (E 500 Pa, ν 0.4), supported at x-min with "
+        "1 dead force of 0 to 1 N in any direction on z-max, each on a patch of 0.11 m²."
+    )
+    text = scene_text(load_dataset_spec("artery-pressure").model_dump(mode="json"))
+    assert "on springs with dead pressures of 0 to 20000 Pa on inner and outer." in text
+
+
+@pytest.mark.parametrize("content", [{}, {"geometry": 5}, {"loads": {"kind": "force"}}])
+def test_a_damaged_description_has_no_sentence(content: dict[str, object]) -> None:
+    assert scene_text(content) == ""
+
+
+def test_strains_are_those_of_the_stored_displacements() -> None:
+    mesh = box_mesh((2.0, 1.0, 1.0), (2, 1, 1))
+    stretches = np.array([1.2, 0.9, 0.95])
+    u = mesh.points * (stretches - 1)
+    item = Sampled(entry(0.001, 1.0), {"worst_reference": u, "typical_reference": 0 * u})
+    ((name, text),) = strain_facts([item], {"points": mesh.points, "cells": mesh.cells})
+    assert name == "strains"
+    assert text.startswith("stretches from 0.9 to 1.2, det F at least 1, at the")
+    assert strain_facts([item], {}) == []
+
+
+def test_the_page_tells_how_to_run_again_and_what_was_not_tested(tmp_path: Path) -> None:
+    run = tiny(tmp_path / "run")
+    run.settings.update(seeds=1)
+    run.methods["pod"] = {"title": "POD", "regime": {"says": "large meshes", "min_dofs": 10**6}}
+    add_row(run, "pod", {"n_modes": 20}, 0.008, 2.5)
+    entries = entries_of(run, "beam-tiny")
+    facts = dict(facts_of(run, "beam-tiny", entries))
+    assert facts["command that runs it all again"].startswith("mor-bench run beam-tiny")
+    assert ("built for", "large meshes") in method_facts(run, "pod")
+    text = limits_of(run, analyse(run), entries)
+    assert text == "Not tested for what they are built for: pod. Trainings: one seed each."
