@@ -31,6 +31,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from mor_bench.errors import InvalidInputError
+from mor_bench.specs.base import MAX_COUNT
 from mor_bench.specs.loads_spec import SplitBy
 from mor_bench.specs.one_line_errors import nearest_name
 from mor_bench.specs.parameters import python_number
@@ -162,7 +163,11 @@ class DataOptions(FolderOptions):
 
     limit: Annotated[
         int | None,
-        Field(ge=1, description="Use only the first samples; they cover the load regions evenly."),
+        Field(
+            ge=1,
+            le=MAX_COUNT,
+            description="Use only the first samples; they cover the load regions evenly.",
+        ),
         CommandLine(metavar="N", default="all samples"),
     ] = None
     workers: Annotated[
@@ -249,7 +254,7 @@ class RunOptions(TrainOptions):
     ] = 1
     cluster: Cluster = None
     test_seed: Annotated[
-        Literal["fresh"] | Annotated[int, Field(ge=0)] | None,
+        Literal["fresh"] | Annotated[int, Field(ge=0, lt=2**63)] | None,
         Field(
             description=(
                 "Also score on a test set that is drawn after all fits, with this seed or a "

@@ -94,8 +94,14 @@ def test_leading_singular_values_and_the_norm_give_the_whole_energy() -> None:
     found = spectrum_of({"singular_values": values[:100], "snapshots_norm": norm})
     assert found is not None
     assert found.tail == pytest.approx(tail[:100])
-    assert found.finding(0.01) == "More than 100 modes are needed for 1 % (training data)"
-    assert found.finding(0.1) == "At least 76 modes are needed for 10 % (training data)"
+    assert (
+        found.finding(0.01)
+        == "More than 100 modes are needed for 1 % on the training samples themselves"
+    )
+    assert (
+        found.finding(0.1)
+        == "At least 76 modes are needed for 10 % on the training samples themselves"
+    )
     assert spectrum_of({"singular_values": values[:400]}) is None  # of an earlier version
 
 

@@ -62,6 +62,7 @@ def run_card(comparison: Comparison) -> Card:
     """Describe a run: its verdicts, settings, machine and files."""
     counts = Counter(row.status for row in comparison.rows)
     settings, machine = comparison.settings, comparison.machine
+    comparison.check_samples()  # without them the verdict would be another one
     analysis = analyse(comparison)
     facts = {}
     for dataset in dataset_names(comparison):

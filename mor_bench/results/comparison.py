@@ -158,8 +158,8 @@ class Comparison:
             self._check_samples_of(row)
 
     def _check_samples_of(self, row: Row) -> None:
-        stated = row.error
-        errors = self.samples(row).get("relative_l2", np.zeros(0))
+        stated, samples = row.error, self.samples(row)
+        errors = samples.get("relative_l2", np.zeros(0))
         path = self.samples_path(row)
         if errors.shape != (row.n_test,):
             raise StoreError(
@@ -168,13 +168,17 @@ class Comparison:
             )
         if stated is None or not row.n_test:
             return
-        figures = {"median": np.median(errors), "maximum": errors.max()}
-        said = {"median": stated.rel_l2_median, "maximum": stated.rel_l2_max}
-        for name, value in figures.items():
-            if not np.isclose(value, said[name], rtol=1e-9, equal_nan=True):
+        figures = [
+            ("median of `relative_l2`", np.median(errors), stated.rel_l2_median),
+            ("maximum of `relative_l2`", errors.max(), stated.rel_l2_max),
+        ]
+        if row.latency_ms and len(times := samples.get("latency_ms", np.zeros(0))):
+            figures.append(("median of `latency_ms`", np.median(times), row.latency_ms.median))
+        for name, value, said in figures:
+            if not np.isclose(value, said, rtol=1e-9, equal_nan=True):
                 raise StoreError(
-                    f"{path}: the {name} of `relative_l2` is {value:.6g}, but results.json says "
-                    f"{said[name]:.6g}. The file belongs to another configuration or run."
+                    f"{path}: the {name} is {value:.6g}, but results.json says {said:.6g}. The "
+                    "file belongs to another configuration or run."
                 )
 
     def samples_path(self, row: Row) -> Path:
@@ -183,8 +187,10 @@ class Comparison:
 
     def _samples_path(self, name: str) -> Path:
         stem = re.sub(r"[^\w.=-]+", "-", name).strip("-")
-        if len(stem) > MOST_STEM:  # file systems allow 255 bytes, with the ends of temporary names
-            stem = f"{stem[:MOST_STEM]}-{hashlib.sha256(stem.encode()).hexdigest()[:12]}"
+        # File systems allow 255 bytes, with the ends of temporary names. Other letters than those
+        # of common labels could make the names of two configurations equal.
+        if len(stem) > MOST_STEM or re.search(r"[^\w.=\-\[\], ]", name):
+            stem = f"{stem[:MOST_STEM]}-{hashlib.sha256(name.encode()).hexdigest()[:12]}"
         return self.out / "samples" / f"{stem}.h5"
 
     def finish(self, analysis: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from math import nan
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, FailFast, Field, model_validator
 
 from mor_bench.errors import printable
 from mor_bench.results.parts import Part, Real, SeedSpread, TrainedElsewhere, TrainingRecord
@@ -366,7 +366,7 @@ class ResultsFile(Part):
     settings: RecordedSettings
     datasets: dict[Label, RecordedDataset]
     methods: dict[Label, RecordedMethod]
-    rows: list[Row]
+    rows: Annotated[list[Row], FailFast()]  # millions of wrong rows would fill the memory
     learning: list[LearningPoint]
 
     @model_validator(mode="after")

@@ -119,11 +119,13 @@ def fit(
         # The import of a third party's module may end Python, or hang.
         cache = chosen.cache or default_cache()
         check_foreign_method(method_spec, cache, default_memory_limit_bytes())
-    unfitted = _unfitted(method_spec, parameters or {})
+    with _one_line(method_spec):
+        unfitted = _unfitted(method_spec, parameters or {})
+        trains = unfitted.trains()
     checkpoint = chosen.checkpoint or out.parent / f".{out.name}.checkpoint"
     training = _training(unfitted, chosen)
     _check_writable("out", out)
-    if unfitted.trains():
+    if trains:
         _check_checkpoint(checkpoint, out)
         unfitted.training = replace(training, checkpoint=checkpoint, progress=listener.training)
     data = load_dataset(
@@ -137,7 +139,7 @@ def fit(
     with pinned_threads(chosen.threads or os.cpu_count() or 1):
         with _one_line(method_spec):
             seconds = _fit_and_save(unfitted, data, out)
-        if unfitted.trains():
+        if trains:
             checkpoint.unlink(missing_ok=True)
         iterations = getattr(unfitted, "iterations_", None)
         if chosen.fit_seconds is not None and iterations is None:
@@ -211,7 +213,7 @@ def _one_line(spec: MethodSpec) -> Iterator[None]:
         yield
     except (MorBenchError, MemoryError):
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a method must not decide the exit code
         if spec.surrogate.startswith(OWN):
             raise
         raise MethodFailedError(f"method {spec.name}: {crash(error)}") from error

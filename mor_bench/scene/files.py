@@ -30,8 +30,8 @@ from mor_bench.scene.soundness import FARTHEST_M, tidied
 MOST_MESH_BYTES, MOST_CELLS = 1 * 2**30, 4_000_000
 """Size limits of a mesh or surface file: bytes, and cells of all kinds."""
 
-_IMPLICIT_CELLS = rb"(?im)^\s*DATASET\s+(STRUCTURED_POINTS|STRUCTURED_GRID|RECTILINEAR_GRID)"
-"""Type of a VTK file of a few bytes that may stand for millions of cells."""
+_IMPLICIT_CELLS = {"STRUCTURED_POINTS", "STRUCTURED_GRID", "RECTILINEAR_GRID"}
+"""Types of a VTK file of a few bytes that may stand for millions of cells."""
 
 FORMATS = [
     ".vtu",
@@ -192,15 +192,22 @@ def _check_alone(path: Path) -> None:
             f"{path}: refers to another file ({words!r}); a mesh must be one file. "
             "Convert it to .vtu or .msh."
         )
-    if suffix == ".vtk" and (
-        found := re.search(_IMPLICIT_CELLS, read_bytes(path, MOST_MESH_BYTES, SpecError))
-    ):
-        raise SpecError(
-            f"{path}: a grid of type {found[1].decode()} lists no cells; convert it to .vtu."
-        )
+    if suffix == ".vtk":
+        _check_lists_cells(path)
     if is_hdf5(path):
         with open_hdf5(path, SpecError):
             pass
+
+
+def _check_lists_cells(path: Path) -> None:
+    """Refuse a VTK file whose cells are implied; words are split as meshio splits them."""
+    content = read_bytes(path, MOST_MESH_BYTES, SpecError)
+    for line in re.finditer(rb"[^\n]{0,200}_[^\n]{0,200}", content):
+        words = line[0].decode("utf-8", errors="replace").upper().split()
+        if kind := _IMPLICIT_CELLS & {*words}:
+            raise SpecError(
+                f"{path}: a grid of type {kind.pop()} lists no cells; convert it to .vtu."
+            )
 
 
 def _reference(suffix: str, path: Path) -> str | None:
@@ -222,7 +229,7 @@ def _xml_reference(content: bytes) -> str | None:
     found: list[str] = []
 
     def begin(name: str, attributes: dict[str, str]) -> None:
-        external = name == "DataItem" and attributes.get("Format", "XML") != "XML"
+        external = attributes.get("Format", "XML") != "XML"
         if external or name.endswith("include"):
             found.append(" ".join([name, *(f"{key}={text}" for key, text in attributes.items())]))
 
@@ -240,9 +247,10 @@ def _read_by_suffix(path: Path, head: bytes) -> meshio.Mesh:
         check_abaqus(path)
     if suffix in (".bdf", ".fem", ".nas"):
         _check_nastran(path)
-    # Ansys and Gmsh both write .msh. With a given format, meshio's message explains the error in
-    # the file.
-    file_format = "gmsh" if suffix == ".msh" and head.startswith(b"$") else None
+    # meshio would try Ansys too, whose reader waits for the end of a cut file for ever.
+    file_format = "gmsh" if suffix == ".msh" else None
+    if file_format and not head.strip():
+        raise SpecError(f"{path}: the file is empty or holds no mesh.")
     printed = StringIO()
     try:
         with redirect_stdout(printed), redirect_stderr(printed), warnings.catch_warnings():

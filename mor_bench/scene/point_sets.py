@@ -25,6 +25,9 @@ _NO_ROWS = np.zeros(0, dtype=np.int64)
 MOST_GROUPS = 10_000
 """Largest number of physical groups in a file; each takes a pass over all cells."""
 
+MOST_NUMBERS = 10_000_000
+"""Largest number of nodes and cells that the ranges of all sets of an Abaqus file may list."""
+
 
 def named_point_sets(mesh: meshio.Mesh, path: Path) -> PointSets:
     """Return the sets of nodes that a file names; sets with the same name are joined.
@@ -95,7 +98,8 @@ def _physical_groups(mesh: meshio.Mesh) -> list[tuple[str, _Rows]]:
 def abaqus_lines(path: Path) -> list[str]:
     """Return the lines of an Abaqus file that may hold a keyword."""
     text = path.read_text(encoding="utf-8", errors="replace")
-    return re.findall(r"^[^\S\n]*[*A-Za-z].*$", text, re.MULTILINE)
+    # Some letters beyond A to Z become such letters in capitals.
+    return re.findall(r"^[^\S\n]*(?:\*|[^\W\d]).*$", text, re.MULTILINE)
 
 
 def abaqus_keyword(line: str) -> str:
@@ -115,8 +119,9 @@ def _keywords(path: Path, keyword: str, parameter: str) -> list[str | None]:
 def check_abaqus(path: Path) -> None:
     """Raise `SpecError` if an Abaqus file has two NSET with the same name, or two NODE blocks.
 
-    meshio would read only one of them.
+    meshio would read only one of them. It would also list every number of a range.
     """
+    _check_ranges(path)
     names = Counter(_keywords(path, "NSET", "NSET"))
     repeated = sorted(name for name, n in names.items() if name is not None and n > 1)
     if repeated:
@@ -129,6 +134,24 @@ def check_abaqus(path: Path) -> None:
             f"{path}: all nodes must stand under one line *NODE; there are {n_blocks}, "
             "and only the last would be read."
         )
+
+
+def _check_ranges(path: Path) -> None:
+    """Refuse sets whose ranges (GENERATE) have more numbers than a mesh may have."""
+    total, inside = 0, False
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            if line.lstrip().startswith("*"):
+                inside = "GENERATE" in line.upper()
+            elif inside:
+                numbers = [int(word) for word in re.findall(r"-?\d{1,18}", line)]
+                first, last, *step = numbers[:3] if len(numbers) > 1 else (0, 0)
+                total += abs(last - first) // max(1, abs(step[0]) if step else 1) + 1
+            if total > MOST_NUMBERS:
+                raise SpecError(
+                    f"{path}: the ranges of its sets (GENERATE) have more than {MOST_NUMBERS:,} "
+                    "numbers."
+                )
 
 
 def _abaqus_blocks(mesh: meshio.Mesh, path: Path) -> list[tuple[str, _Rows]]:

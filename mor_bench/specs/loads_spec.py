@@ -82,6 +82,9 @@ class Spring(StrictModel):
     components: Components = AXES
 
 
+_Acceleration = Annotated[Finite, in_range(-1e12, 1e12, "m/s²")]
+
+
 class Gravity(StrictModel):
     """A uniform body force that acts before and during every load.
 
@@ -93,8 +96,10 @@ class Gravity(StrictModel):
         Along x, y and z; (0, 0, -9.81) by default.
     """
 
-    density_kg_m3: Positive
-    acceleration_m_s2: Annotated[tuple[Finite, Finite, Finite], Field(strict=False)] = (
+    density_kg_m3: Annotated[Positive, in_range(1e-12, 1e12, "kg/m³")]
+    acceleration_m_s2: Annotated[
+        tuple[_Acceleration, _Acceleration, _Acceleration], Field(strict=False)
+    ] = (
         0.0,
         0.0,
         -9.81,

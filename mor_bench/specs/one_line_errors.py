@@ -23,6 +23,9 @@ MAX_SHOWN = 300
 MAX_PROBLEMS = 8
 """Most problems that a message lists."""
 
+MAX_READ = 200
+"""Most problems for which a sentence is made; a file may have a hundred thousand."""
+
 _EXPECTED = "Input should be "
 
 
@@ -69,8 +72,9 @@ def nearest_name(name: str, valid: Iterable[str]) -> str:
 def _message(problems: Sequence[ErrorDetails], model: type[BaseModel]) -> str:
     """Return a sentence for each problem; unknown keys come first."""
     ordered = sorted(problems, key=lambda problem: problem["type"] != "extra_forbidden")
-    sentences = list(dict.fromkeys(_sentence(problem, problems, model) for problem in ordered))
-    more = len(sentences) - MAX_PROBLEMS
+    read = ordered[:MAX_READ]
+    sentences = list(dict.fromkeys(_sentence(problem, read, model) for problem in read))
+    more = len(sentences) - MAX_PROBLEMS + len(ordered) - len(read)
     return " ".join(sentences[:MAX_PROBLEMS]) + (f" And {more} more." if more > 0 else "")
 
 
@@ -120,11 +124,11 @@ def _bad_value(
     message = problem["msg"].removeprefix("Value error, ").removeprefix(_EXPECTED).rstrip(".")
     if len(location) == 2 and not list(_models_in(model.model_fields[str(location[0])].annotation)):
         # A key of several types has one problem per type, each with a step of its own.
-        expected = [
+        expected = dict.fromkeys(
             other["msg"].removeprefix(_EXPECTED)
             for other in problems
             if other["loc"][:1] == location[:1] and other["msg"].startswith(_EXPECTED)
-        ]
+        )
         if len(expected) > 1:
             key, message = str(location[0]), " or ".join(expected)
     if not key:

@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mor_bench.errors import InvalidInputError, SolverError
+from mor_bench.errors import InvalidInputError, SolverError, SpecError
 from mor_bench.mechanics.anderson import Anderson
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
@@ -19,6 +19,7 @@ from mor_bench.method_loading import load_method
 from mor_bench.model_file import size_arrays, take_sizes
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.specs import list_suite, load_method_spec
 from mor_bench.surrogate import Surrogate
 
 Array = NDArray[np.float64]
@@ -122,7 +123,16 @@ class Hybrid(Surrogate):
         return out.reshape(forces.shape)
 
     def unfitted_start(self) -> Surrogate:
+        own = load_method_spec(list_suite("methods")[self.start]) if self._is_named() else None
+        if own is None or not own.surrogate.startswith("mor_bench."):
+            raise SpecError(
+                f"`start` must be the name of a method of mor-bench; got {self.start[:100]!r}."
+            )
         return load_method(self.start, **(self.start_parameters or {}))
+
+    def _is_named(self) -> bool:
+        """Return whether `start` is a name of the suite: a file of a model must not name others."""
+        return self.start in list_suite("methods")
 
     def _guess(self, force: Array) -> Array | None:
         """Return the starting method's answer on the free dofs, m; None if it has none."""

@@ -161,7 +161,7 @@ def test_contradictions_are_refused(changed: dict[str, Any], message: str) -> No
             "`loads.magnitude_n`; did you mean 'magnitude_m'",
         ),
         ({"magnitude_m": [2.0, 1.0]}, "the lower bound must not exceed"),
-        ({"kind": "displacements"}, "'tangential' or 'displacement'; got 'displacements'"),
+        ({"kind": "displacements"}, "'displacement' or 'pressure'; got 'displacements'"),
         ({"region": {"box_m": [[0.6, 0.4, 0.4], [0.9, 0.6, 0.6]]}}, "no node"),
     ],
 )
@@ -183,7 +183,7 @@ def test_a_scene_of_forces_has_no_tool_and_a_tool_no_discretisation_error() -> N
     spec = load_generated_spec(bar().spec.model_dump())
     with pytest.raises(UnsupportedSceneError, match="for forces only"):
         refine(spec)
-    with pytest.raises(InvalidInputError, match="a tool moves the body"):
+    with pytest.raises(InvalidInputError, match="its loads are no forces on patches"):
         spec_of_set(spec, "several-forces")
 
 
