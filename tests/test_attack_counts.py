@@ -38,7 +38,7 @@ def test_the_documented_kills_and_predictions_were_done() -> None:
 @pytest.mark.slow
 def test_the_documented_cases_are_those_that_pytest_finds() -> None:
     rows = re.findall(r"\| `(tests/\w+\.py)` \| ([\d,]+) \|", PAGE.read_text(encoding="utf-8"))
-    assert len(rows) == 10
+    assert len(rows) == 11
     collect = ["--collect-only", "-q", "-m", "slow or not slow", "-p", "no:cacheprovider"]
     found = subprocess.run(
         [sys.executable, "-m", "pytest", *collect, *(file for file, _ in rows)],
