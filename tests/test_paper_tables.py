@@ -118,4 +118,4 @@ def test_the_training_time_of_the_paper_s_table_is_in_minutes() -> None:
     for dataset in ("beam-coarse", "another"):
         table = error_measures(dataset, [network])
         assert table is not None
-        assert table.rows[0][table.headings.index("train (min)")] == "20"
+        assert table.rows[0][table.headings.index("train (core-min)")] == "20"

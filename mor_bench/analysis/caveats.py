@@ -111,7 +111,7 @@ def _number(value: Any) -> int | None:
 def tuning(comparison: Comparison) -> list[dict[str, Any]]:
     """Compare the tuning of each method on each dataset with its tuning budget.
 
-    The seconds are those of fitting, including failed fits.
+    The seconds are those of fitting, including failed fits, but no trainings elsewhere.
     """
     budget = comparison.settings.get("budget") or {}
     out = []
@@ -135,4 +135,6 @@ def tuning(comparison: Comparison) -> list[dict[str, Any]]:
 
 
 def _tuning_seconds(row: Row) -> float:
+    if row.trained_elsewhere:
+        return 0.0
     return row.tuning_s or (row.offline_s.fit if row.offline_s else None) or 0.0

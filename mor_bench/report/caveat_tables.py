@@ -125,7 +125,10 @@ def tuning_table(dataset: str, analysis: Analysis) -> TextTable | None:
         if record["dataset"] == dataset and allowed != (None, None):
             configurations = _of(record["configurations"], allowed[0], str)
             rows.append([record["method"], configurations, _of(record["seconds"], allowed[1])])
-    note = "Configurations and fitting time of each method, out of the common tuning budget."
+    note = (
+        "Configurations and fitting time of each method, out of the common tuning budget. "
+        "Trainings elsewhere have no time here."
+    )
     headings = ["method", "configurations", "fitting (s)"]
     return TextTable("Tuning budget", note, headings, rows) if rows else None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 
 from mor_bench.analysis.draws import VALIDATION
@@ -96,10 +97,26 @@ def details_of(
         figures = [(name, cell(entry)) for name, cell in cells.items()]
         found.append((group, [(name, text) for name, text in figures if text != DASH]))
     notes = [("status", entry.trouble or entry.row.status), ("qualifies", answer)]
+    notes += [("told", entry.group)] if entry.group else []
+    notes += [("run again", run_again(entry))]
+    if elsewhere := entry.row.trained_elsewhere:
+        text = f"{elsewhere.iterations:,} iterations, {number(elsewhere.core_s)} core-s"
+        notes += [("trained elsewhere", text)]
     notes += [("timing not stable", reason) for reason in entry.unstable]
     notes += [("warning", warning) for warning in entry.row.warnings]
     groups = [("Method", list(about)), ("Notes", notes), *found]
     return [(group, figures) for group, figures in groups if figures]
+
+
+def run_again(entry: Entry) -> str:
+    """Return the command that fits and times this configuration alone."""
+    row = entry.row
+    length = {"iterations": row.parameters["iterations"]} if "iterations" in row.parameters else {}
+    chosen = {**row.swept, **length}
+    values = ",".join(f"{key}={value}" for key, value in chosen.items())
+    method = f"{row.method}[{values}]" if chosen else row.method
+    train = ["--train"] if row.training or row.trained_elsewhere else []
+    return shlex.join(["mor-bench", "run", row.dataset, "-m", method, *train])
 
 
 def with_content(tables: Sequence[TextTable]) -> list[TextTable]:

@@ -51,7 +51,7 @@ def error_measures(dataset: str, entries: Sequence[Entry]) -> TextTable | None:
         for size, row in published.items()
         if size not in tried
     ]
-    measured = ("ē (m)", "σ(e) (m)", "max e (m)", "slope", "predict (ms)", "train (min)")
+    measured = ("ē (m)", "σ(e) (m)", "max e (m)", "slope", "predict (ms)", "train (core-min)")
     headings = ["configuration", "c", "k", "FSS"]
     headings += [name for heading in measured for name in (heading, "paper")]
     note = "c channels, k steps, feature space size FSS = c·2ᵏ."
@@ -67,7 +67,7 @@ def error_measures(dataset: str, entries: Sequence[Entry]) -> TextTable | None:
 
 
 def _measured(entry: Entry) -> list[str]:
-    fit_s = entry.figure("offline_s", "fit")
+    fit_s = entry.row.fit_core_s
     errors = ("mean_dof_m", "std_dof_m", "max_dof_m", "slope")
     return [
         *(metres(entry.figure("error", name)) for name in errors),
