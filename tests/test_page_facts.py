@@ -14,6 +14,7 @@ from mor_bench.report.entries import Entry, entries_of
 from mor_bench.report.page_facts import answer_of, facts_of, limits_of, method_facts, reason_of
 from mor_bench.report.page_samples import Sampled
 from mor_bench.report.page_strains import strain_facts
+from mor_bench.report.page_tables import run_again
 from mor_bench.report.scene_text import scene_text
 from mor_bench.results.row import ErrorSummary
 from mor_bench.scene.mesh import box_mesh
@@ -98,3 +99,12 @@ def test_the_page_tells_how_to_run_again_and_what_was_not_tested(tmp_path: Path)
     assert ("built for", "large meshes") in method_facts(run, "pod")
     text = limits_of(run, analyse(run), entries)
     assert text == "Not tested for what they are built for: pod. Trainings: one seed each."
+
+
+def test_a_configuration_tells_the_command_that_repeats_it() -> None:
+    assert run_again(Entry(a_row("pod", {"n_modes": 5}))) == (
+        "mor-bench run beam-tiny -m 'pod[n_modes=5]'"
+    )
+    trained = a_row("umesh", {"channels": 8}, training={"device": "cpu"})
+    trained = trained.with_parts(parameters={"channels": 8, "iterations": 200})
+    assert run_again(Entry(trained)).endswith("-m 'umesh[channels=8,iterations=200]' --train")
