@@ -27,9 +27,10 @@ def browser() -> Iterator[Browser]:
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of a run with everything that a run can measure."""
     made = synthetic_comparison(tmp_path_factory.mktemp("rich"), per_region=8)
+    told = {"umesh": "input", "pca-regression": "linear-response"}
     for row in list(made.rows):
-        if row.method == "fem":
-            made.put(row.with_parts(reference=True))
+        known = {"told": told.get(row.method, "equations")}
+        made.put(row.with_parts(reference=row.method == "fem", **known))
     return render(made, analyse(made, n_resamples=200))[-1]
 
 

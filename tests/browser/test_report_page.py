@@ -198,6 +198,34 @@ def test_the_chart_switches_to_other_figures(open_page: Visit) -> None:
     assert open_page.page.evaluate(points, "pod")[0] == [row["work"] for row in pod]
 
 
+def test_findings_follow_what_is_chosen(open_page: Visit) -> None:
+    data = open_page.data()[0]
+    figure = open_page.page.locator(".frontier")
+    finding = figure.locator(".finding")
+    verdict = finding.inner_text()
+    figure.locator("select").nth(0).select_option("max")
+    rows = [row for row in data["rows"] if not row["reference"] and row["latency"]["median"]]
+    able = [row for row in rows if (row["error"]["max"] or 1e9) <= data["needs"]["error"]]
+    best = min(able, key=lambda row: float(row["latency"]["median"]), default=None)
+    said = f"{best['name']} is the fastest" if best else "No configuration shown has an error"
+    assert finding.inner_text().startswith(said)
+    assert finding.inner_text() in (figure.locator(".plot").get_attribute("aria-label") or "")
+    figure.locator("select").nth(0).select_option("median")
+    assert finding.inner_text() == verdict
+    open_page.page.locator(".filter summary").click()
+    equations = open_page.page.get_by_label("equations", exact=True)
+    equations.uncheck()
+    assert "of those shown" in finding.inner_text()
+    equations.check()
+    assert finding.inner_text() == verdict
+    figure = open_page.page.locator(".deformations")
+    figure.scroll_into_view_if_needed()
+    line = data["deformations"][-1]
+    name = next(row["name"] for row in data["rows"] if row["label"] == line["label"])
+    figure.locator("select").select_option(line["label"])
+    assert figure.locator(".finding").inner_text().startswith(f"{name}: ")
+
+
 def test_a_heading_sorts_by_mouse_and_by_keyboard(open_page: Visit) -> None:
     values = [row["error"]["median"] for row in open_page.data()[0]["rows"]]
     heading = open_page.page.locator('.grid .tabulator-col[tabulator-field="error_value"]')

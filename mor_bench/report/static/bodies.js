@@ -137,6 +137,8 @@ Report.kinds.bodies = (figure, data) => {
   function show() {
     out.value = `× ${Number(factor.value).toFixed(1)}`;
     if (R.state.printing) return Promise.resolve();
+    const left = sampleOf(chosen[0]);
+    if (left) R.say(figure, `${R.nameOf(data, left.label)}, ${left.kind} test load by e: ${left.text}`);
     // One colour scale for both, so that equal colours are equal errors.
     const shown = chosen.map(sampleOf).filter(Boolean);
     const largest = Math.max(...shown.flatMap((s) => sizes(unpacked(s.error))));

@@ -81,6 +81,13 @@ Object.assign(Report, (() => {
     return labelled(figure, text, input);
   }
 
+  // State what a chart shows now, in its caption and for screen readers.
+  function say(figure, finding) {
+    const heading = figure.querySelector("h3").textContent;
+    figure.querySelector(".finding").textContent = `${finding}.`;
+    figure.querySelector(".plot").setAttribute("aria-label", `${heading}: ${finding}.`);
+  }
+
   const rowOf = (data, label) => data.rows.find((row) => row.label === label);
   const styleOf = (data, row) => data.styles[row.method];
   const colour = (data, label) => {
@@ -98,10 +105,13 @@ Object.assign(Report, (() => {
   };
   const nameOf = (data, label) => rowOf(data, label)?.name ?? label;
   const hover = (lines) => lines.map(Report.plain).join("<br>");
+  // The line of the winner's method, or the first one.
+  const winnerOf = (data, lines) => lines.find(
+    (line) => rowOf(data, line.label).method === rowOf(data, data.winner)?.method,
+  ) ?? lines[0];
   const options = (data, lines) => {
-    const labels = lines.map((line) => line.label);
-    const first = labels.find((l) => rowOf(data, l).method === rowOf(data, data.winner)?.method);
-    const ordered = first === undefined ? labels : [first, ...labels.filter((l) => l !== first)];
+    const labels = lines.map((line) => line.label), first = winnerOf(data, lines)?.label;
+    const ordered = labels.length ? [first, ...labels.filter((l) => l !== first)] : [];
     return ordered.map((label) => [label, nameOf(data, label)]);
   };
   // Few significant digits, as in the tables.
@@ -109,6 +119,6 @@ Object.assign(Report, (() => {
 
   return {
     axis, logAxis, layout, legend, draw, choice, slider, tick, rowOf, styleOf, colour, textColour, symbol,
-    nameOf, hover, options, short, isNarrow,
+    nameOf, hover, options, short, isNarrow, say, winnerOf,
   };
 })());

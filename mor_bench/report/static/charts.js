@@ -4,6 +4,14 @@ Report.kinds.distributions = (figure, data) => {
   const R = Report;
   const plot = figure.querySelector(".plot");
   const kind = R.choice(figure, "show", [["error", "error"], ["latency", "latency"]], () => show());
+  function finding() {
+    const lines = data.distributions.filter((line) => line[kind.value].x.length);
+    const line = R.winnerOf(data, lines), row = R.rowOf(data, line.label);
+    const { p95, max } = row[kind.value], name = R.nameOf(data, line.label);
+    return kind.value === "error"
+      ? `${name}: 95 % of the test loads have an error below ${R.short(p95)} %, the worst has ${R.short(max)} %`
+      : `${name}: 95 % of the queries take less than ${R.short(p95)} ms, the slowest ${R.short(max)} ms`;
+  }
   function show() {
     const traces = data.distributions.filter((line) => line[kind.value].x.length).map((line) => ({
       type: "scatter", mode: "lines", name: R.plain(R.nameOf(data, line.label)),
@@ -13,6 +21,7 @@ Report.kinds.distributions = (figure, data) => {
       hovertemplate: `%{y:.3~g} % of ${kind.value === "error" ? "the loads" : "the queries"}: ` +
         `at most %{x:.3~g} ${kind.value === "error" ? "%" : "ms"}`,
     }));
+    R.say(figure, finding());
     const all = data.distributions.map((line) => line[kind.value]).filter((line) => line.x.length);
     const at = (line, share) => line.x[Math.max(0, line.share.findIndex((s) => s >= share))];
     const low = Math.min(...all.map((line) => at(line, 0.01)).filter((v) => v > 0));
@@ -60,6 +69,9 @@ Report.kinds.deformations = (figure, data) => {
       hovertemplate: "median e %{y:.3~g} mm at %{x:.3~g} mm",
     }));
     const line = data.deformations.find((l) => l.label === dots.value);
+    const [least, most] = [line.median_y[0], line.median_y.at(-1)].map(R.short);
+    R.say(figure, `${R.nameOf(data, line.label)}: the median error e is ${least} mm at the smallest ` +
+      `deformations and ${most} mm at the largest`);
     traces.unshift({
       type: "scatter", mode: "markers", name: "test loads", x: line.x, y: line.y, showlegend: false,
       marker: { color: R.colour(data, line.label), size: 5, opacity: 0.35 },
@@ -93,6 +105,9 @@ Report.kinds.positions = (figure, data) => {
     const other = found.x.map((_, i) => i).filter((i) => !(map.error[i] > 0));
     const logs = known.map((i) => Math.log10(map.error[i]));
     const [low, high] = [Math.min(...logs), Math.max(...logs)];
+    const worst = known.reduce((a, b) => (map.error[b] > map.error[a] ? b : a));
+    R.say(figure, `${R.nameOf(data, map.label)}: ${R.short(10 ** low)} to ${R.short(10 ** high)} %, ` +
+      `largest where the load acts around (${found.centres[worst].join(", ")}) m`);
     const ticks = [0, 0.25, 0.5, 0.75, 1].map((t) => low + t * (high - low));
     const at = (i) => `(${found.centres[i].join(", ")}) m`;
     const traces = [

@@ -142,8 +142,24 @@ Report.kinds.frontier = (figure, data) => {
     return [Math.min(...logs) - margin, Math.max(...logs) + margin];
   }
 
+  // The verdict's title holds for medians of all classes; other choices have their own finding.
+  const verdict = figure.querySelector(".finding").textContent.replace(/\.$/, "");
+  function finding(rows) {
+    if (error.selectedIndex === 0 && time.selectedIndex === 0 && rows.length === all.length) return verdict;
+    const [needed, named] = [data.needs.error, error.selectedOptions[0].text];
+    const able = rows.filter((row) => !row.reference && (!needed || y(row) <= needed));
+    const within = needed ? ` with an error (${named}) of at most ${R.short(needed)} %` : "";
+    if (!able.length) return `No configuration shown has an error (${named}) of at most ${R.short(needed)} %`;
+    const best = able.reduce((a, b) => (x(b) < x(a) ? b : a));
+    const cost = time.value === "work" ? "does the least work" : `is the fastest (${time.selectedOptions[0].text})`;
+    return `${best.name} ${cost} of those shown${within}: ${R.short(y(best))} % ` +
+      (time.value === "work" ? `for ${R.short(x(best))} multiply-adds` : `in ${R.short(x(best))} ms`);
+  }
+  const all = shownRows();
+
   function show() {
     const rows = shownRows();
+    R.say(figure, finding(rows));
     const wanted = time.value === "work" || error.value !== "median" ? [] : [data.needs.latency];
     const range = {
       x: rangeOf(rows.map(x), wanted),
