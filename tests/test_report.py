@@ -322,6 +322,7 @@ def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis
     text = text_of(page)
     for said in (
         "processes differ by 14 %",
+        "To draw them again: --test-seed 7.",
         "as large on the hidden test set as on the shipped one",
         "no graphics processor). It is for: 20,000 samples or more, on a GPU",
         "errors over 13 load regions, latencies over 5 processes that differ by",

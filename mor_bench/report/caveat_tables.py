@@ -91,11 +91,14 @@ def hidden_table(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> 
     """Build the table of errors on the hidden test set and on the shipped one."""
     by_label = {entry.label: entry for entry in entries}
     rows = []
+    seeds: dict[int, None] = {}
     for record in analysis["hidden"]:
         entry = by_label.get(record["label"]) if record["dataset"] == dataset else None
         if entry is None or entry.row.hidden is None:
             continue
         found, limit = entry.row.hidden, number(record["limit"])
+        if found.seed is not None:
+            seeds[found.seed] = None
         rows.append(
             [
                 entry.label,
@@ -114,6 +117,8 @@ def hidden_table(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> 
         "Fresh loads of the same distribution that no author of a method has seen. Worse: "
         "the errors differ by more than the numbers of samples explain."
     )
+    if seeds:
+        note += f" To draw them again: --test-seed {', '.join(map(str, seeds))}."
     return TextTable("Hidden test set", note, headings, rows) if rows else None
 
 
