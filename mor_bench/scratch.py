@@ -19,8 +19,16 @@ PREFIX = "mor-bench"
 
 
 def host_name() -> str:
-    """Return this machine's name in the form used in names of temporary files."""
-    return re.sub(r"[^0-9A-Za-z-]", "-", platform.node())
+    """Return the name of this machine, and of this container, for names of temporary files.
+
+    A container on Linux has its own numbers of processes, but may share the machine's name and
+    folders.
+    """
+    name = re.sub(r"[^0-9A-Za-z-]", "-", platform.node())
+    try:
+        return f"{name}-{Path('/proc/self/ns/pid').stat().st_ino}"
+    except OSError:
+        return name
 
 
 def identity(pid: int) -> str | None:

@@ -29,8 +29,8 @@ from tests.hostile_runs import HOSTILE, hostile_run
 from tests.small_runs import method_file, run_small
 
 TAGS = {
-    *("html", "head", "meta", "title", "style", "body", "h1", "h2", "h3", "p", "b", "br", "small"),
-    *("div", "table", "thead", "tbody", "tr", "th", "td", "figure", "img", "figcaption", "dl"),
+    *("html", "head", "meta", "title", "style", "body", "h1", "h2", "h3", "h4", "p", "br", "small"),
+    *("b", "div", "table", "thead", "tbody", "tr", "th", "td", "figure", "img", "figcaption", "dl"),
     *("dt", "dd", "a", "fieldset", "legend", "label", "input", "details", "summary", "code"),
     *("ul", "li", "pre", "header", "nav", "main", "section", "footer", "noscript", "caption"),
     *("button", "dialog", "form", "script", "span", "link"),
@@ -96,6 +96,11 @@ def test_no_text_of_a_file_becomes_markup_or_leads_out_of_the_folder(
         assert page.tags <= TAGS
         assert page.attributes <= ATTRIBUTES
         assert all(not source.startswith(("http", "//", "java")) for source in page.sources)
+        scripts = page.policy.partition("script-src ")[2].partition(";")[0]
+        assert page.policy.startswith("default-src 'none'; ")
+        assert scripts
+        own = {source for source in scripts.split() if not source.startswith("'sha256-")}
+        assert own <= {"'self'", "file:"}
         assert "&lt;script&gt;alert(1)" in text
         assert "{{ 7*7 }}" in text
     assert [path.name for path in tmp_path.iterdir()] == ["outer"]

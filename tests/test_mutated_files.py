@@ -106,16 +106,16 @@ def written_as(file_format: str, **options: Any) -> Callable[[Path], object]:
     return lambda path: meshio.write(path, mesh_of(), file_format=file_format, **options)
 
 
-def plain_msh(path: Path) -> None:
+def plain_msh(path: Path, version: str = "gmsh22") -> None:
     mesh = mesh_of()
     mesh.point_data.clear()
-    meshio.write(path, mesh, file_format="gmsh22", binary=False)
+    meshio.write(path, mesh, file_format=version, binary=False)
 
 
-def surface(path: Path) -> None:
+def surface(path: Path, **options: Any) -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-    meshio.write(path, meshio.Mesh(points, [("triangle", faces)]))
+    meshio.write(path, meshio.Mesh(points, [("triangle", faces)]), **options)
 
 
 def body(path: Path) -> object:
@@ -306,8 +306,13 @@ READERS = [
     Reader("mesh.vtu", written_as("vtu", binary=False), body, TEXT),
     Reader("packed.vtu", written_as("vtu"), body, [mutated_bytes]),
     Reader("mesh.vtk", written_as("vtk", binary=False), body, TEXT),
+    Reader("packed.vtk", written_as("vtk"), body, [mutated_bytes]),
+    Reader("mesh42.vtk", written_as("vtk42", binary=False), body, TEXT),
+    Reader("packed42.vtk", written_as("vtk42"), body, [mutated_bytes]),
     Reader("mesh.msh", plain_msh, body, TEXT),
     Reader("packed.msh", written_as("gmsh"), body, [mutated_bytes]),
+    Reader("mesh41.msh", partial(plain_msh, version="gmsh"), body, TEXT),
+    Reader("packed22.msh", written_as("gmsh22"), body, [mutated_bytes]),
     Reader("mesh1.msh", gmsh1, body, TEXT),
     Reader("mesh.inp", written_as("abaqus"), body, TEXT),
     Reader("mesh.med", written_as("med"), body, [mutated_bytes]),
@@ -320,6 +325,7 @@ READERS = [
     Reader("mesh.f3grid", written_as("flac3d"), body, TEXT),
     Reader("mesh.b8.ugrid", written_as("ugrid"), body, [mutated_bytes]),
     Reader("surface.stl", surface, read_surface, TEXT),
+    Reader("packed.stl", partial(surface, binary=True), read_surface, [mutated_bytes]),
     Reader("surface.obj", surface, read_surface, TEXT),
     Reader("snapshots.npz", snapshots_npz, source, [mutated_bytes]),
     Reader("arrays.npz", snapshots_npz, source, [repacked]),

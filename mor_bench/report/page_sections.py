@@ -133,7 +133,7 @@ def section_of(view: View, dataset: str) -> Section:
         limits=limits_of(comparison, analysis, entries),
         card=verdict,
         given="observed displacements" if is_observed(comparison, dataset) else "nodal forces (N)",
-        needs=needs_text(needs),
+        needs=needs_text(needs).replace("<=", "≤"),
         frontier=frontier(data, _frontier_title(verdict)),
         charts=charts(data),
         rows=[
