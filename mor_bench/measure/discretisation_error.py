@@ -31,7 +31,7 @@ from mor_bench.errors import (
 )
 from mor_bench.machine import describe_machine
 from mor_bench.measure.error_metrics import sample_errors
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.pressed import full_order_model
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.other_meshes import refined
 from mor_bench.scene.scene import Scene, load_scene
@@ -153,12 +153,14 @@ class _OnMesh:
             np.cumsum([load.patches.size for load in loads])[:-1],
         )
         self.scene = mesh
+        if scene.follows:  # the facets that are pressed move, so they are this mesh's own
+            weights, rows = mesh.patch_weights, [load.patches.T for load in loads]
         self.forces = [
             PatchLoads(row.T, load.vectors).nodal_forces(weights)[0]
             for row, load in zip(rows, loads, strict=True)
         ]
         self.at_nodes = interpolation_matrix(mesh.mesh, scene.mesh.points)
-        self.model = FullOrderModel(mesh)
+        self.model = full_order_model(mesh)
 
     def solve(self, row: int, start: NDArray[np.float64] | None) -> NDArray[np.float64]:
         """Solve for displacements (n_nodes of this mesh, 3), m, from a start of that shape."""

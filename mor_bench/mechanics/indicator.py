@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.pressed import full_order_model
 from mor_bench.scene.scene import Scene
 
 
@@ -48,7 +48,7 @@ class ErrorIndicator:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._model = FullOrderModel(scene, "auto")
+        self._model = full_order_model(scene, "auto")
         self._inverse = self._model.turned_rest
 
     def __call__(
@@ -86,7 +86,7 @@ class ErrorIndicator:
     ) -> tuple[float, float]:
         if not (np.isfinite(u).all() and np.isfinite(moved)):
             return np.inf, np.inf
-        residual = load - self._model.force(u).force
+        residual = load - self._model.under_load(load).force(u).force
         if not np.isfinite(residual).all():
             return np.inf, np.inf
         if not residual.any() and moved == 0:

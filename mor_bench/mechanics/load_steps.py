@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass
 class LoadSteps:
-    """Increments of a load factor from 0 to 1, halved on failure and doubled on success.
+    """Increments of a load factor from 0 to 1, halved on failure and grown on success.
 
     Attributes
     ----------
@@ -17,11 +17,14 @@ class LoadSteps:
         Largest load factor with a solution.
     cuts : int
         Number of halvings.
+    growth : float
+        Factor of the increment after a success.
     """
 
     increment: float
     reached: float = 0.0
     cuts: int = 0
+    growth: float = 2.0
 
     @property
     def target(self) -> float:
@@ -34,8 +37,8 @@ class LoadSteps:
         return self.reached == 1.0
 
     def accept(self) -> None:
-        """Record that the target was reached, and double the increment."""
-        self.reached, self.increment = self.target, 2.0 * self.increment
+        """Record that the target was reached, and let the increment grow."""
+        self.reached, self.increment = self.target, self.growth * self.increment
 
     def cut(self) -> None:
         """Record that the target was not reached, and halve the increment."""

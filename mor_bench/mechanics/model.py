@@ -6,7 +6,7 @@ import warnings
 from dataclasses import replace
 from functools import cached_property
 from importlib.util import find_spec
-from typing import get_args
+from typing import ClassVar, Self, get_args
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,6 +19,7 @@ from mor_bench.errors import (
     SolverError,
     SpecError,
     UnconstrainedBodyError,
+    UnsupportedSceneError,
 )
 from mor_bench.mechanics.assembly import (
     Assembler,
@@ -81,6 +82,8 @@ REST_TOLERANCE = 1e-12
 ILL_CONDITIONED = 1e10
 """Condition number above which solutions miss the default tolerance."""
 
+FOLLOWS = "its pressures follow the surface, and the method solves for dead loads only"
+
 RIGID_MODES = (
     "translation x",
     "translation y",
@@ -105,11 +108,16 @@ def unknown_equations(scene: Scene, *, observed: bool = False) -> str | None:
     ----------
     scene : Scene
     observed : bool
-        Whether observed displacements may replace the forces, as for an `ObservedModel`.
+        Whether observed displacements may replace the forces, as for an `ObservedModel`, and
+        pressures may follow the surface, as for a `PressedModel`.
     """
     if scene.material is None:
         return NO_EQUATIONS
-    return None if observed or scene.observed_nodes is None else NO_FORCES
+    if observed:
+        return None
+    if scene.follows:
+        return FOLLOWS
+    return None if scene.observed_nodes is None else NO_FORCES
 
 
 def free_rigid_modes(scene: Scene) -> list[str]:
@@ -157,7 +165,8 @@ def rest_displacement(scene: Scene) -> NDArray[np.float64] | None:
     if "rest" not in scene.memo:
         density = gravity.density_kg_m3 * np.array(gravity.acceleration_m_s2)
         weight = body_force(discretisation_of(scene), density).ravel()[scene.free_dofs]
-        spec, found = scene.generated.model_copy(update={"gravity": None}), np.zeros(0)
+        alone = {"gravity": None, "loads": None}
+        spec, found = scene.generated.model_copy(update=alone), np.zeros(0)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", LockingWarning)  # the model under gravity warns
             light = FullOrderModel(replace(scene, spec=spec), "auto")
@@ -191,14 +200,20 @@ class FullOrderModel:
     Raises
     ------
     UnsupportedSceneError
-        If the scene's snapshots were imported, so that its equations are unknown.
+        If the scene's snapshots were imported, so that its equations are unknown; or its pressures
+        follow the surface, see `PressedModel`.
     UnconstrainedBodyError
         If the supports leave rigid motions free; the message names them.
     MissingDependencyError
         If the solver's library is not installed.
     """
 
+    follows: ClassVar[bool] = False
+    """Whether the loads follow the surface."""
+
     def __init__(self, scene: Scene, solver: SolverName | None = None) -> None:
+        if scene.follows and not self.follows:
+            raise UnsupportedSceneError(f"{scene.name}: {FOLLOWS}.")
         check_supports(scene)
         body = body_of(scene)
         warn_of_locking(scene)
@@ -351,6 +366,11 @@ class FullOrderModel:
                 pattern, tangent, self.turned_rest.at(q), residual, tolerance
             )[0]
         return self.factor(tangent).solve(residual)
+
+    def under_load(self, load: NDArray[np.float64]) -> Self:
+        """Return the model whose forces belong to a load (n_free,), N; they depend on it if it
+        follows the surface."""
+        return self
 
     def solve(
         self,

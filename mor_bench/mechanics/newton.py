@@ -91,7 +91,7 @@ def _is_certified(problem: Problem, q: Array) -> bool:
     return True
 
 
-def _plain(problem: Problem, load: Array, start: Array | None, tolerance: float) -> Attempt:
+def full_steps(problem: Problem, load: Array, start: Array | None, tolerance: float) -> Attempt:
     """Take full Newton steps; from rest, the first one uses the factor that all solves share."""
     load_norm = float(np.linalg.norm(load))
     q = problem.rest_factor.solve(load) if start is None else start.copy()
@@ -120,7 +120,7 @@ def _plain(problem: Problem, load: Array, start: Array | None, tolerance: float)
         q = q + step
         if is_round_off(step, q, floor):
             return Attempt(q, min_det, iteration, converged=_is_certified(problem, q))
-    return Attempt(q, min_det, PLAIN_ITERATIONS, converged=False)
+    return Attempt(q, min_det, iteration, converged=False)
 
 
 def _descent(problem: Problem, q: Array, tangent: Array, residual: Array) -> tuple[Array, bool]:
@@ -220,7 +220,8 @@ def _checked(values: ArrayLike, name: str, problem: Problem) -> Array:
     return np.ascontiguousarray(array, dtype=np.float64)
 
 
-def _checked_load(values: ArrayLike, number: int, problem: Problem) -> Array:
+def checked_load(values: ArrayLike, number: int, problem: Problem) -> Array:
+    """Return a load as float64, (n_unknowns,) N; `InvalidInputError` as `solve_equilibrium`."""
     load = _checked(values, f"load {number}", problem)
     if np.abs(load).max() > MAX_LOAD_N:
         largest = load[np.abs(load).argmax()]
@@ -240,7 +241,7 @@ def solve_equilibria(
     would raise. Loads come in the order in which they finish. A solution does not depend on the
     other loads, to the last digit.
     """
-    loads = [_checked_load(load, number, problem) for number, load in enumerate(loads)]
+    loads = [checked_load(load, number, problem) for number, load in enumerate(loads)]
     starts = [
         None if start is None else _checked(start, "`start`", problem)
         for start in starts or [None] * len(loads)
@@ -275,7 +276,7 @@ def _by_newton(
     problem: Problem, load: Array, start: Array | None, options: NewtonOptions, spent: int
 ) -> Solution:
     """Solve by full Newton steps, then by increments, after ``spent`` earlier iterations."""
-    first = _plain(problem, load, start, options.tolerance)
+    first = full_steps(problem, load, start, options.tolerance)
     iterations = spent + first.iterations
     if first.valid:
         return Solution(first.q, first.min_det_f, iterations, 0)

@@ -27,6 +27,7 @@ from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.multigrid import MultigridFactor
 from mor_bench.mechanics.newton import NewtonOptions, Solution
 from mor_bench.mechanics.pattern import Pattern
+from mor_bench.mechanics.pressed import full_order_model
 from mor_bench.mechanics.rotated import RotatedRest, SingleFactor, nodal_rotations
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import SolverName
@@ -290,7 +291,9 @@ class LinearResponse(Protocol):
 def linear_response(scene: Scene) -> LinearResponse:
     """Prepare the linear response to forces or, with observed nodes, to their displacements."""
     return (
-        Compliance(FullOrderModel(scene)) if scene.observed_nodes is None else ObservedModel(scene)
+        Compliance(full_order_model(scene))
+        if scene.observed_nodes is None
+        else ObservedModel(scene)
     )
 
 
@@ -298,14 +301,14 @@ def forward_model(scene: Scene, solver: SolverName | None = None) -> FullOrderMo
     """Return a factorised model whose input is forces or, with observed nodes, displacements."""
     if scene.observed_nodes is not None:
         return ObservedModel(scene, solver)
-    model = FullOrderModel(scene, solver)
+    model = full_order_model(scene, solver)
     model.prepare()
     return model
 
 
 def generating_model(scene: Scene) -> FullOrderModel | ObservedModel:
     """Return the model whose input are the sampled loads: forces, or the motion of a tool."""
-    return ObservedModel(scene) if scene.motion else FullOrderModel(scene)
+    return ObservedModel(scene) if scene.motion else full_order_model(scene)
 
 
 class ToolForces:

@@ -9,6 +9,7 @@ from mor_bench.errors import MorBenchError
 from mor_bench.report.number_format import number
 from mor_bench.specs import (
     AnyLoads,
+    ChamberedGeometry,
     DatasetSpec,
     Loads,
     Motion,
@@ -71,6 +72,10 @@ def _body(spec: DatasetSpec) -> str:
     body = spec.geometry
     if isinstance(body, TubeGeometry):
         return f"tube with radii of {body.radii_m[0]:g} and {body.radii_m[1]:g} m"
+    if isinstance(body, ChamberedGeometry):
+        n = len(body.chambers)
+        sides = " × ".join(f"{side:g}" for side in body.size_m)
+        return f"box of {sides} m with {n} chamber{'s' if n > 1 else ''}"
     size = getattr(body, "size_m", None)
     if size:
         return f"{body.shape} of {' × '.join(f'{side:g}' for side in size)} m"
@@ -108,7 +113,8 @@ def _loads(loads: AnyLoads) -> str:
     if isinstance(loads, Motion):
         return f"a tool on {_regions([loads.region])} that moves by {ends}"
     if not isinstance(loads, Loads):
-        return f"dead pressures of {ends} on {_regions(loads.regions)}"
+        kind = "pressures that follow the surface" if loads.follower else "dead pressures"
+        return f"{kind}, of {ends}, on {_regions(loads.regions)}"
     n, how = loads.simultaneous, DIRECTIONS[loads.kind]
     return (
         f"{n} dead force{'s' if n != 1 else ''} of {ends} {how} on {_regions([loads.region])}, "

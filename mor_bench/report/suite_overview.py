@@ -21,6 +21,7 @@ from mor_bench.specs import (
 SHAPES = {
     "box": "boxes of hexahedra",
     "l-shape": "L-shapes of hexahedra",
+    "chambered-box": "boxes of hexahedra with chambers",
     "tube": "tubes of hexahedra",
     "voxels": "bodies of voxels",
     "tetrahedra": "bodies of tetrahedra",

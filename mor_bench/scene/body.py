@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.scene.loads import Facets
-from mor_bench.scene.mesh import Mesh, box_mesh, l_mesh
+from mor_bench.scene.mesh import Mesh, box_mesh, chambered_mesh, l_mesh
 from mor_bench.specs import (
     BoxGeometry,
+    ChamberedGeometry,
     DatasetSpec,
     LShapeGeometry,
     TetrahedraGeometry,
@@ -30,6 +31,9 @@ def build_body(
     geometry, tetrahedra = spec.geometry, spec.discretisation.element == "tetrahedron"
     if isinstance(geometry, LShapeGeometry):
         return l_mesh(geometry.size_m, geometry.cells, geometry.cut_cells, tetrahedra), None, {}
+    if isinstance(geometry, ChamberedGeometry):
+        mesh, sets = chambered_mesh(geometry.size_m, geometry.cells, geometry.chambers, tetrahedra)
+        return mesh, None, sets
     if isinstance(geometry, BoxGeometry):
         return box_mesh(geometry.size_m, geometry.cells, tetrahedra), None, {}
     if isinstance(geometry, TubeGeometry):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -124,6 +125,33 @@ def l_mesh(
     box = box_mesh(size_m, cells, tetrahedra)
     x, _, z = np.unravel_index(np.arange(box.n_cells) // (len(KUHN) if tetrahedra else 1), cells)
     return part_of(box, (x < cells[0] - cut_cells[0]) | (z < cells[2] - cut_cells[1]))
+
+
+def chambered_mesh(
+    size_m: tuple[float, float, float],
+    cells: tuple[int, int, int],
+    chambers: Sequence[tuple[tuple[int, int, int], tuple[int, int, int]]],
+    tetrahedra: bool = False,
+) -> tuple[Mesh, dict[str, NDArray[np.int64]]]:
+    """Return a box without the cells of its chambers, and the nodes on the walls of each.
+
+    Parameters
+    ----------
+    size_m, cells, tetrahedra
+        See `box_mesh`. The box's regular grid is kept.
+    chambers : sequence of two times three ints
+        Numbers of cells before the begin and up to the end of each chamber, per axis.
+    """
+    box = box_mesh(size_m, cells, tetrahedra)
+    at = np.indices(cells).reshape(3, -1).T.repeat(len(KUHN) if tetrahedra else 1, axis=0)
+    hollow = [((at >= low) & (at < high)).all(axis=1) for low, high in chambers]
+    mesh = part_of(box, ~np.any(hollow, axis=0))
+    assert mesh.grid_index is not None
+    # The nodes of a chamber's cells that are left are those on its walls.
+    return mesh, {
+        f"chamber-{n}": np.flatnonzero(np.isin(mesh.grid_index, box.cells[own]))
+        for n, own in enumerate(hollow, start=1)
+    }
 
 
 def along_longest_axis(points: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -11,7 +11,7 @@ import numpy as np
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.scene.scene import Scene, by_node, scene_without_patches
 from mor_bench.scene.subdivision import subdivide
-from mor_bench.specs import BoxGeometry, LShapeGeometry
+from mor_bench.specs import BoxGeometry, ChamberedGeometry, LShapeGeometry
 
 
 def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
@@ -20,7 +20,7 @@ def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
     Parameters
     ----------
     scene : Scene
-        A scene with a box or an L.
+        A scene with a box, an L or a chambered box.
     cells : three ints
         Cells per axis.
 
@@ -40,6 +40,8 @@ def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
                 f"{name}: the corner of an L that is cut away must consist of whole cells."
             )
         changed["cut_cells"] = tuple(int(n) for n in cut)
+    elif isinstance(geometry, ChamberedGeometry):
+        changed["chambers"] = _moved_chambers(geometry, cells, name)
     elif not isinstance(geometry, BoxGeometry):
         raise UnsupportedSceneError(
             f"{scene.name}: only the mesh of a box or an L can be made finer or coarser; "
@@ -52,6 +54,20 @@ def with_cells(scene: Scene, cells: tuple[int, int, int]) -> Scene:
         raise UnsupportedSceneError(f"{name}: {error}") from None
 
 
+def _moved_chambers(
+    geometry: ChamberedGeometry, cells: tuple[int, int, int], name: str
+) -> tuple[Any, ...]:
+    """Return the same chambers, in numbers of other cells."""
+    scale = [Fraction(new, old) for new, old in zip(cells, geometry.cells, strict=True)]
+    ends = [
+        [[n * s for n, s in zip(end, scale, strict=True)] for end in chamber]
+        for chamber in geometry.chambers
+    ]
+    if any(n.denominator > 1 for chamber in ends for end in chamber for n in end):
+        raise UnsupportedSceneError(f"{name}: a chamber must consist of whole cells.")
+    return tuple(tuple(tuple(int(n) for n in end) for end in chamber) for chamber in ends)
+
+
 def refined(scene: Scene) -> Scene:
     """Return the same body and supports on a mesh with each cell divided into eight.
 
@@ -62,7 +78,11 @@ def refined(scene: Scene) -> Scene:
         nx, ny, nz = (2 * n for n in geometry.cells)
         return with_cells(scene, (nx, ny, nz))
     mesh, parents = subdivide(scene.mesh)
+    sets = {
+        name: np.flatnonzero(np.isin(parents, nodes).all(axis=1))
+        for name, nodes in scene.point_sets.items()
+    }
     still = np.zeros(scene.mesh.n_dofs, dtype=bool)
     still[scene.fixed_dofs] = True
     fixed, held = by_node(np.all(still.reshape(-1, 3)[parents], axis=1))
-    return replace(scene, mesh=mesh, fixed_nodes=fixed, held_dofs=held, point_sets={})
+    return replace(scene, mesh=mesh, fixed_nodes=fixed, held_dofs=held, point_sets=sets)

@@ -89,7 +89,10 @@ def _inside(points: NDArray[np.float64], region: Region, near: float) -> NDArray
 
 def _in_set(cloud: Cloud, region: PointSetRegion) -> NDArray[np.int64]:
     if region.point_set not in cloud.sets:
-        known = ", ".join(cloud.sets) or "none; only mesh files and tubes have point sets"
+        known = (
+            ", ".join(cloud.sets)
+            or "none; only mesh files, tubes and chambered boxes have point sets"
+        )
         raise SpecError(f"unknown point set {region.point_set!r}. Known: {known}.")
     return np.unique(cloud.sets[region.point_set])
 

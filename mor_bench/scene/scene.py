@@ -158,6 +158,18 @@ class Scene:
         loads = self.spec.loads if isinstance(self.spec, DatasetSpec) else None
         return loads if isinstance(loads, Pressure) else None
 
+    @property
+    def follows(self) -> bool:
+        """True if the scene's pressures follow the deformed surface."""
+        return self.pressure is not None and self.pressure.follower
+
+    @property
+    def pressed_facets(self) -> list[NDArray[np.int64]]:
+        """The facets (n_facets, 4 or 3) of each region of a pressure."""
+        if self.pressure is None:
+            raise UnsupportedSceneError(f"{self.name}: no pressure acts on it.")
+        return [self.surface.within(self._surface_points(r)) for r in self.pressure.regions]
+
     @cached_property
     def _loaded_points(self) -> NDArray[np.int64]:
         plan = self.generated.load_plan
@@ -227,8 +239,7 @@ class Scene:
         if isinstance(plan, Motion):
             raise UnsupportedSceneError(f"{self.name}: a tool moves the body; it has no patches.")
         if isinstance(plan, Pressure):
-            regions = [self._surface_points(region) for region in plan.regions]
-            return pressed_patches(self.surface, [self.surface.within(r) for r in regions])
+            return pressed_patches(self.surface, self.pressed_facets)
         return cut_patches(self.surface, self.loaded_facets, self.patch_nodes, plan.patch_area_m2)
 
     @cached_property
@@ -282,6 +293,11 @@ class Scene:
         """Find all regions now, so empty regions raise one `SpecError` here; return the scene."""
         sampled = isinstance(self.spec, DatasetSpec) and self.spec.loads is not None
         problems = []
+        if self.follows and self.embedded_surface:
+            problems.append(
+                "`loads.follower` must be false where loads act on a smooth surface that the mesh "
+                "only contains."
+            )
         for name in (*(("patch_weights",) if sampled else ()), "output_nodes", "observed_nodes"):
             try:
                 getattr(self, name)

@@ -20,6 +20,7 @@ from mor_bench.specs.dataset_spec import (
 )
 from mor_bench.specs.geometry_spec import (
     BoxGeometry,
+    ChamberedGeometry,
     FileGeometry,
     LShapeGeometry,
     TetrahedraGeometry,
@@ -75,6 +76,7 @@ __all__ = [
     "Battery",
     "BoxGeometry",
     "BoxRegion",
+    "ChamberedGeometry",
     "DatasetSpec",
     "FibreMaterial",
     "FileGeometry",

@@ -47,6 +47,53 @@ class LShapeGeometry(BoxGeometry):
         return self
 
 
+CellRange = Annotated[
+    tuple[
+        Annotated[tuple[Count, Count, Count], Field(strict=False)],
+        Annotated[tuple[Count, Count, Count], Field(strict=False)],
+    ],
+    Field(strict=False),
+]
+
+
+class ChamberedGeometry(BoxGeometry):
+    """A box of H8 cells around closed chambers, such as a soft robot's.
+
+    The walls of chamber n are the set of nodes `chamber-n`, counted from 1.
+
+    Attributes
+    ----------
+    size_m, cells
+        As of a box.
+    chambers : list of two times three ints
+        For each chamber: the numbers of cells before its begin and up to its end, per axis. A cell
+        or more lies between chambers, and between a chamber and the outside.
+    """
+
+    shape: Literal["chambered-box"]  # type: ignore[assignment]
+    chambers: Annotated[tuple[CellRange, ...], Field(strict=False, min_length=1, max_length=8)]
+
+    @model_validator(mode="after")
+    def _has_walls(self) -> ChamberedGeometry:
+        for i, (low, high) in enumerate(self.chambers):
+            inside = all(0 < a < b < n for a, b, n in zip(low, high, self.cells, strict=True))
+            if not inside:
+                raise ValueError(
+                    f"`chambers` must lie inside of the {self.cells} cells, each with a begin "
+                    f"below its end and a wall around it; got {[low, high]}"
+                )
+            for other_low, other_high in self.chambers[:i]:
+                if all(
+                    a <= d and c <= b
+                    for a, b, c, d in zip(low, high, other_low, other_high, strict=True)
+                ):
+                    raise ValueError(
+                        "`chambers` must have a wall between each other; "
+                        f"got {[other_low, other_high]} and {[low, high]}"
+                    )
+        return self
+
+
 class TubeGeometry(StrictModel):
     """A tube of H8 cells along the z axis, or a sector of one that begins at the x axis.
 
@@ -132,6 +179,7 @@ class FileGeometry(StrictModel):
 Geometry = Annotated[
     BoxGeometry
     | LShapeGeometry
+    | ChamberedGeometry
     | TubeGeometry
     | VoxelsGeometry
     | TetrahedraGeometry

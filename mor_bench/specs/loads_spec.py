@@ -215,12 +215,13 @@ class Motion(StrictModel):
 class Pressure(StrictModel):
     """Uniform pressures on regions of the surface, each drawn independently.
 
-    They are dead loads: they act along the normals of the undeformed body.
-
     Attributes
     ----------
     regions : list of Region
         The facets with all corners in a region are pressed.
+    follower : bool
+        Whether the pressures act on the deformed surface, along its normals. If not, they are dead
+        loads along the normals of the undeformed body. Default: false.
     magnitude_pa : two floats
         Range of each pressure, Pa. It pushes into the body.
     samples : int
@@ -238,6 +239,7 @@ class Pressure(StrictModel):
     kind: Literal["pressure"]
     samples: Count
     magnitude_pa: Magnitude
+    follower: bool = False
     sampling: Sampling = "random"
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
 

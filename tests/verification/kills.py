@@ -193,6 +193,8 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file to write the outcomes to")
     given = parser.parse_args()
     wrong, rows = 0, []
+    for name in SIGNALS[1:]:  # a shell or `nohup` may have told its children to ignore them
+        signal.signal(signal.Signals[name], signal.SIG_DFL)
     with tempfile.TemporaryDirectory() as parent:
         for command in given.commands:
             undisturbed(command, Path(parent) / f"{command}-first")  # compiles the kernels

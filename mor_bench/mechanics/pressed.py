@@ -1,0 +1,316 @@
+"""The full-order model under pressures that follow the deformed surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.counting import count
+from mor_bench.errors import (
+    InvalidInputError,
+    InvertedElementError,
+    NoEquilibriumError,
+    SolverError,
+    UnsupportedSceneError,
+)
+from mor_bench.mechanics.accelerated import accelerated, run_in_step
+from mor_bench.mechanics.assembly import State
+from mor_bench.mechanics.linear import NotPositiveDefiniteError
+from mor_bench.mechanics.load_steps import LoadSteps
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.newton import (
+    MAX_ITERATIONS,
+    NewtonOptions,
+    Solution,
+    checked_load,
+    full_steps,
+)
+from mor_bench.mechanics.pattern import Pattern
+from mor_bench.mechanics.problem import Attempt
+from mor_bench.scene.scene import Scene
+from mor_bench.specs import SolverName
+
+Array = NDArray[np.float64]
+
+NOT_A_PRESSURE = 1e-6
+"""Part of a load, relative to its norm, that no pressure on the regions explains: round-off."""
+
+PREDICTOR_TOLERANCE = 1e-3
+"""Relative tolerance of the linear solve that begins an increment."""
+
+_LEVI_CIVITA = np.zeros((3, 3, 3))
+_LEVI_CIVITA[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = 1.0
+_LEVI_CIVITA[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = -1.0
+
+
+def _rule(n_corners: int) -> tuple[Array, Array, float]:
+    """Return values (n_points, n_corners), derivatives (..., 2) and the weight of each point.
+
+    The rule is exact for the force on a facet: 2 x 2 Gauss points on a quadrilateral, one on a
+    triangle.
+    """
+    if n_corners == 3:
+        return np.full((1, 3), 1 / 3), np.array([[[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]]]), 0.5
+    at = (0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)).tolist()
+    x, y = (np.array(axis).ravel() for axis in np.meshgrid(at, at))
+    values = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
+    along_x = np.stack([y - 1, 1 - y, y, -y], axis=1)
+    along_y = np.stack([x - 1, -x, x, 1 - x], axis=1)
+    return values, np.stack([along_x, along_y], axis=2), 0.25
+
+
+class PressedFacets:
+    """Nodal forces of pressures on facets that move: f = -p ∫ N (x_ξ × x_η) dξ dη.
+
+    Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd edition (2008),
+    sections 8.5.2 and 9.3.4.
+
+    Parameters
+    ----------
+    points : (n_nodes, 3) float64
+        Positions at rest, m.
+    regions : sequence of (n_facets, 4 or 3) int64
+        Facets of each region, oriented outwards.
+    dof_of_node : (n_nodes, 3) int64
+        Row of each displacement component in the vectors; ``pattern.n`` at supports.
+    pattern : Pattern
+        Pattern of the stiffness.
+    """
+
+    def __init__(
+        self,
+        points: Array,
+        regions: Sequence[NDArray[np.int64]],
+        dof_of_node: NDArray[np.int64],
+        pattern: Pattern,
+    ) -> None:
+        facets = np.concatenate(regions)
+        self.region = np.repeat(np.arange(len(regions)), [len(own) for own in regions])
+        self._values, self._derivatives, self._weight = _rule(facets.shape[1])
+        self._points, self._dofs, self._n = points[facets], dof_of_node[facets], pattern.n
+        dofs = self._dofs.reshape(len(facets), -1)
+        rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
+        self._kept = (rows <= columns) & (columns < pattern.n)
+        keys = pattern.rows * pattern.n + pattern.indices
+        wanted = rows[self._kept] * pattern.n + columns[self._kept]
+        self._slots, self._n_values = np.searchsorted(keys, wanted), len(keys)
+
+    def _tangents(self, q: Array) -> Array:
+        """Return x_ξ and x_η, (n_facets, n_points, 2, 3), m, at displacements q."""
+        corners = self._points + np.append(q, 0.0)[self._dofs]
+        count(multiply_adds=self._derivatives.size * 3 * len(corners))
+        return np.asarray(np.einsum("pad,fai->fpdi", self._derivatives, corners))
+
+    def force(self, q: Array, pressures: Array) -> Array:
+        """Return the forces (n,), N, of pressures (n_regions,), Pa, at displacements q (n,), m."""
+        tangents = self._tangents(q)
+        vectors = np.cross(tangents[:, :, 0], tangents[:, :, 1])
+        scale = -self._weight * pressures[self.region]
+        own = np.einsum("pa,fpi,f->fai", self._values, vectors, scale)
+        count(multiply_adds=2 * vectors.size + own.size * len(self._values))
+        total = np.bincount(self._dofs.ravel(), own.ravel(), minlength=self._n + 1)
+        return np.asarray(total[: self._n], dtype=np.float64)
+
+    def stiffness(self, q: Array, pressures: Array) -> Array:
+        """Return the symmetric part of -df/dq in the pattern, N/m.
+
+        The whole is symmetric if the region is closed, or ends on supports or planes of symmetry.
+        """
+        tangents = self._tangents(q)
+        spin = np.einsum("pb,fpk->fpbk", self._derivatives[:, :, 0], tangents[:, :, 1])
+        spin -= np.einsum("pb,fpk->fpbk", self._derivatives[:, :, 1], tangents[:, :, 0])
+        moments = np.einsum("pa,fpbk->fabk", self._values, spin)
+        skew = 0.5 * self._weight * (moments - moments.swapaxes(1, 2))
+        own = np.einsum("ijk,fabk,f->faibj", _LEVI_CIVITA, skew, pressures[self.region])
+        count(multiply_adds=2 * spin.size + moments.size * len(self._values) + own.size)
+        entries = own.reshape(self._kept.shape)[self._kept]
+        return np.asarray(np.bincount(self._slots, entries, self._n_values), dtype=np.float64)
+
+
+class PressedModel(FullOrderModel):
+    """Finite-element model of a scene under pressures that follow the deformed surface.
+
+    A load is that of the pressures on the undeformed body, from which the pressures are found. The
+    force of the model is the internal force less the change of the pressures' force.
+
+    Parameters
+    ----------
+    scene : Scene
+        A scene whose pressures follow the surface.
+    solver : str, optional
+        As for `FullOrderModel`.
+
+    Raises
+    ------
+    UnsupportedSceneError
+        If no pressure of the scene follows the surface.
+    UnconstrainedBodyError, MissingDependencyError
+        As `FullOrderModel`.
+    """
+
+    follows: ClassVar[bool] = True
+
+    def __init__(self, scene: Scene, solver: SolverName | None = None) -> None:
+        if not scene.follows:
+            raise UnsupportedSceneError(f"{scene.name}: no pressure follows the surface.")
+        super().__init__(scene, solver)
+        mesh = scene.mesh
+        number = np.full(mesh.n_dofs, self.n_unknowns, dtype=np.int64)
+        number[scene.free_dofs] = np.arange(self.n_unknowns)
+        regions = scene.pressed_facets
+        pattern = self.assembler.pattern
+        self._facets = PressedFacets(self._points, regions, number.reshape(-1, 3), pattern)
+        unit = scene.patch_weights.toarray().reshape(len(regions), 3, -1)
+        self._loads = -unit.swapaxes(1, 2).reshape(len(regions), -1)[:, scene.free_dofs].T
+        self.pressures = np.zeros(len(regions))
+        self._at_rest = np.zeros(self.n_unknowns)
+
+    def pressures_of(self, load: Array) -> Array:
+        """Return the pressures (n_regions,), Pa, of a load (n_free,), N.
+
+        Raises
+        ------
+        InvalidInputError
+            If the load is not that of pressures on the regions.
+        """
+        pressures = np.linalg.lstsq(self._loads, load, rcond=None)[0]
+        rest = float(np.linalg.norm(load - self._loads @ pressures))
+        size = float(np.linalg.norm(load))
+        if not rest <= NOT_A_PRESSURE * size:
+            raise InvalidInputError(
+                f"{self.scene.name}: forces must be those of pressures on its regions, which "
+                f"follow the surface; a part of {rest / size:.2g} of them is not."
+            )
+        return np.asarray(pressures)
+
+    def under(self, pressures: Array) -> Self:
+        """Return the model under other pressures (n_regions,), Pa."""
+        found = copy(self)
+        found.pressures, found._at_rest = pressures, self._loads @ pressures
+        return found
+
+    def under_load(self, load: Array) -> Self:
+        return self.under(self.pressures_of(load))
+
+    def _moved(self, q: Array) -> Array:
+        """Return the change of the pressures' force at displacements q, N."""
+        return self._facets.force(q, self.pressures) - self._at_rest
+
+    def _less(self, state: State, q: Array) -> State:
+        # The change is quadratic along the line to q, so that Simpson's rule gives its exact work.
+        begin, middle, end = (self._moved(part * q) for part in (0.0, 0.5, 1.0))
+        work = float((begin + 4.0 * middle + end) @ q) / 6.0
+        return State(state.force - end, state.energy_j - work, state.min_det_f)
+
+    def force(self, q: Array) -> State:
+        return self._less(super().force(q), q)
+
+    def linearise(self, q: Array) -> tuple[State, Array]:
+        state, values = super().linearise(q)
+        return self._less(state, q), values + self._facets.stiffness(q, self.pressures)
+
+    def solve(
+        self,
+        load: Array,
+        start: Array | None = None,
+        options: NewtonOptions = NewtonOptions(),
+    ) -> Solution:
+        """Solve for forces of pressures on the free dofs, (n_free,) N; see `solve_equilibrium`.
+
+        Raises
+        ------
+        InvalidInputError
+            If the load is not that of pressures on the regions, or as `solve_equilibrium`.
+        SolverError
+            As `solve_equilibrium`.
+        """
+        found = self._solved([load], [start], options)[0]
+        if isinstance(found, SolverError):
+            raise found
+        return found
+
+    def solve_many(
+        self, loads: Array, options: NewtonOptions = NewtonOptions()
+    ) -> list[Solution | SolverError]:
+        """Solve for loads (m, n_free), N; return solutions, or the errors `solve` would raise."""
+        return self._solved(list(loads), [None] * len(loads), options)
+
+    def _solved(
+        self, loads: Sequence[Array], starts: Sequence[Array | None], options: NewtonOptions
+    ) -> list[Solution | SolverError]:
+        self.prepare()  # what copies share
+        loads = [checked_load(load, number, self) for number, load in enumerate(loads)]
+        parts = [self.under_load(load) for load in loads]
+        found: list[Solution | SolverError | None] = [
+            None if load.any() else Solution(np.zeros(self.n_unknowns), 1.0, 0, 0) for load in loads
+        ]
+        left, inverse = [i for i, one in enumerate(found) if one is None], self.accelerator
+        spent = dict.fromkeys(left, 0)
+        if inverse is not None:
+            passes = (
+                accelerated(parts[i], inverse, loads[i], starts[i], options.tolerance) for i in left
+            )
+            for number, attempt in run_in_step(inverse, passes):
+                i = left[number]
+                spent[i] = attempt.iterations
+                if attempt.valid:
+                    found[i] = Solution(attempt.q, attempt.min_det_f, attempt.iterations, 0)
+        return [
+            self._in_increments(parts[i], loads[i], starts[i], options, spent[i])
+            if one is None
+            else one
+            for i, one in enumerate(found)
+        ]
+
+    def _in_increments(
+        self, whole: Self, load: Array, start: Array | None, options: NewtonOptions, spent: int
+    ) -> Solution | SolverError:
+        """Solve by Newton's method, with the pressures in increments if they are too large.
+
+        The tangent at an old state is rarely positive definite under a new pressure. So each
+        increment begins with the linear response to it, of the old state under the old pressure.
+        """
+        tolerance, steps, smallest = options.tolerance, LoadSteps(1.0, growth=1.0), 1.0
+        q = np.zeros(self.n_unknowns)
+        if start is not None:
+            attempt = full_steps(whole, load, start, tolerance)
+            spent += attempt.iterations
+            if attempt.valid:
+                return Solution(attempt.q, attempt.min_det_f, spent, 0)
+        while not steps.complete:
+            old, new = (self.under(t * whole.pressures) for t in (steps.reached, steps.target))
+            attempt = _increment(old, new, q, steps.target * load, tolerance)
+            spent += attempt.iterations
+            if attempt.valid:
+                q = attempt.q
+                steps.accept()
+                continue
+            smallest = min(smallest, attempt.min_det_f)
+            steps.cut()
+            if steps.cuts > options.max_cuts or spent > MAX_ITERATIONS:
+                story = steps.story(spent)
+                if smallest <= 0:
+                    return InvertedElementError(f"elements invert: {story}.", cuts=steps.cuts)
+                return NoEquilibriumError(f"no stable equilibrium found: {story}.", cuts=steps.cuts)
+        return Solution(q, attempt.min_det_f, spent, steps.cuts)
+
+
+def _increment(
+    old: PressedModel, new: PressedModel, q: Array, load: Array, tolerance: float
+) -> Attempt:
+    """Solve under a new pressure, from the state under an old one."""
+    residual = load - new.force(q).force
+    try:
+        step = old.step(q, old.linearise(q)[1], residual, PREDICTOR_TOLERANCE)
+    except NotPositiveDefiniteError:
+        return Attempt(q, 1.0, 1, converged=False)
+    return full_steps(new, load, q + step, tolerance)
+
+
+def full_order_model(scene: Scene, solver: SolverName | None = None) -> FullOrderModel:
+    """Return the model of a scene's forces: dead ones, or pressures that follow the surface."""
+    return PressedModel(scene, solver) if scene.follows else FullOrderModel(scene, solver)
