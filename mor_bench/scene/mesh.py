@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from string import ascii_lowercase
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,8 +150,8 @@ def chambered_mesh(
     assert mesh.grid_index is not None
     # The nodes of a chamber's cells that are left are those on its walls.
     return mesh, {
-        f"chamber-{n}": np.flatnonzero(np.isin(mesh.grid_index, box.cells[own]))
-        for n, own in enumerate(hollow, start=1)
+        f"chamber-{letter}": np.flatnonzero(np.isin(mesh.grid_index, box.cells[own]))
+        for letter, own in zip(ascii_lowercase, hollow, strict=False)
     }
 
 

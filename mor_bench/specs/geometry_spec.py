@@ -59,7 +59,7 @@ CellRange = Annotated[
 class ChamberedGeometry(BoxGeometry):
     """A box of H8 cells around closed chambers, such as a soft robot's.
 
-    The walls of chamber n are the set of nodes `chamber-n`, counted from 1.
+    The walls of the first chamber are the set of nodes `chamber-a`, and so on.
 
     Attributes
     ----------
