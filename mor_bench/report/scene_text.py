@@ -113,8 +113,8 @@ def _loads(loads: AnyLoads) -> str:
     if isinstance(loads, Motion):
         return f"a tool on {_regions([loads.region])} that moves by {ends}"
     if not isinstance(loads, Loads):
-        kind = "pressures that follow the surface" if loads.follower else "dead pressures"
-        return f"{kind}, of {ends}, on {_regions(loads.regions)}"
+        kind = "following" if loads.follower else "dead"
+        return f"{kind} pressures of {ends} on {_regions(loads.regions)}"
     n, how = loads.simultaneous, DIRECTIONS[loads.kind]
     return (
         f"{n} dead force{'s' if n != 1 else ''} of {ends} {how} on {_regions([loads.region])}, "
