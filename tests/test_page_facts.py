@@ -16,7 +16,7 @@ from mor_bench.report.page_samples import Sampled
 from mor_bench.report.page_strains import strain_facts
 from mor_bench.report.page_tables import run_again
 from mor_bench.report.scene_text import scene_text
-from mor_bench.results.row import ErrorSummary
+from mor_bench.results.row import ErrorSummary, SetErrors
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.specs import list_suite, load_dataset_spec
 from tests.report_runs import add_row, tiny
@@ -38,8 +38,8 @@ def entry(error: float, latency_ms: float, n_failed: int = 0) -> Entry:
 
 def test_a_configuration_that_does_not_qualify_names_the_limits_that_it_misses() -> None:
     assert answer_of(replace(entry(0.001, 1.0), qualified=True), NEEDS) == "yes"
-    assert answer_of(entry(0.02, 1.0), NEEDS) == "no: error"
-    assert answer_of(entry(0.02, 4.0), NEEDS) == "no: error, latency"
+    assert answer_of(entry(0.02, 1.0), NEEDS) == "no: error up to 2 %"
+    assert answer_of(entry(0.02, 4.0), NEEDS) == "no: error up to 2 %, latency up to 4 ms"
     assert answer_of(entry(0.001, 1.0, n_failed=2), NEEDS) == "no: loads without an answer"
     assert answer_of(Entry(a_row("pod", status="failed", reason="x")), NEEDS) == "failed"
     text = reason_of(entry(0.02, 4.0), NEEDS)
@@ -98,7 +98,20 @@ def test_the_page_tells_how_to_run_again_and_what_was_not_tested(tmp_path: Path)
     assert facts["command that runs it all again"].startswith("mor-bench run beam-tiny")
     assert ("built for", "large meshes") in method_facts(run, "pod")
     text = limits_of(run, analyse(run), entries)
-    assert text == "Not tested for what they are built for: pod. Trainings: one seed each."
+    assert text.startswith("Data, fits and errors hold for this body, material and supports only")
+    assert "No load outside the range of the training loads was tested." in text
+    assert "Not tested for what they are built for: pod." in text
+    assert text.endswith("do not hold its random seed, `--seeds 3` measures it.")
+
+
+def test_a_fresh_test_set_is_drawn_again_with_its_seed(tmp_path: Path) -> None:
+    run = tiny(tmp_path / "run")
+    run.settings.update(test_seed="fresh")
+    add_row(run, "pod", {"n_modes": 20}, 0.008, 2.5)
+    row = run.rows[0]
+    run.put(row.with_parts(hidden=SetErrors(n=10, seed=77)))
+    command = dict(facts_of(run, "beam-tiny", entries_of(run, "beam-tiny")))
+    assert "--test-seed 77" in command["command that runs it all again"]
 
 
 def test_a_configuration_tells_the_command_that_repeats_it() -> None:

@@ -37,16 +37,15 @@ def limit_text(name: str, limit: float, round_up: bool = False) -> str:
     return f"{FIGURE_NAMES[name]} <= {value}{unit}"
 
 
-def limits_missed(bounds: Mapping[str, float], needs: Requirements) -> list[tuple[str, str]]:
-    """Return the name of each limit that upper bounds exceed, and both numbers in words."""
+def limits_missed(bounds: Mapping[str, float], needs: Requirements) -> list[tuple[str, str, str]]:
+    """Return the name of each limit that upper bounds exceed, the bound and the limit in words."""
     out = []
     for name, limit in needs.asked.items():
         if bounds[name] > limit:
             scale, unit = _UNITS[name]
             said = unit.partition(" (")[0]
             bound = f"{scale * bounds[name]:.3g}{said}" if bounds[name] < inf else "unknown"
-            text = f"{FIGURE_NAMES[name]}: upper bound {bound}, limit {scale * limit:g}{said}"
-            out.append((FIGURE_NAMES[name], text))
+            out.append((FIGURE_NAMES[name], bound, f"{scale * limit:g}{said}"))
     return out
 
 

@@ -21,21 +21,24 @@ from mor_bench.results.comparison import Comparison
 
 
 def answer_of(entry: Entry, needs: Requirements) -> str:
-    """Say whether a configuration qualifies, or which limits it misses: "no: error"."""
+    """Say whether a configuration qualifies, or why not: "no: error up to 2 %"."""
     if entry.qualified or not entry.ran:
         return "yes" if entry.qualified else entry.row.status
-    missed = [name for name, _ in _missed(entry, needs)]
+    missed = [f"{name} up to {bound}" for name, bound, _ in _missed(entry, needs)]
     missed += ["loads without an answer"] if entry.n_failed else []
     return f"no: {', '.join(missed)}" if missed else "no"
 
 
 def reason_of(entry: Entry, needs: Requirements) -> str:
     """As `answer_of`, with the upper bounds and the limits."""
-    missed = [text for _, text in _missed(entry, needs)]
+    missed = [
+        f"{name}: upper bound {bound}, limit {limit}"
+        for name, bound, limit in _missed(entry, needs)
+    ]
     return f"no: {'; '.join(missed)}" if entry.ran and missed else answer_of(entry, needs)
 
 
-def _missed(entry: Entry, needs: Requirements) -> list[tuple[str, str]]:
+def _missed(entry: Entry, needs: Requirements) -> list[tuple[str, str, str]]:
     return [] if entry.qualified else limits_missed(bounds_of(entry.row, entry.intervals), needs)
 
 
@@ -47,16 +50,26 @@ def deformation(entries: Sequence[Entry]) -> str:
 
 
 def limits_of(comparison: Comparison, analysis: Analysis, entries: Sequence[Entry]) -> str:
-    """State what a run does not tell: methods out of their regime, and the number of trainings."""
+    """State for what a run holds, and what it does not tell: regimes, other loads, other seeds."""
     present = {entry.method for entry in entries}
     outside = [
         record["method"]
         for record in analysis["regimes"]
         if record["in_regime"] is False and record["method"] in present
     ]
-    said = f"Not tested for what they are built for: {', '.join(outside)}." if outside else ""
-    seeds = comparison.settings.get("seeds")
-    return f"{said} Trainings: one seed each." if seeds == 1 else said
+    said = [
+        "Data, fits and errors hold for this body, material and supports only; another scene needs "
+        "its own."
+    ]
+    if not any(entry.row.sets for entry in entries):
+        said.append("No load outside the range of the training loads was tested.")
+    if outside:
+        said.append(f"Not tested for what they are built for: {', '.join(outside)}.")
+    if comparison.settings.get("seeds") == 1:
+        said.append(
+            "One training each: the intervals do not hold its random seed, `--seeds 3` measures it."
+        )
+    return " ".join(said)
 
 
 def method_facts(comparison: Comparison, method: str) -> list[tuple[str, str]]:
@@ -84,6 +97,7 @@ def facts_of(
     split += f"validation samples: {_values(row.n_validation for row in rows)}; "
     split += f"test samples: {_values(row.n_test for row in rows)}"
     split += f"; in no part: {unused}" if any(row.n_unused for row in rows) else ""
+    split += _patches(spec, entries)
     counts = (
         f"{sum(r.status == status for r in rows)} {status}" for status in ("failed", "skipped")
     )
@@ -93,6 +107,9 @@ def facts_of(
             pairs = [(k, _WORDS.get((key, k, v), v)) for k, v in flat(spec[key]) if v != "None"]
             facts.append((heading, "; ".join(pair_text(k, v) if k else v for k, v in pairs)))
     asked = asked_of(comparison, dataset)
+    drawn = (row.hidden.seed for row in rows if row.hidden)
+    if (seed := next(drawn, None)) is not None:
+        asked = {**asked, "test_seed": seed}
     command = run_command(asked) if comparison.settings else ""
     return [
         *([("command that runs it all again", command)] if command else []),
@@ -105,6 +122,17 @@ def facts_of(
         ("threads", _values(row.threads for row in rows)),
         ("configurations", f"{len(rows)}: {sum(r.ok for r in rows)} ran, {', '.join(counts)}"),
     ]
+
+
+def _patches(spec: Mapping[str, Any], entries: Sequence[Entry]) -> str:
+    """Count the load patches of each part of a split by region; empty for other splits."""
+    row = next((entry.row for entry in entries if entry.ran), None)
+    each = (spec.get("loads") or {}).get("samples_per_patch")
+    if row is None or row.split != "region" or not each:
+        return ""
+    parts = {"training": row.n_train, "validation": row.n_validation, "test": row.n_test}
+    counts = [f"{n // each} {part}" for part, n in parts.items() if n]
+    return f"; load patches: {', '.join(counts)}, none in two parts"
 
 
 def _refinement(spec: Mapping[str, Any]) -> list[tuple[str, str]]:

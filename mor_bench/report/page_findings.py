@@ -181,7 +181,7 @@ _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
         "losses",
         _losses,
         "Each method minimises its own loss, so compare only curves of one method. Dashed: "
-        "loss on held-out samples.",
+        "loss on samples of the training part that the method holds out.",
     ),
 }
 """By kind: heading, key of the data, function of the finding, and how to read the chart."""

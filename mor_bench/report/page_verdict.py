@@ -155,9 +155,15 @@ def _by_latency(
     if full_order and not first.row.reference:
         fastest = min(full_order, key=lambda e: e.latency_ms)
         ratio = number(fastest.latency_ms / first.latency_ms)
-        sentence += (
-            f" It is {ratio} times as fast as the full-order model ({names[fastest.label]})."
-        )
+        sentence += f" It is {ratio} times as fast as the full-order model"
+        exact = min(full_order, key=lambda e: e.error)
+        sentence += f" ({names[fastest.label]}"
+        if exact is not fastest:
+            times = number(exact.latency_ms / first.latency_ms)
+            sentence += f"; {times} times as {names[exact.label]}"
+        sentence += ")."
+        if fastest in qualified:
+            sentence += " The full-order model itself meets the needs."
     paid = [line.break_even for line in costs.lines if line.label == first.label] if costs else []
     if paid and paid[0] is not None:
         sentence += f" With data and fit, it costs less than that after {whole(paid[0])} queries."
@@ -202,7 +208,14 @@ def _tail(entry: Entry) -> str:
     p95, worst = (entry.figure("error", name) for name in ("rel_l2_p95", "rel_l2_max"))
     if p95 is None or worst is None:
         return ""
-    return f"19 of 20 test loads: at most {percent(p95)} %; worst: {percent(worst)} %"
+    text = f"19 of 20 test loads: at most {percent(p95)} %; worst: {percent(worst)} %"
+    largest, amplitude = (entry.figure("error", name) for name in ("max_nodal_m", "amplitude_m"))
+    if largest is None or amplitude is None:
+        return text
+    return (
+        f"{text}. Largest error of a node: {number(1e3 * largest)} mm, where nodes move up to "
+        f"{number(1e3 * amplitude)} mm"
+    )
 
 
 def _interval(entry: Entry, name: str, shown: Callable[[float | None], str]) -> str:

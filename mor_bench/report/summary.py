@@ -77,7 +77,7 @@ def _origin(training: TrainedElsewhere, comparison: Comparison, method: str) -> 
         f"trained elsewhere for {training.iterations:,} iterations{fewer}; seed {training.seed}, "
         f"{number(training.core_s)} core-seconds on {training.machine} cores, {training.date}, "
         f"commit {training.commit[:7]}; `--train` trains here"
-        + (f" for {here:,} iterations" if here else "")
+        + (f" for {here:,} iterations, those of this profile" if here else "")
     )
 
 
@@ -101,7 +101,7 @@ def interval_basis(dataset: str, analysis: Analysis) -> str:
             if specific is None
             else f"that differ by {percent(specific)} %"
         )
-        drift = f" and drift together by {percent(common)} %" if common else ""
+        drift = f"; the machine's speed drifts by {percent(common)} %" if common else ""
         parts.append(
             f"latencies from one process {spread}"
             if n == 1
