@@ -58,6 +58,10 @@ def check_file(
         raise error(f"{path}: cannot be read: {_words(reason)}.") from None
 
 
+MOST_COMMAS = 2_000_000
+"""Limit of the number of commas; each value takes many times its bytes in the file as an object."""
+
+
 def read_bytes(
     path: Path, most_bytes: int = MOST_BYTES, error: type[MorBenchError] = StoreError
 ) -> bytes:
@@ -171,6 +175,8 @@ def _parsed(
 ) -> Any:
     try:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
+        if text.count(",") > MOST_COMMAS:
+            raise ValueError(f"more than {MOST_COMMAS:,} values")
         value = load(text)
         deep = _is_deep(value)
         if re.search(r"\\u[dD][89a-fA-F]", text):

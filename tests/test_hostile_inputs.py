@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 from time import perf_counter
@@ -14,6 +15,7 @@ from safetensors.numpy import save_file
 
 import mor_bench
 from mor_bench.errors import MorBenchError, SpecError, StoreError
+from mor_bench.export.vtu_files import export_vtu
 from mor_bench.model_file import read_header_and_arrays
 from mor_bench.options import InvalidOptionError, RunOptions
 from mor_bench.results.comparison import Comparison
@@ -214,3 +216,30 @@ def test_arrays_of_no_model_are_refused(tmp_path: Path) -> None:
     save_file({"x": np.zeros(3)}, tmp_path / "x.safetensors")
     with pytest.raises(StoreError):
         mor_bench.load_surrogate(tmp_path / "x.safetensors")
+
+
+@pytest.mark.parametrize("kind", ["link", "pipe"])
+def test_an_exported_sample_replaces_a_link_or_pipe_in_its_place(
+    kind: str, tiny: Dataset, tmp_path: Path
+) -> None:
+    place, victim = tmp_path / "out" / "beam-tiny-test-00001-reference.vtu", tmp_path / "kept"
+    place.parent.mkdir()
+    victim.write_text("mine")
+    if kind == "link":
+        place.symlink_to(victim)
+    else:
+        os.mkfifo(place)
+    assert export_vtu(tiny, 1, tmp_path / "out") == [place]
+    assert victim.read_text() == "mine"
+    assert not place.is_symlink()
+    assert len(meshio.read(place).points) == tiny.scene.mesh.n_nodes
+
+
+def test_a_class_without_an_answer_does_not_pass_the_check(tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text(
+        'surrogate = "mor_bench.surrogate:Surrogate"\ntitle = "t"\nsource = "s"\ntold = "input"\n'
+    )
+    answer = invoke("check", str(path))
+    assert answer.exit_code == 2
+    assert "has neither `answer` nor `predict`" in answer.output

@@ -5,11 +5,13 @@ from __future__ import annotations
 import io
 import json
 import shutil
+import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from rich.console import Console
@@ -72,6 +74,58 @@ def samples_of(path: Path) -> object:
     return own.samples(own.rows[0])
 
 
+def forged_arrays(content: bytes, generator: np.random.Generator) -> bytes:
+    """Change an array of a file of raw samples: its type, shape or values."""
+    buffer = io.BytesIO(content)
+    with h5py.File(buffer, "r+") as file:
+        name = list(file)[generator.integers(len(file))]
+        array = np.asarray(file[name])
+        values = (np.nan, np.inf, -1.0, 1e300, 0.0, 2.0**40)
+        changes: list[Callable[[], Any]] = [
+            lambda: np.array(b"word"),
+            lambda: np.array([b"words"] * 3),
+            lambda: values[generator.integers(len(values))],
+            lambda: array.ravel()[: generator.integers(0, 4)],
+            lambda: array[: len(array) // 2] if array.ndim else array[None],
+            lambda: array[None],
+            lambda: np.full(array.shape, values[generator.integers(len(values))]),
+            lambda: array.astype(("f4", "c16", "i1", "?")[generator.integers(4)]),
+            lambda: np.concatenate([array, array]) if array.ndim else array,
+        ]
+        del file[name]
+        if forged := generator.integers(len(changes) + 1):
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                file[name] = changes[forged - 1]()
+    return buffer.getvalue()
+
+
+def in_a_run(use: Callable[[Path], None], of_dataset: bool) -> Callable[[Path], None]:
+    """Return a reader of raw samples that uses them in a run, in the place of sound ones."""
+
+    def read(path: Path) -> None:
+        folder = path.parent / "run"
+        if not folder.exists():
+            folder.mkdir()
+            a_run(folder / "results.json")
+        row = Comparison.read(folder).rows[0]
+        place = Comparison.read(folder).samples_path(row)
+        place = place.with_name(f"{DATASET}.h5") if of_dataset else place
+        kept = place.read_bytes()
+        place.write_bytes(path.read_bytes())
+        try:
+            use(folder / "results.json")
+        finally:
+            place.write_bytes(kept)
+
+    return read
+
+
+def a_dataset(path: Path) -> None:
+    comparison = Comparison.read(sound_run())
+    shutil.copyfile(comparison.out / "samples" / f"{DATASET}.h5", path)
+
+
 def forged_model(content: bytes, generator: np.random.Generator) -> bytes:
     """Mutate the header or an array of a model, with a checksum that fits."""
     length = int.from_bytes(content[:8], "little")
@@ -122,6 +176,41 @@ def test_mutated_results_are_concluded_on_or_refused(n: int, tmp_path: Path) -> 
     attacked(Reader("results.json", a_run, concluded, JSON), tmp_path, n)
 
 
+@pytest.mark.parametrize("n", [CONCLUDED // 25, pytest.param(CONCLUDED, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("of_dataset", [False, True], ids=["row", "dataset"])
+def test_forged_arrays_are_concluded_on_or_refused(
+    of_dataset: bool, n: int, tmp_path: Path
+) -> None:
+    write, read = a_dataset if of_dataset else a_sample, in_a_run(concluded, of_dataset)
+    attacked(Reader("samples.h5", write, read, [forged_arrays]), tmp_path, n)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("of_dataset", [False, True], ids=["row", "dataset"])
+def test_forged_arrays_are_drawn_or_refused(of_dataset: bool, tmp_path: Path) -> None:
+    write, read = a_dataset if of_dataset else a_sample, in_a_run(drawn, of_dataset)
+    attacked(Reader("samples.h5", write, read, [forged_arrays], DRAWING_S), tmp_path, DRAWN)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("learning", [{}] * 20_000, "20,000 entries; at most 10,000"),
+        ("learning", [{}] * 2_500_000, "more than 2,000,000 values"),
+        ("machine", {str(i): 0 for i in range(20_000)}, "20,000 entries; at most 10,000"),
+    ],
+)
+def test_results_that_would_fill_the_memory_are_refused(
+    key: str, value: Any, said: str, tmp_path: Path
+) -> None:
+    a_run(tmp_path / "results.json")
+    content = json.loads((tmp_path / "results.json").read_text())
+    text = json.dumps({**content, key: value}, separators=(",", ":"))
+    (tmp_path / "results.json").write_text(text)
+    with pytest.raises(StoreError, match=said):
+        Comparison.read(tmp_path)
+
+
 @pytest.mark.slow
 def test_mutated_results_are_drawn_or_refused(tmp_path: Path) -> None:
     attacked(Reader("results.json", a_run, drawn, JSON, DRAWING_S), tmp_path, DRAWN)
@@ -158,7 +247,7 @@ def test_raw_samples_of_another_configuration_are_noticed(tmp_path: Path) -> Non
     assert "belongs to another configuration" in answer.output
     first.write_bytes(kept)
     write_arrays(first, {"relative_l2": np.ones(1)})
-    with pytest.raises(StoreError, match="`relative_l2` must have the shape"):
+    with pytest.raises(StoreError, match="`relative_l2` must have the length"):
         pick(DATASET, comparison=tmp_path)
 
 
@@ -208,3 +297,5 @@ def test_the_documented_counts_are_those_of_these_tests() -> None:
     assert counts["models, with and without the scene in the file"] == 2 * SLOW
     assert counts["runs, with all tables and a choice"] == CONCLUDED
     assert counts["runs, with all figures and the page"] == DRAWN
+    assert counts["runs with forged arrays, with all tables and a choice"] == 2 * CONCLUDED
+    assert counts["runs with forged arrays, with all figures and the page"] == 2 * DRAWN

@@ -157,6 +157,12 @@ def test_little_address_space_changes_no_row_or_is_one_line(
     else:
         assert done.returncode in (1, 2), done
         assert "Traceback" not in done.stderr
+        if done.returncode == 2:
+            check_is_one_line(done.stderr)
+        else:  # a configuration failed, and its row says why
+            rows = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
+            assert all(row["reason"] for row in rows if row["status"] == "failed")
+            assert any(row["status"] == "failed" for row in rows)
         assert kib < 2_000_000, "2 GB are enough for this run"
 
 

@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 
 from mor_bench.scratch import scratch_folder
+from tests.small_runs import COMMAND
+
+ROOT = Path(__file__).parents[1]
 
 IN_A_CONTAINER = ["unshare", "--pid", "--fork", "--mount-proc", "--map-root-user"]
 """Starts a command that has its own numbers of processes, as in a container."""
@@ -34,3 +37,19 @@ def test_a_container_with_the_same_name_keeps_folders_of_the_host(
         done = subprocess.run(command, capture_output=True, text=True, env=environment)
         assert done.stdout == "removed\n", done.stderr
         assert folder.is_dir()
+
+
+def test_a_training_leaves_no_temporary_file(tmp_path: Path) -> None:
+    pytest.importorskip("torch")
+    places = {"TMPDIR": tmp_path / "tmp", "HOME": tmp_path / "home"}
+    for place in places.values():
+        place.mkdir()
+    command = [*COMMAND, "fit", "beam-tiny", "-m", "umesh-small", "--set", "iterations=5"]
+    command += ["--limit", "60", "--cache", "cache", "--out", "net.safetensors"]
+    environment = {**os.environ, **{name: str(place) for name, place in places.items()}}
+    environment.pop("TORCHINDUCTOR_CACHE_DIR", None)
+    environment["PYTHONPATH"] = str(ROOT)
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    left = {path.name for path in places["TMPDIR"].iterdir()}
+    assert left <= {".ses"}  # ONNX Runtime's own, where it is installed

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any
 
+import platformdirs
 import typer
 from typer.core import TyperCommand, TyperGroup
 
@@ -110,6 +113,9 @@ class LazyCommands(TyperGroup):
     def main(self, *args: Any, **extra: Any) -> Any:
         open_streams()
         end_children_with_this_process()
+        # PyTorch makes this folder for every training, and would leave it among temporary files.
+        torch_files = Path(platformdirs.user_cache_dir("mor-bench")) / "torch"
+        os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(torch_files))
         try:
             with clear_errors():
                 return super().main(*args, **extra)

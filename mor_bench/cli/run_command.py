@@ -116,7 +116,9 @@ def run(
 
 
 def _print_plan(planned: Callable[[], Plan], console: Console, as_json: bool) -> None:
-    with notice_if_slow("Planning; a few samples are solved to estimate the times."):
+    with notice_if_slow(
+        "Planning; methods are imported, and a few samples are solved to estimate times."
+    ):
         found = planned()
     if as_json:
         print(json.dumps(found.as_dict(), indent=1))

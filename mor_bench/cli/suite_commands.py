@@ -20,7 +20,7 @@ from mor_bench.specs import list_suite
 
 app = typer.Typer(rich_markup_mode=None)
 
-BUSY = "still checking; large files take a minute."
+BUSY = "still checking; large files, and imports of a method's module, may take two minutes."
 
 LEAST_TITLE = 20
 """Least width of the column of titles, in characters."""

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from mor_bench.errors import InvalidInputError
 from mor_bench.method_loading import load_surrogate
 from mor_bench.scene.scene import Scene
+from mor_bench.scratch import scratch_folder
 from mor_bench.snapshots.dataset import Dataset, Snapshots
+from mor_bench.snapshots.store import write_atomically
 from mor_bench.snapshots.test_sets import SET_NAMES, SetName
 from mor_bench.surrogate import Surrogate
 
@@ -118,7 +120,7 @@ def _write(
     kind = "tetra" if scene.mesh.cells.shape[1] == 4 else "hexahedron"
     path, surface = out / f"{stem}.vtu", scene.embedded_surface
     body = meshio.Mesh(scene.mesh.points, [(kind, scene.mesh.cells)], point_data=dict(fields))
-    body.write(path, binary=True)
+    _write_mesh(body, path)
     if surface is None:
         return [path]
     # The force remains at the nodes: a sum over nodes cannot be interpolated.
@@ -127,5 +129,13 @@ def _write(
     }
     skin = meshio.Mesh(surface.points, [("triangle", surface.facets)], point_data=carried)
     skin_path = out / f"{stem}-surface.vtu"
-    skin.write(skin_path, binary=True)
+    _write_mesh(skin, skin_path)
     return [path, skin_path]
+
+
+def _write_mesh(mesh: meshio.Mesh, path: Path) -> None:
+    """Write a file whole or not at all; a link or pipe in its place is replaced."""
+    with scratch_folder() as folder:
+        mesh.write(folder / "mesh.vtu", binary=True)
+        content = (folder / "mesh.vtu").read_bytes()
+    write_atomically(path, content)

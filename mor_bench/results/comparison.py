@@ -13,6 +13,7 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -25,6 +26,7 @@ from mor_bench.checked_files import read_json
 from mor_bench.errors import StoreError, printable
 from mor_bench.results.arrays import write_arrays
 from mor_bench.results.json_file import write_json
+from mor_bench.results.raw_samples import OF_DATASETS, OF_ROWS, check_arrays
 from mor_bench.results.row import LearningPoint, ResultsFile, Row
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs.one_line_errors import validated
@@ -36,6 +38,9 @@ SCHEMA_VERSION = 2
 
 MOST_LETTERS = 10_000
 """Most letters of a text with control characters."""
+
+MOST_ENTRIES = 10_000
+"""Most entries of a table or list in results.json, such as rows."""
 
 MOST_STEM = 160
 """Letters of the name of a file with raw samples before it is cut."""
@@ -124,8 +129,19 @@ class Comparison:
         largest finite error.
         `typical_prediction`, `typical_reference`, `typical_forces`: the one with the median error.
         `loss_curve`, `validation_curve` (n_intervals,): losses, evenly spread over the training.
+
+        Raises
+        ------
+        StoreError
+            If the file is damaged, or an array has another type, shape or range.
         """
-        return read_hdf5(self.samples_path(row))
+        path = self.samples_path(row)
+        arrays, lengths = read_hdf5(path), {"test": row.n_test, "validation": row.n_validation}
+        if any(name in arrays for name in ("worst_reference", "typical_reference")):
+            with suppress(OSError, KeyError):
+                lengths["nodes"] = len(self.dataset_arrays(row.dataset)["points"])
+        check_arrays(path, arrays, OF_ROWS, lengths)
+        return arrays
 
     def dataset_arrays(self, name: str) -> dict[str, NDArray[Any]]:
         """Read a dataset's arrays.
@@ -134,8 +150,22 @@ class Comparison:
         `snapshots_norm`, the Frobenius norm of these displacements; `points` (n_nodes, 3), `cells`
         (n_cells, 8), `test_regions` (n_test, k), `validation_regions` (n_validation, k);
         `patch_centres` (n_patches, 3), m, of generated samples.
+
+        Raises
+        ------
+        StoreError
+            As `samples`.
         """
-        return read_hdf5(self._samples_path(name))
+        path = self._samples_path(name)
+        arrays = read_hdf5(path)
+        sizes = {
+            (row.n_test, row.n_validation) for row in self.rows if row.ok and row.dataset == name
+        }
+        lengths = (
+            dict(zip(("test", "validation"), sizes.pop(), strict=True)) if len(sizes) == 1 else {}
+        )
+        check_arrays(path, arrays, OF_DATASETS, lengths)
+        return arrays
 
     def check_samples(self, dataset: str | None = None) -> None:
         """Check that the raw samples of the rows that ran exist and give the errors of these rows.
@@ -225,7 +255,9 @@ class Comparison:
         """
         path = Path(out) / "results.json"
         try:
-            content = _without_controls(read_json(path))
+            content = read_json(path)
+            _check_lengths(content)
+            content = _without_controls(content)
             version = content["schema_version"]
             if version != SCHEMA_VERSION:
                 raise StoreError(
@@ -246,6 +278,19 @@ class Comparison:
             file.methods,
             file.learning,
         )
+
+
+def _check_lengths(value: Any) -> None:
+    """Raise `ValueError` for a table or list that no run writes and that would fill the memory."""
+    layer = [value]
+    while layer:
+        layer = [part for part in layer if isinstance(part, dict | list)]
+        longest = max(map(len, layer), default=0)
+        if longest > MOST_ENTRIES:
+            raise ValueError(
+                f"a table or list has {longest:,} entries; at most {MOST_ENTRIES:,} are allowed"
+            )
+        layer = [x for part in layer for x in (part.values() if isinstance(part, dict) else part)]
 
 
 def _without_controls(value: Any) -> Any:

@@ -19,7 +19,16 @@ from mor_bench.specs.method_spec import Told
 MOST_LETTERS = 450
 """Letters of a label before it is cut."""
 
+MOST_SETS = 100
+"""Largest number of named test sets."""
+
 Status = Literal["ok", "failed", "skipped"]
+
+
+def _few(value: Any) -> Any:
+    if isinstance(value, dict) and len(value) > MOST_SETS:
+        raise ValueError(f"there must be at most {MOST_SETS} of them; got {len(value):,}")
+    return value
 
 
 class ErrorSummary(Part):
@@ -134,7 +143,7 @@ class Latency(Part):
     n_queries: int = 0
     n_processes: int = 0
     stable: bool | None = None
-    unstable_because: list[str] = Field(default=[])
+    unstable_because: Annotated[list[str], FailFast()] = Field(default=[])
 
 
 class AllThreadsLatency(Part):
@@ -306,7 +315,7 @@ class Row(Part):
     model_bytes: int | None = None
     cost: dict[str, Real] | None = None
     indicator: IndicatorQuality | None = None
-    sets: dict[str, SetErrors] = Field(default={})
+    sets: Annotated[dict[str, SetErrors], BeforeValidator(_few)] = Field(default={})
     range: RangeFlags | None = None
     hidden: SetErrors | None = None
     training: TrainingRecord | None = None
@@ -314,7 +323,7 @@ class Row(Part):
     seeds: SeedSpread | None = None
     discretisation_error_m: Real | None = None
     discretisation_rel_l2: Real | None = None
-    warnings: list[str] = Field(default=[])
+    warnings: Annotated[list[str], FailFast()] = Field(default=[])
     tuning_s: Real | None = None
 
     @property
@@ -367,7 +376,7 @@ class ResultsFile(Part):
     datasets: dict[Label, RecordedDataset]
     methods: dict[Label, RecordedMethod]
     rows: Annotated[list[Row], FailFast()]  # millions of wrong rows would fill the memory
-    learning: list[LearningPoint]
+    learning: Annotated[list[LearningPoint], FailFast()]
 
     @model_validator(mode="after")
     def _complete(self) -> ResultsFile:

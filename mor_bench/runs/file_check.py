@@ -7,6 +7,7 @@ from pathlib import Path
 from mor_bench.errors import MissingDependencyError
 from mor_bench.mechanics.locking import locking_risk
 from mor_bench.mechanics.model import check_supports, missing_library, rest_displacement
+from mor_bench.method_loading import check_predicts
 from mor_bench.runs.configurations import OWN, check_foreign_method
 from mor_bench.sandbox.process import default_memory_limit_bytes
 from mor_bench.scene.scene import load_scene
@@ -43,6 +44,7 @@ def check_file(path: Path) -> str:
         method = load_method_spec(path)
         if method.surrogate.startswith(OWN):
             check_method(method)
+            check_predicts(method.load_class(), method.surrogate)
         else:
             check_foreign_method(method, default_cache(), default_memory_limit_bytes())
         quick, full = (len(method.configurations(profile)) for profile in ("quick", "full"))

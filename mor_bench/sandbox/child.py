@@ -49,6 +49,7 @@ class _Child:
         seal(restrictions)
         if restrictions.scratch is not None:
             os.environ["TMPDIR"] = tempfile.tempdir = str(restrictions.scratch)
+            os.environ.pop("TORCHINDUCTOR_CACHE_DIR", None)  # where it may not write
         sys.path[:] = import_path
         self.session = made_by(**arguments)
         return {}
