@@ -28,8 +28,9 @@ def analyse(
     All intervals have a level of 95 %. Errors are resampled by a bootstrap over the load regions of
     the test set, and over training seeds if there are several. All methods share the resamples.
     Intervals of latencies come from the spread between fresh processes; effects that all
-    configurations share cancel in ratios. Nothing is corrected for the number of comparisons: about
-    one in twenty pairs of equal methods is called different.
+    configurations share cancel in ratios. Nothing is corrected for the number of comparisons. The
+    level is meant to be at least 95 %: equal methods were called different in fewer than one of
+    twenty pairs, see `tests.verification.timing_trust`.
 
     Parameters
     ----------

@@ -229,6 +229,8 @@ def main(
     rows = []
     variants = [*open_choices(), *changes(), *other_choices()]
     variants = [variant for variant in variants if method in ("", variant.method)]
+    for first in {variant.method: variant for variant in reversed(variants)}.values():
+        fitted(data, first, 0)  # compiles and loads what the first fit would pay for
     for variant in track(variants, description=dataset):
         # Variants with equal parameters and constants are trained once.
         key = f"{new_method(variant, 0)!r} {variant.constant and variant.value}"

@@ -38,7 +38,7 @@ CHUNK = 100
 WHOLE = 10**9
 """No limit on the number of loads."""
 
-FURTHER = {"liver-tet": (0.6, 0.8, 1.0, 1.3)}
+FURTHER = {"liver-tet": (0.6, 0.8, 1.0, 1.3, 2.0, 3.0)}
 """Largest forces of a scene whose loads are refused before it deforms as in the paper, N."""
 
 
