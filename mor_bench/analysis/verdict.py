@@ -17,9 +17,6 @@ from mor_bench.results.json_file import without_nan
 from mor_bench.results.row import Row
 from mor_bench.specs.method_spec import Told
 
-LEAST_OFFLINE_S = 0.5
-"""Offline cost below which a repeated fit takes twice or half as long, core-s."""
-
 RULE = (
     "The fastest configuration wins that answers every load and whose 95 % upper bounds of latency "
     "and of error on the validation part, and whose median error on a fresh test set if there is "
@@ -217,10 +214,10 @@ class Verdict:
 def offline_rank(row: Row) -> tuple[Any, ...]:
     """Rank by offline cost in core-seconds, to two digits, then by speed.
 
-    Repeated fits differ. So costs below `LEAST_OFFLINE_S` count as equal. Rows with an unknown cost
-    come last.
+    Repeated fits of less than a second differ by more than the rounding: the order of such costs is
+    partly chance. Rows with an unknown cost come last.
     """
-    seconds = max(number_or_inf(row.offline_core_s), LEAST_OFFLINE_S)
+    seconds = number_or_inf(row.offline_core_s)
     return float(f"{seconds:.1e}"), *speed_rank(row)
 
 

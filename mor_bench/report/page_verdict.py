@@ -184,7 +184,7 @@ def _by_offline(
     picks += [_pick("next of another method", second, names)] if second else []
     sentence = (
         "Offline cost: core-seconds of training data and fit. Repeated fits differ, so costs "
-        "are compared with two digits, and those below 0.5 core-seconds count as equal."
+        "are compared with two digits; the order of fits of less than a second is partly chance."
     )
     return Ranking("offline cost", f"Take {names[first.label]}", picks, sentence)
 
