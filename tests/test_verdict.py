@@ -138,6 +138,7 @@ def test_the_upper_bound_of_the_validation_errors_qualifies(tmp_path: Path) -> N
         "d", {}, {"test_regions": regions[:, None], "validation_regions": regions[:, None]}
     )
     row = a_row(validation={"rel_l2_median": float(np.median(errors))})
+    row = row.with_parts(n_test=260, n_validation=260)
     made.put(row, {"relative_l2": np.full(260, 0.001), "validation_relative_l2": errors})
     draws = draws_of(made, "d", 500, np.random.default_rng(0))
     high = draws.intervals["a"][VALIDATION][1]
