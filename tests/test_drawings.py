@@ -118,9 +118,10 @@ def test_the_map_of_the_error_has_a_panel_for_the_best_of_each_class(tmp_path: P
     arrays = {"points": MESH.points, "cells": MESH.cells, "patch_centres": centres}
     made.add_dataset("beam", {}, {**arrays, "test_regions": regions})
     for method, told, e in (("a", "input", 0.2), ("b", "input", 0.1), ("c", "equations", 0.3)):
-        row = a_row(method, dataset="beam", told=told, error={"mean_dof_m": e})
+        row = a_row(method, dataset="beam", told=told, n_test=4, error={"mean_dof_m": e})
         made.put(row, {"relative_l2": 0.1 * e * np.array([1.0, 3.0, 20.0, np.inf])})
-    full = a_row("fem", dataset="beam", told="equations", reference=True, error={"mean_dof_m": 0.0})
+    full = a_row("fem", dataset="beam", told="equations", n_test=4, error={"mean_dof_m": 0.0})
+    full = full.with_parts(reference=True)
     made.put(full, {"relative_l2": np.full(4, 1e-9)})
     picture = error_over_position(made, "beam")
     assert picture is not None
@@ -150,7 +151,7 @@ def test_the_slope_of_the_paper_is_drawn_on_its_scenes_only(
     tmp_path: Path, dataset: str, n_lines: int
 ) -> None:
     made = Comparison(tmp_path, {})
-    row = a_row("pod", dataset=dataset, error={"mean_dof_m": 0.002})
+    row = a_row("pod", dataset=dataset, n_test=2, error={"mean_dof_m": 0.002})
     made.put(row, {"amplitude_m": np.array([0.1, 0.3]), "mean_dof_m": np.array([0.001, 0.003])})
     picture = error_against_deformation(made, dataset)
     assert picture is not None

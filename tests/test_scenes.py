@@ -182,6 +182,7 @@ OTHERS = {
     "liver-hex-observed",
     "liver-grasped",
     "artery-pressure",
+    "soft-arm",
 }  # of liver-hex; no patches
 QUICK = {*map(scene_of, list_suite("datasets"))} - SLOW - OTHERS
 

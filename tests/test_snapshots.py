@@ -202,6 +202,7 @@ OTHERS = {
     "liver-hex-observed",
     "liver-grasped",
     "artery-pressure",
+    "soft-arm",
 }  # of liver-hex; no patches
 SLOW = {*map(scene_of, list_suite("datasets"))} - QUICK - OTHERS
 

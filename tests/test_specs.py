@@ -31,6 +31,7 @@ SHIPPED = {
     "liver-hex-observed": (726, 1118, 200, 2000),
     "liver-grasped": (726, 1118, 12, 2000),
     "artery-pressure": (384, 600, 2, 2000),
+    "soft-arm": (692, 1276, 4, 500),
     "liver-tet": (4567, 1118, 200, 2000),
 }
 """Cells, nodes, load patches, moved nodes or pressed regions, and samples of each dataset."""
@@ -100,7 +101,7 @@ def test_every_shipped_method_states_what_it_is_told(name: str) -> None:
 BAD_DATASETS = """
 geometry.sise_m = [1.0] -> unknown key `geometry.sise_m`; did you mean 'size_m'?
 geometry.sise_m = 1 -> Allowed here: cells, shape, size_m.
-geometry.shape = "sphere" -> must be 'box', 'l-shape', 'tube', 'voxels', 'tetrahedra' or 'file'
+geometry.shape = "sphere" -> must be 'box', 'l-shape', 'chambered-box', 'tube', 'voxels', 'tetrahedra' or 'file'
 geometry.cells = - -> key `geometry.cells` is missing.
 geometry.cells = [6, 2] -> key `geometry.cells[2]` is missing.
 geometry.cells = [6, 2, 0] -> `geometry.cells[2]` must be greater than or equal to 1; got 0.
