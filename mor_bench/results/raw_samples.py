@@ -15,6 +15,9 @@ from mor_bench.errors import StoreError
 
 Arrays = Mapping[str, NDArray[Any]]
 
+FARTHEST = 1e30
+"""Largest coordinate, displacement or force."""
+
 MOST_NUMBER = 10**9
 """Largest number of a process, a round, a region or a node."""
 
@@ -29,8 +32,8 @@ class Allowed:
         Real numbers, or whole ones.
     shape : tuple of str or int
         Names of lengths, which must be the same in all arrays of a file, or lengths.
-    low : float
-        Least value; NaN passes, unless `finite`.
+    low, high : float
+        Least and largest value; NaN passes, unless `finite`.
     finite : bool
         Whether every value must be finite.
     """
@@ -38,16 +41,17 @@ class Allowed:
     kind: Literal["real", "whole"]
     shape: tuple[str | int, ...]
     low: float = -inf
+    high: float = inf
     finite: bool = False
 
 
 _ERRORS = Allowed("real", ("test",), 0.0)
-_NODES = Allowed("real", ("nodes", 3))
+_NODES = Allowed("real", ("nodes", 3), -FARTHEST, FARTHEST, finite=True)
 _NUMBERS = Allowed("whole", ("queries",), 0.0)
 _CURVE = Allowed("real", ("any",))
 
 OF_ROWS = {
-    "latency_ms": Allowed("real", ("queries",), 0.0, finite=True),
+    "latency_ms": Allowed("real", ("queries",), 1e-9, finite=True),
     "process": _NUMBERS,
     "round": _NUMBERS,
     **dict.fromkeys(("mean_dof_m", "relative_l2", "max_nodal_m", "amplitude_m"), _ERRORS),
@@ -65,9 +69,9 @@ OF_ROWS = {
 OF_DATASETS = {
     "singular_values": Allowed("real", ("any",), 0.0, finite=True),
     "snapshots_norm": Allowed("real", (), 0.0, finite=True),
-    "points": Allowed("real", ("nodes", 3), finite=True),
+    "points": Allowed("real", ("nodes", 3), -FARTHEST, FARTHEST, finite=True),
     "cells": Allowed("whole", ("cells", "corners"), 0.0),
-    "patch_centres": Allowed("real", ("patches", 3), finite=True),
+    "patch_centres": Allowed("real", ("patches", 3), -FARTHEST, FARTHEST, finite=True),
     "test_regions": Allowed("whole", ("test", "regions"), 0.0),
     "validation_regions": Allowed("whole", ("validation", "validation regions"), 0.0),
 }
@@ -125,8 +129,8 @@ def _problem(array: NDArray[Any], must: Allowed, known: dict[str, int]) -> str:
             return f"have the length {expected} ({length}); got the shape {array.shape}"
     if must.finite and not np.isfinite(array).all():
         return "be finite"
-    if array.size and np.nanmin(np.where(np.isnan(array), inf, array)) < must.low:
-        return f"be at least {must.low:g}"
+    if (array < must.low).any() or (array > must.high).any():
+        return f"lie in [{must.low:g}, {must.high:g}]"
     if must.kind == "whole" and array.size and int(array.max()) > MOST_NUMBER:
         return f"be at most {MOST_NUMBER:,}"
     return ""
