@@ -101,7 +101,7 @@ def test_every_shipped_method_states_what_it_is_told(name: str) -> None:
 BAD_DATASETS = """
 geometry.sise_m = [1.0] -> unknown key `geometry.sise_m`; did you mean 'size_m'?
 geometry.sise_m = 1 -> Allowed here: cells, shape, size_m.
-geometry.shape = "sphere" -> must be 'box', 'l-shape', 'chambered-box', 'tube', 'voxels', 'tetrahedra' or 'file'
+geometry.shape = "sphere" -> must be 'box', 'l-shape', 'chambered-box', 'tube'
 geometry.cells = - -> key `geometry.cells` is missing.
 geometry.cells = [6, 2] -> key `geometry.cells[2]` is missing.
 geometry.cells = [6, 2, 0] -> `geometry.cells[2]` must be greater than or equal to 1; got 0.

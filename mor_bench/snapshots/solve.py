@@ -65,7 +65,8 @@ class Solved:
 def pack(scene: Scene) -> bytes:
     """Serialise the input of a worker: mesh, material, supports and patch weights."""
     mesh = replace(scene.mesh)  # a copy without cached properties
-    sets = scene.point_sets if scene.motion else {}  # the moved region may be one of them
+    # A moved region, or one under a pressure that follows it, may be one of the sets.
+    sets = scene.point_sets if scene.motion or scene.follows else {}
     sent = replace(scene, mesh=mesh, embedded_surface=None, point_sets=sets)
     return pickle.dumps((sent, scene.patch_weights))
 

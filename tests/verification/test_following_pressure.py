@@ -161,8 +161,14 @@ def test_the_discretisation_error_of_a_following_pressure_is_measured(tmp_path: 
 
 @pytest.mark.slow
 def test_methods_learn_following_pressures(tmp_path: Path) -> None:
-    loads = {**FOLLOWING, "regions": ["z-max", "y-max"], "magnitude_pa": [0.0, 4.0]}
-    table = content(supports=CLAMPED, loads={**loads, "samples": 200})
+    box = {"shape": "chambered-box", "size_m": [3.0, 1.0, 1.0], "cells": [6, 3, 5]}
+    sets = [{"point_set": "chamber-a"}, {"point_set": "chamber-b"}]
+    loads = {**FOLLOWING, "regions": sets, "magnitude_pa": [0.0, 20.0], "samples": 200}
+    table = content(
+        geometry={**box, "chambers": [[[1, 1, 1], [5, 2, 2]], [[1, 1, 3], [5, 2, 4]]]},
+        supports=CLAMPED,
+        loads=loads,
+    )
     methods = ["fem", "linear-fem", "pod[n_modes=2]", "pca-regression"]
     comparison = mor_bench.run([table], methods, out=tmp_path / "out", cache=tmp_path)
     rows = {row.method: row for row in comparison.rows}
