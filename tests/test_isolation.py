@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -27,6 +28,15 @@ from tests.small_runs import PLAIN, method_file, run_small
 from tests.third_party import Peeker
 
 FORCES = str(PLAIN[1])
+
+
+def command_lines(processes: list[psutil.Process]) -> list[list[str]]:
+    """Return the command lines of processes that have not ended."""
+    found = []
+    for process in processes:
+        with suppress(psutil.NoSuchProcess):  # a zombie is one, too
+            found.append(process.cmdline())
+    return found
 
 
 def broken_file(folder: Path, how: str) -> Path:
@@ -75,7 +85,7 @@ def test_a_broken_method_spoils_its_own_row_only(cache: Path, tmp_path: Path) ->
         assert rows[how].ok == (words is None), (how, rows[how].reason)
         assert words is None or words in str(rows[how].reason)
     assert Comparison.read(found.out).rows == found.rows
-    left = [process.cmdline() for process in psutil.Process().children(recursive=True)]
+    left = command_lines(psutil.Process().children(recursive=True))
     assert not [command for command in left if str(tmp_path) in " ".join(command)]
 
 
