@@ -24,6 +24,10 @@ def test_the_documented_kills_and_predictions_were_done() -> None:
     assert f"{KILLS} times with each of {', '.join(SIGNALS[:-1])} and {SIGNALS[-1]} for " + (
         f"{', '.join(commands[:-1])} and {commands[-1]}"
     ) in " ".join(PAGE.read_text("utf-8").split())
+    for name in ("generate", "fit", "run"):
+        rows = read_json(trust / f"kills-{name}.json")["kills"]
+        done = [(row["command"], row["signal"], row["kills"], row["wrong"]) for row in rows]
+        assert done == [(name, number, KILLS, 0) for number in SIGNALS]
     load = read_json(trust / "load.json")["methods"]
     assert [row["method"] for row in load] == list(CORE_METHODS)
     for row in load:
