@@ -47,6 +47,7 @@ class Allowed:
 
 _ERRORS = Allowed("real", ("test",), 0.0)
 _NODES = Allowed("real", ("nodes", 3), -FARTHEST, FARTHEST, finite=True)
+_PREDICTION = Allowed("real", ("nodes", 3))  # a broken method may answer anything
 _NUMBERS = Allowed("whole", ("queries",), 0.0)
 _CURVE = Allowed("real", ("any",))
 
@@ -59,8 +60,12 @@ OF_ROWS = {
     "seeds_mean_dof_m": Allowed("real", ("seeds", "test"), 0.0),
     "seeds_relative_l2": Allowed("real", ("seeds", "test"), 0.0),
     "seeds_validation_relative_l2": Allowed("real", ("seeds", "validation"), 0.0),
-    **{f"worst_{part}": _NODES for part in ("prediction", "reference", "forces")},
-    **{f"typical_{part}": _NODES for part in ("prediction", "reference", "forces")},
+    **{f"{sample}_prediction": _PREDICTION for sample in ("worst", "typical")},
+    **{
+        f"{sample}_{part}": _NODES
+        for sample in ("worst", "typical")
+        for part in ("reference", "forces")
+    },
     "loss_curve": _CURVE,
     "validation_curve": _CURVE,
 }
