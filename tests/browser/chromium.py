@@ -72,6 +72,7 @@ def visit(browser: Browser, path: Path, width: int = 1400, **options: Any) -> It
     """Open a page without a network; `options` are those of a browser context."""
     viewport: Any = {"width": width, "height": 900}
     context = browser.new_context(viewport=viewport, offline=True, **options)
+    context.set_default_timeout(120_000)
     page = context.new_page()
     found = Visit(page)
     page.on("request", lambda request: _note(found.requests, request.url, path))
