@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mor_bench.analysis.break_even import at_error_of_the_verdict, break_even
+from mor_bench.analysis.break_even import break_even
 from mor_bench.analysis.caveats import hidden, regimes, tuning
-from mor_bench.analysis.draws import VALIDATION, Draws
-from mor_bench.analysis.frontier import compare
+from mor_bench.analysis.draws import VALIDATION, error_bound
+from mor_bench.analysis.frontier import compare, selecting_error
 from mor_bench.analysis.performance_profile import profile, share_within
-from mor_bench.analysis.selection import error_bounds
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.parts import TrainingRecord
 from mor_bench.results.row import ErrorSummary, Row, SetErrors
@@ -44,6 +44,16 @@ def scored(
     )
 
 
+def medians(rows: Sequence[Row]) -> dict[str, float]:
+    """Return the errors that select rows whose samples are not known."""
+    return {row.label: selecting_error(row) for row in rows}
+
+
+def at_one_percent(rows: Sequence[Row], bounds: Mapping[str, float]) -> list[dict[str, Any]]:
+    records = compare(rows, bounds)["time_at_error"]
+    return [record for record in records if record["target_rel_l2_median"] == 0.01]
+
+
 def test_break_even_matches_hand_computed_values() -> None:
     rows = [
         scored("fem", "loose", 0.005, 1.0, 0.0),
@@ -53,15 +63,16 @@ def test_break_even_matches_hand_computed_values() -> None:
         scored("exact", "exact", 1e-12, 0.1),
         scored("bought", "bought", 1e-3, 1.5, None),
     ]
-    records = compare(rows)["time_at_error"]
-    records += compare([scored("far", "far", 0.5, 1.0)])["time_at_error"]
-    at_one_percent = [r for r in records if r["target_rel_l2_median"] == 0.01]
+    far = scored("far", "far", 0.5, 1.0)
+    bounds = medians([*rows, far])
+    records = [r for some in (rows, [far]) for r in compare(some, bounds)["time_at_error"]]
+    records = [r for r in records if r["target_rel_l2_median"] == 0.01]
     rows += [
         scored("quick", "other", 0.9, 0.1),
         a_row("quick", label="failed", status="failed", tuning_s=15.0),
         a_row("quick", label="skipped", status="skipped"),
     ]
-    found = {record["method"]: record for record in break_even(rows, at_one_percent)}
+    found = {record["method"]: record for record in break_even(rows, records, medians(rows))}
     assert "fem" not in found
     # 40 core-seconds, less 10 to prepare the full-order model, over 0.4 ms.
     assert found["quick"]["queries"] == 75_000
@@ -86,16 +97,18 @@ def test_a_break_even_selects_by_the_rule_of_the_verdict() -> None:
         ),
         scored("quick", "partial", 0.008, 0.1, n_failed=1),
     ]
-    records = [r for r in compare(rows)["time_at_error"] if r["target_rel_l2_median"] == 0.01]
-    bounds = {"fem": 0.002, "unsure": 0.011, "sure": 0.0095}
-    chosen = at_error_of_the_verdict(rows, records, bounds)
-    assert [r["best"] and r["best"]["label"] for r in chosen] == ["fem", "sure"]
-    assert break_even(rows, chosen)[0]["queries"] == 75_000
-    none = at_error_of_the_verdict(rows, records, {"fem": 0.002, "sure": 0.02})
-    assert break_even(rows, none)[0]["verdict"] == "not reached"
-    intervals = {"unsure": {VALIDATION: (0.007, 0.011)}, "sure": {VALIDATION: (0.007, 0.0095)}}
-    found = error_bounds(rows, Draws([], np.zeros((0, 1)), np.zeros((0, 1)), intervals))
-    assert found == {"fem": 0.001, "unsure": 0.011, "sure": 0.0095, "partial": np.inf}
+    bounds = {"fem": 0.002, "unsure": 0.011, "sure": 0.0095, "partial": np.inf}
+    records = at_one_percent(rows, bounds)
+    assert [r["best"] and r["best"]["label"] for r in records] == ["fem", "sure"]
+    assert break_even(rows, records, bounds)[0]["queries"] == 75_000
+    none = at_one_percent(rows, bounds | {"sure": 0.02})
+    assert break_even(rows, none, bounds)[0]["verdict"] == "not reached"
+    intervals: dict[str, dict[str, tuple[float, float]]] = {
+        "unsure": {VALIDATION: (0.007, 0.011)},
+        "sure": {VALIDATION: (0.007, 0.0095)},
+    }
+    found = {row.label: error_bound(row, intervals.get(row.label, {})) for row in rows}
+    assert found == bounds | {"fem": 0.001}
 
 
 def test_the_full_order_model_of_a_break_even_is_chosen_on_the_validation_part() -> None:
@@ -108,17 +121,18 @@ def test_the_full_order_model_of_a_break_even_is_chosen_on_the_validation_part()
         row("fem", "tight", 1e-9, 1e-9, 2.0),
         row("quick", "quick", 0.008, 0.008, 0.6),
     ]
-    records = [r for r in compare(rows)["time_at_error"] if r["target_rel_l2_median"] == 0.01]
-    assert break_even(rows, records)[0]["fem_label"] == "tight"
+    bounds = medians(rows)
+    assert break_even(rows, at_one_percent(rows, bounds), bounds)[0]["fem_label"] == "tight"
 
 
 def test_a_break_even_counts_all_threads_and_no_training_on_a_gpu() -> None:
     rows = [scored("fem", "fem", 0.005, 1.0, 0.0), scored("quick", "quick", 0.008, 0.6)]
-    records = [r for r in compare(rows)["time_at_error"] if r["target_rel_l2_median"] == 0.01]
+    bounds = medians(rows)
+    records = at_one_percent(rows, bounds)
     two = [row.with_parts(threads=2) for row in rows]
-    assert break_even(two, records)[0]["queries"] == 37_500
+    assert break_even(two, records, bounds)[0]["queries"] == 37_500
     on_gpu = [rows[0], rows[1].with_parts(training=TrainingRecord(device="cuda"))]
-    found = break_even(on_gpu, records)[0]
+    found = break_even(on_gpu, records, bounds)[0]
     assert (found["verdict"], found["queries"]) == ("unknown", None)
     assert "its fit" in found["reason"]
 

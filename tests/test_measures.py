@@ -90,7 +90,7 @@ def test_a_frontier_interpolates_in_log_log_and_never_extrapolates() -> None:
     assert [point.label for point in non_dominated(POINTS)] == ["a", "b", "c"]
     middle = time_at_error(POINTS, math.sqrt(0.1 * 0.01))
     assert middle["latency_ms"] == pytest.approx(math.sqrt(10.0))
-    best = {"label": "b", "latency_ms": 10.0, "error": 0.01, "validation": None}
+    best = {"label": "b", "latency_ms": 10.0, "error": 0.01, "bound": None}
     assert middle["best"] == best
     assert time_at_error(POINTS, 0.5)["latency_ms"] == 1.0
     assert time_at_error(POINTS, 0.0005) == {"latency_ms": None, "best": None}
@@ -123,7 +123,7 @@ def test_validation_selects_the_frontier_and_its_errors_are_those_of_the_test() 
         "label": "selected",
         "latency_ms": 2.0,
         "error": 0.012,
-        "validation": 0.008,
+        "bound": 0.008,
     }
     within = error_at_time(points, 4.0)
     assert within["error"] == pytest.approx(0.006)

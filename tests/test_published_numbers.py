@@ -16,7 +16,7 @@ from tests.published.claims import (
     without_evidence,
     wrong_numbers,
 )
-from tests.published.compact import ERRORS, wrong_intervals, wrong_summaries, wrong_verdicts
+from tests.published.compact import ERRORS, wrong_conclusions, wrong_summaries, wrong_verdicts
 from tests.published.pictures import stale_pictures
 from tests.published.stored import REPORTS, ROOT
 
@@ -83,8 +83,8 @@ def test_the_errors_of_a_run_are_those_of_its_samples(run: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("run", RUNS)
-def test_the_intervals_of_a_run_are_those_of_its_samples(run: str) -> None:
-    wrong = list(wrong_intervals(REPORTS / run))
+def test_the_conclusions_of_a_run_follow_from_its_samples(run: str) -> None:
+    wrong = list(wrong_conclusions(REPORTS / run))
     assert not wrong, "\n".join(wrong)
 
 

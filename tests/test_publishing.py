@@ -28,7 +28,7 @@ from tests.published.compact import (
     ERRORS,
     compact,
     verdict_again,
-    wrong_intervals,
+    wrong_conclusions,
     wrong_summaries,
     wrong_verdicts,
 )
@@ -50,12 +50,14 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "stored"
 
 
-def test_the_compact_form_keeps_the_errors_and_no_single_latencies(stored: Path) -> None:
+def test_the_compact_form_keeps_errors_and_latencies_and_no_predictions(stored: Path) -> None:
     assert list(wrong_summaries(stored)) == []
     with h5py.File(stored / ERRORS, "r") as file:
         arrays = file["beam-coarse"]["linear-fem"]
         assert arrays["relative_l2"].dtype == np.float32
-        assert not {"latency_ms", "worst_prediction"} & set(arrays)
+        assert arrays["latency_ms"].dtype == np.float32
+        assert arrays["round"].dtype == np.uint8
+        assert "worst_prediction" not in arrays
 
 
 def test_an_error_that_its_samples_do_not_give_is_found(stored: Path, tmp_path: Path) -> None:
@@ -118,17 +120,16 @@ def test_texts_that_agree_with_each_other_but_not_with_the_samples_are_found(
     assert any(f"pod [n_modes=80]: {named} is" in line for line in found)
 
 
-@pytest.mark.slow
-def test_an_interval_that_the_samples_do_not_give_is_found(stored: Path, tmp_path: Path) -> None:
-    assert list(wrong_intervals(stored)) == []
+def test_a_interval_that_the_samples_do_not_give_is_found(stored: Path, tmp_path: Path) -> None:
+    assert list(wrong_conclusions(stored)) == []
     shutil.copytree(stored, tmp_path / "copy")
     path = tmp_path / "copy" / "comparison.json"
     content = json.loads(path.read_text())
     figure = look_up(content, "rows/label=linear-fem/rel_l2_median")
     figure["high"] = figure["value"] * 1.0001
     path.write_text(json.dumps(content))
-    (found,) = wrong_intervals(tmp_path / "copy")
-    assert "linear-fem: rel_l2_median is" in found
+    (found,) = wrong_conclusions(tmp_path / "copy")
+    assert "(linear-fem)/rel_l2_median/high is" in found
 
 
 @pytest.mark.parametrize("table", ["selected", "verdict", "fastest", "facts"])

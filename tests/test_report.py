@@ -246,11 +246,12 @@ def test_a_row_without_a_number_is_not_good(tmp_path: Path) -> None:
 
 def test_the_best_row_of_a_method_has_a_finite_error() -> None:
     errors = {5: 0.01, 20: float("inf")}
-    rows = [a_row("pod", {"r": r}, error={"mean_dof_m": errors[r]}) for r in (20, 5)]
+    rows = [a_row("pod", {"r": r}, error={"rel_l2_median": errors[r]}) for r in (20, 5)]
     assert [entry.row for entry in best_per_method([Entry(row) for row in rows])] == rows[1:]
     held_out = {5: 0.02, 20: 0.01}
     rows = [
-        row.with_parts(validation=ErrorSummary(mean_dof_m=held_out[row.swept["r"]])) for row in rows
+        row.with_parts(validation=ErrorSummary(rel_l2_median=held_out[row.swept["r"]]))
+        for row in rows
     ]
     assert [entry.row for entry in best_per_method([Entry(row) for row in rows])] == rows[:1]
 

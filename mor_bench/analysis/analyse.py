@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from mor_bench.analysis.bootstrap import LEVEL
-from mor_bench.analysis.break_even import at_error_of_the_verdict, break_even
+from mor_bench.analysis.break_even import break_even
 from mor_bench.analysis.caveats import hidden, regimes, tuning
 from mor_bench.analysis.draws import draws_of, headlines
 from mor_bench.analysis.frontier import compare
 from mor_bench.analysis.pairs import add_intervals
 from mor_bench.analysis.performance_profile import profile
-from mor_bench.analysis.selection import decide, error_bounds
+from mor_bench.analysis.selection import decide
 from mor_bench.analysis.verdict import Requirements, Verdict, needs_of
 from mor_bench.results.comparison import Comparison
 
@@ -42,7 +42,8 @@ def analyse(
     -------
     dict
         `verdicts`: `mor_bench.analysis.verdict.Verdict.summary` of each dataset.
-        `rows`: value, low and high of the main figures of each configuration.
+        `rows`: value, low and high of the main figures of each configuration, and `error_bound`,
+        the error that selects it.
         `time_at_error`, `error_at_time`: records of `mor_bench.analysis.frontier.compare` with
         two additions. `low`, `high`: None where not reached. `not_reached`: share of resamples that
         do not reach the target.
@@ -55,27 +56,21 @@ def analyse(
     """
     analysis: dict[str, Any] = {
         "settings": {"n_resamples": n_resamples, "seed": seed, "level": LEVEL},
-        **compare(comparison.rows),
-        **{name: [] for name in ("rows", "pairwise", "break_even", "hidden", "clusters", "timing")},
+        **{name: [] for name in ("time_at_error", "error_at_time", "rows", "pairwise")},
+        **{name: [] for name in ("break_even", "hidden", "clusters", "timing")},
         "verdicts": [],
     }
     for dataset in dict.fromkeys(row.dataset for row in comparison.rows):
         draws = draws_of(comparison, dataset, n_resamples, np.random.default_rng(seed))
-        targets = {
-            kind: [record for record in analysis[kind] if record["dataset"] == dataset]
-            for kind in ("time_at_error", "error_at_time")
-        }
-        analysis["rows"] += [
-            headlines(row, draws)
-            for row in comparison.rows
-            if row.dataset == dataset and row.status == "ok"
-        ]
+        rows = [row for row in comparison.rows if row.dataset == dataset]
+        targets = compare(rows, draws.error_bounds)
+        analysis["rows"] += [headlines(row, draws) for row in rows if row.status == "ok"]
         requirements = needs_of(comparison, dataset)
         analysis["verdicts"].append(decide(comparison, dataset, requirements, draws).summary())
         analysis["pairwise"] += add_intervals(targets, draws, requirements.error)
-        bounds = error_bounds([row for row in comparison.rows if row.dataset == dataset], draws)
-        reached = at_error_of_the_verdict(comparison.rows, targets["time_at_error"], bounds)
-        analysis["break_even"] += break_even(comparison.rows, reached)
+        for kind, records in targets.items():
+            analysis[kind] += records
+        analysis["break_even"] += break_even(rows, targets["time_at_error"], draws.error_bounds)
         analysis["hidden"] += hidden(comparison.rows, dataset, draws.intervals)
         for name, facts in (("clusters", draws.clusters), ("timing", draws.timing)):
             analysis[name] += [{"dataset": dataset, **facts}] if facts else []

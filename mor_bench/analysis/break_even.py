@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import ceil, inf
+from math import ceil
 from typing import Any
 
-from mor_bench.analysis.frontier import (
-    is_point,
-    median_error,
-    median_latency_ms,
-    selecting_error,
-)
+from mor_bench.analysis.frontier import median_latency_ms
 from mor_bench.results.row import Row
 
 Record = dict[str, Any]
@@ -20,19 +15,24 @@ FULL_ORDER = "fem"
 """Method against which speed-ups and break-even counts are computed."""
 
 
-def break_even(rows: Sequence[Row], at_error: Sequence[Record]) -> list[Record]:
+def break_even(
+    rows: Sequence[Row], at_error: Sequence[Record], bounds: Mapping[str, float]
+) -> list[Record]:
     """Count the queries after which the offline cost of a method pays off, at each error.
 
     The count is the offline cost (data and fit) beyond the preparation of the full-order model,
     divided by what a query saves, both in core-seconds. A query uses its latency times its threads.
     The count compares two configurations: the selected one, and the fastest full-order one that is
-    at least as accurate by the errors that select, those of the validation part.
+    at least as accurate by the errors that select.
 
     Parameters
     ----------
     rows : sequence of Row
+        Those of one dataset.
     at_error : sequence of dict
         Records of time at error; `best` is the selected configuration of the method.
+    bounds : dict
+        The error that selects each row that ran, by label.
 
     Returns
     -------
@@ -42,39 +42,12 @@ def break_even(rows: Sequence[Row], at_error: Sequence[Record]) -> list[Record]:
         (``never``, ``not reached``, ``unknown``) and its `reason`. The other figures are those from
         which the counts are computed: `offline_core_s`, of data, fit and all fits.
     """
-    return [_break_even(rows, record) for record in at_error if record["method"] != FULL_ORDER]
+    others = [record for record in at_error if record["method"] != FULL_ORDER]
+    return [_break_even(rows, record, bounds) for record in others]
 
 
-def sufficient(rows: Sequence[Row], bounds: Mapping[str, float], limit: float) -> Row | None:
-    """Return the fastest row whose error meets a limit by the rule of the verdict.
-
-    `bounds` holds the rows' errors as the verdict compares them, by label.
-    """
-    within = [row for row in rows if bounds.get(row.label, inf) <= limit]
-    return min(within, key=median_latency_ms, default=None)
-
-
-def at_error_of_the_verdict(
-    rows: Sequence[Row], records: Sequence[Record], bounds: Mapping[str, float]
-) -> list[Record]:
-    """Replace the selected configuration of records of time at error by the verdict's choice."""
-    out = []
-    for record in records:
-        key = record["dataset"], record["method"]
-        mine = [row for row in rows if (row.dataset, row.method) == key and is_point(row)]
-        row = sufficient(mine, bounds, record["target_rel_l2_median"])
-        out.append({**record, "best": row and best_of(row)})
-    return out
-
-
-def best_of(row: Row) -> Record:
-    """Return the figures of a selected row that `break_even` needs."""
-    return {"label": row.label, "latency_ms": median_latency_ms(row), "error": median_error(row)}
-
-
-def _break_even(rows: Sequence[Row], record: Record) -> Record:
-    mine = [row for row in rows if row.dataset == record["dataset"]]
-    ran, best = [row for row in mine if row.ok], record["best"]
+def _break_even(rows: Sequence[Row], record: Record, bounds: Mapping[str, float]) -> Record:
+    ran, best = [row for row in rows if row.ok], record["best"]
     out = {key: record[key] for key in ("dataset", "method", "target_rel_l2_median")}
     out |= dict.fromkeys(("label", "latency_ms", "fem_label", "fem_latency_ms", "offline_core_s"))
     out |= {"queries": None, "queries_with_tuning": None}
@@ -82,7 +55,7 @@ def _break_even(rows: Sequence[Row], record: Record) -> Record:
         return {**out, "verdict": "not reached", "reason": "no configuration is that accurate"}
     row = next(row for row in ran if row.label == best["label"])
     latency, data = best["latency_ms"], row.offline_s.data if row.offline_s else None
-    fit, all_fits = row.fit_core_s, _all_fits_core_s(mine, row.method)
+    fit, all_fits = row.fit_core_s, _all_fits_core_s(rows, row.method)
     offline = {"data": data, "fit": fit, "all_fits": all_fits}
     out |= {"label": row.label, "latency_ms": latency, "offline_core_s": offline}
     full_order = [
@@ -90,7 +63,7 @@ def _break_even(rows: Sequence[Row], record: Record) -> Record:
         for other in ran
         if other.method == FULL_ORDER
         and other.latency_ms
-        and selecting_error(other) <= selecting_error(row)
+        and bounds[other.label] <= bounds[row.label]
     ]
     if not full_order:
         reason = f"no configuration of {FULL_ORDER} is as accurate"

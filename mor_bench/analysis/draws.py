@@ -56,6 +56,8 @@ class Draws:
     intervals : dict
         By label: the intervals of `rel_l2_median`, `mean_dof_m`, `latency_ms` and `VALIDATION`,
         where there are raw samples.
+    error_bounds : dict
+        By label: `error_bound` of each row that ran.
     clusters, timing : dict
         The resampled units, and the spread between processes; empty without raw samples.
     """
@@ -64,6 +66,7 @@ class Draws:
     log_latencies: NDArray[np.float64]
     log_errors: NDArray[np.float64]
     intervals: dict[str, dict[str, Interval]] = field(default_factory=dict)
+    error_bounds: dict[str, float] = field(default_factory=dict)
     clusters: dict[str, Any] = field(default_factory=dict)
     timing: dict[str, Any] = field(default_factory=dict)
 
@@ -102,9 +105,33 @@ def draws_of(comparison: Comparison, dataset: str, n: int, generator: np.random.
         latencies,
         np.log(np.maximum(np.array(drawn).reshape(len(usable), n), EXACT)),
         intervals,
+        {row.label: error_bound(row, intervals[row.label]) for row in ran},
         resampler.resampled,
         _timing_facts(raw),
     )
+
+
+def answers_all(row: Row) -> bool:
+    """Return whether a row ran and left no load of any part without an answer."""
+    others = (row.hidden, row.validation)
+    return row.ok and row.n_failed == 0 and not any(o and o.rel_l2_max == inf for o in others)
+
+
+def error_bound(row: Row, intervals: Mapping[str, Interval]) -> float:
+    """Return the error that selects a row: `error_high`; infinite without an answer to a load."""
+    return error_high(row, intervals) if answers_all(row) else inf
+
+
+def error_high(row: Row, intervals: Mapping[str, Interval]) -> float:
+    """Return the error of a row that is compared with limits.
+
+    It is the upper end of the 95 % interval on the validation part, or on the test set if there is
+    none. The median error on a fresh test set counts if it is larger.
+    """
+    error = selecting_error(row)
+    _, high = intervals.get(VALIDATION if row.validation else "rel_l2_median", (0.0, error))
+    fresh = number_or_inf(row.hidden.rel_l2_median) if row.hidden else 0.0
+    return max(error, high, fresh)
 
 
 def _raw_samples(comparison: Comparison, row: Row) -> Samples:
@@ -185,7 +212,7 @@ def finite_or_none(value: float) -> float | None:
 def headlines(row: Row, draws: Draws) -> dict[str, Any]:
     """Value, low and high of the median error, the mean error and the median latency of a row.
 
-    The median error on the validation part is added if there is one.
+    The median error on the validation part is added if there is one, and the error that selects.
     A latency interval that was stored with the row takes precedence.
     """
     error, latency = row.error, row.latency_ms
@@ -198,6 +225,7 @@ def headlines(row: Row, draws: Draws) -> dict[str, Any]:
     if row.validation:
         values[VALIDATION] = selecting_error(row)
     found: dict[str, Any] = {"dataset": row.dataset, "label": row.label}
+    found["error_bound"] = finite_or_none(draws.error_bounds[row.label])
     for name, value in values.items():
         low, high = intervals.get(name, (inf, inf))
         if (

@@ -1,14 +1,14 @@
 """Time at error and error at time, from the swept configurations of each method.
 
-The validation errors select the configurations of the frontier; its errors are those of the test
-set. Old results without a validation part select by test errors. Between two adjacent
+The errors that the verdict compares with a limit select the configurations of the frontier: upper
+bounds on the validation part. Its errors are those of the test set. Between two adjacent
 configurations the frontier is a straight line in log-log. Nothing is extrapolated beyond them. Each
-interpolated figure comes with the real configuration that the validation errors select.
+interpolated figure comes with the configuration that the verdict would choose for the target.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import exp, inf, isnan, log
 from typing import Any
@@ -35,17 +35,17 @@ EXACT = 1e-16
 class Point:
     """A configuration on the plane of latency and test error.
 
-    `validation` is the error that selects configurations; without one, the test error does.
+    `bound` is the error that selects configurations; without one, the test error does.
     """
 
     latency_ms: float
     error: float
     label: str
-    validation: float | None = None
+    bound: float | None = None
 
     @property
     def selecting(self) -> float:
-        return self.error if self.validation is None else self.validation
+        return self.error if self.bound is None else self.bound
 
 
 def non_dominated(points: Sequence[Point]) -> list[Point]:
@@ -69,8 +69,8 @@ def _interpolate(x: float, x0: float, y0: float, x1: float, y1: float) -> float:
 def time_at_error(points: Sequence[Point], target: float) -> dict[str, Any]:
     """Return the interpolated latency at an error, and the configuration to select for it.
 
-    Selected is the fastest one whose validation error meets the target. The interpolated latency is
-    that at which the test error of the frontier first meets it. None: not reached.
+    Selected is the fastest one whose `selecting` error meets the target. The interpolated latency
+    is that at which the test error of the frontier first meets it. None: not reached.
     """
     able = [p for p in points if p.selecting <= target and p.selecting < USELESS]
     best = _selected(min(able, key=lambda p: (p.latency_ms, p.selecting), default=None))
@@ -96,15 +96,15 @@ def _selected(point: Point | None) -> dict[str, Any] | None:
         "label": point.label,
         "latency_ms": point.latency_ms,
         "error": point.error,
-        "validation": point.validation,
+        "bound": point.bound,
     }
 
 
 def error_at_time(points: Sequence[Point], target_ms: float) -> dict[str, Any]:
     """Return the interpolated error at a latency, and the configuration to select within it.
 
-    Selected is the one with the least validation error. The interpolated error is the test error of
-    the frontier. None: not reached.
+    Selected is the one with the least `selecting` error. The interpolated error is the test error
+    of the frontier. None: not reached.
     """
     able = [p for p in points if p.latency_ms <= target_ms and p.selecting < USELESS]
     best = _selected(min(able, key=lambda p: (p.selecting, p.latency_ms), default=None))
@@ -215,10 +215,11 @@ def is_point(row: Row) -> bool:
     return row.status == "ok" and row.error is not None and 0 < median_latency_ms(row) < inf
 
 
-def compare(rows: Sequence[Row]) -> dict[str, Any]:
-    """Time at error and error at time of all methods on all datasets.
+def compare(rows: Sequence[Row], bounds: Mapping[str, float]) -> dict[str, Any]:
+    """Time at error and error at time of all methods on a dataset.
 
-    A method without a usable row reaches no target.
+    A method without a usable row reaches no target. `bounds` holds the error that selects each row,
+    by label.
     """
     at_error, at_time = [], []
     for dataset, method in dict.fromkeys((row.dataset, row.method) for row in rows):
@@ -227,7 +228,7 @@ def compare(rows: Sequence[Row]) -> dict[str, Any]:
                 median_latency_ms(row),
                 median_error(row),
                 row.label,
-                selecting_error(row) if row.validation else None,
+                bounds[row.label],
             )
             for row in rows
             if (row.dataset, row.method) == (dataset, method) and is_point(row)

@@ -18,10 +18,8 @@ from mor_bench.analysis.frontier import (
     frontier_draws,
     median_error,
     median_latency_ms,
-    selecting_error,
 )
 from mor_bench.analysis.latency_intervals import verdict_of
-from mor_bench.results.row import Row
 
 Record = dict[str, Any]
 LogTimes = dict[str, dict[float, NDArray[np.float64]]]
@@ -54,7 +52,7 @@ def add_intervals(
         for record in records["error_at_time"]:
             if record["method"] == method:
                 _add_interval(record, "error", errors[record["target_latency_ms"]])
-    values = _measured_times(draws.rows, targets)
+    values = _measured_times(draws, targets)
     dataset = records["time_at_error"][0]["dataset"] if records["time_at_error"] else ""
     return [
         {
@@ -79,17 +77,14 @@ def _method_draws(
         n = draws.log_latencies.shape[1]
         return np.full((len(targets), n), inf), np.full((len(TARGET_TIMES_MS), n), inf)
     errors = draws.log_errors[mine]
-    selecting = _log_selecting([draws.rows[i] for i in mine], errors)
+    selecting = np.broadcast_to(_log_selecting(draws, mine), errors.shape)
     return frontier_draws(draws.log_latencies[mine], errors, targets, TARGET_TIMES_MS, selecting)
 
 
-def _log_selecting(rows: Sequence[Row], log_errors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the errors that select the frontier: measured on validation, or else resampled."""
-    out = log_errors.copy()
-    for i, row in enumerate(rows):
-        if row.validation:
-            out[i] = np.log(max(selecting_error(row), EXACT))
-    return out
+def _log_selecting(draws: Draws, numbers: Sequence[int]) -> NDArray[np.float64]:
+    """Return the errors (n, 1) that select the frontier; they are not resampled."""
+    bounds = [draws.error_bounds[draws.rows[i].label] for i in numbers]
+    return np.log(np.maximum(bounds, EXACT))[:, None]
 
 
 def _add_interval(record: Record, key: str, draws: NDArray[np.float64]) -> None:
@@ -103,16 +98,15 @@ def _add_interval(record: Record, key: str, draws: NDArray[np.float64]) -> None:
     record["not_reached"] = float(np.mean(~np.isfinite(draws)))
 
 
-def _measured_times(
-    rows: Sequence[Row], targets: Sequence[float]
-) -> dict[tuple[str, float], float]:
+def _measured_times(draws: Draws, targets: Sequence[float]) -> dict[tuple[str, float], float]:
     """Log latency of each method at each error without resampling; infinite if not reached."""
     out: dict[tuple[str, float], float] = {}
-    for method in dict.fromkeys(row.method for row in rows):
-        mine = [row for row in rows if row.method == method]
+    for method in dict.fromkeys(row.method for row in draws.rows):
+        numbers = [i for i, row in enumerate(draws.rows) if row.method == method]
+        mine = [draws.rows[i] for i in numbers]
         latencies = np.log([[median_latency_ms(row)] for row in mine])
         errors = np.log(np.maximum([[median_error(row)] for row in mine], EXACT))
-        at_error, _ = frontier_draws(latencies, errors, targets, (), _log_selecting(mine, errors))
+        at_error, _ = frontier_draws(latencies, errors, targets, (), _log_selecting(draws, numbers))
         for target, value in zip(targets, at_error[:, 0], strict=True):
             out[method, target] = float(value)
     return out

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from mor_bench.analysis.bootstrap import central_interval
-from mor_bench.analysis.draws import VALIDATION, Draws, Interval
-from mor_bench.analysis.frontier import median_latency_ms, number_or_inf, selecting_error
+from mor_bench.analysis.draws import Draws, Interval, answers_all, error_high
+from mor_bench.analysis.frontier import median_latency_ms, number_or_inf
 from mor_bench.analysis.latency_intervals import verdict_of
 from mor_bench.analysis.selection_text import worded
 from mor_bench.analysis.told import is_observed
@@ -44,7 +44,7 @@ def decide(
     asked = requirements.asked
     rows = [row for row in comparison.rows if row.dataset == dataset]
     figures = {row.label: bounds_of(row, draws.intervals.get(row.label, {})) for row in rows}
-    answering = [row for row in rows if _answers_all(row)]
+    answering = [row for row in rows if answers_all(row)]
     qualified = [row for row in answering if _meets(figures[row.label], asked)]
     qualified.sort(key=speed_rank)
     verdict = Verdict(
@@ -82,34 +82,16 @@ def asked_of(comparison: Comparison, dataset: str) -> dict[str, Any]:
 
 def bounds_of(row: Row, intervals: Mapping[str, Interval]) -> dict[str, float]:
     """Return the upper bounds of a row by the names of the limits; infinite where unknown."""
-    error = selecting_error(row)
-    _, error_high = intervals.get(VALIDATION if row.validation else "rel_l2_median", (0.0, error))
-    fresh = number_or_inf(row.hidden.rel_l2_median) if row.hidden else 0.0
     latency = row.latency_ms
     _, latency_high = intervals.get("latency_ms", (0.0, 0.0))
     stored = latency.high if latency and latency.high is not None else latency_high
     memory = row.memory_bytes.predict if row.memory_bytes else None
     return {
-        "error": max(error, error_high, fresh),
+        "error": error_high(row, intervals),
         "latency_ms": max(median_latency_ms(row), stored),
         "memory_bytes": number_or_inf(memory),
         "offline_s": number_or_inf(row.offline_core_s),
     }
-
-
-def error_bounds(rows: Sequence[Row], draws: Draws) -> dict[str, float]:
-    """Return, by label, the error that the verdict compares with a limit; infinite if unusable."""
-    return {
-        row.label: bounds_of(row, draws.intervals.get(row.label, {}))["error"]
-        if _answers_all(row)
-        else inf
-        for row in rows
-    }
-
-
-def _answers_all(row: Row) -> bool:
-    others = (row.hidden, row.validation)
-    return row.ok and row.n_failed == 0 and not any(o and o.rel_l2_max == inf for o in others)
 
 
 def _meets(figures: Mapping[str, float], asked: Mapping[str, float]) -> bool:

@@ -23,7 +23,7 @@ from mor_bench.report.canvas import (
     shortened,
     uncut,
 )
-from mor_bench.report.entries import best_per_method, entries_of
+from mor_bench.report.entries import Analysis, best_per_method, entries_of
 from mor_bench.report.labels import Note, Point, annotate
 from mor_bench.report.method_styles import readable, style_of
 from mor_bench.report.number_format import number
@@ -35,10 +35,10 @@ MOST_LINES = 14
 
 CAPTION = (
     "Height: the share of test loads (or of queries) with at most this error (or latency). Each "
-    "method has its configuration with the smallest ē. Full-order solves on the dataset's mesh are "
-    "in the lower panel only, because their error is that of their tolerance. A line that ends "
-    "below 100 % has loads without a prediction. An arrow leads to values beyond the axis. "
-    "Dotted: the dataset's need."
+    "method has its most accurate configuration, by the error that the verdict uses. Full-order "
+    "solves on the dataset's mesh are in the lower panel only, because their error is that of "
+    "their tolerance. A line that ends below 100 % has loads without a prediction. An arrow "
+    "leads to values beyond the axis. Dotted: the dataset's need."
 )
 
 
@@ -59,9 +59,11 @@ class Staircase:
         return float(self.values[max(0, int(np.ceil(share * len(self.values))) - 1)])
 
 
-def staircases(comparison: Comparison, dataset: str, key: str) -> list[Staircase]:
+def staircases(
+    comparison: Comparison, dataset: str, key: str, analysis: Analysis | None = None
+) -> list[Staircase]:
     """Read the errors in % ("relative_l2") or the latencies in ms ("latency_ms") of all methods."""
-    entries = entries_of(comparison, dataset)
+    entries = entries_of(comparison, dataset, analysis)
     names, found = short_names(entry.row for entry in entries), []
     for entry in best_per_method(entries):
         if key == "relative_l2" and entry.row.reference:
@@ -76,12 +78,15 @@ def staircases(comparison: Comparison, dataset: str, key: str) -> list[Staircase
     return sorted(found, key=lambda stairs: stairs.at(0.95))[:MOST_LINES]
 
 
-def error_distribution(comparison: Comparison, dataset: str) -> Picture | None:
+def error_distribution(
+    comparison: Comparison, dataset: str, analysis: Analysis | None = None
+) -> Picture | None:
     """Draw the distributions of error and latency; None without raw errors."""
-    errors = staircases(comparison, dataset, "relative_l2")
+    errors = staircases(comparison, dataset, "relative_l2", analysis)
     if not errors:
         return None
-    latencies, needs = staircases(comparison, dataset, "latency_ms"), needs_of(comparison, dataset)
+    latencies = staircases(comparison, dataset, "latency_ms", analysis)
+    needs = needs_of(comparison, dataset)
     finding = f"95 % of the loads: {shortened(errors[0].name, 40)} errs by at most "
     finding += f"{number(errors[0].at(0.95))} %"
     if len(errors) > 1:

@@ -21,7 +21,7 @@ from mor_bench.report.canvas import (
     plain,
     shortened,
 )
-from mor_bench.report.entries import Entry, best_per_method, entries_of
+from mor_bench.report.entries import Analysis, Entry, best_per_method, entries_of
 from mor_bench.report.method_styles import style_of
 from mor_bench.report.number_format import number
 from mor_bench.report.published_figures import SCENES, scene_of
@@ -34,8 +34,8 @@ FAR = 2.0
 """Samples above this multiple of the 99th percentile lie beyond the axis."""
 
 CAPTION = (
-    "Each dot is a test sample. Each panel shows a method's configuration "
-    "with the smallest ē, of the validation part if there is one. "
+    "Each dot is a test sample. Each panel shows a method's most accurate "
+    "configuration, by the error that the verdict uses. "
     "Full-order solves on the dataset's mesh are left out. "
     "The line is the least-squares line through the origin. "
     "Its slope (mm of error per m of deformation) compares methods at a glance. "
@@ -63,12 +63,14 @@ class Samples:
         return float(x @ y / (x @ x)) if len(x) and x.max() > 0 and y.max() > 0 else None
 
 
-def error_against_deformation(comparison: Comparison, dataset: str) -> Picture | None:
+def error_against_deformation(
+    comparison: Comparison, dataset: str, analysis: Analysis | None = None
+) -> Picture | None:
     """Draw the error e of every test sample over its largest displacement.
 
     None if there are no raw samples with an error.
     """
-    entries = entries_of(comparison, dataset)
+    entries = entries_of(comparison, dataset, analysis)
     best = [e for e in best_per_method(entries) if not e.row.reference]
     found = [s for e in best if (s := _read(comparison, e)) is not None]
     panels = [samples for samples in found if samples.slope is not None]
@@ -78,9 +80,9 @@ def error_against_deformation(comparison: Comparison, dataset: str) -> Picture |
     if left_out:
         caption += f" Without errors: {', '.join(left_out)}."
     if len(panels) > MOST_PANELS:
-        panels.sort(key=lambda s: s.entry.selecting_error_m)
+        panels.sort(key=lambda s: s.entry.error_bound)
         more = [s.entry.method for s in panels[MOST_PANELS:]]
-        caption += f" Not drawn, because their ē is larger: {', '.join(more)}."
+        caption += f" Not drawn, because they are less accurate: {', '.join(more)}."
         panels = panels[:MOST_PANELS]
     scene = SCENES.get(scene_of(dataset))
     slope = scene.network.slope if scene else None

@@ -28,7 +28,7 @@ from mor_bench.report.canvas import (
     shortened,
     uncut,
 )
-from mor_bench.report.entries import Entry, entries_of
+from mor_bench.report.entries import Analysis, Entry, entries_of
 from mor_bench.report.number_format import percent
 from mor_bench.report.projection import View
 from mor_bench.report.short_names import short_names
@@ -46,8 +46,8 @@ PANEL_IN = 2.8
 READING = (
     "Each dot is a load patch. Its colour is the median relative L2 error of the test samples with "
     "a load there. A cross marks an infinite median. Small grey dots are patches without a test "
-    "sample. Each panel shows the configuration with the smallest ē among the methods that are "
-    "told the same, selected on validation samples if there are any."
+    "sample. Each panel shows the most accurate configuration among the methods that are told the "
+    "same, by the error that the verdict uses."
 )
 
 
@@ -99,7 +99,9 @@ def median_per_patch(
     return out
 
 
-def error_over_position(comparison: Comparison, dataset: str) -> Picture | None:
+def error_over_position(
+    comparison: Comparison, dataset: str, analysis: Analysis | None = None
+) -> Picture | None:
     """Draw the median error at each load patch, a panel for the best of each class of methods.
 
     None without the patches' centres or raw samples.
@@ -111,7 +113,7 @@ def error_over_position(comparison: Comparison, dataset: str) -> Picture | None:
     except (OSError, KeyError):
         return None
     maps, observed = [], is_observed(comparison, dataset)
-    entries = entries_of(comparison, dataset)
+    entries = entries_of(comparison, dataset, analysis)
     names = short_names([e.row for e in entries])
     for entry in _best_of_each_class(entries):
         try:
@@ -158,10 +160,10 @@ def _finding(maps: list[PatchErrors]) -> str:
 
 
 def _best_of_each_class(entries: list[Entry]) -> list[Entry]:
-    """Return the configuration with the smallest ē of each class; references are left out."""
-    ran = [e for e in entries if e.ran and not e.row.reference and isfinite(e.selecting_error_m)]
+    """Return the most accurate configuration of each class; references are left out."""
+    ran = [e for e in entries if e.ran and not e.row.reference and isfinite(e.error_bound)]
     return [
-        min((e for e in ran if e.row.told == told), key=lambda e: e.selecting_error_m)
+        min((e for e in ran if e.row.told == told), key=lambda e: e.error_bound)
         for told in classes_of(e.row for e in ran)
     ]
 

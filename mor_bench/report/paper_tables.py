@@ -159,13 +159,13 @@ def same_error_or_time(dataset: str, entries: Sequence[Entry]) -> list[TextTable
     """Build the paper's two comparisons with its best network: at the same error and time.
 
     The first shows each method's fastest configuration that is as accurate as the network. The
-    second shows its most accurate configuration that is as fast. Validation errors select, where
-    there are any; the figures are those on the test set. Empty if no network ran.
+    second shows its most accurate configuration that is as fast. The errors of the verdict select;
+    the figures are those on the test set. Empty if no network ran.
     """
     network = _best_network(entries)
     if network is None:
         return []
-    accurate = [e for e in entries if e.ran and e.selecting_error_m <= network.selecting_error_m]
+    accurate = [e for e in entries if e.ran and e.error_bound <= network.error_bound]
     fast = [e for e in entries if e.ran and e.latency_ms <= network.latency_ms]
     error, time = metres(network.mean_error_m), number(network.latency_ms)
     methods = list(dict.fromkeys(e.method for e in entries))
@@ -173,15 +173,15 @@ def same_error_or_time(dataset: str, entries: Sequence[Entry]) -> list[TextTable
         _comparison(
             "Comparison at the same error",
             f"The fastest configuration of each method that is as accurate as {network.label} "
-            f"(ē = {error} m), by the validation part if there is one.",
+            f"(ē = {error} m), by the error that the verdict uses.",
             _least(methods, accurate, lambda e: e.latency_ms),
             SAME_ERROR if scene_of(dataset) == COMPARED else {},
         ),
         _comparison(
             "Comparison at the same time",
-            f"The most accurate configuration of each method, by the validation part if there is "
-            f"one, within {time} ms, the latency of {network.label}.",
-            _least(methods, fast, lambda e: e.selecting_error_m),
+            f"The most accurate configuration of each method, by the error that the verdict "
+            f"uses, within {time} ms, the latency of {network.label}.",
+            _least(methods, fast, lambda e: e.error_bound),
             SAME_TIME if scene_of(dataset) == COMPARED else {},
         ),
     ]
@@ -190,7 +190,7 @@ def same_error_or_time(dataset: str, entries: Sequence[Entry]) -> list[TextTable
 def _best_network(entries: Sequence[Entry]) -> Entry | None:
     """Return the most accurate network with a latency, under any method name."""
     networks = [entry for entry in entries if _size(entry) is not None]
-    best = min(networks, key=lambda e: e.selecting_error_m, default=None)
+    best = min(networks, key=lambda e: e.error_bound, default=None)
     if best is None or not (isfinite(best.mean_error_m) and isfinite(best.latency_ms)):
         return None
     return best

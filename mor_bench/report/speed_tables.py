@@ -29,9 +29,10 @@ PAIRWISE_LEGEND = (
 )
 
 TARGETS_NOTE = (
-    "Test errors, interpolated along the frontier of a method. The validation part (without one: "
-    "the test set) selects its configurations: no other one is both faster and more accurate. "
-    "In brackets: the configuration selected for the target, with its figure on the test set."
+    "Test errors, interpolated along the frontier of a method. The error of the verdict (the 95 % "
+    "upper bound on the validation part) selects its configurations: no other one is both faster "
+    "and more accurate. In brackets: the configuration that the verdict would choose for the "
+    "target, with its figure on the test set."
 )
 
 FACTORS = (1.0, 1.5, 2.0, 5.0, 10.0, 100.0)
@@ -201,7 +202,7 @@ def break_even_table(
         "divided by those that a query saves. "
         "With tuning: all fits of the method count, failed ones too. "
         "The saving is against the fastest full-order configuration that is at least as accurate "
-        "on the validation part. "
+        "by the same rule. "
         "Never: the full-order model is as fast. Errors that a method does not reach are left out."
     )
     return TextTable("Whole cost", note, headings, rows) if rows else None

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mor_bench.analysis.frontier import selecting_error
+from mor_bench.analysis.analyse import N_RESAMPLES
+from mor_bench.analysis.draws import draws_of
 from mor_bench.analysis.seeds import seed_interval
 from mor_bench.errors import MorBenchError
 from mor_bench.results.comparison import Comparison
@@ -138,11 +139,13 @@ def _spread(errors: Sequence[float]) -> Spread:
 def draw_learning_curves(stage: Stage, fits: Mapping[str, CachedFit]) -> None:
     """Measure errors over the number of training samples.
 
-    Each method that learns is measured in its configuration with the least validation error.
+    Each method that learns is measured in its most accurate configuration, by the error that the
+    verdict uses.
     """
     comparison, name = stage.comparison, stage.spec.name
     comparison.learning = [point for point in comparison.learning if point.dataset != name]
     methods = [cached.configuration.method.name for cached in fits.values()]
+    bounds = draws_of(comparison, name, N_RESAMPLES, np.random.default_rng(0)).error_bounds
     for method in dict.fromkeys(methods):
         mine = [
             (stage.row(label), cached)
@@ -151,7 +154,7 @@ def draw_learning_curves(stage: Stage, fits: Mapping[str, CachedFit]) -> None:
         ]
         if not mine:
             continue
-        best, cached = min(mine, key=lambda pair: selecting_error(pair[0]))
+        best, cached = min(mine, key=lambda pair: bounds[pair[0].label])
         for n in _learning_sizes(stage.training_data.n_train):
             comparison.learning.append(_learning_point(stage, cached, n, best))
             comparison.write()

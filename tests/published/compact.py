@@ -1,10 +1,10 @@
-"""A run in compact form: results, conclusions, and the errors of every test sample.
+"""A run in compact form: results, conclusions, the errors of samples and the latencies of queries.
 
 FOLDER/results.json       as the run wrote it
 FOLDER/comparison.json    the same; wordings of sentences follow the code, numbers never change
-FOLDER/errors.h5                               per-sample errors in single precision
+FOLDER/errors.h5                               errors of samples, latencies of queries, float32
 
-Latencies of single queries, predictions and loss curves are left out.
+Predictions and loss curves are left out.
 """
 
 from __future__ import annotations
@@ -20,12 +20,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.analysis.draws import Draws, Interval, draws_of, headlines
+from mor_bench.analysis.analyse import analyse
+from mor_bench.analysis.draws import Draws, Interval
 from mor_bench.analysis.selection import decide
 from mor_bench.analysis.verdict import RULE, Verdict, needs_of
 from mor_bench.measure.error_metrics import ERRORS as FIGURES
 from mor_bench.measure.error_metrics import SampleErrors, summary
 from mor_bench.results.comparison import Comparison
+from mor_bench.results.json_file import without_nan
 from mor_bench.results.row import Row
 from mor_bench.snapshots.store import write_atomically
 from tests.published.stored import content_of
@@ -33,11 +35,8 @@ from tests.published.stored import content_of
 ERRORS = "errors.h5"
 
 LEFT_OUT = (
-    "latency_ms",
     "all_threads_ms",
     "gc_ms",
-    "process",
-    "round",
     "used",
     "loss_curve",
     "validation_curve",
@@ -53,7 +52,15 @@ LEFT_OUT = (
 PACKED_BYTES = 8192
 """Larger arrays are compressed; for smaller ones the description of the compression is larger."""
 
-KEPT_OF_DATASETS = ("test_regions", "validation_regions", "singular_values", "snapshots_norm")
+KEPT_OF_DATASETS = (
+    "test_regions",
+    "validation_regions",
+    "singular_values",
+    "snapshots_norm",
+    "points",
+    "cells",
+    "patch_centres",
+)
 
 
 def compact(run: Path, folder: Path, shown: str) -> None:
@@ -83,6 +90,8 @@ def compact(run: Path, folder: Path, shown: str) -> None:
 def _write(group: h5py.Group, arrays: Mapping[str, NDArray[Any]]) -> None:
     for name, array in arrays.items():
         stored = array.astype(np.float32) if array.dtype == np.float64 else array
+        if array.dtype.kind == "i":
+            stored = array.astype(np.min_scalar_type(int(array.max(initial=0))))
         packed = {"compression": "gzip", "shuffle": True} if stored.nbytes > PACKED_BYTES else {}
         group.create_dataset(name, data=stored, track_times=False, **packed)
 
@@ -187,34 +196,37 @@ def _relative(errors: NDArray[Any]) -> dict[str, float]:
     }
 
 
-def wrong_intervals(folder: Path) -> Iterator[str]:
-    """Resample the errors of the samples again; yield each figure of comparison.json that differs.
+def wrong_conclusions(folder: Path) -> Iterator[str]:
+    """Draw all conclusions again from the stored samples; yield each number that differs.
 
-    Latencies of single queries are not stored, so their intervals are those of results.json.
+    Of verdicts, labels are compared; see `wrong_verdicts` for their sentences.
     """
-    run, analysis = StoredRun.read(folder), content_of("comparison.json", folder)
-    settings = analysis["settings"]
-    for name in run.datasets:
-        generator = np.random.default_rng(settings["seed"])
-        draws = draws_of(run, name, settings["n_resamples"], generator)
-        stated = {r["label"]: r for r in analysis["rows"] if r["dataset"] == name}
-        rows = [row for row in run.rows if row.dataset == name and row.ok]
-        if set(stated) != {row.label for row in rows}:
-            yield f"{name}: the rows of results.json and comparison.json differ"
-        for row in rows:
-            again, said = headlines(row, draws), stated.get(row.label, {})
-            if row.latency_ms is None or row.latency_ms.low is None:
-                again.pop("latency_ms")
-            for figure, ends in again.items():
-                if isinstance(ends, dict) and not _same(ends, said.get(figure)):
-                    yield f"{name}, {row.label}: {figure} is {ends}, stated as {said.get(figure)}"
+    run, stated = StoredRun.read(folder), content_of("comparison.json", folder)
+    settings = stated["settings"]
+    again = analyse(run, n_resamples=settings["n_resamples"], seed=settings["seed"])
+    plain: dict[str, Any] = without_nan(again)
+    for verdict in (*plain["verdicts"], *(stated := json.loads(json.dumps(stated)))["verdicts"]):
+        for sentences in ("headline", "evidence", "beside"):
+            verdict.pop(sentences, None)
+    yield from _differences(plain, stated, "")
 
 
-def _same(computed: Mapping[str, float | None], said: Mapping[str, float | None] | None) -> bool:
-    return said is not None and all(
-        _close(*(inf if x is None else x for x in (value, said[end])))
-        for end, value in computed.items()
-    )
+def _differences(computed: Any, said: Any, where: str) -> Iterator[str]:
+    if isinstance(computed, dict) and isinstance(said, dict) and set(computed) == set(said):
+        name = said.get("label") or said.get("method") or said.get("dataset")
+        where = f"{where} ({name})" if isinstance(name, str) else where
+        for key in computed:
+            yield from _differences(computed[key], said[key], f"{where}/{key}")
+    elif isinstance(computed, list) and isinstance(said, list) and len(computed) == len(said):
+        for i, (value, other) in enumerate(zip(computed, said, strict=True)):
+            yield from _differences(value, other, f"{where}/{i}")
+    elif not _same(computed, said):
+        yield f"{where} is {computed}, stated as {said}"
+
+
+def _same(computed: Any, said: Any) -> bool:
+    numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in (computed, said))
+    return _close(computed, said) if numbers else bool(computed == said)
 
 
 def _close(value: float, said: float) -> bool:

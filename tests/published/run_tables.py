@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import inf, isfinite, isnan
 from typing import Any
 
-from mor_bench.analysis.break_even import FULL_ORDER, best_of, break_even, sufficient
-from mor_bench.analysis.draws import VALIDATION
-from mor_bench.analysis.frontier import median_error, median_latency_ms, selecting_error
+from mor_bench.analysis.break_even import FULL_ORDER, break_even
+from mor_bench.analysis.frontier import median_error, median_latency_ms, number_or_inf
 from mor_bench.analysis.told import class_text, is_observed
 from mor_bench.report.entries import entries_of
 from mor_bench.report.number_format import DASH, number, percent, short_swept
@@ -58,9 +57,9 @@ def _by_method(rows: Iterable[Row]) -> dict[str, list[Row]]:
     return found
 
 
-def chosen(rows: Sequence[Row]) -> Row:
-    """Return the configuration that the validation samples select: the smallest median error."""
-    return min(rows, key=lambda row: (selecting_error(row), row.label))
+def chosen(rows: Sequence[Row], bounds: Mapping[str, float]) -> Row:
+    """Return the most accurate configuration, by the error that the verdict uses."""
+    return min(rows, key=lambda row: (bounds[row.label], row.label))
 
 
 def _configuration(row: Row) -> str:
@@ -116,26 +115,25 @@ def _queries(run: Comparison, row: Row, need: float) -> str:
     """Return the break-even number of queries of a row against `fem` at its error."""
     if row.method == FULL_ORDER:
         return DASH
+    rows = [other for other in run.rows if other.dataset == row.dataset]
     record = {"dataset": row.dataset, "method": row.method, "target_rel_l2_median": need}
-    reached = best_of(row) if error_bound(run, row) <= need else None
-    (found,) = break_even(run.rows, [{**record, "best": reached}])
+    bounds = error_bounds(run, row.dataset)
+    best = {"label": row.label, "latency_ms": median_latency_ms(row)}
+    record["best"] = best if bounds[row.label] <= need else None
+    (found,) = break_even(rows, [record], bounds)
     return f"{found['queries']:,}" if found["queries"] is not None else str(found["verdict"])
 
 
-def error_bound(run: Comparison, row: Row) -> float:
-    """Return the error that the verdict compares with a limit; see `selection.RULE`."""
-    fresh = row.hidden.rel_l2_median if row.hidden else 0.0
-    if row.n_failed:
-        return inf
-    for stored in (run.analysis or {})["rows"]:
-        if (stored["dataset"], stored["label"]) == (row.dataset, row.label):
-            high = stored.get(VALIDATION, stored["rel_l2_median"])["high"]
-            return max(selecting_error(row), fresh, inf if high is None else high)
-    return inf
+def error_bounds(run: Comparison, dataset: str) -> dict[str, float]:
+    """Return, by label, the error that selects each configuration that ran on a dataset."""
+    stored = [r for r in (run.analysis or {})["rows"] if r["dataset"] == dataset]
+    return {r["label"]: number_or_inf(r["error_bound"]) for r in stored}
 
 
-def _bounds(run: Comparison, rows: Sequence[Row]) -> dict[str, float]:
-    return {row.label: error_bound(run, row) for row in rows}
+def sufficient(rows: Sequence[Row], bounds: Mapping[str, float], limit: float) -> Row | None:
+    """Return the fastest row whose error meets a limit by the rule of the verdict."""
+    within = [row for row in rows if bounds[row.label] <= limit]
+    return min(within, key=median_latency_ms, default=None)
 
 
 def selected(source: str, dataset: str = "", methods: str = "", by: str = "need") -> str:
@@ -147,8 +145,9 @@ def selected(source: str, dataset: str = "", methods: str = "", by: str = "need"
     run = run_of(source)
     name = dataset or next(iter(run.datasets))
     need = float((run.datasets[name].get("needs") or {}).get("error", 0.01))
+    bounds = error_bounds(run, name)
     rows = [
-        (sufficient(own, _bounds(run, own), need) if by == "need" else None) or chosen(own)
+        (sufficient(own, bounds, need) if by == "need" else None) or chosen(own, bounds)
         for own in _by_method(_rows(run, dataset, methods)).values()
     ]
     headings = ["method", "is given", "selected", *ERRORS_SHOWN, "fresh test: median %", "ms"]
@@ -179,14 +178,14 @@ def fastest(source: str, dataset: str = "", methods: str = "") -> str:
     run = run_of(source)
     name = dataset or next(iter(run.datasets))
     headings = ["method", "is given", *(f"≤ {number(100 * level)} %" for level in LEVELS)]
-    body = []
+    body, bounds = [], error_bounds(run, name)
     for method, rows in _by_method(_rows(run, dataset, methods)).items():
         cells = [f"`{method}`", class_text(rows[0], is_observed(run, name))]
         for level in LEVELS:
-            best = sufficient(rows, _bounds(run, rows), level)
+            best = sufficient(rows, bounds, level)
             missed = best is not None and median_error(best) > level
             cells.append((DASH if best is None else _latency(run, best)) + " †" * missed)
-        least = chosen(rows)
+        least = chosen(rows, bounds)
         largest = least.error.rel_l2_max if least.error else inf
         cells.append(f"{_error(run, least)}; {_percent(largest)}")
         body.append(cells)
@@ -207,9 +206,10 @@ def indicated(source: str, methods: str = "") -> str:
     """Show how well errors are estimated without the reference; SOURCE is FOLDER,FOLDER,…."""
     runs = [run_of(folder) for folder in source.split(",")]
     names = [next(iter(run.datasets)) for run in runs]
-    columns = [
-        {m: chosen(own) for m, own in _by_method(_rows(run, "", methods)).items()} for run in runs
-    ]
+    columns = []
+    for run, name in zip(runs, names, strict=True):
+        bounds, mine = error_bounds(run, name), _by_method(_rows(run, "", methods))
+        columns.append({method: chosen(own, bounds) for method, own in mine.items()})
     body = []
     for method in columns[0]:
         cells = [f"`{method}`", class_text(columns[0][method], is_observed(runs[0], names[0]))]
@@ -238,7 +238,9 @@ def paper(source: str, methods: str = "") -> str:
         run = run_of(folder)
         name = next(iter(run.datasets))
         entries = [
-            e for e in entries_of(run, name) if not methods or e.method in methods.split(",")
+            e
+            for e in entries_of(run, name, run.analysis)
+            if not methods or e.method in methods.split(",")
         ]
         table = against_the_paper(name, entries)
         if table is None:
