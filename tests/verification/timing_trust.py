@@ -27,21 +27,22 @@ import numpy as np
 
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.latency_intervals import latency_intervals
-from mor_bench.measure.latency import PROTOCOLS, Queries, measure_latencies
+from mor_bench.measure.latency import PROTOCOLS, Queries, TimedMethod, measure_latencies
 from mor_bench.measure.timing import Timing, why_unstable
 from mor_bench.results.comparison import Comparison
 from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.snapshots.dataset import load_dataset
 from mor_bench.snapshots.sampling import draw_loads
 from tests.synthetic import a_row
-from tests.timed_methods import timed_method
+from tests.timed_methods import fitted_method, timed_method
 from tests.verification.trust_record import trust_record
 
 DATASET = "beam-tiny"
 AT_ONCE = 20
 """Comparisons, of three processes each, that are measured side by side."""
 
-RERUN_PAIRS = 15
-"""Pairs of successive measurements; with the methods below, 105 repeated medians."""
+RERUN_PAIRS = 10
+"""Pairs of successive measurements; with the methods below, 110 repeated medians."""
 
 RERUN_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "fem": ("mor_bench.surrogates.fem:FullFEM", {"tolerance": 1e-4}),
@@ -52,6 +53,15 @@ RERUN_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "linear-fem": ("mor_bench.surrogates.linear_fem:LinearFEM", {}),
     "slowed": ("tests.third_party:Slowed", {"part": 0.5}),
 }
+RERUN_FITTED: dict[str, tuple[str, dict[str, Any]]] = {
+    "pod": ("mor_bench.surrogates.pod:PODGalerkin", {"n_modes": 20}),
+    "pod-tensor": ("mor_bench.surrogates.pod_tensor:TensorPOD", {"n_modes": 20}),
+    "hpod": ("mor_bench.surrogates.hpod:HyperReducedPOD", {"n_modes": 20}),
+    "pca-regression": ("mor_bench.surrogates.pca_regression:PCARegression", {}),
+}
+"""Methods that learn from the first `SAMPLES` samples."""
+
+SAMPLES = 300
 
 Part = dict[str, Any]
 """Counts of a part, each with its total (`of`), and whether all meet their goals (`trusted`)."""
@@ -66,12 +76,11 @@ def _queries(scene: Scene, folder: Path) -> Queries:
 def _measured(
     scene: Scene,
     folder: Path,
-    methods: dict[str, tuple[str, dict[str, Any]]],
+    timed: dict[str, TimedMethod],
     seed: int,
     processes: str = "full",
 ) -> dict[str, Timing]:
     protocol = replace(PROTOCOLS[processes], all_cores=False)
-    timed = {name: timed_method(scene, folder, *method) for name, method in methods.items()}
     timings = measure_latencies(timed, _queries(scene, folder), protocol, 1, seed=seed)
     failed = {name: timing.failed for name, timing in timings.items() if timing.failed}
     if failed:
@@ -118,8 +127,13 @@ def _count_pairs(scene: Scene, folder: Path, n: int, protocol: str) -> dict[str,
     false, found = 0, 0
     for start in range(0, n, AT_ONCE):
         numbers = range(start, min(n, start + AT_ONCE))
-        methods: dict[str, tuple[str, dict[str, Any]]] = {
-            f"{name}{i}": ("tests.third_party:Slowed", {"part": 0.1 if name == "slowed" else 0.0})
+        methods = {
+            f"{name}{i}": timed_method(
+                scene,
+                folder,
+                "tests.third_party:Slowed",
+                {"part": 0.1 if name == "slowed" else 0.0},
+            )
             for i in numbers
             for name in ("one", "same", "slowed")
         }
@@ -140,12 +154,17 @@ def reruns(scene: Scene, folder: Path, n: int) -> Part:
     Like a repeated run, every measurement has the same seed.
     """
     counts: dict[str, dict[str, Any]] = {}
+    methods = {name: timed_method(scene, folder, *found) for name, found in RERUN_METHODS.items()}
+    samples = load_dataset(DATASET, SAMPLES, cache=folder / "cache").train
+    for name, found in RERUN_FITTED.items():
+        model = folder / f"{name}.safetensors"
+        methods[name] = fitted_method(scene, model, *found, samples)
     for protocol in PROTOCOLS:
         before: dict[str, Any] = {}
         inside: list[bool] = []
         misses: list[str] = []
         for number in range(n + 1):
-            timings = _measured(scene, folder, RERUN_METHODS, 0, protocol)
+            timings = _measured(scene, folder, methods, 0, protocol)
             after = {name: timing.samples for name, timing in timings.items()}
             for name, (low, high) in latency_intervals(before).items():
                 median = float(np.median(after[name]["latency_ms"]))
@@ -166,7 +185,7 @@ def reruns(scene: Scene, folder: Path, n: int) -> Part:
 
 def busy(scene: Scene, folder: Path, _: int) -> Part:
     """Check that a timing is called unstable beside a busy process, and only then."""
-    methods = {"fem": RERUN_METHODS["fem"]}
+    methods = {"fem": timed_method(scene, folder, *RERUN_METHODS["fem"])}
     quiet = why_unstable(_measured(scene, folder, methods, 0)["fem"], 1)
     other = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
