@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import matplotlib
@@ -20,10 +20,15 @@ from matplotlib import image
 from numpy.typing import NDArray
 from PIL import Image
 
-from mor_bench.report.canvas import as_png
+from mor_bench.report.canvas import Picture, as_png
+from mor_bench.report.entries import Analysis
+from mor_bench.report.error_against_deformation import error_against_deformation
 from mor_bench.report.error_against_time import error_against_time
+from mor_bench.report.error_over_position import error_over_position
 from mor_bench.report.figures import explain_names
+from mor_bench.results.comparison import Comparison
 from mor_bench.snapshots.store import write_atomically
+from tests.published.compact import ERRORS, StoredRun
 from tests.published.stored import ROOT, EvidenceError, run_of
 
 DRAWN = re.compile(
@@ -33,12 +38,21 @@ DRAWN = re.compile(
 PICTURE = re.compile(r"!\[[^\]]*\]\((?P<path>[^)]+\.png)\)")
 
 
+DRAWINGS: dict[str, Callable[[Comparison, str, Analysis], Picture | None]] = {
+    "error-against-time": error_against_time,
+    "error-against-deformation": error_against_deformation,
+    "error-over-position": error_over_position,
+}
+"""The pictures of a run that a page may show."""
+
+
 def drawn(source: str, kind: str, dataset: str) -> bytes:
     """Draw a figure from a stored run; return the PNG with its digests."""
-    if kind != "error-against-time":
+    if kind not in DRAWINGS:
         raise EvidenceError(f"{source}: there is no picture {kind!r}.")
-    run = run_of(source)
-    picture = error_against_time(run, dataset, run.analysis or {})
+    analysis = run_of(source).analysis or {}
+    run = StoredRun.read(ROOT / source)
+    picture = DRAWINGS[kind](run, dataset, analysis)
     if picture is None:
         raise EvidenceError(f"{source}: no configuration of {dataset} can be drawn.")
     explain_names(picture, run, dataset)
@@ -52,7 +66,8 @@ def drawn(source: str, kind: str, dataset: str) -> bytes:
 
 def source_digest(source: str) -> str:
     """Digest of the files that a picture of a run is drawn from."""
-    files = [(ROOT / source / name).read_bytes() for name in ("results.json", "comparison.json")]
+    names = ("results.json", "comparison.json", ERRORS)
+    files = [(ROOT / source / name).read_bytes() for name in names]
     return hashlib.sha256(b"\0".join(files)).hexdigest()
 
 
