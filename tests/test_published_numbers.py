@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -19,6 +20,7 @@ from tests.published.claims import (
 from tests.published.compact import ERRORS, wrong_conclusions, wrong_summaries, wrong_verdicts
 from tests.published.pictures import stale_pictures
 from tests.published.stored import REPORTS, ROOT
+from tests.verification.trust_record import git
 
 NAMES = [path.relative_to(ROOT).as_posix() for path in pages()]
 RUNS = sorted(
@@ -32,6 +34,7 @@ FILES = [
     for path in sorted((ROOT / folder).glob("*.toml"))
 ]
 MOST_BYTES = 50e6
+COMMIT = re.compile(r'"?commit"?\s*[:=]\s*"([0-9a-f]{40})')
 
 
 def _read(page: str) -> str:
@@ -92,6 +95,20 @@ def test_the_conclusions_of_a_run_follow_from_its_samples(run: str) -> None:
 def test_the_verdict_of_a_run_is_that_of_its_rows(run: str) -> None:
     wrong = list(wrong_verdicts(REPORTS / run))
     assert not wrong, "\n".join(wrong)
+
+
+def test_every_record_names_a_commit_of_the_history() -> None:
+    if not (ROOT / ".git").exists() or git("rev-parse", "--is-shallow-repository") == "true":
+        pytest.skip("the history is not here")
+    files = [path for folder in ("reports", "datasets", "trained") for path in _records(folder)]
+    found = {commit for path in files for commit in COMMIT.findall(path.read_text("utf-8"))}
+    assert len(found) > 3
+    assert found <= set(git("rev-list", "HEAD").split())
+
+
+def _records(folder: str) -> list[Path]:
+    """Return the tracked files of a folder that may name the commit of a measurement."""
+    return [ROOT / name for name in git("ls-files", f"{folder}/*.json", f"{folder}/*.toml").split()]
 
 
 def test_the_evidence_is_small() -> None:
