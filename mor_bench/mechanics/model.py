@@ -133,7 +133,7 @@ def free_rigid_modes(scene: Scene) -> list[str]:
         held = np.concatenate([held, springs @ modes.reshape(-1, 6) / springs.max()])
     if len(held) == 0:
         return list(RIGID_MODES)
-    _, s, vt = np.linalg.svd(held, full_matrices=True)
+    _, s, vt = np.linalg.svd(np.linalg.qr(held, mode="r"), full_matrices=True)
     free = vt[np.append(s, np.zeros(6 - len(s))) <= 1e-9 * s[0]]
     return [RIGID_MODES[int(np.abs(mode).argmax())] for mode in free]
 
