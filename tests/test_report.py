@@ -180,7 +180,7 @@ def test_the_page_lists_every_configuration_once_and_omits_unmeasured_figures(
     text = text_of(page)
     for word in ("results.json", "samples/", "x-min", "2.4", "Nothing is extrapolated"):
         assert word in text
-    for absent in ("Timing", "Memory and cost", "Named test sets", "Hidden test set", "Tuning"):
+    for absent in ("Timing", "Memory and cost", "Named test sets", "Fresh test set", "Tuning"):
         assert f"<caption>{absent}" not in page
     assert "nan" not in text.split()
     assert not re.search(r"<tbody>\s*</tbody>", page)
@@ -295,7 +295,7 @@ def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis
     assert [title for title in captions if not title.startswith("Who is faster")] == [
         "Configurations of beam-coarse",
         "Named test sets",
-        "Hidden test set",
+        "Fresh test set",
         "Worst test loads of each method",
         "Test loads that are hard for most methods",
         "Time at error: median latency at a median relative L2 error",
@@ -304,7 +304,7 @@ def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis
         "Timing",
         "Memory and cost",
         "Named test sets",
-        "Hidden test set",
+        "Fresh test set",
         "Tuning budget",
         "Error measures of the networks",
         "Against the paper, by slope and relative error",
@@ -324,7 +324,7 @@ def test_the_page_has_a_section_for_every_measurement(rich: Comparison, analysis
     for said in (
         "processes differ by 14 %",
         "To draw them again: --test-seed 7.",
-        "as large on the hidden test set as on the shipped one",
+        "as large on the fresh test set as on the shipped one",
         "no graphics processor). It is for: 20,000 samples or more, on a GPU",
         "errors over 13 load regions, latencies over 5 processes that differ by",
         "6 of 5 (over)",

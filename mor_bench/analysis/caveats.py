@@ -1,4 +1,4 @@
-"""Caveats of a ranking: the hidden test set, untested regimes, tuning budgets."""
+"""Caveats of a ranking: the fresh test set, untested regimes, tuning budgets."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def _recall_cell(found: SetErrors | FlagCounts, median: float) -> str:
 
 
 def hidden_table(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> TextTable | None:
-    """Build the table of errors on the hidden test set and on the shipped one."""
+    """Build the table of errors on the fresh test set and on the shipped one."""
     by_label = {entry.label: entry for entry in entries}
     rows = []
     seeds: dict[int, None] = {}
@@ -114,12 +114,12 @@ def hidden_table(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> 
     headings = ["configuration", "samples", "median (%)", "p95 (%)", "max (%)"]
     headings += ["main test set: median (%)", "ratio", "verdict"]
     note = (
-        "Fresh loads of the same distribution that no author of a method has seen. Worse: "
-        "the errors differ by more than the numbers of samples explain."
+        "Loads of the same distribution, drawn after all fits: no author of a method has seen "
+        "them. Worse: the errors differ by more than the numbers of samples explain."
     )
     if seeds:
         note += f" To draw them again: --test-seed {', '.join(map(str, seeds))}."
-    return TextTable("Hidden test set", note, headings, rows) if rows else None
+    return TextTable("Fresh test set", note, headings, rows) if rows else None
 
 
 def tuning_table(dataset: str, analysis: Analysis) -> TextTable | None:

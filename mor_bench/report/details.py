@@ -11,7 +11,7 @@ from mor_bench.report.caveat_tables import (
     regimes_table,
     tuning_table,
 )
-from mor_bench.report.entries import Analysis, Entry, best_per_method, entries_of
+from mor_bench.report.entries import Analysis, Entry, entries_of, selected_per_method
 from mor_bench.report.measurement_tables import indicated, resources, seeds, timing, training
 from mor_bench.report.paper_tables import against_the_paper, error_measures, same_error_or_time
 from mor_bench.report.speed_tables import break_even_table, pairwise, profile_table
@@ -44,13 +44,13 @@ def dataset_details(comparison: Comparison, dataset: str, analysis: Analysis) ->
 def hard_cases(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> list[TextTable]:
     """List the tables about loads that are harder than those of the main test set, or fresh.
 
-    Each method has its best configuration there.
+    Each method has its fastest configuration that qualifies there, or else its most accurate one.
     """
-    best = best_per_method(entries)
+    chosen = selected_per_method(entries)
     tables = (
-        named_sets(best),
-        out_of_range([entry for entry in best if entry.row.sets]),
-        hidden_table(dataset, best, analysis),
+        named_sets(chosen),
+        out_of_range([entry for entry in chosen if entry.row.sets]),
+        hidden_table(dataset, chosen, analysis),
     )
     return [table for table in tables if table is not None]
 

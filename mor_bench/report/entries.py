@@ -234,6 +234,15 @@ def best_per_method(entries: Sequence[Entry]) -> list[Entry]:
     ]
 
 
+def selected_per_method(entries: Sequence[Entry]) -> list[Entry]:
+    """Return each method's fastest configuration that qualifies, or else its most accurate one."""
+    fastest: dict[str, Entry] = {}
+    for entry in sorted(entries, key=lambda e: e.latency_ms):
+        if entry.qualified:
+            fastest.setdefault(entry.method, entry)
+    return [fastest.get(entry.method, entry) for entry in best_per_method(entries)]
+
+
 def most_accurate(entries: Sequence[Entry]) -> tuple[Entry, str]:
     """Return the most accurate configuration, by the error that the verdict uses, and how.
 

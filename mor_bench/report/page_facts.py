@@ -49,6 +49,32 @@ def deformation(entries: Sequence[Entry]) -> str:
     return f"Largest displacement of the test loads: {number(largest)} m." if largest else ""
 
 
+_UNSEEN = {
+    "region": "The test loads are centred where no training load is centred.",
+    "direction": "The test loads have directions that no training load has.",
+    "sample": "The test loads are drawn as the training loads are.",
+}
+"""What is new in the test loads of each split."""
+
+
+def _compared(comparison: Comparison, entries: Sequence[Entry]) -> str:
+    """Name the quantities that are compared, and their references."""
+    names = {entry.row.dataset for entry in entries}
+    imported = any(comparison.datasets.get(name, {}).get("snapshots") for name in names)
+    reference = "the data" if imported else "full-order solutions on this mesh"
+    with_reactions = any(entry.figure("error", "reaction_rel_median") for entry in entries)
+    what = "displacements and reactions" if with_reactions else "displacements"
+    others = "stresses and motion in time"
+    others = others if with_reactions else f"reactions, {others}"
+    return f"Errors are those of static {what} against {reference}; {others} are not compared."
+
+
+def _answered(entries: Sequence[Entry]) -> str:
+    """Count the configurations that ran and answered every load."""
+    good = sum(entry.ran and not entry.n_failed for entry in entries)
+    return f"{good} of {len(entries)} configurations ran and answered every test load."
+
+
 def limits_of(comparison: Comparison, analysis: Analysis, entries: Sequence[Entry]) -> str:
     """State for what a run holds, and what it does not tell: regimes, other loads, other seeds."""
     present = {entry.method for entry in entries}
@@ -57,12 +83,18 @@ def limits_of(comparison: Comparison, analysis: Analysis, entries: Sequence[Entr
         for record in analysis["regimes"]
         if record["in_regime"] is False and record["method"] in present
     ]
-    said = [
-        "Data, fits and errors hold for this body, material and supports only; another scene needs "
-        "its own."
-    ]
+    said = [_compared(comparison, entries), _answered(entries)]
+    said.append(
+        "Data, fits and errors hold for this body, material, supports and kind of load only; "
+        "another scene needs its own."
+    )
+    split = next((entry.row.split for entry in entries if entry.ran), None)
+    if split in _UNSEEN:
+        said.append(_UNSEEN[split])
     if not any(entry.row.sets for entry in entries):
-        said.append("No load outside the range of the training loads was tested.")
+        said.append("No load larger than the training loads was tested.")
+    if processor := comparison.machine.get("processor"):
+        said.append(f"Latencies hold for {processor}; `--retime` measures them on another machine.")
     if outside:
         said.append(f"Not tested for what they are built for: {', '.join(outside)}.")
     if comparison.settings.get("seeds") == 1:

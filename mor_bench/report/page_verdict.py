@@ -166,7 +166,8 @@ def _by_latency(
             sentence += " The full-order model itself meets the needs."
     paid = [line.break_even for line in costs.lines if line.label == first.label] if costs else []
     if paid and paid[0] is not None:
-        sentence += f" With data and fit, it costs less than that after {whole(paid[0])} queries."
+        sentence += f" With data and fit, it costs less than that after {whole(paid[0])} queries "
+        sentence += "(fits of other configurations left out)."
     return Ranking("latency", f"Take {names[first.label]}", picks, sentence)
 
 
@@ -196,14 +197,14 @@ def _pick(part: str, entry: Entry, names: Mapping[str, str]) -> Pick:
         names[entry.label],
         percent(entry.figure("error", "rel_l2_median")),
         _interval(entry, "rel_l2_median", percent),
-        _tail(entry),
+        ". ".join(filter(None, (_error_tail(entry), _latency_tail(entry)))),
         number(entry.figure("latency_ms", "median")),
         _interval(entry, "latency_ms", number),
         offline_text(entry),
     )
 
 
-def _tail(entry: Entry) -> str:
+def _error_tail(entry: Entry) -> str:
     """State the errors of the difficult test loads."""
     p95, worst = (entry.figure("error", name) for name in ("rel_l2_p95", "rel_l2_max"))
     if p95 is None or worst is None:
@@ -216,6 +217,12 @@ def _tail(entry: Entry) -> str:
         f"{text}. Largest error of a node: {number(1e3 * largest)} mm, where nodes move up to "
         f"{number(1e3 * amplitude)} mm"
     )
+
+
+def _latency_tail(entry: Entry) -> str:
+    """State the latency of slow queries."""
+    p99 = entry.figure("latency_ms", "p99")
+    return "" if p99 is None else f"99 of 100 queries: at most {number(p99)} ms"
 
 
 def _interval(entry: Entry, name: str, shown: Callable[[float | None], str]) -> str:

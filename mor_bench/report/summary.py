@@ -24,7 +24,7 @@ def warnings_of(entries: Sequence[Entry]) -> list[tuple[str, str]]:
 def notes_of(comparison: Comparison, dataset: str, analysis: Analysis) -> list[tuple[str, str]]:
     """List doubts, each after the name of its configuration or method.
 
-    Doubts are unstable timings, networks trained elsewhere, a hidden test set that disagrees, and
+    Doubts are unstable timings, networks trained elsewhere, a fresh test set that disagrees, and
     untested regimes.
     """
     entries = entries_of(comparison, dataset)
@@ -47,12 +47,12 @@ def notes_of(comparison: Comparison, dataset: str, analysis: Analysis) -> list[t
 
 
 def hidden_doubts(dataset: str, analysis: Analysis) -> list[tuple[str, str]]:
-    """List the configurations that are clearly worse on the hidden test set, and by how much."""
+    """List the configurations that are clearly worse on the fresh test set, and by how much."""
     doubts = []
     for record in analysis["hidden"]:
         if record["dataset"] == dataset and record["worse"]:
             ratio = "infinitely" if record["ratio"] is None else f"{number(record['ratio'])} times"
-            doubt = f"the median error is {ratio} as large on the hidden test set as on the shipped"
+            doubt = f"the median error is {ratio} as large on the fresh test set as on the shipped"
             doubts.append((record["label"], f"{doubt} one"))
     return doubts
 

@@ -100,6 +100,7 @@ def _matrix(timings: dict[str, Timing], folder: Path) -> dict[tuple[str, str], s
         row = a_row(
             name,
             dataset=DATASET,
+            n_test=len(regions),
             error={"rel_l2_median": float(np.median(errors)), "mean_dof_m": 1e-4},
             latency_ms={"median": float(np.median(timing.latency_ms))},
         )
