@@ -15,7 +15,7 @@ Report.kinds.bodies = (figure, data) => {
   const methods = R.options(data, kinds.includes("worst")
     ? found.samples.filter((s) => s.kind === "worst") : found.samples);
   const redraw = () => show();
-  const kind = R.choice(figure, "test load", kinds.map((k) => [k, k]), redraw);
+  const kind = R.choice(figure, "test load", kinds.map((k) => [k, `${k} by mean error e`]), redraw);
   const chosen = [
     R.choice(figure, "left", methods, redraw), R.choice(figure, "right", methods, redraw),
   ];
