@@ -50,9 +50,9 @@ def resources(entries: Sequence[Entry]) -> TextTable | None:
         "model": lambda e: bytes_text(e.row.model_bytes),
     }
     note = (
-        "Memory: peak resident memory. Counts: means per query, which do not depend on the machine. "
-        "A linear response is part of the query; on a small mesh it is a product with the stored "
-        "inverse, which counts as multiply-adds."
+        "Memory: peak resident memory. Counts: means per query, which do not depend on the "
+        "machine. A linear response is part of the query; on a small mesh it is a product "
+        "with the stored inverse, which counts as multiply-adds."
     )
     return table_of("Memory and cost", note, entries, columns)
 
