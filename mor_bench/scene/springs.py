@@ -29,8 +29,8 @@ class Springs:
     ----------
     points : (n, 3) float64
         Positions, m.
-    stiffness : (n, 3) float64
-        Stiffness along each axis, N/m.
+    stiffness : (n, 3, 3) float64
+        Force per displacement, N/m.
     """
 
     points: NDArray[np.float64]
@@ -39,8 +39,9 @@ class Springs:
     def matrix(self, mesh: Mesh) -> sp.csr_array:
         """Return the stiffness over the nodal dofs of a mesh, (n_dofs, n_dofs), N/m."""
         shape = sp.kron(interpolation_matrix(mesh, self.points), sp.eye_array(3), format="csr")
-        weighted = shape.multiply(self.stiffness.ravel()[:, None])
-        return sp.csr_array(shape.T @ weighted)
+        numbers = np.arange(len(self.points) + 1)
+        blocks = sp.bsr_array((self.stiffness, numbers[:-1], numbers))
+        return sp.csr_array(shape.T @ blocks.tocsr() @ shape)
 
 
 def foundations(
@@ -58,20 +59,25 @@ def foundations(
         facets = surface.within(region_points(cloud, spring.region))
         if len(facets) == 0:
             raise SpecError("a region of `springs` holds no facet of the surface.")
-        stiffness = [spring.stiffness_n_m3 * (axis in spring.components) for axis in AXES]
-        found.append(_springs_on(surface, facets, np.array(stiffness)))
+        points, vectors = _quadrature(surface, facets)
+        areas = np.linalg.norm(vectors, axis=1)[:, None, None]
+        if spring.normal:
+            directions = vectors[:, :, None] * vectors[:, None] / areas
+        else:
+            directions = areas * np.diag([float(axis in spring.components) for axis in AXES])
+        found.append(Springs(points, spring.stiffness_n_m3 * directions))
     return tuple(found)
 
 
-def _springs_on(
-    surface: Facets, facets: NDArray[np.int64], stiffness_n_m3: NDArray[np.float64]
-) -> Springs:
-    """Return springs on facets, with stiffnesses (3,) per area along the axes."""
+def _quadrature(
+    surface: Facets, facets: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return points (n, 3), m, on facets and normals (n, 3) whose lengths are areas, m²."""
     corners = surface.points[facets]
     if facets.shape[1] == 3:
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         points = np.einsum("pa,fai->fpi", _SIXTHS, corners)
-        areas = np.repeat(np.linalg.norm(normals, axis=1)[:, None] / 6.0, 3, axis=1)
+        vectors = np.repeat(normals[:, None] / 6.0, 3, axis=1)
     else:
         s, t = (a.ravel() for a in np.meshgrid(_X, _X))
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
@@ -79,5 +85,5 @@ def _springs_on(
         along_s = np.einsum("pa,fai->fpi", signs[:, 0] * v / 4, corners)
         along_t = np.einsum("pa,fai->fpi", signs[:, 1] * u / 4, corners)
         points = np.einsum("pa,fai->fpi", u * v / 4, corners)
-        areas = np.linalg.norm(np.cross(along_s, along_t), axis=2) * np.outer(_W, _W).ravel()
-    return Springs(points.reshape(-1, 3), areas.reshape(-1, 1) * stiffness_n_m3)
+        vectors = np.cross(along_s, along_t) * np.outer(_W, _W).reshape(-1, 1)
+    return points.reshape(-1, 3), vectors.reshape(-1, 3)

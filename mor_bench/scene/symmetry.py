@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.materials import HolzapfelGasserOgden, Material
 from mor_bench.scene.scene import Scene
 
@@ -48,10 +50,7 @@ def mirrors(scene: Scene) -> list[Mirror]:
     own_cells = _rows(cells)
     held = [scene.fixed_dofs[scene.fixed_dofs % 3 == i] // 3 for i in range(3)]
     kept = *held, np.unique(scene.patch_weights.indices)
-    gravity, springs = scene.generated.gravity, np.zeros((len(points), 3))
-    if scene.spring_matrix is not None:
-        springs = scene.spring_matrix.diagonal().reshape(-1, 3)
-    found = []
+    gravity, springs, found = scene.generated.gravity, scene.spring_matrix, []
     for axis in range(3):
         images = points.copy()
         images[:, axis] = low[axis] + high[axis] - points[:, axis]
@@ -62,11 +61,19 @@ def mirrors(scene: Scene) -> list[Mirror]:
             and distance.max() <= near
             and len(np.unique(nodes)) == len(nodes)
             and np.array_equal(_rows(nodes[cells]), own_cells)
-            and np.allclose(springs[nodes], springs, atol=1e-6 * springs.max())
+            and (springs is None or _is_own_image(springs, nodes, axis))
             and all(np.array_equal(np.sort(nodes[part]), np.sort(part)) for part in kept)
         ):
             found.append(Mirror(axis, nodes.astype(np.int64)))
     return found
+
+
+def _is_own_image(matrix: sp.csr_array, nodes: NDArray[np.int64], axis: int) -> bool:
+    """Return whether a stiffness (n_dofs, n_dofs) is its own mirror image."""
+    dofs = dofs_of_nodes(nodes)
+    signs = sp.diags_array(np.tile(np.where(np.arange(3) == axis, -1.0, 1.0), len(nodes)))
+    image = signs @ matrix[dofs][:, dofs] @ signs
+    return bool(abs(image - matrix).max() <= 1e-6 * matrix.max())
 
 
 def _has_fibres_as_image(material: Material | None, axis: int) -> bool:

@@ -75,11 +75,21 @@ class Spring(StrictModel):
         Traction per displacement from the undeformed body.
     components : tuple of str
         The components of the displacement that the springs resist: all three by default.
+    normal : bool
+        Whether they resist only the displacement along the normal of the undeformed surface, as a
+        frictionless foundation does. Excludes `components`.
     """
 
     region: Region
     stiffness_n_m3: Annotated[Positive, in_range(1e-12, 1e18, "N/m³")]
     components: Components = AXES
+    normal: Annotated[bool, Field(exclude_if=lambda value: not value)] = False
+
+    @model_validator(mode="after")
+    def _one_direction(self) -> Self:
+        if self.normal and "components" in self.model_fields_set:
+            raise ValueError("`normal = true` and `components` exclude each other; remove one")
+        return self
 
 
 _Acceleration = Annotated[Finite, in_range(-1e12, 1e12, "m/s²")]

@@ -19,10 +19,12 @@ from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.reduction.tensors import TensorProblem
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.scene import Scene, load_scene
+from mor_bench.scene.symmetry import mirrors
 from mor_bench.specs import load_generated_spec
 from mor_bench.surrogates.hyper_reduced import nodal, reduced_points
 
 from .scenes import patch_load, reactions
+from .test_pressure import forces_of, tube
 
 Array = NDArray[np.float64]
 BED = {"region": "z-min", "stiffness_n_m3": 200.0}
@@ -88,6 +90,54 @@ def test_springs_along_one_axis_resist_that_axis_alone() -> None:
     motions = ("rotation about z", "translation x", "translation y")
     assert tuple(sorted(raised.value.free_motions)) == motions
     FullOrderModel(block(500.0))
+
+
+def test_springs_along_the_normal_of_a_plane_are_those_along_its_axis() -> None:
+    normal, axis = (
+        block(500.0, springs=[{**BED, **direction}]).spring_matrix
+        for direction in ({"normal": True}, {"components": ["z"]})
+    )
+    assert normal is not None
+    assert axis is not None
+    np.testing.assert_allclose(normal.toarray(), axis.toarray(), atol=1e-12 * axis.max())
+
+
+@pytest.mark.parametrize("normal", [False, True])
+def test_a_pressed_tube_in_a_bed_converges_to_the_solution_of_lame(normal: bool) -> None:
+    pressure, young, poisson, inner, outer, bed = 1.0, 1e5, 0.3, 1.0, 2.0, 5e4
+    # u = (1 + ν) / E ((1 - 2ν) A r + B / r), the radial stress is A - B / r².
+    factors = np.array([(1 - 2 * poisson) * outer, 1 / outer]) * bed * (1 + poisson) / young
+    rows = [[1.0, -1 / inner**2], [1.0 + factors[0], factors[1] - 1 / outer**2]]
+    a, b = np.linalg.solve(rows, [-pressure, 0.0])
+    errors = []
+    for n in (4, 8):
+        spring = {"region": {"point_set": "outer"}, "stiffness_n_m3": bed, "normal": normal}
+        scene = load_scene({**tube(n, young).spec.model_dump(mode="json"), "springs": [spring]})
+        u = solved(scene, forces_of(scene, pressure))
+        radius = np.linalg.norm(scene.mesh.points[:, :2], axis=1)
+        exact = (1 + poisson) / young * ((1 - 2 * poisson) * a * radius + b / radius)
+        radial = np.sum(u[:, :2] * scene.mesh.points[:, :2], axis=1) / radius
+        errors.append(np.linalg.norm(radial - exact) / np.linalg.norm(exact))
+    assert errors[-1] < 5e-3
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.2)
+
+
+def test_a_tube_turns_almost_freely_in_springs_along_its_normals() -> None:
+    ratios = []  # only facets that do not follow the circle resist the turn
+    for n in (4, 8):
+        works = []
+        for normal in (True, False):
+            spring = {"region": {"point_set": "outer"}, "stiffness_n_m3": 1.0, "normal": normal}
+            content = tube(n, 1e3, 360.0).spec.model_dump(mode="json")
+            scene = load_scene({**content, "springs": [spring]})
+            x, y = scene.mesh.points[:, :2].T
+            turn = np.stack([-y, x, 0.0 * x], axis=1).ravel()
+            assert scene.spring_matrix is not None
+            works.append(float(turn @ (scene.spring_matrix @ turn)))
+        ratios.append(works[0] / works[1])
+        assert {mirror.axis for mirror in mirrors(scene)} == {0, 1, 2}
+    assert ratios[0] < 0.01
+    assert np.log2(ratios[0] / ratios[1]) == pytest.approx(2.0, abs=0.2)
 
 
 def bedded(**changed: Any) -> Scene:
@@ -178,6 +228,7 @@ def test_springs_have_the_area_of_their_surface_on_any_mesh() -> None:
         ({"region": "z-min"}, r"key `springs\[0\].stiffness_n_m3` is missing"),
         ({**BED, "stiffness_n_m3": 0.0}, r"`springs\[0\].stiffness_n_m3` must be greater than 0"),
         ({**BED, "components": []}, "one to three different components"),
+        ({**BED, "components": ["z"], "normal": True}, "exclude each other"),
         ({**BED, "region": {"nearest_m": [[0.0, 0.0, 0.0], 1]}}, "holds no facet of the surface"),
     ],
 )
