@@ -234,9 +234,8 @@ def paper(source: str, methods: str = "") -> str:
     """
     headings: Sequence[str] = ()
     body = []
-    for folder in source.split(","):
-        run = run_of(folder)
-        name = next(iter(run.datasets))
+    runs = [run_of(folder) for folder in source.split(",")]
+    for run, name in ((each, name) for each in runs for name in each.datasets):
         entries = [
             e
             for e in entries_of(run, name, run.analysis)
@@ -244,7 +243,7 @@ def paper(source: str, methods: str = "") -> str:
         ]
         table = against_the_paper(name, entries)
         if table is None:
-            raise EvidenceError(f"{folder}: {name} is no scene of the paper, or nothing ran.")
+            raise EvidenceError(f"{source}: {name} is no scene of the paper, or nothing ran.")
         headings = table.headings
         told = {e.label: class_text(e.row, is_observed(run, name)) for e in entries}
         body += [[name, row[0], told.get(row[0], "force only"), *row[1:]] for row in table.rows]
