@@ -25,6 +25,8 @@ from mor_bench.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from mor_bench.errors import MorBenchError as MorBenchError
+    from mor_bench.measure.error_bounds import ErrorBound as ErrorBound
+    from mor_bench.measure.error_bounds import error_bound as error_bound
     from mor_bench.method_loading import load_method as load_method
     from mor_bench.method_loading import load_surrogate as load_surrogate
     from mor_bench.report.notebook import Comparison as Comparison
@@ -41,12 +43,14 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "Comparison": "mor_bench.report.notebook",
+    "ErrorBound": "mor_bench.measure.error_bounds",
     "Fit": "mor_bench.runs.single_fit",
     "MorBenchError": "mor_bench.errors",
     "Scene": "mor_bench.scene.scene",
     "Snapshots": "mor_bench.snapshots.dataset",
     "Surrogate": "mor_bench.surrogate",
     "Verdict": "mor_bench.runs.pick",
+    "error_bound": "mor_bench.measure.error_bounds",
     "fit": "mor_bench.runs.single_fit",
     "load_dataset": "mor_bench.snapshots.dataset",
     "load_method": "mor_bench.method_loading",

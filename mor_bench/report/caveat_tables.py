@@ -87,6 +87,36 @@ def _recall_cell(found: SetErrors | FlagCounts, median: float) -> str:
     return f"{percent(median)} %\nflagged {flagged} %\n{recall}"
 
 
+def error_bounds(entries: Sequence[Entry]) -> TextTable | None:
+    """Build the table of calibrated error bounds and their coverage of each test set."""
+    bounded = [entry for entry in entries if entry.row.bound]
+    if not bounded:
+        return None
+    names = dict.fromkeys(name for e in bounded if e.row.bound for name in e.row.bound.coverage)
+    rows = []
+    for entry in bounded:
+        found = entry.row.bound
+        assert found is not None
+        shares = (found.coverage.get(name) for name in names)
+        rows.append(
+            [
+                entry.label,
+                percent(found.relative_l2),
+                f"{found.n} in {found.n_groups}",
+                *(DASH if share is None else percent(share) for share in shares),
+            ]
+        )
+    level = percent(bounded[0].row.bound.level if bounded[0].row.bound else None)
+    note = (
+        f"Bound: {level} % of new loads have at most this relative L2 error, if they are like the "
+        "validation loads. It is calibrated on them by split-conformal prediction, with load "
+        "regions as groups; with too few groups it is infinite. Other columns: the share of each "
+        "test set within the bound (%)."
+    )
+    headings = ["configuration", "bound (%)", "samples in groups", *names]
+    return TextTable("Error bounds", note, headings, rows)
+
+
 def hidden_table(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> TextTable | None:
     """Build the table of errors on the fresh test set and on the shipped one."""
     by_label = {entry.label: entry for entry in entries}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mor_bench.report.caveat_tables import (
+    error_bounds,
     hidden_table,
     named_sets,
     out_of_range,
@@ -30,6 +31,7 @@ def dataset_details(comparison: Comparison, dataset: str, analysis: Analysis) ->
         indicated(entries),
         named_sets(entries),
         out_of_range(entries),
+        error_bounds(entries),
         hidden_table(dataset, entries, analysis),
         training(entries),
         seeds(entries),
@@ -50,6 +52,7 @@ def hard_cases(dataset: str, entries: Sequence[Entry], analysis: Analysis) -> li
     tables = (
         named_sets(chosen),
         out_of_range([entry for entry in chosen if entry.row.sets]),
+        error_bounds([entry for entry in chosen if entry.row.sets]),
         hidden_table(dataset, chosen, analysis),
     )
     return [table for table in tables if table is not None]

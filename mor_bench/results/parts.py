@@ -113,3 +113,31 @@ class SeedSpread(Part):
     mean_dof_m: Spread | None = None
     rel_l2_median: Spread | None = None
     trainings: list[SeedTraining] = []
+
+
+class IndicatorQuality(Part):
+    """Agreement of errors estimated from the equilibrium residual with measured errors.
+
+    Attributes
+    ----------
+    n : int
+        Compared samples.
+    rank_correlation, residual_rank_correlation : float
+        Spearman correlation of the measured error with the correction and with the residual.
+    ratio_p5, ratio_median, ratio_p95 : float
+        Percentiles of estimated over measured error.
+    """
+
+    n: int
+    rank_correlation: Real
+    residual_rank_correlation: Real
+    ratio_p5: Real
+    ratio_median: Real
+    ratio_p95: Real
+
+
+class Memory(Part):
+    """Peak resident memory of a process during fitting and during prediction, bytes."""
+
+    fit: int | float
+    predict: int | float | None = None

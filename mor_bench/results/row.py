@@ -11,7 +11,15 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, FailFast, Field, model_validator
 
 from mor_bench.errors import printable
-from mor_bench.results.parts import Part, Real, SeedSpread, TrainedElsewhere, TrainingRecord
+from mor_bench.results.parts import (
+    IndicatorQuality,
+    Memory,
+    Part,
+    Real,
+    SeedSpread,
+    TrainedElsewhere,
+    TrainingRecord,
+)
 from mor_bench.results.recorded import RecordedDataset, RecordedMethod, RecordedSettings
 from mor_bench.specs.base import Label
 from mor_bench.specs.method_spec import Told
@@ -170,34 +178,6 @@ class Offline(Part):
     fit_core_s: Real | None = None
 
 
-class Memory(Part):
-    """Peak resident memory of a process during fitting and during prediction, bytes."""
-
-    fit: int | float
-    predict: int | float | None = None
-
-
-class IndicatorQuality(Part):
-    """Agreement of errors estimated from the equilibrium residual with measured errors.
-
-    Attributes
-    ----------
-    n : int
-        Compared samples.
-    rank_correlation, residual_rank_correlation : float
-        Spearman correlation of the measured error with the correction and with the residual.
-    ratio_p5, ratio_median, ratio_p95 : float
-        Percentiles of estimated over measured error.
-    """
-
-    n: int
-    rank_correlation: Real
-    residual_rank_correlation: Real
-    ratio_p5: Real
-    ratio_median: Real
-    ratio_p95: Real
-
-
 class FlagCounts(Part):
     """Range flags of the main test set; the fields are those of `SetErrors`."""
 
@@ -231,6 +211,28 @@ class RangeFlags(Part):
     n_flagged: int
     false_alarms: Real
     test: FlagCounts
+
+
+class BoundQuality(Part):
+    """A bound of the error from the validation samples, and its coverage of each test set.
+
+    Attributes
+    ----------
+    level : float
+        Share of new loads for which the bound is meant to hold.
+    relative_l2 : float
+        The bound of the relative L2 error, as a fraction; infinite if there are too few groups.
+    n, n_groups : int
+        Validation samples, and independent groups among them.
+    coverage : dict of str to float
+        Share of the samples of each test set whose error is within the bound.
+    """
+
+    level: Real
+    relative_l2: Real
+    n: int
+    n_groups: int
+    coverage: Annotated[dict[str, Real], BeforeValidator(_few)] = Field(default={})
 
 
 class Row(Part):
@@ -273,6 +275,8 @@ class Row(Part):
     sets : dict of SetErrors
         Named test sets.
     range : RangeFlags or None
+    bound : BoundQuality or None
+        A calibrated bound of the error, see `mor_bench.measure.error_bounds`.
     hidden : SetErrors or None
         A test set drawn after all fits.
     training : TrainingRecord or None
@@ -317,6 +321,7 @@ class Row(Part):
     indicator: IndicatorQuality | None = None
     sets: Annotated[dict[str, SetErrors], BeforeValidator(_few)] = Field(default={})
     range: RangeFlags | None = None
+    bound: BoundQuality | None = None
     hidden: SetErrors | None = None
     training: TrainingRecord | None = None
     trained_elsewhere: TrainedElsewhere | None = None

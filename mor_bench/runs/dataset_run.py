@@ -18,11 +18,18 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import MorBenchError, SolverError
 from mor_bench.measure.discretisation_error import measured
+from mor_bench.measure.error_bounds import calibrated, covered
 from mor_bench.measure.indicator_quality import indicator_summary
 from mor_bench.measure.range_flags import flags_of
 from mor_bench.reduction.basis import pod
 from mor_bench.results.comparison import Comparison
-from mor_bench.results.row import IndicatorQuality, Memory, Offline, RangeFlags, Row
+from mor_bench.results.parts import IndicatorQuality, Memory
+from mor_bench.results.row import (
+    BoundQuality,
+    Offline,
+    RangeFlags,
+    Row,
+)
 from mor_bench.runs.cached_fit import CachedFit, RunEnvironment
 from mor_bench.runs.configurations import Configuration, sealed_folders
 from mor_bench.runs.extra_stages import (
@@ -315,11 +322,27 @@ class DatasetRun:
             indicator=None if indicator is None else IndicatorQuality(**indicator),
             sets={name: set_errors(score, flags) for name, score in others.items()},
             range=RangeFlags.model_validate(flags.as_dict(main)) if flags else None,
+            bound=self._bound(held, {"test": main, **others}),
             training=training_record(record, configuration.training),
             trained_elsewhere=record.trained_elsewhere,
             warnings=[*row.warnings, *record.warnings, *ignored_seconds(record, asked_s)],
         )
         return row, {**main, **_validation_samples(held), **loss_curves(record)}
+
+    def _bound(self, held: Score | None, tests: Mapping[str, Score]) -> BoundQuality | None:
+        """Return the bound of the error that the validation samples give, and its coverage."""
+        if held is None:
+            return None
+        by = self.context.options.split or self.spec.split.by
+        regions = self.data.validation.regions if by == "region" else None
+        bound = calibrated(held["relative_l2"], regions)
+        return BoundQuality(
+            level=bound.level,
+            relative_l2=bound.relative_l2,
+            n=bound.n_samples,
+            n_groups=bound.n_groups,
+            coverage=covered(bound, tests),
+        )
 
 
 def _validation_samples(score: Score | None) -> Score:

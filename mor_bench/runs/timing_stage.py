@@ -17,7 +17,8 @@ from mor_bench.measure.latency import (
     probe_s,
 )
 from mor_bench.measure.timing import Timing, check_answers, timing_summary
-from mor_bench.results.row import AllThreadsLatency, Latency, Memory, Row
+from mor_bench.results.parts import Memory
+from mor_bench.results.row import AllThreadsLatency, Latency, Row
 from mor_bench.runs.cached_fit import CachedFit
 from mor_bench.runs.code_digest import measuring_digest
 from mor_bench.runs.extra_stages import Stage

@@ -1,0 +1,126 @@
+"""Bounds of a prediction's error, calibrated by split-conformal prediction.
+
+The samples for the calibration must not have been used for training. Loads of one region share
+their errors, so a region counts as one group: Lee, Barber and Willett, "Distribution-free inference
+with hierarchical data" (2023), section 3. The bound then holds for a load in a new region, if the
+regions are exchangeable. It says nothing about other kinds of loads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf, isfinite
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mor_bench.errors import InvalidInputError
+from mor_bench.measure.error_metrics import sample_errors
+from mor_bench.measure.predictions import predict_all
+from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.surrogate import Surrogate
+
+LEVEL = 0.9
+"""Default share of loads whose error the bound holds for."""
+
+
+@dataclass(frozen=True)
+class ErrorBound:
+    """A bound of the relative L2 error that holds for a given share of new loads.
+
+    Attributes
+    ----------
+    level : float
+        Share of loads for which the bound holds.
+    relative_l2 : float
+        Bound of the norm of the error over the norm of the reference; infinite if there are too few
+        groups for this level.
+    n_samples, n_groups : int
+        Samples of the calibration, and independent groups among them.
+    """
+
+    level: float
+    relative_l2: float
+    n_samples: int
+    n_groups: int
+
+    def of_prediction(self, displacements: ArrayLike) -> NDArray[np.float64]:
+        """Return the bound of the norm of each prediction's error, m.
+
+        From |e| <= b |u| and |u| <= |û| + |e| follows |e| <= b / (1 - b) |û| for a relative bound
+        b < 1. It is infinite for b >= 1.
+
+        Parameters
+        ----------
+        displacements : (n_nodes, 3) or (n, n_nodes, 3)
+            Predictions û, m.
+
+        Returns
+        -------
+        array of shape () or (n,)
+        """
+        norm = np.linalg.norm(np.asarray(displacements, dtype=np.float64), axis=(-2, -1))
+        share = self.relative_l2
+        return np.asarray(share / (1 - share) * norm if share < 1 else np.full(norm.shape, inf))
+
+
+def error_bound(method: Surrogate, samples: Snapshots, level: float = LEVEL) -> ErrorBound:
+    """Calibrate a bound of a fitted method's error on samples that it has not learned from.
+
+    Parameters
+    ----------
+    method : Surrogate
+    samples : Snapshots
+        For example `Dataset.validation`.
+    level : float
+        In (0, 1).
+
+    Raises
+    ------
+    InvalidInputError
+        If the level is out of range, or there are no samples.
+    """
+    if not 0 < level < 1:
+        raise InvalidInputError(f"`level` of `error_bound` must be in (0, 1); got {level!r}.")
+    if len(samples) == 0:
+        raise InvalidInputError("`samples` of `error_bound` must hold at least one sample; got 0.")
+    scene, given = samples.scene, samples.given
+    predicted = predict_all(method, given)
+    errors = sample_errors(predicted, samples.displacements, scene.output_nodes)
+    return calibrated(errors.relative_l2, samples.regions, level)
+
+
+def calibrated(
+    errors: NDArray[np.float64], regions: NDArray[np.int64] | None, level: float = LEVEL
+) -> ErrorBound:
+    """Return the bound from the relative L2 errors (n,) of a calibration set.
+
+    Parameters
+    ----------
+    errors : (n,) float64
+    regions : (n,) or (n, k) int64, optional
+        Load regions of the samples. Samples with several forces share regions in many ways, so each
+        counts as a group of its own. So does each sample if `regions` is None.
+    level : float
+    """
+    groups = np.arange(len(errors))
+    if regions is not None and regions.ndim == 1:
+        groups = np.unique(regions, return_inverse=True)[1]
+    n_groups = int(groups.max()) + 1
+    mass = 1.0 / np.bincount(groups)[groups] / (n_groups + 1)
+    order = np.argsort(errors, kind="stable")
+    reached = np.flatnonzero(np.cumsum(mass[order]) >= level - 1e-12)
+    bound = float(errors[order[reached[0]]]) if len(reached) else inf
+    return ErrorBound(level, bound, len(errors), n_groups)
+
+
+def covered(bound: ErrorBound, scores: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """Return the share of the samples of each test set whose error keeps the bound."""
+    if not isfinite(bound.relative_l2):
+        return {}
+    return {
+        name: float((score["relative_l2"] <= bound.relative_l2).mean())
+        for name, score in scores.items()
+    }

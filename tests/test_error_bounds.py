@@ -1,0 +1,94 @@
+"""Calibrated bounds of the error: quantiles by hand, simulated coverage, a real method."""
+
+from __future__ import annotations
+
+from math import inf
+
+import numpy as np
+import pytest
+
+import mor_bench
+from mor_bench.errors import InvalidInputError
+from mor_bench.measure.error_bounds import ErrorBound, calibrated, covered
+from mor_bench.snapshots.dataset import Dataset
+
+
+def test_without_groups_the_bound_is_the_usual_conformal_quantile() -> None:
+    # ceil((19 + 1) 0.9) = 18: the 18th smallest of 19 errors.
+    errors = np.random.default_rng(0).permutation(np.arange(1.0, 20.0))
+    bound = calibrated(errors, None, 0.9)
+    assert (bound.relative_l2, bound.n_samples, bound.n_groups) == (18.0, 19, 19)
+
+
+def test_each_group_has_the_same_weight_however_many_samples_it_has() -> None:
+    # Weights: 1/4 for each of three groups and for the new one. Half is reached by both groups of
+    # small errors; 0.7 needs most of the third group.
+    errors = np.array([1.0, 2.0, 10.0, 11.0, 12.0, 13.0])
+    regions = np.array([7, 3, 5, 5, 5, 5])
+    assert calibrated(errors, regions, 0.5).relative_l2 == 2.0
+    assert calibrated(errors, regions, 0.70).relative_l2 == 13.0
+    assert calibrated(errors, regions, 0.60).relative_l2 == 11.0
+    assert calibrated(errors, regions, 0.5).n_groups == 3
+
+
+def test_too_few_groups_give_an_infinite_bound_and_no_coverage() -> None:
+    regions = np.repeat(np.arange(8), 50)
+    bound = calibrated(np.ones(400), regions, 0.9)
+    assert bound.relative_l2 == inf
+    assert covered(bound, {"test": {"relative_l2": np.ones(3)}}) == {}
+    assert bound.of_prediction(np.ones((2, 4, 3))).tolist() == [inf, inf]
+
+
+def test_samples_with_several_forces_count_one_by_one() -> None:
+    regions = np.zeros((19, 3), dtype=np.int64)
+    assert calibrated(np.arange(1.0, 20.0), regions, 0.9).n_groups == 19
+
+
+def test_bounds_hold_for_new_groups_as_often_as_promised() -> None:
+    # Errors depend on the group. Treating samples as independent would cover new groups less.
+    generator = np.random.default_rng(1)
+    n_groups, n, trials = 12, 30, 3000
+    regions = np.repeat(np.arange(n_groups), n)
+    hits = naive = 0
+    for _ in range(trials):
+        levels = generator.lognormal(sigma=1.0, size=n_groups + 1)
+        errors = levels[:-1, None] * generator.uniform(size=(n_groups, n))
+        new = levels[-1] * generator.uniform()
+        hits += new <= calibrated(errors.ravel(), regions, 0.9).relative_l2
+        naive += new <= calibrated(errors.ravel(), None, 0.9).relative_l2
+    assert hits / trials >= 0.9
+    assert naive / trials < 0.89
+
+
+def test_absolute_bounds_follow_from_the_norm_of_the_prediction() -> None:
+    bound = ErrorBound(0.9, 0.2, 10, 10)
+    generator = np.random.default_rng(2)
+    reference = generator.normal(size=(50, 6, 3))
+    direction = generator.normal(size=reference.shape)
+    norm = np.linalg.norm(reference, axis=(1, 2))
+    error = direction * (0.2 * norm / np.linalg.norm(direction, axis=(1, 2)))[:, None, None]
+    limits = bound.of_prediction(reference + error)
+    assert (np.linalg.norm(error, axis=(1, 2)) <= limits * (1 + 1e-12)).all()
+    assert bound.of_prediction(reference[0]).shape == ()
+    # The worst case is attained: an error along the reference that makes it shorter.
+    shorter = reference[0] * 0.8
+    assert bound.of_prediction(shorter) == pytest.approx(0.2 * norm[0])
+
+
+def test_a_fitted_method_is_calibrated_on_samples_that_it_has_not_seen(tiny: Dataset) -> None:
+    method = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
+    bound = mor_bench.error_bound(method, tiny.validation, level=0.5)
+    errors = np.linalg.norm(
+        method.predict(tiny.validation.forces) - tiny.validation.displacements, axis=(1, 2)
+    ) / np.linalg.norm(tiny.validation.displacements, axis=(1, 2))
+    regions = tiny.validation.regions
+    assert bound == calibrated(errors, regions, 0.5)
+    assert errors.min() < bound.relative_l2 <= errors.max()
+
+
+def test_a_level_out_of_range_and_no_samples_are_refused(tiny: Dataset) -> None:
+    method = mor_bench.load_method("linear-fem").fit(tiny.scene, None)
+    with pytest.raises(InvalidInputError, match=r"`level` of `error_bound` must be in \(0, 1\)"):
+        mor_bench.error_bound(method, tiny.validation, level=90)
+    with pytest.raises(InvalidInputError, match="at least one sample; got 0"):
+        mor_bench.error_bound(method, tiny.validation[:0])
