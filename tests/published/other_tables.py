@@ -103,6 +103,29 @@ def scaling(source: str) -> str:
     )
 
 
+def law_speed(source: str) -> str:
+    """Show what a residual and a tangent of each law cost on each element."""
+    rows = {(row["law"], row["element"]): row for row in content_of(source)["rows"]}
+    elements = list(dict.fromkeys(element for _, element in rows))
+    headings = ["", *(f"{element}: {kind}" for element in elements for kind in _KINDS)]
+    body = [
+        [
+            law,
+            *(
+                f"{number(rows[law, element][f'{kind}_ratio'])} "
+                f"({number(rows[law, element][f'{kind}_ms'])} ms)"
+                for element in elements
+                for kind in _KINDS
+            ),
+        ]
+        for law in dict.fromkeys(law for law, _ in rows)
+    ]
+    return markdown(headings, body)
+
+
+_KINDS = ("residual", "tangent")
+
+
 def generation(source: str) -> str:
     """Show the cost of generating samples against their number."""
     headings = ["samples", "seconds", "samples/s", "ms per sample", "disk, MB", "memory: parent"]
@@ -361,6 +384,7 @@ def evidence(source: str) -> str:
 OTHER_TABLES: dict[str, Callable[..., str]] = {
     "peers": peers,
     "reduced-peers": reduced_peers,
+    "law-speed": law_speed,
     "scaling": scaling,
     "generation": generation,
     "random-loads": random_loads,
