@@ -49,8 +49,9 @@ class ErrorBound:
     def of_prediction(self, displacements: ArrayLike) -> NDArray[np.float64]:
         """Return the bound of the norm of each prediction's error, m.
 
-        From |e| <= b |u| and |u| <= |û| + |e| follows |e| <= b / (1 - b) |û| for a relative bound
-        b < 1. It is infinite for b >= 1.
+        A relative bound b < 1 gives the error at most b / (1 - b) times the norm of the prediction,
+        since the norm of the reference is at most that of the prediction plus that of the error.
+        For b >= 1 the bound is infinite.
 
         Parameters
         ----------

@@ -74,6 +74,9 @@ _NOT_PROSE = (
     re.compile(r"^ {4}.*$", re.MULTILINE),
     BLOCK,
     re.compile(r"<!--.*?-->", re.DOTALL),
+    re.compile(r"\$\$.*?\$\$", re.DOTALL),  # formulas
+    re.compile(r"\$[^$\n]+\$"),
+    re.compile(r"^:{3,}.*$", re.MULTILINE),  # directives of the site
     re.compile(r"`[^`\n]+`"),
     re.compile(r"\]\([^)]*\)"),
     re.compile(r"https?://\S+|arXiv \d+\.\d+"),

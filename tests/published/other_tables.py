@@ -107,23 +107,19 @@ def law_speed(source: str) -> str:
     """Show what a residual and a tangent of each law cost on each element."""
     rows = {(row["law"], row["element"]): row for row in content_of(source)["rows"]}
     elements = list(dict.fromkeys(element for _, element in rows))
-    headings = ["", *(f"{element}: {kind}" for element in elements for kind in _KINDS)]
+    pairs = [(element, kind) for element in elements for kind in ("residual", "tangent")]
     body = [
         [
             law,
             *(
                 f"{number(rows[law, element][f'{kind}_ratio'])} "
                 f"({number(rows[law, element][f'{kind}_ms'])} ms)"
-                for element in elements
-                for kind in _KINDS
+                for element, kind in pairs
             ),
         ]
         for law in dict.fromkeys(law for law, _ in rows)
     ]
-    return markdown(headings, body)
-
-
-_KINDS = ("residual", "tangent")
+    return markdown(["", *(f"{element}: {kind}" for element, kind in pairs)], body)
 
 
 def generation(source: str) -> str:

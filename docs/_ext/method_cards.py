@@ -1,0 +1,175 @@
+"""Pages made from the suite and the stored runs: a card per method, and the list of them.
+
+A card shows the method file, the text of `cards/NAME.md` (equation, algorithm, cost, failures), the
+class, and every stored measurement of the method with its curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from sphinx.application import Sphinx
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+
+from mor_bench.report.cards import Card, method_card
+from mor_bench.report.method_styles import style_of
+from mor_bench.report.number_format import number, percent
+from mor_bench.report.suite_overview import overview
+from mor_bench.results.comparison import Comparison
+from mor_bench.results.row import Row
+from mor_bench.specs import load_method_spec
+from mor_bench.specs.suite_folder import list_suite
+
+ROOT = Path(__file__).parents[2]
+
+
+@cache
+def stored_rows() -> dict[str, list[Row]]:
+    """Return the measured rows of every stored run, by its folder in `reports/`."""
+    runs = sorted(path.parent for path in (ROOT / "reports").rglob("results.json"))
+    found = {}
+    for run in runs:
+        rows = Comparison.read(run).rows
+        name = run.relative_to(ROOT / "reports").as_posix()
+        found[name] = [row for row in rows if row.ok and row.error and row.latency_ms]
+    return found
+
+
+def measured(method: str) -> Iterator[tuple[str, Row]]:
+    for run, rows in stored_rows().items():
+        yield from ((run, row) for row in rows if row.method == method)
+
+
+def picture(method: str, folder: Path) -> str | None:
+    """Draw the method's curve over the grey points of all others of its widest stored run."""
+    own = {run: [r for r in rows if r.method == method] for run, rows in stored_rows().items()}
+    if not any(own.values()):
+        return None
+    run = max(own, key=lambda name: (bool(own[name]), len(stored_rows()[name])))
+    dataset = own[run][0].dataset
+    points = [row for row in stored_rows()[run] if row.dataset == dataset]
+    figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
+    others = [row for row in points if row.method != method]
+    axes.plot(*_places(others), "o", color="#c8c8c8", ms=4, label="other methods")
+    mine = [row for row in points if row.method == method]
+    style = style_of(method)
+    axes.plot(*_places(mine), marker=style.marker, color=style.colour, label=method)
+    axes.set(xscale="log", yscale="log", xlabel="latency of one query, median (ms)")
+    axes.set(ylabel="relative L2 error, median (%)", title=f"{method} on {dataset}")
+    axes.legend(frameon=False)
+    axes.grid(color="#e8e8e8")
+    figure.savefig(folder / f"{method}.png", dpi=110)
+    plt.close(figure)
+    return f"{method}.png"
+
+
+def _places(rows: list[Row]) -> tuple[list[float], list[float]]:
+    shown = [row for row in rows if row.error and row.error.rel_l2_median > 1e-6]
+    return (
+        [row.latency_ms.median for row in shown if row.latency_ms],
+        [100 * row.error.rel_l2_median for row in shown if row.error],
+    )
+
+
+def table(method: str) -> list[str]:
+    rows = list(measured(method))
+    if not rows:
+        return ["No stored run measures this method yet."]
+    headings = ["run", "dataset", "configuration", "median %", "p95 %", "max %", "ms"]
+    lines = [f"| {' | '.join(headings)} |", f"|{'---|' * len(headings)}"]
+    for run, row in rows:
+        assert row.error
+        assert row.latency_ms
+        swept = ", ".join(f"{key}={value}" for key, value in row.swept.items()) or "–"
+        e, ms = row.error, row.latency_ms.median
+        errors = [percent(x) for x in (e.rel_l2_median, e.rel_l2_p95, e.rel_l2_max)]
+        cells = [f"`{run}`", f"`{row.dataset}`", swept, *errors, number(ms)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def card_page(name: str, folder: Path) -> str:
+    """Return the source of a method's page."""
+    spec = load_method_spec(name)
+    card = method_card(spec)
+    lines = [f"# {name}", "", f"**{spec.title}**", ""]
+    text = ROOT / "docs" / "cards" / f"{name}.md"
+    if text.exists():
+        lines += [f"```{{include}} ../cards/{name}.md", "```", ""]
+    lines += ["## In short", "", *_facts(card), "", *_hyperparameters(card)]
+    lines += ["## Measured", "", "Errors are those of the test samples of each stored run.", ""]
+    if shown := picture(name, folder):
+        caption = f"Error over latency of {name}, with the other methods of the run in grey."
+        lines += [f"![{caption}]({shown})", ""]
+    lines += [*table(name), ""]
+    target = spec.surrogate.replace(":", ".")
+    module, _, cls = target.rpartition(".")
+    lines += ["## Class", "", "```{eval-rst}", f".. currentmodule:: {module}", ""]
+    lines += [f".. autoclass:: {cls}", "   :no-members:", "   :no-index:", "```", ""]
+    lines += ["## Commands", "", "```bash", *card.commands, "```", ""]
+    return "\n".join(lines)
+
+
+def _facts(card: Card) -> Iterator[str]:
+    for fact, value in card.facts.items():
+        yield f"{fact}\n: {' '.join(value.split())}\n"
+
+
+def _hyperparameters(card: Card) -> Iterator[str]:
+    if card.hyperparameters:
+        yield "| hyperparameter | in `mor-bench run` | allowed |\n|---|---|---|"
+        for row in card.hyperparameters:
+            cells = " | ".join(cell.replace("|", "\\|") or "–" for cell in row)
+            yield f"| {cells} |"
+        yield ""
+
+
+def index_page() -> str:
+    """Return the source of the list of all methods."""
+    lines = [
+        "# Method cards",
+        "",
+        "Every method of the suite: its equation, its algorithm, its cost, where it fails, and its",
+        "measured curve. [Which method?](../which-method.md) helps to choose.",
+        "",
+    ]
+    items = overview()["methods"]
+    by_family: dict[str, list[Any]] = {}
+    for item in items:
+        by_family.setdefault(item.family, []).append(item)
+    for family, members in by_family.items():
+        lines += [f"## {family.capitalize()}", "", "| method | title | needs |", "|---|---|---|"]
+        lines += [f"| [{m.name}]({m.name}.md) | {m.title} | {m.needs} |" for m in members]
+        lines += [""]
+    lines += ["```{toctree}", ":hidden:", "", *(item.name for item in items), "```", ""]
+    return "\n".join(lines)
+
+
+def make_pages(app: Sphinx) -> None:
+    """Write all pages before Sphinx reads its sources; unchanged ones keep their time."""
+    folder = Path(app.srcdir) / "methods"
+    folder.mkdir(exist_ok=True)
+    names = list(list_suite("methods", ROOT))
+    for name in names:
+        _write(folder / f"{name}.md", card_page(name, folder))
+    _write(folder / "index.md", index_page())
+    for path in folder.iterdir():
+        if path.stem not in {*names, "index", "orders-of-convergence"}:
+            path.unlink()
+
+
+def _write(path: Path, text: str) -> None:
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.connect("builder-inited", make_pages)
+    return {"parallel_read_safe": True}
