@@ -90,7 +90,7 @@ def _frames(
     margin = 0.04 * np.ptp(screen, axis=0).max()
     box = np.array([screen.min(axis=0) - margin, screen.max(axis=0) + margin])
     scale = (largest / 100, largest)
-    look = Look(mesh.boundary_facets, VIEW, box, scale, COLOUR_MAP, int(2 * DPI * SIZE_IN[0]))
+    look = Look(mesh.drawn_facets, VIEW, box, scale, COLOUR_MAP, int(2 * DPI * SIZE_IN[0]))
     shots = [
         Shot(mesh.points + step, size, mesh.points + step, mesh.points)
         for step, size in zip(steps, sizes, strict=True)

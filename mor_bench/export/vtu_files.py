@@ -117,7 +117,7 @@ def _observed(scene: Scene) -> list[int] | None:
 def _write(
     scene: Scene, fields: Mapping[str, NDArray[np.float64]], out: Path, stem: str
 ) -> list[Path]:
-    kind = "tetra" if scene.mesh.cells.shape[1] == 4 else "hexahedron"
+    kind = {4: "tetra", 8: "hexahedron", 10: "tetra10"}[scene.mesh.cells.shape[1]]
     path, surface = out / f"{stem}.vtu", scene.embedded_surface
     body = meshio.Mesh(scene.mesh.points, [(kind, scene.mesh.cells)], point_data=dict(fields))
     _write_mesh(body, path)

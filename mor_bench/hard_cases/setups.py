@@ -16,6 +16,7 @@ from mor_bench.reduction.galerkin import GalerkinProblem
 from mor_bench.scene.materials import Material, SaintVenantKirchhoff
 from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import load_scene
+from mor_bench.scene.second_order import with_middles
 from mor_bench.specs import SolverName
 
 Array = NDArray[np.float64]
@@ -37,10 +38,18 @@ def free_assembler(mesh: Mesh, law: Material = LAW, selective: bool = False) -> 
     return Assembler(body, np.arange(mesh.n_dofs).reshape(-1, 3), mesh.n_dofs)
 
 
-def distorted_box(cells: tuple[int, int, int], tetrahedra: bool = False, seed: int = 0) -> Mesh:
+def of_order(mesh: Mesh, order: int) -> Mesh:
+    """Return the mesh, or with order 2 that of T10 made from its T4."""
+    return with_middles(mesh, {})[0] if order == 2 else mesh
+
+
+def distorted_box(
+    cells: tuple[int, int, int], tetrahedra: bool = False, seed: int = 0, order: int = 1
+) -> Mesh:
     """Return a unit box whose inner nodes are moved at random.
 
-    They move by up to 0.3 of a cell's edge, or 0.15 with tetrahedra, which are thinner.
+    They move by up to 0.3 of a cell's edge, or 0.15 with tetrahedra, which are thinner. Edges stay
+    straight.
     """
     mesh = box_mesh((1.0, 1.0, 1.0), cells, tetrahedra)
     inner = np.all((mesh.points > 1e-9) & (mesh.points < 1 - 1e-9), axis=1)
@@ -50,7 +59,7 @@ def distorted_box(cells: tuple[int, int, int], tetrahedra: bool = False, seed: i
         * (0.15 if tetrahedra else 0.3)
         / np.array(cells)
     )
-    return Mesh(points, mesh.cells)
+    return of_order(Mesh(points, mesh.cells), order)
 
 
 def patch_test_error(mesh: Mesh, law: Material = LAW, selective: bool = False) -> float:
@@ -72,17 +81,19 @@ def patch_test_error(mesh: Mesh, law: Material = LAW, selective: bool = False) -
 
 
 def confined_column(
-    law: Material = LAW, tetrahedra: bool = False, selective: bool = False
+    law: Material = LAW, tetrahedra: bool = False, selective: bool = False, order: int = 1
 ) -> GalerkinProblem:
     """Return a cube between rigid lateral walls whose top moves along the axis as one.
 
     It has a single unknown.
     """
-    mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1), tetrahedra)
-    dofs = np.full((8, 3), 4)
-    dofs[mesh.points[:, 0] == 1.0, 0] = np.arange(4)
+    mesh = of_order(box_mesh((1.0, 1.0, 1.0), (1, 1, 1), tetrahedra), order)
+    moved = mesh.points[:, 0] > 0
+    n = int(moved.sum())
+    dofs = np.full((mesh.n_nodes, 3), n)
+    dofs[moved, 0] = np.arange(n)
     body = Discretisation(mesh.points, mesh.cells, law, selective)
-    return GalerkinProblem(Assembler(body, dofs, 4), np.ones((4, 1)))
+    return GalerkinProblem(Assembler(body, dofs, n), mesh.points[moved, :1])
 
 
 @dataclass(frozen=True)
@@ -184,9 +195,11 @@ class Bars:
         return np.asarray(u.reshape(-1, 3)[self.end, 0])
 
 
-def make_bars(tetrahedra: bool = False, selective: bool = False, contrast: float = 1e6) -> Bars:
+def make_bars(
+    tetrahedra: bool = False, selective: bool = False, contrast: float = 1e6, order: int = 1
+) -> Bars:
     """Return the bars, of Saint Venant-Kirchhoff with Y = 1 Pa in the soft one and ν = 0."""
-    mesh = box_mesh((2.0, 1.0, 1.0), (2, 1, 1), tetrahedra)
+    mesh = of_order(box_mesh((2.0, 1.0, 1.0), (2, 1, 1), tetrahedra), order)
     free = mesh.points[:, 0] > 0
     dofs, n = _numbered(mesh, free)
     stiff = mesh.points[mesh.cells].mean(axis=1)[:, 0] < 1
@@ -196,7 +209,9 @@ def make_bars(tetrahedra: bool = False, selective: bool = False, contrast: float
     for facet in mesh.boundary_facets[
         (mesh.points[mesh.boundary_facets][:, :, 0] == 2.0).all(axis=1)
     ]:
-        load[facet, 0] += 0.5 * (Bars.stretch**3 - Bars.stretch) / (4 if len(facet) == 4 else 6)
+        # A uniform traction acts on a facet's corners, or on the middles of six nodes.
+        share = 0.5 * (Bars.stretch**3 - Bars.stretch) / (4 if len(facet) == 4 else 6)
+        load[facet[-3:] if len(facet) == 6 else facet, 0] += share
     return Bars(assembler, load[free].ravel(), mesh.points[free][:, 0] == 2.0)
 
 

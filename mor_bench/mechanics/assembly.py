@@ -59,8 +59,8 @@ class Discretisation:
     ----------
     points : (n_nodes, 3) float64
         Reference positions, m.
-    cells : (n_cells, 8) or (n_cells, 4) int
-        Nodes of the H8 or T4 cells to sum over.
+    cells : (n_cells, 8), (n_cells, 4) or (n_cells, 10) int
+        Nodes of the H8, T4 or T10 cells to sum over.
     material : Material
     selective : bool
         Whether the volumetric energy is integrated with mean gradients, which cures volumetric

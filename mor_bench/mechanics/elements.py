@@ -1,4 +1,4 @@
-"""Reference elements, H8 with 2x2x2 Gauss points and T4 with one, and their shape functions."""
+"""Reference elements and shape functions: H8 with 2x2x2 Gauss points, T4 with one, T10 with 4."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
-from mor_bench.scene.interpolation import trilinear
+from mor_bench.scene.interpolation import quadratic, trilinear
 from mor_bench.scene.mesh import HEX_CORNERS
 
 Array = NDArray[np.float64]
@@ -50,6 +50,14 @@ _VALUES, _DERIVATIVES = trilinear(_GAUSS)
 H8 = Element("H8", _DERIVATIVES, np.ones(8), trilinear(np.zeros((1, 3)))[1][0], _VALUES)
 T4 = Element("T4", _LINEAR[None], np.array([1.0 / 6.0]), _LINEAR, np.full((1, 4), 0.25))
 
+# Exact for quadratic polynomials (Hammer, Marlowe and Stroud 1956).
+_NEAR, _FAR = (5.0 - np.sqrt(5.0)) / 20.0, (5.0 + 3.0 * np.sqrt(5.0)) / 20.0
+_FOUR = np.full((4, 3), _NEAR) + (_FAR - _NEAR) * np.eye(4, 3, -1)
+_VALUES, _DERIVATIVES = quadratic(_FOUR)
+T10 = Element(
+    "T10", _DERIVATIVES, np.full(4, 1.0 / 24.0), quadratic(np.full((1, 3), 0.25))[1][0], _VALUES
+)
+
 
 def element_of(cells: NDArray[np.int64]) -> Element:
     """Return the element with as many nodes as the cells.
@@ -59,11 +67,12 @@ def element_of(cells: NDArray[np.int64]) -> Element:
     InvalidInputError
         If no element has that number of nodes.
     """
-    for element in (H8, T4):
+    for element in (H8, T4, T10):
         if cells.ndim == 2 and cells.shape[1] == element.n_nodes:
             return element
     raise InvalidInputError(
-        f"cells must have shape (n_cells, 8) for H8 or (n_cells, 4) for T4; got {cells.shape}."
+        "cells must have shape (n_cells, 8) for H8, (n_cells, 4) for T4 or (n_cells, 10) for T10; "
+        f"got {cells.shape}."
     )
 
 

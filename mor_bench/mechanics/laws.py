@@ -649,13 +649,15 @@ _J = np.array([0, 1, 2, 1, 2, 2])
 
 @njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _component(u, g, i, j, l, n):
-    """Return H_ij = Σ_a u_a,i g_a,j of 4 or 8 nodes; loops over nodes would not be vectorised."""
+    """Return H_ij = Σ_a u_a,i g_a,j of 4, 8 or 10 nodes; LLVM would not vectorise a loop."""
     L = LANES
     h = u[i * L + l] * g[j * L + l] + u[(3 + i) * L + l] * g[(3 + j) * L + l]
     h += u[(6 + i) * L + l] * g[(6 + j) * L + l] + u[(9 + i) * L + l] * g[(9 + j) * L + l]
-    if n == 8:
+    if n >= 8:
         h += u[(12 + i) * L + l] * g[(12 + j) * L + l] + u[(15 + i) * L + l] * g[(15 + j) * L + l]
         h += u[(18 + i) * L + l] * g[(18 + j) * L + l] + u[(21 + i) * L + l] * g[(21 + j) * L + l]
+    if n == 10:
+        h += u[(24 + i) * L + l] * g[(24 + j) * L + l] + u[(27 + i) * L + l] * g[(27 + j) * L + l]
     return h
 
 
@@ -826,11 +828,14 @@ def _add_forces(P, g, f, n):
             _add_row(f, g, 1, p, i, l)
             _add_row(f, g, 2, p, i, l)
             _add_row(f, g, 3, p, i, l)
-            if n == 8:
+            if n >= 8:
                 _add_row(f, g, 4, p, i, l)
                 _add_row(f, g, 5, p, i, l)
                 _add_row(f, g, 6, p, i, l)
                 _add_row(f, g, 7, p, i, l)
+            if n == 10:
+                _add_row(f, g, 8, p, i, l)
+                _add_row(f, g, 9, p, i, l)
 
 
 @njit(error_model="numpy", fastmath={"contract", "nsz"})

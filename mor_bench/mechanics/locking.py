@@ -8,7 +8,7 @@ from mor_bench.errors import LockingWarning
 from mor_bench.scene.scene import Scene
 
 LOCKING_FROM = 0.45
-"""Poisson's ratio above which H8 with full integration and T4 lock in volume."""
+"""Poisson's ratio above which H8 with full integration and T4 lock in volume; T10 do not."""
 
 
 def locking_risk(scene: Scene) -> str | None:
@@ -16,12 +16,12 @@ def locking_risk(scene: Scene) -> str | None:
     if scene.material is None:
         return None
     poisson = scene.material.poisson_at_rest
-    if poisson <= LOCKING_FROM or scene.selective:
+    n_nodes = scene.mesh.cells.shape[1]
+    if poisson <= LOCKING_FROM or scene.selective or n_nodes == 10:
         return None
-    tetrahedra = scene.mesh.cells.shape[1] == 4
     cells, remedy = "fully integrated H8", 'integration = "selective"'
-    if tetrahedra:
-        cells, remedy = "T4", f'element = "hexahedron" and {remedy}'
+    if n_nodes == 4:
+        cells, remedy = "T4", f'order = 2, or element = "hexahedron" and {remedy},'
     return (
         f"{scene.name}: with Poisson's ratio {poisson:.6g} at rest, above {LOCKING_FROM}, {cells} "
         f"cells lock: displacements are too small; set {remedy} under [discretisation]."

@@ -32,6 +32,7 @@ from mor_bench.mechanics.newton import (
 from mor_bench.mechanics.pattern import Pattern
 from mor_bench.mechanics.problem import Attempt
 from mor_bench.scene.scene import Scene
+from mor_bench.scene.triangle_rules import DEGREE_4, DEGREE_4_WEIGHTS, quadratic_triangle
 from mor_bench.specs import SolverName
 
 Array = NDArray[np.float64]
@@ -51,8 +52,11 @@ def _rule(n_corners: int) -> tuple[Array, Array, float]:
     """Return values (n_points, n_corners), derivatives (..., 2) and the weight of each point.
 
     The rule is exact for the force on a facet: 2 x 2 Gauss points on a quadrilateral, one on a
-    triangle.
+    triangle, six on a triangle of six nodes. Those six differ in weight; their values contain it.
     """
+    if n_corners == 6:
+        shape, derivatives = quadratic_triangle(DEGREE_4)
+        return shape * DEGREE_4_WEIGHTS[:, None], derivatives, 1.0
     if n_corners == 3:
         return np.full((1, 3), 1 / 3), np.array([[[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]]]), 0.5
     at = (0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)).tolist()
@@ -73,7 +77,7 @@ class PressedFacets:
     ----------
     points : (n_nodes, 3) float64
         Positions at rest, m.
-    regions : sequence of (n_facets, 4 or 3) int64
+    regions : sequence of (n_facets, 4, 3 or 6) int64
         Facets of each region, oriented outwards.
     dof_of_node : (n_nodes, 3) int64
         Row of each displacement component in the vectors; ``pattern.n`` at supports.

@@ -193,7 +193,7 @@ def _draw(
         axes.set_aspect("equal")
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
-        view.draw_surface(axes, mesh.points, mesh.boundary_facets, (BODY, BODY_EDGE))
+        view.draw_surface(axes, mesh.points, mesh.drawn_facets, (BODY, BODY_EDGE))
         _draw_patches(axes, view.project(centres)[0], found, scale, points_per_m)
     mappable = ScalarMappable(scale, COLOUR_MAP)
     most = max(float(found.finite.max(initial=0.0)) for found in maps)

@@ -28,8 +28,8 @@ def bodies(found: Sequence[Sampled], mesh: Mesh | None, most_bytes: int) -> dict
     """
     if mesh is None:
         return None
-    nodes, facets = np.unique(mesh.boundary_facets, return_inverse=True)
-    facets = facets.reshape(mesh.boundary_facets.shape)
+    nodes, facets = np.unique(mesh.drawn_facets, return_inverse=True)
+    facets = facets.reshape(mesh.drawn_facets.shape)
     samples: list[dict[str, Any]] = []
     n_left_out, used = 0, 0
     for item in found:
@@ -44,7 +44,7 @@ def bodies(found: Sequence[Sampled], mesh: Mesh | None, most_bytes: int) -> dict
         return None
     return {
         "points": packed(mesh.points[nodes]),
-        "corners": mesh.boundary_facets.shape[1],
+        "corners": mesh.drawn_facets.shape[1],
         "facets": _encoded(facets.astype("<i4")),
         "edges": _encoded(_edges(mesh, nodes).astype("<i4")),
         "size_m": float(np.linalg.norm(np.diff(mesh.bounds, axis=0))),
@@ -66,7 +66,7 @@ def _encoded(array: NDArray[Any]) -> str:
 
 def _edges(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return all edges of the surface, or its sharp ones if there are many."""
-    facets = mesh.boundary_facets
+    facets = mesh.drawn_facets
     pairs = np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2)
     edges = np.unique(np.sort(pairs, axis=1), axis=0)
     if len(edges) > MOST_EDGES:
@@ -115,7 +115,7 @@ def _arrow(
     place, moved = (size @ points / size.sum() for points in (mesh.points, reference))
     length = 0.2 * float(np.linalg.norm(np.diff(mesh.bounds, axis=0)))
     arrow = length * total / np.linalg.norm(total)
-    facets = mesh.boundary_facets
+    facets = mesh.drawn_facets
     loaded = facets[np.isin(facets, np.flatnonzero(size > 0)).any(axis=1)]
     pushes = normals(mesh.points, loaded).sum(axis=0) @ total < 0
     return {

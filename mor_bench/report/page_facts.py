@@ -195,7 +195,11 @@ _SCENE = {
 
 _WORDS = {
     ("discretisation", "element", "hexahedron"): "hexahedron with 8 nodes (H8)",
-    ("discretisation", "element", "tetrahedron"): "tetrahedron with 4 nodes (T4)",
+    (
+        "discretisation",
+        "element",
+        "tetrahedron",
+    ): "tetrahedron with 4 nodes (T4), or with 10 (T10) if order is 2",
     ("loads", "kind", "force"): "force, its direction uniform on the sphere",
     ("loads", "kind", "normal"): "force along the normal, pressing or pulling",
     ("loads", "kind", "tangential"): "force along the surface, its direction uniform",

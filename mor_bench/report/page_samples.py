@@ -159,7 +159,7 @@ def positions(
 
 def outline(mesh: Mesh, view: View | None = None) -> NDArray[np.int64]:
     """Return the surface's sharp edges (n, 2); with a view, the visible ones and the silhouette."""
-    facets = mesh.boundary_facets
+    facets = mesh.drawn_facets
     pairs = np.sort(np.stack([facets, np.roll(facets, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     owner = np.repeat(np.arange(len(facets)), facets.shape[1])
     edges, place, count = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)

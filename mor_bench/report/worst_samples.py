@@ -144,7 +144,7 @@ def _draw(
     high = uncut([s.largest_m for s in samples])[1]
     width = round(1.5 * DPI * WIDTH_IN / columns)
     colours = (high / 10**DECADES, high)
-    look = Look(mesh.boundary_facets, VIEW, limits, colours, COLOUR_MAP, width)
+    look = Look(mesh.drawn_facets, VIEW, limits, colours, COLOUR_MAP, width)
     shots = [
         Shot(mesh.points + s.prediction, s.nodal_m, mesh.points + s.reference, mesh.points)
         for s in samples
@@ -246,9 +246,7 @@ def _arrow(mesh: Mesh, sample: WorstSample) -> NDArray[np.float64] | None:
     points = mesh.points + sample.reference
     place = size @ points / size.sum()
     arrow = 0.16 * _diagonal(mesh) * total / np.linalg.norm(total)
-    loaded = mesh.boundary_facets[
-        np.isin(mesh.boundary_facets, np.flatnonzero(size > 0)).any(axis=1)
-    ]
+    loaded = mesh.drawn_facets[np.isin(mesh.drawn_facets, np.flatnonzero(size > 0)).any(axis=1)]
     pushes = normals(points, loaded).sum(axis=0) @ total < 0
     return np.stack([place - arrow, place] if pushes else [place, place + arrow])
 

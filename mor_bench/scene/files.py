@@ -55,12 +55,12 @@ FORMATS = [
 ]
 """Formats that are read. meshio has others, but damaged files can keep it busy for ever."""
 
-CELLS = ("hexahedron", "tetra")
+CELLS = ("hexahedron", "tetra", "tetra10")
 """Supported volume cells, by meshio's names."""
 
 
 def read_mesh(path: Path, unit_m: float) -> tuple[Mesh, PointSets]:
-    """Read the H8 or T4 cells of a mesh file, and its named sets of nodes.
+    """Read the H8, T4 or T10 cells of a mesh file, and its named sets of nodes.
 
     Cells of lower dimension only name nodes, see `mor_bench.scene.point_sets`. Unused nodes are
     dropped, cells are oriented and nodes may be renumbered, see `mor_bench.scene.soundness`.
@@ -88,8 +88,8 @@ def read_mesh(path: Path, unit_m: float) -> tuple[Mesh, PointSets]:
     if len(kinds) != 1 or not kinds <= {*CELLS}:
         found = " and ".join(sorted(kinds)) or "no volume cells"
         raise SpecError(
-            f"{path}: the cells must all be linear hexahedra or all linear tetrahedra, "
-            f"{' or '.join(CELLS)}; got {found}."
+            f"{path}: all cells must be hexahedra with 8 nodes, or all tetrahedra with 4 nodes, or "
+            f"all tetrahedra with 10 nodes ({', '.join(CELLS)}); got {found}."
         )
     blocks = [np.asarray(block.data, np.int64) for block in raw.cells if block.type in kinds]
     try:

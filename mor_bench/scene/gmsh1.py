@@ -11,6 +11,7 @@ from pathlib import Path
 
 import meshio
 import numpy as np
+from numpy.typing import NDArray
 
 from mor_bench.errors import SpecError, printable
 
@@ -20,6 +21,9 @@ _NAMES = (
 )
 _TYPES = dict(enumerate(_NAMES.split(), start=1))
 """meshio's name for each element type. Linear elements have VTK's node order."""
+
+_VTK_ORDER = {"tetra10": [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]}
+"""Places of VTK's nodes among Gmsh's, where they differ."""
 
 
 def is_gmsh1(head: bytes) -> bool:
@@ -51,7 +55,7 @@ def read_gmsh1(path: Path) -> meshio.Mesh:
             groups.append(physical)
         return meshio.Mesh(
             points,
-            [(kind, np.array(cells, dtype=np.int64)) for kind, (cells, _) in blocks.items()],
+            [(kind, _in_vtk_order(kind, cells)) for kind, (cells, _) in blocks.items()],
             cell_data={"gmsh:physical": [np.array(groups) for _, groups in blocks.values()]},
         )
     except KeyError as error:
@@ -63,6 +67,11 @@ def read_gmsh1(path: Path) -> meshio.Mesh:
     except (ValueError, OverflowError) as error:
         reason = printable(str(error), 300, keep="")
         raise SpecError(f"{path}: invalid Gmsh 1 file: {reason}.") from None
+
+
+def _in_vtk_order(kind: str, cells: list[list[int]]) -> NDArray[np.int64]:
+    nodes = np.array(cells, dtype=np.int64)
+    return nodes[:, _VTK_ORDER[kind]] if kind in _VTK_ORDER else nodes
 
 
 def _section(lines: Sequence[str], name: str) -> list[list[str]]:

@@ -137,7 +137,8 @@ def default_shape(mesh: Mesh) -> tuple[int, int, int]:
 
 
 def _volume(mesh: Mesh) -> float:
-    """Return the volume of the body, m³, with each hexahedron cut into six tetrahedra."""
-    tetrahedra = mesh.cells if mesh.cells.shape[1] == 4 else mesh.cells[:, KUHN].reshape(-1, 4)
+    """Return the volume of the body, m³, with straight edges and hexahedra cut into six T4."""
+    hexahedra = mesh.cells.shape[1] == 8
+    tetrahedra = mesh.cells[:, KUHN].reshape(-1, 4) if hexahedra else mesh.cells[:, :4]
     corners = mesh.points[tetrahedra]
     return float(np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 6)

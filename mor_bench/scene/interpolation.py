@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mor_bench.errors import OutsideMeshError
-from mor_bench.scene.mesh import HEX_CORNERS, Mesh
+from mor_bench.scene.mesh import HEX_CORNERS, TET_EDGES, Mesh
 
 OUTSIDE = 1e-9
 """Tolerance for a point outside its cell, in reference coordinates; far above round-off."""
@@ -25,6 +26,19 @@ def trilinear(xi: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
     corners = 2.0 * HEX_CORNERS - 1.0
     x, y, z = np.moveaxis(1 + xi[:, None, :] * corners, 2, 0)
     return x * y * z / 8, corners * np.stack([y * z, x * z, x * y], axis=2) / 8
+
+
+def quadratic(xi: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return shape functions (n, 10) of T10 at xi (n, 3), and derivatives (n, 10, 3).
+
+    With barycentric coordinates λ: λ_a (2 λ_a - 1) at corners, and 4 λ_a λ_b at middles of edges.
+    """
+    at = np.concatenate([1 - xi.sum(axis=1, keepdims=True), xi], axis=1)
+    slopes = np.concatenate([-np.ones((1, 3)), np.eye(3)])
+    a, b = at[:, TET_EDGES[:, 0]], at[:, TET_EDGES[:, 1]]
+    values = np.concatenate([at * (2 * at - 1), 4 * a * b], axis=1)
+    middles = a[:, :, None] * slopes[TET_EDGES[:, 1]] + b[:, :, None] * slopes[TET_EDGES[:, 0]]
+    return values, np.concatenate([(4 * at - 1)[:, :, None] * slopes, 4 * middles], axis=1)
 
 
 def _tetrahedron(
@@ -44,10 +58,33 @@ def _hexahedron(
 
     Newton's method finds the reference coordinates.
     """
-    xi = np.zeros_like(points)
+    shape, xi, missed = _inverted(trilinear, corners, points, np.zeros_like(points))
+    return shape, np.where(missed, np.inf, np.maximum(np.abs(xi).max(axis=1) - 1, 0))
+
+
+def _quadratic_tetrahedron(
+    nodes: NDArray[np.float64], points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return shape functions (n, 10) at points in T10 (n, 10, 3), and distances outside.
+
+    Newton's method starts from the tetrahedron with straight edges, where it ends at once.
+    """
+    start = np.clip(_tetrahedron(nodes[:, :4], points)[0][:, 1:], -2, 2)
+    shape, xi, missed = _inverted(quadratic, nodes, points, start)
+    least = np.minimum(xi.min(axis=1), 1 - xi.sum(axis=1))
+    return shape, np.where(missed, np.inf, np.maximum(-least, 0))
+
+
+def _inverted(
+    functions: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]],
+    corners: NDArray[np.float64],
+    points: NDArray[np.float64],
+    xi: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Return shape functions and reference coordinates of points, and where there are none."""
     size = np.linalg.norm(np.ptp(corners, axis=1), axis=1)
     for _ in range(NEWTON_STEPS):
-        shape, derivatives = trilinear(xi)
+        shape, derivatives = functions(xi)
         miss = points - np.einsum("na,nai->ni", shape, corners)
         jacobian = np.einsum("nai,nad->nid", corners, derivatives)
         # The map may fold outside the cell. There, only the fact that the point is outside matters.
@@ -57,13 +94,16 @@ def _hexahedron(
         xi = np.clip(xi + step, -2, 2)
         if (np.abs(step) <= ROUND_OFF).all():
             break
-    shape, _ = trilinear(xi)
+    shape, _ = functions(xi)
     missed = np.linalg.norm(points - np.einsum("na,nai->ni", shape, corners), axis=1) / size
-    return shape, np.where(missed > 1e-12, np.inf, np.maximum(np.abs(xi).max(axis=1) - 1, 0))
+    return shape, xi, missed > 1e-12
+
+
+_LOCATE = {4: _tetrahedron, 8: _hexahedron, 10: _quadratic_tetrahedron}
 
 
 class _Cells(NamedTuple):
-    """Corners (n_cells, 4 or 8, 3) of cells, bounding boxes with a margin, and centres."""
+    """Nodes (n_cells, 4, 8 or 10, 3) of cells, bounding boxes with a margin, and centres."""
 
     corners: NDArray[np.float64]
     low: NDArray[np.float64]
@@ -74,10 +114,14 @@ class _Cells(NamedTuple):
 
 def _searchable(mesh: Mesh) -> _Cells:
     corners = mesh.points[mesh.cells]
-    low, high = corners.min(axis=1), corners.max(axis=1)
+    hull = corners
+    if corners.shape[1] == 10:  # a curved edge lies between its ends and its control point
+        ends = corners[:, TET_EDGES].sum(axis=2)
+        hull = np.concatenate([corners, 2 * corners[:, 4:] - 0.5 * ends], axis=1)
+    low, high = hull.min(axis=1), hull.max(axis=1)
     margin = 1e-6 * np.linalg.norm(high - low, axis=1).max()
     centres = corners.mean(axis=1)
-    reach = float(np.linalg.norm(corners - centres[:, None], axis=2).max()) + margin
+    reach = float(np.linalg.norm(hull - centres[:, None], axis=2).max()) + margin
     return _Cells(corners, low - margin, high + margin, cKDTree(centres), reach)
 
 
@@ -103,7 +147,7 @@ def interpolation_matrix(mesh: Mesh, points: NDArray[np.float64]) -> sp.csr_arra
         If a point lies in no cell.
     """
     cells = _searchable(mesh)
-    locate = _tetrahedron if mesh.cells.shape[1] == 4 else _hexahedron
+    locate = _LOCATE[mesh.cells.shape[1]]
     cell_of = np.zeros(len(points), dtype=np.int64)
     shape_of = np.zeros((len(points), mesh.cells.shape[1]))
     searched = np.arange(len(points))

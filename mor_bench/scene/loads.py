@@ -15,6 +15,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.errors import SpecError
+from mor_bench.scene.mesh import corners_of
+from mor_bench.scene.triangle_rules import DEGREE_2, quadratic_triangle
 
 POINTS_PER_PATCH = 256
 """Least number of surface quadrature points in a patch."""
@@ -34,15 +36,15 @@ class Facets:
     ----------
     points : (n_points, 3) float64
         Positions, m.
-    facets : (n_facets, 4 or 3) int64
-        Point numbers, oriented outwards.
+    facets : (n_facets, 4, 3 or 6) int64
+        Point numbers, oriented outwards. Six are the corners and the middles of a triangle's edges.
     """
 
     points: NDArray[np.float64]
     facets: NDArray[np.int64]
 
     def within(self, points: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the facets (n, 4 or 3) with all corners among some points."""
+        """Return the facets (n, 4, 3 or 6) with all nodes among some points."""
         inside = np.zeros(len(self.points), dtype=bool)
         inside[points] = True
         return self.facets[inside[self.facets].all(axis=1)]
@@ -50,7 +52,7 @@ class Facets:
 
 @dataclass(frozen=True)
 class _Quadrature:
-    """Points of a midpoint rule on facets.
+    """Points of a quadrature rule on facets.
 
     Attributes
     ----------
@@ -69,7 +71,7 @@ class _Quadrature:
 
 @dataclass(frozen=True)
 class Patches:
-    """Load patches on a surface, given by the points of a midpoint rule.
+    """Load patches on a surface, given by the points of a quadrature rule.
 
     Attributes
     ----------
@@ -109,7 +111,7 @@ def cut_patches(
     Parameters
     ----------
     surface : Facets
-    facets : (n_facets, 4 or 3) int
+    facets : (n_facets, 4, 3 or 6) int
         The part of the surface on which patches may lie.
     centres : (n_patches,) int
         Numbers of points of the surface.
@@ -170,8 +172,8 @@ def pressed_patches(surface: Facets, regions: Sequence[NDArray[np.int64]]) -> Pa
 
 def _area(surface: Facets, facets: NDArray[np.int64]) -> float:
     """Return the area of facets, m²; of a warped quadrilateral, that of two triangles."""
-    corners = surface.points[facets]
-    halves = [corners[:, [0, i, i + 1]] for i in range(1, facets.shape[1] - 1)]
+    corners = surface.points[corners_of(facets)]
+    halves = [corners[:, [0, i, i + 1]] for i in range(1, corners.shape[1] - 1)]
     crosses = [np.cross(h[:, 1] - h[:, 0], h[:, 2] - h[:, 0]) for h in halves]
     return float(sum(0.5 * np.linalg.norm(cross, axis=1).sum() for cross in crosses))
 
@@ -218,11 +220,17 @@ def _nearest(
 
 
 def _quadrature(surface: Facets, facets: NDArray[np.int64], area_m2: float) -> _Quadrature:
-    """Return a midpoint rule. If it has too many points, long triangles are halved first."""
+    """Return a rule for each part of equally divided facets.
+
+    If it has too many points, long triangles are halved instead.
+    """
     spacing = sqrt(area_m2 / POINTS_PER_PATCH)
-    longest = _longest_edge(surface.points[facets])
-    if len(facets) * max(2, ceil(longest / spacing)) ** 2 <= MAX_SURFACE_POINTS:
-        return _midpoint_rule(surface, facets, spacing)
+    if facets.shape[1] == 6:
+        spacing *= sqrt(len(DEGREE_2))  # each part has more points
+    longest = _longest_edge(surface.points[corners_of(facets)])
+    per_part = len(DEGREE_2) if facets.shape[1] == 6 else 1
+    if len(facets) * per_part * max(2, ceil(longest / spacing)) ** 2 <= MAX_SURFACE_POINTS:
+        return _divided_rule(surface, facets, spacing)
     if facets.shape[1] == 3:
         corners, to_corners = _halved(surface, facets, 2 * spacing)
         if len(corners) <= MAX_PIECES:
@@ -240,14 +248,14 @@ def _longest_edge(corners: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
 
 
-def _midpoint_rule(surface: Facets, facets: NDArray[np.int64], spacing: float) -> _Quadrature:
+def _divided_rule(surface: Facets, facets: NDArray[np.int64], spacing: float) -> _Quadrature:
     corners, n_corners = surface.points[facets], facets.shape[1]
-    m = max(2, ceil(_longest_edge(corners) / spacing))
-    shape, derivatives = _midpoints(n_corners, m)
+    m = max(2, ceil(_longest_edge(surface.points[corners_of(facets)]) / spacing))
+    shape, derivatives = _points_of(n_corners, m)
     positions = np.einsum("pa,fai->fpi", shape, corners)
     tangents = np.einsum("pad,fai->fpdi", derivatives, corners)
     areas = np.cross(tangents[:, :, 0], tangents[:, :, 1]) / m**2
-    areas = areas if n_corners == 4 else 0.5 * areas
+    areas = areas * {4: 1.0, 3: 0.5, 6: 0.5 / len(DEGREE_2)}[n_corners]
     n_points = len(facets) * len(shape)
     rows = np.repeat(np.arange(n_points), n_corners)
     columns = np.repeat(facets, len(shape), axis=0).ravel()
@@ -256,10 +264,11 @@ def _midpoint_rule(surface: Facets, facets: NDArray[np.int64], spacing: float) -
     return _Quadrature(positions.reshape(-1, 3), areas.reshape(-1, 3), matrix)
 
 
-def _midpoints(n_corners: int, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return shape functions (n, n_corners) and derivatives (n, n_corners, 2) at midpoints.
+def _points_of(n_corners: int, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return shape functions (n, n_corners) and derivatives (n, n_corners, 2) at points.
 
-    They are the midpoints of the m² equal parts of a quadrilateral or triangle.
+    They are the midpoints of the m² equal parts of a quadrilateral or triangle. On a facet of six
+    nodes each part has three points, so that its consistent load is exact.
     """
     i, j = (a.ravel() for a in np.meshgrid(np.arange(m), np.arange(m), indexing="ij"))
     if n_corners == 4:
@@ -271,6 +280,12 @@ def _midpoints(n_corners: int, m: int) -> tuple[NDArray[np.float64], NDArray[np.
     up, down = i + j < m, i + j < m - 1
     x = np.append((i + 1 / 3)[up] / m, (i + 2 / 3)[down] / m)
     y = np.append((j + 1 / 3)[up] / m, (j + 2 / 3)[down] / m)
+    if n_corners == 6:
+        # A part that points down is turned by half a turn.
+        away = (DEGREE_2 - 1 / 3) / m
+        turns = np.append(np.ones(up.sum()), -np.ones(down.sum()))
+        at = np.stack([x, y], axis=1)[:, None] + turns[:, None, None] * away
+        return quadratic_triangle(at.reshape(-1, 2))
     gradients = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
     return np.stack([1 - x - y, x, y], axis=1), np.tile(gradients, (len(x), 1, 1))
 

@@ -1,4 +1,4 @@
-"""Meshes of hexahedra (H8) or tetrahedra (T4), with their regular grid, if any."""
+"""Meshes of hexahedra (H8) or tetrahedra (T4, T10), with their regular grid, if any."""
 
 from __future__ import annotations
 
@@ -20,8 +20,18 @@ FACES = {
         [[0, 4, 7, 3], [1, 2, 6, 5], [0, 1, 5, 4], [3, 7, 6, 2], [0, 3, 2, 1], [4, 5, 6, 7]]
     ),
     4: np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]),
+    10: np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]]),
 }
-"""Faces of a hexahedron (8) and a tetrahedron (4) in VTK order, oriented outwards."""
+"""Faces of a hexahedron (8) and of tetrahedra (4, 10) in VTK order, oriented outwards.
+
+A face of six nodes has its corners first, then the middles of the edges 01, 12 and 20.
+"""
+
+TET_EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
+"""Corners of a tetrahedron's edges, in VTK's order of the middles."""
+
+_QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
+"""Four triangles of a facet of six nodes."""
 
 KUHN = np.array(
     [[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]]
@@ -31,13 +41,13 @@ KUHN = np.array(
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh of H8 or of T4 cells.
+    """A mesh of H8, of T4 or of T10 cells.
 
     Attributes
     ----------
     points : (n_nodes, 3) float64
         Reference positions, m.
-    cells : (n_cells, 8) or (n_cells, 4) int64
+    cells : (n_cells, 8), (n_cells, 4) or (n_cells, 10) int64
         Node numbers in VTK order.
     grid_shape : (int, int, int) or None
         Nodes per axis of the regular grid that contains the mesh.
@@ -64,21 +74,32 @@ class Mesh:
 
     @cached_property
     def boundary_facets(self) -> NDArray[np.int64]:
-        """(n_facets, 4 or 3) node numbers of the faces of a single cell, oriented outwards."""
+        """(n_facets, 4, 3 or 6) node numbers of the faces of a single cell, oriented outwards."""
         faces = FACES[self.cells.shape[1]]
         faces = self.cells[:, faces].reshape(-1, faces.shape[1])
-        nodes = np.zeros((len(faces), 4), dtype=np.int64)
-        nodes[:, -faces.shape[1] :] = np.sort(faces, axis=1)
+        corners, nodes = corners_of(faces), np.zeros((len(faces), 4), dtype=np.int64)
+        nodes[:, -corners.shape[1] :] = np.sort(corners, axis=1)
         keys = nodes[:, ::2] * self.n_nodes + nodes[:, 1::2]
         order = np.lexsort(keys.T)
         is_new = np.ones(len(faces) + 1, dtype=bool)
         is_new[1:-1] = (keys[order[1:]] != keys[order[:-1]]).any(axis=1)
         return np.asarray(faces[np.sort(order[is_new[:-1] & is_new[1:]])])
 
+    @property
+    def drawn_facets(self) -> NDArray[np.int64]:
+        """(n_facets, 4 or 3) boundary facets as polygons; those of six nodes become four."""
+        facets = self.boundary_facets
+        return facets[:, _QUARTERS].reshape(-1, 3) if facets.shape[1] == 6 else facets
+
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """(2, 3) lowest and highest corner of the bounding box, m."""
         return np.array([self.points.min(axis=0), self.points.max(axis=0)])
+
+
+def corners_of(facets: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the corners (n, 4 or 3) of facets (n, 4, 3 or 6)."""
+    return facets[:, :3] if facets.shape[1] == 6 else facets
 
 
 def box_mesh(

@@ -23,6 +23,7 @@ from mor_bench.scene.materials import Material, make_material
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.observed_regions import moved_nodes, observed_nodes
 from mor_bench.scene.regions import Cloud, region_points
+from mor_bench.scene.second_order import with_middles
 from mor_bench.scene.snapshot_file import ImportedArrays, read_arrays
 from mor_bench.scene.springs import Springs, foundations
 from mor_bench.specs import (
@@ -165,7 +166,7 @@ class Scene:
 
     @property
     def pressed_facets(self) -> list[NDArray[np.int64]]:
-        """The facets (n_facets, 4 or 3) of each region of a pressure."""
+        """The facets (n_facets, 4, 3 or 6) of each region of a pressure."""
         if self.pressure is None:
             raise UnsupportedSceneError(f"{self.name}: no pressure acts on it.")
         return [self.surface.within(self._surface_points(r)) for r in self.pressure.regions]
@@ -229,7 +230,7 @@ class Scene:
 
     @cached_property
     def loaded_facets(self) -> NDArray[np.int64]:
-        """(n_facets, 4 or 3) facets on which patches may lie."""
+        """(n_facets, 4, 3 or 6) facets on which patches may lie."""
         return self.surface.within(self._loaded_points)
 
     @cached_property
@@ -349,12 +350,7 @@ def imported_scene(spec: ImportedDatasetSpec, arrays: ImportedArrays) -> Scene:
 def scene_without_patches(spec: DatasetSpec) -> Scene:
     """Build a scene without searching its load region."""
     mesh, surface, point_sets = build_body(spec)
-    element = "tetrahedron" if mesh.cells.shape[1] == 4 else "hexahedron"
-    if element != spec.discretisation.element:
-        raise SpecError(
-            f"`discretisation.element` must be {element!r}, as in the mesh; "
-            f"got {spec.discretisation.element!r}."
-        )
+    mesh, point_sets = _in_elements(spec, mesh, point_sets)
     cloud = Cloud(mesh.points, np.unique(mesh.boundary_facets), point_sets)
     still = np.zeros((mesh.n_nodes, 3), dtype=bool)
     for support in spec.supports:
@@ -365,6 +361,23 @@ def scene_without_patches(spec: DatasetSpec) -> Scene:
     material, held = make_material(spec.material), by_node(still)
     springs = foundations(spec, surface or Facets(mesh.points, mesh.boundary_facets), point_sets)
     return Scene(spec, mesh, material, *held, surface, point_sets, springs)
+
+
+def _in_elements(
+    spec: DatasetSpec, mesh: Mesh, point_sets: Mapping[str, NDArray[np.int64]]
+) -> tuple[Mesh, Mapping[str, NDArray[np.int64]]]:
+    """Return the mesh in the elements of a dataset file; `SpecError` if it has others."""
+    wanted, n_nodes = spec.discretisation, mesh.cells.shape[1]
+    element = "hexahedron" if n_nodes == 8 else "tetrahedron"
+    if element != wanted.element:
+        raise SpecError(
+            f"`discretisation.element` must be {element!r}, as in the mesh; got {wanted.element!r}."
+        )
+    if n_nodes == 10 and wanted.order == 1:
+        raise SpecError("`discretisation.order` must be 2, as in the mesh; got 1.")
+    return (
+        with_middles(mesh, point_sets) if (n_nodes, wanted.order) == (4, 2) else (mesh, point_sets)
+    )
 
 
 def by_node(still: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -1,9 +1,9 @@
 """Snapshots from another program: arrays in an NPZ or HDF5 file.
 
-Required: `points` (n_nodes, 3), m; `cells` (n_cells, 8 or 4) in VTK order, counted from 0; `forces`
-and `displacements` (n, n_nodes, 3), N and m. Optional: `fixed_nodes` (n_fixed,); `regions` (n,), or
-(n, k) with k forces at once, load-region ids from 0; `test` and `validation` (n,), true or 1 for
-test and validation samples.
+Required: `points` (n_nodes, 3), m; `cells` (n_cells, 8, 4 or 10) in VTK order, counted from 0;
+`forces` and `displacements` (n, n_nodes, 3), N and m. Optional: `fixed_nodes` (n_fixed,);
+`regions` (n,), or (n, k) with k forces at once, load-region ids from 0; `test` and `validation`
+(n,), true or 1 for test and validation samples.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def _check_shapes(arrays: Mapping[str, NDArray[Any]]) -> None:
     n, n_nodes = len(np.atleast_1d(arrays["forces"])), len(np.atleast_1d(arrays["points"]))
     shapes: dict[str, tuple[tuple[int | None, ...], ...]] = {
         "points": ((None, 3),),
-        "cells": ((None, 8), (None, 4)),
+        "cells": ((None, 8), (None, 4), (None, 10)),
         "forces": ((n, n_nodes, 3),),
         "displacements": ((n, n_nodes, 3),),
         "fixed_nodes": ((None,),),

@@ -11,8 +11,16 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mor_bench.errors import SpecError
-from mor_bench.scene.interpolation import trilinear
-from mor_bench.scene.mesh import FACES, HEX_CORNERS, Mesh, along_longest_axis, inverse_of
+from mor_bench.scene.interpolation import quadratic, trilinear
+from mor_bench.scene.mesh import (
+    FACES,
+    HEX_CORNERS,
+    TET_EDGES,
+    Mesh,
+    along_longest_axis,
+    corners_of,
+    inverse_of,
+)
 
 SAME_PLACE = 1e-9
 """Distance below which two nodes coincide, as a fraction of the bounding box's diagonal."""
@@ -30,8 +38,15 @@ FLAT = 1e-12
 """det J / |J|³ below which a cell is flat: the round-off of an exact zero."""
 
 _GAUSS = (2.0 * HEX_CORNERS - 1.0) / np.sqrt(3.0)
-_TURNED = {4: [1, 0, 2, 3], 8: [4, 5, 6, 7, 0, 1, 2, 3]}
-"""Order of a cell's corners that inverts its orientation."""
+_CURVED = np.concatenate([np.full((4, 3), 0.138) + 0.447 * np.eye(4, 3, -1), np.eye(4, 3, -1)])
+"""Gauss points and corners of a tetrahedron, where T10 are checked."""
+
+_TURNED = {
+    4: [1, 0, 2, 3],
+    8: [4, 5, 6, 7, 0, 1, 2, 3],
+    10: [1, 0, 2, 3, 4, 6, 5, 8, 7, 9],
+}
+"""Order of a cell's nodes that inverts its orientation."""
 
 
 def tidied(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[Mesh, NDArray[np.int64]]:
@@ -41,7 +56,7 @@ def tidied(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[Mesh,
     ----------
     points : (n_points, 3) float64
         Positions, m.
-    cells : (n_cells, 8) or (n_cells, 4) int64
+    cells : (n_cells, 8), (n_cells, 4) or (n_cells, 10) int64
 
     Returns
     -------
@@ -69,15 +84,16 @@ def tidied(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[Mesh,
 def in_grid(mesh: Mesh) -> Mesh:
     """Return the mesh with its axis-parallel regular grid, if it has one.
 
-    Each node must have its own grid point, and no cell may be larger than the spacing.
+    Each node must have its own grid point, and no edge may be longer than the spacing.
     """
+    step = 2 if mesh.cells.shape[1] == 10 else 1
     low, size = mesh.points.min(axis=0), np.ptp(mesh.points, axis=0)
     near = IN_GRID * float(np.linalg.norm(size))
     gaps = [np.diff(np.sort(x)) for x in mesh.points.T]
     steps = np.array([gap[gap > near].mean() for gap in gaps])
     index = np.rint((mesh.points - low) / steps).astype(np.int64)
     off = np.abs(mesh.points - low - index * steps).max()
-    one_step = np.ptp(index[mesh.cells], axis=1).max() <= 1
+    one_step = np.ptp(index[mesh.cells], axis=1).max() <= step
     if off > near or not one_step or len(np.unique(index, axis=0)) < mesh.n_nodes:
         return mesh
     nx, ny, nz = (int(n) + 1 for n in index.max(axis=0))
@@ -91,7 +107,8 @@ def check_numbers(points: NDArray[np.float64], cells: NDArray[np.int64]) -> None
         raise SpecError("there must be points and cells; got none.")
     if cells.ndim != 2 or cells.shape[1] not in FACES:
         raise SpecError(
-            f"cells must have shape (n_cells, 8) for H8 or (n_cells, 4) for T4; got {cells.shape}."
+            "cells must have shape (n_cells, 8) for H8, (n_cells, 4) for T4 or (n_cells, 10) for "
+            f"T10; got {cells.shape}."
         )
     if not np.isfinite(points).all():
         first = int(np.argwhere(~np.isfinite(points))[0, 0])
@@ -114,7 +131,8 @@ def sound_cells(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArra
     ------
     SpecError
         If nodes coincide; a cell is flat, inverted or repeated; more than two cells share a face;
-        two cells lie on the same side of a face; or some cells are not connected through faces.
+        two cells lie on the same side of a face; some cells are not connected through faces; or
+        an edge of T10 has several middles, or another cell's corner in the middle.
     """
     near = SAME_PLACE * float(np.linalg.norm(np.ptp(points, axis=0)))
     tree = cKDTree(points)
@@ -127,6 +145,8 @@ def sound_cells(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArra
             f"{points[pairs[:, 0].min()].tolist()} m; merge them."
         )
     cells = outwards(points, cells)
+    if cells.shape[1] == 10:
+        _check_middles(cells)
     faces = _face_numbers(cells)
     _check_overlap(cells, faces.ravel())
     _check_parts(faces)
@@ -162,11 +182,15 @@ def outwards(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[n
 def _extreme_volumes(
     corners: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the least and greatest det J / |J|³ of cells (n, 4 or 8, 3) at Gauss points."""
+    """Return the least and greatest det J / |J|³ of cells (n, 4, 8 or 10, 3) at Gauss points.
+
+    T10 are also checked at their corners.
+    """
     if corners.shape[1] == 4:
         jacobian = corners[:, None, 1:] - corners[:, None, :1]
     else:
-        jacobian = np.einsum("cai,qad->cqdi", corners, trilinear(_GAUSS)[1])
+        slopes = trilinear(_GAUSS)[1] if corners.shape[1] == 8 else quadratic(_CURVED)[1]
+        jacobian = np.einsum("cai,qad->cqdi", corners, slopes)
     size = np.maximum(np.linalg.norm(jacobian, axis=(2, 3)) ** 3, np.finfo(float).tiny)
     volumes = np.linalg.det(jacobian) / size
     return volumes.min(axis=1), volumes.max(axis=1)
@@ -181,13 +205,27 @@ def _check_overlap(cells: NDArray[np.int64], numbers: NDArray[np.int64]) -> None
             f"{int((shared > 2).sum())} faces belong to more than two cells: cells overlap."
         )
     # Seen from outside, the two cells at a face number its corners in opposite directions.
-    corners = FACES[cells.shape[1]]
+    corners = corners_of(FACES[cells.shape[1]])
     faces = cells[:, corners].reshape(-1, corners.shape[1])
     second = faces[np.arange(len(faces)), (faces.argmin(axis=1) + 1) % faces.shape[1]]
     n_sides = len(np.unique(np.stack([numbers, second], axis=1), axis=0))
     if n_sides < len(faces):
         raise SpecError(
             f"{len(faces) - n_sides} faces have both of their cells on one side: cells overlap."
+        )
+
+
+def _check_middles(cells: NDArray[np.int64]) -> None:
+    """Raise `SpecError` if the cells at an edge do not share one node in its middle."""
+    edges = np.sort(cells[:, TET_EDGES], axis=2).reshape(-1, 2)
+    whole = np.unique(np.column_stack([edges, cells[:, 4:].ravel()]), axis=0)
+    n_wrong = len(whole) - len(np.unique(edges, axis=0))
+    n_wrong += len(whole) - len(np.unique(whole[:, 2]))
+    n_wrong += len(np.intersect1d(cells[:, :4], cells[:, 4:]))
+    if n_wrong:
+        raise SpecError(
+            "every edge of tetrahedra with ten nodes must have one middle of its own, which all of "
+            f"its cells share and no cell has as a corner; {n_wrong} have not."
         )
 
 
@@ -202,7 +240,7 @@ def _check_parts(faces: NDArray[np.int64]) -> None:
 
 def _face_numbers(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     """Number the faces (n_cells, 6 or 4) of cells; equal faces have the same number."""
-    corners = FACES[cells.shape[1]]
+    corners = corners_of(FACES[cells.shape[1]])
     faces = np.sort(cells[:, corners].reshape(-1, corners.shape[1]), axis=1)
     return np.unique(faces, axis=0, return_inverse=True)[1].reshape(len(cells), len(corners))
 

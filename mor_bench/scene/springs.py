@@ -14,6 +14,7 @@ from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.regions import Cloud, region_points
+from mor_bench.scene.triangle_rules import DEGREE_4, DEGREE_4_WEIGHTS, quadratic_triangle
 from mor_bench.specs import AXES, DatasetSpec
 
 _X, _W = np.polynomial.legendre.leggauss(3)
@@ -78,6 +79,11 @@ def _quadrature(
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         points = np.einsum("pa,fai->fpi", _SIXTHS, corners)
         vectors = np.repeat(normals[:, None] / 6.0, 3, axis=1)
+    elif facets.shape[1] == 6:
+        shape, derivatives = quadratic_triangle(DEGREE_4)
+        along = np.einsum("pad,fai->dfpi", derivatives, corners)
+        points = np.einsum("pa,fai->fpi", shape, corners)
+        vectors = np.cross(along[0], along[1]) * DEGREE_4_WEIGHTS[:, None]
     else:
         s, t = (a.ravel() for a in np.meshgrid(_X, _X))
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])

@@ -7,7 +7,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.scene.mesh import HEX_CORNERS, Mesh, along_longest_axis, inverse_of
+from mor_bench.scene.interpolation import quadratic
+from mor_bench.scene.mesh import HEX_CORNERS, TET_EDGES, Mesh, along_longest_axis, inverse_of
 
 _THIRDS = list(product(range(3), repeat=3))
 """Positions of the 27 nodes of a divided hexahedron, in half edges along its axes."""
@@ -26,7 +27,7 @@ HEX_CHILDREN = np.array(
     [[_THIRDS.index(tuple(origin + place)) for place in HEX_CORNERS] for origin in HEX_CORNERS]
 )
 
-TET_PARENTS = [[0], [1], [2], [3], [0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]]
+TET_PARENTS = [[0], [1], [2], [3], *TET_EDGES.tolist()]
 """Corners and midpoints of edges of a tetrahedron."""
 
 _TET_CORNERS = [[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3]]
@@ -49,8 +50,11 @@ def subdivide(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
     mesh : Mesh
         Nodes are numbered along the body's longest axis, for a small bandwidth.
     parents : (n_nodes, 8) int64
-        Each new node is the mean of these old nodes; all occur equally often.
+        Each new node is the mean of these old nodes; all occur equally often. Curved edges of
+        T10 stay curved, so their new nodes are only near the mean.
     """
+    if mesh.cells.shape[1] == 10:
+        return _quadratic(mesh)
     hexahedra = mesh.cells.shape[1] == 8
     local = HEX_PARENTS if hexahedra else TET_PARENTS
     padded = np.array([np.repeat(parents, 8 // len(parents)) for parents in local])
@@ -59,6 +63,30 @@ def subdivide(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
     numbers = numbers.reshape(mesh.n_cells, len(local))
     points = mesh.points[parents].mean(axis=1)
     cells = numbers[:, HEX_CHILDREN].reshape(-1, 8) if hexahedra else _tetrahedra(points, numbers)
+    order = along_longest_axis(points)
+    return Mesh(points[order], inverse_of(order)[cells]), parents[order]
+
+
+def _quadratic(mesh: Mesh) -> tuple[Mesh, NDArray[np.int64]]:
+    """Divide T10: the old nodes are the new corners, and the new middles lie between two of them.
+
+    A middle's place in the cell is the mean of the places of its two nodes.
+    """
+    a, b = np.triu_indices(10, 1)
+    places = np.array([np.eye(4, 3, -1)[parents].mean(axis=0) for parents in TET_PARENTS])
+    shape = quadratic(0.5 * (places[a] + places[b]))[0]
+    between = np.einsum("pa,cai->cpi", shape, mesh.points[mesh.cells]).reshape(-1, 3)
+    pairs = np.sort(np.stack([mesh.cells[:, a], mesh.cells[:, b]], axis=2), axis=2)
+    keys = (pairs @ [mesh.n_nodes, 1]).ravel()
+    corners = _tetrahedra(mesh.points, mesh.cells)
+    edges = np.sort(corners[:, TET_EDGES], axis=2)
+    used, number = np.unique((edges @ [mesh.n_nodes, 1]).ravel(), return_inverse=True)
+    known, first = np.unique(keys, return_index=True)
+    points = np.concatenate([mesh.points, between[first[np.searchsorted(known, used)]]])
+    cells = np.hstack([corners, mesh.n_nodes + number.reshape(-1, len(TET_EDGES))])
+    ends = np.stack([used // mesh.n_nodes, used % mesh.n_nodes], axis=1)
+    own = np.repeat(np.arange(mesh.n_nodes)[:, None], 8, axis=1)
+    parents = np.concatenate([own, np.repeat(ends, 4, axis=1)])
     order = along_longest_axis(points)
     return Mesh(points[order], inverse_of(order)[cells]), parents[order]
 

@@ -17,18 +17,27 @@ class Discretisation(StrictModel):
     """The elements and their quadrature.
 
     Selective integration takes the volumetric energy from the mean gradient of each hexahedron.
+
+    Attributes
+    ----------
+    order : 1 or 2
+        Degree of the shape functions. Order 2 gives tetrahedra ten nodes: nodes in the middles of
+        edges are added to a mesh without them.
     """
 
     element: Literal["hexahedron", "tetrahedron"] = "hexahedron"
     integration: Literal["full", "selective"] = "full"
+    order: Literal[1, 2] = Field(default=1, exclude_if=lambda value: value == 1)
 
     @model_validator(mode="after")
     def _has_points_to_spare(self) -> Discretisation:
         if self.element == "tetrahedron" and self.integration == "selective":
             raise ValueError(
-                "`integration` of tetrahedra must be 'full', since they have one quadrature "
-                "point; got 'selective'"
+                "`integration` of tetrahedra must be 'full'; got 'selective'. Where they lock, set "
+                "`order = 2`"
             )
+        if self.element == "hexahedron" and self.order == 2:
+            raise ValueError("`order` of hexahedra must be 1; got 2")
         return self
 
 

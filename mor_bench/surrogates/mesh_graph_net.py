@@ -25,11 +25,15 @@ from mor_bench.surrogates.field_surrogate import Arrays, Input
 
 HEXAHEDRON = "01 12 23 30 45 56 67 74 04 15 26 37"
 TETRAHEDRON = "01 02 03 12 13 23"
+QUADRATIC = "04 41 15 52 26 60 07 73 18 83 29 93 45 56 46 47 78 48 58 89 59 67 79 69"
 EDGES = {
     n: np.array([[int(node) for node in edge] for edge in edges.split()])
-    for n, edges in ((8, HEXAHEDRON), (4, TETRAHEDRON))
+    for n, edges in ((8, HEXAHEDRON), (4, TETRAHEDRON), (10, QUADRATIC))
 }
-"""Node pairs along the edges of a hexahedron and of a tetrahedron, in VTK order."""
+"""Node pairs along the edges of a hexahedron and of tetrahedra, in VTK order.
+
+Each face of a tetrahedron with ten nodes counts as four triangles.
+"""
 
 
 class Graph(nn.Module):

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.hard_cases.setups import of_order
 from mor_bench.mechanics.assembly import Assembler, Discretisation
 from mor_bench.mechanics.banded import BandedCholesky
 from mor_bench.mechanics.elements import T4, shape_gradients
-from mor_bench.scene.interpolation import trilinear
+from mor_bench.scene.interpolation import quadratic, trilinear
 from mor_bench.scene.materials import (
     Corotational,
     HolzapfelGasserOgden,
@@ -21,7 +23,7 @@ from mor_bench.scene.materials import (
     SaintVenantKirchhoff,
     Yeoh,
 )
-from mor_bench.scene.mesh import box_mesh
+from mor_bench.scene.mesh import Mesh, box_mesh
 
 Array = NDArray[np.float64]
 FIBRES = ((1.0, 1.0, 0.0), (1.0, -1.0, 0.5))
@@ -43,9 +45,52 @@ COMPRESSIBLE: dict[str, Material] = {
     "corotational": Corotational(1.0, 0.3),
     "holzapfel-gasser-ogden": HolzapfelGasserOgden(0.19, 0.1, 0.9, 0.1, FIBRES, 0.8),
 }
-ELEMENTS = [("hexahedron", False), ("hexahedron", True), ("tetrahedron", False)]
+ELEMENTS = [
+    ("hexahedron", False),
+    ("hexahedron", True),
+    ("tetrahedron", False),
+    ("quadratic tetrahedron", False),
+]
+"""Names of elements, and whether they are integrated selectively."""
+
 ISOTROPIC = [name for name in LAWS if name != "holzapfel-gasser-ogden"]
 EVERY = list(itertools.product(LAWS, ELEMENTS))
+
+
+def mesh_options(element: str) -> dict[str, Any]:
+    """Return the options of a mesh of an element for `mor_bench.hard_cases.setups`."""
+    return {"tetrahedra": element != "hexahedron", "order": 2 if "quadratic" in element else 1}
+
+
+def discretisation(kind: tuple[str, bool]) -> dict[str, Any]:
+    """Return the table `[discretisation]` of an element."""
+    order: dict[str, Any] = {"order": 2} if "quadratic" in kind[0] else {}
+    integration = "selective" if kind[1] else "full"
+    return {"element": kind[0].split()[-1], "integration": integration, **order}
+
+
+def unit_box(n: int, element: str) -> Mesh:
+    """Return n x n x n hexahedra in a unit box, or their tetrahedra."""
+    options = mesh_options(element)
+    mesh = box_mesh((1.0, 1.0, 1.0), (n, n, n), options["tetrahedra"])
+    return of_order(mesh, options["order"])
+
+
+def fine_rule(element: str) -> tuple[Array, Array, Array]:
+    """Return shape functions, their derivatives and weights of a rule for loads and errors."""
+    if element == "hexahedron":
+        places = np.array(list(itertools.product((-1, 1), repeat=3))) / np.sqrt(3.0)
+        return *trilinear(places), np.ones(8)
+    if element == "tetrahedron":
+        a, b = 0.58541020, 0.13819660
+        shape = np.full((4, 4), b) + (a - b) * np.eye(4)
+        return shape, np.repeat(T4.derivatives, 4, axis=0), np.full(4, 1 / 24)
+    # A rule of a cube, folded to the tetrahedron.
+    line, w = np.polynomial.legendre.leggauss(4)
+    u, v, t = (axis.ravel() for axis in np.meshgrid(*[0.5 + 0.5 * line] * 3, indexing="ij"))
+    weights = np.einsum("i,j,k->ijk", w, w, w).ravel() / 8 * (1 - u) ** 2 * (1 - v)
+    places = np.stack([u, (1 - u) * v, (1 - u) * (1 - v) * t], axis=1)
+    return *quadratic(places), weights
 
 
 def piola(law: Material, gradient: Array) -> Array:
@@ -133,15 +178,7 @@ def body_force(x: Array, law: Material) -> Array:
 
 def manufactured_error(n: int, element: str, selective: bool, law: Material) -> tuple[float, float]:
     """Return the L2 and H1 errors on n³ cells under the field's body force."""
-    mesh = box_mesh((1.0, 1.0, 1.0), (n, n, n), element == "tetrahedron")
-    if element == "hexahedron":
-        places = np.array(list(itertools.product((-1, 1), repeat=3))) / np.sqrt(3.0)
-        shape, derivatives = trilinear(places)
-        weights = np.ones(8)
-    else:
-        a, b = 0.58541020, 0.13819660
-        shape, weights = np.full((4, 4), b) + (a - b) * np.eye(4), np.full(4, 1 / 24)
-        derivatives = np.repeat(T4.derivatives, 4, axis=0)
+    mesh, (shape, derivatives, weights) = unit_box(n, element), fine_rule(element)
     gradients, det_j = shape_gradients(mesh.points, mesh.cells, derivatives)
     volume = det_j * weights
     x = np.einsum("qa,cai->cqi", shape, mesh.points[mesh.cells])

@@ -11,6 +11,8 @@ from mor_bench.mechanics.assembly import Assembler, discretisation_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import Scene, load_scene
 
+from .laws_and_elements import discretisation
+
 Array = NDArray[np.float64]
 
 
@@ -19,9 +21,12 @@ def scene_of(
 ) -> Scene:
     """Return a shipped scene with another law, element and Poisson's ratio."""
     spec = mor_bench.load_scene(base).spec.model_dump(mode="json")
-    discretisation = {"element": kind[0], "integration": "selective" if kind[1] else "full"}
     return load_scene(
-        {**spec, "discretisation": discretisation, "material": material_table(law, 500.0, poisson)}
+        {
+            **spec,
+            "discretisation": discretisation(kind),
+            "material": material_table(law, 500.0, poisson),
+        }
     )
 
 

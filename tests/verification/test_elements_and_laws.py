@@ -31,7 +31,9 @@ from .laws_and_elements import (
     ISOTROPIC,
     LAWS,
     manufactured_error,
+    mesh_options,
     piola,
+    unit_box,
 )
 from .scenes import scene_of
 
@@ -39,7 +41,7 @@ Array = NDArray[np.float64]
 
 
 def warped(element: str, cells: tuple[int, int, int] = (2, 2, 2)) -> Mesh:
-    return distorted_box(cells, element == "tetrahedron")
+    return distorted_box(cells, **mesh_options(element))
 
 
 @pytest.mark.parametrize(("law", "kind"), EVERY)
@@ -91,7 +93,7 @@ def homogeneous(
     gradient: Array, law: Material, element: str, selective: bool
 ) -> tuple[Array, float]:
     """Return stress and energy density of a unit cube under a deformation gradient."""
-    mesh = box_mesh((1.0, 1.0, 1.0), (2, 2, 2), element == "tetrahedron")
+    mesh = unit_box(2, element)
     state = free_assembler(mesh, law, selective).force(
         (mesh.points @ (gradient - np.eye(3)).T).ravel()
     )
@@ -204,13 +206,14 @@ def test_the_derivative_of_the_force_is_symmetric(law: str, kind: tuple[str, boo
     model = free_assembler(mesh, LAWS[law], kind[1])
     rng = np.random.default_rng(0)
     stretched = mesh.points * (0.4, 0.0, -0.2)  # far from the kink where fibres become slack
+    closer = 0.25 if "quadratic" in kind[0] else 1.0  # as their nodes are
     u, one, other = (
-        stretched.ravel() + 0.02 * rng.normal(size=model.n_dofs),
+        stretched.ravel() + closer * 0.02 * rng.normal(size=model.n_dofs),
         rng.normal(size=model.n_dofs),
         rng.normal(size=model.n_dofs),
     )
 
-    def slope(direction: Array, h: float = 5e-4) -> Array:
+    def slope(direction: Array, h: float = closer * 5e-4) -> Array:
         force = [model.force(u + k * h * direction).force for k in (-2, -1, 1, 2)]
         return np.asarray((force[0] - 8 * force[1] + 8 * force[2] - force[3]) / (12 * h))
 
@@ -270,7 +273,7 @@ def slow_unless(quick: Callable[..., bool], cases: Iterable[Any]) -> list[Any]:
     ("law", "kind"),
     slow_unless(
         lambda law, kind: law == "neo-hookean" and not kind[1],
-        [c for c in EVERY if c[1][0] == "hexahedron" or c[0] == "saint-venant-kirchhoff"],
+        [c for c in EVERY if c[1][0] != "tetrahedron" or c[0] == "saint-venant-kirchhoff"],
     ),
 )
 def test_manufactured_solution_converges_at_the_right_order(
@@ -278,11 +281,12 @@ def test_manufactured_solution_converges_at_the_right_order(
 ) -> None:
     """T4 needs finer meshes: its L2 order is 1.95 from 14 to 20 cells."""
     material = COMPRESSIBLE[law]
-    n = (6, 12) if kind[0] == "hexahedron" else (16, 20)
+    n = {"hexahedron": (6, 12), "tetrahedron": (16, 20)}.get(kind[0], (4, 8))
     coarse, fine = (manufactured_error(cells, *kind, material) for cells in n)
     order = np.log(np.divide(coarse, fine)) / np.log(n[1] / n[0])
-    assert order[0] >= 1.95
-    assert order[1] >= 0.95
+    degree = 2 if "quadratic" in kind[0] else 1
+    assert order[0] >= degree + 1 - 0.05 * degree
+    assert order[1] >= degree - 0.05 * degree
 
 
 @pytest.fixture(scope="module")
@@ -372,7 +376,7 @@ def test_huge_loads_end_in_a_valid_answer_or_a_typed_error(
     [
         (
             [[0, 1, 2, 3, 4]],
-            r"cells must have shape \(n_cells, 8\) for H8 or \(n_cells, 4\) for T4; got \(1, 5\)",
+            r"\(n_cells, 8\) for H8, .* or \(n_cells, 10\) for T10; got \(1, 5\)",
         ),
         ([[0, 2, 1, 4]], r"cell 0 is inverted or degenerate"),
         ([[0, 1, 2, 3]], r"cell 0 is inverted or degenerate"),

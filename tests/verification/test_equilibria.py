@@ -29,7 +29,7 @@ from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.specs import SolverName
 
-from .laws_and_elements import ELEMENTS, EVERY, ISOTROPIC, LAWS, piola
+from .laws_and_elements import ELEMENTS, EVERY, ISOTROPIC, LAWS, mesh_options, piola
 from .scenes import patch_load, relative_residual, scene_of
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ def test_confined_compression_ends_at_the_limit_point(
     kind: tuple[str, bool], steps: int, factor: float
 ) -> None:
     """Beyond it, plain Newton converges to a mirrored element."""
-    column, q = confined_column(LAW, kind[0] == "tetrahedron", kind[1]), None
+    column, q = confined_column(LAW, selective=kind[1], **mesh_options(kind[0])), None
     for step in range(1, steps + 1):
         level = factor * step / steps
         if level > 1:
@@ -60,7 +60,7 @@ def test_confined_compression_ends_at_the_limit_point(
 @pytest.mark.parametrize("kind", ELEMENTS)
 def test_an_unstable_equilibrium_is_never_returned(kind: tuple[str, bool]) -> None:
     """Under 0.9 of the limit load the residual vanishes at a stable and an unstable stretch."""
-    column = confined_column(LAW, kind[0] == "tetrahedron", kind[1])
+    column = confined_column(LAW, selective=kind[1], **mesh_options(kind[0]))
     ratio = 0.9 * 2 / (3 * np.sqrt(3))
     unstable, stable = sorted(
         root.real for root in np.roots([1.0, 0.0, -1.0, ratio]) if root.real > 0
@@ -77,7 +77,7 @@ def test_an_unstable_equilibrium_is_never_returned(kind: tuple[str, bool]) -> No
 def test_laws_without_a_limit_point_carry_more(law: str, kind: tuple[str, bool]) -> None:
     for factor in (1.01, 3.0):
         solution = solve_equilibrium(
-            confined_column(LAWS[law], kind[0] == "tetrahedron", kind[1]),
+            confined_column(LAWS[law], selective=kind[1], **mesh_options(kind[0])),
             np.array([factor * LIMIT_PA]),
         )
         alpha = 1 + solution.displacement[0]
@@ -225,7 +225,7 @@ def test_a_column_beyond_its_buckling_load_is_never_called_stable_when_straight(
 
 @pytest.mark.parametrize("kind", ELEMENTS)
 def test_stiffness_contrast_of_a_million(kind: tuple[str, bool]) -> None:
-    bars = make_bars(kind[0] == "tetrahedron", kind[1])
+    bars = make_bars(selective=kind[1], **mesh_options(kind[0]))
     np.testing.assert_allclose(bars.end_displacement(), Bars.stretch - 1, rtol=2e-6)
 
 
