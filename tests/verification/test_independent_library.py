@@ -18,7 +18,7 @@ from mor_bench.mechanics.model import FullOrderModel, rest_displacement
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.scene import Scene
 
-from .laws_and_elements import LAWS
+from .laws_and_elements import ELEMENTS, LAWS, discretisation
 
 Array = NDArray[np.float64]
 
@@ -68,13 +68,18 @@ def felupe_law(scene: Scene) -> Any:
     return tensortrax.Hyperelastic(energy)
 
 
+REGIONS = {
+    4: ("tetra", felupe.RegionTetra),
+    8: ("hexahedron", felupe.RegionHexahedron),
+    10: ("tetra10", felupe.RegionQuadraticTetra),
+}
+
+
 def felupe_solution(scene: Scene, forces: Array) -> Array:
     """Return displacements, (n_nodes, 3) m."""
-    tetrahedra = scene.mesh.cells.shape[1] == 4
-    mesh = felupe.Mesh(scene.mesh.points, scene.mesh.cells, "tetra" if tetrahedra else "hexahedron")
-    field = felupe.FieldContainer(
-        [felupe.Field((felupe.RegionTetra if tetrahedra else felupe.RegionHexahedron)(mesh), dim=3)]
-    )
+    kind, region = REGIONS[scene.mesh.cells.shape[1]]
+    mesh = felupe.Mesh(scene.mesh.points, scene.mesh.cells, kind)
+    field = felupe.FieldContainer([felupe.Field(region(mesh), dim=3)])
     still = np.isin(np.arange(scene.mesh.n_dofs), scene.fixed_dofs).reshape(-1, 3)
     fixed = {
         f"support {axis}": felupe.Boundary(
@@ -125,16 +130,18 @@ def test_solutions_agree_with_felupe_on_twenty_random_loads() -> None:
     compare(mor_bench.load_scene("beam-coarse"), 20)
 
 
-@pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
+@pytest.mark.parametrize("kind", [kind for kind in ELEMENTS if not kind[1]])
 @pytest.mark.parametrize("law", list(LAWS))
-def test_solutions_agree_with_felupe_for_every_law_and_element(law: str, element: str) -> None:
+def test_solutions_agree_with_felupe_for_every_law_and_element(
+    law: str, kind: tuple[str, bool]
+) -> None:
     spec = mor_bench.load_scene("beam-tiny").spec.model_dump(mode="json")
     material = material_table(law, 500.0, 0.4)
     if law == "ogden":
         material |= {"alpha": [2.0, -2.0], "mu_pa": [140.0, -35.0]}
     compare(
         mor_bench.load_scene(
-            {**spec, "discretisation": {"element": element}, "material": material}
+            {**spec, "discretisation": discretisation(kind), "material": material}
         ),
         2,
     )
