@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.errors import SpecError
+from mor_bench.hard_cases.setups import of_order
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.files import read_mesh, read_triangles
@@ -25,7 +26,11 @@ from mor_bench.scene.soundness import in_grid
 from mor_bench.scene.triangle_distance import distances
 
 SIZE, CELLS = (1.2, 0.4, 0.4), (6, 2, 2)
-ELEMENTS = {"hexahedron": "hexahedron", "tetra": "tetrahedron"}
+ELEMENTS: dict[str, dict[str, Any]] = {
+    "hexahedron": {"element": "hexahedron"},
+    "tetra": {"element": "tetrahedron"},
+    "tetra10": {"element": "tetrahedron", "order": 2},
+}
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -43,14 +48,14 @@ def content(**changes: Any) -> dict[str, Any]:
 
 
 def of_file(
-    path: Path, *, support: Any = "x-min", load: Any = "z-max", element: str = "hexahedron"
+    path: Path, *, support: Any = "x-min", load: Any = "z-max", kind: str = "hexahedron"
 ) -> dict[str, Any]:
     """Return the beam with its mesh from a file in metres."""
     return content(
         geometry={"shape": "file", "file": str(path)},
         supports=[{"region": support}],
         loads={**content()["loads"], "region": load},
-        discretisation={"element": element},
+        discretisation=ELEMENTS[kind],
     )
 
 
@@ -63,15 +68,15 @@ def sides(mesh: Mesh) -> list[NDArray[np.int64]]:
     ]
 
 
-@pytest.fixture(scope="module", params=["hexahedron", "tetra"])
+@pytest.fixture(scope="module", params=[*ELEMENTS])
 def beam(request: pytest.FixtureRequest) -> tuple[str, Mesh, meshio.Mesh]:
     """The beam's mesh, and its meshio mesh with shuffled nodes, two unused nodes and two sides."""
     kind = request.param
-    mesh = box_mesh(SIZE, CELLS, kind == "tetra")
+    mesh = of_order(box_mesh(SIZE, CELLS, kind != "hexahedron"), 2 if kind == "tetra10" else 1)
     order = np.random.default_rng(0).permutation(mesh.n_nodes)
     number = np.argsort(order)
     points = np.vstack([mesh.points[order], [[9.0, 9.0, 9.0], [8.0, 8.0, 8.0]]])
-    flat = "quad" if kind == "hexahedron" else "triangle"
+    flat = {"hexahedron": "quad", "tetra": "triangle", "tetra10": "triangle6"}[kind]
     cells = [(kind, number[mesh.cells]), *((flat, number[side]) for side in sides(mesh))]
     return kind, mesh, meshio.Mesh(points, cells)
 
@@ -107,11 +112,16 @@ def write_gmsh_reversed(raw: meshio.Mesh, path: Path) -> None:
 
 def write_gmsh1(raw: meshio.Mesh, path: Path) -> None:
     """Write the format of the manual, with gaps between the numbers of nodes and elements."""
-    types = {"hexahedron": 5, "tetra": 4, "quad": 3, "triangle": 2}
+    types = {"hexahedron": 5, "tetra": 4, "quad": 3, "triangle": 2, "tetra10": 11, "triangle6": 9}
+    swapped = {"tetra10": [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]}
     lines = ["$NOD", str(len(raw.points))]
     lines += [f"{3 * i + 5} {x:.17g} {y:.17g} {z:.17g}" for i, (x, y, z) in enumerate(raw.points)]
     blocks = zip(raw.cells, (7, 1, 2), strict=True)
-    rows = [(types[block.type], tag, row) for block, tag in blocks for row in block.data]
+    rows = [
+        (types[block.type], tag, row[swapped.get(block.type, slice(None))])
+        for block, tag in blocks
+        for row in block.data
+    ]
     lines += ["$ENDNOD", "$ELM", str(len(rows))]
     for i, (kind, tag, row) in enumerate(rows):
         nodes = " ".join(str(3 * n + 5) for n in row)
@@ -122,6 +132,7 @@ def write_gmsh1(raw: meshio.Mesh, path: Path) -> None:
 def write_abaqus(raw: meshio.Mesh, path: Path) -> None:
     """Write a point set, and a set that only the second of three ELEMENT lines names."""
     names = {"hexahedron": "C3D8", "tetra": "C3D4", "quad": "S4", "triangle": "S3"}
+    names |= {"tetra10": "C3D10", "triangle6": "STRI65"}
     lines = ["*HEADING", "*NODE"]
     lines += [f"{10 + i}, {x:.17g}, {y:.17g}, {z:.17g}" for i, (x, y, z) in enumerate(raw.points)]
     first = 1
@@ -173,7 +184,7 @@ def solve(scene: Scene) -> NDArray[np.float64]:
 @pytest.fixture(scope="module")
 def expected(beam: tuple[str, Mesh, meshio.Mesh]) -> NDArray[np.float64]:
     """The displacements of the original box."""
-    return solve(mor_bench.load_scene(content(discretisation={"element": ELEMENTS[beam[0]]})))
+    return solve(mor_bench.load_scene(content(discretisation=ELEMENTS[beam[0]])))
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -189,7 +200,7 @@ def test_every_format_gives_the_solution_of_its_original_box(
     write(meshio.Mesh(1000 * raw.points, raw.cells), path)  # in millimetres
     left, top = ("1", "2") if name == "gmsh 1" else ("left", "top")
     sets = {"support": {"point_set": left}, "load": {"point_set": top}}
-    spec = of_file(path, **sets, element=ELEMENTS[kind])
+    spec = of_file(path, **sets, kind=kind)
     scene = mor_bench.load_scene({**spec, "geometry": {**spec["geometry"], "unit_m": 1e-3}})
     assert scene.mesh.cells.shape == mesh.cells.shape
     derivatives = element_of(scene.mesh.cells).derivatives
@@ -252,8 +263,8 @@ def test_groups_with_the_same_number_are_named_by_dimension(tmp_path: Path) -> N
 def test_inverted_cells_are_reoriented(beam: tuple[str, Mesh, meshio.Mesh], tmp_path: Path) -> None:
     kind, mesh, _ = beam
     mirrored, some = mesh.points * [1, 1, -1] + [0, 0, 0.4], mesh.cells.copy()
-    if kind == "tetra":
-        some[::3] = some[::3][:, [1, 0, 2, 3]]
+    if kind != "hexahedron":
+        some[::3] = some[::3][:, [1, 0, 2, 3, 4, 6, 5, 8, 7, 9][: some.shape[1]]]
     for points, cells in ((mirrored, mesh.cells), (mesh.points, some)):
         meshio.Mesh(points, [(kind, cells)]).write(tmp_path / "mesh.vtk")
         read, _ = read_mesh(tmp_path / "mesh.vtk", 1.0)
@@ -343,7 +354,26 @@ def test_empty_and_unknown_regions_give_an_error_that_names_them(
 def test_an_element_other_than_that_of_the_file_is_refused(folder: Path) -> None:
     message = "must be 'hexahedron', as in the mesh; got 'tetrahedron'"
     with pytest.raises(SpecError, match=message):
-        mor_bench.load_scene(of_file(folder / "beam.vtu", element="tetrahedron"))
+        mor_bench.load_scene(of_file(folder / "beam.vtu", kind="tetra"))
+
+
+def test_middles_are_added_to_a_file_without_them_and_needed_where_a_file_has_them(
+    tmp_path: Path,
+) -> None:
+    linear = box_mesh(SIZE, CELLS, tetrahedra=True)
+    whole = of_order(linear, 2)
+    meshio.Mesh(linear.points, [("tetra", linear.cells)]).write(tmp_path / "linear.vtu")
+    meshio.Mesh(whole.points, [("tetra10", whole.cells)]).write(tmp_path / "whole.vtu")
+    made, read = (
+        mor_bench.load_scene(of_file(tmp_path / f"{name}.vtu", kind="tetra10"))
+        for name in ("linear", "whole")
+    )
+    np.testing.assert_array_equal(made.mesh.points, read.mesh.points)
+    np.testing.assert_allclose(solve(made), solve(read), rtol=0, atol=1e-9)
+    with pytest.raises(
+        SpecError, match=r"`discretisation\.order` must be 2, as in the mesh; got 1"
+    ):
+        mor_bench.load_scene(of_file(tmp_path / "whole.vtu", kind="tetra"))
 
 
 def test_the_distance_to_a_triangle_is_that_to_its_nearest_sample_point() -> None:
