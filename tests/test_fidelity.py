@@ -242,12 +242,8 @@ def test_the_tip_deflection_converges_to_an_independent_limit() -> None:
     assert limit[0] == pytest.approx(0.518, rel=0.02)
 
 
-TABLES: list[dict[str, Any]] = [
-    {},
-    {"element": "tetrahedron"},
-    {"integration": "selective"},
-    {"element": "tetrahedron", "order": 2},
-]
+T4: dict[str, Any] = {"element": "tetrahedron"}
+TABLES = [{}, T4, {"integration": "selective"}, {**T4, "order": 2}]
 
 
 @pytest.mark.parametrize("changes", TABLES)
@@ -290,8 +286,7 @@ def test_refinement_works_for_every_element(discretisation: dict[str, Any], tmp_
     n = 144 if "element" in discretisation else 24
     assert [mesh["n_cells"] for mesh in record["meshes"]] == [n, 8 * n]
     assert {load["limit"] for load in record["loads"]} == {"finest"}
-    least, most = (0.001, 0.05) if "order" in discretisation else (0.02, 0.7)
-    assert least < record["relative_l2"] < most
+    assert 0.02 < record["relative_l2"] * (15 if "order" in discretisation else 1) < 0.7
 
 
 def test_a_record_keeps_its_measurements_and_is_used_only_for_its_physics(
