@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 
 from mor_bench.errors import SpecError
+from mor_bench.hard_cases.setups import of_order
 from mor_bench.scene.files import read_mesh
-from mor_bench.scene.mesh import box_mesh
+from mor_bench.scene.mesh import TET_EDGES, Mesh, box_mesh
 
 HEX = box_mesh((2.0, 1.0, 1.0), (2, 1, 1))
 TET = box_mesh((2.0, 1.0, 1.0), (2, 1, 1), tetrahedra=True)
@@ -61,6 +63,53 @@ def on_one_side(kind: str) -> meshio.Mesh:
     return meshio.Mesh(points, [(kind, np.vstack([cell, higher]))])
 
 
+def quadratic(change: Callable[[Mesh], Mesh]) -> meshio.Mesh:
+    mesh = change(of_order(TET, 2))
+    return meshio.Mesh(mesh.points, [("tetra10", mesh.cells)])
+
+
+def curved(cell: int, shift: list[float]) -> meshio.Mesh:
+    """Move the middle of a cell's first edge so far that the cell folds."""
+
+    def change(mesh: Mesh) -> Mesh:
+        points = mesh.points.copy()
+        points[mesh.cells[cell, 4]] += shift
+        return Mesh(points, mesh.cells)
+
+    return quadratic(change)
+
+
+def split_edge() -> meshio.Mesh:
+    """Give one of the cells at an edge a middle of its own."""
+
+    def change(mesh: Mesh) -> Mesh:
+        cells = mesh.cells.copy()
+        shared = np.flatnonzero((cells == cells[0, 9]).any(axis=1))
+        assert len(shared) > 1
+        cells[0, 9] = mesh.n_nodes
+        moved = mesh.points[mesh.cells[0, 9]] + [0.0, 0.0, 1e-3]
+        return Mesh(np.vstack([mesh.points, moved]), cells)
+
+    return quadratic(change)
+
+
+def corner_as_middle() -> meshio.Mesh:
+    """Use a node in the middle of an edge as the corner of another cell."""
+
+    def change(mesh: Mesh) -> Mesh:
+        cells = mesh.cells.copy()
+        apex = np.array([[0.5, 0.5, 2.0]])
+        base = cells[0, [0, 4, 6]]
+        corners = np.append(base, mesh.n_nodes)
+        a, b = corners[TET_EDGES].T
+        points = np.vstack([mesh.points, apex])
+        middles = points[[a, b]].mean(axis=0) + 1e-3
+        added = np.append(corners, mesh.n_nodes + 1 + np.arange(6))
+        return Mesh(np.vstack([points, middles]), np.vstack([cells, added]))
+
+    return quadratic(change)
+
+
 def alone(kind: str, n: int) -> meshio.Mesh:
     return meshio.Mesh(np.random.default_rng(0).random((n, 3)), [(kind, [range(n)])])
 
@@ -90,9 +139,12 @@ UNSOUND: list[tuple[meshio.Mesh, str]] = [
     (three_on_one_face(), r"1 faces belong to more than two cells"),
     (on_one_side("hexahedron"), "1 faces have both of their cells on one side"),
     (on_one_side("tetra"), "1 faces have both of their cells on one side"),
-    (MIXED, "hexahedron or tetra; got hexahedron and pyramid and tetra"),
+    (MIXED, r"\(hexahedron, tetra, tetra10\); got hexahedron and pyramid and tetra"),
+    (curved(0, [0.9, 0.1, 0.0]), r"cell \d \(counted from 0\) is flat or folded"),
+    (split_edge(), "every edge .* one middle of its own, .*; 1 have not"),
+    (corner_as_middle(), r"one middle of its own, .*; \d have not"),
     (meshio.Mesh(HEX.points, [("quad", HEX.boundary_facets)]), "got no volume cells"),
-    (alone("tetra10", 10), "got tetra10"),
+    (alone("hexahedron20", 20), "got hexahedron20"),
     (alone("wedge", 6), "got wedge"),
     (hexes(HEX.cells + 1), r"cells must have nodes in \[0, 11\]; got 1 to 12"),
 ]

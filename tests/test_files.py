@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 import mor_bench
 from mor_bench.errors import SpecError
+from mor_bench.hard_cases.setups import of_order
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.files import read_mesh, read_triangles
@@ -23,9 +24,14 @@ from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import Scene
 from mor_bench.scene.soundness import in_grid
 from mor_bench.scene.triangle_distance import distances
+from tests.mesh_writers import write_abaqus, write_gmsh, write_gmsh1, write_gmsh_reversed, write_vtk
 
 SIZE, CELLS = (1.2, 0.4, 0.4), (6, 2, 2)
-ELEMENTS = {"hexahedron": "hexahedron", "tetra": "tetrahedron"}
+ELEMENTS: dict[str, dict[str, Any]] = {
+    "hexahedron": {"element": "hexahedron"},
+    "tetra": {"element": "tetrahedron"},
+    "tetra10": {"element": "tetrahedron", "order": 2},
+}
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -43,14 +49,14 @@ def content(**changes: Any) -> dict[str, Any]:
 
 
 def of_file(
-    path: Path, *, support: Any = "x-min", load: Any = "z-max", element: str = "hexahedron"
+    path: Path, *, support: Any = "x-min", load: Any = "z-max", kind: str = "hexahedron"
 ) -> dict[str, Any]:
     """Return the beam with its mesh from a file in metres."""
     return content(
         geometry={"shape": "file", "file": str(path)},
         supports=[{"region": support}],
         loads={**content()["loads"], "region": load},
-        discretisation={"element": element},
+        discretisation=ELEMENTS[kind],
     )
 
 
@@ -63,86 +69,17 @@ def sides(mesh: Mesh) -> list[NDArray[np.int64]]:
     ]
 
 
-@pytest.fixture(scope="module", params=["hexahedron", "tetra"])
+@pytest.fixture(scope="module", params=[*ELEMENTS])
 def beam(request: pytest.FixtureRequest) -> tuple[str, Mesh, meshio.Mesh]:
     """The beam's mesh, and its meshio mesh with shuffled nodes, two unused nodes and two sides."""
     kind = request.param
-    mesh = box_mesh(SIZE, CELLS, kind == "tetra")
+    mesh = of_order(box_mesh(SIZE, CELLS, kind != "hexahedron"), 2 if kind == "tetra10" else 1)
     order = np.random.default_rng(0).permutation(mesh.n_nodes)
     number = np.argsort(order)
     points = np.vstack([mesh.points[order], [[9.0, 9.0, 9.0], [8.0, 8.0, 8.0]]])
-    flat = "quad" if kind == "hexahedron" else "triangle"
+    flat = {"hexahedron": "quad", "tetra": "triangle", "tetra10": "triangle6"}[kind]
     cells = [(kind, number[mesh.cells]), *((flat, number[side]) for side in sides(mesh))]
     return kind, mesh, meshio.Mesh(points, cells)
-
-
-def write_gmsh(version: str, binary: bool) -> Callable[[meshio.Mesh, Path], None]:
-    def write(raw: meshio.Mesh, path: Path) -> None:
-        # A body and one of its faces may have the same number.
-        tags = zip(raw.cells, (1, 1, 2), strict=True)
-        numbers = [np.full(len(block), tag) for block, tag in tags]
-        fields = {"body": np.array([1, 3]), "left": np.array([1, 2]), "top": np.array([2, 2])}
-        data = {"gmsh:physical": numbers, "gmsh:geometrical": [n.copy() for n in numbers]}
-        dim_tags = np.tile([3, 1], (len(raw.points), 1))
-        for entity, block in zip((1, 2), raw.cells[1:], strict=True):
-            dim_tags[block.data] = 2, entity
-        point_data = {"gmsh:dim_tags": dim_tags} if version == "4.1" else {}
-        options = {"cell_data": data, "field_data": fields, "point_data": point_data}
-        mesh = meshio.Mesh(raw.points, raw.cells, **options)
-        meshio.gmsh.write(path, mesh, fmt_version=version, binary=binary)
-
-    return write
-
-
-def write_gmsh_reversed(raw: meshio.Mesh, path: Path) -> None:
-    """Write a Gmsh file with a reversed surface in a group, marked by a negative number."""
-    write_gmsh("4.1", False)(raw, path)
-    lines = path.read_text().splitlines()
-    first = lines.index("$Entities") + 2  # surface 1: number, box, number of groups, groups
-    words = lines[first].split()
-    assert words[:1] + words[7:9] == ["1", "1", "1"]
-    lines[first] = " ".join([*words[:8], "-1", *words[9:]])
-    path.write_text("\n".join([*lines, ""]))
-
-
-def write_gmsh1(raw: meshio.Mesh, path: Path) -> None:
-    """Write the format of the manual, with gaps between the numbers of nodes and elements."""
-    types = {"hexahedron": 5, "tetra": 4, "quad": 3, "triangle": 2}
-    lines = ["$NOD", str(len(raw.points))]
-    lines += [f"{3 * i + 5} {x:.17g} {y:.17g} {z:.17g}" for i, (x, y, z) in enumerate(raw.points)]
-    blocks = zip(raw.cells, (7, 1, 2), strict=True)
-    rows = [(types[block.type], tag, row) for block, tag in blocks for row in block.data]
-    lines += ["$ENDNOD", "$ELM", str(len(rows))]
-    for i, (kind, tag, row) in enumerate(rows):
-        nodes = " ".join(str(3 * n + 5) for n in row)
-        lines.append(f"{2 * i + 1} {kind} {tag} {tag} {len(row)} {nodes}")
-    path.write_text("\n".join([*lines, "$ENDELM", ""]))
-
-
-def write_abaqus(raw: meshio.Mesh, path: Path) -> None:
-    """Write a point set, and a set that only the second of three ELEMENT lines names."""
-    names = {"hexahedron": "C3D8", "tetra": "C3D4", "quad": "S4", "triangle": "S3"}
-    lines = ["*HEADING", "*NODE"]
-    lines += [f"{10 + i}, {x:.17g}, {y:.17g}, {z:.17g}" for i, (x, y, z) in enumerate(raw.points)]
-    first = 1
-    for block, extra in zip(raw.cells, ("", ", ELSET=left", ""), strict=True):
-        lines += [f"*ELEMENT, TYPE={names[block.type]}{extra}"]
-        for i, row in enumerate(block.data):
-            lines.append(", ".join(map(str, [first + i, *(10 + n for n in row)])))
-        first += len(block.data)
-    lines += ["*NSET, NSET=top", *(f"{10 + n}," for n in np.unique(raw.cells[2].data))]
-    path.write_text("\n".join([*lines, ""]))
-
-
-def write_vtk(file_format: str, binary: bool) -> Callable[[meshio.Mesh, Path], None]:
-    def write(raw: meshio.Mesh, path: Path) -> None:
-        numbers = np.arange(len(raw.points))
-        left, top = (np.isin(numbers, block.data).astype(int) for block in raw.cells[1:])
-        masks = {"left": left, "top": top}
-        mesh = meshio.Mesh(raw.points, raw.cells[:1], point_data=masks)
-        mesh.write(path, file_format=file_format, binary=binary)
-
-    return write
 
 
 FORMATS: dict[str, tuple[str, Callable[[meshio.Mesh, Path], None]]] = {
@@ -173,7 +110,7 @@ def solve(scene: Scene) -> NDArray[np.float64]:
 @pytest.fixture(scope="module")
 def expected(beam: tuple[str, Mesh, meshio.Mesh]) -> NDArray[np.float64]:
     """The displacements of the original box."""
-    return solve(mor_bench.load_scene(content(discretisation={"element": ELEMENTS[beam[0]]})))
+    return solve(mor_bench.load_scene(content(discretisation=ELEMENTS[beam[0]])))
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -189,7 +126,7 @@ def test_every_format_gives_the_solution_of_its_original_box(
     write(meshio.Mesh(1000 * raw.points, raw.cells), path)  # in millimetres
     left, top = ("1", "2") if name == "gmsh 1" else ("left", "top")
     sets = {"support": {"point_set": left}, "load": {"point_set": top}}
-    spec = of_file(path, **sets, element=ELEMENTS[kind])
+    spec = of_file(path, **sets, kind=kind)
     scene = mor_bench.load_scene({**spec, "geometry": {**spec["geometry"], "unit_m": 1e-3}})
     assert scene.mesh.cells.shape == mesh.cells.shape
     derivatives = element_of(scene.mesh.cells).derivatives
@@ -252,8 +189,8 @@ def test_groups_with_the_same_number_are_named_by_dimension(tmp_path: Path) -> N
 def test_inverted_cells_are_reoriented(beam: tuple[str, Mesh, meshio.Mesh], tmp_path: Path) -> None:
     kind, mesh, _ = beam
     mirrored, some = mesh.points * [1, 1, -1] + [0, 0, 0.4], mesh.cells.copy()
-    if kind == "tetra":
-        some[::3] = some[::3][:, [1, 0, 2, 3]]
+    if kind != "hexahedron":
+        some[::3] = some[::3][:, [1, 0, 2, 3, 4, 6, 5, 8, 7, 9][: some.shape[1]]]
     for points, cells in ((mirrored, mesh.cells), (mesh.points, some)):
         meshio.Mesh(points, [(kind, cells)]).write(tmp_path / "mesh.vtk")
         read, _ = read_mesh(tmp_path / "mesh.vtk", 1.0)
@@ -343,7 +280,26 @@ def test_empty_and_unknown_regions_give_an_error_that_names_them(
 def test_an_element_other_than_that_of_the_file_is_refused(folder: Path) -> None:
     message = "must be 'hexahedron', as in the mesh; got 'tetrahedron'"
     with pytest.raises(SpecError, match=message):
-        mor_bench.load_scene(of_file(folder / "beam.vtu", element="tetrahedron"))
+        mor_bench.load_scene(of_file(folder / "beam.vtu", kind="tetra"))
+
+
+def test_middles_are_added_to_a_file_without_them_and_needed_where_a_file_has_them(
+    tmp_path: Path,
+) -> None:
+    linear = box_mesh(SIZE, CELLS, tetrahedra=True)
+    whole = of_order(linear, 2)
+    meshio.Mesh(linear.points, [("tetra", linear.cells)]).write(tmp_path / "linear.vtu")
+    meshio.Mesh(whole.points, [("tetra10", whole.cells)]).write(tmp_path / "whole.vtu")
+    made, read = (
+        mor_bench.load_scene(of_file(tmp_path / f"{name}.vtu", kind="tetra10"))
+        for name in ("linear", "whole")
+    )
+    np.testing.assert_array_equal(made.mesh.points, read.mesh.points)
+    np.testing.assert_allclose(solve(made), solve(read), rtol=0, atol=1e-9)
+    with pytest.raises(
+        SpecError, match=r"`discretisation\.order` must be 2, as in the mesh; got 1"
+    ):
+        mor_bench.load_scene(of_file(tmp_path / "whole.vtu", kind="tetra"))
 
 
 def test_the_distance_to_a_triangle_is_that_to_its_nearest_sample_point() -> None:

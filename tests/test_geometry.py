@@ -392,7 +392,7 @@ def test_the_liver_is_held_in_the_notch_between_its_lobes() -> None:
 
 
 def test_the_liver_of_tetrahedra_is_as_fine_as_in_the_paper_and_keeps_the_volume() -> None:
-    mesh = liver_tetrahedra()
+    mesh = liver_tetrahedra(0.013)
     check_tetrahedra(mesh)
     assert (mesh.n_cells, mesh.n_nodes) == (4567, 1118)
     assert (mesh.n_cells, mesh.n_nodes) == pytest.approx((4859, 1059), rel=0.065)

@@ -36,20 +36,25 @@ LAWS: dict[str, dict[str, Any]] = {
     },
     "yeoh": {"c10_pa": 89.0, "c20_pa": -20.0, "c30_pa": 15.0, "bulk_pa": 833.0},
 }
-ELEMENTS = {
+ELEMENTS: dict[str, tuple[Any, ...]] = {
     "H8": ("hexahedron", "full"),
     "H8 selective": ("hexahedron", "selective"),
     "T4": ("tetrahedron", "full"),
+    "T10": ("tetrahedron", "full", 2),
 }
 
 
 def model(law: str = "saint-venant-kirchhoff", element: str = "H8") -> FullOrderModel:
     """beam-tiny of another law and element."""
     spec = load_generated_spec("beam-tiny").model_dump(mode="json", exclude_none=True)
-    kind, integration = ELEMENTS[element]
+    kind, integration, *order = ELEMENTS[element]
     spec |= {
         "material": {"law": law, **LAWS[law]},
-        "discretisation": {"element": kind, "integration": integration},
+        "discretisation": {
+            "element": kind,
+            "integration": integration,
+            **({"order": order[0]} if order else {}),
+        },
     }
     return FullOrderModel(load_scene(spec))
 
@@ -76,7 +81,8 @@ def test_relaxation_ends_at_the_full_order_solution(law: str, element: str) -> N
         residual = np.linalg.norm(load - full.force(found.displacement).force)
         assert residual <= 1.001e-7 * np.linalg.norm(load)
         assert found.min_det_f == pytest.approx(full.force(found.displacement).min_det_f, rel=1e-12)
-        assert np.linalg.norm(found.displacement - exact) <= 2e-6 * np.linalg.norm(exact)
+        most = 1e-5 if element == "T10" else 2e-6  # the finer nodes hide long waves in the residual
+        assert np.linalg.norm(found.displacement - exact) <= most * np.linalg.norm(exact)
         assert found.cuts == 0
 
 

@@ -20,6 +20,7 @@ from mor_bench.scene.other_meshes import with_cells
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.test_sets import spec_of_set
 from mor_bench.specs import list_suite, load_generated_spec
+from tests.verification.laws_and_elements import discretisation
 
 WIDTH, DEPTH, HEIGHT = 28.424, 10.0, 40.0
 
@@ -41,20 +42,22 @@ def area_of(facets: NDArray[np.float64]) -> float:
     return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
 
-@pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
+@pytest.mark.parametrize("element", ["hexahedron", "tetrahedron", "quadratic tetrahedron"])
 def test_the_l_has_volume_surface_and_grid_of_a_box_without_a_corner(element: str) -> None:
-    mesh = load_scene(content(discretisation={"element": element})).mesh
+    mesh = load_scene(content(discretisation=discretisation((element, False)))).mesh
     arm, column = WIDTH * 3 / 13 * HEIGHT, WIDTH * 4 / 9 * HEIGHT * 10 / 13
     reference = element_of(mesh.cells)
     det_j = shape_gradients(mesh.points, mesh.cells, reference.derivatives)[1]
     assert (det_j @ reference.weights).sum() == pytest.approx(DEPTH * (arm + column), rel=1e-12)
     expected = 2 * (arm + column) + 2 * DEPTH * (WIDTH + HEIGHT)
-    assert area_of(mesh.points[mesh.boundary_facets]) == pytest.approx(expected, rel=1e-12)
-    assert mesh.grid_shape == (10, 6, 14)
+    assert area_of(mesh.points[mesh.drawn_facets]) == pytest.approx(expected, rel=1e-12)
+    n = 2 if "quadratic" in element else 1
+    assert mesh.grid_shape == (9 * n + 1, 5 * n + 1, 13 * n + 1)
     assert mesh.grid_index is not None
-    assert len(np.unique(mesh.grid_index)) == mesh.n_nodes == 540
+    n_nodes = (5 * n + 1) * ((9 * n + 1) * (3 * n + 1) + (4 * n + 1) * 10 * n)
+    assert len(np.unique(mesh.grid_index)) == mesh.n_nodes == n_nodes
     place = np.stack(np.unravel_index(mesh.grid_index, mesh.grid_shape), axis=1)
-    spacing = [WIDTH / 9, DEPTH / 5, HEIGHT / 13]
+    spacing = np.array([WIDTH / 9, DEPTH / 5, HEIGHT / 13]) / n
     np.testing.assert_allclose(mesh.points, place * spacing, rtol=1e-12, atol=1e-12)
 
 

@@ -30,6 +30,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "H8": {},
     "H8, selective": {"discretisation": {"integration": "selective"}},
     "T4": {"discretisation": {"element": "tetrahedron"}},
+    "T10": {"discretisation": {"element": "tetrahedron", "order": 2}},
     "auxetic": {"material": {"law": "saint-venant-kirchhoff", "young_pa": 500.0, "poisson": -0.3}},
     "auxetic, selective": {
         "material": {"law": "saint-venant-kirchhoff", "young_pa": 500.0, "poisson": -0.3},

@@ -57,7 +57,7 @@ def build_body(
     if isinstance(geometry, TetrahedraGeometry):
         from mor_bench.scene.liver import liver_tetrahedra
 
-        return liver_tetrahedra(), None, {}
+        return liver_tetrahedra(geometry.spacing_m), None, {}
     from mor_bench.scene.files import read_mesh
 
     mesh, point_sets = read_mesh(geometry.file.checked(), geometry.unit_m)

@@ -13,6 +13,10 @@ MAX_CELLS = 400_000
 """Largest number of cells of a grid, with 1.2 million unknowns."""
 
 
+LIVER_SPACING_M = 0.013
+"""Default spacing of the liver's tetrahedra, which gives 4,567 cells."""
+
+
 def _fits_in_memory(value: tuple[int, int, int]) -> tuple[int, int, int]:
     if value[0] * value[1] * value[2] > MAX_CELLS:
         raise ValueError(f"there must be at most {MAX_CELLS:,} cells in all")
@@ -155,10 +159,20 @@ class VoxelsGeometry(StrictModel):
 
 
 class TetrahedraGeometry(StrictModel):
-    """The two-lobed liver that comes with the package, meshed with T4 of about one size."""
+    """The two-lobed liver that comes with the package, meshed with tetrahedra of about one size.
+
+    Attributes
+    ----------
+    spacing_m : float
+        Edge of the cubes that the tetrahedra come from. A third of the tetrahedra have an edge of
+        this length.
+    """
 
     shape: Literal["tetrahedra"]
     surface: Literal["liver"]
+    spacing_m: Annotated[
+        float, Field(ge=0.008, le=0.03, exclude_if=lambda value: value == LIVER_SPACING_M)
+    ] = LIVER_SPACING_M
 
 
 class FileGeometry(StrictModel):

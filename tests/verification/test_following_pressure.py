@@ -20,6 +20,7 @@ from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.mechanics.pressed import PressedModel
 from mor_bench.scene.scene import Scene, load_scene
 
+from .laws_and_elements import ELEMENTS, discretisation
 from .scenes import reactions
 from .test_pressure import LOADS, PLANES, TUBE, YOUNG_PA, content, forces_of, pressed
 
@@ -41,22 +42,23 @@ def solved(scene: Scene, *pressures: float) -> Array:
 def area_vectors(points: Array, facets: NDArray[np.int64]) -> Array:
     """Return the area vector (n_facets, 3), m², of facets that may be warped."""
     corners = points[facets]
-    if facets.shape[1] == 3:
+    if facets.shape[1] != 4:
         return 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return 0.5 * np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
 
 
-@pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
+@pytest.mark.parametrize("kind", [kind for kind in ELEMENTS if not kind[1]])
 @pytest.mark.parametrize("whole", [True, False])
-def test_force_energy_and_tangent_are_derivatives(element: str, whole: bool) -> None:
+def test_force_energy_and_tangent_are_derivatives(kind: tuple[str, bool], whole: bool) -> None:
     scene = pressed(
-        discretisation={"element": element},
+        discretisation=discretisation(kind),
         supports=CLAMPED,
         loads={**FOLLOWING, "regions": ["surface" if whole else "z-max"]},
     )
     model = PressedModel(scene).under(np.array([30.0]))
     generator = np.random.default_rng(0)
-    q, along = 0.05 * generator.normal(size=(2, model.n_unknowns))
+    size = 0.01 if "quadratic" in kind[0] else 0.05
+    q, along = size * generator.normal(size=(2, model.n_unknowns))
     step = 1e-6
     after, before = (model.force(q + sign * step * along) for sign in (1, -1))
     state, values = model.linearise(q)
@@ -74,8 +76,14 @@ def test_force_energy_and_tangent_are_derivatives(element: str, whole: bool) -> 
 
 
 @pytest.mark.parametrize("pressure", [30.0, 150.0, -60.0])
-def test_a_cube_under_pressure_on_all_sides_has_its_closed_form(pressure: float) -> None:
-    scene = pressed(loads={**FOLLOWING, "regions": ["x-max", "y-max", "z-max"]})
+@pytest.mark.parametrize("kind", ELEMENTS)
+def test_a_cube_under_pressure_on_all_sides_has_its_closed_form(
+    pressure: float, kind: tuple[str, bool]
+) -> None:
+    scene = pressed(
+        loads={**FOLLOWING, "regions": ["x-max", "y-max", "z-max"]},
+        discretisation=discretisation(kind),
+    )
     u = solved(scene, pressure, pressure, pressure)
     # Cauchy's stress S / λ is -p, with S = 3 K (λ² - 1) / 2.
     bulk = YOUNG_PA / (3 * (1 - 2 * 0.3))
