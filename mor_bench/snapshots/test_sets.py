@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.specs import AnyTable, DatasetSpec, Loads, Motion, Pressure, Several
+from mor_bench.specs import AnyTable, DatasetSpec, LineLoads, Loads, Motion, Pressure, Several
 
 SetName = Literal[
     "in-range",
@@ -53,6 +53,8 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
         return f"there is no such set; known: {', '.join(SET_NAMES)}"
     if name == "unseen-regions" and spec.tests.unseen_region is None:
         return "its file names no `tests.unseen_region`"
+    if name == "unseen-regions" and isinstance(spec.load_plan, LineLoads):
+        return "its loads act along given lines"
     if name == "paper-amplitude" and spec.tests.paper_magnitude_n is None:
         return "its file names no `tests.paper_magnitude_n`"
     if name == "unseen-directions" and spec.load_plan.kind == "pressure":

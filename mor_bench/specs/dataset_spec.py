@@ -133,15 +133,18 @@ class DatasetSpec(CommonDatasetSpec):
 
     @model_validator(mode="after")
     def _fixed_regions(self) -> Self:
-        """Check what a plan excludes whose samples all act on the same regions."""
+        """Check what a plan excludes whose samples do not act on one region each."""
         if not isinstance(self.loads, Motion | Pressure | Several):
             return self
         where = f"where `loads.kind` is {self.loads.kind!r}"
+        why = "all samples act on the same regions"
+        if isinstance(self.loads, Several):
+            where, why = "with several tables `[[loads]]`", "they act on several regions at once"
         possible = ("sample", "direction") if isinstance(self.loads, Motion) else ("sample",)
         if self.split.by not in possible:
             raise ValueError(
-                f"`split.by` must be {' or '.join(map(repr, possible))} {where}, since all samples "
-                f"act on the same regions; got {self.split.by!r}"
+                f"`split.by` must be {' or '.join(map(repr, possible))} {where}, since {why}; "
+                f"got {self.split.by!r}"
             )
         if self.observed is not None and isinstance(self.loads, Motion):
             raise ValueError(

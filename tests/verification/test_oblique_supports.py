@@ -203,6 +203,8 @@ METHODS: dict[str, tuple[dict[str, Any], float]] = {
     "fem-warm": ({"tolerance": 1e-12}, 1e-10),
     "linear-fem": ({}, 1e-10),
     "pod": ({"n_modes": 12, "tolerance": 1e-12}, 1e-8),
+    "pod-tensor": ({"n_modes": 12, "tolerance": 1e-12}, 1e-8),
+    "sparse-polynomial": ({}, 1e-5),
     "hpod": ({"n_modes": 6, "cubature_tolerance": 0.0, "tolerance": 1e-12}, 1e-8),
     "ecm": ({"n_modes": 6, "cubature_tolerance": 1e-6, "tolerance": 1e-12}, 1e-3),
     "deim": ({"n_modes": 6, "n_force_modes": 10, "tolerance": 1e-12}, 5e-2),
@@ -237,6 +239,45 @@ def test_methods_predict_for_a_turned_block_what_they_predict_for_the_block(name
     assert other.frames is not None
     local = other.frames.to_local(answers[1].reshape(5, -1))
     assert np.abs(local[:, other.frames.held_dofs]).max() <= 1e-14 * size
+
+
+@pytest.mark.parametrize("name", ["pod-tensor", "pod", "hpod"])
+def test_methods_know_springs_and_weight_on_oblique_planes(name: str) -> None:
+    law = material_table("saint-venant-kirchhoff", 500.0, 0.4)
+    down = np.array([0.3, -0.5, -1.0])
+    bodies = []
+    for direction in (down, ROTATION @ down):
+        weight = {"density_kg_m3": 10.0, "acceleration_m_s2": direction.tolist()}
+        bodies.append(load_scene({**SPEC, "material": law, "springs": SPRINGS, "gravity": weight}))
+    scene, other = bodies[0], turned(bodies[1])
+    forces, answers = loads(scene, 12, 10.0), []
+    for body, given in ((scene, forces), (other, forces @ ROTATION.T)):
+        method = load_method(name, **METHODS[name][0]).fit(body, samples_of(body, given[:9]))
+        answers.append(method.predict(given[9:]))
+    size = float(np.abs(answers[0]).max())
+    np.testing.assert_allclose(answers[1] @ ROTATION, answers[0], atol=1e-7 * size)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("umesh-linear", {"channels": 8, "steps": 1, "iterations": 3}),
+        ("deeponet", {"iterations": 3}),
+    ],
+)
+def test_networks_predict_no_displacement_along_a_direction(
+    name: str, parameters: dict[str, Any]
+) -> None:
+    slope = {"region": "x-min", "direction": [1.0, 0.5, 0.0]}
+    others = [{"region": f"{axis}-min", "components": [axis]} for axis in "yz"]
+    scene = load_scene({**SPEC, "supports": [slope, *others]})
+    forces = loads(scene, 12, 10.0)
+    method = load_method(name, **parameters).fit(scene, samples_of(scene, forces[:10]))
+    found = method.predict(forces[10:])
+    edge = scene.mesh.points[:, 0] == 0.0
+    assert np.abs(found[:, ~edge]).max() > 0.0
+    along = found[:, edge] @ [1.0, 0.5, 0.0]
+    assert np.abs(along).max() <= 1e-14 * np.abs(found).max()
 
 
 def test_what_supports_hold_is_removed_from_predictions() -> None:

@@ -195,5 +195,5 @@ def test_wrong_tables_are_refused(tables: list[dict[str, Any]], message: str) ->
 
 
 def test_several_tables_are_split_by_sample() -> None:
-    with pytest.raises(SpecError, match=r"`split.by` must be 'sample' where `loads.kind`"):
+    with pytest.raises(SpecError, match=r"`split.by` must be 'sample' with several tables"):
         together(PRESSURE, FORCE, split={"by": "region"})
