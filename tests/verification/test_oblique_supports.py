@@ -93,6 +93,15 @@ def test_the_tangent_is_the_derivative_of_the_force() -> None:
     assert energy == pytest.approx(float(model.force(q).force @ step), rel=1e-7)
 
 
+def test_forces_of_cells_add_up_to_the_force() -> None:
+    scene = turned(load_scene(SPEC))
+    model = FullOrderModel(scene)
+    q = 0.05 * np.random.default_rng(2).normal(size=model.n_unknowns)
+    own = model.assembler.cell_forces(q)
+    total = np.bincount(model.cell_dofs.ravel(), own.ravel(), model.n_unknowns + 1)[:-1]
+    np.testing.assert_allclose(total, model.force(q).force, atol=1e-12)
+
+
 def tube(angle: float, n: int, follower: bool) -> Scene:
     """Return a sector of a tube between planes of symmetry under an inner pressure."""
     across = [-sin(angle), cos(angle), 0.0]
