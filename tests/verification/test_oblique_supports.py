@@ -39,6 +39,15 @@ def test_a_turned_block_on_oblique_planes_moves_like_the_block(law: str, solver:
     np.testing.assert_allclose(found @ ROTATION, expected, atol=1e-10)
 
 
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_turned_block_of_tetrahedra_moves_like_the_block(order: int) -> None:
+    elements = {"element": "tetrahedron", "order": order}
+    scene = load_scene({**SPEC, "discretisation": elements})
+    forces = loads(scene)
+    found = solved(turned(scene), forces @ ROTATION.T)
+    np.testing.assert_allclose(found @ ROTATION, solved(scene, forces), atol=1e-10)
+
+
 @pytest.mark.parametrize("changed", [{"springs": SPRINGS}, {"gravity": True}])
 def test_a_turned_block_with_springs_or_weight_moves_like_the_block(changed: Any) -> None:
     down, side = [0.3, -0.5, -1.0], ROTATION @ [0.3, -0.5, -1.0]
@@ -267,6 +276,7 @@ def test_methods_know_springs_and_weight_on_oblique_planes(name: str) -> None:
     np.testing.assert_allclose(answers[1] @ ROTATION, answers[0], atol=1e-7 * size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "parameters"),
     [
