@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from mor_bench.errors import MorBenchError as MorBenchError
     from mor_bench.measure.error_bounds import ErrorBound as ErrorBound
     from mor_bench.measure.error_bounds import error_bound as error_bound
+    from mor_bench.mechanics.reactions import reaction_forces as reaction_forces
     from mor_bench.method_loading import load_method as load_method
     from mor_bench.method_loading import load_surrogate as load_surrogate
     from mor_bench.report.notebook import Comparison as Comparison
@@ -57,6 +58,7 @@ _HOMES = {
     "load_scene": "mor_bench.scene.scene",
     "load_surrogate": "mor_bench.method_loading",
     "pick": "mor_bench.runs.pick",
+    "reaction_forces": "mor_bench.mechanics.reactions",
     "run": "mor_bench.report.notebook",
 }
 

@@ -32,9 +32,9 @@ from pydantic.fields import FieldInfo
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.specs.base import MAX_COUNT
-from mor_bench.specs.loads_spec import SplitBy
 from mor_bench.specs.one_line_errors import nearest_name
 from mor_bench.specs.parameters import python_number
+from mor_bench.specs.split_spec import SplitBy
 
 Device = Literal["auto", "cpu", "cuda"]
 Profile = Literal["quick", "full"]

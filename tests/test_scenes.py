@@ -198,8 +198,8 @@ def test_every_load_patch_lies_on_the_surface_and_pushes_free_nodes(name: str) -
     for scene in map(load_scene, [spec, spec_of_set(spec, "unseen-regions")]):
         assert np.isin(scene.patch_nodes, scene.surface.facets).all()
         # The mean normal of a flat patch has length 1.
-        sums = np.linalg.norm(scene.patches.normal_sums(), axis=1)
-        assert (sums / scene.patches.areas.sum(axis=1)).min() > 0.6
+        sums = np.linalg.norm(scene.acting[0].patches.normal_sums(), axis=1)
+        assert (sums / scene.acting[0].patches.areas.sum(axis=1)).min() > 0.6
         free = np.setdiff1d(np.arange(scene.mesh.n_nodes), scene.fixed_nodes)
         assert scene.patch_weights[:, free].sum(axis=1).min() > 0.2
 
@@ -222,7 +222,7 @@ def test_patches_on_long_triangles_have_their_area_and_moment(tmp_path: Path) ->
         load_scene(on_surface(path, cells, region="x-max", patch_area_m2=2e-3, kind="normal"))
     spec = on_surface(path, cells, region="surface", patch_area_m2=2e-4, kind="normal")
     scene = load_scene(spec)
-    patches, surface = scene.patches, scene.surface
+    patches, surface = scene.acting[0].patches, scene.surface
     np.testing.assert_allclose(patches.areas.sum(axis=1), 2e-4, rtol=1e-12)
     points, shares = scene.patch_points(np.arange(len(scene.patch_nodes)))
     at_nodes = scene.patch_weights @ scene.mesh.points

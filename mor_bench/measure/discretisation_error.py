@@ -79,14 +79,14 @@ def chosen_samples(scene: Scene, n_loads: int) -> NDArray[np.int64]:
     samples.
     """
     loads, n_patches = scene.generated.load_plan, len(scene.patch_nodes)
+    last = loads.steps - 1  # whole loads
     if loads.samples_per_patch is None:
-        return np.arange(min(n_loads, n_samples_of(scene)))
+        return np.arange(min(n_loads, n_samples_of(scene) // loads.steps)) * loads.steps + last
     generator = np.random.default_rng([loads.seed, 0xD15C])
     bounds = np.arange(n_loads + 1) * n_patches // n_loads
     patches = generator.integers(bounds[:-1], bounds[1:])
-    return np.asarray(
-        generator.integers(loads.samples_per_patch, size=n_loads) * n_patches + patches
-    )
+    chosen = generator.integers(loads.samples_per_patch, size=n_loads) * n_patches + patches
+    return np.asarray(chosen * loads.steps + last)
 
 
 def limit_of(
@@ -164,12 +164,10 @@ class _OnMesh:
 
     def solve(self, row: int, start: NDArray[np.float64] | None) -> NDArray[np.float64]:
         """Solve for displacements (n_nodes of this mesh, 3), m, from a start of that shape."""
-        free = self.scene.free_dofs
-        out = np.zeros(self.scene.mesh.n_dofs)
-        out[free] = self.model.solve(
-            self.forces[row].ravel()[free], None if start is None else start.ravel()[free]
-        ).displacement
-        return out.reshape(-1, 3)
+        known = [self.forces[row]] if start is None else [self.forces[row], start]
+        free = self.scene.at_free_dofs(np.stack(known).reshape(len(known), -1))
+        found = self.model.solve(free[0], None if start is None else free[1]).displacement
+        return self.scene.at_all_dofs(found[None]).reshape(-1, 3)
 
 
 @dataclass

@@ -19,7 +19,7 @@ class ReactionErrors:
     """
 
     def __init__(self, scene: Scene) -> None:
-        self._free, self._forces = scene.free_dofs, ToolForces(scene)
+        self._scene, self._forces = scene, ToolForces(scene)
 
     def __call__(
         self, predicted: NDArray[np.float64], references: NDArray[np.float64]
@@ -37,5 +37,5 @@ class ReactionErrors:
         return np.where(np.isfinite(errors), errors, np.inf)
 
     def _resultants(self, displacements: NDArray[np.float64]) -> NDArray[np.float64]:
-        free = displacements.reshape(len(displacements), -1)[:, self._free]
+        free = self._scene.at_free_dofs(displacements.reshape(len(displacements), -1))
         return np.asarray(self._forces(free).sum(axis=1))

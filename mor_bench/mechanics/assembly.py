@@ -25,8 +25,10 @@ from mor_bench.mechanics.kernels import (
 )
 from mor_bench.mechanics.laws import general_force, general_multiply_adds
 from mor_bench.mechanics.pattern import Pattern, build_pattern
+from mor_bench.mechanics.turned import TurnedDofs
 from mor_bench.scene.materials import Material, SaintVenantKirchhoff
 from mor_bench.scene.scene import Scene
+from mor_bench.scene.supports import Frames
 from mor_bench.specs import NO_EQUATIONS
 
 Array = NDArray[np.float64]
@@ -167,6 +169,10 @@ def _placed(
     return matrix, slots, entries[upper]
 
 
+def _local(fields: Array, frames: Frames) -> Array:
+    return frames.to_local(fields.ravel()).reshape(-1, 3)
+
+
 class Assembler:
     """Internal force and tangent of a set of cells over chosen dofs.
 
@@ -179,6 +185,17 @@ class Assembler:
         Length of the vectors.
     cell_weights : (n_cells,) float64, optional
         Cubature weights that multiply each cell's energy; 1 by default.
+    frames : Frames, optional
+        Axes of the nodes whose vectors are not along x, y and z.
+
+    Attributes
+    ----------
+    pattern : Pattern
+        Pattern of the tangent.
+    turned : TurnedDofs or None
+        The dofs along x, y and z over which cells are summed, if some nodes have frames.
+    summed_pattern : Pattern
+        Pattern of the sum over cells, before `turned` reduces it.
 
     Raises
     ------
@@ -192,24 +209,34 @@ class Assembler:
         dof_of_node: NDArray[np.int64],
         n_dofs: int,
         cell_weights: Array | None = None,
+        frames: Frames | None = None,
     ) -> None:
         quadrature, material = quadrature_of(body), body.material
         weights = quadrature.weights
         if cell_weights is not None:
             weights = weights * cell_weights[:, None]
         n_cells, n_points, n_nodes, _ = quadrature.gradients.shape
-        dofs = dof_of_node[body.cells].reshape(n_cells, 3 * n_nodes)
         self.pattern, slots = build_pattern(dof_of_node, body.cells, n_dofs)
         self.n_dofs = n_dofs
+        # The kernels sum over dofs along x, y and z, which nodes with frames have beside their own.
+        self.turned: TurnedDofs | None = None
+        self.summed_pattern, self._n_summed = self.pattern, n_dofs
+        own, self._cells = dof_of_node, body.cells
+        if frames is not None:
+            self.turned = TurnedDofs(frames, dof_of_node, n_dofs)
+            dof_of_node, self._n_summed = self.turned.dof_of_node, self.turned.n
+            self.summed_pattern, slots = build_pattern(dof_of_node, body.cells, self._n_summed)
+            self.turned.of_patterns(self.summed_pattern, self.pattern)
+        dofs = dof_of_node[body.cells].reshape(n_cells, 3 * n_nodes)
         self.n_cells = n_cells
         self.extent_m = float(np.ptp(body.points, axis=0).max())
         self.material = material
-        self._n_values = len(self.pattern.indices) + 1
+        self._n_values = len(self.summed_pattern.indices) + 1
         self._gradients = _batched(
             quadrature.gradients.reshape(n_cells, n_points, 3 * n_nodes), 0.0
         ).reshape(-1, n_points, 3 * n_nodes * LANES)
-        self._dofs = _batched(dofs.astype(np.int32), n_dofs)
-        self._slots = _batched(slots, len(self.pattern.indices))
+        self._dofs = _batched(dofs.astype(np.int32), self._n_summed)
+        self._slots = _batched(slots, len(self.summed_pattern.indices))
         self._has_own_kernel = isinstance(material, SaintVenantKirchhoff) and n_nodes == H8.n_nodes
         if self._has_own_kernel:
             self._w_lam = _batched(weights * quadrature.parameters[:, 0], 0.0)
@@ -221,19 +248,20 @@ class Assembler:
             self._parameters = np.repeat(quadrature.parameters, LANES, axis=1)
             per_point = general_multiply_adds(material.law, quadrature.parameters.shape[1], n_nodes)
         self._multiply_adds = n_cells * n_points * per_point[0], n_cells * n_points * per_point[1]
+        self._plain = body.springs is None and body.rest is None and frames is None
         self._springs: tuple[sp.csr_array, NDArray[np.int64], Array] | None = None
         if body.springs is not None:
-            self._springs = _placed(body.springs, dof_of_node.ravel(), self.pattern)
+            self._springs = _placed(body.springs, dof_of_node.ravel(), self.summed_pattern)
         self._rest: tuple[Array, Array] | None = None
         if body.rest is not None:
             rest = np.zeros(n_dofs + 1)
-            rest[dof_of_node] = body.rest
+            rest[own] = body.rest if frames is None else _local(body.rest, frames)
             rest[n_dofs] = 0.0
-            self._rest = rest, self.force(rest[:-1]).force
+            self._rest = self._total(rest[:-1]), self.force(rest[:-1]).force
 
     def _total(self, u: Array) -> Array:
-        """Return total displacements, with a zero for the supports."""
-        padded = np.append(u, 0.0)
+        """Return total displacements along x, y and z, with a zero for the supports."""
+        padded = np.append(u if self.turned is None else self.turned.spread(u), 0.0)
         return padded if self._rest is None else padded + self._rest[0]
 
     def _from_rest(self, u: Array, force: Array, energy: float, min_det_f: float) -> State:
@@ -278,24 +306,33 @@ class Assembler:
 
     def force(self, u: Array) -> State:
         """Return the state at displacements ``u`` (n_dofs,), m."""
-        force = np.zeros(self.n_dofs + 1)
-        if self._springs is None and self._rest is None:  # three calls fewer
+        force = np.zeros(self._n_summed + 1)
+        if self._plain:  # three calls fewer
             return State(force[:-1], *self._sum(np.append(u, 0.0), self._dofs, force, np.zeros(0)))
         found = self._sum_all(self._total(u), force, np.zeros(0))
-        return self._from_rest(u, force[:-1], *found)
+        return self._from_rest(u, self._at_unknowns(force), *found)
+
+    def _at_unknowns(self, force: Array) -> Array:
+        """Return the forces at the unknowns, of forces at the kernels' dofs and a last entry."""
+        return force[:-1] if self.turned is None else self.turned.gather(force[:-1])
 
     def force_and_tangent(self, u: Array) -> tuple[State, Array]:
         """Return the state and the values of the tangent stiffness, N/m, in ``pattern``."""
-        force, values = np.zeros(self.n_dofs + 1), np.zeros(self._n_values)
+        force, values = np.zeros(self._n_summed + 1), np.zeros(self._n_values)
         found = self._sum_all(self._total(u), force, values)
-        return self._from_rest(u, force[:-1], *found), values[:-1]
+        state = self._from_rest(u, self._at_unknowns(force), *found)
+        return state, values[:-1] if self.turned is None else self.turned.tangent(values[:-1])
 
     def cell_forces(self, u: Array) -> Array:
-        """Return each cell's own internal force, (n_cells, 3 n_nodes), N, to train cubatures."""
+        """Return each cell's own internal force, (n_cells, 3 n_nodes), N, to train cubatures.
+
+        The components are along the axes of the nodes' frames.
+        """
         own = self._cell_forces(self._total(u))
         if self._rest is not None:
             own = own - self._cell_forces(self._rest[0])
-        return np.moveaxis(own, 2, 1).reshape(-1, self._dofs.shape[1])[: self.n_cells]
+        forces = np.moveaxis(own, 2, 1).reshape(-1, self._dofs.shape[1])[: self.n_cells]
+        return forces if self.turned is None else self.turned.cell_forces(forces, self._cells)
 
     def _cell_forces(self, total: Array) -> Array:
         local = np.arange(self._dofs.size, dtype=np.int32).reshape(self._dofs.shape)
@@ -308,7 +345,8 @@ class Assembler:
     ) -> tuple[int, int, float]:
         """Take steps of dynamic relaxation from u (n_dofs,), m, at rest; see `kernels.advance`.
 
-        Overwrites ``u``. Returns the number of steps, how the last one ended, and min det F there.
+        Frames of nodes are not known here. Overwrites ``u``. Returns the number of steps, how the
+        last one ended, and min det F there.
         """
         padded, v, before = self._total(u), np.zeros(self.n_dofs), np.zeros(self.n_dofs)
         load = load if self._rest is None else load + self._rest[1]

@@ -110,7 +110,8 @@ class Compliance:
     """
 
     def __init__(self, model: FullOrderModel) -> None:
-        self._factor, self._free = model.rest_factor, model.scene.free_dofs
+        self._scene, self._factor = model.scene, model.rest_factor
+        self._free = model.scene.free_dofs
         n_dofs, n_free = model.scene.mesh.n_dofs, len(self._free)
         kept = dofs_of_nodes(np.unique(model.scene.patch_weights.indices))
         kept = kept[np.isin(kept, self._free)]
@@ -145,6 +146,12 @@ class Compliance:
         (n, n_dofs) float64
             Displacements, m, exactly zero at the supports.
         """
+        if (frames := self._scene.frames) is not None:
+            return frames.to_global(self._respond(frames.to_local(loads)))
+        return self._respond(loads)
+
+    def _respond(self, loads: Array) -> Array:
+        """Return responses in the frames of the nodes, as the loads are."""
         loads = np.ascontiguousarray(loads)  # the kernel is compiled once per memory order
         out, used = np.empty(loads.shape), np.empty(len(loads), dtype=np.int64)
         _respond(self.columns, self._place, self._most, loads, out, used)
@@ -162,7 +169,7 @@ class Compliance:
         """Map forces (n_free,) or (n_free, m), N, to displacements, m, like a `Factor`."""
         loads = np.zeros((rhs.size // len(self._free), len(self._place)))
         loads[:, self._free] = rhs.T
-        return np.ascontiguousarray(self.respond(loads)[:, self._free].T).reshape(rhs.shape)
+        return np.ascontiguousarray(self._respond(loads)[:, self._free].T).reshape(rhs.shape)
 
     def to_coordinates(self, axes: Array) -> Array:
         """Return K₀⁻¹A on all dofs, zero at the supports.
@@ -178,7 +185,6 @@ class Compliance:
         -------
         (n_dofs, r) float64
         """
-        out = np.zeros((len(self._place), axes.shape[1]))
         with uncounted():
-            out[self._free] = self._factor.solve(axes)
-        return out
+            found = self._factor.solve(axes)
+        return self._scene.columns_at_all_dofs(found)

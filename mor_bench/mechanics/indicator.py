@@ -74,10 +74,13 @@ class ErrorIndicator:
                 f"forces and displacements must have shape (n, {shape[1]}, 3); "
                 f"got {forces.shape} and {displacements.shape}."
             )
-        n_dofs, free = self._scene.mesh.n_dofs, self._scene.free_dofs
-        loads, fields = forces.reshape(-1, n_dofs)[:, free], displacements.reshape(-1, n_dofs)
-        moved = np.linalg.norm(np.delete(fields, free, axis=1), axis=1)
-        triples = zip(loads, fields[:, free], moved, strict=True)
+        n_dofs, scene = self._scene.mesh.n_dofs, self._scene
+        loads = scene.at_free_dofs(forces.reshape(-1, n_dofs))
+        fields = displacements.reshape(-1, n_dofs)
+        if scene.frames is not None:
+            fields = scene.frames.to_local(fields)
+        moved = np.linalg.norm(np.delete(fields, scene.free_dofs, axis=1), axis=1)
+        triples = zip(loads, fields[:, scene.free_dofs], moved, strict=True)
         pairs = np.array([self._indicated(*triple) for triple in triples]).reshape(-1, 2)
         return Indication(pairs[:, 0], pairs[:, 1])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from importlib.util import find_spec
@@ -18,7 +19,6 @@ from mor_bench.errors import (
     MissingDependencyError,
     SolverError,
     SpecError,
-    UnconstrainedBodyError,
     UnsupportedSceneError,
 )
 from mor_bench.mechanics.assembly import (
@@ -40,6 +40,7 @@ from mor_bench.mechanics.linear import (
 from mor_bench.mechanics.locking import warn_of_locking
 from mor_bench.mechanics.multigrid import Multigrid, MultigridFactor
 from mor_bench.mechanics.newton import NewtonOptions, Solution, solve_equilibria, solve_equilibrium
+from mor_bench.mechanics.rigid_motions import check_supports
 from mor_bench.mechanics.rotated import (
     BlockJacobi,
     JacobiFactor,
@@ -84,15 +85,6 @@ ILL_CONDITIONED = 1e10
 
 FOLLOWS = "its pressures follow the surface, and the method solves for dead loads only"
 
-RIGID_MODES = (
-    "translation x",
-    "translation y",
-    "translation z",
-    "rotation about x",
-    "rotation about y",
-    "rotation about z",
-)
-
 
 def missing_library(solver: SolverName) -> str | None:
     """Return what must be installed before a solver can be used; None if nothing."""
@@ -120,35 +112,6 @@ def unknown_equations(scene: Scene, *, observed: bool = False) -> str | None:
     return None if scene.observed_nodes is None else NO_FORCES
 
 
-def free_rigid_modes(scene: Scene) -> list[str]:
-    """Return the rigid motions that the supports leave free, named by their largest component."""
-    x = scene.mesh.points - scene.mesh.points.mean(axis=0)
-    x = x / np.abs(x).max()
-    modes = np.zeros((len(x), 3, 6))
-    modes[:, :, :3] = np.eye(3)
-    for axis in range(3):
-        modes[:, :, 3 + axis] = np.cross(np.eye(3)[axis], x)
-    held = modes.reshape(-1, 6)[scene.fixed_dofs]
-    if (springs := scene.spring_matrix) is not None:
-        held = np.concatenate([held, springs @ modes.reshape(-1, 6) / springs.max()])
-    if len(held) == 0:
-        return list(RIGID_MODES)
-    _, s, vt = np.linalg.svd(np.linalg.qr(held, mode="r"), full_matrices=True)
-    free = vt[np.append(s, np.zeros(6 - len(s))) <= 1e-9 * s[0]]
-    return [RIGID_MODES[int(np.abs(mode).argmax())] for mode in free]
-
-
-def check_supports(scene: Scene) -> None:
-    """Raise `UnconstrainedBodyError`, naming the rigid modes that the supports leave free."""
-    free = free_rigid_modes(scene)
-    if free:
-        raise UnconstrainedBodyError(
-            f"the supports of {scene.name} leave rigid motions free: {', '.join(free)}; "
-            "fix at least three nodes not in line, or as many components elsewhere.",
-            free_motions=tuple(free),
-        )
-
-
 def rest_displacement(scene: Scene) -> NDArray[np.float64] | None:
     """Return the displacements (n_nodes, 3) of the rest state under gravity, m.
 
@@ -164,7 +127,7 @@ def rest_displacement(scene: Scene) -> NDArray[np.float64] | None:
         return None
     if "rest" not in scene.memo:
         density = gravity.density_kg_m3 * np.array(gravity.acceleration_m_s2)
-        weight = body_force(discretisation_of(scene), density).ravel()[scene.free_dofs]
+        weight = scene.at_free_dofs(body_force(discretisation_of(scene), density).reshape(1, -1))[0]
         alone = {"gravity": None, "loads": None}
         spec, found = scene.generated.model_copy(update=alone), np.zeros(0)
         with warnings.catch_warnings():
@@ -174,8 +137,7 @@ def rest_displacement(scene: Scene) -> NDArray[np.float64] | None:
             found = light.solve(weight, options=NewtonOptions(REST_TOLERANCE)).displacement
         except SolverError as error:
             raise SolverError(f"{scene.name}: no rest state under gravity: {error}") from None
-        scene.memo["rest"] = np.zeros(scene.mesh.n_dofs)
-        scene.memo["rest"][scene.free_dofs] = found
+        scene.memo["rest"] = scene.at_all_dofs(found[None])[0]
     return scene.memo["rest"].reshape(-1, 3)
 
 
@@ -230,12 +192,18 @@ class FullOrderModel:
         number[scene.free_dofs] = np.arange(self.n_unknowns)
         dof_of_node = number.reshape(-1, 3)
         self.cell_dofs = dof_of_node[mesh.cells].reshape(mesh.n_cells, -1)
-        self.rest = None if body.rest is None else body.rest.ravel()[scene.free_dofs]
+        self.rest: NDArray[np.float64] | None = None
+        if body.rest is not None:
+            self.rest = scene.at_free_dofs(body.rest.reshape(1, -1))[0]
         self.springs: sp.csr_array | None = None
         if body.springs is not None:
-            self.springs = body.springs[scene.free_dofs][:, scene.free_dofs]
+            springs, free = body.springs, scene.free_dofs
+            if scene.frames is not None:
+                turn = scene.frames.matrix(mesh.n_nodes)
+                springs = sp.csr_array(turn @ springs @ turn.T)
+            self.springs = springs[free][:, free]
         self._points = mesh.points if body.rest is None else mesh.points + body.rest
-        self.assembler = Assembler(body, dof_of_node, self.n_unknowns)
+        self.assembler = Assembler(body, dof_of_node, self.n_unknowns, frames=scene.frames)
         self.extent = self.assembler.extent_m
         self._direct = self._direct_solver()
 
@@ -250,7 +218,8 @@ class FullOrderModel:
         banded = BandedCholesky(pattern)
         if banded.entries <= MAX_BAND_ENTRIES:
             return banded
-        return Multigrid(pattern, self.scene.mesh.points[self.moving_nodes])
+        points = self.scene.mesh.points[self.moving_nodes]
+        return Multigrid(pattern, points, self.moving_frames)
 
     @cached_property
     def rest_tangent(self) -> NDArray[np.float64]:
@@ -312,7 +281,17 @@ class FullOrderModel:
         """An approximate inverse of all tangents, R K₀⁻¹ Rᵀ; needs a banded or multigrid factor."""
         factor = self.rest_factor
         assert isinstance(factor, BandedFactor | MultigridFactor)
-        return RotatedRest(factor.single_precision(), self.assembler.pattern, self.turning_cells)
+        single, pattern = factor.single_precision(), self.assembler.pattern
+        return RotatedRest(single, pattern, self.turning_cells, self.moving_frames)
+
+    @property
+    def moving_frames(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+        """Numbers among the moving nodes (n,), and axes (n, 3, 3), of nodes with frames."""
+        frames = self.scene.frames
+        if frames is None:
+            return None
+        own = np.isin(frames.nodes, self.moving_nodes)
+        return np.searchsorted(self.moving_nodes, frames.nodes[own]), frames.axes[own]
 
     @property
     def moving_nodes(self) -> NDArray[np.int64]:
@@ -382,8 +361,14 @@ class FullOrderModel:
         return solve_equilibrium(self, load, start, options)
 
     def solve_many(
-        self, loads: NDArray[np.float64], options: NewtonOptions = NewtonOptions()
+        self,
+        loads: NDArray[np.float64],
+        options: NewtonOptions = NewtonOptions(),
+        starts: Sequence[NDArray[np.float64] | None] | None = None,
     ) -> list[Solution | SolverError]:
-        """Solve for loads (m, n_free), N; return solutions, or the errors `solve` would raise."""
-        found = dict(solve_equilibria(self, list(loads), options=options))
+        """Solve for loads (m, n_free), N, optionally each from a guess (n_free,), m.
+
+        Returns solutions, or the errors `solve` would raise.
+        """
+        found = dict(solve_equilibria(self, list(loads), starts, options))
         return [found[i] for i in range(len(loads))]

@@ -30,10 +30,17 @@ class Multigrid:
     pattern : Pattern
     points : (n_nodes, 3) float64
         Reference positions of the nodes with a free dof, m.
+    frames : tuple of arrays, optional
+        Indices (n,) of nodes whose vectors are in a frame, and its axes (n, 3, 3), as rows.
     """
 
-    def __init__(self, pattern: Pattern, points: NDArray[np.float64]) -> None:
-        self._pattern, self._points = pattern, points
+    def __init__(
+        self,
+        pattern: Pattern,
+        points: NDArray[np.float64],
+        frames: tuple[NDArray[np.int64], NDArray[np.float64]] | None = None,
+    ) -> None:
+        self._pattern, self._points, self._frames = pattern, points, frames
 
     def factor(self, values: NDArray[np.float64]) -> MultigridFactor:
         """Build the hierarchy, which counts as a factorisation without arithmetic.
@@ -41,7 +48,7 @@ class Multigrid:
         Does not check that the matrix is positive definite.
         """
         count(factorisations=1)
-        return MultigridFactor(self._pattern, values, self._points)
+        return MultigridFactor(self._pattern, values, self._points, self._frames)
 
 
 class MultigridFactor:
@@ -51,7 +58,11 @@ class MultigridFactor:
     """
 
     def __init__(
-        self, pattern: Pattern, values: NDArray[np.float64], points: NDArray[np.float64]
+        self,
+        pattern: Pattern,
+        values: NDArray[np.float64],
+        points: NDArray[np.float64],
+        frames: tuple[NDArray[np.int64], NDArray[np.float64]] | None = None,
     ) -> None:
         from pyamg import smoothed_aggregation_solver
 
@@ -62,6 +73,8 @@ class MultigridFactor:
         motions[:, :, :3] = np.eye(3)
         for axis in range(3):
             motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], x / np.abs(x).max())
+        if frames is not None:
+            motions[frames[0]] = frames[1] @ motions[frames[0]]
         near_null = pattern.pad(pattern.cut(motions.reshape(-1, 6)))
         # The coarsest matrix of plates and other ill-conditioned bodies may be indefinite
         # in single precision, or even in double precision.

@@ -29,6 +29,7 @@ from mor_bench.mechanics.newton import NewtonOptions, Solution
 from mor_bench.mechanics.pattern import Pattern
 from mor_bench.mechanics.pressed import full_order_model
 from mor_bench.mechanics.rotated import RotatedRest, SingleFactor, nodal_rotations
+from mor_bench.mechanics.turned import along_axes, in_frames
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import SolverName
 
@@ -56,7 +57,7 @@ class _HiddenRest(RotatedRest):
         whole: FullOrderModel,
         hidden: NDArray[np.int64],
     ) -> None:
-        super().__init__(factor, pattern, whole.turning_cells)
+        super().__init__(factor, pattern, whole.turning_cells, whole.moving_frames)
         self._whole, self._hidden = whole.assembler.pattern, hidden
         moving = whole.moving_nodes
         rows = np.searchsorted(moving, np.unique(whole.scene.free_dofs[hidden] // 3))
@@ -75,9 +76,13 @@ class _HiddenRest(RotatedRest):
         if q is not None:
             base[self._hidden] += q
         u = np.append(self._whole.pad(base), np.zeros(3)).reshape(-1, 3)
+        if self.frames is not None:
+            u = along_axes(u, *self.frames)
         rotations = np.empty((len(u), 3, 3))
         iterations = nodal_rotations(u, *self.cells, rotations)
         count(multiply_adds=4 * self.cells[1].size + 20 * len(rotations) + 40 * int(iterations))
+        if self.frames is not None:
+            rotations = in_frames(rotations, *self.frames)
         return np.asarray(rotations[self._rows])
 
 
@@ -204,9 +209,7 @@ class ObservedModel:
 
     def respond(self, observed: Array) -> Array:
         """Return `linear_response` on all dofs, (n, n_dofs), m; zero at the supports."""
-        out = np.zeros(observed.shape)
-        out[:, self.scene.free_dofs] = self.linear_response(observed[:, self.scene.free_dofs])
-        return out
+        return self.scene.at_all_dofs(self.linear_response(self.scene.at_free_dofs(observed)))
 
     def to_coordinates(self, axes: Array) -> Array:
         """Return Eᵀ A for all dofs, where E u_o is the linear extension of u_o.
@@ -222,11 +225,11 @@ class ObservedModel:
         -------
         (n_dofs, r) float64
         """
-        out = np.zeros((self.scene.mesh.n_dofs, axes.shape[1]))
+        out = np.zeros(axes.shape)
         with uncounted():
             hidden = self._model.rest_factor.solve(np.ascontiguousarray(axes[self._model.hidden]))
-        out[self.scene.free_dofs[self._seen]] = axes[self._seen] - self._coupling.T @ hidden
-        return out
+        out[self._seen] = axes[self._seen] - self._coupling.T @ hidden
+        return self.scene.columns_at_all_dofs(out)
 
     def solve_many(
         self, observed: Array, options: NewtonOptions = NewtonOptions()
@@ -336,8 +339,7 @@ class ToolForces:
         scene = self._model.scene
         forces = np.zeros((len(displacements), scene.mesh.n_nodes, 3))
         for row, u in zip(forces, displacements, strict=True):
-            internal = np.zeros(scene.mesh.n_dofs)
             finite = bool(np.isfinite(u).all())
-            internal[scene.free_dofs] = self._model.force(u).force if finite else np.nan
-            row[self._nodes] = internal.reshape(-1, 3)[self._nodes]
+            force = self._model.force(u).force if finite else np.full(len(u), np.nan)
+            row[self._nodes] = scene.at_all_dofs(force[None]).reshape(-1, 3)[self._nodes]
         return forces

@@ -166,10 +166,15 @@ class PressedModel(FullOrderModel):
         number = np.full(mesh.n_dofs, self.n_unknowns, dtype=np.int64)
         number[scene.free_dofs] = np.arange(self.n_unknowns)
         regions = scene.pressed_facets
-        pattern = self.assembler.pattern
-        self._facets = PressedFacets(self._points, regions, number.reshape(-1, 3), pattern)
+        turned, dof_of_node = self.assembler.turned, number.reshape(-1, 3)
+        self._facets = PressedFacets(
+            self._points,
+            regions,
+            dof_of_node if turned is None else turned.dof_of_node,
+            self.assembler.summed_pattern,
+        )
         unit = scene.patch_weights.toarray().reshape(len(regions), 3, -1)
-        self._loads = -unit.swapaxes(1, 2).reshape(len(regions), -1)[:, scene.free_dofs].T
+        self._loads = -scene.at_free_dofs(unit.swapaxes(1, 2).reshape(len(regions), -1)).T
         self.pressures = np.zeros(len(regions))
         self._at_rest = np.zeros(self.n_unknowns)
 
@@ -202,7 +207,9 @@ class PressedModel(FullOrderModel):
 
     def _moved(self, q: Array) -> Array:
         """Return the change of the pressures' force at displacements q, N."""
-        return self._facets.force(q, self.pressures) - self._at_rest
+        if (turned := self.assembler.turned) is None:
+            return self._facets.force(q, self.pressures) - self._at_rest
+        return turned.gather(self._facets.force(turned.spread(q), self.pressures)) - self._at_rest
 
     def _less(self, state: State, q: Array) -> State:
         # The change is quadratic along the line to q, so that Simpson's rule gives its exact work.
@@ -215,7 +222,10 @@ class PressedModel(FullOrderModel):
 
     def linearise(self, q: Array) -> tuple[State, Array]:
         state, values = super().linearise(q)
-        return self._less(state, q), values + self._facets.stiffness(q, self.pressures)
+        if (turned := self.assembler.turned) is None:
+            return self._less(state, q), values + self._facets.stiffness(q, self.pressures)
+        own = self._facets.stiffness(turned.spread(q), self.pressures)
+        return self._less(state, q), values + turned.tangent(own)
 
     def solve(
         self,
@@ -238,10 +248,16 @@ class PressedModel(FullOrderModel):
         return found
 
     def solve_many(
-        self, loads: Array, options: NewtonOptions = NewtonOptions()
+        self,
+        loads: Array,
+        options: NewtonOptions = NewtonOptions(),
+        starts: Sequence[Array | None] | None = None,
     ) -> list[Solution | SolverError]:
-        """Solve for loads (m, n_free), N; return solutions, or the errors `solve` would raise."""
-        return self._solved(list(loads), [None] * len(loads), options)
+        """Solve for loads (m, n_free), N, optionally each from a guess (n_free,), m.
+
+        Returns solutions, or the errors `solve` would raise.
+        """
+        return self._solved(list(loads), starts or [None] * len(loads), options)
 
     def _solved(
         self, loads: Sequence[Array], starts: Sequence[Array | None], options: NewtonOptions

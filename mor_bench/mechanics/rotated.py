@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from mor_bench.counting import count, is_counting, uncounted
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
 from mor_bench.mechanics.pattern import Pattern
+from mor_bench.mechanics.turned import along_axes, in_frames
 
 Array = NDArray[np.float64]
 
@@ -202,6 +203,8 @@ class RotatedRest:
         (n_cells, n_cell_nodes) int32: index of each cell's nodes among the nodes with a free dof;
         fixed nodes have the index n_free_nodes. (n_cells, n_cell_nodes, 3) float64: dN_a/dX at the
         cells' centres, 1/m. (n_cells,) float64: volumes of the cells, m³.
+    frames : tuple of arrays, optional
+        Indices (n,) of nodes whose vectors are in a frame, and its axes (n, 3, 3), as rows.
     """
 
     def __init__(
@@ -209,15 +212,17 @@ class RotatedRest:
         factor: SingleFactor,
         pattern: Pattern,
         cells: tuple[NDArray[np.int32], Array, Array],
+        frames: tuple[NDArray[np.int64], Array] | None = None,
     ) -> None:
-        self._factor, self._pattern = factor, pattern
+        self._factor, self._pattern, self.frames = factor, pattern, frames
         self._place = np.ascontiguousarray(factor.place[::3] // 3)
         self.cells = cells
         self._identity = np.tile(np.eye(3), (len(self._place) + 1, 1, 1))
 
     def at_nodes(self, q: Array) -> Array:
         """Return displacements (n_free_nodes + 1, 3), m; the last row, of fixed nodes, is zero."""
-        return np.append(self._pattern.pad(q), np.zeros(3)).reshape(-1, 3)
+        u = np.append(self._pattern.pad(q), np.zeros(3)).reshape(-1, 3)
+        return u if self.frames is None else along_axes(u, *self.frames)
 
     def turned(self, q: Array | None) -> Array:
         """Return nodal rotations (n_nodes + 1, 3, 3) at displacements q (n,), m.
@@ -230,7 +235,7 @@ class RotatedRest:
         iterations = nodal_rotations(self.at_nodes(q), *self.cells, rotations)
         # The terms count components of the cells' nodes, nodes, and iterations.
         count(multiply_adds=4 * self.cells[1].size + 20 * len(self._place) + 40 * int(iterations))
-        return rotations
+        return rotations if self.frames is None else in_frames(rotations, *self.frames)
 
     def solve_many(self, residuals: Sequence[Array], rotations: Sequence[Array]) -> Array:
         """Return approximate displacements (m, n), m, under forces (n,), N.

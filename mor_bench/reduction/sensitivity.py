@@ -72,10 +72,10 @@ def sensitivities(
     n, k = loads.patches.shape
     inputs, outputs = np.zeros((n, 3 * k, axes.shape[1])), np.zeros((n, 3 * k, modes.shape[1]))
     at_rest = _RestResponses(model, axes, modes, of_force)
-    largest = float(np.linalg.norm(loads.vectors, axis=2).max())
+    largest, scales = float(np.linalg.norm(loads.vectors, axis=2).max()), scene.patch_scales
     n_failed = 0
     for i, patches in enumerate(loads.patches):
-        units = [_unit_forces(scene, patch, largest) for patch in patches]
+        units = [_unit_forces(scene, patch, largest * scales[patch]) for patch in patches]
         known = [at_rest.of(patch, unit) for patch, unit in zip(patches, units, strict=True)]
         try:
             factor = model.factor(model.linearise(snapshots.free_displacements[i])[1])
@@ -103,7 +103,7 @@ def _unit_forces(scene: Scene, patch: int, size_n: float) -> Array:
     """Return forces (3, n_free), N, of one size along each axis on a patch."""
     on_nodes = scene.patch_weights[[patch]].toarray()[0]
     unit: Array = (size_n * np.einsum("n,ab->anb", on_nodes, np.eye(3))).reshape(3, -1)
-    return unit[:, scene.free_dofs]
+    return scene.at_free_dofs(unit)
 
 
 class _RestResponses:

@@ -34,8 +34,7 @@ class Subspace:
 
     def __init__(self, scene: Scene, modes: Array) -> None:
         self.n_modes = modes.shape[1]
-        self._modes = np.zeros((scene.mesh.n_dofs, self.n_modes))
-        self._modes[scene.free_dofs] = modes
+        self._modes = scene.columns_at_all_dofs(modes)
         nodes = scene.output_nodes
         self._wanted = None if len(nodes) == scene.mesh.n_nodes else dofs_of_nodes(nodes)
         self._expanding = self._modes if self._wanted is None else self._modes[self._wanted]

@@ -92,17 +92,16 @@ class _Gradients:
     def __init__(self, model: FullOrderModel, modes: Array, chunk_bytes_per_point: int) -> None:
         self.quadrature = quadrature_of(discretisation_of(model.scene))
         self.n_modes = modes.shape[1]
-        self._local = np.vstack([modes, np.zeros(self.n_modes)])
-        self._cell_dofs = model.cell_dofs
+        self._modes = model.scene.columns_at_all_dofs(modes).reshape(-1, 3, self.n_modes)
+        self._cells = model.scene.mesh.cells
         bytes_per_cell = chunk_bytes_per_point * self.quadrature.gradients.shape[1]
         self._step = max(1, int(CHUNK_BYTES / bytes_per_cell))
 
     def __iter__(self) -> Iterator[tuple[slice, Array]]:
         """Yield cells, and Hᵢ at their points (n, 3, 3, r)."""
-        n_cells, _, n_nodes, _ = self.quadrature.gradients.shape
-        for first in range(0, n_cells, self._step):
+        for first in range(0, len(self._cells), self._step):
             part = slice(first, first + self._step)
-            local = self._local[self._cell_dofs[part]].reshape(-1, n_nodes, 3, self.n_modes)
+            local = self._modes[self._cells[part]]
             gradients = np.einsum(
                 "cqaj,caim->cqijm", self.quadrature.gradients[part], local, optimize=True
             )

@@ -48,5 +48,7 @@ def weighted_cells(
     rows = np.flatnonzero(touched.reshape(-1)[scene.free_dofs])
     dof_of_node = np.full(scene.mesh.n_dofs, len(rows), dtype=np.int64)
     dof_of_node[scene.free_dofs[rows]] = np.arange(len(rows))
-    assembler = Assembler(body_of(scene, cells), dof_of_node.reshape(-1, 3), len(rows), weights)
+    assembler = Assembler(
+        body_of(scene, cells), dof_of_node.reshape(-1, 3), len(rows), weights, scene.frames
+    )
     return assembler, rows

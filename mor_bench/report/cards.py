@@ -26,7 +26,7 @@ from mor_bench.report.suite_overview import (
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.file_check import check_file
 from mor_bench.snapshots.test_sets import available_sets
-from mor_bench.specs import AnyDatasetSpec, DatasetSpec, MethodSpec
+from mor_bench.specs import AnyDatasetSpec, DatasetSpec, MethodSpec, tables_of
 from mor_bench.specs.parameters import annotated_defaults
 
 UNITS = {"m": "m", "m2": "m²", "pa": "Pa", "n": "N", "s": "s"}
@@ -146,9 +146,12 @@ def dataset_card(spec: AnyDatasetSpec, path: Path, cache: Path | None = None) ->
         facts |= {
             "geometry": _pairs(spec.geometry.model_dump(mode="json", exclude_none=True)),
             "material": _pairs(spec.material.model_dump(mode="json", exclude_none=True)),
-            "loads": f"{loads.simultaneous} at a time, kind {loads.kind}, "
-            f"{loads.magnitude[0]:g} to {loads.magnitude[1]:g} {loads.unit}, "
-            f"{loads.sampling}"
+            "loads": f"{loads.simultaneous} at a time, kind "
+            + " and ".join(
+                f"{table.kind}, {table.magnitude[0]:g} to {table.magnitude[1]:g} {table.unit}"
+                for table in tables_of(loads)
+            )
+            + f", {loads.sampling}"
             if loads
             else "",
             "split": _pairs(spec.split.model_dump(mode="json", exclude_none=True)) if loads else "",

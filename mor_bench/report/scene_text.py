@@ -11,10 +11,13 @@ from mor_bench.specs import (
     AnyLoads,
     ChamberedGeometry,
     DatasetSpec,
-    Loads,
+    LineLoads,
     Motion,
+    PointLoads,
     PointSetRegion,
+    Pressure,
     Region,
+    Several,
     TubeGeometry,
     load_recorded_spec,
 )
@@ -34,6 +37,8 @@ SYMBOLS = {"young_pa": "E", "poisson": "ν"}
 
 DIRECTIONS = {
     "force": "in any direction",
+    "point": "in any direction",
+    "line": "in any direction",
     "normal": "along the normal",
     "tangential": "along the surface",
 }
@@ -108,15 +113,20 @@ def _regions(regions: Iterable[Region]) -> str:
 
 def _loads(loads: AnyLoads) -> str:
     """State number, size, direction and place of the loads."""
+    if isinstance(loads, Several):
+        return ", and ".join(map(_loads, loads.tables))
     low, high = loads.magnitude
     ends = f"{low:g} to {high:g} {loads.unit}"
     if isinstance(loads, Motion):
         return f"a tool on {_regions([loads.region])} that moves by {ends}"
-    if not isinstance(loads, Loads):
+    if isinstance(loads, Pressure):
         kind = "following" if loads.follower else "dead"
         return f"{kind} pressures of {ends} on {_regions(loads.regions)}"
     n, how = loads.simultaneous, DIRECTIONS[loads.kind]
-    return (
-        f"{n} dead force{'s' if n != 1 else ''} of {ends} {how} on {_regions([loads.region])}, "
-        f"each on a patch of {loads.patch_area_m2:g} m²"
-    )
+    forces = f"{n} dead force{'s' if n != 1 else ''} of {ends} {how}"
+    if isinstance(loads, LineLoads):
+        return f"{forces} along lines"
+    where = f"{forces} on {_regions([loads.region])}"
+    if isinstance(loads, PointLoads):
+        return f"{where}, each at a point"
+    return f"{where}, each on a patch of {loads.patch_area_m2:g} m²"

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from mor_bench.errors import InvalidInputError, MissingDependencyError, UnusableClassError
 from mor_bench.measure.method_session import MethodSession
-from mor_bench.mechanics.model import check_supports
+from mor_bench.mechanics.rigid_motions import check_supports
 from mor_bench.options import RunOptions
 from mor_bench.results.row import label_of
 from mor_bench.sandbox.process import (

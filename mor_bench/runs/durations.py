@@ -95,7 +95,7 @@ def sample_seconds(spec: DatasetSpec) -> float:
     scene = load_scene(spec)
     model = generating_model(scene)
     forces = draw_loads(scene, 0, PROBED).nodal_forces(scene.patch_weights)
-    free_forces = forces.reshape(PROBED, -1)[:, scene.free_dofs]
+    free_forces = scene.at_free_dofs(forces.reshape(PROBED, -1))
     model.solve_many(free_forces[:1])
     start = perf_counter()
     model.solve_many(free_forces)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from mor_bench.errors import MissingDependencyError
 from mor_bench.mechanics.locking import locking_risk
-from mor_bench.mechanics.model import check_supports, missing_library, rest_displacement
+from mor_bench.mechanics.model import missing_library, rest_displacement
+from mor_bench.mechanics.rigid_motions import check_supports
 from mor_bench.method_loading import check_predicts
 from mor_bench.runs.configurations import OWN, check_foreign_method
 from mor_bench.sandbox.process import default_memory_limit_bytes
@@ -74,6 +75,8 @@ def _generated(spec: DatasetSpec) -> str:
             loaded = f"{len(scene.observed_nodes)} moved nodes"
         if scene.pressure:
             loaded = f"{len(scene.pressure.regions)} pressed regions"
+        if len(scene.acting) > 1:
+            loaded = f"{len(scene.acting)} tables of loads"
         samples = f"{loaded}, {n_samples_of(scene)} samples"
         text = f"dataset, {size}, {samples}"
     risk = locking_risk(scene)

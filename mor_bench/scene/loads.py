@@ -21,6 +21,9 @@ from mor_bench.scene.triangle_rules import DEGREE_2, quadratic_triangle
 POINTS_PER_PATCH = 256
 """Least number of surface quadrature points in a patch."""
 
+POINTS_PER_LINE = 1024
+"""Quadrature points of a line. A midpoint rule gives the resultant and its moment exactly."""
+
 MAX_SURFACE_POINTS = 200_000
 """Largest number of quadrature points. A patch that needs more is tiny compared with its facet."""
 
@@ -167,6 +170,34 @@ def pressed_patches(surface: Facets, regions: Sequence[NDArray[np.int64]]) -> Pa
         np.concatenate([rule.points for rule in rules]),
         sp.csr_array(sp.vstack([rule.values for rule in rules])),
         np.concatenate(vectors) / areas[:, None],
+    )
+
+
+def point_patches(surface: Facets, nodes: NDArray[np.int64]) -> Patches:
+    """Return patches that are single points of a surface; their "areas" are 1."""
+    shape = len(nodes), len(surface.points)
+    values = sp.csr_array((np.ones(len(nodes)), (np.arange(len(nodes)), nodes)), shape=shape)
+    return Patches(
+        sp.csr_array(sp.eye_array(len(nodes))),
+        surface.points[nodes],
+        values,
+        np.zeros((len(nodes), 3)),
+    )
+
+
+def line_patches(lines: Sequence[Sequence[Sequence[float]]]) -> Patches:
+    """Return patches that are straight lines between two points; their "areas" are lengths, m.
+
+    They have no shape functions on the surface: a mesh interpolates to their points.
+    """
+    ends = np.array(lines)
+    along = (np.arange(POINTS_PER_LINE) + 0.5) / POINTS_PER_LINE
+    points = ends[:, None, 0] + along[:, None] * (ends[:, 1] - ends[:, 0])[:, None]
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / POINTS_PER_LINE
+    areas = sp.block_diag([np.full((1, POINTS_PER_LINE), length) for length in lengths])
+    n = len(ends) * POINTS_PER_LINE
+    return Patches(
+        sp.csr_array(areas), points.reshape(-1, 3), sp.csr_array((n, 0)), np.zeros((n, 3))
     )
 
 

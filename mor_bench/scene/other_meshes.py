@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
-from mor_bench.scene.scene import Scene, by_node, scene_without_patches
+from mor_bench.scene.scene import Scene, scene_without_patches
 from mor_bench.scene.subdivision import subdivide
+from mor_bench.scene.supports import Held, held_by_parents
 from mor_bench.specs import BoxGeometry, ChamberedGeometry, LShapeGeometry
 
 
@@ -82,7 +83,13 @@ def refined(scene: Scene) -> Scene:
         name: np.flatnonzero(np.isin(parents, nodes).all(axis=1))
         for name, nodes in scene.point_sets.items()
     }
-    still = np.zeros(scene.mesh.n_dofs, dtype=bool)
-    still[scene.fixed_dofs] = True
-    fixed, held = by_node(np.all(still.reshape(-1, 3)[parents], axis=1))
-    return replace(scene, mesh=mesh, fixed_nodes=fixed, held_dofs=held, point_sets=sets)
+    held = Held(scene.fixed_nodes, scene.held_dofs, scene.frames)
+    finer = held_by_parents(scene.mesh.n_nodes, held, parents)
+    return replace(
+        scene,
+        mesh=mesh,
+        fixed_nodes=finer.fixed_nodes,
+        held_dofs=finer.held_dofs,
+        frames=finer.frames,
+        point_sets=sets,
+    )

@@ -14,6 +14,7 @@ from mor_bench.specs import (
     BoxRegion,
     NearestRegion,
     NearSurfaceRegion,
+    PlaneRegion,
     PointSetRegion,
     Region,
     SphereRegion,
@@ -81,6 +82,11 @@ def _inside(points: NDArray[np.float64], region: Region, near: float) -> NDArray
         centre, radius = region.sphere_m
         distance = np.linalg.norm(points - np.array(centre), axis=1)
         return np.asarray(distance <= radius + near)
+    if isinstance(region, PlaneRegion):
+        point, normal = (np.array(vector) for vector in region.plane_m)
+        normal = normal / np.abs(normal).max()
+        distance = np.abs((points - point) @ (normal / np.linalg.norm(normal)))
+        return np.asarray(distance <= (region.within_m or near))
     assert isinstance(region, str)
     x = points[:, "xyz".index(region[0])]
     bound = x.min() if region.endswith("min") else x.max()

@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import pi, sqrt
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
+from mor_bench.scene.acting import Acting, Ground
 from mor_bench.scene.body import build_body
 from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.interpolation import interpolation_matrix
-from mor_bench.scene.loads import Facets, Patches, cut_patches, pressed_patches, spread_out
+from mor_bench.scene.loads import Facets
 from mor_bench.scene.materials import Material, make_material
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.observed_regions import moved_nodes, observed_nodes
@@ -26,16 +25,16 @@ from mor_bench.scene.regions import Cloud, region_points
 from mor_bench.scene.second_order import with_middles
 from mor_bench.scene.snapshot_file import ImportedArrays, read_arrays
 from mor_bench.scene.springs import Springs, foundations
+from mor_bench.scene.supports import Frames, held_by
 from mor_bench.specs import (
-    AXES,
     AnyDatasetSpec,
     DatasetSpec,
     ImportedDatasetSpec,
     Motion,
     Pressure,
-    Region,
     generated,
     load_dataset_spec,
+    tables_of,
 )
 
 
@@ -54,6 +53,8 @@ class Scene:
         Nodes with u = 0.
     held_dofs : (n_held,) int64
         Components of other nodes with u = 0, as on rollers and planes of symmetry.
+    frames : Frames or None
+        Axes of the nodes with oblique supports. Along the first of them, u = 0.
     embedded_surface : Facets or None
         The smooth surface from which a mesh of voxels was made. Loads act on it.
     point_sets : mapping of str to (n,) int64
@@ -69,6 +70,7 @@ class Scene:
     material: Material | None
     fixed_nodes: NDArray[np.int64]
     held_dofs: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    frames: Frames | None = field(default=None, kw_only=True, repr=False)
     embedded_surface: Facets | None = field(default=None, repr=False)
     point_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict, repr=False)
 
@@ -93,13 +95,45 @@ class Scene:
 
     @cached_property
     def free_dofs(self) -> NDArray[np.int64]:
-        """(n_free,) dofs, 3 * node + axis, that no support holds."""
-        return np.setdiff1d(np.arange(self.mesh.n_dofs), self.fixed_dofs)
+        """(n_free,) dofs, 3 * node + axis, that no support holds.
+
+        The axes are x, y and z, or those of the node's frame.
+        """
+        free = np.setdiff1d(np.arange(self.mesh.n_dofs), self.fixed_dofs)
+        return free if self.frames is None else np.setdiff1d(free, self.frames.held_dofs)
 
     @property
     def fixed_dofs(self) -> NDArray[np.int64]:
-        """Sorted dofs with u = 0: those of the fixed nodes, and the held ones."""
+        """Sorted dofs along x, y and z with u = 0: those of the fixed nodes, and the held ones."""
         return np.union1d(dofs_of_nodes(self.fixed_nodes), self.held_dofs)
+
+    def at_free_dofs(self, fields: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return nodal vectors (n, n_dofs), along x, y and z, at the free dofs, (n, n_free)."""
+        if self.frames is not None:
+            fields = self.frames.to_local(fields)
+        return fields[:, self.free_dofs]
+
+    def at_all_dofs(self, free: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return nodal vectors (n, n_dofs), along x, y and z, from (n, n_free); 0 at supports."""
+        fields = np.zeros((len(free), self.mesh.n_dofs))
+        fields[:, self.free_dofs] = free
+        return fields if self.frames is None else self.frames.to_global(fields)
+
+    def columns_at_all_dofs(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return columns (n_dofs, m), along x, y and z, from (n_free, m); 0 at supports."""
+        whole = np.zeros((self.mesh.n_dofs, columns.shape[1]))
+        whole[self.free_dofs] = columns
+        if self.frames is None:
+            return whole
+        return np.ascontiguousarray(self.frames.to_global(whole.T).T)
+
+    def hold(self, fields: NDArray[np.float64]) -> None:
+        """Remove what supports hold from displacements (n, n_dofs), m, in place."""
+        fields[:, self.fixed_dofs] = 0.0
+        if self.frames is not None:
+            local = self.frames.to_local(fields)
+            local[:, self.frames.held_dofs] = 0.0
+            fields[:] = self.frames.to_global(local)
 
     @cached_property
     def spring_matrix(self) -> sp.csr_array | None:
@@ -155,7 +189,7 @@ class Scene:
 
     @property
     def pressure(self) -> Pressure | None:
-        """The plan of pressures; None if the scene has another or no plan."""
+        """The plan of pressures; None if the scene has another, several or no plan."""
         loads = self.spec.loads if isinstance(self.spec, DatasetSpec) else None
         return loads if isinstance(loads, Pressure) else None
 
@@ -164,29 +198,25 @@ class Scene:
         """True if the scene's pressures follow the deformed surface."""
         return self.pressure is not None and self.pressure.follower
 
+    @cached_property
+    def acting(self) -> tuple[Acting, ...]:
+        """The loads of each table `[loads]`; `SpecError` if there is none."""
+        ground = Ground(
+            self.mesh,
+            self.surface,
+            self.embedded_surface is not None,
+            self.point_sets,
+            self.fixed_nodes,
+            self.observed_nodes if self.motion else None,
+        )
+        return tuple(Acting(table, ground) for table in tables_of(self.generated.load_plan))
+
     @property
     def pressed_facets(self) -> list[NDArray[np.int64]]:
         """The facets (n_facets, 4, 3 or 6) of each region of a pressure."""
         if self.pressure is None:
             raise UnsupportedSceneError(f"{self.name}: no pressure acts on it.")
-        return [self.surface.within(self._surface_points(r)) for r in self.pressure.regions]
-
-    @cached_property
-    def _loaded_points(self) -> NDArray[np.int64]:
-        plan = self.generated.load_plan
-        regions = plan.regions if isinstance(plan, Pressure) else (plan.region,)
-        return np.unique(np.concatenate([self._surface_points(region) for region in regions]))
-
-    def _surface_points(self, region: Region) -> NDArray[np.int64]:
-        on_surface = np.unique(self.surface.facets)
-        sets = {} if self.embedded_surface else self.point_sets
-        cloud = Cloud(self.surface.points, on_surface, sets)
-        found = np.intersect1d(region_points(cloud, region), on_surface)
-        if not len(found):
-            raise SpecError(
-                "the load region holds nodes inside the body only, none on its surface."
-            )
-        return found
+        return self.acting[0].pressed_facets
 
     @cached_property
     def patch_nodes(self) -> NDArray[np.int64]:
@@ -194,59 +224,31 @@ class Scene:
 
         The index of a patch here is its load-region id. On a mesh's own boundary the points are
         nodes. A moved tool counts as one patch, at one of its nodes; a pressure as three, at the
-        middle of its region.
+        middle of its region; a line as one, at the point nearest to its middle. The patches of
+        several tables follow one another.
         """
-        loads = self.generated.load_plan
-        if isinstance(loads, Pressure):
-            regions = [self._surface_points(region) for region in loads.regions]
-            middles = [self.surface.points[region].mean(axis=0) for region in regions]
-            return np.repeat(np.concatenate([self._surface_point(m) for m in middles]), 3)
-        if isinstance(loads, Motion):
-            assert self.observed_nodes is not None
-            points = self.mesh.points[self.observed_nodes]
-            middle = np.linalg.norm(points - points.mean(axis=0), axis=1).argmin()
-            return self._surface_point(points[middle])
-        region = self._loaded_points
-        if loads.n_patches is None:
-            return region
-        points = self.surface.points[region]
-        if len(self.fixed_nodes):
-            distance = cKDTree(self.mesh.points[self.fixed_nodes]).query(points)[0]
-            region = region[distance > sqrt(loads.patch_area_m2 / pi)]
-        if loads.n_patches > len(region):
-            raise SpecError(
-                f"`n_patches` must be in [1, {len(region)}], the number of points of the load "
-                f"region away from the supports; got {loads.n_patches}."
-            )
-        return region[spread_out(self.surface.points[region], loads.n_patches)]
-
-    def _surface_point(self, position: NDArray[np.float64]) -> NDArray[np.int64]:
-        return np.array([np.linalg.norm(self.surface.points - position, axis=1).argmin()])
+        return np.concatenate([acting.nodes for acting in self.acting])
 
     @property
     def patch_centres(self) -> NDArray[np.float64]:
         """(n_patches, 3) positions of the patches' centres, m."""
         return self.surface.points[self.patch_nodes]
 
+    @property
+    def patch_normals(self) -> NDArray[np.float64]:
+        """(n_patches, 3) outward unit normals, each the mean over its patch."""
+        return np.concatenate([acting.normals for acting in self.acting])
+
     @cached_property
     def loaded_facets(self) -> NDArray[np.int64]:
         """(n_facets, 4, 3 or 6) facets on which patches may lie."""
-        return self.surface.within(self._loaded_points)
+        return np.concatenate([acting.facets for acting in self.acting])
 
     @cached_property
-    def patches(self) -> Patches:
-        """The load patches as points of the surface with areas."""
-        plan = self.generated.load_plan
-        if isinstance(plan, Motion):
-            raise UnsupportedSceneError(f"{self.name}: a tool moves the body; it has no patches.")
-        if isinstance(plan, Pressure):
-            return pressed_patches(self.surface, self.pressed_facets)
-        return cut_patches(self.surface, self.loaded_facets, self.patch_nodes, plan.patch_area_m2)
-
-    @cached_property
-    def patch_normals(self) -> NDArray[np.float64]:
-        """(n_patches, 3) outward unit normals, each the mean over its patch."""
-        return self.patches.mean_normals()
+    def patch_scales(self) -> NDArray[np.float64]:
+        """(n_patches,) largest load of each patch, relative to the largest of all tables."""
+        ends = [acting.plan.magnitude[1] for acting in self.acting]
+        return np.repeat(np.array(ends) / max(ends), [len(acting.nodes) for acting in self.acting])
 
     def patch_points(self, patches: NDArray[np.int64]) -> tuple[NDArray[np.float64], sp.csr_array]:
         """Return the tractions of patches as forces at surface points, the same on every mesh.
@@ -264,13 +266,19 @@ class Scene:
             Share of the patch's force at each point; rows sum to 1. Of a pressure: the component
             of the area vector at each point, m².
         """
-        areas = self.patches.areas[patches]
-        used = np.unique(areas.indices)
-        return self.patches.points[used], self._weights(areas[:, used])
-
-    def _weights(self, areas: sp.csr_array) -> sp.csr_array:
-        """Return the weights of patches from their areas: shares, or those of a pressure."""
-        return areas if self.pressure else _rows_to_one(areas)
+        if len(self.acting) == 1:
+            return self.acting[0].points(patches)
+        ends = np.cumsum([len(acting.nodes) for acting in self.acting])
+        table = np.searchsorted(ends, patches, side="right")
+        rows = [np.flatnonzero(table == k) for k in range(len(ends))]
+        parts = [
+            acting.points(patches[own] - (ends[k - 1] if k else 0))
+            for k, (acting, own) in enumerate(zip(self.acting, rows, strict=True))
+        ]
+        shares = sp.csr_array(sp.block_diag([shares for _, shares in parts]))
+        return np.concatenate([points for points, _ in parts]), shares[
+            np.argsort(np.concatenate(rows))
+        ]
 
     @cached_property
     def patch_weights(self) -> sp.csr_array:
@@ -280,15 +288,8 @@ class Scene:
         nodes of the surrounding cells. For a moved tool they are 1 at each of its nodes. For a
         pressure they are components of area vectors, m².
         """
-        if self.motion:
-            assert self.observed_nodes is not None
-            columns = self.observed_nodes, np.array([0, len(self.observed_nodes)])
-            moved = np.ones(len(self.observed_nodes)), *columns
-            return sp.csr_array(moved, shape=(1, self.mesh.n_nodes))
-        if self.embedded_surface:
-            points, shares = self.patch_points(np.arange(len(self.patch_nodes)))
-            return self._weights(sp.csr_array(shares @ interpolation_matrix(self.mesh, points)))
-        return self._weights(sp.csr_array(self.patches.areas @ self.patches.values))
+        parts = [acting.weights for acting in self.acting]
+        return parts[0] if len(parts) == 1 else sp.csr_array(sp.vstack(parts))
 
     def prepare(self) -> Scene:
         """Find all regions now, so empty regions raise one `SpecError` here; return the scene."""
@@ -307,10 +308,6 @@ class Scene:
         if problems:
             raise SpecError(" ".join(problems))
         return self
-
-
-def _rows_to_one(matrix: sp.csr_array) -> sp.csr_array:
-    return sp.csr_array(matrix.multiply(1.0 / matrix.sum(axis=1)[:, None]))
 
 
 def as_spec(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> AnyDatasetSpec:
@@ -352,15 +349,19 @@ def scene_without_patches(spec: DatasetSpec) -> Scene:
     mesh, surface, point_sets = build_body(spec)
     mesh, point_sets = _in_elements(spec, mesh, point_sets)
     cloud = Cloud(mesh.points, np.unique(mesh.boundary_facets), point_sets)
-    still = np.zeros((mesh.n_nodes, 3), dtype=bool)
-    for support in spec.supports:
-        nodes = region_points(cloud, support.region)
-        still[nodes[:, None], [AXES.index(axis) for axis in support.components]] = True
-    if still.all():
-        raise SpecError("the supports fix every node of the mesh: nothing can move.")
-    material, held = make_material(spec.material), by_node(still)
+    material, held = make_material(spec.material), held_by(spec.supports, cloud)
     springs = foundations(spec, surface or Facets(mesh.points, mesh.boundary_facets), point_sets)
-    return Scene(spec, mesh, material, *held, surface, point_sets, springs)
+    return Scene(
+        spec,
+        mesh,
+        material,
+        held.fixed_nodes,
+        held.held_dofs,
+        surface,
+        point_sets,
+        springs,
+        frames=held.frames,
+    )
 
 
 def _in_elements(
@@ -378,9 +379,3 @@ def _in_elements(
     return (
         with_middles(mesh, point_sets) if (n_nodes, wanted.order) == (4, 2) else (mesh, point_sets)
     )
-
-
-def by_node(still: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return nodes without a free component, and held dofs of the others, from (n_nodes, 3)."""
-    fixed = np.all(still, axis=1, keepdims=True)
-    return np.flatnonzero(fixed), np.flatnonzero(still & ~fixed)

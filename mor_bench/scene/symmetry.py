@@ -40,9 +40,13 @@ class Mirror:
 def mirrors(scene: Scene) -> list[Mirror]:
     """Return the mirror planes of a scene with its loaded nodes, at most one per axis.
 
+    None are looked for where supports are oblique.
+
     The image of a solution solves the image of its load, because laws are isotropic or their fibres
     have an image too.
     """
+    if scene.frames is not None:
+        return []
     points, cells = scene.mesh.points, scene.mesh.cells
     low, high = points.min(axis=0), points.max(axis=0)
     near = SAME_PLACE * np.linalg.norm(high - low)

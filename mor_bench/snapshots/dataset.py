@@ -19,7 +19,7 @@ from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import GenerationOptions, generate, read_shards
 from mor_bench.snapshots.given import Given, given_of
 from mor_bench.snapshots.imported_dataset import NodalLoads, nodal_loads, read_samples
-from mor_bench.snapshots.sampling import PatchLoads, n_samples_of, repeated
+from mor_bench.snapshots.sampling import PatchLoads, n_samples_of, path_of_samples, repeated
 from mor_bench.snapshots.split import split_imported, split_samples
 from mor_bench.snapshots.test_sets import SetName, check_regions, spec_of_set
 from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, SplitBy
@@ -92,13 +92,12 @@ class Snapshots:
     @property
     def free_forces(self) -> NDArray[np.float64]:
         """(n_samples, n_free) nodal forces at the free dofs, N."""
-        return self.forces.reshape(len(self), self.scene.mesh.n_dofs)[:, self.scene.free_dofs]
+        return self.scene.at_free_dofs(self.forces.reshape(len(self), self.scene.mesh.n_dofs))
 
     @cached_property
     def displacements(self) -> NDArray[np.float64]:
         """(n_samples, n_nodes, 3) nodal displacements, m."""
-        full = np.zeros((len(self), self.scene.mesh.n_dofs))
-        full[:, self.scene.free_dofs] = self.free_displacements
+        full = self.scene.at_all_dofs(self.free_displacements)
         return read_only(full.reshape(len(self), self.scene.mesh.n_nodes, 3))
 
     @property
@@ -221,7 +220,8 @@ def _split(
         )
     valid, n_patches = main.valid, len(main.scene.patch_nodes)
     chosen = spec.split.model_copy(update={"by": by})
-    parts = split_samples(main.loads[valid], n_patches, chosen, spec.load_plan.seed)
+    paths = path_of_samples(main.scene, valid)
+    parts = split_samples(main.loads[valid], n_patches, chosen, spec.load_plan.seed, paths)
     train, validation, test = main.snapshots([valid[part] for part in parts])
     sets: dict[str, Snapshots] = {n: s.snapshots([s.valid])[0] for n, s in others.items()}
     n_refused, n_unused = len(main.status) - len(valid), len(valid) - sum(map(len, parts))

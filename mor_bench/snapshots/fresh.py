@@ -9,9 +9,9 @@ from mor_bench.mechanics.newton import Solution
 from mor_bench.mechanics.observed import generating_model
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.snapshots.sampling import draw_loads, n_samples_of
+from mor_bench.snapshots.sampling import draw_loads, n_samples_of, path_of_samples
 from mor_bench.snapshots.split import split_samples
-from mor_bench.specs import DatasetSpec, SplitBy
+from mor_bench.specs import DatasetSpec, SplitBy, with_seed
 
 MAX_FRESH = 400
 """Largest number of samples. One process solves them while the run waits."""
@@ -39,12 +39,14 @@ def fresh_test_set(spec: DatasetSpec, scene: Scene, by: SplitBy, seed: int, n: i
     SolverError
         If none of the loads has a valid equilibrium.
     """
-    other = spec.model_copy(update={"loads": spec.load_plan.model_copy(update={"seed": seed})})
+    other = spec.model_copy(update={"loads": with_seed(spec.load_plan, seed)})
     drawn = draw_loads(load_scene(other), 0, n_samples_of(scene))
     split = spec.split.model_copy(update={"by": by})
-    held = drawn[split_samples(drawn, len(scene.patch_nodes), split, spec.load_plan.seed).test]
+    paths = path_of_samples(scene, np.arange(len(drawn)))
+    n_patches, own_seed = len(scene.patch_nodes), spec.load_plan.seed
+    held = drawn[split_samples(drawn, n_patches, split, own_seed, paths).test]
     held = held[: min(n, MAX_FRESH)]
-    values = held.nodal_forces(scene.patch_weights).reshape(len(held), -1)[:, scene.free_dofs]
+    values = scene.at_free_dofs(held.nodal_forces(scene.patch_weights).reshape(len(held), -1))
     found = generating_model(scene).solve_many(values)
     solved = [(i, answer) for i, answer in enumerate(found) if isinstance(answer, Solution)]
     if not solved:

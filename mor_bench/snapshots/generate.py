@@ -115,7 +115,8 @@ class _Plan:
         return pack(self.scene)
 
     def task(self, number: int) -> Task:
-        return Task(self.key, self._problem, number * SHARD_SIZE, self.loads(number))
+        steps = self.scene.generated.load_plan.steps
+        return Task(self.key, self._problem, number * SHARD_SIZE, self.loads(number), steps=steps)
 
     def has(self, number: int) -> bool:
         """Return whether the right shard exists; warn if an existing one is damaged or wrong."""

@@ -13,13 +13,16 @@ latin-hypercube, sobol
     from one design for the samples of each patch, with seed (seed, patch); with combinations, from
     one design for all samples.
 
+With several tables, sample i has the i-th loads of each. If a table asks for n steps, sample i is
+step i modulo n, plus 1, of load i / n.
+
 A sample depends neither on the order of generation nor on the number of workers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -28,8 +31,17 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from mor_bench.errors import SpecError
+from mor_bench.scene.acting import Acting
 from mor_bench.scene.scene import Scene
-from mor_bench.specs import MAX_COUNT, Loads, Motion, Pressure, Sampling
+from mor_bench.specs import (
+    MAX_COUNT,
+    LineLoads,
+    Loads,
+    Motion,
+    PointLoads,
+    Pressure,
+    Sampling,
+)
 
 MAX_COMBINATIONS = 5_000_000
 """Largest number of listed combinations of patches. With three patches each, they need 120 MB."""
@@ -40,7 +52,10 @@ MAX_PAIRED = 10_000
 MAX_DRAWS = 1000
 """Tries per sample to draw patches that are far apart."""
 
-N_COORDINATES = {"force": 3, "displacement": 3, "tangential": 2, "normal": 1}
+Drawn = Loads | PointLoads | LineLoads | Motion
+"""Tables whose loads are vectors."""
+
+N_COORDINATES = {"force": 3, "point": 3, "line": 3, "displacement": 3, "tangential": 2, "normal": 1}
 """Coordinates of one force or displacement, by kind of load."""
 
 
@@ -85,16 +100,32 @@ def n_samples_of(scene: Scene, limit: int | None = None) -> int:
         If the plan has more than `MAX_COUNT` samples.
     """
     loads = scene.generated.load_plan
-    whole = loads.samples or 0
-    if loads.samples_per_patch:
-        whole = len(scene.patch_nodes) * loads.samples_per_patch
+    whole = _n_loads(scene) * loads.steps
     if whole > MAX_COUNT:
+        if loads.steps > 1:
+            raise SpecError(
+                f"`steps`: {_n_loads(scene):,} loads in {loads.steps:,} steps each are {whole:,} "
+                f"samples; at most {MAX_COUNT:,} are allowed."
+            )
         raise SpecError(
             f"`samples_per_patch`: {len(scene.patch_nodes):,} patches with "
             f"{loads.samples_per_patch:,} samples each are {whole:,} samples; at most "
             f"{MAX_COUNT:,} are allowed."
         )
     return whole if limit is None else min(limit, whole)
+
+
+def _n_loads(scene: Scene) -> int:
+    """Return the number of loads of a scene's plan, each of which may be applied in steps."""
+    loads = scene.generated.load_plan
+    if loads.samples_per_patch:
+        return len(scene.patch_nodes) * loads.samples_per_patch
+    return loads.samples or 0
+
+
+def path_of_samples(scene: Scene, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number of the load that each sample is a step of, (n,) int64."""
+    return numbers // scene.generated.load_plan.steps
 
 
 def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
@@ -105,20 +136,45 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
     SpecError
         If no patches are as far apart as the plan requires.
     """
-    loads, numbers = scene.generated.load_plan, np.arange(start, stop)
+    numbers, steps = np.arange(start, stop), scene.generated.load_plan.steps
+    if steps == 1:
+        return _drawn(scene, numbers)
+    paths, row = np.unique(path_of_samples(scene, numbers), return_inverse=True)
+    whole = _drawn(scene, paths)[row]
+    parts = (numbers % steps + 1) / steps
+    return replace(whole, vectors=whole.vectors * parts[:, None, None])
+
+
+def _drawn(scene: Scene, numbers: NDArray[np.int64]) -> PatchLoads:
+    """Return some loads of a plan, each as a whole."""
+    whole = _n_loads(scene)
+    parts = [_drawn_from(acting, numbers, whole) for acting in scene.acting]
+    if len(parts) == 1:
+        return parts[0]
+    n_patches = [len(acting.nodes) for acting in scene.acting]
+    firsts = np.append(0, np.cumsum(n_patches)[:-1])
+    return PatchLoads(
+        np.hstack([part.patches + first for part, first in zip(parts, firsts, strict=True)]),
+        np.concatenate([part.vectors for part in parts], axis=1),
+    )
+
+
+def _drawn_from(acting: Acting, numbers: NDArray[np.int64], whole: int) -> PatchLoads:
+    """Return some of ``whole`` loads of one table."""
+    loads = acting.plan
     if isinstance(loads, Pressure):
         return _pressures(loads, numbers)
-    chosen, k = _combinations(scene), loads.simultaneous
+    chosen, k = _combinations(acting), loads.simultaneous
     if chosen is None:
-        patches = np.stack([_apart(scene, int(i)) for i in numbers])
+        patches = np.stack([_apart(acting, int(i)) for i in numbers])
     else:
         patches = chosen[numbers % len(chosen)]
     free = N_COORDINATES[loads.kind] == 3  # directions that depend on no normal
-    normals = np.zeros((*patches.shape, 3)) if free else scene.patch_normals[patches]
+    normals = np.zeros((*patches.shape, 3)) if free else acting.normals[patches]
     if loads.sampling == "random":
         drawn = [_random_forces(loads, int(i), n) for i, n in zip(numbers, normals, strict=True)]
         return PatchLoads(patches, np.stack(drawn))
-    d, whole = N_COORDINATES[loads.kind], n_samples_of(scene)
+    d = N_COORDINATES[loads.kind]
     if k == 1:
         assert chosen is not None
         size, turns = -(-whole // len(chosen)), numbers // len(chosen)
@@ -144,14 +200,14 @@ def _pressures(loads: Pressure, numbers: NDArray[np.int64]) -> PatchLoads:
     return PatchLoads(patches, vectors.reshape(len(numbers), 3 * d, 3))
 
 
-def _combinations(scene: Scene) -> NDArray[np.int64] | None:
+def _combinations(acting: Acting) -> NDArray[np.int64] | None:
     """Return the jointly loaded patches (n_combinations, k) in order of use; None if too many."""
-    loads = scene.generated.load_plan
+    loads = acting.plan
     if loads.samples_per_patch:
-        return np.arange(len(scene.patch_nodes))[:, None]
+        return np.arange(len(acting.nodes))[:, None]
     distance = loads.min_distance_m or 0.0
     found: NDArray[np.int64] | None = far_apart(
-        scene.patch_centres.tobytes(), loads.simultaneous, distance
+        acting.centres.tobytes(), loads.simultaneous, distance
     )
     if found is None:
         return None
@@ -201,9 +257,9 @@ def far_apart(centres: bytes, k: int, distance: float) -> NDArray[np.int64] | No
     return sets
 
 
-def _apart(scene: Scene, number: int) -> NDArray[np.int64]:
+def _apart(acting: Acting, number: int) -> NDArray[np.int64]:
     """Return the patches (k,) of one sample, each drawn far enough from all before it."""
-    loads, centres = scene.generated.load_plan, scene.patch_centres
+    loads, centres = acting.plan, acting.centres
     generator = np.random.default_rng([loads.seed, 0xC0B1, number])
     for _ in range(MAX_DRAWS):
         chosen, allowed = np.zeros(0, dtype=np.int64), np.arange(len(centres))
@@ -219,9 +275,7 @@ def _apart(scene: Scene, number: int) -> NDArray[np.int64]:
     )
 
 
-def _random_forces(
-    loads: Loads | Motion, number: int, normals: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _random_forces(loads: Drawn, number: int, normals: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the forces (k, 3) of one sample on patches with normals (k, 3)."""
     generator = np.random.default_rng([loads.seed, number])
     if N_COORDINATES[loads.kind] < 3:
@@ -248,7 +302,7 @@ def _design(sampling: Sampling, seed: tuple[int, ...], n: int, d: int) -> NDArra
 
 
 def _forces(
-    loads: Loads | Motion, unit: NDArray[np.float64], normals: NDArray[np.float64]
+    loads: Drawn, unit: NDArray[np.float64], normals: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return forces (n, k, 3), N, for coordinates (n, k, d) in [0, 1] and normals (n, k, 3).
 

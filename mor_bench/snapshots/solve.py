@@ -15,11 +15,12 @@ from numba.core.event import TimingListener, install_listener
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from mor_bench.errors import InvertedElementError, WorkerError
+from mor_bench.errors import InvertedElementError, SolverError, WorkerError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import Solution
 from mor_bench.mechanics.observed import ObservedModel, generating_model
 from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.load_paths import solve_paths
 from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.snapshots.store import STATUSES, Shard
 
@@ -45,6 +46,8 @@ class Task:
     loads : PatchLoads
     generator_version : int
         The sender's version.
+    steps : int
+        Samples of each load path.
     """
 
     dataset: str
@@ -52,6 +55,7 @@ class Task:
     start: int
     loads: PatchLoads
     generator_version: int = GENERATOR_VERSION
+    steps: int = 1
 
 
 @dataclass(frozen=True)
@@ -112,6 +116,15 @@ class _SingleThreaded:
 _single_threaded = _SingleThreaded()
 
 
+def _solutions(
+    model: FullOrderModel | ObservedModel, values: NDArray[np.float64], task: Task
+) -> list[Solution | SolverError]:
+    if task.steps == 1:
+        return model.solve_many(values)
+    assert isinstance(model, FullOrderModel)
+    return solve_paths(model, values, task.start, task.steps)
+
+
 def solve_task(task: Task) -> Solved:
     """Solve the samples of one shard, on one thread.
 
@@ -127,13 +140,13 @@ def solve_task(task: Task) -> Solved:
         )
     model, weights = _kept.of(task.problem)
     loads = task.loads
-    values = loads.nodal_forces(weights).reshape(len(loads), -1)[:, model.scene.free_dofs]
+    values = model.scene.at_free_dofs(loads.nodal_forces(weights).reshape(len(loads), -1))
     displacements = np.full(values.shape, np.nan)
     min_det_f: NDArray[np.float64] = np.full(len(loads), np.nan)
     status = np.zeros(len(loads), dtype=np.uint8)
     with _single_threaded(), install_listener("numba:compile", TimingListener()) as compilation:  # type: ignore[no-untyped-call]
         begun = perf_counter()
-        for row, found in enumerate(model.solve_many(values)):
+        for row, found in enumerate(_solutions(model, values, task)):
             if isinstance(found, Solution):
                 displacements[row], min_det_f[row] = found.displacement, found.min_det_f
             else:

@@ -26,7 +26,13 @@ class Parts(NamedTuple):
     test: NDArray[np.int64]
 
 
-def split_samples(loads: PatchLoads | NodalLoads, n_regions: int, split: Split, seed: int) -> Parts:
+def split_samples(
+    loads: PatchLoads | NodalLoads,
+    n_regions: int,
+    split: Split,
+    seed: int,
+    paths: NDArray[np.int64] | None = None,
+) -> Parts:
     """Divide samples into a training, a validation and a test part.
 
     The split holds out any samples, whole load regions, or forces in a cone around a random axis;
@@ -34,7 +40,8 @@ def split_samples(loads: PatchLoads | NodalLoads, n_regions: int, split: Split, 
     is a test sample if all of its forces are held out for the test, and unused if only some are. Of
     the others, it is a validation sample if at least one of its forces is held out for validation.
     The fractions of regions, or of the sphere, are chosen such that each part gets its fraction of
-    the used samples.
+    the used samples. Samples with the same number in ``paths`` (n,) are steps of one load, whose
+    patches and directions are the same; a split by sample keeps them together.
 
     Raises
     ------
@@ -51,9 +58,13 @@ def split_samples(loads: PatchLoads | NodalLoads, n_regions: int, split: Split, 
     # samples have a force there.
     ring = 1 - (1 - split.validation_fraction / (1 - split.test_fraction)) ** (1 / k)
     if split.by == "sample":
+        row = np.arange(n)
+        if paths is not None:
+            numbers, row = np.unique(paths, return_inverse=True)
+            n = len(numbers)
         n_test = round(split.test_fraction * n)
         n_validation = round(split.validation_fraction * n)
-        rank = np.argsort(generator.permutation(n))[:, None]
+        rank = np.argsort(generator.permutation(n))[row][:, None]
         test, validation = rank < n_test, rank < n_test + n_validation
     elif split.by == "region":
         n_test = min(max(1, round(part * n_regions)), n_regions - 1)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.specs import DatasetSpec, Loads
+from mor_bench.specs import AnyTable, DatasetSpec, LineLoads, Loads, Motion, Pressure, Several
 
 SetName = Literal[
     "in-range",
@@ -53,11 +53,15 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
         return f"there is no such set; known: {', '.join(SET_NAMES)}"
     if name == "unseen-regions" and spec.tests.unseen_region is None:
         return "its file names no `tests.unseen_region`"
+    if name == "unseen-regions" and isinstance(spec.load_plan, LineLoads):
+        return "its loads act along given lines"
     if name == "paper-amplitude" and spec.tests.paper_magnitude_n is None:
         return "its file names no `tests.paper_magnitude_n`"
     if name == "unseen-directions" and spec.load_plan.kind == "pressure":
         return "a pressure has one direction"
-    if name == "unseen-directions" and spec.load_plan.kind in ("force", "displacement"):
+    if name == "unseen-directions" and spec.load_plan.kind == "several":
+        return "several tables of loads act together"
+    if name == "unseen-directions" and spec.load_plan.kind not in ("normal", "tangential"):
         return (
             "its directions are all over the sphere; "
             "the split by direction holds some of them out of training"
@@ -89,10 +93,21 @@ def spec_of_set(spec: DatasetSpec, name: SetName) -> DatasetSpec:
     """
     if reason := why_not(spec, name):
         raise InvalidInputError(f"{spec.name} has no test set {name!r}: {reason}.")
-    loads = spec.load_plan
+    plan = spec.load_plan
+    if isinstance(plan, Several):
+        tables = [_changed(spec, table, name) for table in plan.tables]
+        loads: dict[str, Any] = {"kind": "several", "tables": tables}
+    else:
+        loads = _changed(spec, plan, name)
+    content = {**spec.model_dump(), "name": f"{spec.name}--{name}"}
+    return DatasetSpec.model_validate({**content, "loads": loads})
+
+
+def _changed(spec: DatasetSpec, loads: AnyTable, name: SetName) -> dict[str, Any]:
+    """Return a table of loads of a named test set."""
     low, high = loads.magnitude
     changed: dict[str, Any] = {"samples": spec.tests.samples, "seed": loads.seed + SEED_SHIFT}
-    if isinstance(loads, Loads):
+    if not isinstance(loads, Motion | Pressure):
         changed["samples_per_patch"] = None
     if name in ("2x", "4x"):
         times = int(name[0])
@@ -105,8 +120,7 @@ def spec_of_set(spec: DatasetSpec, name: SetName) -> DatasetSpec:
         changed["kind"] = "tangential" if loads.kind == "normal" else "normal"
     elif name == "several-forces":
         changed.update(simultaneous=N_SEVERAL, min_distance_m=FAR * _diagonal(load_scene(spec)))
-    content = {**spec.model_dump(), "name": f"{spec.name}--{name}"}
-    return DatasetSpec.model_validate({**content, "loads": {**loads.model_dump(), **changed}})
+    return {**loads.model_dump(), **changed}
 
 
 def with_test_sets(spec: DatasetSpec) -> list[DatasetSpec]:

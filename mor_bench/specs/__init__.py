@@ -28,14 +28,17 @@ from mor_bench.specs.geometry_spec import (
     VoxelsGeometry,
 )
 from mor_bench.specs.loads_spec import (
-    AXES,
     AnyLoads,
+    AnyTable,
+    LineLoads,
     Loads,
     Motion,
+    PointLoads,
     Pressure,
     Sampling,
-    Split,
-    SplitBy,
+    Several,
+    tables_of,
+    with_seed,
 )
 from mor_bench.specs.material_spec import (
     FibreMaterial,
@@ -51,6 +54,7 @@ from mor_bench.specs.region_spec import (
     BoxRegion,
     NearestRegion,
     NearSurfaceRegion,
+    PlaneRegion,
     PointSetRegion,
     Region,
     SphereRegion,
@@ -63,7 +67,9 @@ from mor_bench.specs.spec_files import (
     load_method_spec,
     load_recorded_spec,
 )
+from mor_bench.specs.split_spec import Split, SplitBy
 from mor_bench.specs.suite_folder import find_suite, list_suite
+from mor_bench.specs.support_spec import AXES, Support
 
 __all__ = [
     "AXES",
@@ -73,6 +79,7 @@ __all__ = [
     "RECORDED",
     "AnyDatasetSpec",
     "AnyLoads",
+    "AnyTable",
     "Battery",
     "BoxGeometry",
     "BoxRegion",
@@ -82,6 +89,7 @@ __all__ = [
     "FileGeometry",
     "ImportedDatasetSpec",
     "LShapeGeometry",
+    "LineLoads",
     "Loads",
     "MethodSpec",
     "MooneyRivlinMaterial",
@@ -90,16 +98,20 @@ __all__ = [
     "NearestRegion",
     "Observed",
     "OgdenMaterial",
+    "PlaneRegion",
+    "PointLoads",
     "PointSetRegion",
     "Pressure",
     "Race",
     "Region",
     "Sampling",
+    "Several",
     "SolverName",
     "SourceFile",
     "SphereRegion",
     "Split",
     "SplitBy",
+    "Support",
     "TetrahedraGeometry",
     "TubeGeometry",
     "TwoLameMaterial",
@@ -117,4 +129,6 @@ __all__ = [
     "load_generated_spec",
     "load_method_spec",
     "load_recorded_spec",
+    "tables_of",
+    "with_seed",
 ]

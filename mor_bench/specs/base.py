@@ -44,6 +44,17 @@ Area = Annotated[Positive, in_range(1e-18, 1e18, "m²")]
 Modulus = Annotated[Positive, in_range(1e-6, 1e15, "Pa")]
 Coordinate = Annotated[Finite, in_range(-1e9, 1e9, "m")]
 Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
+
+
+def _not_zero(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not 1e-150 < max(map(abs, value)) < 1e150:
+        raise ValueError("the largest component must be between 1e-150 and 1e150 in size")
+    return value
+
+
+Direction = Annotated[tuple[Finite, Finite, Finite], Field(strict=False), AfterValidator(_not_zero)]
+"""A direction in space; its length has no meaning."""
+
 Text = Annotated[str, Field(max_length=10_000), AfterValidator(_printable)]
 Label = Annotated[str, Field(max_length=500), AfterValidator(_one_line)]
 """A name in tables and in names of files."""

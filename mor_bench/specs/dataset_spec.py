@@ -14,19 +14,16 @@ from mor_bench.specs.base import Name, Positive, StrictModel, Text
 from mor_bench.specs.geometry_spec import Geometry
 from mor_bench.specs.loads_spec import (
     AnyLoads,
-    ExtraTests,
-    Gravity,
-    ImportedSplit,
     LoadPlan,
     Motion,
     Pressure,
-    Split,
-    Spring,
-    Support,
+    Several,
 )
 from mor_bench.specs.material_spec import Discretisation, MaterialSpec, SolverName
 from mor_bench.specs.region_spec import Outputs, Region
 from mor_bench.specs.source_file import File, without_paths
+from mor_bench.specs.split_spec import ExtraTests, ImportedSplit, Split
+from mor_bench.specs.support_spec import Gravity, Spring, Support
 
 MAX_NODES = 1_000_000
 """Largest number of nodes of the grid to which samples are interpolated."""
@@ -116,9 +113,9 @@ class DatasetSpec(CommonDatasetSpec):
         Foundations, none by default.
     gravity : Gravity, optional
         A constant pre-load: displacements are measured from the rest state under it.
-    loads : Loads, Motion or Pressure, optional
-        Sampled forces, displacements of a tool, or pressures. Without it the scene can be solved
-        for given forces, but no samples can be drawn.
+    loads : Loads, PointLoads, LineLoads, Motion, Pressure or Several, optional
+        Sampled forces, displacements of a tool, pressures, or several of them together. Without it
+        the scene can be solved for given forces, but no samples can be drawn.
     """
 
     geometry: Geometry
@@ -136,15 +133,18 @@ class DatasetSpec(CommonDatasetSpec):
 
     @model_validator(mode="after")
     def _fixed_regions(self) -> Self:
-        """Check what a plan excludes whose samples all act on the same regions."""
-        if not isinstance(self.loads, Motion | Pressure):
+        """Check what a plan excludes whose samples do not act on one region each."""
+        if not isinstance(self.loads, Motion | Pressure | Several):
             return self
         where = f"where `loads.kind` is {self.loads.kind!r}"
+        why = "all samples act on the same regions"
+        if isinstance(self.loads, Several):
+            where, why = "with several tables `[[loads]]`", "they act on several regions at once"
         possible = ("sample", "direction") if isinstance(self.loads, Motion) else ("sample",)
         if self.split.by not in possible:
             raise ValueError(
-                f"`split.by` must be {' or '.join(map(repr, possible))} {where}, since all samples "
-                f"act on the same regions; got {self.split.by!r}"
+                f"`split.by` must be {' or '.join(map(repr, possible))} {where}, since {why}; "
+                f"got {self.split.by!r}"
             )
         if self.observed is not None and isinstance(self.loads, Motion):
             raise ValueError(

@@ -1,18 +1,24 @@
-"""Tables `[loads]`, `[[supports]]`, `[split]` and `[tests]` of a dataset file."""
+"""The table `[loads]` of a dataset file, or several tables `[[loads]]`."""
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, Self, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from mor_bench.specs.base import Area, Count, Finite, Length, Positive, StrictModel, in_range
+from mor_bench.specs.base import (
+    Area,
+    Count,
+    Length,
+    StrictModel,
+    Triple,
+)
 from mor_bench.specs.region_spec import Region
 
 LoadKind = Literal["force", "normal", "tangential"]
 Sampling = Literal["random", "latin-hypercube", "sobol"]
-SplitBy = Literal["region", "sample", "direction"]
-Fraction = Annotated[float, Field(gt=0, lt=1)]
+SEED_STEP = 7_368_787
+"""Difference between the seeds of several tables, so that equal seeds give independent draws."""
 
 
 def _ordered(value: tuple[float, float]) -> tuple[float, float]:
@@ -32,91 +38,65 @@ Magnitude = Annotated[
 """Lower and upper end of a range of forces, N, displacements, m, or pressures, Pa."""
 
 
-Axis = Literal["x", "y", "z"]
-AXES: tuple[Axis, ...] = get_args(Axis)
+Steps = Annotated[int, Field(ge=1, le=1000, exclude_if=lambda value: value == 1)]
+"""Number of equal steps in which each load is applied; every step is a sample."""
 
 
-def _different(value: tuple[Axis, ...]) -> tuple[Axis, ...]:
-    if not value or len(set(value)) < len(value):
-        raise ValueError("one to three different components must be given")
-    return value
-
-
-Components = Annotated[
-    tuple[Axis, ...],
-    Field(strict=False, exclude_if=lambda value: set(value) == set(AXES)),
-    AfterValidator(_different),
-]
-
-
-class Support(StrictModel):
-    """A region whose nodes do not move, or move only perpendicular to some axes.
+class _SampledForces(StrictModel):
+    """Keys of all tables that draw forces on places of the surface.
 
     Attributes
     ----------
-    region : Region
-    components : tuple of str
-        The components of the displacement that are zero: all three by default. One component is a
-        roller; on a plane across its axis, it is a plane of symmetry.
+    simultaneous : int
+        Number of places that are loaded at once.
+    min_distance_m : float, optional
+        Least distance between the centres of places that are loaded at once, m.
+        Required with `simultaneous` > 1.
+    samples_per_patch, samples : int, optional
+        Number of samples; give exactly one of them. With `samples`, places (or combinations of
+        them) come in random order, each as often as the others.
+    magnitude_n : two floats
+        Range of each force, N.
+    sampling : str
+        Plan for directions and magnitudes.
+    seed : int
+    steps : int
+        Each load is applied in so many equal steps; each step is a sample. Default: 1.
     """
 
-    region: Region
-    components: Components = AXES
+    simultaneous: Annotated[int, Field(ge=1, le=8)] = 1
+    min_distance_m: Length | None = None
+    samples_per_patch: Count | None = None
+    samples: Count | None = None
+    magnitude_n: Magnitude
+    sampling: Sampling = "random"
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    steps: Steps = 1
 
+    unit: ClassVar[str] = "N"
 
-class Spring(StrictModel):
-    """A Winkler foundation: springs without mass on the surface of a region.
-
-    Attributes
-    ----------
-    region : Region
-        The facets with all corners in it rest on springs.
-    stiffness_n_m3 : float
-        Traction per displacement from the undeformed body.
-    components : tuple of str
-        The components of the displacement that the springs resist: all three by default.
-    normal : bool
-        Whether they resist only the displacement along the normal of the undeformed surface, as a
-        frictionless foundation does. Excludes `components`.
-    """
-
-    region: Region
-    stiffness_n_m3: Annotated[Positive, in_range(1e-12, 1e18, "N/m³")]
-    components: Components = AXES
-    normal: Annotated[bool, Field(exclude_if=lambda value: not value)] = False
+    @property
+    def magnitude(self) -> tuple[float, float]:
+        """The range of each force, N."""
+        return self.magnitude_n
 
     @model_validator(mode="after")
-    def _one_direction(self) -> Self:
-        if self.normal and "components" in self.model_fields_set:
-            raise ValueError("`normal = true` and `components` exclude each other; remove one")
+    def _consistent(self) -> Self:
+        if (self.samples_per_patch is None) == (self.samples is None):
+            raise ValueError("exactly one of `samples_per_patch` and `samples` must be given")
+        if self.simultaneous > 1 and self.samples is None:
+            raise ValueError(
+                "with `simultaneous` > 1 `samples` must be given, not `samples_per_patch`"
+            )
+        if (self.simultaneous > 1) != (self.min_distance_m is not None):
+            raise ValueError(
+                "`min_distance_m` must be given with `simultaneous` > 1 and only then; "
+                f"got `simultaneous` {self.simultaneous}"
+            )
         return self
 
 
-_Acceleration = Annotated[Finite, in_range(-1e12, 1e12, "m/s²")]
-
-
-class Gravity(StrictModel):
-    """A uniform body force that acts before and during every load.
-
-    Attributes
-    ----------
-    density_kg_m3 : float
-        Density of the undeformed body.
-    acceleration_m_s2 : three floats
-        Along x, y and z; (0, 0, -9.81) by default.
-    """
-
-    density_kg_m3: Annotated[Positive, in_range(1e-12, 1e12, "kg/m³")]
-    acceleration_m_s2: Annotated[
-        tuple[_Acceleration, _Acceleration, _Acceleration], Field(strict=False)
-    ] = (
-        0.0,
-        0.0,
-        -9.81,
-    )
-
-
-class Loads(StrictModel):
+class Loads(_SampledForces):
     """Forces on patches of the surface and how to draw them; see `mor_bench.snapshots.sampling`.
 
     Attributes
@@ -131,58 +111,62 @@ class Loads(StrictModel):
     n_patches : int, optional
         Number of patches, spread evenly over the region away from the supports.
         Default: one patch around each node of the region.
-    simultaneous : int
-        Number of patches that are loaded at once.
-    min_distance_m : float, optional
-        Least distance between the centres of patches that are loaded at once, m.
-        Required with `simultaneous` > 1.
-    samples_per_patch, samples : int, optional
-        Number of samples; give exactly one of them. With `samples`, patches (or combinations of
-        them) come in random order, each as often as the others.
-    magnitude_n : two floats
-        Range of each force, N.
-    sampling : str
-        Plan for directions and magnitudes.
-    seed : int
     """
 
     region: Region
     kind: LoadKind
     patch_area_m2: Area
     n_patches: Count | None = None
-    simultaneous: Annotated[int, Field(ge=1, le=8)] = 1
-    min_distance_m: Length | None = None
-    samples_per_patch: Count | None = None
-    samples: Count | None = None
-    magnitude_n: Magnitude
-    sampling: Sampling = "random"
-    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-
-    unit: ClassVar[str] = "N"
-
-    @property
-    def magnitude(self) -> tuple[float, float]:
-        """The range of each force, N."""
-        return self.magnitude_n
 
     @model_validator(mode="after")
-    def _consistent(self) -> Loads:
-        if (self.samples_per_patch is None) == (self.samples is None):
-            raise ValueError("exactly one of `samples_per_patch` and `samples` must be given")
-        if self.simultaneous > 1 and self.samples is None:
-            raise ValueError(
-                "with `simultaneous` > 1 `samples` must be given, not `samples_per_patch`"
-            )
-        if (self.simultaneous > 1) != (self.min_distance_m is not None):
-            raise ValueError(
-                "`min_distance_m` must be given with `simultaneous` > 1 and only then; "
-                f"got `simultaneous` {self.simultaneous}"
-            )
+    def _different(self) -> Self:
         if self.kind == "normal" and self.magnitude_n[0] == self.magnitude_n[1]:
             raise ValueError(
                 "`magnitude_n` of normal forces must be a range, or samples would repeat; "
                 f"got {self.magnitude_n}"
             )
+        return self
+
+
+class PointLoads(_SampledForces):
+    """Forces on single points of the surface, in directions uniform on the sphere.
+
+    The answer depends on the mesh: the displacement of the loaded point grows without bound under
+    refinement.
+
+    Attributes
+    ----------
+    region : Region
+        Where the points may lie: the nodes of the surface that are not fixed.
+    n_patches : int, optional
+        Number of points, spread evenly over the region. Default: each node of the region.
+    """
+
+    region: Region
+    kind: Literal["point"]
+    n_patches: Count | None = None
+
+
+class LineLoads(_SampledForces):
+    """Forces spread evenly along straight lines, in directions uniform on the sphere.
+
+    Attributes
+    ----------
+    lines : list of pairs of points
+        Both ends of each line, m: on an edge, across a face, or inside the body.
+    """
+
+    kind: Literal["line"]
+    lines: Annotated[
+        tuple[Annotated[tuple[Triple, Triple], Field(strict=False)], ...],
+        Field(strict=False, min_length=1, max_length=1000),
+    ]
+
+    @model_validator(mode="after")
+    def _lengths(self) -> Self:
+        for number, (begin, end) in enumerate(self.lines):
+            if begin == end:
+                raise ValueError(f"the two ends of `lines[{number}]` must differ; got {begin}")
         return self
 
 
@@ -207,6 +191,7 @@ class Motion(StrictModel):
     simultaneous: ClassVar[int] = 1
     samples_per_patch: ClassVar[int | None] = None
     min_distance_m: ClassVar[float | None] = None
+    steps: ClassVar[int] = 1
     unit: ClassVar[str] = "m"
 
     region: Region
@@ -239,6 +224,8 @@ class Pressure(StrictModel):
     sampling : str
         Plan for the pressures.
     seed : int
+    steps : int
+        Each load is applied in so many equal steps; each step is a sample. Default: 1.
     """
 
     samples_per_patch: ClassVar[int | None] = None
@@ -252,6 +239,7 @@ class Pressure(StrictModel):
     follower: bool = False
     sampling: Sampling = "random"
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    steps: Steps = 1
 
     @property
     def simultaneous(self) -> int:
@@ -264,47 +252,110 @@ class Pressure(StrictModel):
         return self.magnitude_pa
 
 
-AnyLoads = Loads | Motion | Pressure
-LoadPlan = Annotated[AnyLoads, Field(discriminator="kind")]
+AnyTable = Loads | PointLoads | LineLoads | Motion | Pressure
+Table = Annotated[AnyTable, Field(discriminator="kind")]
 
 
-class Split(StrictModel):
-    """Choice of the validation and test samples; see `mor_bench.snapshots.split`."""
-
-    test_fraction: Fraction = 0.2
-    validation_fraction: Fraction = 0.15
-    by: SplitBy = "region"
-
-    @model_validator(mode="after")
-    def _some_left(self) -> Self:
-        held_out = self.test_fraction + self.validation_fraction
-        if held_out >= 1:
-            raise ValueError(
-                "`test_fraction` and `validation_fraction` must leave samples for training: "
-                f"their sum must be less than 1; got {held_out:g}"
-            )
-        return self
-
-
-class ImportedSplit(Split):
-    """Choice of imported validation and test samples: as `Split`, or by the arrays of the file."""
-
-    by: Literal["region", "sample", "direction", "file"] = "region"  # type: ignore[assignment]
-
-
-class ExtraTests(StrictModel):
-    """The named test sets beside the main one; see `mor_bench.snapshots.test_sets`.
+class Several(StrictModel):
+    """Several tables `[[loads]]`, which act together: each sample has a draw of each table.
 
     Attributes
     ----------
-    samples : int
-        Number of samples in each set.
-    unseen_region : Region, optional
-        A part of the surface where no load of the main set acts.
-    paper_magnitude_n : two floats, optional
-        Range of each force at which the set's largest deformation is that of the paper, N.
+    tables : list of tables
+        Dead loads; their nodal forces are added. All have the same `samples` and `steps`.
     """
 
-    samples: Count = 200
-    unseen_region: Region | None = None
-    paper_magnitude_n: Magnitude | None = None
+    samples_per_patch: ClassVar[int | None] = None
+    min_distance_m: ClassVar[float | None] = None
+    unit: ClassVar[str] = "N or Pa"
+
+    kind: Literal["several"]
+    tables: Annotated[tuple[Table, ...], Field(strict=False, min_length=2, max_length=8)]
+
+    @property
+    def magnitude(self) -> tuple[float, float]:
+        """The least and the largest load of all tables, in their units."""
+        ends = [table.magnitude for table in self.tables]
+        return min(low for low, _ in ends), max(high for _, high in ends)
+
+    @property
+    def simultaneous(self) -> int:
+        """Number of loads of a sample."""
+        return sum(table.simultaneous for table in self.tables)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples, or of loads that are applied in steps."""
+        found = self.tables[0].samples
+        assert found is not None
+        return found
+
+    @property
+    def seed(self) -> int:
+        return self.tables[0].seed
+
+    @property
+    def sampling(self) -> Sampling:
+        return self.tables[0].sampling
+
+    @property
+    def steps(self) -> int:
+        return self.tables[0].steps
+
+    @model_validator(mode="after")
+    def _together(self) -> Self:
+        kinds = [
+            "follower pressure"
+            if isinstance(table, Pressure) and table.follower
+            else f"{table.kind}"
+            for table in self.tables
+        ]
+        for alone in ("displacement", "follower pressure"):
+            if alone in kinds:
+                place = kinds.index(alone)
+                other = kinds[1 if place == 0 else 0]
+                raise ValueError(
+                    f"`loads` cannot combine the kinds {alone!r} and {other!r}: only dead loads "
+                    "act together"
+                )
+        for name in ("samples", "steps"):
+            values = [getattr(table, name) for table in self.tables]
+            if None in values or len(set(values)) > 1:
+                raise ValueError(
+                    f"all tables `[[loads]]` must give the same `{name}`; got "
+                    f"{', '.join('none' if value is None else str(value) for value in values)}"
+                )
+        return self
+
+
+AnyLoads = AnyTable | Several
+
+
+def tables_of(loads: AnyLoads) -> tuple[AnyTable, ...]:
+    """Return the tables of a plan. Those of several have different seeds."""
+    if not isinstance(loads, Several):
+        return (loads,)
+    return tuple(
+        table.model_copy(update={"seed": (table.seed + SEED_STEP * number) % 2**63})
+        for number, table in enumerate(loads.tables)
+    )
+
+
+def with_seed(loads: AnyLoads, seed: int) -> AnyLoads:
+    """Return the same plan with another seed."""
+    if isinstance(loads, Several):
+        tables = tuple(table.model_copy(update={"seed": seed}) for table in loads.tables)
+        return loads.model_copy(update={"tables": tables})
+    return loads.model_copy(update={"seed": seed})
+
+
+def _wrapped(value: Any) -> Any:
+    """Return a list of tables as one table of a plan."""
+    if isinstance(value, list | tuple):
+        return value[0] if len(value) == 1 else {"kind": "several", "tables": value}
+    return value
+
+
+LoadPlan = Annotated[
+    Annotated[AnyTable | Several, Field(discriminator="kind")], BeforeValidator(_wrapped)
+]

@@ -12,8 +12,8 @@ from pydantic import Field, field_validator, model_validator
 
 from mor_bench.specs.base import Count, Label, Positive, StrictModel, Text
 from mor_bench.specs.battery import Battery
-from mor_bench.specs.loads_spec import SplitBy
 from mor_bench.specs.parameters import check_parameters, load_class
+from mor_bench.specs.split_spec import SplitBy
 
 Told = Literal["input", "linear-response", "equations"]
 """Information at query time: the input alone, with its linear response, or with the equations.

@@ -82,6 +82,7 @@ def _sentence(
     problem: ErrorDetails, problems: Sequence[ErrorDetails], model: type[BaseModel]
 ) -> str:
     steps, _ = _walk(model, problem["loc"])
+    steps = [step for step in steps if step != "tables"]  # a list of tables in the file
     key = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in steps)
     key = key.lstrip(".")
     match problem["type"]:
@@ -92,7 +93,8 @@ def _sentence(
         case "union_tag_not_found":
             return f"key `{key}.{_discriminator(problem)}` is missing."
         case "union_tag_invalid":
-            *others, last = problem["ctx"]["expected_tags"].split(", ")
+            tags = problem["ctx"]["expected_tags"].split(", ")
+            *others, last = (tag for tag in tags if tag != "'several'")
             return (
                 f"`{key}.{_discriminator(problem)}` must be {', '.join(others)} or {last}; "
                 f"got {problem['ctx']['tag']!r}."

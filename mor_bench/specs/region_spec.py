@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Discriminator, Field, Tag
 
-from mor_bench.specs.base import Count, Length, StrictModel, Text, Triple
+from mor_bench.specs.base import Count, Direction, Length, StrictModel, Text, Triple
 from mor_bench.specs.source_file import File
 
 
@@ -21,6 +21,16 @@ class SphereRegion(StrictModel):
     """The nodes inside a sphere: centre and radius, m."""
 
     sphere_m: Annotated[tuple[Triple, Length], Field(strict=False)]
+
+
+class PlaneRegion(StrictModel):
+    """The nodes on a plane: a point on it, m, and its normal, whose length has no meaning.
+
+    Nodes within `within_m` of it count too; by default, only as near as round-off.
+    """
+
+    plane_m: Annotated[tuple[Triple, Direction], Field(strict=False)]
+    within_m: Annotated[Length | None, Field(exclude_if=lambda value: value is None)] = None
 
 
 class NearestRegion(StrictModel):
@@ -48,6 +58,7 @@ NamedRegion = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max", "sur
 REGIONS: dict[str, type[BaseModel]] = {
     "box_m": BoxRegion,
     "sphere_m": SphereRegion,
+    "plane_m": PlaneRegion,
     "nearest_m": NearestRegion,
     "point_set": PointSetRegion,
     "near_surface": NearSurfaceRegion,
@@ -65,6 +76,7 @@ def _kind_of_region(value: Any) -> str:
 _Placed = (
     Annotated[BoxRegion, Tag("by box_m")]
     | Annotated[SphereRegion, Tag("by sphere_m")]
+    | Annotated[PlaneRegion, Tag("by plane_m")]
     | Annotated[NearestRegion, Tag("by nearest_m")]
     | Annotated[PointSetRegion, Tag("by point_set")]
     | Annotated[NearSurfaceRegion, Tag("by near_surface")]

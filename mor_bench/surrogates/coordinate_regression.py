@@ -136,10 +136,10 @@ class CoordinateRegression(Surrogate, ABC):
         given, targets = samples.given.values.reshape(len(samples), -1), samples.free_displacements
         if self.input == "linear-response":
             self.response_ = linear_response(scene)
-            inputs = self.response_.respond(given)[:, scene.free_dofs]
+            inputs = scene.at_free_dofs(self.response_.respond(given))
             targets = targets - inputs
         else:
-            inputs = given[:, scene.free_dofs]
+            inputs = scene.at_free_dofs(given)
         usual = min(self.usual_inputs[self.input], *inputs[:, inputs.any(axis=0)].shape)
         self.axes_ = axes = input_axes(inputs, self.n_input_modes or usual, self.evenness)
         self.modes_ = modes = pod(targets, self.n_output_modes).modes
@@ -173,7 +173,7 @@ class CoordinateRegression(Surrogate, ABC):
         if self.input == "linear-response" and not hasattr(self, "response_"):
             self.response_ = linear_response(scene)
         self.from_forces_ = self._to_coordinates(self.axes_)
-        self._expanding = np.ascontiguousarray(self._on_all_dofs(self.modes_).T)
+        self._expanding = np.ascontiguousarray(scene.columns_at_all_dofs(self.modes_).T)
 
     def answer(self, forces: Array) -> Array:
         loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
@@ -191,12 +191,7 @@ class CoordinateRegression(Surrogate, ABC):
         """Return the matrix A (n_dofs, n_inputs) with z = fᵀA for a load f."""
         if self.input == "linear-response":
             return self.response_.to_coordinates(axes)
-        return self._on_all_dofs(axes)
-
-    def _on_all_dofs(self, modes: Array) -> Array:
-        whole = np.zeros((self.scene_.mesh.n_dofs, modes.shape[1]))
-        whole[self.scene_.free_dofs] = modes
-        return whole
+        return self.scene_.columns_at_all_dofs(axes)
 
 
 def _shuffled(samples: Snapshots) -> Snapshots:

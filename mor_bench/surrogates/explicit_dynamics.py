@@ -39,6 +39,8 @@ class ExplicitDynamics(Surrogate):
     needs_snapshots: ClassVar = False
 
     def supports(self, scene: Scene) -> str | None:
+        if scene.frames is not None:
+            return "it moves nodes along x, y and z only, and some supports are oblique"
         return unknown_equations(scene)
 
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:

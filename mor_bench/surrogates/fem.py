@@ -49,15 +49,14 @@ class FullFEM(Surrogate):
         self.model_ = forward_model(scene, self.solver)
 
     def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        out = np.zeros((len(forces), self.scene_.mesh.n_dofs))
-        free = self.scene_.free_dofs
-        loads = forces.reshape(out.shape)[:, free]
-        solutions = self.model_.solve_many(loads, NewtonOptions(self.tolerance))
+        scene = self.scene_
+        loads = scene.at_free_dofs(forces.reshape(len(forces), scene.mesh.n_dofs))
+        solutions, out = self.model_.solve_many(loads, NewtonOptions(self.tolerance)), loads.copy()
         for row, found in zip(out, solutions, strict=True):
             if isinstance(found, SolverError):
                 raise found
-            row[free] = found.displacement
-        return out.reshape(forces.shape)
+            row[:] = found.displacement
+        return scene.at_all_dofs(out).reshape(forces.shape)
 
     def answer_observed(self, observed: ObservedDisplacements) -> NDArray[np.float64]:
         return self.answer(observed.values)

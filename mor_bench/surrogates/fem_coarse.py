@@ -13,8 +13,9 @@ from pydantic import Field
 
 from mor_bench.counting import count
 from mor_bench.errors import UnconstrainedBodyError, UnsupportedSceneError
-from mor_bench.mechanics.model import FullOrderModel, check_supports, unknown_equations
+from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.mechanics.rigid_motions import check_supports
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.other_meshes import with_cells
 from mor_bench.scene.scene import Scene
@@ -63,12 +64,10 @@ class CoarseFEM(Surrogate):
         out = np.zeros_like(forces)
         count(multiply_adds=6 * self.interpolation_.nnz * len(forces))
         for row, load in zip(out, forces, strict=True):
-            displacement = np.zeros(coarse.mesh.n_dofs)
-            displacement[coarse.free_dofs] = self.model_.solve(
-                (self.restriction_ @ load).ravel()[coarse.free_dofs], options=options
-            ).displacement
-            row[:] = self.interpolation_ @ displacement.reshape(-1, 3)
-        out.reshape(len(out), self.scene_.mesh.n_dofs)[:, self.scene_.fixed_dofs] = 0
+            on_coarse = coarse.at_free_dofs((self.restriction_ @ load).reshape(1, -1))[0]
+            found = self.model_.solve(on_coarse, options=options).displacement
+            row[:] = self.interpolation_ @ coarse.at_all_dofs(found[None]).reshape(-1, 3)
+        self.scene_.hold(out.reshape(len(out), self.scene_.mesh.n_dofs))
         return out
 
     def _coarse(self, scene: Scene) -> Scene:

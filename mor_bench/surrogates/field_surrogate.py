@@ -258,7 +258,7 @@ class FieldSurrogate(Surrogate, ABC):
         out: Array = learned.to(torch.float64).numpy() * self.output_scale_
         if self.input == "linear-response":
             out += inputs
-        out.reshape(len(out), self.scene_.mesh.n_dofs)[:, self.scene_.fixed_dofs] = 0.0
+        self.scene_.hold(out.reshape(len(out), self.scene_.mesh.n_dofs))
         if self.zero_at_rest:  # the network rounds differently in a batch
             out[~forces.any(axis=(1, 2))] = 0.0
         return out

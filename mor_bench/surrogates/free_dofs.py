@@ -31,11 +31,11 @@ def answer_each(scene: Scene, forces: Array, solve: Callable[[Array], Array]) ->
     -------
     (n, n_nodes, 3) float64
     """
-    out = np.zeros((len(forces), scene.mesh.n_dofs))
-    free = scene.free_dofs
-    for row, load in zip(out, forces.reshape(out.shape)[:, free], strict=True):
-        row[free] = solve(load)
-    return out.reshape(forces.shape)
+    loads = scene.at_free_dofs(forces.reshape(len(forces), scene.mesh.n_dofs))
+    found = np.empty(loads.shape)
+    for row, load in zip(found, loads, strict=True):
+        row[:] = solve(load)
+    return scene.at_all_dofs(found).reshape(forces.shape)
 
 
 def galerkin_or_polynomial(

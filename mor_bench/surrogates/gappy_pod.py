@@ -71,10 +71,10 @@ class GappyPOD(Surrogate):
 
     def answer_observed(self, observed: ObservedDisplacements) -> NDArray[np.float64]:
         batch = observed.values.reshape(-1, self.scene_.mesh.n_dofs)
-        free = self.scene_.free_dofs
+        scene = self.scene_
         count(multiply_adds=len(batch) * (self.fitting_.size + self.modes_.size))
-        out = np.zeros_like(batch)
-        out[:, free] = (batch[:, free[self.places_]] @ self.fitting_.T) @ self.modes_.T
+        seen = scene.at_free_dofs(batch)[:, self.places_]
+        out = scene.at_all_dofs((seen @ self.fitting_.T) @ self.modes_.T)
         return out.reshape(observed.values.shape)
 
 

@@ -114,13 +114,13 @@ class Hybrid(Surrogate):
         self.model_.prepare()
 
     def answer(self, forces: Array) -> Array:
-        free = self.scene_.free_dofs
-        out = np.zeros((len(forces), self.scene_.mesh.n_dofs))
-        for row, force in zip(out, forces, strict=True):
-            load = force.ravel()[free]
+        scene = self.scene_
+        loads = scene.at_free_dofs(forces.reshape(len(forces), scene.mesh.n_dofs))
+        out = np.zeros(loads.shape)
+        for row, load, force in zip(out, loads, forces, strict=True):
             if load.any():
-                row[free] = self._solve(load, self._guess(force))
-        return out.reshape(forces.shape)
+                row[:] = self._solve(load, self._guess(force))
+        return scene.at_all_dofs(out).reshape(forces.shape)
 
     def unfitted_start(self) -> Surrogate:
         own = load_method_spec(list_suite("methods")[self.start]) if self._is_named() else None
@@ -137,7 +137,7 @@ class Hybrid(Surrogate):
     def _guess(self, force: Array) -> Array | None:
         """Return the starting method's answer on the free dofs, m; None if it has none."""
         try:
-            guess = self.start_.predict(force).ravel()[self.scene_.free_dofs]
+            guess = self.scene_.at_free_dofs(self.start_.predict(force).reshape(1, -1))[0]
         except SolverError:
             return None
         return guess if np.isfinite(guess).all() else None

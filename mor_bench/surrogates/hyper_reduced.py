@@ -39,9 +39,7 @@ def training_coordinates(displacements: Array, modes: Array, n_snapshots: int) -
 
 def nodal(scene: Scene, rows: Array) -> Array:
     """Return modes (n_nodes, 3, r) from a row for each free dof; zero at supports."""
-    full = np.zeros((scene.mesh.n_dofs, rows.shape[1]))
-    full[scene.free_dofs] = rows
-    return full.reshape(scene.mesh.n_nodes, 3, -1)
+    return scene.columns_at_all_dofs(rows).reshape(scene.mesh.n_nodes, 3, -1)
 
 
 def reduced_points(

@@ -160,7 +160,7 @@ class SeparatedLoad(Surrogate):
         if self.base == "linear-response":
             self.compliance_ = Compliance(FullOrderModel(scene))
             responses = self.compliance_.respond(samples.forces.reshape(len(samples), -1))
-            targets = targets - responses[:, scene.free_dofs]
+            targets = targets - scene.at_free_dofs(responses)
         positions, vectors = load_coordinates(scene.mesh.points, samples.forces)
         frame, ends = _frame(positions[vectors.any(axis=1)], scene.mesh.points)
         largest = float(np.linalg.norm(vectors, axis=1).max())
@@ -225,8 +225,7 @@ class SeparatedLoad(Surrogate):
         expansion = self.vectors_.size + self.modes_.size
         products = coefficients + 2 * terms.shape[1] + functions + expansion
         count(multiply_adds=len(forces) * (products + 7 * scene.mesh.n_nodes))
-        out = np.zeros((len(forces), scene.mesh.n_dofs))
-        out[:, scene.free_dofs] = (terms @ self.vectors_) @ self.modes_.T
+        out = scene.at_all_dofs((terms @ self.vectors_) @ self.modes_.T)
         if self.base == "linear-response":
             out += self.compliance_.respond(forces.reshape(out.shape))
         return out.reshape(forces.shape)

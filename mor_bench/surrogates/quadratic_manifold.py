@@ -115,7 +115,8 @@ def _states_under_loads(model: FullOrderModel, manifold: QuadraticManifold) -> l
     """Return equilibria q on the manifold, with all cells, under random forces on patches."""
     scene, rng = model.scene, np.random.default_rng(0)
     linear = GalerkinProblem(model.assembler, manifold.modes)
-    on_nodes, largest = scene.patch_weights.toarray(), scene.generated.load_plan.magnitude[1]
+    on_nodes = scene.patch_weights.toarray() * scene.patch_scales[:, None]
+    largest = scene.generated.load_plan.magnitude[1]
     chosen = np.linspace(0, len(on_nodes) - 1, N_CUBATURE_LOADS).round().astype(int)
     vectors = rng.normal(size=(len(chosen), 3))
     vectors *= (
@@ -125,7 +126,7 @@ def _states_under_loads(model: FullOrderModel, manifold: QuadraticManifold) -> l
     )
     states = []
     for weights, vector in zip(on_nodes[chosen], vectors, strict=True):
-        load = np.outer(weights, vector).ravel()[scene.free_dofs]
+        load = scene.at_free_dofs(np.outer(weights, vector).reshape(1, -1))[0]
         problem = ManifoldProblem(linear, manifold, manifold.curvature(load))
         try:
             states.append(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
+from mor_bench.errors import UnsupportedSceneError
 from mor_bench.learning.inference import (
     Backend,
     Inference,
@@ -216,6 +217,10 @@ class UMesh(FieldSurrogate):
         return int(network.multiply_adds(self.grid_.shape)) + self.grid_.multiply_adds
 
     def onnx_model(self) -> Any:
+        if self.scene_.frames is not None:
+            raise UnsupportedSceneError(
+                f"{self.scene_.name}: a graph cannot hold its oblique supports."
+            )
         at_rest = None
         if self.zero_at_rest:
             with torch.inference_mode():

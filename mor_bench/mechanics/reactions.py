@@ -1,0 +1,103 @@
+"""Forces of the supports on the body, from displacements and the forces that act on it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mor_bench.errors import InvalidInputError, UnsupportedSceneError
+from mor_bench.mechanics.assembly import Assembler, body_force, discretisation_of
+from mor_bench.mechanics.model import rest_displacement
+from mor_bench.mechanics.pressed import PressedFacets, PressedModel
+from mor_bench.scene.scene import Scene
+from mor_bench.specs import NO_EQUATIONS
+
+Array = NDArray[np.float64]
+
+
+class Reactions:
+    """Computes the forces of the supports, f_int(u) - f, along the directions that they hold.
+
+    The internal force contains that of springs. Weight counts to the forces, and pressures that
+    follow the surface act on the deformed one. So at an equilibrium, the reactions, the forces, the
+    weight and the forces of the springs on the body have no resultant and no moment.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Raises
+    ------
+    UnsupportedSceneError
+        If the scene's equations are unknown.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        if scene.material is None:
+            raise UnsupportedSceneError(f"{scene.name}: {NO_EQUATIONS}.")
+        body, n_dofs = discretisation_of(scene), scene.mesh.n_dofs
+        numbers = np.arange(n_dofs).reshape(-1, 3)
+        self._scene, self._assembler = scene, Assembler(body, numbers, n_dofs)
+        self._rest, self._weight = np.zeros(n_dofs), np.zeros(n_dofs)
+        gravity, rest = scene.generated.gravity, rest_displacement(scene)
+        if gravity is not None and rest is not None:
+            density = gravity.density_kg_m3 * np.array(gravity.acceleration_m_s2)
+            self._rest, self._weight = rest.ravel(), body_force(body, density).ravel()
+        self._pressed: tuple[PressedModel, PressedFacets] | None = None
+        if scene.follows:
+            points = scene.mesh.points + self._rest.reshape(-1, 3)
+            pattern = self._assembler.pattern
+            facets = PressedFacets(points, scene.pressed_facets, numbers, pattern)
+            self._pressed = PressedModel(scene), facets
+
+    def __call__(self, displacements: Array, forces: Array) -> Array:
+        """Return the reactions (n, n_nodes, 3), N; zero where nothing is held.
+
+        Parameters
+        ----------
+        displacements, forces : (n, n_nodes, 3) float64
+            Displacements, m, and forces, N, as of `Snapshots`: without the rest state and weight.
+
+        Raises
+        ------
+        InvalidInputError
+            If a shape is wrong.
+        """
+        shape = (len(displacements), self._scene.mesh.n_nodes, 3)
+        if displacements.shape != shape or forces.shape != shape:
+            raise InvalidInputError(
+                f"displacements and forces must have shape (n, {shape[1]}, 3); "
+                f"got {displacements.shape} and {forces.shape}."
+            )
+        scene, rows = self._scene, zip(displacements, forces, strict=True)
+        whole = np.array([self._residual(u.ravel(), f.ravel()) for u, f in rows])
+        whole = whole.reshape(len(displacements), scene.mesh.n_dofs)
+        return np.asarray((whole - scene.at_all_dofs(scene.at_free_dofs(whole))).reshape(shape))
+
+    def _residual(self, u: Array, force: Array) -> Array:
+        if self._pressed is not None:
+            model, facets = self._pressed
+            pressures = model.pressures_of(self._scene.at_free_dofs(force[None])[0])
+            force = facets.force(u, pressures)
+        internal = self._assembler.force(self._rest + u).force
+        return np.asarray(internal - self._weight - force)
+
+
+def reaction_forces(scene: Scene, displacements: ArrayLike, forces: ArrayLike) -> Array:
+    """Return the forces of the supports on the body, N, as an array of the displacements' shape.
+
+    Parameters
+    ----------
+    scene : Scene
+    displacements, forces : (n_nodes, 3) or (n, n_nodes, 3)
+        As for `Reactions`, which is faster for many calls.
+    """
+    u, f = np.asarray(displacements, dtype=np.float64), np.asarray(forces, dtype=np.float64)
+    if u.ndim not in (2, 3) or u.shape != f.shape:
+        raise InvalidInputError(
+            "displacements and forces must have the same shape (n_nodes, 3) or (n, n_nodes, 3); "
+            f"got {u.shape} and {f.shape}."
+        )
+    return Reactions(scene)(u.reshape(-1, *u.shape[-2:]), f.reshape(-1, *f.shape[-2:])).reshape(
+        u.shape
+    )

@@ -1,0 +1,193 @@
+"""The loads of one table of a dataset file on the body: where they act, and their nodal weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from math import pi, sqrt
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mor_bench.errors import OutsideMeshError, SpecError, UnsupportedSceneError
+from mor_bench.scene.interpolation import interpolation_matrix
+from mor_bench.scene.loads import (
+    Facets,
+    Patches,
+    cut_patches,
+    line_patches,
+    point_patches,
+    pressed_patches,
+    spread_out,
+)
+from mor_bench.scene.mesh import Mesh
+from mor_bench.scene.regions import Cloud, region_points
+from mor_bench.specs import AnyTable, LineLoads, Loads, Motion, PointLoads, Pressure, Region
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The body that loads act on.
+
+    Attributes
+    ----------
+    mesh : Mesh
+    surface : Facets
+        The mesh's boundary, or a smooth surface inside the mesh.
+    embedded : bool
+        Whether it is such a smooth surface.
+    point_sets : mapping of str to (n,) int64
+    fixed_nodes : (n_fixed,) int64
+    tool_nodes : (n_moved,) int64, optional
+        The nodes that a tool moves.
+    """
+
+    mesh: Mesh
+    surface: Facets
+    embedded: bool
+    point_sets: Mapping[str, NDArray[np.int64]]
+    fixed_nodes: NDArray[np.int64]
+    tool_nodes: NDArray[np.int64] | None
+
+
+@dataclass(frozen=True)
+class Acting:
+    """The patches of one table `[loads]`.
+
+    A patch is an area, a point, a line, one component of a pressed region, or a tool.
+    """
+
+    plan: AnyTable
+    ground: Ground
+
+    def surface_points(self, region: Region) -> NDArray[np.int64]:
+        """Return the sorted points of the surface in a region; `SpecError` if none."""
+        surface = self.ground.surface
+        on_surface = np.unique(surface.facets)
+        sets = {} if self.ground.embedded else self.ground.point_sets
+        cloud = Cloud(surface.points, on_surface, sets)
+        found = np.intersect1d(region_points(cloud, region), on_surface)
+        if not len(found):
+            raise SpecError(
+                "the load region holds nodes inside the body only, none on its surface."
+            )
+        return found
+
+    @cached_property
+    def _loaded_points(self) -> NDArray[np.int64]:
+        plan = self.plan
+        assert not isinstance(plan, LineLoads)
+        regions = plan.regions if isinstance(plan, Pressure) else (plan.region,)
+        return np.unique(np.concatenate([self.surface_points(region) for region in regions]))
+
+    @cached_property
+    def nodes(self) -> NDArray[np.int64]:
+        """(n_patches,) surface point at the centre of each patch, see `Scene.patch_nodes`."""
+        plan, surface = self.plan, self.ground.surface
+        if isinstance(plan, Pressure):
+            regions = [self.surface_points(region) for region in plan.regions]
+            middles = [surface.points[region].mean(axis=0) for region in regions]
+            return np.repeat(np.concatenate([self._nearest(m) for m in middles]), 3)
+        if isinstance(plan, Motion):
+            assert self.ground.tool_nodes is not None
+            points = self.ground.mesh.points[self.ground.tool_nodes]
+            middle = np.linalg.norm(points - points.mean(axis=0), axis=1).argmin()
+            return self._nearest(points[middle])
+        if isinstance(plan, LineLoads):
+            return np.concatenate([self._nearest(np.mean(ends, axis=0)) for ends in plan.lines])
+        region = self._loaded_points
+        if isinstance(plan, PointLoads) and not self.ground.embedded:
+            region = np.setdiff1d(region, self.ground.fixed_nodes)
+            if not len(region):
+                raise SpecError("the load region holds fixed nodes only, which no force can move.")
+        if plan.n_patches is None:
+            return region
+        points = surface.points[region]
+        if isinstance(plan, Loads) and len(self.ground.fixed_nodes):
+            fixed = self.ground.mesh.points[self.ground.fixed_nodes]
+            distance = cKDTree(fixed).query(points)[0]
+            region = region[distance > sqrt(plan.patch_area_m2 / pi)]
+        if plan.n_patches > len(region):
+            raise SpecError(
+                f"`n_patches` must be in [1, {len(region)}], the number of points of the load "
+                f"region away from the supports; got {plan.n_patches}."
+            )
+        return region[spread_out(surface.points[region], plan.n_patches)]
+
+    def _nearest(self, position: NDArray[np.float64]) -> NDArray[np.int64]:
+        return np.array([np.linalg.norm(self.ground.surface.points - position, axis=1).argmin()])
+
+    @property
+    def centres(self) -> NDArray[np.float64]:
+        """(n_patches, 3) positions of the patches' centres, m."""
+        return self.ground.surface.points[self.nodes]
+
+    @cached_property
+    def facets(self) -> NDArray[np.int64]:
+        """(n_facets, 4, 3 or 6) facets on which patches may lie."""
+        if isinstance(self.plan, LineLoads):
+            return self.ground.surface.facets[:0]
+        return self.ground.surface.within(self._loaded_points)
+
+    @property
+    def pressed_facets(self) -> list[NDArray[np.int64]]:
+        """The facets (n_facets, 4, 3 or 6) of each region of a pressure."""
+        assert isinstance(self.plan, Pressure)
+        surface = self.ground.surface
+        return [surface.within(self.surface_points(r)) for r in self.plan.regions]
+
+    @cached_property
+    def patches(self) -> Patches:
+        """The patches as points with areas."""
+        plan, surface = self.plan, self.ground.surface
+        if isinstance(plan, Motion):
+            raise UnsupportedSceneError("a tool moves the body; it has no patches.")
+        if isinstance(plan, Pressure):
+            return pressed_patches(surface, self.pressed_facets)
+        if isinstance(plan, PointLoads):
+            return point_patches(surface, self.nodes)
+        if isinstance(plan, LineLoads):
+            return line_patches(plan.lines)
+        return cut_patches(surface, self.facets, self.nodes, plan.patch_area_m2)
+
+    @cached_property
+    def normals(self) -> NDArray[np.float64]:
+        """(n_patches, 3) outward unit normals, each the mean over its patch."""
+        return self.patches.mean_normals()
+
+    def points(self, patches: NDArray[np.int64]) -> tuple[NDArray[np.float64], sp.csr_array]:
+        """Return the tractions of some patches as forces at points, see `Scene.patch_points`."""
+        areas = self.patches.areas[patches]
+        used = np.unique(areas.indices)
+        return self.patches.points[used], self._weights(areas[:, used])
+
+    def _weights(self, areas: sp.csr_array) -> sp.csr_array:
+        """Return the weights of patches from their areas: shares, or those of a pressure."""
+        return areas if isinstance(self.plan, Pressure) else _rows_to_one(areas)
+
+    @cached_property
+    def weights(self) -> sp.csr_array:
+        """(n_patches, n_nodes) nodal weights of the patches, see `Scene.patch_weights`."""
+        mesh = self.ground.mesh
+        if isinstance(self.plan, Motion):
+            assert self.ground.tool_nodes is not None
+            columns = self.ground.tool_nodes, np.array([0, len(self.ground.tool_nodes)])
+            moved = np.ones(len(self.ground.tool_nodes)), *columns
+            return sp.csr_array(moved, shape=(1, mesh.n_nodes))
+        if self.ground.embedded or isinstance(self.plan, LineLoads):
+            points, shares = self.points(np.arange(len(self.nodes)))
+            try:
+                at_nodes = interpolation_matrix(mesh, points)
+            except OutsideMeshError as error:
+                if not isinstance(self.plan, LineLoads):
+                    raise
+                raise SpecError(f"`loads.lines` must lie in the body: {error}") from None
+            return self._weights(sp.csr_array(shares @ at_nodes))
+        return self._weights(sp.csr_array(self.patches.areas @ self.patches.values))
+
+
+def _rows_to_one(matrix: sp.csr_array) -> sp.csr_array:
+    return sp.csr_array(matrix.multiply(1.0 / matrix.sum(axis=1)[:, None]))
