@@ -210,7 +210,9 @@ def test_a_number_is_seen(text: str) -> None:
     assert NUMBER.search(f"It has {text} here.")
 
 
-@pytest.mark.parametrize("text", ["two methods", "T4 and H8", "float32", "a second set", "half of them"])
+@pytest.mark.parametrize(
+    "text", ["two methods", "T4 and H8", "float32", "a second set", "half of them"]
+)
 def test_a_name_is_not_taken_for_a_number(text: str) -> None:
     assert not NUMBER.search(f"It has {text} here.")
 

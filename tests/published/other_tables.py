@@ -367,7 +367,9 @@ def timed_work(source: str) -> str:
         largest = max(map(abs, found.values()))
         cells = [f"{len(methods)}", f"{len(found)}", f"{content['queries']:,}", f"{largest:g}"]
         body.append([f"`{content['dataset']}`", *cells])
-    return markdown(["dataset", "methods", "configurations", "queries", "largest difference, %"], body)
+    return markdown(
+        ["dataset", "methods", "configurations", "queries", "largest difference, %"], body
+    )
 
 
 OTHER_TABLES: dict[str, Callable[..., str]] = {
