@@ -199,7 +199,9 @@ def test_an_entry_whose_text_left_the_page_is_found(claim: Statement) -> None:
 
 SEEN = (
     "0.38 ms; 5 µs; 20 times; a factor of two; 1e-4 m; 18 of 25; 8,000 s; .037; 3×; 75 %; 22 MB; "
-    "five times; 10⁸; 33 core-minutes; two minutes; 1.6–1.8; 135 H8; 64 patches; Section 3"
+    "five times; 10⁸; 33 core-minutes; two minutes; 1.6–1.8; 135 H8; 64 patches; Section 3; "
+    "at most a minute; half an hour; less than a second; half of the loads; thousands of percent; "
+    "hundreds of seconds; thousands of the samples"
 )
 
 
@@ -208,7 +210,9 @@ def test_a_number_is_seen(text: str) -> None:
     assert NUMBER.search(f"It has {text} here.")
 
 
-@pytest.mark.parametrize("text", ["two methods", "T4 and H8", "float32"])
+@pytest.mark.parametrize(
+    "text", ["two methods", "T4 and H8", "float32", "a second set", "half of them"]
+)
 def test_a_name_is_not_taken_for_a_number(text: str) -> None:
     assert not NUMBER.search(f"It has {text} here.")
 

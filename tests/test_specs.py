@@ -29,6 +29,7 @@ SHIPPED = {
     "beam-fine-paper": (3267, 4032, 336, 33600),
     "liver-hex": (726, 1118, 200, 2000),
     "liver-hex-observed": (726, 1118, 200, 2000),
+    "liver-hex-paper": (726, 1118, 200, 2000),
     "liver-grasped": (726, 1118, 12, 2000),
     "artery-pressure": (384, 600, 2, 2000),
     "soft-arm": (692, 1276, 4, 500),

@@ -142,7 +142,10 @@ def _alternatives(verdict: Verdict, choice: Row) -> list[str]:
         lines.append(f"Cannot be told apart from the winner in latency: {undecided}.")
     if cheapest is not None:
         name = "the winner itself" if cheapest == choice else _short(cheapest)
-        lines.append(f"Cheapest offline: {name}, {_core_seconds(cheapest.offline_core_s)}.")
+        cost = cheapest.offline_core_s
+        chance = " Repeated fits differ: the order of such costs is partly chance."
+        brief = cost is not None and cost < CHANCE_S
+        lines.append(f"Cheapest offline: {name}, {_core_seconds(cost)}.{chance * brief}")
     for told, best in verdict.best_told.items():
         name = "none qualifies" if best is None else _short(best)
         lines.append(f"Best when told {told_text(told, verdict.observed)}: {name}.")
@@ -269,8 +272,16 @@ def evidence(verdict: Verdict, row: Row) -> list[str]:
     return lines
 
 
+CHANCE_S = 1.0
+"""Offline cost below which repeated fits differ by factors, core-seconds; not shown in digits."""
+
+
 def _core_seconds(value: float | None) -> str:
-    return "offline cost unknown" if value is None else f"{value:.3g} core-seconds of data and fit"
+    if value is None:
+        return "offline cost unknown"
+    if value < CHANCE_S:
+        return "less than one core-second of data and fit"
+    return f"{value:.3g} core-seconds of data and fit"
 
 
 def _errors(found: ErrorSummary | SetErrors | None) -> str:

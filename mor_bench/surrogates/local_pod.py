@@ -61,7 +61,7 @@ class LocalPOD(Surrogate):
         Norm of the reduced residual relative to that of the reduced load, in (0, 1].
     """
 
-    n_clusters: Annotated[int, Field(ge=1)] = 32
+    n_clusters: Annotated[int, Field(ge=1)] = 64
     n_modes: Annotated[int, Field(ge=1)] = 10
     tolerance: Annotated[float, Field(gt=0, le=1)] = 1e-8
 

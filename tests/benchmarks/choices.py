@@ -160,7 +160,7 @@ def other_choices() -> list[Variant]:
         for method, choice, parameters, constant, values in tried
         for value in values
     ]
-    for n in (32, 8, 16, 64):
+    for n in (64, 8, 16, 32):
         parameters = {"n_clusters": n, "n_modes": 10}
         variants.append(Variant("others", "local-pod: clusters", str(n), "local-pod", parameters))
     return variants

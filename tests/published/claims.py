@@ -50,13 +50,18 @@ _NUMBER = r"[-−]?\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?|[-−]?\.\d+"
 
 _WORDS = (
     "two|three|four|five|six|seven|eight|nine|ten|twelve|fifteen|sixteen|twenty|thirty|forty|fifty|"
-    "sixty|hundred|thousand|half|a third|a quarter|a fifth|a tenth|two thirds|three quarters"
+    "sixty|hundreds?|thousands?|half|a third|a quarter|a fifth|a tenth|two thirds|three quarters"
 )
+
+_UNITS = "times|seconds|minutes|hours|per cent|percent|million"
+
+_SHARES = "time|error|samples|memory|core|cores|loads|cells|queries|iterations"
 
 NUMBER = re.compile(
     rf"10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+|(?<![\w.,])(?:{_NUMBER})"
-    rf"|\b(?:{_WORDS})(?: \w+)? (?:times|seconds|minutes|hours|per cent|million)\b"
-    rf"|\b(?:{_WORDS}) (?:of )?(?:the|all|a) (?:time|error|samples|memory|core|cores)\b"
+    rf"|\b(?:{_WORDS})(?: \w+)? (?:{_UNITS})\b"
+    rf"|\b(?:{_WORDS}) (?:of )?(?:the|all|a) (?:{_SHARES})\b"
+    r"|\b(?:a|an|one|half an?) (?:minute|hour)\b|\b(?:than|about|most|least) (?:a|one) second\b"
     rf"|factor of (?:about )?(?:{_WORDS})|twice as"
 )
 """A number, and words that look like a measurement."""

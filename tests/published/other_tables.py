@@ -377,6 +377,20 @@ def evidence(source: str) -> str:
     return markdown(headings, body)
 
 
+def timed_work(source: str) -> str:
+    """Show how far the counted work of timed and scored loads differs; SOURCE is FILE,FILE,…."""
+    body = []
+    for content in map(content_of, source.split(",")):
+        found = content["difference_percent"]
+        methods = {label.partition(" [")[0] for label in found}
+        largest = max(map(abs, found.values()))
+        cells = [f"{len(methods)}", f"{len(found)}", f"{content['queries']:,}", f"{largest:g}"]
+        body.append([f"`{content['dataset']}`", *cells])
+    return markdown(
+        ["dataset", "methods", "configurations", "queries", "largest difference, %"], body
+    )
+
+
 OTHER_TABLES: dict[str, Callable[..., str]] = {
     "peers": peers,
     "reduced-peers": reduced_peers,
@@ -394,4 +408,5 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "hard-cases": hard_cases,
     "hard-loads": hard_loads,
     "evidence": evidence,
+    "timed-work": timed_work,
 }

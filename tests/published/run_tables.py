@@ -8,6 +8,7 @@ from typing import Any
 
 from mor_bench.analysis.break_even import FULL_ORDER, break_even
 from mor_bench.analysis.frontier import median_error, median_latency_ms, number_or_inf
+from mor_bench.analysis.selection_text import CHANCE_S
 from mor_bench.analysis.told import class_text, is_observed
 from mor_bench.report.entries import entries_of
 from mor_bench.report.number_format import DASH, number, percent, short_swept
@@ -108,7 +109,12 @@ def _offline(row: Row) -> str:
         return DASH
     found = row.trained_elsewhere
     origin = f" (trained elsewhere, {found.iterations:,} iterations)" if found else ""
-    return f"{number(row.offline_s.data)} + {number(row.offline_s.fit_core_s)}{origin}"
+    return f"{number(row.offline_s.data)} + {_core_s(row.offline_s.fit_core_s)}{origin}"
+
+
+def _core_s(seconds: float) -> str:
+    """Return the cost of a fit; repeated fits of less than a second differ by factors."""
+    return number(seconds) if seconds >= CHANCE_S else f"< {CHANCE_S:g}"
 
 
 def _queries(run: Comparison, row: Row, need: float) -> str:
@@ -246,8 +252,21 @@ def paper(source: str, methods: str = "") -> str:
             raise EvidenceError(f"{source}: {name} is no scene of the paper, or nothing ran.")
         headings = table.headings
         told = {e.label: class_text(e.row, is_observed(run, name)) for e in entries}
-        body += [[name, row[0], told.get(row[0], "force only"), *row[1:]] for row in table.rows]
-    return markdown(["scene", headings[0], "is given", *headings[1:]], body)
+        lasted = {e.label: _iterations(e.row) for e in entries}
+        body += [
+            [name, first, told.get(first, "force only"), lasted.get(first, PAPER_ITERATIONS), *rest]
+            for first, *rest in table.rows
+        ]
+    return markdown(["scene", headings[0], "is given", "iterations", *headings[1:]], body)
+
+
+PAPER_ITERATIONS = "100,000"
+"""Iterations of each network of the paper, as it states them."""
+
+
+def _iterations(row: Row) -> str:
+    """Return the iterations of a training; a dash for a method without one."""
+    return DASH if row.training is None else f"{row.training.iterations:,}"
 
 
 def facts(source: str, dataset: str = "") -> str:
