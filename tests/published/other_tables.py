@@ -12,6 +12,7 @@ from mor_bench.analysis.told import class_of_method
 from mor_bench.report.number_format import DASH, number
 from mor_bench.scene.scene import load_scene
 from mor_bench.specs import load_method_spec
+from tests.published.cost_tables import generation, law_speed, scaling
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
 from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of, look_up
@@ -82,64 +83,6 @@ def paper_amplitude(source: str) -> str:
     ]
     headings = ["dataset", "loads", "up to, N", "number", "refused", "largest u, m", "paper, m"]
     return markdown(headings, body)
-
-
-def scaling(source: str) -> str:
-    """Show the cost of a solve against the number of unknowns."""
-    headings = ["unknowns", "rest state", "set-up, s", "solve, ms", "iterations", "peak MB"]
-    return markdown(
-        headings,
-        [
-            [
-                f"{row['unknowns']:,}",
-                "banded" if "Banded" in row["rest_state"] else "multigrid",
-                f"{row['set_up_s']:.1f}",
-                number(1e3 * row["solve_s"]),
-                f"{row['iterations']:.0f}",
-                number(row["peak_mb"]),
-            ]
-            for row in content_of(source)["sizes"]
-        ],
-    )
-
-
-def law_speed(source: str) -> str:
-    """Show what a residual and a tangent of each law cost on each element."""
-    rows = {(row["law"], row["element"]): row for row in content_of(source)["rows"]}
-    elements = list(dict.fromkeys(element for _, element in rows))
-    pairs = [(element, kind) for element in elements for kind in ("residual", "tangent")]
-    body = [
-        [
-            law,
-            *(
-                f"{number(rows[law, element][f'{kind}_ratio'])} "
-                f"({number(rows[law, element][f'{kind}_ms'])} ms)"
-                for element, kind in pairs
-            ),
-        ]
-        for law in dict.fromkeys(law for law, _ in rows)
-    ]
-    return markdown(["", *(f"{element}: {kind}" for element, kind in pairs)], body)
-
-
-def generation(source: str) -> str:
-    """Show the cost of generating samples against their number."""
-    headings = ["samples", "seconds", "samples/s", "ms per sample", "disk, MB", "memory: parent"]
-    return markdown(
-        [*headings, "memory: worker"],
-        [
-            [
-                f"{row['samples']:,}",
-                f"{row['seconds']:.1f}",
-                number(row["rate"]),
-                number(1e3 / row["rate"]),
-                number(row["disk_mb"]),
-                f"{number(row['parent_mb'])} MB",
-                f"{number(row['worker_mb'])} MB" if row["worker_mb"] else DASH,
-            ]
-            for row in content_of(source)["sizes"]
-        ],
-    )
 
 
 def random_loads(source: str) -> str:

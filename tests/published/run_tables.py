@@ -112,9 +112,9 @@ def _offline(row: Row) -> str:
     return f"{number(row.offline_s.data)} + {_core_s(row.offline_s.fit_core_s)}{origin}"
 
 
-def _core_s(seconds: float) -> str:
+def _core_s(seconds: float | None) -> str:
     """Return the cost of a fit; repeated fits of less than a second differ by factors."""
-    return number(seconds) if seconds >= CHANCE_S else f"< {CHANCE_S:g}"
+    return number(seconds) if seconds is None or seconds >= CHANCE_S else f"< {CHANCE_S:g}"
 
 
 def _queries(run: Comparison, row: Row, need: float) -> str:
