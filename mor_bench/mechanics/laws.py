@@ -153,6 +153,40 @@ def _write(D, l, y, i, q):
     D[20 * LANES + l] = y5 * f + qb * c + q * f * f
 
 
+@njit(forceinline=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _add_products(D, l, y, i, q, w, n):
+    """Add to D what `_write` writes, and w n ⊗ n for a symmetric tensor n of 6 components."""
+    a, b, c, d, e, f = i
+    p0, p1, p2, p3, p4, p5 = 0.5 * a, 0.5 * b, 0.5 * c, 0.5 * d, 0.5 * e, 0.5 * f
+    y0, y1, y2, y3, y4, y5 = y
+    n0, n1, n2, n3, n4, n5 = n
+    m0, m1, m2, m3, m4, m5 = w * n0, w * n1, w * n2, w * n3, w * n4, w * n5
+    r = 2.0 * q
+    ra, rb, rc, rd, re, rf = r * a, r * b, r * c, r * d, r * e, r * f
+    qa, qb, qd, qe = q * a, q * b, q * d, q * e
+    D[l] += y0 * a + ra * a + m0 * n0
+    D[LANES + l] += y0 * p1 + p0 * y1 + rd * d + m0 * n1
+    D[2 * LANES + l] += y0 * p2 + p0 * y2 + re * e + m0 * n2
+    D[3 * LANES + l] += y0 * p3 + p0 * y3 + ra * d + m0 * n3
+    D[4 * LANES + l] += y0 * p4 + p0 * y4 + ra * e + m0 * n4
+    D[5 * LANES + l] += y0 * p5 + p0 * y5 + rd * e + m0 * n5
+    D[6 * LANES + l] += y1 * b + rb * b + m1 * n1
+    D[7 * LANES + l] += y1 * p2 + p1 * y2 + rf * f + m1 * n2
+    D[8 * LANES + l] += y1 * p3 + p1 * y3 + rd * b + m1 * n3
+    D[9 * LANES + l] += y1 * p4 + p1 * y4 + rd * f + m1 * n4
+    D[10 * LANES + l] += y1 * p5 + p1 * y5 + rb * f + m1 * n5
+    D[11 * LANES + l] += y2 * c + rc * c + m2 * n2
+    D[12 * LANES + l] += y2 * p3 + p2 * y3 + re * f + m2 * n3
+    D[13 * LANES + l] += y2 * p4 + p2 * y4 + re * c + m2 * n4
+    D[14 * LANES + l] += y2 * p5 + p2 * y5 + rf * c + m2 * n5
+    D[15 * LANES + l] += y3 * d + qa * b + qd * d + m3 * n3
+    D[16 * LANES + l] += y3 * p4 + p3 * y4 + qa * f + qd * e + m3 * n4
+    D[17 * LANES + l] += y3 * p5 + p3 * y5 + qd * f + qe * b + m3 * n5
+    D[18 * LANES + l] += y4 * e + qa * c + qe * e + m4 * n4
+    D[19 * LANES + l] += y4 * p5 + p4 * y5 + qd * c + qe * f + m4 * n5
+    D[20 * LANES + l] += y5 * f + qb * c + q * f * f + m5 * n5
+
+
 @njit(error_model="numpy", fastmath={"contract", "nsz"})
 def _saint_venant_kirchhoff(E, p, S, D):
     """Saint Venant-Kirchhoff, W = λ/2 tr(E)² + μ tr(E²); p = (λ, μ)."""
@@ -298,13 +332,12 @@ def _yeoh(E, p, S, D):
 
 
 @njit(error_model="numpy", fastmath={"contract", "nsz"})
-def _add_fibres(work, E, stiffness, N, S, D):
+def _add_fibres(I, E, stiffness, N, S, D):
     """Add a family of fibres, k1/(2 k2) (exp(k2 x²) - 1) with x = J^(-2/3) N:C - 1 >= 0.
 
-    ``work`` holds C⁻¹ (6), J^(-2/3), and places for d²W/dx² and a part of D (21).
+    ``I`` holds C⁻¹ (6), J^(-2/3), and places for four factors of D.
     """
     L = LANES
-    I, T = work[: 8 * L], work[8 * L :]
     for l in range(LANES):
         inverse = I[l], I[L + l], I[2 * L + l], I[3 * L + l], I[4 * L + l], I[5 * L + l]
         i0, i1, i2, i3, i4, i5 = inverse
@@ -330,7 +363,16 @@ def _add_fibres(work, E, stiffness, N, S, D):
             # dx/dC = J^(-2/3) (N - N:C/3 C⁻¹); 4 d²W/dx² dx/dC ⊗ dx/dC, with N ⊗ N last.
             w = 4.0 * root * root * k1 * (1.0 + 2.0 * k2 * x * x) * growth
             wide = w * length / 3.0
-            v, t = -4.0 / 3.0 * a - 2.0 * wide, third / 1.5 + wide * length / 3.0
+            I[7 * L + l], I[8 * L + l] = w, third
+            I[9 * L + l] = -4.0 / 3.0 * a - 2.0 * wide
+            I[10 * L + l] = third / 1.5 + wide * length / 3.0
+    if D is not None:
+        for l in range(LANES):
+            inverse = I[l], I[L + l], I[2 * L + l], I[3 * L + l], I[4 * L + l], I[5 * L + l]
+            i0, i1, i2, i3, i4, i5 = inverse
+            n = N[l], N[L + l], N[2 * L + l], N[3 * L + l], N[4 * L + l], N[5 * L + l]
+            n0, n1, n2, n3, n4, n5 = n
+            v, t = I[9 * L + l], I[10 * L + l]
             y = (
                 v * n0 + t * i0,
                 v * n1 + t * i1,
@@ -339,16 +381,7 @@ def _add_fibres(work, E, stiffness, N, S, D):
                 v * n4 + t * i4,
                 v * n5 + t * i5,
             )
-            _write(T, l, y, inverse, third)
-            I[7 * L + l] = w
-    if D is not None:
-        w, c = I[7 * L :], 0
-        for m in range(6):
-            for n in range(m, 6):
-                x, y, out, part = N[m * L :], N[n * L :], D[c * L :], T[c * L :]
-                for l in range(LANES):
-                    out[l] += part[l] + w[l] * x[l] * y[l]
-                c += 1
+            _add_products(D, l, y, inverse, I[8 * L + l], I[7 * L + l], n)
 
 
 @njit(error_model="numpy", fastmath={"contract", "nsz"})
@@ -359,7 +392,7 @@ def _holzapfel_gasser_ogden(E, p, S, D):
     dispersion d. Gasser, Ogden & Holzapfel, Journal of the Royal Society Interface 3 (2006), 15-35.
     """
     L = LANES
-    work = np.empty(29 * L)
+    work = np.empty(11 * L)
     for l in range(LANES):
         c10, bulk, J = p[l], p[L + l], E[6 * L + l]
         inverse = _inverse(E, l)
@@ -1032,7 +1065,7 @@ _LAW_MULTIPLY_ADDS = {
 }
 """Multiply-adds per point for energy and stress, and for the tangent; 4 sweeps are usual."""
 
-_OGDEN_TERM_MULTIPLY_ADDS, _FIBRE_MULTIPLY_ADDS = (15, 128), (33, 150)
+_OGDEN_TERM_MULTIPLY_ADDS, _FIBRE_MULTIPLY_ADDS = (15, 128), (33, 135)
 """Those of a term of Ogden's law, and of a family of fibres."""
 
 _STRAIN_MULTIPLY_ADDS, _WEIGH_MULTIPLY_ADDS, _DERIVATIVE_MULTIPLY_ADDS = 33, 34, 333
