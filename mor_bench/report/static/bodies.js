@@ -101,13 +101,22 @@ Report.kinds.bodies = (figure, data) => {
     return sample.force ? [...out, ...arrow(sample.force)] : out;
   }
 
-  // One box around both bodies, so that they have the same size.
+  // One box around both bodies, with one scale for all axes of both views.
   function boxOf(all) {
-    return Object.fromEntries(["x", "y", "z"].map((key) => {
+    const keys = ["x", "y", "z"];
+    const ranges = keys.map((key) => {
       const values = all.flatMap((trace) => trace[key] ?? []).filter((v) => v !== null);
+      return [values.reduce((a, b) => Math.min(a, b)), values.reduce((a, b) => Math.max(a, b))];
+    });
+    const lengths = ranges.map(([low, high]) => Math.max(high - low, 1e-3 * found.size_m));
+    const middle = Math.cbrt(lengths.reduce((a, b) => a * b));
+    const axes = keys.map((key, i) => {
+      const centre = (ranges[i][0] + ranges[i][1]) / 2;
       return [`${key}axis`, { visible: false, showspikes: false,
-        range: [values.reduce((a, b) => Math.min(a, b)), values.reduce((a, b) => Math.max(a, b))] }];
-    }));
+        range: [centre - lengths[i] / 2, centre + lengths[i] / 2] }];
+    });
+    return { ...Object.fromEntries(axes), aspectmode: "manual",
+      aspectratio: Object.fromEntries(keys.map((key, i) => [key, lengths[i] / middle])) };
   }
 
   function one(view, select, drawn, box) {
@@ -116,8 +125,7 @@ Report.kinds.bodies = (figure, data) => {
     view.previousElementSibling.textContent = `${R.nameOf(data, select.value)}: ${text}`;
     return R.draw(view, drawn, R.layout({
       height: R.isNarrow() ? 300 : 400, margin: { l: 0, r: 0, t: 8, b: 0 },
-      scene: { ...box, aspectmode: "data", camera,
-        bgcolor: R.theme().paper },
+      scene: { ...box, camera, bgcolor: R.theme().paper },
     }));
   }
 

@@ -3,6 +3,7 @@
 Object.assign(Report, (() => {
   const CONFIG = { displayModeBar: false, responsive: true, showTips: false };
   const PRINT_WIDTH = 680;
+  const FONT = 'system-ui, "DejaVu Sans", sans-serif';
 
   const isNarrow = () => window.innerWidth < 700 || Report.state.printing;
 
@@ -21,11 +22,25 @@ Object.assign(Report, (() => {
     return axis(title, { type: "log", ...decades, ...more });
   }
 
+  // Counts such as 10k and 1M: powers of ten only where they span more than three decades.
+  function countAxis(title, [low, high]) {
+    const step = Math.max(1, Math.ceil((high - low) / (isNarrow() ? 5 : 10)));
+    const decades = high - low > 3 || isNarrow() ? { dtick: step } : {};
+    return axis(title, { type: "log", range: [low, high], tickformat: "~s", ...decades });
+  }
+
+  const PEN = document.createElement("canvas").getContext("2d");
+  // Width of a text in pixels.
+  function widthOf(text, size) {
+    PEN.font = `${size}px ${FONT}`;
+    return PEN.measureText(text).width;
+  }
+
   function layout(more = {}) {
     const { ink, paper } = Report.theme();
     return {
       paper_bgcolor: paper, plot_bgcolor: paper, hovermode: "closest",
-      font: { color: ink, size: 13, family: 'system-ui, "DejaVu Sans", sans-serif' },
+      font: { color: ink, size: 13, family: FONT },
       margin: { l: 58, r: 12, t: 24, b: 48 },
       hoverlabel: { align: "left", bgcolor: paper, bordercolor: ink, font: { color: ink, size: 13 } },
       ...(Report.state.printing ? { width: PRINT_WIDTH, autosize: false } : { autosize: true }),
@@ -114,11 +129,17 @@ Object.assign(Report, (() => {
     const ordered = labels.length ? [first, ...labels.filter((l) => l !== first)] : [];
     return ordered.map((label) => [label, nameOf(data, label)]);
   };
-  // Few significant digits, as in the tables.
-  const short = (value) => (value === null ? "–" : Number(value.toPrecision(3)).toString());
+  // Few significant digits; the same text as `number` makes for the tables.
+  function short(value) {
+    if (value === null) return "–";
+    const size = Math.abs(value);
+    if (size === 0 || (size >= 1e-3 && size < 99.95)) return Number(value.toPrecision(3)).toString();
+    if (size >= 1 && size < 1e5) return value.toFixed(0);
+    return value.toExponential(1).replace(/([+-])(\d)$/, (_, sign, digit) => `${sign}0${digit}`);
+  }
 
   return {
-    axis, logAxis, layout, legend, draw, choice, slider, tick, rowOf, styleOf, colour, textColour, symbol,
+    axis, logAxis, countAxis, widthOf, layout, legend, draw, choice, slider, tick, rowOf, styleOf, colour, textColour, symbol,
     nameOf, hover, options, short, isNarrow, say, winnerOf,
   };
 })());

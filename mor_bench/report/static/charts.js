@@ -236,7 +236,7 @@ Report.kinds.costs = (figure, data) => {
         hoverinfo: "text" });
     }
     return R.draw(left, traces, R.layout({
-      xaxis: R.logAxis("number of queries", { tickformat: "~e", dtick: R.isNarrow() ? 2 : 1 }),
+      xaxis: R.countAxis("number of queries", [0, top]),
       yaxis: R.logAxis("core-seconds"), height: 440,
       legend: { orientation: "h", y: -0.2, font: { size: 12 } },
     }));

@@ -19,11 +19,13 @@ Report.kinds.frontier = (figure, data) => {
   const x = (row) => (time.value === "work" ? row.work : row.latency[time.value]);
   const y = (row) => row.error[error.value];
   const inside = (value) => Math.min(Math.max(value, FLOOR), TOP);
+  let hidden = new Set(); // methods that the legend hides
+  let size = [500, 450]; // of the plot in pixels; after drawing, the real one
 
   function shownRows() {
-    const hidden = [...document.querySelectorAll(".filter input:not(:checked)")].map((i) => i.value);
+    const filtered = [...document.querySelectorAll(".filter input:not(:checked)")].map((i) => i.value);
     return data.rows.filter(
-      (row) => x(row) > 0 && y(row) !== null && y(row) >= 0 && !hidden.includes(row.told),
+      (row) => x(row) > 0 && y(row) !== null && y(row) >= 0 && !filtered.includes(row.told),
     );
   }
 
@@ -39,21 +41,43 @@ Report.kinds.frontier = (figure, data) => {
     };
   }
 
-  // Place in pixels along an axis, at the usual size of the chart.
-  const at = (value, [low, high], size) => (size * (Math.log10(value) - low)) / (high - low);
+  // Place of a row in pixels, from the lower left corner of the plot.
+  const at = (value, [low, high], length) => (length * (Math.log10(value) - low)) / (high - low);
+  const pixels = (row, range) => [at(x(row), range.x, size[0]), at(inside(y(row)), range.y, size[1])];
+  // A box around a centre, and whether two of them overlap.
+  const boxAt = ([px, py], width, height) => [px - width / 2, py - height / 2, px + width / 2, py + height / 2];
+  const overlap = (a, b) => a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
 
-  // Labels of the front that do not cover each other, at the usual size of the chart.
-  function labelled(rows, range) {
-    const taken = [], found = new Set();
+  // Labels of the front that do not cover each other or a text in `taken`, which grows by them.
+  function labelled(rows, range, taken) {
+    const found = new Set();
     for (const row of rows.filter((r) => r.front && y(r) === inside(y(r)))) {
-      const box = [at(x(row), range.x, 500), at(y(row), range.y, 450), 8 * labelOf(row).length + 14];
-      const apart = ([px, py, width]) => Math.abs(py - box[1]) > 15
-        || px > box[0] + box[2] || box[0] > px + width;
-      if (taken.every(apart)) { taken.push(box); found.add(row); }
+      const [px, py] = pixels(row, range), width = R.widthOf(labelOf(row), 12);
+      const box = [px + 3, py + 1, px + width + 12, py + 24];
+      if (taken.some((other) => overlap(box, other))) continue;
+      taken.push(box);
+      found.add(row);
     }
     return found;
   }
 
+  // What is plotted comes first; the medians follow if they are not what is plotted.
+  function hoverOf(row) {
+    const [name, medianError, medianLatency, ...rest] = row.hover;
+    const [shownError, shownTime] = [error, time].map((select) => select.selectedOptions[0].text);
+    const plotted = [
+      error.value === "median" ? medianError : `error, ${shownError}: ${R.short(y(row))} %`,
+      time.value === "median" ? medianLatency
+        : time.value === "work" ? `work: ${R.short(x(row))} multiply-adds` : `${shownTime}: ${R.short(x(row))} ms`,
+    ];
+    const medians = [
+      ...(error.value === "median" ? [] : [`median ${medianError}`]),
+      ...(time.value === "median" ? [] : [`median ${medianLatency}`]),
+    ];
+    return R.hover([name, ...plotted, ...medians, ...rest]);
+  }
+
+  const FRONT = "Pareto front";
   const labelOf = (row) => row.name.split(" · ")[1] ?? row.name;
 
   function trace(rows, group, named) {
@@ -67,7 +91,8 @@ Report.kinds.frontier = (figure, data) => {
       x: rows.map(x), y: rows.map((row) => inside(y(row))),
       text: rows.map((row) => (named.has(row) ? R.plain(labelOf(row)) : "")),
       textposition: "top right", textfont: { color: R.textColourOf(style), size: 12 },
-      hovertext: rows.map((row) => R.hover(row.hover)), hoverinfo: "text",
+      hovertext: rows.map(hoverOf), hoverinfo: "text",
+      visible: hidden.has(R.plain(rows[0].method)) ? "legendonly" : true,
       line: { color: colour, width: 1 },
       marker: {
         color: colour, size: 10, line: { color: colour, width: 1.5 },
@@ -85,7 +110,8 @@ Report.kinds.frontier = (figure, data) => {
       if (y(row) < 100 && (!best.length || y(row) < y(best.at(-1)))) best.push(row);
     }
     return {
-      type: "scatter", mode: "lines", name: "Pareto front", x: best.map(x),
+      type: "scatter", mode: "lines", name: FRONT, x: best.map(x),
+      visible: hidden.has(FRONT) ? "legendonly" : true,
       y: best.map((row) => inside(y(row))), hoverinfo: "skip",
       line: { shape: "hv", dash: "dash", width: 1.5, color: R.theme().ink },
     };
@@ -115,24 +141,33 @@ Report.kinds.frontier = (figure, data) => {
     return { shapes, annotations };
   }
 
-  // Values beyond the axis stand at its edge, with an arrow and the value, over no other marker.
-  function cuts(rows, range) {
-    const [wide, high] = R.isNarrow() ? [290, 310] : [500, 450];
-    const pixels = (row) => [at(x(row), range.x, wide), at(inside(y(row)), range.y, high)];
-    const taken = rows.map((row) => [...pixels(row), 12]);
-    return rows.filter((row) => y(row) > TOP || y(row) < FLOOR).map((row) => {
+  // Places of the centre of a label beside its marker, the nearest first.
+  const AWAY = [26, 42, 58, 74, 90, 106, 122, 138];
+  const BESIDE = [0, 0.5, -0.5, 1, -1];
+
+  // Values beyond the axis stand at its edge, with an arrow and the value. Such a label covers no
+  // text in `taken`, and markers only where there is no other place; without a place it is left out.
+  function cuts(rows, range, taken) {
+    const markers = rows.map((row) => boxAt(pixels(row, range), 12, 12));
+    return rows.filter((row) => y(row) > TOP || y(row) < FLOOR).flatMap((row) => {
       const value = `${R.short(y(row))} %`;
-      const text = R.plain(R.isNarrow() ? value : `${row.name}: ${value}`);
-      const side = y(row) > TOP ? 1 : -1, [px, py] = pixels(row), width = 6.5 * text.length;
-      const free = (away) => taken.every(([qx, qy, other]) =>
-        Math.abs(qy - (py - side * away)) > 18 || Math.abs(qx - px) > (width + other) / 2);
-      const away = [26, 42, 58, 74, 90, 106].find(free) ?? 26;
-      taken.push([px, py - side * away, width]);
-      return {
-        x: Math.log10(x(row)), y: Math.log10(inside(y(row))), ax: 0, ay: side * away, text,
+      const text = R.isNarrow() ? value : `${row.name}: ${value}`;
+      const side = y(row) > TOP ? 1 : -1, [px, py] = pixels(row, range), width = R.widthOf(text, 11) + 6;
+      const places = AWAY.flatMap((away) => BESIDE.map((part) => {
+        const shift = part * width;
+        const box = boxAt([px + shift, py - side * away], width, 19);
+        return { shift, away, box, covered: markers.filter((marker) => overlap(box, marker)).length };
+      })).filter(({ box }) => box[0] >= 0 && box[1] >= 0 && box[2] <= size[0] && box[3] <= size[1]
+        && !taken.some((other) => overlap(box, other)));
+      if (!places.length) return [];
+      const best = places.reduce((a, b) => (b.covered < a.covered ? b : a));
+      taken.push(best.box);
+      return [{
+        x: Math.log10(x(row)), y: Math.log10(inside(y(row))), ax: best.shift, ay: side * best.away,
+        text: R.plain(text),
         bgcolor: R.theme().paper, arrowhead: 2, arrowside: "start", startarrowhead: 0,
         font: { size: 11, color: R.theme().ink }, arrowcolor: R.theme().quiet,
-      };
+      }];
     });
   }
 
@@ -159,13 +194,17 @@ Report.kinds.frontier = (figure, data) => {
 
   function show() {
     const rows = shownRows();
-    R.say(figure, finding(rows));
+    const visible = rows.filter((row) => !hidden.has(R.plain(row.method)));
+    R.say(figure, finding(visible));
     const wanted = time.value === "work" || error.value !== "median" ? [] : [data.needs.latency];
     const range = {
       x: rangeOf(rows.map(x), wanted),
       y: rangeOf(rows.map((row) => inside(y(row))), [data.needs.error]),
     };
-    const traces = [], named = labelled(rows, range);
+    const { shapes, annotations } = marks(range);
+    const taken = annotations.filter((note) => note.yref !== "paper")
+      .map((note) => [0, 0, R.widthOf(note.text, 12) + 6, 19]);
+    const traces = [], named = labelled(visible, range, taken);
     for (const group of data.groups) {
       const mine = rows.filter((row) => row.group === group);
       for (const method of new Set(mine.map((row) => row.method))) {
@@ -173,17 +212,38 @@ Report.kinds.frontier = (figure, data) => {
       }
     }
     traces.push(front(rows));
-    const { shapes, annotations } = marks(range);
     const title = time.value === "work" ? "multiply-adds of one query"
       : `latency of one query, ${time.selectedOptions[0].text.split(", ")[1]} (ms)`;
     const its = R.layout({
-      xaxis: R.logAxis(title, { range: range.x }),
+      xaxis: time.value === "work" ? R.countAxis(title, range.x) : R.logAxis(title, { range: range.x }),
       yaxis: R.logAxis(`relative L2 error, ${error.selectedOptions[0].text} (%)`, { range: range.y }),
-      shapes, annotations: [...annotations, ...cuts(rows, range)],
+      shapes, annotations: [...annotations, ...cuts(visible, range, taken)],
       ...R.legend(traces.length + data.groups.length, R.isNarrow() ? 400 : 560),
     });
     its.legend.groupclick = "toggleitem";
-    return R.draw(plot, traces, its);
+    const drawn = R.draw(plot, traces, its);
+    follow();
+    return drawn;
+  }
+
+  // Labels follow the legend, and the real size of the plot.
+  let following = false;
+  function follow() {
+    if (following) return;
+    following = true;
+    plot.on("plotly_restyle", () => {
+      hidden = new Set(plot.data.filter((t) => t.visible === "legendonly").map((t) => t.name));
+      show();
+    });
+    plot.on("plotly_afterplot", fit);
+    fit();
+  }
+  function fit() {
+    const { xaxis, yaxis } = plot._fullLayout;
+    const now = [xaxis._length, yaxis._length];
+    if (now.every((length, i) => Math.abs(length - size[i]) < 4)) return;
+    size = now;
+    show();
   }
 
   document.querySelectorAll(".filter input").forEach((i) => i.addEventListener("change", redraw));

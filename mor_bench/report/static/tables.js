@@ -41,6 +41,18 @@ Report.table = (grid, data) => {
     box.append(value, small);
     return box;
   };
+  // Texts with numbers inside, in the order of the numbers: r3 before r10, 1e-08 before 0.01.
+  const parts = (text) => text.split(/(\d+(?:\.\d+)?(?:e[+-]?\d+)?)/);
+  function natural(a, b) {
+    const [one, two] = [parts(a), parts(b)];
+    for (let i = 0; i < Math.min(one.length, two.length); i += 1) {
+      const sign = i % 2 ? Number(one[i]) - Number(two[i]) : one[i].localeCompare(two[i]);
+      if (sign) return sign;
+    }
+    return one.length - two.length;
+  }
+  const byMethod = (a, b, first, second) =>
+    first.getData().method.localeCompare(second.getData().method) || natural(a, b);
   const textCell = (cell) => document.createTextNode(cell.getValue());
   const numbers = { sorter: "number", sorterParams: { alignEmptyValues: "bottom" }, hozAlign: "right" };
 
@@ -52,12 +64,12 @@ Report.table = (grid, data) => {
     layout: "fitColumns",
     columnHeaderSortMulti: false,
     columns: [
-      { title: "configuration", field: "name", formatter: nameCell, minWidth: 150, widthGrow: 3 },
+      { title: "configuration", field: "name", formatter: nameCell, sorter: byMethod, minWidth: 150, widthGrow: 3 },
       { title: "error (%)", field: "error_value", formatter: figureCell("error"), minWidth: 98, ...numbers },
       { title: "latency (ms)", field: "latency_value", formatter: figureCell("latency"), minWidth: 104, ...numbers },
       { title: "offline", field: "offline", formatter: figureCell("offline"), minWidth: 84, ...numbers },
       { title: "told", field: "group", formatter: textCell, minWidth: 150, widthGrow: 2 },
-      { title: "qualifies", field: "answer", formatter: textCell, minWidth: 96 },
+      { title: "qualifies", field: "answer", formatter: textCell, sorter: natural, minWidth: 96 },
     ],
     rowFormatter: (row) => {
       const { qualified, failed, status, front } = row.getData();
@@ -95,6 +107,12 @@ Report.table = (grid, data) => {
   label.append("find ", search);
   bar.append(label);
   const only = R.tick(figure, "only those that qualify", false, filter);
+  const status = document.createElement("p");
+  status.setAttribute("role", "status");
+  bar.after(status);
+  table.on("dataFiltered", (_, found) => {
+    status.textContent = found.length ? "" : "No configuration matches this search and these filters.";
+  });
   search.addEventListener("input", filter);
 
   function filter() {
