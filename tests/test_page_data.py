@@ -18,6 +18,7 @@ from mor_bench.report.page import render
 from mor_bench.report.page_index import standings
 from mor_bench.report.page_sections import View
 from mor_bench.report.page_verdict import method_card
+from mor_bench.report.page_worst import worst_cases
 from mor_bench.report.short_names import short_names
 from mor_bench.results.comparison import Comparison
 from tests.report_runs import N_TEST, add_row, data_of, markup_of, text_of, tiny
@@ -148,3 +149,17 @@ def test_the_vendored_scripts_are_those_of_their_packages() -> None:
     assert {name for name, _ in noted} == {p.name for p in vendor.iterdir() if ".min." in p.name}
     for name, digest in noted:
         assert hashlib.sha256((vendor / name).read_bytes()).hexdigest() == digest
+
+
+def test_the_two_worst_loads_are_told_apart() -> None:
+    arrays = {
+        "relative_l2": np.array([0.05, 0.002, 0.019]),
+        "max_nodal_m": np.array([0.0004, 0.0003, 0.0114]),
+        "amplitude_m": np.array([0.0076, 0.15, 0.46]),
+    }
+    middle, relative, absolute = worst_cases(arrays)
+    assert middle == "Middle (medians): 1.9 %, 0.4 mm at the worst node, moves 150 mm."
+    assert relative == "Worst relative: 5 % (a small load, moves 7.6 mm)."
+    assert absolute == "Worst absolute: 11.4 mm at a node (1.9 %, moves 460 mm)."
+    assert worst_cases({"relative_l2": np.ones(3)}) == []
+    assert worst_cases({**arrays, "relative_l2": np.array([1.0, np.inf, 0.1])}) == []

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -42,21 +44,27 @@ CAPTION = (
 )
 
 
+Dash = Literal["-", "--", ":", "-."]
+
+_DASHES: tuple[Dash, ...] = ("-", "--", ":", "-.")
+"""Line styles of the members of a family, as on the page."""
+
+
 @dataclass(frozen=True)
 class Staircase:
-    """A method's name and its values in ascending order; infinite ones have no prediction."""
+    """A method's name, its values in ascending order, and their 95th percentile.
+
+    Infinite values have no prediction. The percentile is the one that the tables show.
+    """
 
     method: str
     name: str
     values: NDArray[np.float64]
+    p95: float
 
     @property
     def finite(self) -> NDArray[np.float64]:
         return self.values[np.isfinite(self.values) & (self.values > 0)]
-
-    def at(self, share: float) -> float:
-        """Return the value that this share of all values does not exceed."""
-        return float(self.values[max(0, int(np.ceil(share * len(self.values))) - 1)])
 
 
 def staircases(
@@ -72,10 +80,13 @@ def staircases(
             raw = np.sort(np.asarray(comparison.samples(entry.row)[key], dtype=float))
         except (OSError, KeyError):
             continue
-        scale = 100.0 if key == "relative_l2" else 1.0
-        found.append(Staircase(entry.method, str(names[entry.label]), scale * raw))
+        if key == "relative_l2":
+            raw, p95 = 100 * raw, 100 * (entry.figure("error", "rel_l2_p95") or inf)
+        else:
+            p95 = entry.figure("latency_ms", "p95") or inf
+        found.append(Staircase(entry.method, str(names[entry.label]), raw, p95))
     found = [stairs for stairs in found if len(stairs.finite)]
-    return sorted(found, key=lambda stairs: stairs.at(0.95))[:MOST_LINES]
+    return sorted(found, key=lambda stairs: stairs.p95)[:MOST_LINES]
 
 
 def error_distribution(
@@ -88,15 +99,15 @@ def error_distribution(
     latencies = staircases(comparison, dataset, "latency_ms", analysis)
     needs = needs_of(comparison, dataset)
     finding = f"95 % of the loads: {shortened(errors[0].name, 40)} errs by at most "
-    finding += f"{number(errors[0].at(0.95))} %"
+    finding += f"{number(errors[0].p95)} %"
     if len(errors) > 1:
-        finding += f", {shortened(errors[-1].name, 40)} by {number(errors[-1].at(0.95))} %"
+        finding += f", {shortened(errors[-1].name, 40)} by {number(errors[-1].p95)} %"
     subject = f"{dataset}: distribution of errors and latencies, the best configuration per method"
     figure = new_figure(3.6 * (1 + bool(latencies)), finding, subject)
     panels = figure.subplots(1 + bool(latencies), 1, squeeze=False).ravel()
     draw_distribution(panels[0], errors, needs)
     for axes in panels[1:]:
-        _draw(axes, latencies, needs.latency_ms)
+        _draw(axes, latencies, needs.latency_ms, "ms")
         axes.set_xlabel("latency of a query, at most (ms)", fontsize=LABEL)
         axes.set_ylabel("queries (%)", fontsize=LABEL)
     return Picture(
@@ -106,12 +117,12 @@ def error_distribution(
 
 def draw_distribution(axes: Axes, errors: Sequence[Staircase], needs: Requirements) -> None:
     """Draw the share of test loads with at most an error, a staircase per method."""
-    _draw(axes, errors, None if needs.error is None else 100 * needs.error)
+    _draw(axes, errors, None if needs.error is None else 100 * needs.error, "%")
     axes.set_xlabel("relative L2 error of a test load, at most (%)", fontsize=LABEL)
     axes.set_ylabel("test loads (%)", fontsize=LABEL)
 
 
-def _draw(axes: Axes, found: Sequence[Staircase], need: float | None) -> None:
+def _draw(axes: Axes, found: Sequence[Staircase], need: float | None, unit: str) -> None:
     """Draw the staircases, with their names beside them."""
     dress(axes)
     axes.set_xscale("log")
@@ -123,29 +134,55 @@ def _draw(axes: Axes, found: Sequence[Staircase], need: float | None) -> None:
         axes.axvline(need, color=GREY, linestyle=":", linewidth=1.2, zorder=1)
     log_ticks(axes.xaxis, axes.get_xlim())
     (start, end), notes, lines = axes.get_xlim(), [], []
+    dashes = dashes_of([stairs.method for stairs in found])
     for stairs in found:
         style, x = style_of(stairs.method), stairs.finite
         y = 100 * (np.searchsorted(stairs.values, x, side="right") / len(stairs.values))
-        axes.step(x, y, where="post", color=style.colour, linewidth=1.6, label=stairs.method)
+        axes.step(
+            x,
+            y,
+            where="post",
+            color=style.colour,
+            linewidth=1.6,
+            label=stairs.method,
+            linestyle=dashes[stairs.method],
+        )
         lines.append(np.column_stack([x, y]))
         text = shortened(stairs.name, 30)
         offsets: Sequence[Point] = _BESIDE
         places = [(float(np.quantile(x, q)), 100 * q) for q in np.linspace(0.6, 0.05, 12)]
         if x[-1] > end:
-            text = f"{text}: up to {number(float(x[-1]))} →"
+            text = f"{text}: up to {number(float(x[-1]))} {unit} →"
             places, offsets = [(end, float(np.interp(end, x, y)))], _ABOVE_ONE_ANOTHER
         elif x[-1] < start:
-            text, places = f"← {text}: up to {number(float(x[-1]))}", [(start, 50.0)]
+            text, places = f"← {text}: up to {number(float(x[-1]))} {unit}", [(start, 50.0)]
         must = not start <= x[-1] <= end
         notes.append(Note(text, places, readable(style.colour), "bold", offsets, must=must))
     missing = {note.text for note in annotate(axes, notes, [], lines)}
     handles = [
-        Line2D([], [], color=style_of(stairs.method).colour, label=plain(text))
+        Line2D(
+            [],
+            [],
+            color=style_of(stairs.method).colour,
+            linestyle=dashes[stairs.method],
+            label=plain(text),
+        )
         for stairs in found
         if (text := shortened(stairs.name, 30)) in missing
     ]
     if handles:
         axes.legend(handles=handles, loc="lower right", fontsize=NOTE, frameon=False)
+
+
+def dashes_of(methods: Sequence[str]) -> dict[str, Dash]:
+    """Return a line style per method, so that lines of one family, with similar hues, differ."""
+    seen: dict[str, int] = {}
+    found: dict[str, Dash] = {}
+    for method in sorted(dict.fromkeys(methods)):
+        family = style_of(method).family
+        found[method] = _DASHES[seen.get(family, 0) % len(_DASHES)]
+        seen[family] = seen.get(family, 0) + 1
+    return found
 
 
 _BESIDE = ((8, -4), (-8, 4), (10, -9), (-10, 9))

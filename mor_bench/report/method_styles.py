@@ -58,6 +58,9 @@ _MARKERS = (
 )
 """Markers of the suite's methods in matplotlib and plotly."""
 
+_OTHER_SHADE = {"pca-regression-force": 1}
+"""Shades of methods that a default run compares with another one of the same shade."""
+
 _OTHER_MARKERS = (("*", "star"), ("h", "hexagon2"), ("8", "octagon"), ("d", "diamond-tall"))
 """Markers of all other methods."""
 
@@ -187,7 +190,7 @@ def _suite() -> dict[str, MethodStyle]:
     for first, (family, (shades, members)) in enumerate(_FAMILIES.items()):
         for i, method in enumerate(members):
             marker, symbol = _MARKERS[(first + i) % len(_MARKERS)]
-            colour, dark = shades[i % len(shades)]
+            colour, dark = shades[_OTHER_SHADE.get(method, i) % len(shades)]
             styles[method] = MethodStyle(colour, dark, symbol, marker, family)
     return styles
 

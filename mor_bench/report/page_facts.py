@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,8 @@ def deformation(entries: Sequence[Entry]) -> str:
 
 
 _UNSEEN = {
-    "region": "The test loads are centred where no training load is centred.",
+    "region": "No test load is centred where a training load is centred; neighbouring patches "
+    "overlap.",
     "direction": "The test loads have directions that no training load has.",
     "sample": "The test loads are drawn as the training loads are.",
 }
@@ -91,6 +93,8 @@ def limits_of(comparison: Comparison, analysis: Analysis, entries: Sequence[Entr
     split = next((entry.row.split for entry in entries if entry.ran), None)
     if split in _UNSEEN:
         said.append(_UNSEEN[split])
+    if counts := _patches(comparison.datasets.get(entries[0].row.dataset, {}), entries):
+        said.append(f"The split: {_samples(entries)}{counts}.")
     if not any(entry.row.sets for entry in entries):
         said.append("No load larger than the training loads was tested.")
     if processor := comparison.machine.get("processor"):
@@ -154,6 +158,33 @@ def facts_of(
         ("threads", _values(row.threads for row in rows)),
         ("configurations", f"{len(rows)}: {sum(r.ok for r in rows)} ran, {', '.join(counts)}"),
     ]
+
+
+def _samples(entries: Sequence[Entry]) -> str:
+    """Count the loads of each part of a split."""
+    row = next(entry.row for entry in entries if entry.ran)
+    parts = {"training": row.n_train, "validation": row.n_validation or 0, "test": row.n_test}
+    return ", ".join(f"{n:,} {part}" for part, n in parts.items()) + " loads"
+
+
+def protocol_of(comparison: Comparison, dataset: str, entries: Sequence[Entry]) -> str:
+    """State in a few sentences how all configurations were timed and tuned."""
+    rows = [entry.row for entry in entries if entry.ran and entry.row.latency_ms]
+    if not rows:
+        return ""
+    processes = _values(r.latency_ms.n_processes for r in rows if r.latency_ms)
+    rounds = set()
+    for row in rows[:1]:
+        with suppress(OSError, KeyError):
+            rounds = set(np.asarray(comparison.samples(row)["round"]).tolist())
+    turns = f" in {len(rounds)} interleaved rounds" if len(rounds) > 1 else ""
+    threads = _values(row.threads for row in rows)
+    budget = comparison.settings.get("budget") or {}
+    allowed = [f"{budget['configurations']} configurations"] if budget.get("configurations") else []
+    allowed += [f"{budget['seconds']:g} s of fitting"] if budget.get("seconds") else []
+    text = f"One query at a time, {threads} thread{'s' * (threads != '1')}, after warm-up, in "
+    text += f"{processes} fresh process{'es' * (processes != '1')}{turns}."
+    return f"{text} Budget of each method: {' and '.join(allowed)}." if allowed else text
 
 
 def _patches(spec: Mapping[str, Any], entries: Sequence[Entry]) -> str:

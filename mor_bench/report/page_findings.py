@@ -34,9 +34,9 @@ def frontier(data: Data, title: str) -> Chart:
     """Return the chart of error against latency."""
     reading = (
         "Left and down is better. Lines join the configurations of a method. Bars are 95 % "
-        "intervals. Open markers: the timing was not stable. A label with a number belongs to a "
-        "marker beyond the axis, drawn at its edge. The dashed steps are the Pareto "
-        "front. References solve the full equations on the dataset's own mesh. "
+        "intervals, for medians only. Open markers: the timing was not stable. A label with a "
+        "number belongs to a marker beyond the axis, drawn at its edge. The dashed steps "
+        "are the Pareto front. References solve the full equations on the dataset's own mesh. "
         "Click on the legend to hide a method, double-click to isolate it. By keyboard: Tab to the "
         "legend, arrow keys to an entry, then Enter or Shift+Enter."
     )
@@ -167,7 +167,8 @@ _CHARTS: dict[str, tuple[str, str, Callable[[Data], str], str]] = {
         _singular,
         "Tail: the relative root-mean-square error of the best linear basis of r modes on the "
         "training snapshots. No method with a linear basis of r modes can be more accurate "
-        "there. Markers: the ranks that were tried.",
+        "there. It is a mean over the training loads: single loads need more modes. Markers: the "
+        "ranks that were tried.",
     ),
     "learning": (
         "Learning curves",

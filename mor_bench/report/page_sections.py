@@ -13,7 +13,7 @@ from mor_bench.report.canvas import Drawn
 from mor_bench.report.details import dataset_details, hard_cases
 from mor_bench.report.entries import Analysis, Entry, entries_of, verdict_of
 from mor_bench.report.hardest_loads import hardest_loads
-from mor_bench.report.number_format import explain_short_names
+from mor_bench.report.number_format import explain_short_names, percent
 from mor_bench.report.page_data import Shown, cells_of, dataset_arrays, payload, reading_order
 from mor_bench.report.page_facts import (
     answer_of,
@@ -21,12 +21,14 @@ from mor_bench.report.page_facts import (
     facts_of,
     limits_of,
     method_facts,
+    protocol_of,
 )
 from mor_bench.report.page_findings import Chart, charts, frontier
 from mor_bench.report.page_samples import sampled
 from mor_bench.report.page_strains import strain_facts
 from mor_bench.report.page_tables import figure_tables, with_content
-from mor_bench.report.page_verdict import Card, card, method_card
+from mor_bench.report.page_verdict import Card, FullOrder, card, method_card
+from mor_bench.report.page_worst import worst_cases
 from mor_bench.report.scene_text import scene_text
 from mor_bench.report.short_names import ShortName, constants, renamed
 from mor_bench.report.speed_tables import target_table
@@ -54,7 +56,9 @@ class Section:
     parameters that do not vary. `given` is what every method gets. `events` are failures, doubts
     and warnings other than unstable timings, which are `unsteady`. `methods` are facts about each.
     `hard` are tables about difficult loads, `targets` and `details` all further tables.
-    `body_picture` replaces the turning bodies on paper. `data` is the content for the scripts.
+    `body_picture` replaces the turning bodies on paper. `worst` describes the worst test loads by
+    label, and `faster` is the title of the table of pairs. `protocol` says how all was measured.
+    `data` is the content for the scripts.
     """
 
     name: str
@@ -78,6 +82,9 @@ class Section:
     details: list[TextTable]
     methods: list[tuple[str, list[tuple[str, str]]]]
     body_picture: Drawn | None
+    worst: dict[str, list[str]]
+    faster: str
+    protocol: str
     data: dict[str, Any]
 
 
@@ -157,6 +164,9 @@ def section_of(view: View, dataset: str) -> Section:
             for method in dict.fromkeys(entry.method for entry in entries)
         ],
         body_picture=next(pictures, None),
+        worst={item.entry.label: worst_cases(item.arrays) for item in samples},
+        faster=f"Who is faster at {percent(needs.error)} %, the required error",
+        protocol=protocol_of(comparison, dataset, entries),
         data=data,
     )
 
@@ -168,7 +178,17 @@ def _card(view: View, dataset: str, entries: Sequence[Entry], names: Mapping[str
     found = verdict_of(view.analysis, dataset)
     if view.method:
         return method_card(found, entries, names, view.method)
-    return card(found, entries, names, costs_of(view.comparison, dataset, view.analysis, entries))
+    costs = costs_of(view.comparison, dataset, view.analysis, entries)
+    error = needs_of(view.comparison, dataset).error
+    pairs, break_even = (
+        [
+            record
+            for record in view.analysis[key]
+            if (record["dataset"], record["target_rel_l2_median"]) == (dataset, error)
+        ]
+        for key in ("pairwise", "break_even")
+    )
+    return card(found, entries, names, FullOrder(costs, pairs, break_even))
 
 
 def _events(view: View, dataset: str, entries: Sequence[Entry]) -> list[Event]:

@@ -12,6 +12,12 @@ from mor_bench.report.number_format import DASH, number, percent, span, whole
 from mor_bench.report.short_names import renamed
 from mor_bench.report.whole_cost import Costs
 
+MESH_MEANING = (
+    "For the real body, all configurations with a smaller error rank equal. The ranking and the "
+    "needed error hold for this mesh's own solution."
+)
+"""What a discretisation error means for the ranking."""
+
 MOST_NAMES = 4
 """Most names in a sentence; the others are counted."""
 
@@ -26,9 +32,22 @@ class Pick:
     error: str
     error_span: str
     tail: str
+    slow: str
     latency: str
     latency_span: str
     offline: str
+
+
+@dataclass(frozen=True)
+class FullOrder:
+    """What is known of the winner against the full-order model.
+
+    `pairs` and `break_even` are records of the analysis for this dataset at the required error.
+    """
+
+    costs: Costs | None = None
+    pairs: Sequence[Mapping[str, Any]] = ()
+    break_even: Sequence[Mapping[str, Any]] = ()
 
 
 @dataclass(frozen=True)
@@ -73,20 +92,22 @@ def card(
     verdict: Mapping[str, Any],
     entries: Sequence[Entry],
     names: Mapping[str, str],
-    costs: Costs | None = None,
+    known: FullOrder | None = None,
 ) -> Card:
-    """Build the card of a dataset from its verdict; `costs` add when the winner pays off."""
+    """Build the card of a dataset from its verdict; `known` adds the gain over the full order."""
     by_label = {entry.label: entry for entry in entries}
     qualified = [by_label[label] for label in verdict["qualified"] if label in by_label]
     sentences = list(verdict["beside"])
     unsteady = next((s for s in sentences if "timings w" in s), "")
     stability, _, command = unsteady.partition(" Time again: ")
     mesh = next((s for s in sentences if s.startswith("The discretisation error")), "")
+    if " is " in mesh:
+        mesh = f"{mesh.split('. ')[0]}. {MESH_MEANING}"
     rankings = []
     if qualified:
         undecided = [names[label] for label in verdict["undecided"] if label in names]
         rankings = [
-            _by_latency(qualified, verdict["runner_up"], undecided, names, entries, costs),
+            _by_latency(qualified, verdict["runner_up"], undecided, names, (entries, known)),
             _by_offline(qualified, verdict["cheapest"], names),
         ]
     headline = renamed(verdict["headline"], names)
@@ -137,9 +158,9 @@ def _by_latency(
     runner_up: str | None,
     undecided: Sequence[str],
     names: Mapping[str, str],
-    entries: Sequence[Entry],
-    costs: Costs | None,
+    others: tuple[Sequence[Entry], FullOrder | None],
 ) -> Ranking:
+    entries, known = others
     first = qualified[0]
     second = next((e for e in qualified if e.label == runner_up), None)
     picks = [_pick("fastest", first, names)]
@@ -157,18 +178,47 @@ def _by_latency(
         ratio = number(fastest.latency_ms / first.latency_ms)
         sentence += f" It is {ratio} times as fast as the full-order model"
         exact = min(full_order, key=lambda e: e.error)
-        sentence += f" ({names[fastest.label]}"
+        sentence += f" ({_marked(fastest, names)}"
         if exact is not fastest:
             times = number(exact.latency_ms / first.latency_ms)
-            sentence += f"; {times} times as {names[exact.label]}"
+            sentence += f"; {times} times as {_marked(exact, names)}"
         sentence += ")."
+        sentence += _interval_of_pair(known, fastest.method, first.method)
         if fastest in qualified:
             sentence += " The full-order model itself meets the needs."
-    paid = [line.break_even for line in costs.lines if line.label == first.label] if costs else []
-    if paid and paid[0] is not None:
-        sentence += f" With data and fit, it costs less than that after {whole(paid[0])} queries "
-        sentence += "(fits of other configurations left out)."
+    sentence += _pays_off(known, first)
     return Ranking("latency", f"Take {names[first.label]}", picks, sentence)
+
+
+def _marked(entry: Entry, names: Mapping[str, str]) -> str:
+    """Mark a configuration whose timing is not stable, as the tables do."""
+    return names[entry.label] + ("~" if entry.unstable else "")
+
+
+def _interval_of_pair(known: FullOrder | None, full_order: str, method: str) -> str:
+    """State the gain over the full-order model at the required error, with its interval."""
+    pairs = known.pairs if known else ()
+    pair = next((p for p in pairs if (p["a"], p["b"]) == (full_order, method)), None)
+    if pair is None or None in (pair["ratio"], pair["low"], pair["high"]):
+        return ""
+    ends = f"{number(pair['low'])}–{number(pair['high'])}"
+    at = percent(pair["target_rel_l2_median"])
+    return f" Interpolated at {at} %: {number(pair['ratio'])} times ({ends})."
+
+
+def _pays_off(known: FullOrder | None, first: Entry) -> str:
+    """State after how many queries the winner is cheaper in total than the full-order model."""
+    lines = known.costs.lines if known and known.costs else []
+    line = next((line for line in lines if line.label == first.label), None)
+    if known is None or line is None or line.break_even is None:
+        return ""
+    records = (r for r in known.break_even if r["label"] == first.label)
+    tuned = next((r["queries_with_tuning"] for r in records), None)
+    n = first.row.n_train + (first.row.n_validation or 0)
+    samples = f"{whole(n)} samples ({number(line.data)} core-s) and the" if line.data else "its"
+    text = f" Including {samples} fit, it is cheaper in total than the full-order model after "
+    text += f"{whole(line.break_even)} queries"
+    return f"{text} ({whole(tuned)} with tuning)." if tuned is not None else f"{text}."
 
 
 def _by_offline(
@@ -197,7 +247,8 @@ def _pick(part: str, entry: Entry, names: Mapping[str, str]) -> Pick:
         names[entry.label],
         percent(entry.figure("error", "rel_l2_median")),
         _interval(entry, "rel_l2_median", percent),
-        ". ".join(filter(None, (_error_tail(entry), _latency_tail(entry)))),
+        _error_tail(entry),
+        _latency_tail(entry),
         number(entry.figure("latency_ms", "median")),
         _interval(entry, "latency_ms", number),
         offline_text(entry),
@@ -209,20 +260,13 @@ def _error_tail(entry: Entry) -> str:
     p95, worst = (entry.figure("error", name) for name in ("rel_l2_p95", "rel_l2_max"))
     if p95 is None or worst is None:
         return ""
-    text = f"19 of 20 test loads: at most {percent(p95)} %; worst: {percent(worst)} %"
-    largest, amplitude = (entry.figure("error", name) for name in ("max_nodal_m", "amplitude_m"))
-    if largest is None or amplitude is None:
-        return text
-    return (
-        f"{text}. Largest error of a node: {number(1e3 * largest)} mm, where nodes move up to "
-        f"{number(1e3 * amplitude)} mm"
-    )
+    return f"19 of 20 test loads: at most {percent(p95)} %; worst: {percent(worst)} %"
 
 
 def _latency_tail(entry: Entry) -> str:
     """State the latency of slow queries."""
     p99 = entry.figure("latency_ms", "p99")
-    return "" if p99 is None else f"99 of 100 queries: at most {number(p99)} ms"
+    return "" if p99 is None else f"99 of 100 queries: at most {number(p99)} ms."
 
 
 def _interval(entry: Entry, name: str, shown: Callable[[float | None], str]) -> str:

@@ -41,15 +41,18 @@ BELOW_RANKS = 1 / 30
 SIGMA = "singular values σᵢ / σ₁"
 TAIL = "left out by r modes: √(Σ σᵢ² over i > r / Σ σᵢ²)"
 
+ROOM_PT = 270.0
+"""Height of the axes, about."""
+
 STEP_PT = 14.0
-"""Distance between the markers of two methods that tested the same rank."""
+"""Distance between the rows of markers of two methods, above the axis."""
 
 CAPTION = (
     "Grey: singular values σᵢ of the training snapshots relative to the largest. Black: the "
     "root of the energy that r modes leave out. It is the relative root-mean-square error "
     "of the best linear basis of r modes on the training snapshots. On these snapshots, "
-    "no method with a linear basis of r modes can be more accurate. Markers below the black line: "
-    "the methods that tried this rank."
+    "no method with a linear basis of r modes can be more accurate. Markers at the bottom: "
+    "the methods that tried this rank; their height has no meaning."
 )
 
 
@@ -125,6 +128,9 @@ def draw_singular_values(axes: Axes, spectrum: Spectrum, entries: Sequence[Entry
     tested = sorted({rank for ranks in used.values() for rank in ranks})
     shown = [float(tail[rank - 1]) for rank in tested] or tail.tolist()
     bottom = max(BELOW_RANKS * min(shown, default=1.0), ROUND_OFF)
+    part = min(0.6, (len(used) + 0.5) * STEP_PT / ROOM_PT)
+    strip = (2.5 / bottom) ** (-part / (1 - part))  # free room below the curves, for the markers
+    bottom *= strip
     axes.set_ylim(100 * bottom, 250)
     last = int(np.argmax(tail < bottom)) if (tail < bottom).any() else len(sigma)
     axes.set_xlim(0.85, 1.15 * max(last, 2))
@@ -139,11 +145,12 @@ def draw_singular_values(axes: Axes, spectrum: Spectrum, entries: Sequence[Entry
         Note(f"r{rank}: {percent(y / 100)} %", [(x, y)], offsets=above)
         for rank, (x, y) in zip(tested, points, strict=True)
     ]
-    notes += _method_names(used, tail)
+    notes += _method_names(used, 100 * bottom)
     if last < len(sigma):
         text = f"falls to {percent(float(tail.min()))} % at {len(tail):,} →"
         end = (axes.get_xlim()[1], 100 * bottom)
-        notes.insert(0, Note(text, [end], offsets=((-6, 8),), must=True))
+        above_strip = (-6, STEP_PT * (len(used) + 0.5))
+        notes.insert(0, Note(text, [end], offsets=(above_strip,), must=True))
     for text, curve, colour in (("left out by r modes", tail, INK), ("σᵢ / σ₁", sigma, GREY)):
         places = [(float(i), 100 * float(curve[i - 1])) for i in range(2, min(len(curve), last))]
         notes.append(Note(text, places[:: max(1, len(places) // 30)], colour, "bold"))
@@ -164,24 +171,26 @@ def _ranks(entries: Sequence[Entry], most: int) -> dict[str, list[int]]:
 def _draw_ranks(
     axes: Axes, used: dict[str, list[int]], tail: NDArray[np.float64]
 ) -> list[tuple[float, float]]:
-    """Mark ranks with a dot on the curve, and with each method's marker below it.
+    """Mark ranks with a dot on the curve, and with each method's marker in a row above the axis.
 
     Return the places of all marks in data coordinates.
     """
     figure = axes.get_figure(root=True)
     assert figure is not None
-    markers = []
+    markers, curve = [], list[tuple[float, float]]()
     for place, (method, ranks) in enumerate(used.items()):
         style = style_of(method)
         y = 100 * tail[np.subtract(ranks, 1)]
         axes.plot(ranks, y, "o", color=INK, ms=5, zorder=4)
-        down = ScaledTranslation(0, -STEP_PT * (place + 1) / 72, figure.dpi_scale_trans)
-        (marks,) = axes.plot(ranks, y, style.marker, zorder=5, label=method)
+        up = ScaledTranslation(0, STEP_PT * (place + 0.7) / 72, figure.dpi_scale_trans)
+        low = np.full(len(ranks), axes.get_ylim()[0])
+        (marks,) = axes.plot(ranks, low, style.marker, zorder=5, label=method)
         marks.set(ms=8, mec="white", mew=0.5, mfc=style.colour)
-        marks.set_transform(axes.transData + down)
-        markers.append((marks, np.column_stack([ranks, y])))
-    lay_out(figure)  # the layout decides how far down the markers are
-    found = [xy for _, xy in markers]
+        marks.set_transform(axes.transData + up)
+        curve += [(float(rank), float(height)) for rank, height in zip(ranks, y, strict=True)]
+        markers.append((marks, np.column_stack([ranks, low])))
+    lay_out(figure)  # the layout decides how high the markers are
+    found = [np.array(curve).reshape(-1, 2)]
     found += [
         axes.transData.inverted().transform(marks.get_transform().transform(xy))
         for marks, xy in markers
@@ -189,12 +198,12 @@ def _draw_ranks(
     return [(float(x), float(y)) for xy in found for x, y in xy]
 
 
-def _method_names(used: dict[str, list[int]], tail: NDArray[np.float64]) -> list[Note]:
+def _method_names(used: dict[str, list[int]], bottom: float) -> list[Note]:
     """Label each method's markers at one of its ranks, the largest first."""
     notes = []
     for place, (method, ranks) in enumerate(used.items()):
-        places = [(float(rank), 100 * float(tail[rank - 1])) for rank in ranks[::-1]]
-        low = -STEP_PT * (place + 1) + 6
+        places = [(float(rank), bottom) for rank in ranks[::-1]]
+        low = STEP_PT * (place + 0.7) - 5.5
         colour, name = readable(style_of(method).colour), shortened(method, 30)
         beside = ((9.0, low), (-9.0, low))
         notes.append(Note(name, places, colour, "bold", beside, leader=False))

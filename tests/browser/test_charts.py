@@ -173,3 +173,35 @@ def test_a_search_without_a_hit_says_so(open_page: Visit) -> None:
     assert status.inner_text().startswith("No configuration matches")
     page.get_by_label("find").fill("")
     assert status.inner_text() == ""
+
+
+def test_the_first_screen_holds_the_verdict_and_its_doubts(open_page: Visit) -> None:
+    for selector in (".verdict", ".pick dl", ".mesh", ".stability", ".card pre", ".frontier .plot"):
+        box = open_page.page.locator(f".first {selector}").first.bounding_box()
+        assert box is not None
+        assert box["y"] + box["height"] <= 900, selector
+    hidden = "(e) => e.scrollHeight - e.clientHeight"
+    assert open_page.page.locator(".card pre").first.evaluate(hidden) <= 2
+
+
+def test_no_figure_breaks_in_print(open_page: Visit) -> None:
+    open_page.page.emulate_media(media="print")
+    open_page.page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+    broken = open_page.page.evaluate(
+        r"""() => [...document.querySelectorAll("main td")].flatMap((cell) => {
+            const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT);
+            const found = [];
+            while (walker.nextNode()) {
+                const text = walker.currentNode, words = /\d[\d.,eE+–-]*/g;
+                for (const match of text.data.matchAll(words)) {
+                    const range = document.createRange();
+                    range.setStart(text, match.index);
+                    range.setEnd(text, match.index + match[0].length);
+                    const tops = new Set([...range.getClientRects()].map((b) => Math.round(b.y)));
+                    if (tops.size > 1) found.push(match[0]);
+                }
+            }
+            return found;
+        })"""
+    )
+    assert broken == []

@@ -47,7 +47,10 @@
   // A link into a folded part opens it.
   const unfold = () => {
     const part = document.getElementById(window.location.hash.slice(1));
-    if (part instanceof HTMLDetailsElement) part.open = true;
+    const folded = part?.closest("details");
+    if (!folded) return;
+    folded.open = true;
+    part.scrollIntoView();
   };
   window.addEventListener("hashchange", unfold);
   unfold();
