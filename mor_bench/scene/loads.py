@@ -312,10 +312,9 @@ def _points_of(n_corners: int, m: int) -> tuple[NDArray[np.float64], NDArray[np.
     x = np.append((i + 1 / 3)[up] / m, (i + 2 / 3)[down] / m)
     y = np.append((j + 1 / 3)[up] / m, (j + 2 / 3)[down] / m)
     if n_corners == 6:
-        # A part that points down is turned by half a turn.
+        # Parts that point down have the same second moments, so the same points serve them.
         away = (DEGREE_2 - 1 / 3) / m
-        turns = np.append(np.ones(up.sum()), -np.ones(down.sum()))
-        at = np.stack([x, y], axis=1)[:, None] + turns[:, None, None] * away
+        at = np.stack([x, y], axis=1)[:, None] + away
         return quadratic_triangle(at.reshape(-1, 2))
     gradients = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
     return np.stack([1 - x - y, x, y], axis=1), np.tile(gradients, (len(x), 1, 1))
