@@ -48,6 +48,7 @@ from mor_bench.mechanics.rotated import (
     condition_number,
     conjugate_gradients,
 )
+from mor_bench.mechanics.warping import warp_of
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import NO_EQUATIONS, NO_FORCES, SolverName
 
@@ -76,6 +77,8 @@ MAX_BAND_ENTRIES = 1e8
 
 PCG_FROM = 3000
 """Number of unknowns above which conjugate gradients beat a banded factor per Newton step."""
+WARP_FROM = 10_000
+"""Number of unknowns from which large responses are bent; smaller meshes keep all digits."""
 JACOBI_ITERATIONS = 20_000
 CERTIFY_TOLERANCE = 1e-2
 REST_TOLERANCE = 1e-12
@@ -279,10 +282,14 @@ class FullOrderModel:
     @cached_property
     def turned_rest(self) -> RotatedRest:
         """An approximate inverse of all tangents, R K₀⁻¹ Rᵀ; needs a banded or multigrid factor."""
-        factor = self.rest_factor
+        factor, pattern, warp = self.rest_factor, self.assembler.pattern, None
         assert isinstance(factor, BandedFactor | MultigridFactor)
-        single, pattern = factor.single_precision(), self.assembler.pattern
-        return RotatedRest(single, pattern, self.turning_cells, self.moving_frames)
+        single, cells = factor.single_precision(), self.turning_cells
+        banded = isinstance(factor, BandedFactor) and self.moving_frames is None
+        if self.n_unknowns >= WARP_FROM and banded:
+            place = single.place[::3] // 3
+            warp = warp_of(self._points, self.scene.mesh.cells, cells, pattern, place)
+        return RotatedRest(single, pattern, cells, self.moving_frames, warp)
 
     @property
     def moving_frames(self) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:

@@ -11,13 +11,17 @@ from scipy.sparse import linalg as sp_linalg
 
 from mor_bench.counting import count
 from mor_bench.errors import SolverError
+from mor_bench.mechanics.cycles import Cycle, level_of
 from mor_bench.mechanics.pattern import Pattern
+from mor_bench.mechanics.rotated import multiply
 
 CYCLE_TOLERANCE = 1e-12
 """Relative residual of a solve by multigrid."""
 ACCEPTED_RESIDUAL = 1e-8
 """Relative residual that is accepted where round-off prevents a smaller one."""
 MAX_CYCLES = 300
+COARSEST = 200
+"""Largest number of aggregates on the coarsest level, whose matrix is inverted."""
 
 
 class Multigrid:
@@ -54,7 +58,7 @@ class Multigrid:
 class MultigridFactor:
     """A multigrid hierarchy.
 
-    One V-cycle in float32 is the preconditioner. A solve uses conjugate gradients with it.
+    One W-cycle in float32 is the preconditioner. A solve uses conjugate gradients with it.
     """
 
     def __init__(
@@ -66,8 +70,7 @@ class MultigridFactor:
     ) -> None:
         from pyamg import smoothed_aggregation_solver
 
-        self._pattern, matrix = pattern, pattern.whole.symmetric(pattern.complete(values))
-        self._matrix = sp.csr_matrix(matrix).tobsr(blocksize=(3, 3))
+        self._pattern, self._values = pattern, pattern.complete(values)
         x = points - points.mean(axis=0)
         motions = np.zeros((len(points), 3, 6))
         motions[:, :, :3] = np.eye(3)
@@ -76,34 +79,22 @@ class MultigridFactor:
         if frames is not None:
             motions[frames[0]] = frames[1] @ motions[frames[0]]
         near_null = pattern.pad(pattern.cut(motions.reshape(-1, 6)))
-        # The coarsest matrix of plates and other ill-conditioned bodies may be indefinite
-        # in single precision, or even in double precision.
-        for dtype, coarse in (
-            (np.float32, "cholesky"),
-            (np.float64, "cholesky"),
-            (np.float64, "pinv"),
-        ):
-            levels: Any = smoothed_aggregation_solver(
-                self._matrix.astype(dtype),
+        blocks = sp.csr_matrix(pattern.whole.symmetric(self._values)).tobsr(blocksize=(3, 3))
+        # Matrices of plates and other ill-conditioned bodies may be indefinite in single precision.
+        for dtype in (np.float32, np.float64):
+            hierarchy: Any = smoothed_aggregation_solver(
+                blocks.astype(dtype),
                 B=near_null.astype(dtype),
                 strength=None,
                 improve_candidates=None,
-                max_coarse=500,
-                presmoother=("block_gauss_seidel", {"sweep": "forward"}),
-                postsmoother=("block_gauss_seidel", {"sweep": "backward"}),
-                coarse_solver=coarse,
+                max_coarse=COARSEST,
+            ).levels
+            coarsest = hierarchy[-1].A.toarray().astype(np.float64)
+            self._cycle = Cycle(
+                [level_of(level.A, level.P, dtype) for level in hierarchy[:-1]],
+                np.linalg.pinv(coarsest, rcond=1e-14, hermitian=True).astype(dtype),
             )
-            self._cycle, self._dtype = levels.aspreconditioner(), dtype
-            # A cycle has three sweeps over each level's matrix (smoother, residual, smoother), the
-            # transfers, and the coarsest solve.
-            transfers = sum(
-                3 * level.A.nnz + level.R.nnz + level.P.nnz for level in levels.levels[:-1]
-            )
-            self._cycle_multiply_adds = int(transfers + levels.levels[-1].A.shape[0] ** 2)
-            try:
-                response = self._cycle @ np.ones(pattern.whole.n, dtype)
-            except np.linalg.LinAlgError:
-                continue
+            response = self._cycle(np.ones(pattern.whole.n, dtype))
             if np.isfinite(response).all() and response.sum() > 0:
                 break
         self.place = np.arange(pattern.whole.n)
@@ -112,30 +103,39 @@ class MultigridFactor:
         return self
 
     def solve_in_place(self, x: NDArray[np.float32]) -> None:
-        count(back_solves=len(x), multiply_adds=len(x) * self._cycle_multiply_adds)
+        count(back_solves=len(x), multiply_adds=len(x) * self._cycle.multiply_adds)
         for row in x:
-            row[:] = self._cycle @ row.astype(self._dtype)
+            row[:] = self._cycle(row.astype(self._cycle.dtype))
 
     def solve(self, rhs: NDArray[np.float64]) -> NDArray[np.float64]:
         if rhs.ndim == 2:
             return np.stack([self.solve(column) for column in rhs.T], axis=1)
+        whole, n = self._pattern.whole, self._pattern.whole.n
         rhs, scale = self._pattern.pad(rhs), float(np.abs(rhs).max()) or 1.0
+
+        def product(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            y = np.empty(n)
+            multiply(whole.indptr, whole.indices, self._values, x.ravel(), y)
+            return y
 
         def one_cycle(residual: NDArray[np.float64]) -> NDArray[Any]:
             # A cycle, a product with the matrix, and six with vectors.
             count(
                 back_solves=1,
-                multiply_adds=self._cycle_multiply_adds + self._matrix.nnz + 6 * len(rhs),
+                multiply_adds=self._cycle.multiply_adds + 2 * len(self._values) + 5 * n,
             )
-            return np.asarray(self._cycle @ residual.astype(self._dtype))
+            return np.asarray(self._cycle(residual.ravel().astype(self._cycle.dtype)))
 
-        cycle = sp_linalg.LinearOperator(self._matrix.shape, one_cycle, dtype=np.float64)
+        matrix, cycle = (
+            sp_linalg.LinearOperator((n, n), apply, dtype=np.float64)
+            for apply in (product, one_cycle)
+        )
         solution, failed = sp_linalg.cg(
-            self._matrix, rhs / scale, rtol=CYCLE_TOLERANCE, maxiter=MAX_CYCLES, M=cycle
+            matrix, rhs / scale, rtol=CYCLE_TOLERANCE, maxiter=MAX_CYCLES, M=cycle
         )
         missed = 0.0
         if failed:
-            left = self._matrix @ solution - rhs / scale
+            left = product(solution) - rhs / scale
             missed = float(np.linalg.norm(left) / np.linalg.norm(rhs / scale))
         if not missed <= ACCEPTED_RESIDUAL:
             raise SolverError(

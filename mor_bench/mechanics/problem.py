@@ -36,6 +36,10 @@ class Turning(Protocol):
         """Return the rotated response at rest to a random force; soft modes dominate it."""
         ...
 
+    def bent(self, q: Array) -> Array | None:
+        """Return a linear response q with true rotations; None if that is not worth it."""
+        ...
+
     def solve_many(self, residuals: Sequence[Array], rotations: Sequence[Array]) -> Array:
         """Return corrections (m, n_unknowns), each for one residual under its own rotations.
 

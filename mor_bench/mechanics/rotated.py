@@ -23,6 +23,7 @@ from mor_bench.counting import count, is_counting, uncounted
 from mor_bench.mechanics.linear import Factor, NotPositiveDefiniteError
 from mor_bench.mechanics.pattern import Pattern
 from mor_bench.mechanics.turned import along_axes, in_frames
+from mor_bench.mechanics.warping import Warp
 
 Array = NDArray[np.float64]
 
@@ -205,6 +206,8 @@ class RotatedRest:
         cells' centres, 1/m. (n_cells,) float64: volumes of the cells, m³.
     frames : tuple of arrays, optional
         Indices (n,) of nodes whose vectors are in a frame, and its axes (n, 3, 3), as rows.
+    warp : Warp, optional
+        Bends linear responses.
     """
 
     def __init__(
@@ -213,8 +216,10 @@ class RotatedRest:
         pattern: Pattern,
         cells: tuple[NDArray[np.int32], Array, Array],
         frames: tuple[NDArray[np.int64], Array] | None = None,
+        warp: Warp | None = None,
     ) -> None:
         self._factor, self._pattern, self.frames = factor, pattern, frames
+        self._warp = warp
         self._place = np.ascontiguousarray(factor.place[::3] // 3)
         self.cells = cells
         self._identity = np.tile(np.eye(3), (len(self._place) + 1, 1, 1))
@@ -236,6 +241,11 @@ class RotatedRest:
         # The terms count components of the cells' nodes, nodes, and iterations.
         count(multiply_adds=4 * self.cells[1].size + 20 * len(self._place) + 40 * int(iterations))
         return rotations if self.frames is None else in_frames(rotations, *self.frames)
+
+    def bent(self, q: Array) -> Array | None:
+        """Return a linear response q (n,), m, with true rotations; None without a warp."""
+        warp = self._warp
+        return None if warp is None else self._pattern.cut(warp(self.at_nodes(q)).ravel())
 
     def solve_many(self, residuals: Sequence[Array], rotations: Sequence[Array]) -> Array:
         """Return approximate displacements (m, n), m, under forces (n,), N.

@@ -1,6 +1,8 @@
 """The whole nonlinear solve beside other finite-element codes, under one dead load.
 
     python -m tests.benchmarks.peers --dataset beam-coarse --loads 5 --rounds 3
+    python -m tests.benchmarks.peers --dataset beam-fine --amplitude 0.5 --amplitude 2 \\
+        --peer "felupe, Pardiso"
 
 Every contender gets the same nodes, 8-node hexahedra with 2 x 2 x 2 Gauss points, supports and
 nodal forces, the Saint Venant-Kirchhoff law, plain Newton from zero displacement, and the same
@@ -145,6 +147,33 @@ def pick_loads(scene: Scene, n: int) -> tuple[list[int], Array]:
     return chosen.tolist(), drawn[chosen].nodal_forces(scene.patch_weights)
 
 
+def bending_loads(scene: Scene, amplitudes: Sequence[float]) -> Array:
+    """Return uniform loads (n, n_nodes, 3), N, on the face x-max that move it so far, m.
+
+    They point along y. Each is found to 0.1 % by a secant in the size of the load.
+    """
+    x, free, model = scene.mesh.points, scene.free_dofs, FullOrderModel(scene)
+    on_end = np.isclose(x[:, 0], x[:, 0].max())
+    corners = on_end[scene.mesh.cells]
+    facets = scene.mesh.cells[corners.sum(axis=1) == 4], corners[corners.sum(axis=1) == 4]
+    weights = np.bincount(facets[0][facets[1]], minlength=len(x)).astype(float)
+    unit = np.zeros_like(x)
+    unit[:, 1] = weights / weights.sum()
+
+    def moved(size: float) -> float:
+        u = np.zeros(scene.mesh.n_dofs)
+        u[free] = model.solve(size * unit.ravel()[free]).displacement
+        return float(np.linalg.norm(u.reshape(-1, 3)[on_end].mean(axis=0)))
+
+    size, found, loads = 1e-3, moved(1e-3), []
+    for amplitude in sorted(amplitudes):
+        while abs(found - amplitude) > 1e-3 * amplitude:
+            size *= amplitude / found
+            found = moved(size)
+        loads.append(size * unit)
+    return np.stack(loads)
+
+
 def compare(scene: Scene, forces: Array, contenders: Sequence[Contender], rounds: int) -> list[Row]:
     """Time the contenders and check what they answer.
 
@@ -235,11 +264,18 @@ def installed_entries(console: Console, solvers: Sequence[str]) -> list[Entry]:
 
 
 def compare_on(
-    name: str, entries: Sequence[Entry], options: TimingOptions, console: Console
+    name: str,
+    entries: Sequence[Entry],
+    amplitudes: Sequence[float],
+    options: TimingOptions,
+    console: Console,
 ) -> dict[str, Any]:
     """Compare on one dataset, print the tables, and return their content."""
     scene = mor_bench.load_scene(name)
-    samples, forces = pick_loads(scene, options.loads)
+    if amplitudes:
+        samples, forces = list(range(len(amplitudes))), bending_loads(scene, amplitudes)
+    else:
+        samples, forces = pick_loads(scene, options.loads)
     norms = [float(np.linalg.norm(load.ravel()[scene.free_dofs])) for load in forces]
     console.rule(
         f"{name}: {scene.mesh.n_cells} cells, {len(scene.free_dofs)} unknowns, "
@@ -255,7 +291,8 @@ def compare_on(
         {**vars(row), "times_as_long": float(np.median(row.medians_ms / rows[0].medians_ms))}
         for row in rows
     ]
-    return {"samples": samples, "load_norms_n": norms, "contenders": contenders}
+    chosen = {"amplitudes_m": sorted(amplitudes)} if amplitudes else {"samples": samples}
+    return {**chosen, "load_norms_n": norms, "contenders": contenders}
 
 
 @with_options
@@ -270,6 +307,18 @@ def main(
         list[str] | None,
         typer.Option(help=f"Our solvers; by default {', '.join(OWN_SOLVERS)}.", show_default=False),
     ] = None,
+    amplitude: Annotated[
+        list[float] | None,
+        typer.Option(
+            help="Instead of the dataset's loads: one on the end face that moves it so far, m. "
+            "Repeat for more.",
+            show_default=False,
+        ),
+    ] = None,
+    peer: Annotated[
+        list[str] | None,
+        typer.Option(help="Only these peers, by label; by default all.", show_default=False),
+    ] = None,
     *,
     options: TimingOptions,
 ) -> None:
@@ -277,8 +326,10 @@ def main(
     pin_threads("tests.benchmarks.peers", options.threads)
     console = Console()
     entries = installed_entries(console, solver or OWN_SOLVERS)
-    names = dataset or ["beam-coarse", "beam-fine"]
-    options.write({"datasets": {n: compare_on(n, entries, options, console) for n in names}})
+    if peer is not None:
+        entries = [one for one in entries if one not in PEERS or one.label in peer]
+    names, far = dataset or ["beam-coarse", "beam-fine"], amplitude or []
+    options.write({"datasets": {n: compare_on(n, entries, far, options, console) for n in names}})
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from mor_bench.errors import (
 from mor_bench.hard_cases.setups import LAW, dense, distorted_box, free_assembler
 from mor_bench.mechanics.assembly import Assembler, Discretisation
 from mor_bench.mechanics.banded import BandedCholesky
+from mor_bench.mechanics.cycles import Cycle, level_of
 from mor_bench.mechanics.linear import (
     NotPositiveDefiniteError,
     SparseLU,
@@ -249,3 +250,57 @@ def test_a_load_has_the_same_answer_alone_and_among_others(large: FullOrderModel
         for name in ("min_det_f", "iterations", "cuts"):
             assert getattr(alone, name) == getattr(among, name)
     assert refused == 1
+
+
+def beam_across(across: int) -> FullOrderModel:
+    spec = mor_bench.load_scene("beam-coarse").spec.model_dump(mode="json")
+    box = {"shape": "box", "size_m": [4.0, 1.0, 1.0], "cells": [4 * across, across, across]}
+    return FullOrderModel(mor_bench.load_scene({**spec, "geometry": box}))
+
+
+def test_a_multigrid_cycle_is_symmetric_and_as_good_on_finer_meshes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A fourfold number of unknowns takes at most a third more iterations."""
+    monkeypatch.setattr("mor_bench.mechanics.model.MAX_BAND_ENTRIES", 0)
+    monkeypatch.setattr("mor_bench.mechanics.multigrid.COARSEST", 6)
+    iterations, rng = [], np.random.default_rng(0)
+    for across in (5, 8):
+        model = beam_across(across)
+        factor = model.rest_factor
+        assert isinstance(factor, MultigridFactor)
+        x = rng.normal(size=(2, model.n_unknowns)).astype(np.float32)
+        answers = x.copy()
+        factor.solve_in_place(answers)
+        work, back = float(x[0] @ answers[1]), float(x[1] @ answers[0])
+        assert abs(work - back) <= 1e-4 * np.linalg.norm(x[0]) * np.linalg.norm(answers[1])
+        iterations.append(model.solve(tip_load(model.scene, 0.5)).iterations)
+    assert iterations[1] <= 4 / 3 * iterations[0]
+
+
+def test_a_multigrid_cycle_equals_its_definition_with_dense_matrices() -> None:
+    """Sweeps by L + D and D + Lᵀ in blocks of 3, and two cycles of the next level."""
+    model, rng = FullOrderModel(mor_bench.load_scene("beam-tiny")), np.random.default_rng(0)
+    matrices = [dense(model.assembler, model.rest_tangent)]
+    transfers = [rng.normal(size=shape) for shape in ((len(matrices[0]), 60), (60, 18))]
+    for P in transfers:
+        matrices.append(P.T @ matrices[-1] @ P)
+
+    def defined(depth: int, b: Array) -> Array:
+        if depth == 2:
+            return np.linalg.solve(matrices[2], b)
+        A, P = matrices[depth], transfers[depth]
+        node = np.arange(len(b)) // 3
+        forward = np.where(node[:, None] >= node, A, 0.0)
+        x = np.linalg.solve(forward, b)
+        coarse = P.T @ (b - A @ x)
+        found = defined(depth + 1, coarse)
+        if depth == 0:
+            found = found + defined(1, coarse - matrices[1] @ found)
+        x = x + P @ found
+        return np.asarray(x + np.linalg.solve(forward.T, b - A @ x))
+
+    levels = [level_of(A, P, np.float64) for A, P in zip(matrices, transfers, strict=False)]
+    cycle, b = Cycle(levels, np.linalg.inv(matrices[2])), rng.normal(size=len(matrices[0]))
+    wanted = defined(0, b)
+    np.testing.assert_allclose(cycle(b), wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
