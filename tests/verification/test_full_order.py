@@ -288,7 +288,7 @@ def test_a_multigrid_cycle_equals_its_definition_with_dense_matrices() -> None:
 
     def defined(depth: int, b: Array) -> Array:
         if depth == 2:
-            return np.linalg.solve(matrices[2], b)
+            return np.asarray(np.linalg.solve(matrices[2], b), dtype=np.float64)
         A, P = matrices[depth], transfers[depth]
         node = np.arange(len(b)) // 3
         forward = np.where(node[:, None] >= node, A, 0.0)
