@@ -38,7 +38,7 @@ TAGS = {
 ATTRIBUTES = {
     *("charset", "name", "content", "http-equiv", "lang", "class", "colspan", "rowspan", "alt"),
     *("src", "href", "id", "type", "checked", "data-told", "value", "scope", "tabindex", "role"),
-    *("aria-label", "aria-labelledby", "data-chart", "data-index", "method", "rel"),
+    *("aria-label", "aria-labelledby", "data-by", "data-chart", "data-index", "method", "rel"),
 }
 
 

@@ -266,7 +266,10 @@ BAD: list[tuple[Callable[[Arrays], Arrays], str]] = [
     (with_(displacements=lambda u: u[:-1]), r"`displacements` must have .* got \(209, 63, 3\)"),
     (with_(points=lambda x: x[:, :2]), r"`points` must have shape \(any, 3\); got \(63, 2\)"),
     (with_(points=lambda x: 1.0), r"`points` must have shape \(any, 3\); got \(\)"),
-    (with_(cells=lambda c: c[:, :6]), r"shape \(any, 8\) or \(any, 4\); got \(24, 6\)"),
+    (
+        with_(cells=lambda c: c[:, :6]),
+        r"shape \(any, 8\) or \(any, 4\) or \(any, 10\); got \(24, 6\)",
+    ),
     (with_(cells=lambda c: c.astype(float)), "`cells` must hold integers; got dtype float64"),
     (with_(forces=lambda f: f.astype(complex)), "must hold real numbers; got dtype complex128"),
     (with_(forces=lambda f: f.astype(str)), "`forces` must hold real numbers; got dtype <U"),

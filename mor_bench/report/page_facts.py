@@ -190,8 +190,9 @@ def protocol_of(comparison: Comparison, dataset: str, entries: Sequence[Entry]) 
 def _patches(spec: Mapping[str, Any], entries: Sequence[Entry]) -> str:
     """Count the load patches of each part of a split by region; empty for other splits."""
     row = next((entry.row for entry in entries if entry.ran), None)
-    each = (spec.get("loads") or {}).get("samples_per_patch")
-    if row is None or row.split != "region" or not each:
+    loads = spec.get("loads")
+    each = loads.get("samples_per_patch") if isinstance(loads, dict) else None
+    if row is None or row.split != "region" or not isinstance(each, int) or each < 1:
         return ""
     parts = {"training": row.n_train, "validation": row.n_validation, "test": row.n_test}
     counts = [f"{n // each} {part}" for part, n in parts.items() if n]
