@@ -187,13 +187,12 @@ class CurvedProblem(DenseProblem):
         return *self._state(q, c, slopes, whole), (tangents, forces)
 
 
-def curved_system(
-    model: FullOrderModel, modes: Array, states: list[tuple[Array, Array]]
-) -> Array:
+def curved_system(model: FullOrderModel, modes: Array, states: list[tuple[Array, Array]]) -> Array:
     """Return the training matrix of a cubature on the manifold, compressed by QR.
 
-    G[(s, i), e] = (D_sᵀ Φᵀ)ᵢ f_e(u_s); the target is G·1. Jain, Tiso: Hyper-reduction over nonlinear
-    manifolds for large nonlinear mechanical systems, J. Comput. Nonlinear Dynam. 14 (2019).
+    G[(s, i), e] = (D_sᵀ Φᵀ)ᵢ f_e(u_s); the target is G·1. Jain, Tiso: Hyper-reduction over
+    nonlinear manifolds for large nonlinear mechanical systems, J. Comput. Nonlinear Dynam. 14
+    (2019).
 
     Parameters
     ----------

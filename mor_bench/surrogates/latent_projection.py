@@ -70,8 +70,9 @@ class LatentLSPG(LatentGalerkin):
 
     def prepare(self, scene: Scene, model: Arrays) -> None:
         super().prepare(scene, model)
-        sampled = self.curved_.sampled
-        lower = np.linalg.cholesky(sampled.rest_tangent) if self.weighting == "stiffness" else None
+        sampled, lower = self.curved_.sampled, None
+        if self.weighting == "stiffness":
+            lower = np.linalg.cholesky(sampled.rest_tangent).astype(np.float64, copy=False)
         self.weighting_ = Weighting(sampled.modes, lower)
 
     def solve(self, load: CurvedLoad) -> Array:

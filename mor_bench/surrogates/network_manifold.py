@@ -50,7 +50,9 @@ class NetworkManifold(CurvedPOD):
         scale = float(np.sqrt((coordinates[:, n_latent:] ** 2).sum(axis=1).mean()))
         device, known = device_of(self.training), (coordinates / sizes, coordinates / scale)
         named_data = dict(
-            zip(("inputs", "outputs", "weights"), (*known, coordinate_weights(samples)), strict=True)
+            zip(
+                ("inputs", "outputs", "weights"), (*known, coordinate_weights(samples)), strict=True
+            )
         )
         data = {
             name: torch.from_numpy(array.astype(np.float32)).to(device)
@@ -82,9 +84,7 @@ class NetworkManifold(CurvedPOD):
     def _n_outputs(self, n_latent: int, n_coordinates: int) -> int:
         return n_coordinates if self.encodes else n_coordinates - n_latent
 
-    def _loss(
-        self, networks: list[Perceptron], data: dict[str, Tensor], linear: Tensor
-    ) -> Loss:
+    def _loss(self, networks: list[Perceptron], data: dict[str, Tensor], linear: Tensor) -> Loss:
         x, wanted, weights = data["inputs"], data["outputs"], data["weights"]
         decoder, r = networks[0], len(linear)
         nothing, first = torch.zeros_like(x[:1]), wanted.shape[1] - decoder.weights[-1].shape[1]
@@ -101,7 +101,8 @@ class NetworkManifold(CurvedPOD):
             missing = wanted[rows, first:] - (decoder(z) - at_rest - slope)
             if first == 0:
                 missing = missing - nn.functional.pad(z * linear, (0, wanted.shape[1] - r))
-            return ((missing * weights[rows]) ** 2).sum(dim=1).mean()
+            mean: Tensor = ((missing * weights[rows]) ** 2).sum(dim=1).mean()
+            return mean
 
         return loss
 
