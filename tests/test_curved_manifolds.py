@@ -33,7 +33,7 @@ def network_map(flat: bool) -> NetworkMap:
     return NetworkMap([rng.normal(size=shape) for shape in shapes], 8, flat)
 
 
-MAPS = {
+MAPS: dict[str, CoordinateMap] = {
     "quadratic": quadratic_map(),
     "network": network_map(False),
     "flat network": network_map(True),
@@ -42,7 +42,7 @@ MAPS = {
 
 @pytest.mark.parametrize("name", MAPS)
 def test_slopes_and_curvatures_are_derivatives_of_the_map(name: str) -> None:
-    curve: CoordinateMap = MAPS[name]
+    curve = MAPS[name]
     rng, h = np.random.default_rng(2), 1e-5
     q, weights = rng.normal(size=3), rng.normal(size=8)
     c, slopes = curve.at(q)
@@ -131,7 +131,7 @@ def test_the_curve_lowers_the_error_of_the_flat_space(name: str, tiny: Dataset) 
 
 def test_a_cubature_on_the_manifold_keeps_few_cells_and_the_answer(tiny: Dataset) -> None:
     whole = NAMES["quadratic-manifold-pod"]
-    few = whole | {"cubature_tolerance": 1e-3}
+    few = whole | {"cubature_tolerance": 0.05}
     methods = [
         mor_bench.load_method("quadratic-manifold-pod", **parameters).fit(tiny.scene, tiny.train)
         for parameters in (whole, few)
@@ -140,4 +140,4 @@ def test_a_cubature_on_the_manifold_keeps_few_cells_and_the_answer(tiny: Dataset
     assert cells[1] < cells[0] == tiny.scene.mesh.n_cells
     full, sampled = (method.predict(tiny.test.forces[:20]) for method in methods)
     off = np.linalg.norm(sampled - full, axis=(1, 2)) / np.linalg.norm(full, axis=(1, 2))
-    assert np.median(off) < 0.01
+    assert np.median(off) < 0.05
