@@ -80,7 +80,17 @@ _FAMILIES: dict[str, tuple[_Shades, tuple[str, ...]]] = {
     ),
     "projection": (
         (("#005B94", "#56B4E9"), ("#0080C7", "#9ACFF2"), ("#00385C", "#2E9BD9")),
-        ("pod", "local-pod", "pod-tensor", "modal-derivatives", "quadratic-manifold"),
+        (
+            "pod",
+            "local-pod",
+            "pod-tensor",
+            "modal-derivatives",
+            "quadratic-manifold",
+            "quadratic-manifold-pod",
+            "pod-ann",
+            "latent-galerkin",
+            "latent-lspg",
+        ),
     ),
     "hyper-reduction": (
         (("#D55E00", "#FF9248"), ("#973F00", "#FFBE94"), ("#EA5B2B", "#F2701A")),
