@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -141,8 +141,17 @@ def _descent(problem: Problem, q: Array, tangent: Array, residual: Array) -> tup
     return problem.rest_factor.solve(residual), False
 
 
-def _damped(problem: Problem, load: Array, start: Array, tolerance: float) -> Attempt:
-    """Descend on the potential W(q) - f·q from a valid state, never leaving det F > 0."""
+def damped_steps(
+    problem: Problem,
+    load: Array,
+    start: Array,
+    tolerance: float,
+    size_of: Callable[[Array], float] | None = None,
+) -> Attempt:
+    """Descend on the potential W(q) - f·q from a valid state, never leaving det F > 0.
+
+    The tolerance is relative to the norm of the load, or to ``size_of(q)`` where it is given.
+    """
     load_norm = float(np.linalg.norm(load))
     q, before = start, np.inf
     for iteration in range(1, DAMPED_ITERATIONS + 1):
@@ -151,7 +160,8 @@ def _damped(problem: Problem, load: Array, start: Array, tolerance: float) -> At
         step, stable = _descent(problem, q, tangent, residual)
         size = float(np.linalg.norm(residual))
         floor, before = problem.extent if size > 0.5 * before else 0.0, size
-        if stable and (size <= tolerance * load_norm or is_round_off(step, q, floor)):
+        allowed = tolerance * (load_norm if size_of is None else size_of(q))
+        if stable and (size <= allowed or is_round_off(step, q, floor)):
             return Attempt(q, state.min_det_f, iteration, converged=_is_certified(problem, q))
         slope, work = float(residual @ step), float(load @ q)
         potential, noise = state.energy_j - work, 1e-14 * (state.energy_j + abs(work))
@@ -281,13 +291,13 @@ def _by_newton(
     if first.valid:
         return Solution(first.q, first.min_det_f, iterations, 0)
     if start is not None:  # it may lie on a branch that cannot be reached from rest
-        attempt = _damped(problem, load, start, options.tolerance)
+        attempt = damped_steps(problem, load, start, options.tolerance)
         iterations += attempt.iterations
         if attempt.valid:
             return Solution(attempt.q, attempt.min_det_f, iterations, 0)
     q, steps = np.zeros(problem.n_unknowns), LoadSteps(0.5)
     while True:
-        attempt = _damped(problem, steps.target * load, q, options.tolerance)
+        attempt = damped_steps(problem, steps.target * load, q, options.tolerance)
         iterations += attempt.iterations
         if attempt.valid:
             q = attempt.q

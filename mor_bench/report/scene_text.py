@@ -10,11 +10,13 @@ from mor_bench.report.number_format import number
 from mor_bench.specs import (
     AnyLoads,
     ChamberedGeometry,
+    Contact,
     DatasetSpec,
     Loads,
     Motion,
     PointSetRegion,
     Region,
+    SphereInstrument,
     TubeGeometry,
     load_recorded_spec,
 )
@@ -112,6 +114,12 @@ def _loads(loads: AnyLoads) -> str:
     ends = f"{low:g} to {high:g} {loads.unit}"
     if isinstance(loads, Motion):
         return f"a tool on {_regions([loads.region])} that moves by {ends}"
+    if isinstance(loads, Contact):
+        shape = "sphere" if isinstance(loads.instrument, SphereInstrument) else "plane"
+        return (
+            f"a rigid {shape} that touches {_regions([loads.region])} without friction and moves "
+            f"by {ends}"
+        )
     if not isinstance(loads, Loads):
         kind = "following" if loads.follower else "dead"
         return f"{kind} pressures of {ends} on {_regions(loads.regions)}"

@@ -72,6 +72,8 @@ def _generated(spec: DatasetSpec) -> str:
         loaded = f"{len(scene.patch_nodes)} load patches"
         if scene.motion and scene.observed_nodes is not None:
             loaded = f"{len(scene.observed_nodes)} moved nodes"
+        if scene.contact and scene.observed_nodes is not None:
+            loaded = f"{len(scene.observed_nodes)} nodes to touch"
         if scene.pressure:
             loaded = f"{len(scene.pressure.regions)} pressed regions"
         samples = f"{loaded}, {n_samples_of(scene)} samples"

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.scene.body import build_body
+from mor_bench.scene.contact_surface import ContactSurface, contact_surface, touched_nodes
 from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets, Patches, cut_patches, pressed_patches, spread_out
@@ -29,6 +30,7 @@ from mor_bench.scene.springs import Springs, foundations
 from mor_bench.specs import (
     AXES,
     AnyDatasetSpec,
+    Contact,
     DatasetSpec,
     ImportedDatasetSpec,
     Motion,
@@ -123,12 +125,17 @@ class Scene:
     def observed_nodes(self) -> NDArray[np.int64] | None:
         """(n_observed,) sorted nodes with given displacements; None if forces are given.
 
+        Where an instrument presses, these are the nodes that it may touch. The displacement of the
+        instrument is given there, not that of the nodes.
+
         Raises
         ------
         SpecError
-            If the region has no free node of the surface, or contains every free node; or if a
-            moved region has a node of a support.
+            If the region has no free node of the surface, or contains every free node; if a moved
+            region has a node of a support; or for problems of an instrument.
         """
+        if self.contact:
+            return touched_nodes(self.contact, self.contact_surface, self.fixed_dofs)
         if self.motion:
             return moved_nodes(self._cloud, self.motion, self.fixed_dofs)
         if self.spec.observed is None:
@@ -139,6 +146,20 @@ class Scene:
     def motion(self) -> Motion | None:
         """The plan of prescribed displacements; None if the scene has another or no plan."""
         return self.spec.motion if isinstance(self.spec, DatasetSpec) else None
+
+    @property
+    def contact(self) -> Contact | None:
+        """The plan of an instrument that presses; None if the scene has another or no plan."""
+        loads = self.spec.loads if isinstance(self.spec, DatasetSpec) else None
+        return loads if isinstance(loads, Contact) else None
+
+    @cached_property
+    def contact_surface(self) -> ContactSurface:
+        """The surface that an instrument may touch; `SpecError` for problems of the instrument."""
+        if self.contact is None or self.material is None:
+            raise UnsupportedSceneError(f"{self.name}: no instrument presses it.")
+        young, facets = self.material.young_at_rest, self.loaded_facets
+        return contact_surface(self.contact, self.surface, facets, self.mesh, young)
 
     @cached_property
     def surface(self) -> Facets:
@@ -194,13 +215,16 @@ class Scene:
 
         The index of a patch here is its load-region id. On a mesh's own boundary the points are
         nodes. A moved tool counts as one patch, at one of its nodes; a pressure as three, at the
-        middle of its region.
+        middle of its region. So does an instrument, at the point nearest to it.
         """
         loads = self.generated.load_plan
         if isinstance(loads, Pressure):
             regions = [self._surface_points(region) for region in loads.regions]
             middles = [self.surface.points[region].mean(axis=0) for region in regions]
             return np.repeat(np.concatenate([self._surface_point(m) for m in middles]), 3)
+        if isinstance(loads, Contact):
+            surface = self.contact_surface
+            return self._surface_point(surface.points[surface.gaps_at_rest.argmin()])
         if isinstance(loads, Motion):
             assert self.observed_nodes is not None
             points = self.mesh.points[self.observed_nodes]
@@ -237,7 +261,7 @@ class Scene:
     def patches(self) -> Patches:
         """The load patches as points of the surface with areas."""
         plan = self.generated.load_plan
-        if isinstance(plan, Motion):
+        if isinstance(plan, Motion | Contact):
             raise UnsupportedSceneError(f"{self.name}: a tool moves the body; it has no patches.")
         if isinstance(plan, Pressure):
             return pressed_patches(self.surface, self.pressed_facets)
@@ -277,10 +301,11 @@ class Scene:
         """(n_patches, n_nodes) nodal weights of a force on each patch; rows sum to 1.
 
         They are the consistent load of a uniform traction. An embedded surface passes it to the
-        nodes of the surrounding cells. For a moved tool they are 1 at each of its nodes. For a
-        pressure they are components of area vectors, m².
+        nodes of the surrounding cells. For a moved tool they are 1 at each of its nodes, and for an
+        instrument at each node that it may touch. For a pressure they are components of area
+        vectors, m².
         """
-        if self.motion:
+        if self.motion or self.contact:
             assert self.observed_nodes is not None
             columns = self.observed_nodes, np.array([0, len(self.observed_nodes)])
             moved = np.ones(len(self.observed_nodes)), *columns
@@ -305,7 +330,7 @@ class Scene:
             except SpecError as problem:
                 problems.append(str(problem))
         if problems:
-            raise SpecError(" ".join(problems))
+            raise SpecError(" ".join(dict.fromkeys(problems)))
         return self
 
 

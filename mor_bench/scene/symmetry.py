@@ -41,8 +41,10 @@ def mirrors(scene: Scene) -> list[Mirror]:
     """Return the mirror planes of a scene with its loaded nodes, at most one per axis.
 
     The image of a solution solves the image of its load, because laws are isotropic or their fibres
-    have an image too.
+    have an image too. A scene with an instrument has no plane: its image is another instrument.
     """
+    if scene.contact:
+        return []
     points, cells = scene.mesh.points, scene.mesh.cells
     low, high = points.min(axis=0), points.max(axis=0)
     near = SAME_PLACE * np.linalg.norm(high - low)

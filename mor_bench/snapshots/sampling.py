@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from mor_bench.errors import SpecError
+from mor_bench.scene.contact_surface import unit
 from mor_bench.scene.scene import Scene
-from mor_bench.specs import MAX_COUNT, Loads, Motion, Pressure, Sampling
+from mor_bench.specs import MAX_COUNT, Contact, Loads, Motion, Pressure, Sampling
 
 MAX_COMBINATIONS = 5_000_000
 """Largest number of listed combinations of patches. With three patches each, they need 120 MB."""
@@ -108,6 +109,8 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
     loads, numbers = scene.generated.load_plan, np.arange(start, stop)
     if isinstance(loads, Pressure):
         return _pressures(loads, numbers)
+    if isinstance(loads, Contact):
+        return _instrument_motions(loads, numbers)
     chosen, k = _combinations(scene), loads.simultaneous
     if chosen is None:
         patches = np.stack([_apart(scene, int(i)) for i in numbers])
@@ -132,16 +135,35 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
 def _pressures(loads: Pressure, numbers: NDArray[np.int64]) -> PatchLoads:
     """Return pressures, as the forces -p e_i on three patches of each region."""
     d = len(loads.regions)
-    if loads.sampling == "random":
-        drawn = [np.random.default_rng([loads.seed, int(i)]).uniform(size=d) for i in numbers]
-        unit = np.reshape(drawn, (len(numbers), d))
-    else:
-        unit = _design(loads.sampling, (loads.seed,), loads.samples, d)[numbers]
     low, high = loads.magnitude
-    pressures = low + (high - low) * unit
+    pressures = low + (high - low) * _in_unit_cube(loads, numbers, d)
     vectors = -pressures[:, :, None, None] * np.eye(3)
     patches = np.tile(np.arange(3 * d), (len(numbers), 1))
     return PatchLoads(patches, vectors.reshape(len(numbers), 3 * d, 3))
+
+
+def _instrument_motions(loads: Contact, numbers: NDArray[np.int64]) -> PatchLoads:
+    """Return displacements of an instrument, in directions uniform on a cap of the sphere."""
+    drawn = _in_unit_cube(loads, numbers, 3)
+    axis = unit(loads.direction)
+    first, second = (found[0, 0] for found in _tangents(axis[None, None]))
+    height = 1.0 - drawn[:, 0] * (1.0 - np.cos(np.deg2rad(loads.spread_deg)))
+    radius, angle = np.sqrt(np.maximum(1.0 - height**2, 0.0)), 2 * np.pi * drawn[:, 1]
+    around = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
+    low, high = loads.magnitude
+    size = low + (high - low) * drawn[:, 2]
+    vectors = size[:, None] * (height[:, None] * axis + radius[:, None] * around)
+    return PatchLoads(np.zeros((len(numbers), 1), dtype=np.int64), vectors[:, None])
+
+
+def _in_unit_cube(
+    loads: Pressure | Contact, numbers: NDArray[np.int64], d: int
+) -> NDArray[np.float64]:
+    """Return the coordinates (n, d) of samples that all act on the same regions."""
+    if loads.sampling == "random":
+        drawn = [np.random.default_rng([loads.seed, int(i)]).uniform(size=d) for i in numbers]
+        return np.reshape(drawn, (len(numbers), d))
+    return _design(loads.sampling, (loads.seed,), loads.samples, d)[numbers]
 
 
 def _combinations(scene: Scene) -> NDArray[np.int64] | None:

@@ -57,6 +57,8 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
         return "its file names no `tests.paper_magnitude_n`"
     if name == "unseen-directions" and spec.load_plan.kind == "pressure":
         return "a pressure has one direction"
+    if name == "unseen-directions" and spec.load_plan.kind == "contact":
+        return "its directions are those of an instrument, around `loads.direction`"
     if name == "unseen-directions" and spec.load_plan.kind in ("force", "displacement"):
         return (
             "its directions are all over the sphere; "

@@ -10,6 +10,7 @@ Start reading with `dataset_spec.py` and `method_spec.py`; `spec_files.py` reads
 from mor_bench.specs.base import MAX_COUNT
 from mor_bench.specs.battery import Battery, Race
 from mor_bench.specs.dataset_spec import (
+    CONTACT,
     NO_EQUATIONS,
     NO_FORCES,
     AnyDatasetSpec,
@@ -27,9 +28,11 @@ from mor_bench.specs.geometry_spec import (
     TubeGeometry,
     VoxelsGeometry,
 )
+from mor_bench.specs.instrument_spec import Instrument, PlaneInstrument, SphereInstrument
 from mor_bench.specs.loads_spec import (
     AXES,
     AnyLoads,
+    Contact,
     Loads,
     Motion,
     Pressure,
@@ -67,6 +70,7 @@ from mor_bench.specs.suite_folder import find_suite, list_suite
 
 __all__ = [
     "AXES",
+    "CONTACT",
     "MAX_COUNT",
     "NO_EQUATIONS",
     "NO_FORCES",
@@ -77,10 +81,12 @@ __all__ = [
     "BoxGeometry",
     "BoxRegion",
     "ChamberedGeometry",
+    "Contact",
     "DatasetSpec",
     "FibreMaterial",
     "FileGeometry",
     "ImportedDatasetSpec",
+    "Instrument",
     "LShapeGeometry",
     "Loads",
     "MethodSpec",
@@ -90,6 +96,7 @@ __all__ = [
     "NearestRegion",
     "Observed",
     "OgdenMaterial",
+    "PlaneInstrument",
     "PointSetRegion",
     "Pressure",
     "Race",
@@ -97,6 +104,7 @@ __all__ = [
     "Sampling",
     "SolverName",
     "SourceFile",
+    "SphereInstrument",
     "SphereRegion",
     "Split",
     "SplitBy",
