@@ -30,11 +30,12 @@ SHIPPED = {
     "liver-hex": (726, 1118, 200, 2000),
     "liver-hex-observed": (726, 1118, 200, 2000),
     "liver-grasped": (726, 1118, 12, 2000),
+    "liver-pressed": (726, 1118, 422, 1000),
     "artery-pressure": (384, 600, 2, 2000),
     "soft-arm": (692, 1276, 4, 500),
     "liver-tet": (4567, 1118, 200, 2000),
 }
-"""Cells, nodes, load patches, moved nodes or pressed regions, and samples of each dataset."""
+"""Cells, nodes, load patches (or moved nodes, pressed regions, nodes to touch), and samples."""
 
 LARGE = [name for name in SHIPPED if name.startswith(("beam-fine", "liver"))]
 
@@ -46,6 +47,7 @@ def test_every_shipped_dataset_has_its_pinned_counts(name: str) -> None:
     counts, _, warning = check_file(list_suite("datasets")[name]).partition("; warning: ")
     cells, nodes, patches, samples = SHIPPED[name]
     kinds = {"displacement": "moved nodes", "pressure": "pressed regions"}
+    kinds["contact"] = "nodes to touch"
     loaded = kinds.get(load_generated_spec(name).load_plan.kind, "load patches")
     expected = f"{cells} cells, {nodes} nodes, {patches} {loaded}, {samples} samples"
     assert counts == f"dataset, {expected}"
@@ -153,7 +155,7 @@ loads.magnitude_n = [0.0, 1e-300] -> `loads.magnitude_n[1]` must be greater than
 loads.samples_per_patch = 1000000000000000000 -> must be less than or equal to 10000000
 loads.samples_per_patch = 0 -> `loads.samples_per_patch` must be greater than or equal to 1
 loads.seed = -1 -> `loads.seed` must be greater than or equal to 0; got -1.
-loads.kind = "x" -> `loads.kind` must be 'force', 'normal', 'tangential', 'displacement' or
+loads.kind = "x" -> `loads.kind` must be 'force', 'normal', 'tangential', 'displacement', 'pressure' or
 split.by = "patch" -> `split.by` must be 'region', 'sample' or 'direction'; got 'patch'.
 split.test_fraction = 1.0 -> `split.test_fraction` must be less than 1; got 1.0.
 needs.error = true -> `needs.error` must be a valid number; got True.

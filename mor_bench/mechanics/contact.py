@@ -18,15 +18,26 @@ from mor_bench.mechanics.assembly import State
 from mor_bench.mechanics.contact_points import ContactPoints, NodalContact, Touch, motion_of
 from mor_bench.mechanics.load_steps import LoadSteps
 from mor_bench.mechanics.model import FullOrderModel
-from mor_bench.mechanics.newton import NewtonOptions, Solution, damped_steps
-from mor_bench.mechanics.problem import Problem
+from mor_bench.mechanics.newton import NewtonOptions, Solution, descent, is_certified
+from mor_bench.mechanics.problem import Attempt, Problem, is_round_off
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import SolverName
 
 Array = NDArray[np.float64]
 
+ITERATIONS = 60
+"""Largest number of Newton iterations in one step of the instrument."""
+
 MOST_ITERATIONS = 1000
 """Largest number of Newton iterations, over all steps of the instrument."""
+
+MAX_HALVINGS = 14
+ARMIJO = 1e-4
+LEVEL = 0.9
+"""Slope of the potential at the end of a step, relative to its begin, that accepts the step.
+
+At small strains, round-off in the energy hides its descent. The slope does not suffer from that.
+"""
 
 
 class PressedProblem(Problem, Protocol):
@@ -59,11 +70,10 @@ def solve_contact(
     options : NewtonOptions
         The tolerance is relative to the norm of the contact's force.
     """
-    nothing, q = np.zeros(model.n_unknowns), np.zeros(model.n_unknowns)
-    steps, spent = LoadSteps(first_step), 0
+    q, steps, spent = np.zeros(model.n_unknowns), LoadSteps(first_step), 0
     while True:
         placed = model.under(steps.target * motion)
-        found = damped_steps(placed, nothing, q, options.tolerance, placed.contact_size)
+        found = _settled(placed, q, options.tolerance)
         spent += found.iterations
         if found.valid:
             q = found.q
@@ -78,6 +88,34 @@ def solve_contact(
             if found.min_det_f <= 0:
                 return InvertedElementError(f"elements invert: {story}.", cuts=steps.cuts)
             return NoEquilibriumError(f"no stable equilibrium found: {story}.", cuts=steps.cuts)
+
+
+def _settled(model: PressedProblem, start: Array, tolerance: float) -> Attempt:
+    """Descend on the potential of body and contact from a valid state, never leaving det F > 0."""
+    if not start.any() and not model.contact_size(start):  # exactly at rest
+        return Attempt(start, model.force(start).min_det_f, 1, converged=True)
+    q, before = start, np.inf
+    for iteration in range(1, ITERATIONS + 1):
+        state, tangent = model.linearise(q)
+        residual = -state.force
+        step, stable = descent(model, q, tangent, residual)
+        size = float(np.linalg.norm(residual))
+        floor, before = model.extent if size > 0.5 * before else 0.0, size
+        small = size <= tolerance * model.contact_size(q) or is_round_off(step, q, floor)
+        if stable and small:
+            return Attempt(q, state.min_det_f, iteration, converged=is_certified(model, q))
+        slope = float(residual @ step)
+        for halving in range(MAX_HALVINGS):
+            length = 0.5**halving
+            trial = model.force(q + length * step)
+            descends = trial.energy_j <= state.energy_j - ARMIJO * length * slope
+            levels = abs(float(trial.force @ step)) <= LEVEL * slope
+            if trial.min_det_f > 0 and (descends or levels):
+                break
+        else:
+            return Attempt(q, trial.min_det_f, iteration, converged=False)
+        q = q + length * step
+    return Attempt(q, trial.min_det_f, ITERATIONS, converged=False)
 
 
 class ContactModel(FullOrderModel):

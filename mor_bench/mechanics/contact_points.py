@@ -181,8 +181,9 @@ class ContactMap:
     def blocks(self, touch: Touch, curved: bool = True) -> Array:
         """Return each touching point's stiffness over its dofs, (n_touching, d, d), N/m."""
         values, width = self._values[touch.points], 3 * self._values.shape[1]
-        own = np.einsum("pa,pb,pij->paibj", values, values, touch.blocks(curved), optimize=True)
-        count(multiply_adds=2 * own.size)
+        pairs = values[:, :, None, None, None] * values[:, None, None, :, None]
+        own = pairs * touch.blocks(curved)[:, None, :, None, :]
+        count(multiply_adds=own.size)
         return np.asarray(own.reshape(-1, width, width))
 
 

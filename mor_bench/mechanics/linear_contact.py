@@ -28,8 +28,8 @@ class LinearContact:
     """K₀ u = f(u), with the stiffness at rest K₀ and the contact's forces f.
 
     With the compliance C = K₀⁻¹ at the dofs that the instrument may touch, u = C f. Newton's steps
-    solve (1 + C K) δ = C f - u, where K is the contact's stiffness at the few dofs that touch. It
-    leaves out the curvature of the instrument, so that each step descends on the potential.
+    solve (1 + C K) δ = C f - u, where K is the contact's stiffness at the few dofs that touch. K
+    leaves out the curvature of the instrument where a step would not descend on the potential.
 
     Parameters
     ----------
@@ -87,24 +87,36 @@ class LinearContact:
     def _settled(self, motion: Array, forces: Array) -> Array:
         """Iterate from the forces (n,), N, at another place of the instrument."""
         u = self._flexibility @ forces
+        touch = self._contact.touch(u, motion)
         for _ in range(MAX_ITERATIONS):
-            touch = self._contact.touch(u, motion)
             wanted = self._contact.force(touch)
             excess = wanted - forces
             if float(np.linalg.norm(excess)) <= TOLERANCE * float(np.linalg.norm(wanted)):
                 return wanted
-            change = self._newton(touch, wanted, excess) - forces
-            step = self._flexibility @ change
-            count(multiply_adds=2 * self._flexibility.size)
-            forces, u = self._searched(motion, (forces, u), (change, step))
+            for curved in (True, False):
+                change = self._newton(touch, wanted, excess, curved) - forces
+                step = self._flexibility @ change
+                count(multiply_adds=self._flexibility.size)
+                if (slope := float(excess @ step)) > 0:
+                    break
+            before = 0.5 * float(forces @ u) + touch.energy_j
+            for halving in range(MAX_HALVINGS):
+                length = 0.5**halving
+                other, moved = forces + length * change, u + length * step
+                touch = self._contact.touch(moved, motion)
+                left = float((self._contact.force(touch) - other) @ step)
+                if 0.5 * float(other @ moved) + touch.energy_j <= before or abs(left) <= slope:
+                    break
+            forces, u = other, moved
         raise NoEquilibriumError(
             f"{self.scene.name}: linear elasticity with contact did not converge in "
             f"{MAX_ITERATIONS} iterations."
         )
 
-    def _newton(self, touch: Touch, wanted: Array, excess: Array) -> Array:
+    def _newton(self, touch: Touch, wanted: Array, excess: Array, curved: bool) -> Array:
         """Return the forces of the equilibrium with the contact linearised."""
-        own = self._contact.dofs[touch.points].reshape(len(touch.points), -1)
+        dofs = self._contact.dofs
+        own = dofs[touch.points].reshape(-1, 3 * dofs.shape[1])
         used = np.unique(own)
         used = used[used < len(wanted)]
         if not len(used):
@@ -113,7 +125,7 @@ class LinearContact:
         place[used] = np.arange(len(used))
         local, size = place[own], len(used) + 1
         at = (local[:, :, None] * size + local[:, None, :]).ravel()
-        blocks = self._contact.blocks(touch, curved=False).ravel()
+        blocks = self._contact.blocks(touch, curved).ravel()
         stiffness = np.bincount(at, blocks, size**2).reshape(size, size)[:-1, :-1]
         compliance = self._flexibility[np.ix_(used, used)]
         system = np.eye(len(used)) + compliance @ stiffness
@@ -122,18 +134,3 @@ class LinearContact:
         found = wanted.copy()
         found[used] -= stiffness @ moved
         return found
-
-    def _searched(
-        self, motion: Array, state: tuple[Array, Array], change: tuple[Array, Array]
-    ) -> tuple[Array, Array]:
-        """Return forces and displacements along a change that lowers the potential."""
-        before = self._potential(motion, *state)
-        for halving in range(MAX_HALVINGS):
-            length = 0.5**halving
-            forces, u = (old + length * new for old, new in zip(state, change, strict=True))
-            if self._potential(motion, forces, u) <= before * (1 + 1e-14):
-                break
-        return forces, u
-
-    def _potential(self, motion: Array, forces: Array, u: Array) -> float:
-        return 0.5 * float(forces @ u) + self._contact.touch(u, motion).energy_j

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,7 +83,8 @@ def _forcing(size: float, before: float, target: float) -> float:
     return 0.1 if size <= target else min(0.1, max(0.9 * (size / before) ** 2, 0.3 * target / size))
 
 
-def _is_certified(problem: Problem, q: Array) -> bool:
+def is_certified(problem: Problem, q: Array) -> bool:
+    """Return whether no negative curvature was found at a solution; see `Problem.certify`."""
     try:
         problem.certify(q)
     except NotPositiveDefiniteError:
@@ -102,7 +103,7 @@ def full_steps(problem: Problem, load: Array, start: Array | None, tolerance: fl
         if near:  # one more residual is cheap, and usually no further tangent is needed
             state = problem.force(q)
             if float(np.linalg.norm(load - state.force)) <= tolerance * load_norm:
-                return Attempt(q, state.min_det_f, iteration, converged=_is_certified(problem, q))
+                return Attempt(q, state.min_det_f, iteration, converged=is_certified(problem, q))
         state, tangent = problem.linearise(q)
         residual, min_det = load - state.force, state.min_det_f
         size = float(np.linalg.norm(residual))
@@ -114,16 +115,16 @@ def full_steps(problem: Problem, load: Array, start: Array | None, tolerance: fl
         except NotPositiveDefiniteError:
             break
         if size <= tolerance * load_norm:
-            return Attempt(q, min_det, iteration, converged=_is_certified(problem, q))
+            return Attempt(q, min_det, iteration, converged=is_certified(problem, q))
         floor = problem.extent if size > 0.5 * before else 0.0
         near, before = size <= np.sqrt(tolerance) * load_norm, size
         q = q + step
         if is_round_off(step, q, floor):
-            return Attempt(q, min_det, iteration, converged=_is_certified(problem, q))
+            return Attempt(q, min_det, iteration, converged=is_certified(problem, q))
     return Attempt(q, min_det, iteration, converged=False)
 
 
-def _descent(problem: Problem, q: Array, tangent: Array, residual: Array) -> tuple[Array, bool]:
+def descent(problem: Problem, q: Array, tangent: Array, residual: Array) -> tuple[Array, bool]:
     """Return a descent direction, and whether the tangent itself was positive definite.
 
     An indefinite tangent is shifted towards the rest-state stiffness until it is positive definite.
@@ -141,28 +142,18 @@ def _descent(problem: Problem, q: Array, tangent: Array, residual: Array) -> tup
     return problem.rest_factor.solve(residual), False
 
 
-def damped_steps(
-    problem: Problem,
-    load: Array,
-    start: Array,
-    tolerance: float,
-    size_of: Callable[[Array], float] | None = None,
-) -> Attempt:
-    """Descend on the potential W(q) - f·q from a valid state, never leaving det F > 0.
-
-    The tolerance is relative to the norm of the load, or to ``size_of(q)`` where it is given.
-    """
+def _damped(problem: Problem, load: Array, start: Array, tolerance: float) -> Attempt:
+    """Descend on the potential W(q) - f·q from a valid state, never leaving det F > 0."""
     load_norm = float(np.linalg.norm(load))
     q, before = start, np.inf
     for iteration in range(1, DAMPED_ITERATIONS + 1):
         state, tangent = problem.linearise(q)
         residual = load - state.force
-        step, stable = _descent(problem, q, tangent, residual)
+        step, stable = descent(problem, q, tangent, residual)
         size = float(np.linalg.norm(residual))
         floor, before = problem.extent if size > 0.5 * before else 0.0, size
-        allowed = tolerance * (load_norm if size_of is None else size_of(q))
-        if stable and (size <= allowed or is_round_off(step, q, floor)):
-            return Attempt(q, state.min_det_f, iteration, converged=_is_certified(problem, q))
+        if stable and (size <= tolerance * load_norm or is_round_off(step, q, floor)):
+            return Attempt(q, state.min_det_f, iteration, converged=is_certified(problem, q))
         slope, work = float(residual @ step), float(load @ q)
         potential, noise = state.energy_j - work, 1e-14 * (state.energy_j + abs(work))
         for halving in range(MAX_HALVINGS):
@@ -291,13 +282,13 @@ def _by_newton(
     if first.valid:
         return Solution(first.q, first.min_det_f, iterations, 0)
     if start is not None:  # it may lie on a branch that cannot be reached from rest
-        attempt = damped_steps(problem, load, start, options.tolerance)
+        attempt = _damped(problem, load, start, options.tolerance)
         iterations += attempt.iterations
         if attempt.valid:
             return Solution(attempt.q, attempt.min_det_f, iterations, 0)
     q, steps = np.zeros(problem.n_unknowns), LoadSteps(0.5)
     while True:
-        attempt = damped_steps(problem, steps.target * load, q, options.tolerance)
+        attempt = _damped(problem, steps.target * load, q, options.tolerance)
         iterations += attempt.iterations
         if attempt.valid:
             q = attempt.q

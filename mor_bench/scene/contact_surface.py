@@ -3,9 +3,11 @@
 The contact energy is Π = ½ ∫ k ⟨-g⟩² dA over the undeformed surface: g is the gap between the
 deformed surface and the instrument, ⟨x⟩ = max(x, 0), and k the penalty stiffness. The Gauss points
 of the facets integrate it: uniform pressures exactly, and the force changes smoothly where the edge
-of the contact crosses a facet. Points at the nodes alone would miss an instrument that is smaller
-than a facet. The penetration is the traction over k. By default k = `STIFFER` E / h, with Young's
-modulus E at rest and the mean size h of the facets.
+of the contact crosses a facet. With points at the nodes alone, the force of a small instrument
+would jump from node to node.
+
+The penetration is the traction over k. By default k = `STIFFER` E / h, with Young's modulus E at
+rest and the mean size h of the facets.
 
 Wriggers: Computational Contact Mechanics, 2nd edition (2006), sections 6.3.2 and 9.2.
 """
@@ -36,7 +38,10 @@ Young's modulus then penetrates by a thousandth of a facet."""
 ROUND_OFF = 1e-9
 """Penetration at rest, relative to the size of the touched region, that counts as round-off."""
 
-MAX_TURN = 0.5
+LEAST_RADIUS = 0.5
+"""Least radius of a sphere, in mean sizes of a facet. A smaller one slips between the points."""
+
+MAX_STEP = 0.5
 """Largest step of a sphere, in radii. The surface must never get past its centre."""
 
 
@@ -66,7 +71,7 @@ class Ball:
 
     @property
     def longest_step_m(self) -> float:
-        return MAX_TURN * self.radius
+        return MAX_STEP * self.radius
 
     def gaps(self, points: Array) -> tuple[Array, Array, Array]:
         away = points - self.centre
@@ -158,8 +163,8 @@ def contact_surface(
     Raises
     ------
     SpecError
-        If there is no facet; or for every problem of the instrument's place and motion: it
-        penetrates the facets at rest, or no motion reaches them.
+        If there is no facet; or for every problem of the instrument: it penetrates the facets at
+        rest, no motion reaches them, or it is much smaller than they are.
     """
     if len(facets) == 0:
         raise SpecError(
@@ -168,8 +173,16 @@ def contact_surface(
     points, vectors, shapes = surface_quadrature(surface, facets)
     areas = np.linalg.norm(vectors, axis=1)
     instrument = instrument_of(plan)
-    _check_place(plan, instrument, points, surface.points[facets])
-    penalty = plan.penalty_n_m3 or STIFFER * young_pa / np.sqrt(areas.sum() / len(facets))
+    size = float(np.sqrt(areas.sum() / len(facets)))
+    problems = [
+        *_misplaced(
+            plan, instrument, np.concatenate([points, surface.points[facets].reshape(-1, 3)])
+        ),
+        *_too_small(instrument, size),
+    ]
+    if problems:
+        raise SpecError(" ".join(problems))
+    penalty = plan.penalty_n_m3 or STIFFER * young_pa / size
     if surface.points is mesh.points:
         rows = np.repeat(np.arange(len(points)), shapes.shape[1])
         columns = np.repeat(facets, len(shapes), axis=0).ravel()
@@ -181,19 +194,31 @@ def contact_surface(
     return ContactSurface(instrument, points, values, penalty * areas, float(penalty))
 
 
-def _check_place(plan: Contact, instrument: Instrument, points: Array, corners: Array) -> None:
-    nearest = float(instrument.gaps(np.concatenate([points, corners.reshape(-1, 3)]))[0].min())
-    size = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
-    if nearest < -ROUND_OFF * size:
-        raise SpecError(
-            f"`loads.instrument` must not penetrate `loads.region` at rest; it does, by "
+def _misplaced(plan: Contact, instrument: Instrument, points: Array) -> list[str]:
+    """Return what is wrong with the place of an instrument near points (n, 3), m."""
+    nearest, farthest = float(instrument.gaps(points)[0].min()), plan.magnitude_m[1]
+    if nearest < -ROUND_OFF * float(np.ptp(points, axis=0).max()):
+        return [
+            "`loads.instrument` must not penetrate `loads.region` at rest; it does, by "
             f"{-nearest:.6g} m. Move it back by at least as much."
-        )
-    if nearest >= plan.magnitude_m[1]:
-        raise SpecError(
+        ]
+    if nearest >= farthest:
+        return [
             f"`loads.magnitude_m` must reach `loads.region`: the instrument is {nearest:.6g} m "
-            f"away from it and moves by at most {plan.magnitude_m[1]:g} m."
-        )
+            f"away from it and moves by at most {farthest:g} m."
+        ]
+    return []
+
+
+def _too_small(instrument: Instrument, size: float) -> list[str]:
+    """Return whether a ball is too small for facets of a mean size, m."""
+    if isinstance(instrument, Ball) and instrument.radius < LEAST_RADIUS * size:
+        return [
+            f"`loads.instrument.sphere.radius_m` must be at least {LEAST_RADIUS * size:.6g}, "
+            f"{LEAST_RADIUS:g} mean sizes of a facet of `loads.region`, or the mesh finer; "
+            f"got {instrument.radius:g}."
+        ]
+    return []
 
 
 def touched_nodes(
