@@ -245,6 +245,40 @@ def test_linear_elasticity_with_contact_is_the_limit_of_small_motions(
         response.to_coordinates(np.ones((len(scene.free_dofs), 1)))
 
 
+@pytest.mark.parametrize("instrument", [BALL, FLAT])
+def test_linear_elasticity_balances_the_contact_at_large_motions(
+    instrument: dict[str, Any],
+) -> None:
+    scene = block(instrument)
+    model, response = ContactModel(scene), LinearContact(scene)
+    stiffness = model.assembler.pattern.symmetric(model.rest_tangent)
+    for motion in ([0.05, -0.03, -0.1], [0.3, 0.3, -0.2], [0.0, 0.0, -0.3]):
+        u = response.respond(given(scene, motion).reshape(1, -1))[0, scene.free_dofs]
+        placed = model.under(np.array(motion))
+        # The force of the model is that of the body less that of the contact.
+        contact = FullOrderModel(scene).force(u).force - placed.force(u).force
+        excess = np.linalg.norm(stiffness @ u - contact)
+        assert excess < 1e-7 * np.linalg.norm(contact)
+        assert placed.reaction(u)[2] > 1.0
+
+
+def test_an_instrument_that_barely_touches_needs_no_smaller_steps() -> None:
+    """The energy of tiny strains is round-off, which must not stop the descent."""
+    scene = block({"sphere": {"radius_m": 5.0, "centre_m": [0.45, 0.55, 5.5]}})
+    model = ContactModel(scene)
+    nearest = scene.contact_surface.gaps_at_rest.min()
+    for depth in nearest + np.array([1e-8, 1e-7, 1e-6, 1e-5]):
+        values = given(scene, [0.0, 0.0, -depth]).ravel()[scene.free_dofs]
+        found = model.solve(values, options=TIGHT)
+        assert found.cuts == 0
+        assert found.iterations < 20
+        placed = model.under(np.array([0.0, 0.0, -depth]))
+        assert placed.reaction(found.displacement)[2] > 0
+        forces = placed.contact_size(found.displacement)
+        residual = np.linalg.norm(placed.force(found.displacement).force)
+        assert residual < 1e-5 * forces  # round-off of the strains
+
+
 @pytest.mark.parametrize("name", ["pod", "hpod", "ecm"])
 def test_reduced_models_with_all_modes_give_the_full_order_answer(name: str) -> None:
     scene = block(geometry={"shape": "box", "size_m": [1.0, 1.0, 0.5], "cells": [3, 3, 2]})
