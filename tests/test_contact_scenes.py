@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -171,12 +173,7 @@ def test_test_sets_and_texts(data: Dataset) -> None:
     assert dataset_family(spec) == "boxes of hexahedra, pressed by an instrument"
 
 
-def test_a_file_is_checked(tmp_path: Path) -> None:
-    path = tmp_path / "pressed.toml"
-    shipped = load_generated_spec("liver-pressed").model_dump(mode="json")
-    assert shipped["loads"]["kind"] == "contact"
-    path.write_text(
-        """title = "Block under a plane"
+FILE = """title = "Block under a plane"
 [geometry]
 shape = "box"
 size_m = [1.0, 1.0, 0.5]
@@ -196,10 +193,34 @@ magnitude_m = [0.0, 0.1]
 samples = 10
 [split]
 by = "sample"
-""",
-        encoding="utf-8",
-    )
+"""
+
+
+def test_a_file_is_checked(tmp_path: Path) -> None:
+    path = tmp_path / "pressed.toml"
+    shipped = load_generated_spec("liver-pressed").model_dump(mode="json")
+    assert shipped["loads"]["kind"] == "contact"
+    path.write_text(FILE, encoding="utf-8")
     assert check_file(path) == "dataset, 4 cells, 18 nodes, 9 nodes to touch, 10 samples"
+
+
+def test_a_check_finds_an_instrument_in_the_rest_state(tmp_path: Path) -> None:
+    path = tmp_path / "heavy.toml"
+    up = "acceleration_m_s2 = [0.0, 0.0, 9.81]"
+    path.write_text(f"{FILE}[gravity]\ndensity_kg_m3 = 10.0\n{up}\n", encoding="utf-8")
+    with pytest.raises(SpecError, match="at rest under gravity"):
+        check_file(path)
+
+
+@pytest.mark.slow
+def test_other_scenes_do_not_load_the_contact() -> None:
+    script = """
+import sys
+import mor_bench.mechanics.observed, mor_bench.surrogates.fem, mor_bench.surrogates.hpod
+import mor_bench.surrogates.linear_fem, mor_bench.surrogates.pod
+sys.exit(any("contact" in name.rpartition(".")[2] and "mechanics" in name for name in sys.modules))
+"""
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
 
 QUICK = sorted(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -191,7 +192,7 @@ class CoordinateRegression(Surrogate, ABC):
     def answer_observed(self, observed: ObservedDisplacements) -> Array:
         return self.answer(observed.values)
 
-    @property
+    @cached_property
     def _kinked(self) -> bool:
         """True if the response to the input is not linear, so that z is taken of the response."""
         return self.input == "linear-response" and self.scene_.contact is not None
