@@ -30,7 +30,7 @@ SHIPPED = {
     "liver-hex": (726, 1118, 200, 2000),
     "liver-hex-observed": (726, 1118, 200, 2000),
     "liver-grasped": (726, 1118, 12, 2000),
-    "liver-pressed": (726, 1118, 422, 1000),
+    "liver-pressed": (726, 1118, 422, 512),
     "artery-pressure": (384, 600, 2, 2000),
     "soft-arm": (692, 1276, 4, 500),
     "liver-tet": (4567, 1118, 200, 2000),

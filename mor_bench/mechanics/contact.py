@@ -113,6 +113,8 @@ def _settled(model: PressedProblem, start: Array, tolerance: float) -> Attempt:
             if trial.min_det_f > 0 and (descends or levels):
                 break
         else:
+            if stable and is_round_off(step, q, model.extent):  # nothing can descend any more
+                return Attempt(q, state.min_det_f, iteration, converged=is_certified(model, q))
             return Attempt(q, trial.min_det_f, iteration, converged=False)
         q = q + length * step
     return Attempt(q, trial.min_det_f, ITERATIONS, converged=False)

@@ -31,9 +31,9 @@ from mor_bench.specs import AXES, Contact, PlaneInstrument
 
 Array = NDArray[np.float64]
 
-STIFFER = 100.0
+STIFFER = 1000.0
 """Default penalty stiffness, in Young's moduli per mean size of a facet. A traction of a tenth of
-Young's modulus then penetrates by a thousandth of a facet."""
+Young's modulus then penetrates by a ten-thousandth of a facet."""
 
 ROUND_OFF = 1e-9
 """Penetration at rest, relative to the size of the touched region, that counts as round-off."""

@@ -34,10 +34,10 @@ def hertz_ratio(scene: Scene, depth: float) -> float:
     return float(4 * model.reaction(u)[2] / exact)  # a quarter of the ball
 
 
-def test_a_ball_on_a_large_block_feels_the_force_of_hertz_within_eight_percent() -> None:
+def test_a_ball_on_a_large_block_feels_the_force_of_hertz_within_ten_percent() -> None:
     errors = [hertz_ratio(graded(n, 32.0), 0.05) - 1 for n in (1, 2)]
     # Two cells per contact radius, and a block of 32 contact radii, which is stiffer by 2 percent.
-    assert 0.0 < errors[1] < 0.08
+    assert 0.0 < errors[1] < 0.1
     assert errors[1] < 0.5 * errors[0]
 
 
@@ -174,7 +174,7 @@ def test_a_stiffer_penalty_penetrates_less() -> None:
     orders = np.log10(np.divide(depths[:-1], depths[1:]))
     assert orders.min() > 0.5  # 1, if the traction did not depend on it
     default = block().contact_surface
-    assert default.penalty_n_m3 == pytest.approx(100 * YOUNG_PA / 0.25)
+    assert default.penalty_n_m3 == pytest.approx(1000 * YOUNG_PA / 0.25)
     assert default.stiffness.sum() == pytest.approx(default.penalty_n_m3)  # the area is 1 m²
 
 
