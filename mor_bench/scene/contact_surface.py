@@ -136,6 +136,11 @@ class ContactSurface:
         return self.instrument.gaps(self.points)[0]
 
     @property
+    def nearest(self) -> Array:
+        """The point (3,) nearest to the instrument at rest, m."""
+        return np.asarray(self.points[self.gaps_at_rest.argmin()])
+
+    @property
     def nodes(self) -> NDArray[np.int64]:
         """Nodes of the mesh that move the points, (n_touched,), sorted."""
         return np.unique(self.values.indices).astype(np.int64)

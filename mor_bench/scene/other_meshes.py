@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
-from mor_bench.scene.scene import Scene, by_node, scene_without_patches
+from mor_bench.scene.dofs import by_node
+from mor_bench.scene.scene import Scene, scene_without_patches
 from mor_bench.scene.subdivision import subdivide
 from mor_bench.specs import BoxGeometry, ChamberedGeometry, LShapeGeometry
 

@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from mor_bench.errors import SpecError, UnsupportedSceneError
 from mor_bench.scene.body import build_body
 from mor_bench.scene.contact_surface import ContactSurface, contact_surface, touched_nodes
-from mor_bench.scene.dofs import dofs_of_nodes
-from mor_bench.scene.interpolation import interpolation_matrix
+from mor_bench.scene.dofs import by_node, dofs_of_nodes
+from mor_bench.scene.interpolation import interpolation_matrix, rows_to_one
 from mor_bench.scene.loads import Facets, Patches, cut_patches, pressed_patches, spread_out
 from mor_bench.scene.materials import Material, make_material
 from mor_bench.scene.mesh import Mesh
@@ -125,8 +125,7 @@ class Scene:
     def observed_nodes(self) -> NDArray[np.int64] | None:
         """(n_observed,) sorted nodes with given displacements; None if forces are given.
 
-        Where an instrument presses, these are the nodes that it may touch. The displacement of the
-        instrument is given there, not that of the nodes.
+        Where an instrument presses, its displacement is given at the nodes that it may touch.
 
         Raises
         ------
@@ -223,8 +222,7 @@ class Scene:
             middles = [self.surface.points[region].mean(axis=0) for region in regions]
             return np.repeat(np.concatenate([self._surface_point(m) for m in middles]), 3)
         if isinstance(loads, Contact):
-            surface = self.contact_surface
-            return self._surface_point(surface.points[surface.gaps_at_rest.argmin()])
+            return self._surface_point(self.contact_surface.nearest)
         if isinstance(loads, Motion):
             assert self.observed_nodes is not None
             points = self.mesh.points[self.observed_nodes]
@@ -294,7 +292,7 @@ class Scene:
 
     def _weights(self, areas: sp.csr_array) -> sp.csr_array:
         """Return the weights of patches from their areas: shares, or those of a pressure."""
-        return areas if self.pressure else _rows_to_one(areas)
+        return areas if self.pressure else rows_to_one(areas)
 
     @cached_property
     def patch_weights(self) -> sp.csr_array:
@@ -332,10 +330,6 @@ class Scene:
         if problems:
             raise SpecError(" ".join(dict.fromkeys(problems)))
         return self
-
-
-def _rows_to_one(matrix: sp.csr_array) -> sp.csr_array:
-    return sp.csr_array(matrix.multiply(1.0 / matrix.sum(axis=1)[:, None]))
 
 
 def as_spec(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> AnyDatasetSpec:
@@ -403,9 +397,3 @@ def _in_elements(
     return (
         with_middles(mesh, point_sets) if (n_nodes, wanted.order) == (4, 2) else (mesh, point_sets)
     )
-
-
-def by_node(still: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return nodes without a free component, and held dofs of the others, from (n_nodes, 3)."""
-    fixed = np.all(still, axis=1, keepdims=True)
-    return np.flatnonzero(fixed), np.flatnonzero(still & ~fixed)

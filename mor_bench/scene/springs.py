@@ -84,9 +84,9 @@ def surface_quadrature(
         points = np.einsum("pa,fai->fpi", shapes, corners)
         vectors = np.repeat(normals[:, None] / 6.0, 3, axis=1)
     elif facets.shape[1] == 6:
-        shape, derivatives = quadratic_triangle(DEGREE_4)
+        shapes, derivatives = quadratic_triangle(DEGREE_4)
         along = np.einsum("pad,fai->dfpi", derivatives, corners)
-        points = np.einsum("pa,fai->fpi", shape, corners)
+        points = np.einsum("pa,fai->fpi", shapes, corners)
         vectors = np.cross(along[0], along[1]) * DEGREE_4_WEIGHTS[:, None]
     else:
         s, t = (a.ravel() for a in np.meshgrid(_X, _X))

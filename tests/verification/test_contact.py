@@ -85,12 +85,15 @@ def test_a_plane_compresses_a_block_as_the_closed_form_with_the_penalty(confined
     assert deepest == pytest.approx(traction(stretch) / penalty, rel=1e-8)
 
 
-@pytest.mark.parametrize("element", ["hexahedron", "tetrahedron"])
+@pytest.mark.parametrize(
+    "element",
+    [{"element": "hexahedron"}, {"element": "tetrahedron"}, {"element": "tetrahedron", "order": 2}],
+)
 @pytest.mark.parametrize("instrument", [BALL, FLAT])
 def test_force_and_tangent_are_derivatives_of_the_energy(
-    element: str, instrument: dict[str, Any]
+    element: dict[str, Any], instrument: dict[str, Any]
 ) -> None:
-    scene = block(instrument, discretisation={"element": element})
+    scene = block(instrument, discretisation=element)
     model = ContactModel(scene).under(np.array([0.05, -0.03, -0.1]))
     generator = np.random.default_rng(0)
     q, along = 0.02 * generator.normal(size=(2, model.n_unknowns))
