@@ -97,6 +97,7 @@ def test_force_and_tangent_are_derivatives_of_the_energy(
     model = ContactModel(scene).under(np.array([0.05, -0.03, -0.1]))
     generator = np.random.default_rng(0)
     q, along = 0.02 * generator.normal(size=(2, model.n_unknowns))
+    q *= 0.25  # larger ones invert small elements
     assert len(model.touch(q).points) > 10
     step = 1e-6
     after, before = (model.force(q + sign * step * along) for sign in (1, -1))
