@@ -33,7 +33,7 @@ from mor_bench.snapshots.given import (
     checked_given,
 )
 from mor_bench.snapshots.load_range import LoadRange
-from mor_bench.specs import NO_FORCES, check_parameters
+from mor_bench.specs import CONTACT, NO_FORCES, check_parameters
 from mor_bench.training_options import TrainingOptions
 
 if TYPE_CHECKING:
@@ -223,7 +223,9 @@ class Surrogate:
 
     def supports(self, scene: Scene) -> str | None:
         """Return the reason why the method cannot handle a scene, or None if it can."""
-        return None if self.takes_observations or scene.observed_nodes is None else NO_FORCES
+        if self.takes_observations or scene.observed_nodes is None:
+            return None
+        return CONTACT if scene.contact else NO_FORCES
 
     def value(self, name: str) -> Any:
         """Return the value of a hyperparameter, or the value chosen for it if it is "auto"."""
@@ -256,7 +258,8 @@ class Surrogate:
             flags = self.range_.excludes(given.values)
         elif self.scene_.observed_nodes is not None:
             raise UnknownRangeError(
-                f"{self.scene_.name}: the range of the training loads is not known: {NO_FORCES}."
+                f"{self.scene_.name}: the range of the training loads is not known: "
+                f"{CONTACT if self.scene_.contact else NO_FORCES}."
             )
         else:
             raise UnknownRangeError(
@@ -281,7 +284,8 @@ class Surrogate:
         given = self._checked(forces)
         if self.scene_.observed_nodes is not None:
             raise UnsupportedSceneError(
-                f"{self.scene_.name}: the error cannot be estimated: {NO_FORCES}."
+                f"{self.scene_.name}: the error cannot be estimated: "
+                f"{CONTACT if self.scene_.contact else NO_FORCES}."
             )
         predicted = np.asarray(displacements)
         if predicted.dtype.kind != "f" or predicted.shape != np.shape(forces):

@@ -184,6 +184,7 @@ SLOW = {"beam-fine", "liver-hex", "liver-tet"}
 OTHERS = {
     "liver-hex-observed",
     "liver-grasped",
+    "liver-pressed",
     "artery-pressure",
     "soft-arm",
 }  # of liver-hex; no patches

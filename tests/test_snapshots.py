@@ -201,6 +201,7 @@ QUICK = {"beam-tiny", "beam-nearly-incompressible", "block-compression"}
 OTHERS = {
     "liver-hex-observed",
     "liver-grasped",
+    "liver-pressed",
     "artery-pressure",
     "soft-arm",
 }  # of liver-hex; no patches

@@ -31,11 +31,12 @@ SHIPPED = {
     "liver-hex-observed": (726, 1118, 200, 2000),
     "liver-hex-paper": (726, 1118, 200, 2000),
     "liver-grasped": (726, 1118, 12, 2000),
+    "liver-pressed": (726, 1118, 422, 512),
     "artery-pressure": (384, 600, 2, 2000),
     "soft-arm": (692, 1276, 4, 500),
     "liver-tet": (4567, 1118, 200, 2000),
 }
-"""Cells, nodes, load patches, moved nodes or pressed regions, and samples of each dataset."""
+"""Cells, nodes, load patches (or moved nodes, pressed regions, nodes to touch), and samples."""
 
 LARGE = [name for name in SHIPPED if name.startswith(("beam-fine", "liver"))]
 
@@ -47,6 +48,7 @@ def test_every_shipped_dataset_has_its_pinned_counts(name: str) -> None:
     counts, _, warning = check_file(list_suite("datasets")[name]).partition("; warning: ")
     cells, nodes, patches, samples = SHIPPED[name]
     kinds = {"displacement": "moved nodes", "pressure": "pressed regions"}
+    kinds["contact"] = "nodes to touch"
     loaded = kinds.get(load_generated_spec(name).load_plan.kind, "load patches")
     expected = f"{cells} cells, {nodes} nodes, {patches} {loaded}, {samples} samples"
     assert counts == f"dataset, {expected}"

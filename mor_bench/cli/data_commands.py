@@ -14,13 +14,14 @@ from mor_bench.cli.console import make_console
 from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import DatasetName, Json, QuietOutput, with_options
 from mor_bench.cli.progress_bars import show_progress
+from mor_bench.errors import UnsupportedSceneError
 from mor_bench.measure.discretisation_error import RefinementPlan
 from mor_bench.measure.discretisation_error import refine as refine_dataset
 from mor_bench.options import Cluster, CommandLine, DataOptions, FolderOptions
 from mor_bench.report.console_tables import print_discretisation
 from mor_bench.snapshots.generate import generate as generate_shards
 from mor_bench.snapshots.test_sets import with_test_sets
-from mor_bench.specs import load_generated_spec
+from mor_bench.specs import Contact, load_generated_spec
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -105,6 +106,11 @@ def refine(
     Later runs show it beside the errors of the methods.
     """
     spec = load_generated_spec(dataset, options.suite)
+    if isinstance(spec.loads, Contact):
+        raise UnsupportedSceneError(
+            f"{spec.name}: the discretisation error can be measured for forces only, not where "
+            "`loads.kind` is 'contact'."
+        )
     console = make_console(stderr=True)
     with show_progress(console, quiet=output.quiet) as listener, threadpool_limits(1):
         record = refine_dataset(

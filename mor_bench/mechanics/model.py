@@ -50,7 +50,7 @@ from mor_bench.mechanics.rotated import (
 )
 from mor_bench.mechanics.warping import warp_of
 from mor_bench.scene.scene import Scene
-from mor_bench.specs import NO_EQUATIONS, NO_FORCES, SolverName
+from mor_bench.specs import CONTACT, NO_EQUATIONS, NO_FORCES, SolverName
 
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 """Methods of solving equilibria.
@@ -96,7 +96,7 @@ def missing_library(solver: SolverName) -> str | None:
     return None
 
 
-def unknown_equations(scene: Scene, *, observed: bool = False) -> str | None:
+def unknown_equations(scene: Scene, *, observed: bool = False, contact: bool = False) -> str | None:
     """Return why a scene's equilibria cannot be solved for; None if they can.
 
     Parameters
@@ -104,12 +104,16 @@ def unknown_equations(scene: Scene, *, observed: bool = False) -> str | None:
     scene : Scene
     observed : bool
         Whether observed displacements may replace the forces, as for an `ObservedModel`, and
-        pressures may follow the surface, as for a `PressedModel`.
+        pressures may follow the surface, as for a `PressedModel`, and an instrument may press.
+    contact : bool
+        Whether an instrument may press.
     """
     if scene.material is None:
         return NO_EQUATIONS
-    if observed:
+    if observed or (contact and scene.contact):
         return None
+    if scene.contact:
+        return CONTACT
     if scene.follows:
         return FOLLOWS
     return None if scene.observed_nodes is None else NO_FORCES
@@ -320,13 +324,14 @@ class FullOrderModel:
         return BlockJacobi(self.assembler.pattern)
 
     @property
-    def _iterative(self) -> bool:
+    def iterative(self) -> bool:
+        """True if Newton's steps are found by conjugate gradients."""
         by_size = self.n_unknowns >= PCG_FROM or isinstance(self._direct, Multigrid)
         return self.solver in ("rotated-pcg", "jacobi-pcg") or (self.solver == "auto" and by_size)
 
     def certify(self, q: NDArray[np.float64]) -> None:
         """Look for negative curvature by conjugate gradients, if the solver is iterative."""
-        if self._iterative:
+        if self.iterative:
             force = np.random.default_rng(0).normal(size=self.n_unknowns)
             self.step(q, self.linearise(q)[1], force, CERTIFY_TOLERANCE)
 
@@ -347,7 +352,7 @@ class FullOrderModel:
             return conjugate_gradients(
                 pattern, tangent, self._jacobi, residual, tolerance, JACOBI_ITERATIONS
             )[0]
-        if self._iterative:
+        if self.iterative:
             return conjugate_gradients(
                 pattern, tangent, self.turned_rest.at(q), residual, tolerance
             )[0]

@@ -83,7 +83,8 @@ def _forcing(size: float, before: float, target: float) -> float:
     return 0.1 if size <= target else min(0.1, max(0.9 * (size / before) ** 2, 0.3 * target / size))
 
 
-def _is_certified(problem: Problem, q: Array) -> bool:
+def is_certified(problem: Problem, q: Array) -> bool:
+    """Return whether no negative curvature was found at a solution; see `Problem.certify`."""
     try:
         problem.certify(q)
     except NotPositiveDefiniteError:
@@ -102,7 +103,7 @@ def full_steps(problem: Problem, load: Array, start: Array | None, tolerance: fl
         if near:  # one more residual is cheap, and usually no further tangent is needed
             state = problem.force(q)
             if float(np.linalg.norm(load - state.force)) <= tolerance * load_norm:
-                return Attempt(q, state.min_det_f, iteration, converged=_is_certified(problem, q))
+                return Attempt(q, state.min_det_f, iteration, converged=is_certified(problem, q))
         state, tangent = problem.linearise(q)
         residual, min_det = load - state.force, state.min_det_f
         size = float(np.linalg.norm(residual))
@@ -114,16 +115,16 @@ def full_steps(problem: Problem, load: Array, start: Array | None, tolerance: fl
         except NotPositiveDefiniteError:
             break
         if size <= tolerance * load_norm:
-            return Attempt(q, min_det, iteration, converged=_is_certified(problem, q))
+            return Attempt(q, min_det, iteration, converged=is_certified(problem, q))
         floor = problem.extent if size > 0.5 * before else 0.0
         near, before = size <= np.sqrt(tolerance) * load_norm, size
         q = q + step
         if is_round_off(step, q, floor):
-            return Attempt(q, min_det, iteration, converged=_is_certified(problem, q))
+            return Attempt(q, min_det, iteration, converged=is_certified(problem, q))
     return Attempt(q, min_det, iteration, converged=False)
 
 
-def _descent(problem: Problem, q: Array, tangent: Array, residual: Array) -> tuple[Array, bool]:
+def descent(problem: Problem, q: Array, tangent: Array, residual: Array) -> tuple[Array, bool]:
     """Return a descent direction, and whether the tangent itself was positive definite.
 
     An indefinite tangent is shifted towards the rest-state stiffness until it is positive definite.
@@ -148,11 +149,11 @@ def _damped(problem: Problem, load: Array, start: Array, tolerance: float) -> At
     for iteration in range(1, DAMPED_ITERATIONS + 1):
         state, tangent = problem.linearise(q)
         residual = load - state.force
-        step, stable = _descent(problem, q, tangent, residual)
+        step, stable = descent(problem, q, tangent, residual)
         size = float(np.linalg.norm(residual))
         floor, before = problem.extent if size > 0.5 * before else 0.0, size
         if stable and (size <= tolerance * load_norm or is_round_off(step, q, floor)):
-            return Attempt(q, state.min_det_f, iteration, converged=_is_certified(problem, q))
+            return Attempt(q, state.min_det_f, iteration, converged=is_certified(problem, q))
         slope, work = float(residual @ step), float(load @ q)
         potential, noise = state.energy_j - work, 1e-14 * (state.energy_j + abs(work))
         for halving in range(MAX_HALVINGS):

@@ -292,7 +292,14 @@ class LinearResponse(Protocol):
 
 
 def linear_response(scene: Scene) -> LinearResponse:
-    """Prepare the linear response to forces or, with observed nodes, to their displacements."""
+    """Prepare the linear response to forces or, with observed nodes, to their displacements.
+
+    Where an instrument presses, it is that of linear elasticity with the same contact.
+    """
+    if scene.contact:
+        from mor_bench.mechanics.linear_contact import LinearContact
+
+        return LinearContact(scene)
     return (
         Compliance(full_order_model(scene))
         if scene.observed_nodes is None
@@ -302,32 +309,41 @@ def linear_response(scene: Scene) -> LinearResponse:
 
 def forward_model(scene: Scene, solver: SolverName | None = None) -> FullOrderModel | ObservedModel:
     """Return a factorised model whose input is forces or, with observed nodes, displacements."""
-    if scene.observed_nodes is not None:
+    if scene.observed_nodes is not None and not scene.contact:
         return ObservedModel(scene, solver)
-    model = full_order_model(scene, solver)
+    model = _contact_model(scene, solver) if scene.contact else full_order_model(scene, solver)
     model.prepare()
     return model
 
 
+def _contact_model(scene: Scene, solver: SolverName | None) -> FullOrderModel:
+    from mor_bench.mechanics.contact import ContactModel  # other scenes need not load it
+
+    return ContactModel(scene, solver)
+
+
 def generating_model(scene: Scene) -> FullOrderModel | ObservedModel:
     """Return the model whose input are the sampled loads: forces, or the motion of a tool."""
+    if scene.contact:
+        return _contact_model(scene, None)
     return ObservedModel(scene) if scene.motion else full_order_model(scene)
 
 
 class ToolForces:
-    """Forces of a moved tool on its nodes: the internal forces there.
+    """Forces of a moved tool, or an instrument, on its nodes: the internal forces there.
 
     Their sum is minus the reaction that the tool feels. Foundations resist, and gravity acts, as
-    part of the internal forces.
+    part of the internal forces. At an equilibrium they are the forces of the contact.
 
     Parameters
     ----------
     scene : Scene
-        A scene with a moved tool.
+        A scene with a moved tool, or an instrument that presses.
     """
 
     def __init__(self, scene: Scene) -> None:
-        if scene.motion is None or scene.observed_nodes is None:
+        moved = scene.motion or scene.contact
+        if moved is None or scene.observed_nodes is None:
             raise UnsupportedSceneError(f"{scene.name}: no tool moves the body.")
         self._model, self._nodes = FullOrderModel(scene), scene.observed_nodes
 

@@ -82,10 +82,18 @@ class DenseProblem(ABC):
     """Base of reduced problems: symmetric dense tangents, and a Cholesky factor for each step."""
 
     accelerator = None
+    n_unknowns: int
+    extent: float
 
     @property
     @abstractmethod
     def rest_tangent(self) -> NDArray[np.float64]: ...
+
+    @abstractmethod
+    def force(self, q: NDArray[np.float64]) -> State: ...
+
+    @abstractmethod
+    def linearise(self, q: NDArray[np.float64]) -> tuple[State, NDArray[np.float64]]: ...
 
     @cached_property
     def rest_factor(self) -> Factor:

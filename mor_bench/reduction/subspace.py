@@ -35,6 +35,7 @@ class Subspace:
     def __init__(self, scene: Scene, modes: Array) -> None:
         self.n_modes = modes.shape[1]
         self._modes = scene.columns_at_all_dofs(modes)
+        self._free = scene.free_dofs
         nodes = scene.output_nodes
         self._wanted = None if len(nodes) == scene.mesh.n_nodes else dofs_of_nodes(nodes)
         self._expanding = self._modes if self._wanted is None else self._modes[self._wanted]
@@ -61,4 +62,11 @@ class Subspace:
         out = np.empty((len(batch), len(self._modes)))
         for row, load in zip(out, project(self._modes, batch.reshape(out.shape)), strict=True):
             self.expand(solve(load), row)
+        return out.reshape(batch.shape)
+
+    def answer_given(self, batch: Array, solve: Callable[[Array], Array]) -> Array:
+        """Return displacements as `answer`; ``solve`` maps values on the free dofs to q."""
+        out = np.empty((len(batch), len(self._modes)))
+        for row, given in zip(out, batch.reshape(out.shape), strict=True):
+            self.expand(solve(given[self._free]), row)
         return out.reshape(batch.shape)

@@ -10,6 +10,7 @@ from mor_bench.report.number_format import number
 from mor_bench.specs import (
     AnyLoads,
     ChamberedGeometry,
+    Contact,
     DatasetSpec,
     LineLoads,
     Motion,
@@ -18,6 +19,7 @@ from mor_bench.specs import (
     Pressure,
     Region,
     Several,
+    SphereInstrument,
     TubeGeometry,
     load_recorded_spec,
 )
@@ -119,6 +121,12 @@ def _loads(loads: AnyLoads) -> str:
     ends = f"{low:g} to {high:g} {loads.unit}"
     if isinstance(loads, Motion):
         return f"a tool on {_regions([loads.region])} that moves by {ends}"
+    if isinstance(loads, Contact):
+        shape = "sphere" if isinstance(loads.instrument, SphereInstrument) else "plane"
+        return (
+            f"a rigid {shape} that touches {_regions([loads.region])} without friction and moves "
+            f"by {ends}"
+        )
     if isinstance(loads, Pressure):
         kind = "following" if loads.follower else "dead"
         return f"{kind} pressures of {ends} on {_regions(loads.regions)}"

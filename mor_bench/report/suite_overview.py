@@ -83,6 +83,8 @@ def dataset_family(spec: AnyDatasetSpec) -> str:
         return f"{family}, displacements prescribed"
     if spec.loads and spec.loads.kind == "pressure":
         return f"{family}, under pressure"
+    if spec.loads and spec.loads.kind == "contact":
+        return f"{family}, pressed by an instrument"
     return f"{family}, displacements observed" if spec.observed else family
 
 

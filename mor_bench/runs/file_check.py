@@ -73,6 +73,11 @@ def _generated(spec: DatasetSpec) -> str:
         loaded = f"{len(scene.patch_nodes)} load patches"
         if scene.motion and scene.observed_nodes is not None:
             loaded = f"{len(scene.observed_nodes)} moved nodes"
+        if scene.contact and scene.observed_nodes is not None:
+            from mor_bench.mechanics.contact_points import ContactPoints  # other scenes need none
+
+            ContactPoints(scene)  # does the instrument penetrate the body at rest under gravity?
+            loaded = f"{len(scene.observed_nodes)} nodes to touch"
         if scene.pressure:
             loaded = f"{len(scene.pressure.regions)} pressed regions"
         if len(scene.acting) > 1:

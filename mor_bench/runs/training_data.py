@@ -155,9 +155,10 @@ class TrainingData:
 
     @cached_property
     def reaction_errors(self) -> ReactionErrors | None:
-        """Errors of a moved tool's reaction; None without one, or if only some nodes are wanted."""
+        """Errors of a tool's reaction; None without a tool, or if only some nodes are wanted."""
         whole = len(self.scene.output_nodes) == self.scene.mesh.n_nodes
-        return ReactionErrors(self.scene) if self.scene.motion and whole else None
+        tool = self.scene.motion or self.scene.contact
+        return ReactionErrors(self.scene) if tool and whole else None
 
     def first(self, n: int) -> TrainingData:
         """Return the same data with only the first training samples and the main test set."""

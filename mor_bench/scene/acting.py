@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import pi, sqrt
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mor_bench.errors import OutsideMeshError, SpecError, UnsupportedSceneError
-from mor_bench.scene.interpolation import interpolation_matrix
+from mor_bench.scene.interpolation import interpolation_matrix, rows_to_one
 from mor_bench.scene.loads import (
     Facets,
     Patches,
@@ -25,7 +25,16 @@ from mor_bench.scene.loads import (
 )
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.regions import Cloud, region_points
-from mor_bench.specs import AnyTable, LineLoads, Loads, Motion, PointLoads, Pressure, Region
+from mor_bench.specs import (
+    AnyTable,
+    Contact,
+    LineLoads,
+    Loads,
+    Motion,
+    PointLoads,
+    Pressure,
+    Region,
+)
 
 
 @dataclass(frozen=True)
@@ -90,14 +99,15 @@ class Acting:
         if isinstance(plan, Pressure):
             regions = [self.surface_points(region) for region in plan.regions]
             middles = [surface.points[region].mean(axis=0) for region in regions]
-            return np.repeat(np.concatenate([self._nearest(m) for m in middles]), 3)
+            return np.repeat(np.concatenate([self.nearest(m) for m in middles]), 3)
         if isinstance(plan, Motion):
             assert self.ground.tool_nodes is not None
             points = self.ground.mesh.points[self.ground.tool_nodes]
             middle = np.linalg.norm(points - points.mean(axis=0), axis=1).argmin()
-            return self._nearest(points[middle])
+            return self.nearest(points[middle])
         if isinstance(plan, LineLoads):
-            return np.concatenate([self._nearest(np.mean(ends, axis=0)) for ends in plan.lines])
+            return np.concatenate([self.nearest(np.mean(ends, axis=0)) for ends in plan.lines])
+        assert not isinstance(plan, Contact)  # see `Scene.patch_nodes`
         region = self._loaded_points
         if isinstance(plan, PointLoads) and not self.ground.embedded:
             region = np.setdiff1d(region, self.ground.fixed_nodes)
@@ -117,7 +127,8 @@ class Acting:
             )
         return region[spread_out(surface.points[region], plan.n_patches)]
 
-    def _nearest(self, position: NDArray[np.float64]) -> NDArray[np.int64]:
+    def nearest(self, position: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the surface point nearest to a position (3,), m, as an array (1,)."""
         return np.array([np.linalg.norm(self.ground.surface.points - position, axis=1).argmin()])
 
     @property
@@ -143,7 +154,7 @@ class Acting:
     def patches(self) -> Patches:
         """The patches as points with areas."""
         plan, surface = self.plan, self.ground.surface
-        if isinstance(plan, Motion):
+        if isinstance(plan, Motion | Contact):
             raise UnsupportedSceneError("a tool moves the body; it has no patches.")
         if isinstance(plan, Pressure):
             return pressed_patches(surface, self.pressed_facets)
@@ -166,7 +177,7 @@ class Acting:
 
     def _weights(self, areas: sp.csr_array) -> sp.csr_array:
         """Return the weights of patches from their areas: shares, or those of a pressure."""
-        return areas if isinstance(self.plan, Pressure) else _rows_to_one(areas)
+        return areas if isinstance(self.plan, Pressure) else rows_to_one(areas)
 
     @cached_property
     def weights(self) -> sp.csr_array:
@@ -189,5 +200,19 @@ class Acting:
         return self._weights(sp.csr_array(self.patches.areas @ self.patches.values))
 
 
-def _rows_to_one(matrix: sp.csr_array) -> sp.csr_array:
-    return sp.csr_array(matrix.multiply(1.0 / matrix.sum(axis=1)[:, None]))
+def points_of(
+    acting: Sequence[Acting], patches: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], sp.csr_array]:
+    """Return the tractions of patches of several tables, see `Scene.patch_points`."""
+    if len(acting) == 1:
+        return acting[0].points(patches)
+    ends = np.cumsum([len(table.nodes) for table in acting])
+    number = np.searchsorted(ends, patches, side="right")
+    rows = [np.flatnonzero(number == k) for k in range(len(ends))]
+    parts = [
+        table.points(patches[own] - (ends[k - 1] if k else 0))
+        for k, (table, own) in enumerate(zip(acting, rows, strict=True))
+    ]
+    shares = sp.csr_array(sp.block_diag([shares for _, shares in parts]))
+    order = np.argsort(np.concatenate(rows))
+    return np.concatenate([points for points, _ in parts]), shares[order]

@@ -186,3 +186,8 @@ def _outside(mesh: Mesh, lost: NDArray[np.float64]) -> OutsideMeshError:
         f"{which} outside the mesh, whose bounds are {low} to {high} m; "
         f"the first is {lost[0].tolist()} m."
     )
+
+
+def rows_to_one(matrix: sp.csr_array) -> sp.csr_array:
+    """Return a matrix whose rows are divided by their sums."""
+    return sp.csr_array(matrix.multiply(1.0 / matrix.sum(axis=1)[:, None]))

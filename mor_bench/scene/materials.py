@@ -34,6 +34,16 @@ class Material(ABC):
         """Poisson's ratio at small strains."""
 
     @property
+    @abstractmethod
+    def shear_at_rest(self) -> float:
+        """Shear modulus at small strains, Pa; without fibres."""
+
+    @property
+    def young_at_rest(self) -> float:
+        """Young's modulus at small strains, Pa; without fibres."""
+        return 2.0 * (1.0 + self.poisson_at_rest) * self.shear_at_rest
+
+    @property
     def parameters(self) -> tuple[float, ...]:
         """Parameters of the law's function."""
         return self._scaled(1.0, 1.0)
@@ -67,6 +77,10 @@ class _TwoLame(Material):
     @property
     def poisson_at_rest(self) -> float:
         return self.poisson
+
+    @property
+    def shear_at_rest(self) -> float:
+        return self.lame_mu
 
     @property
     def lame_lambda(self) -> float:
@@ -130,8 +144,12 @@ class MooneyRivlin(Material):
         return shape * self.c10_pa, shape * self.c01_pa, volume * self.bulk_pa
 
     @property
+    def shear_at_rest(self) -> float:
+        return 2 * (self.c10_pa + self.c01_pa)
+
+    @property
     def poisson_at_rest(self) -> float:
-        return poisson_of(self.bulk_pa, 2 * (self.c10_pa + self.c01_pa))
+        return poisson_of(self.bulk_pa, self.shear_at_rest)
 
 
 @dataclass(frozen=True)
@@ -159,9 +177,12 @@ class Ogden(Material):
         return (volume * self.bulk_pa, *pairs)
 
     @property
+    def shear_at_rest(self) -> float:
+        return 0.5 * sum(mu * alpha for mu, alpha in zip(self.mu_pa, self.alpha, strict=True))
+
+    @property
     def poisson_at_rest(self) -> float:
-        twice_shear = sum(mu * alpha for mu, alpha in zip(self.mu_pa, self.alpha, strict=True))
-        return poisson_of(self.bulk_pa, 0.5 * twice_shear)
+        return poisson_of(self.bulk_pa, self.shear_at_rest)
 
 
 @dataclass(frozen=True)
@@ -187,8 +208,12 @@ class Yeoh(Material):
         return (*shear, volume * self.bulk_pa)
 
     @property
+    def shear_at_rest(self) -> float:
+        return 2 * self.c10_pa
+
+    @property
     def poisson_at_rest(self) -> float:
-        return poisson_of(self.bulk_pa, 2 * self.c10_pa)
+        return poisson_of(self.bulk_pa, self.shear_at_rest)
 
 
 @dataclass(frozen=True)
@@ -232,9 +257,13 @@ class HolzapfelGasserOgden(Material):
         return [(1 - 3 * d) * a[i] * a[j] + (d if i == j else 0.0) for i, j in pairs]
 
     @property
+    def shear_at_rest(self) -> float:
+        return 2 * self.c10_pa
+
+    @property
     def poisson_at_rest(self) -> float:
         """Poisson's ratio of the matrix at small strains."""
-        return poisson_of(self.bulk_pa, 2 * self.c10_pa)
+        return poisson_of(self.bulk_pa, self.shear_at_rest)
 
 
 def make_material(

@@ -13,8 +13,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mor_bench.errors import SpecError, UnsupportedSceneError
-from mor_bench.scene.acting import Acting, Ground
+from mor_bench.scene.acting import Acting, Ground, points_of
 from mor_bench.scene.body import build_body
+from mor_bench.scene.contact_surface import ContactSurface, contact_surface, touched_nodes
 from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.loads import Facets
@@ -28,6 +29,7 @@ from mor_bench.scene.springs import Springs, foundations
 from mor_bench.scene.supports import Frames, held_by
 from mor_bench.specs import (
     AnyDatasetSpec,
+    Contact,
     DatasetSpec,
     ImportedDatasetSpec,
     Motion,
@@ -157,12 +159,16 @@ class Scene:
     def observed_nodes(self) -> NDArray[np.int64] | None:
         """(n_observed,) sorted nodes with given displacements; None if forces are given.
 
+        Where an instrument presses, its displacement is given at the nodes that it may touch.
+
         Raises
         ------
         SpecError
-            If the region has no free node of the surface, or contains every free node; or if a
-            moved region has a node of a support.
+            If the region has no free node of the surface, or contains every free node; if a moved
+            region has a node of a support; or for problems of an instrument.
         """
+        if self.contact:
+            return touched_nodes(self.contact, self.contact_surface, self.fixed_dofs)
         if self.motion:
             return moved_nodes(self._cloud, self.motion, self.fixed_dofs)
         if self.spec.observed is None:
@@ -173,6 +179,20 @@ class Scene:
     def motion(self) -> Motion | None:
         """The plan of prescribed displacements; None if the scene has another or no plan."""
         return self.spec.motion if isinstance(self.spec, DatasetSpec) else None
+
+    @property
+    def contact(self) -> Contact | None:
+        """The plan of an instrument that presses; None if the scene has another or no plan."""
+        loads = self.spec.loads if isinstance(self.spec, DatasetSpec) else None
+        return loads if isinstance(loads, Contact) else None
+
+    @cached_property
+    def contact_surface(self) -> ContactSurface:
+        """The surface that an instrument may touch; `SpecError` for problems of the instrument."""
+        if self.contact is None or self.material is None:
+            raise UnsupportedSceneError(f"{self.name}: no instrument presses it.")
+        young, facets = self.material.young_at_rest, self.loaded_facets
+        return contact_surface(self.contact, self.surface, facets, self.mesh, young)
 
     @cached_property
     def surface(self) -> Facets:
@@ -224,9 +244,11 @@ class Scene:
 
         The index of a patch here is its load-region id. On a mesh's own boundary the points are
         nodes. A moved tool counts as one patch, at one of its nodes; a pressure as three, at the
-        middle of its region; a line as one, at the point nearest to its middle. The patches of
-        several tables follow one another.
+        middle of its region; a line as one, at the point nearest to its middle; an instrument as
+        one, at the point nearest to it. The patches of several tables follow one another.
         """
+        if self.contact:
+            return self.acting[0].nearest(self.contact_surface.nearest)
         return np.concatenate([acting.nodes for acting in self.acting])
 
     @property
@@ -247,6 +269,8 @@ class Scene:
     @cached_property
     def patch_scales(self) -> NDArray[np.float64]:
         """(n_patches,) largest load of each patch, relative to the largest of all tables."""
+        if len(self.acting) == 1:
+            return np.ones(len(self.patch_nodes))
         ends = [acting.plan.magnitude[1] for acting in self.acting]
         return np.repeat(np.array(ends) / max(ends), [len(acting.nodes) for acting in self.acting])
 
@@ -266,28 +290,22 @@ class Scene:
             Share of the patch's force at each point; rows sum to 1. Of a pressure: the component
             of the area vector at each point, m².
         """
-        if len(self.acting) == 1:
-            return self.acting[0].points(patches)
-        ends = np.cumsum([len(acting.nodes) for acting in self.acting])
-        table = np.searchsorted(ends, patches, side="right")
-        rows = [np.flatnonzero(table == k) for k in range(len(ends))]
-        parts = [
-            acting.points(patches[own] - (ends[k - 1] if k else 0))
-            for k, (acting, own) in enumerate(zip(self.acting, rows, strict=True))
-        ]
-        shares = sp.csr_array(sp.block_diag([shares for _, shares in parts]))
-        return np.concatenate([points for points, _ in parts]), shares[
-            np.argsort(np.concatenate(rows))
-        ]
+        return points_of(self.acting, patches)
 
     @cached_property
     def patch_weights(self) -> sp.csr_array:
         """(n_patches, n_nodes) nodal weights of a force on each patch; rows sum to 1.
 
         They are the consistent load of a uniform traction. An embedded surface passes it to the
-        nodes of the surrounding cells. For a moved tool they are 1 at each of its nodes. For a
-        pressure they are components of area vectors, m².
+        nodes of the surrounding cells. For a moved tool they are 1 at each of its nodes, and for an
+        instrument at each node that it may touch. For a pressure they are components of area
+        vectors, m².
         """
+        if self.contact:
+            assert self.observed_nodes is not None
+            touched = np.zeros((1, self.mesh.n_nodes))
+            touched[:, self.observed_nodes] = 1.0
+            return sp.csr_array(touched)
         parts = [acting.weights for acting in self.acting]
         return parts[0] if len(parts) == 1 else sp.csr_array(sp.vstack(parts))
 
@@ -306,7 +324,7 @@ class Scene:
             except SpecError as problem:
                 problems.append(str(problem))
         if problems:
-            raise SpecError(" ".join(problems))
+            raise SpecError(" ".join(dict.fromkeys(problems)))
         return self
 
 

@@ -60,7 +60,7 @@ def foundations(
         facets = surface.within(region_points(cloud, spring.region))
         if len(facets) == 0:
             raise SpecError("a region of `springs` holds no facet of the surface.")
-        points, vectors = _quadrature(surface, facets)
+        points, vectors, _ = surface_quadrature(surface, facets)
         areas = np.linalg.norm(vectors, axis=1)[:, None, None]
         if spring.normal:
             directions = vectors[:, :, None] * vectors[:, None] / areas
@@ -70,19 +70,23 @@ def foundations(
     return tuple(found)
 
 
-def _quadrature(
+def surface_quadrature(
     surface: Facets, facets: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return points (n, 3), m, on facets and normals (n, 3) whose lengths are areas, m²."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return points (n, 3), m, on facets and normals (n, 3) whose lengths are areas, m².
+
+    The third array holds the shape functions of a facet at its points, (n_points, n_corners).
+    """
     corners = surface.points[facets]
     if facets.shape[1] == 3:
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        points = np.einsum("pa,fai->fpi", _SIXTHS, corners)
+        shapes = _SIXTHS
+        points = np.einsum("pa,fai->fpi", shapes, corners)
         vectors = np.repeat(normals[:, None] / 6.0, 3, axis=1)
     elif facets.shape[1] == 6:
-        shape, derivatives = quadratic_triangle(DEGREE_4)
+        shapes, derivatives = quadratic_triangle(DEGREE_4)
         along = np.einsum("pad,fai->dfpi", derivatives, corners)
-        points = np.einsum("pa,fai->fpi", shape, corners)
+        points = np.einsum("pa,fai->fpi", shapes, corners)
         vectors = np.cross(along[0], along[1]) * DEGREE_4_WEIGHTS[:, None]
     else:
         s, t = (a.ravel() for a in np.meshgrid(_X, _X))
@@ -90,6 +94,7 @@ def _quadrature(
         u, v = 1 + np.outer(s, signs[:, 0]), 1 + np.outer(t, signs[:, 1])
         along_s = np.einsum("pa,fai->fpi", signs[:, 0] * v / 4, corners)
         along_t = np.einsum("pa,fai->fpi", signs[:, 1] * u / 4, corners)
-        points = np.einsum("pa,fai->fpi", u * v / 4, corners)
+        shapes = u * v / 4
+        points = np.einsum("pa,fai->fpi", shapes, corners)
         vectors = np.cross(along_s, along_t) * np.outer(_W, _W).reshape(-1, 1)
-    return points.reshape(-1, 3), vectors.reshape(-1, 3)
+    return points.reshape(-1, 3), vectors.reshape(-1, 3), shapes

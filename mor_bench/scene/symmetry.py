@@ -43,9 +43,9 @@ def mirrors(scene: Scene) -> list[Mirror]:
     None are looked for where supports are oblique.
 
     The image of a solution solves the image of its load, because laws are isotropic or their fibres
-    have an image too.
+    have an image too. A scene with an instrument has no plane: its image is another instrument.
     """
-    if scene.frames is not None:
+    if scene.frames is not None or scene.contact:
         return []
     points, cells = scene.mesh.points, scene.mesh.cells
     low, high = points.min(axis=0), points.max(axis=0)

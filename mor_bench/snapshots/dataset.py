@@ -69,10 +69,10 @@ class Snapshots:
 
     @cached_property
     def forces(self) -> NDArray[np.float64]:
-        """(n_samples, n_nodes, 3) nodal forces, N; those of the tool where it moves the body."""
+        """(n_samples, n_nodes, 3) nodal forces, N; those of the tool where one moves the body."""
         if isinstance(self.loads, NodalLoads):
             return self.loads.forces
-        if self.scene.motion:
+        if self.scene.motion or self.scene.contact:
             return read_only(ToolForces(self.scene)(self.free_displacements))
         return read_only(self.loads.nodal_forces(self.scene.patch_weights))
 
@@ -80,11 +80,14 @@ class Snapshots:
     def given(self) -> Given:
         """Input of the methods: the forces, or the displacements of the observed nodes.
 
-        Displacements are zero at all other nodes.
+        Displacements are zero at all other nodes. Where an instrument presses, they are its own.
         """
         nodes = self.scene.observed_nodes
         if nodes is None:
             return given_of(self.scene, self.forces)
+        if self.scene.contact and isinstance(self.loads, PatchLoads):
+            moved = self.loads.nodal_forces(self.scene.patch_weights)
+            return given_of(self.scene, read_only(moved))
         seen = np.zeros_like(self.displacements)
         seen[:, nodes] = self.displacements[:, nodes]
         return given_of(self.scene, read_only(seen))

@@ -32,9 +32,11 @@ from scipy.spatial.distance import cdist
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.acting import Acting
+from mor_bench.scene.contact_surface import unit
 from mor_bench.scene.scene import Scene
 from mor_bench.specs import (
     MAX_COUNT,
+    Contact,
     LineLoads,
     Loads,
     Motion,
@@ -164,6 +166,8 @@ def _drawn_from(acting: Acting, numbers: NDArray[np.int64], whole: int) -> Patch
     loads = acting.plan
     if isinstance(loads, Pressure):
         return _pressures(loads, numbers)
+    if isinstance(loads, Contact):
+        return _instrument_motions(loads, numbers)
     chosen, k = _combinations(acting), loads.simultaneous
     if chosen is None:
         patches = np.stack([_apart(acting, int(i)) for i in numbers])
@@ -188,16 +192,35 @@ def _drawn_from(acting: Acting, numbers: NDArray[np.int64], whole: int) -> Patch
 def _pressures(loads: Pressure, numbers: NDArray[np.int64]) -> PatchLoads:
     """Return pressures, as the forces -p e_i on three patches of each region."""
     d = len(loads.regions)
-    if loads.sampling == "random":
-        drawn = [np.random.default_rng([loads.seed, int(i)]).uniform(size=d) for i in numbers]
-        unit = np.reshape(drawn, (len(numbers), d))
-    else:
-        unit = _design(loads.sampling, (loads.seed,), loads.samples, d)[numbers]
     low, high = loads.magnitude
-    pressures = low + (high - low) * unit
+    pressures = low + (high - low) * _in_unit_cube(loads, numbers, d)
     vectors = -pressures[:, :, None, None] * np.eye(3)
     patches = np.tile(np.arange(3 * d), (len(numbers), 1))
     return PatchLoads(patches, vectors.reshape(len(numbers), 3 * d, 3))
+
+
+def _instrument_motions(loads: Contact, numbers: NDArray[np.int64]) -> PatchLoads:
+    """Return displacements of an instrument, in directions uniform on a cap of the sphere."""
+    drawn = _in_unit_cube(loads, numbers, 3)
+    axis = unit(loads.direction)
+    first, second = (found[0, 0] for found in _tangents(axis[None, None]))
+    height = 1.0 - drawn[:, 0] * (1.0 - np.cos(np.deg2rad(loads.spread_deg)))
+    radius, angle = np.sqrt(np.maximum(1.0 - height**2, 0.0)), 2 * np.pi * drawn[:, 1]
+    around = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
+    low, high = loads.magnitude
+    size = low + (high - low) * drawn[:, 2]
+    vectors = size[:, None] * (height[:, None] * axis + radius[:, None] * around)
+    return PatchLoads(np.zeros((len(numbers), 1), dtype=np.int64), vectors[:, None])
+
+
+def _in_unit_cube(
+    loads: Pressure | Contact, numbers: NDArray[np.int64], d: int
+) -> NDArray[np.float64]:
+    """Return the coordinates (n, d) of samples that all act on the same regions."""
+    if loads.sampling == "random":
+        drawn = [np.random.default_rng([loads.seed, int(i)]).uniform(size=d) for i in numbers]
+        return np.reshape(drawn, (len(numbers), d))
+    return _design(loads.sampling, (loads.seed,), loads.samples, d)[numbers]
 
 
 def _combinations(acting: Acting) -> NDArray[np.int64] | None:

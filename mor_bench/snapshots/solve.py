@@ -70,8 +70,9 @@ def pack(scene: Scene) -> bytes:
     """Serialise the input of a worker: mesh, material, supports and patch weights."""
     mesh = replace(scene.mesh)  # a copy without cached properties
     # A moved region, or one under a pressure that follows it, may be one of the sets.
-    sets = scene.point_sets if scene.motion or scene.follows else {}
-    sent = replace(scene, mesh=mesh, embedded_surface=None, point_sets=sets)
+    sets = scene.point_sets if scene.motion or scene.follows or scene.contact else {}
+    touched = scene.embedded_surface if scene.contact else None
+    sent = replace(scene, mesh=mesh, embedded_surface=touched, point_sets=sets)
     return pickle.dumps((sent, scene.patch_weights))
 
 

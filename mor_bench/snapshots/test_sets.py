@@ -61,6 +61,8 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
         return "a pressure has one direction"
     if name == "unseen-directions" and spec.load_plan.kind == "several":
         return "several tables of loads act together"
+    if name == "unseen-directions" and spec.load_plan.kind == "contact":
+        return "its directions are those of an instrument, around `loads.direction`"
     if name == "unseen-directions" and spec.load_plan.kind not in ("normal", "tangential"):
         return (
             "its directions are all over the sphere; "
@@ -107,7 +109,7 @@ def _changed(spec: DatasetSpec, loads: AnyTable, name: SetName) -> dict[str, Any
     """Return a table of loads of a named test set."""
     low, high = loads.magnitude
     changed: dict[str, Any] = {"samples": spec.tests.samples, "seed": loads.seed + SEED_SHIFT}
-    if not isinstance(loads, Motion | Pressure):
+    if not isinstance(loads, Motion | Pressure | Contact):
         changed["samples_per_patch"] = None
     if name in ("2x", "4x"):
         times = int(name[0])

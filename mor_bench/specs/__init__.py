@@ -10,6 +10,7 @@ Start reading with `dataset_spec.py` and `method_spec.py`; `spec_files.py` reads
 from mor_bench.specs.base import MAX_COUNT
 from mor_bench.specs.battery import Battery, Race
 from mor_bench.specs.dataset_spec import (
+    CONTACT,
     NO_EQUATIONS,
     NO_FORCES,
     AnyDatasetSpec,
@@ -27,15 +28,17 @@ from mor_bench.specs.geometry_spec import (
     TubeGeometry,
     VoxelsGeometry,
 )
+from mor_bench.specs.instrument_spec import Instrument, PlaneInstrument, SphereInstrument
+from mor_bench.specs.load_ranges import Sampling
 from mor_bench.specs.loads_spec import (
     AnyLoads,
     AnyTable,
+    Contact,
     LineLoads,
     Loads,
     Motion,
     PointLoads,
     Pressure,
-    Sampling,
     Several,
     tables_of,
     with_seed,
@@ -73,6 +76,7 @@ from mor_bench.specs.support_spec import AXES, Support
 
 __all__ = [
     "AXES",
+    "CONTACT",
     "MAX_COUNT",
     "NO_EQUATIONS",
     "NO_FORCES",
@@ -84,10 +88,12 @@ __all__ = [
     "BoxGeometry",
     "BoxRegion",
     "ChamberedGeometry",
+    "Contact",
     "DatasetSpec",
     "FibreMaterial",
     "FileGeometry",
     "ImportedDatasetSpec",
+    "Instrument",
     "LShapeGeometry",
     "LineLoads",
     "Loads",
@@ -98,6 +104,7 @@ __all__ = [
     "NearestRegion",
     "Observed",
     "OgdenMaterial",
+    "PlaneInstrument",
     "PlaneRegion",
     "PointLoads",
     "PointSetRegion",
@@ -108,6 +115,7 @@ __all__ = [
     "Several",
     "SolverName",
     "SourceFile",
+    "SphereInstrument",
     "SphereRegion",
     "Split",
     "SplitBy",

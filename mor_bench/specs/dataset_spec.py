@@ -14,6 +14,7 @@ from mor_bench.specs.base import Name, Positive, StrictModel, Text
 from mor_bench.specs.geometry_spec import Geometry
 from mor_bench.specs.loads_spec import (
     AnyLoads,
+    Contact,
     LoadPlan,
     Motion,
     Pressure,
@@ -30,6 +31,7 @@ MAX_NODES = 1_000_000
 
 NO_EQUATIONS = "its snapshots were imported, so its equations are not known"
 NO_FORCES = "its forces are not known, only the displacements of a part of its surface"
+CONTACT = "an instrument presses it, and the method needs given forces"
 
 Side = Annotated[int, Field(ge=2, le=1024)]
 
@@ -113,8 +115,9 @@ class DatasetSpec(CommonDatasetSpec):
         Foundations, none by default.
     gravity : Gravity, optional
         A constant pre-load: displacements are measured from the rest state under it.
-    loads : Loads, PointLoads, LineLoads, Motion, Pressure or Several, optional
-        Sampled forces, displacements of a tool, pressures, or several of them together. Without it
+    loads : Loads, PointLoads, LineLoads, Motion, Pressure, Contact or Several, optional
+        Sampled forces, displacements of a tool, pressures, motions of an instrument, or several of
+        them together. Without it
         the scene can be solved for given forces, but no samples can be drawn.
     """
 
@@ -134,23 +137,27 @@ class DatasetSpec(CommonDatasetSpec):
     @model_validator(mode="after")
     def _fixed_regions(self) -> Self:
         """Check what a plan excludes whose samples do not act on one region each."""
-        if not isinstance(self.loads, Motion | Pressure | Several):
+        if not isinstance(self.loads, Motion | Pressure | Contact | Several):
             return self
         where = f"where `loads.kind` is {self.loads.kind!r}"
         why = "all samples act on the same regions"
         if isinstance(self.loads, Several):
             where, why = "with several tables `[[loads]]`", "they act on several regions at once"
-        possible = ("sample", "direction") if isinstance(self.loads, Motion) else ("sample",)
+        moves = isinstance(self.loads, Motion | Contact)
+        possible = ("sample", "direction") if moves else ("sample",)
         if self.split.by not in possible:
             raise ValueError(
                 f"`split.by` must be {' or '.join(map(repr, possible))} {where}, since {why}; "
                 f"got {self.split.by!r}"
             )
-        if self.observed is not None and isinstance(self.loads, Motion):
-            raise ValueError(
-                f"`observed` must be absent {where}: the methods get the displacements of "
-                "`loads.region`"
-            )
+        if self.observed is not None and moves:
+            given = "displacements of `loads.region`"
+            if isinstance(self.loads, Contact):
+                given = "displacement of `loads.instrument`"
+            raise ValueError(f"`observed` must be absent {where}: the methods get the {given}")
+        oblique = any(support.direction is not None for support in self.supports)
+        if oblique and isinstance(self.loads, Contact):
+            raise ValueError(f"`supports.direction` must be absent {where}")
         for name in ("unseen_region", "paper_magnitude_n"):
             if getattr(self.tests, name) is not None:
                 raise ValueError(f"`tests.{name}` must be absent {where}")

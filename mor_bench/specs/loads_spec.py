@@ -4,42 +4,20 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from mor_bench.specs.base import (
     Area,
     Count,
     Length,
+    Positive,
     StrictModel,
     Triple,
+    in_range,
 )
+from mor_bench.specs.instrument_spec import Direction, Instrument
+from mor_bench.specs.load_ranges import SEED_STEP, LoadKind, Magnitude, Sampling, Steps
 from mor_bench.specs.region_spec import Region
-
-LoadKind = Literal["force", "normal", "tangential"]
-Sampling = Literal["random", "latin-hypercube", "sobol"]
-SEED_STEP = 7_368_787
-"""Difference between the seeds of several tables, so that equal seeds give independent draws."""
-
-
-def _ordered(value: tuple[float, float]) -> tuple[float, float]:
-    if value[0] > value[1]:
-        raise ValueError("the lower bound must not exceed the upper one")
-    return value
-
-
-Magnitude = Annotated[
-    tuple[
-        Annotated[float, Field(ge=0, allow_inf_nan=False)],
-        Annotated[float, Field(ge=1e-12, le=1e12)],
-    ],
-    Field(strict=False),
-    AfterValidator(_ordered),
-]
-"""Lower and upper end of a range of forces, N, displacements, m, or pressures, Pa."""
-
-
-Steps = Annotated[int, Field(ge=1, le=1000, exclude_if=lambda value: value == 1)]
-"""Number of equal steps in which each load is applied; every step is a sample."""
 
 
 class _SampledForces(StrictModel):
@@ -252,7 +230,68 @@ class Pressure(StrictModel):
         return self.magnitude_pa
 
 
-AnyTable = Loads | PointLoads | LineLoads | Motion | Pressure
+class Contact(StrictModel):
+    """A rigid instrument without friction that moves against a part of the surface.
+
+    Each sample is a displacement of the instrument from its place at rest. The penalty traction on
+    the undeformed surface is the stiffness times the penetration, along the instrument's normal.
+
+    Attributes
+    ----------
+    region : Region
+        What the instrument may touch: the facets with all corners in it. All others pass through.
+    instrument : SphereInstrument or PlaneInstrument
+        It must not penetrate the region at rest.
+    direction : three floats
+        Axis of the directions in which it moves; the length is ignored.
+    spread_deg : float
+        Largest angle between a motion and the axis. The directions are uniform on the sphere
+        within it. Default: 0, always along the axis.
+    magnitude_m : two floats
+        Range of the displacement, m.
+    samples : int
+        Number of samples.
+    penalty_n_m3 : float, optional
+        Stiffness of the contact: traction per penetration, N/m³. Default: see
+        `mor_bench.scene.contact_surface`.
+    sampling : str
+        Plan for directions and magnitudes.
+    seed : int
+    """
+
+    simultaneous: ClassVar[int] = 1
+    samples_per_patch: ClassVar[int | None] = None
+    steps: ClassVar[int] = 1
+    min_distance_m: ClassVar[float | None] = None
+    unit: ClassVar[str] = "m"
+
+    region: Region
+    kind: Literal["contact"]
+    instrument: Instrument
+    direction: Direction
+    spread_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
+    magnitude_m: Magnitude
+    samples: Count
+    penalty_n_m3: Annotated[Positive, in_range(1e-12, 1e24, "N/m³")] | None = None
+    sampling: Sampling = "random"
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+
+    @property
+    def magnitude(self) -> tuple[float, float]:
+        """The range of the displacement, m."""
+        return self.magnitude_m
+
+    @model_validator(mode="after")
+    def _different_samples(self) -> Self:
+        if self.spread_deg == 0 and self.magnitude_m[0] == self.magnitude_m[1]:
+            raise ValueError(
+                "`magnitude_m` must be a range where `spread_deg` is 0, or samples would repeat; "
+                f"got {self.magnitude_m}"
+            )
+        return self
+
+
+AnyTable = Loads | PointLoads | LineLoads | Motion | Pressure | Contact
 Table = Annotated[AnyTable, Field(discriminator="kind")]
 
 
@@ -310,7 +349,7 @@ class Several(StrictModel):
             else f"{table.kind}"
             for table in self.tables
         ]
-        for alone in ("displacement", "follower pressure"):
+        for alone in ("displacement", "contact", "follower pressure"):
             if alone in kinds:
                 place = kinds.index(alone)
                 other = kinds[1 if place == 0 else 0]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from mor_bench.specs.base import Count, StrictModel
-from mor_bench.specs.loads_spec import Magnitude
+from mor_bench.specs.load_ranges import Magnitude
 from mor_bench.specs.region_spec import Region
 
 SplitBy = Literal["region", "sample", "direction"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -65,7 +66,8 @@ class CoordinateRegression(Surrogate, ABC):
     input, g learns only the nonlinear remainder. With the force as input, g needs no equations, but
     it has no information about load regions without training samples. In a scene with observed
     nodes, their displacements replace the force, and their linear extension replaces the linear
-    response.
+    response. Where an instrument presses, its displacement replaces the force, and linear
+    elasticity with the same contact replaces the linear response.
 
     A subclass declares the parameters below as its hyperparameters, and `derivatives` if it can
     learn from them. `regress` learns g, `take` restores its arrays, and `coefficients` evaluates
@@ -136,7 +138,8 @@ class CoordinateRegression(Surrogate, ABC):
         given, targets = samples.given.values.reshape(len(samples), -1), samples.free_displacements
         if self.input == "linear-response":
             self.response_ = linear_response(scene)
-            inputs = scene.at_free_dofs(self.response_.respond(given))
+            response = self.response_.respond(given)
+            inputs = scene.at_free_dofs(response)
             targets = targets - inputs
         else:
             inputs = scene.at_free_dofs(given)
@@ -144,7 +147,7 @@ class CoordinateRegression(Surrogate, ABC):
         self.axes_ = axes = input_axes(inputs, self.n_input_modes or usual, self.evenness)
         self.modes_ = modes = pod(targets, self.n_output_modes).modes
         known = CoordinateSamples(
-            project(self._to_coordinates(axes), given),
+            project(self._to_coordinates(axes), response if self._kinked else given),
             targets @ modes,
             error_weights(samples.free_displacements)[:, None],
         )
@@ -177,19 +180,26 @@ class CoordinateRegression(Surrogate, ABC):
 
     def answer(self, forces: Array) -> Array:
         loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
+        if self._kinked:
+            loads = self.response_.respond(loads)
         coefficients = self.coefficients(project(self.from_forces_, loads))
         count(multiply_adds=len(loads) * self.modes_.size)
         out = coefficients @ self._expanding
         if self.input == "linear-response":
-            out += self.response_.respond(loads)
+            out += loads if self._kinked else self.response_.respond(loads)
         return out.reshape(forces.shape)
 
     def answer_observed(self, observed: ObservedDisplacements) -> Array:
         return self.answer(observed.values)
 
+    @cached_property
+    def _kinked(self) -> bool:
+        """True if the response to the input is not linear, so that z is taken of the response."""
+        return self.input == "linear-response" and self.scene_.contact is not None
+
     def _to_coordinates(self, axes: Array) -> Array:
         """Return the matrix A (n_dofs, n_inputs) with z = fᵀA for a load f."""
-        if self.input == "linear-response":
+        if self.input == "linear-response" and not self._kinked:
             return self.response_.to_coordinates(axes)
         return self.scene_.columns_at_all_dofs(axes)
 

@@ -45,6 +45,11 @@ class GappyPOD(Surrogate):
     regularisation: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1e-4
 
     def supports(self, scene: Scene) -> str | None:
+        if scene.contact:
+            return (
+                "it completes displacements of a part of the surface, and the scene gives the "
+                "motion of an instrument"
+            )
         return (
             "it completes displacements of a part of the surface, and the scene gives forces"
             if scene.observed_nodes is None

@@ -22,6 +22,7 @@ from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto
 from mor_bench.reduction.subspace import Subspace, extent_of
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.surrogate import Surrogate
 
 Array = NDArray[np.float64]
@@ -88,7 +89,7 @@ class CubatureSurrogate(Surrogate):
     }
 
     def supports(self, scene: Scene) -> str | None:
-        return unknown_equations(scene)
+        return unknown_equations(scene, contact=True)
 
     @abstractmethod
     def choose_cells(
@@ -123,9 +124,19 @@ class CubatureSurrogate(Surrogate):
         points = reduced_points(scene, self.cells_, self.weights_, nodal(scene, self.modes_))
         self.problem_ = CubatureProblem(points, extent_of(scene))
         self.problem_.prepare()
+        if scene.contact:
+            from mor_bench.reduction.pressed_modes import PressedModes  # only such scenes need it
+
+            self.pressed_ = PressedModes(scene, self.problem_, self.modes_)
 
     def answer(self, forces: Array) -> Array:
         options = NewtonOptions(self.value("tolerance"))
         return self.subspace_.answer(
             forces, lambda load: self.problem_.solve(load, options).displacement
+        )
+
+    def answer_observed(self, observed: ObservedDisplacements) -> Array:
+        options = NewtonOptions(self.value("tolerance"))
+        return self.subspace_.answer_given(
+            observed.values, lambda given: self.pressed_.solve(given, options)
         )

@@ -21,6 +21,7 @@ from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto
 from mor_bench.reduction.subspace import Subspace
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.surrogate import Surrogate
 
 
@@ -57,7 +58,7 @@ class PODGalerkin(Surrogate):
     sized: ClassVar = {"n_modes": MODES, "tolerance": TOLERANCES}
 
     def supports(self, scene: Scene) -> str | None:
-        return unknown_equations(scene)
+        return unknown_equations(scene, contact=True)
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         n_modes = self.value("n_modes")
@@ -83,9 +84,18 @@ class PODGalerkin(Surrogate):
         self.subspace_ = Subspace(scene, self.modes_)
         self.problem_ = GalerkinProblem(FullOrderModel(scene).assembler, self.modes_)
         self.problem_.prepare()
+        if scene.contact:
+            from mor_bench.reduction.pressed_modes import PressedModes  # only such scenes need it
+
+            self.pressed_ = PressedModes(scene, self.problem_, self.modes_)
 
     def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         return self.subspace_.answer(
             forces,
             lambda load: solve_equilibrium(self.problem_, load, options=self.options_).displacement,
+        )
+
+    def answer_observed(self, observed: ObservedDisplacements) -> NDArray[np.float64]:
+        return self.subspace_.answer_given(
+            observed.values, lambda given: self.pressed_.solve(given, self.options_)
         )

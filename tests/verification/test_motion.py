@@ -161,7 +161,7 @@ def test_contradictions_are_refused(changed: dict[str, Any], message: str) -> No
             "`loads.magnitude_n`; did you mean 'magnitude_m'",
         ),
         ({"magnitude_m": [2.0, 1.0]}, "the lower bound must not exceed"),
-        ({"kind": "displacements"}, "'displacement' or 'pressure'; got 'displacements'"),
+        ({"kind": "displacements"}, "'pressure' or 'contact'; got 'displacements'"),
         ({"region": {"box_m": [[0.6, 0.4, 0.4], [0.9, 0.6, 0.6]]}}, "no node"),
     ],
 )

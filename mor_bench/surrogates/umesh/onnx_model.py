@@ -122,6 +122,11 @@ def _linear_response(
 ) -> str:
     """Add the product with a dense compliance; ONNX has no sparse solve."""
     n_nodes, n_dofs = scene.mesh.n_nodes, scene.mesh.n_dofs
+    if scene.contact:
+        raise UnavailableBackendError(
+            f"the response of {scene.name} to its instrument is not linear, and is not written "
+            "as ONNX."
+        )
     if n_dofs > MAX_RESPONSE_DOFS:
         raise UnavailableBackendError(
             f"the linear response of {scene.name} has {n_dofs:,} unknowns; ONNX has no sparse "

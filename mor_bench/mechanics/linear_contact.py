@@ -1,0 +1,136 @@
+"""Linear elasticity of a body that an instrument presses: contact is its only nonlinearity."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mor_bench.counting import count, uncounted
+from mor_bench.errors import NoEquilibriumError, UnsupportedSceneError
+from mor_bench.mechanics.compliance import Compliance
+from mor_bench.mechanics.contact_points import ContactMap, ContactPoints, Touch, motion_of
+from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.scene.dofs import dofs_of_nodes
+from mor_bench.scene.scene import Scene
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 1e-10
+"""Change of the contact's forces in a step, relative to them, at which the iteration ends."""
+
+MAX_ITERATIONS = 100
+MAX_HALVINGS = 20
+CHUNK = 256
+"""Columns of the compliance that are computed together."""
+
+
+class LinearContact:
+    """K₀ u = f(u), with the stiffness at rest K₀ and the contact's forces f.
+
+    With the compliance C = K₀⁻¹ at the dofs that the instrument may touch, u = C f. Newton's steps
+    solve (1 + C K) δ = C f - u, where K is the contact's stiffness at the few dofs that touch. K
+    leaves out the curvature of the instrument where a step would not descend on the potential.
+
+    Parameters
+    ----------
+    scene : Scene
+        A scene with an instrument.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene, model = scene, FullOrderModel(scene)
+        self._compliance = Compliance(model)
+        assert scene.observed_nodes is not None
+        dofs = np.intersect1d(dofs_of_nodes(scene.observed_nodes), scene.free_dofs)
+        self._dofs, self._places = dofs, np.searchsorted(scene.free_dofs, dofs)
+        n = len(dofs)
+        self._flexibility = np.empty((n, n))
+        with uncounted():
+            for start in range(0, n, CHUNK):
+                columns = np.arange(start, min(start + CHUNK, n))
+                units = np.zeros((model.n_unknowns, len(columns)))
+                units[self._places[columns], np.arange(len(columns))] = 1.0
+                self._flexibility[:, columns] = self._compliance.solve(units)[self._places]
+        number = np.full(scene.mesh.n_dofs, n, dtype=np.int64)
+        number[dofs] = np.arange(n)
+        self._contact = ContactMap(ContactPoints(scene), number.reshape(-1, 3), n)
+
+    def respond(self, loads: Array, /) -> Array:
+        """Return the responses (n, n_dofs), m, to displacements of the instrument of that shape.
+
+        Raises
+        ------
+        NoEquilibriumError
+            If the iteration does not converge.
+        """
+        forces = np.zeros(loads.shape)
+        for row, given in zip(forces, loads, strict=True):
+            motion = motion_of(self.scene, given[self.scene.free_dofs])
+            if motion.any():
+                row[self._dofs] = self._solved(motion)
+        return self._compliance.respond(forces)
+
+    def to_coordinates(self, axes: Array) -> Array:
+        """Raise an error, since the response is not a linear function of the displacement."""
+        raise UnsupportedSceneError(
+            f"{self.scene.name}: the response to an instrument is not a linear function."
+        )
+
+    def _solved(self, motion: Array) -> Array:
+        """Return the contact's forces (n_touched_dofs,), N."""
+        n_steps = int(np.ceil(1.0 / self._contact.points.first_step(motion)))
+        forces = np.zeros(len(self._dofs))
+        for step in range(1, n_steps + 1):
+            forces = self._settled(step / n_steps * motion, forces)
+        return forces
+
+    def _settled(self, motion: Array, forces: Array) -> Array:
+        """Iterate from the forces (n,), N, at another place of the instrument."""
+        u = self._flexibility @ forces
+        touch = self._contact.touch(u, motion)
+        for _ in range(MAX_ITERATIONS):
+            wanted = self._contact.force(touch)
+            excess = wanted - forces
+            if float(np.linalg.norm(excess)) <= TOLERANCE * float(np.linalg.norm(wanted)):
+                return wanted
+            for curved in (True, False):
+                change = self._newton(touch, wanted, excess, curved) - forces
+                step = self._flexibility @ change
+                count(multiply_adds=self._flexibility.size)
+                if (slope := float(excess @ step)) > 0:
+                    break
+            before = 0.5 * float(forces @ u) + touch.energy_j
+            for halving in range(MAX_HALVINGS):
+                length = 0.5**halving
+                other, moved = forces + length * change, u + length * step
+                touch = self._contact.touch(moved, motion)
+                left = float((self._contact.force(touch) - other) @ step)
+                if 0.5 * float(other @ moved) + touch.energy_j <= before or abs(left) <= slope:
+                    break
+            forces, u = other, moved
+        raise NoEquilibriumError(
+            f"{self.scene.name}: linear elasticity with contact did not converge in "
+            f"{MAX_ITERATIONS} iterations."
+        )
+
+    def _newton(self, touch: Touch, wanted: Array, excess: Array, curved: bool) -> Array:
+        """Return the forces of the equilibrium with the contact linearised."""
+        dofs = self._contact.dofs
+        own = dofs[touch.points].reshape(-1, 3 * dofs.shape[1])
+        used = np.unique(own)
+        used = used[used < len(wanted)]
+        if not len(used):
+            return wanted
+        place = np.full(len(wanted) + 1, len(used))
+        place[used] = np.arange(len(used))
+        local, size = place[own], len(used) + 1
+        at = (local[:, :, None] * size + local[:, None, :]).ravel()
+        blocks = self._contact.blocks(touch, curved).ravel()
+        stiffness = np.bincount(at, blocks, size**2).reshape(size, size)[:-1, :-1]
+        compliance = self._flexibility[np.ix_(used, used)]
+        system = np.eye(len(used)) + compliance @ stiffness
+        moved = np.linalg.solve(system, self._flexibility[used] @ excess)
+        count(factorisations=1, multiply_adds=len(used) ** 3 + len(used) * len(wanted))
+        found = wanted.copy()
+        found[used] -= stiffness @ moved
+        return found

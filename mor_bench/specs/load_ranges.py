@@ -1,0 +1,33 @@
+"""Ranges and plans that all tables of loads share."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+
+LoadKind = Literal["force", "normal", "tangential"]
+Sampling = Literal["random", "latin-hypercube", "sobol"]
+SEED_STEP = 7_368_787
+"""Difference between the seeds of several tables, so that equal seeds give independent draws."""
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise ValueError("the lower bound must not exceed the upper one")
+    return value
+
+
+Magnitude = Annotated[
+    tuple[
+        Annotated[float, Field(ge=0, allow_inf_nan=False)],
+        Annotated[float, Field(ge=1e-12, le=1e12)],
+    ],
+    Field(strict=False),
+    AfterValidator(_ordered),
+]
+"""Lower and upper end of a range of forces, N, displacements, m, or pressures, Pa."""
+
+
+Steps = Annotated[int, Field(ge=1, le=1000, exclude_if=lambda value: value == 1)]
+"""Number of equal steps in which each load is applied; every step is a sample."""
