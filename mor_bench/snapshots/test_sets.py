@@ -24,7 +24,16 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.specs import AnyTable, DatasetSpec, LineLoads, Loads, Motion, Pressure, Several
+from mor_bench.specs import (
+    AnyTable,
+    Contact,
+    DatasetSpec,
+    LineLoads,
+    Loads,
+    Motion,
+    Pressure,
+    Several,
+)
 
 SetName = Literal[
     "in-range",
