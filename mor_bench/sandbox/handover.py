@@ -21,6 +21,8 @@ def arrays_of(snapshots: Snapshots) -> dict[str, NDArray[np.generic]]:
     forces = (
         {"forces": loads.forces} if isinstance(loads, NodalLoads) else {"vectors": loads.vectors}
     )
+    if snapshots.scene.parameter_names:
+        forces["parameters"] = snapshots.parameters
     return {
         "patches": loads.patches,
         **forces,
@@ -48,6 +50,6 @@ def read_snapshots(folder: Path, scene: Scene) -> Snapshots:
     loads = (
         NodalLoads(arrays["forces"], patches)
         if "forces" in arrays
-        else PatchLoads(patches, arrays["vectors"])
+        else PatchLoads(patches, arrays["vectors"], arrays.get("parameters"))
     )
     return Snapshots(scene, loads, arrays["free_displacements"], arrays["min_det_f"])

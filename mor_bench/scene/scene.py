@@ -85,6 +85,12 @@ class Scene:
         """The spec of a scene with known equations; `UnsupportedSceneError` for any other."""
         return generated(self.spec)
 
+    @cached_property
+    def parameter_names(self) -> tuple[str, ...]:
+        """The names of the sampled parameters; empty if samples differ in their loads only."""
+        table = self.spec.parameters if isinstance(self.spec, DatasetSpec) else None
+        return () if table is None else table.names
+
     @property
     def selective(self) -> bool:
         """True if the volumetric energy is computed from the cells' mean gradients."""

@@ -153,9 +153,11 @@ class _Plan:
         return bool(
             shard.patches.shape == loads.patches.shape
             and shard.vectors.shape == loads.vectors.shape
+            and shard.parameters.shape == loads.parameters.shape
             and len(shard.status) == len(loads)
             and (shard.patches == loads.patches).all()
             and np.abs(shard.vectors - loads.vectors).max() <= ROUND_OFF * largest
+            and np.allclose(shard.parameters, loads.parameters, rtol=ROUND_OFF, atol=0.0)
         )
 
 

@@ -13,6 +13,9 @@ latin-hypercube, sobol
     from one design for the samples of each patch, with seed (seed, patch); with combinations, from
     one design for all samples.
 
+Sampled parameters of the body are further coordinates: of the same design, or of a generator with
+seed (seed, i) and a constant.
+
 A sample depends neither on the order of generation nor on the number of workers.
 """
 
@@ -44,7 +47,7 @@ N_COORDINATES = {"force": 3, "displacement": 3, "tangential": 2, "normal": 1}
 """Coordinates of one force or displacement, by kind of load."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class PatchLoads:
     """Loads in compact form: k force vectors on k patches per sample, or the motion of one tool.
 
@@ -54,16 +57,29 @@ class PatchLoads:
         Patch numbers, which are also the load-region ids, in ascending order.
     vectors : (n_samples, k, 3) float64
         Forces, N, or displacements, m.
+    parameters : (n_samples, n_parameters) float64
+        Values of the scene's sampled parameters; without any, there are no columns.
     """
 
     patches: NDArray[np.int64]
     vectors: NDArray[np.float64]
+    parameters: NDArray[np.float64]
+
+    def __init__(
+        self,
+        patches: NDArray[np.int64],
+        vectors: NDArray[np.float64],
+        parameters: NDArray[np.float64] | None = None,
+    ) -> None:
+        if parameters is None:
+            parameters = np.zeros((len(patches), 0))
+        vars(self).update(patches=patches, vectors=vectors, parameters=parameters)
 
     def __len__(self) -> int:
         return len(self.patches)
 
     def __getitem__(self, index: NDArray[np.int64] | slice) -> PatchLoads:
-        return PatchLoads(self.patches[index], self.vectors[index])
+        return PatchLoads(self.patches[index], self.vectors[index], self.parameters[index])
 
     def nodal_forces(self, weights: sp.csr_array) -> NDArray[np.float64]:
         """Return nodal forces, N, or displacements, m, of a moved tool, from a scene's weights.
@@ -107,7 +123,7 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
     """
     loads, numbers = scene.generated.load_plan, np.arange(start, stop)
     if isinstance(loads, Pressure):
-        return _pressures(loads, numbers)
+        return _pressures(scene, loads, numbers)
     chosen, k = _combinations(scene), loads.simultaneous
     if chosen is None:
         patches = np.stack([_apart(scene, int(i)) for i in numbers])
@@ -117,31 +133,52 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
     normals = np.zeros((*patches.shape, 3)) if free else scene.patch_normals[patches]
     if loads.sampling == "random":
         drawn = [_random_forces(loads, int(i), n) for i, n in zip(numbers, normals, strict=True)]
-        return PatchLoads(patches, np.stack(drawn))
+        return PatchLoads(patches, np.stack(drawn), _random_parameters(scene, numbers))
     d, whole = N_COORDINATES[loads.kind], n_samples_of(scene)
+    n = k * d + len(scene.parameter_names)
     if k == 1:
         assert chosen is not None
         size, turns = -(-whole // len(chosen)), numbers // len(chosen)
-        designs = [_design(loads.sampling, (loads.seed, int(p)), size, d) for p in patches[:, 0]]
+        designs = [_design(loads.sampling, (loads.seed, int(p)), size, n) for p in patches[:, 0]]
         unit = np.stack([design[turn] for design, turn in zip(designs, turns, strict=True)])
     else:
-        unit = _design(loads.sampling, (loads.seed,), whole, k * d)[numbers]
-    return PatchLoads(patches, _forces(loads, unit.reshape(len(numbers), k, d), normals))
+        unit = _design(loads.sampling, (loads.seed,), whole, n)[numbers]
+    forces = _forces(loads, unit[:, : k * d].reshape(len(numbers), k, d), normals)
+    return PatchLoads(patches, forces, _parameters(scene, unit[:, k * d :]))
 
 
-def _pressures(loads: Pressure, numbers: NDArray[np.int64]) -> PatchLoads:
+def _parameters(scene: Scene, unit: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return sampled parameters for coordinates in [0, 1], (n, n_parameters) both."""
+    table = scene.generated.parameters
+    return unit if table is None else table.values(unit)
+
+
+def _random_parameters(scene: Scene, numbers: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the parameters (n, n_parameters) of samples with a random plan."""
+    n = len(scene.parameter_names)
+    if n == 0:
+        return np.zeros((len(numbers), 0))
+    seed = scene.generated.load_plan.seed
+    drawn = [np.random.default_rng([seed, 0xB0D7, int(i)]).uniform(size=n) for i in numbers]
+    return _parameters(scene, np.stack(drawn))
+
+
+def _pressures(scene: Scene, loads: Pressure, numbers: NDArray[np.int64]) -> PatchLoads:
     """Return pressures, as the forces -p e_i on three patches of each region."""
-    d = len(loads.regions)
+    d, parameters = len(loads.regions), np.zeros((len(numbers), 0))
     if loads.sampling == "random":
         drawn = [np.random.default_rng([loads.seed, int(i)]).uniform(size=d) for i in numbers]
         unit = np.reshape(drawn, (len(numbers), d))
+        parameters = _random_parameters(scene, numbers)
     else:
-        unit = _design(loads.sampling, (loads.seed,), loads.samples, d)[numbers]
+        n = d + len(scene.parameter_names)
+        unit = _design(loads.sampling, (loads.seed,), loads.samples, n)[numbers]
+        unit, parameters = unit[:, :d], _parameters(scene, unit[:, d:])
     low, high = loads.magnitude
     pressures = low + (high - low) * unit
     vectors = -pressures[:, :, None, None] * np.eye(3)
     patches = np.tile(np.arange(3 * d), (len(numbers), 1))
-    return PatchLoads(patches, vectors.reshape(len(numbers), 3 * d, 3))
+    return PatchLoads(patches, vectors.reshape(len(numbers), 3 * d, 3), parameters)
 
 
 def _combinations(scene: Scene) -> NDArray[np.int64] | None:
@@ -283,7 +320,13 @@ def _tangents(normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 def repeated(parts: Sequence[tuple[Scene, PatchLoads]]) -> int:
     """Return how many samples repeat others, in several sets of loads on one body."""
     rows = [
-        np.hstack([scene.patch_nodes[loads.patches], loads.vectors.reshape(len(loads), -1)])
+        np.hstack(
+            [
+                loads.parameters,
+                scene.patch_nodes[loads.patches],
+                loads.vectors.reshape(len(loads), -1),
+            ]
+        )
         for scene, loads in parts
     ]
     width = max(row.shape[1] for row in rows)

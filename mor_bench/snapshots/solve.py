@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from mor_bench.errors import InvertedElementError, WorkerError
-from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import Solution
-from mor_bench.mechanics.observed import ObservedModel, generating_model
+from mor_bench.mechanics.parametric import Generator, generator_of
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.sampling import PatchLoads
 from mor_bench.snapshots.store import STATUSES, Shard
@@ -75,13 +74,13 @@ class _Kept(threading.local):
     """The last model of each thread. Models have buffers, so threads do not share them."""
 
     problem: bytes = b""
-    model: FullOrderModel | ObservedModel
+    model: Generator
     weights: sp.csr_array
 
-    def of(self, problem: bytes) -> tuple[FullOrderModel | ObservedModel, sp.csr_array]:
+    def of(self, problem: bytes) -> tuple[Generator, sp.csr_array]:
         if self.problem != problem:
             scene, self.weights = pickle.loads(problem)
-            self.model, self.problem = generating_model(scene), problem
+            self.model, self.problem = generator_of(scene), problem
         return self.model, self.weights
 
 
@@ -133,7 +132,7 @@ def solve_task(task: Task) -> Solved:
     status = np.zeros(len(loads), dtype=np.uint8)
     with _single_threaded(), install_listener("numba:compile", TimingListener()) as compilation:  # type: ignore[no-untyped-call]
         begun = perf_counter()
-        for row, found in enumerate(model.solve_many(values)):
+        for row, found in enumerate(model.solve_many(values, loads.parameters)):
             if isinstance(found, Solution):
                 displacements[row], min_det_f[row] = found.displacement, found.min_det_f
             else:
@@ -142,5 +141,5 @@ def solve_task(task: Task) -> Solved:
         seconds = perf_counter() - begun
     if compilation.done:  # the compiled kernels stay, for all later samples
         seconds = max(seconds - compilation.duration, 0.0)
-    columns = loads.patches, loads.vectors, displacements, min_det_f, status
+    columns = loads.patches, loads.vectors, displacements, min_det_f, status, loads.parameters
     return Solved(Shard(task.dataset, task.start, *columns), seconds)

@@ -13,6 +13,8 @@ unseen-directions
     directions all over the sphere, use the split by direction instead.
 several-forces
     Three simultaneous forces, far apart, if the main set has one.
+unseen-parameters
+    The loads of the main plan, on bodies whose sampled parameters all lie outside their ranges.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.specs import DatasetSpec, Loads
+from mor_bench.specs import DatasetSpec, Loads, SampledParameters, check_parameters_of
 
 SetName = Literal[
     "in-range",
@@ -34,6 +36,7 @@ SetName = Literal[
     "unseen-regions",
     "unseen-directions",
     "several-forces",
+    "unseen-parameters",
 ]
 
 SET_NAMES: tuple[SetName, ...] = get_args(SetName)
@@ -51,6 +54,8 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
     """Return the reason why a dataset has no such test set, or None if it has one."""
     if name not in SET_NAMES:
         return f"there is no such set; known: {', '.join(SET_NAMES)}"
+    if name == "unseen-parameters":
+        return _no_parameters_outside(spec)
     if name == "unseen-regions" and spec.tests.unseen_region is None:
         return "its file names no `tests.unseen_region`"
     if name == "paper-amplitude" and spec.tests.paper_magnitude_n is None:
@@ -72,6 +77,21 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
         if distance == 0 or _farthest(scene.patch_centres, distance) < N_SEVERAL:
             return f"it has no {N_SEVERAL} load patches that are {distance:g} m apart"
     return None
+
+
+def _no_parameters_outside(spec: DatasetSpec) -> str | None:
+    """Return why parameters cannot be drawn outside their ranges; None if they can."""
+    if spec.parameters is None:
+        return "it has no table `parameters`"
+    try:
+        check_parameters_of(_outside(spec, spec.parameters), spec.material)
+    except ValueError as error:
+        return f"`tests.unseen_parameters` is too large: {error}"
+    return None
+
+
+def _outside(spec: DatasetSpec, parameters: SampledParameters) -> SampledParameters:
+    return parameters.model_copy(update={"outside": spec.tests.unseen_parameters})
 
 
 def available_sets(spec: DatasetSpec) -> list[SetName]:
@@ -106,6 +126,8 @@ def spec_of_set(spec: DatasetSpec, name: SetName) -> DatasetSpec:
     elif name == "several-forces":
         changed.update(simultaneous=N_SEVERAL, min_distance_m=FAR * _diagonal(load_scene(spec)))
     content = {**spec.model_dump(), "name": f"{spec.name}--{name}"}
+    if name == "unseen-parameters" and spec.parameters is not None:
+        content["parameters"] = _outside(spec, spec.parameters).model_dump()
     return DatasetSpec.model_validate({**content, "loads": {**loads.model_dump(), **changed}})
 
 

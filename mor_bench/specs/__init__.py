@@ -55,6 +55,12 @@ from mor_bench.specs.region_spec import (
     Region,
     SphereRegion,
 )
+from mor_bench.specs.sampled_parameters import (
+    LIMITS,
+    SampledParameters,
+    check_parameters_of,
+    material_with,
+)
 from mor_bench.specs.source_file import RECORDED, SourceFile
 from mor_bench.specs.spec_files import (
     is_method_file,
@@ -67,6 +73,7 @@ from mor_bench.specs.suite_folder import find_suite, list_suite
 
 __all__ = [
     "AXES",
+    "LIMITS",
     "MAX_COUNT",
     "NO_EQUATIONS",
     "NO_FORCES",
@@ -94,6 +101,7 @@ __all__ = [
     "Pressure",
     "Race",
     "Region",
+    "SampledParameters",
     "Sampling",
     "SolverName",
     "SourceFile",
@@ -108,6 +116,7 @@ __all__ = [
     "all_configurations",
     "check_method",
     "check_parameters",
+    "check_parameters_of",
     "find_suite",
     "generated",
     "is_method_file",
@@ -117,4 +126,5 @@ __all__ = [
     "load_generated_spec",
     "load_method_spec",
     "load_recorded_spec",
+    "material_with",
 ]

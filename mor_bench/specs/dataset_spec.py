@@ -26,6 +26,7 @@ from mor_bench.specs.loads_spec import (
 )
 from mor_bench.specs.material_spec import Discretisation, MaterialSpec, SolverName
 from mor_bench.specs.region_spec import Outputs, Region
+from mor_bench.specs.sampled_parameters import SampledParameters, check_parameters_of
 from mor_bench.specs.source_file import File, without_paths
 
 MAX_NODES = 1_000_000
@@ -119,6 +120,8 @@ class DatasetSpec(CommonDatasetSpec):
     loads : Loads, Motion or Pressure, optional
         Sampled forces, displacements of a tool, or pressures. Without it the scene can be solved
         for given forces, but no samples can be drawn.
+    parameters : SampledParameters, optional
+        Properties of the body that vary between samples, beside the loads.
     """
 
     geometry: Geometry
@@ -131,6 +134,9 @@ class DatasetSpec(CommonDatasetSpec):
     ] = ()
     gravity: Gravity | None = None
     loads: LoadPlan | None = None
+    parameters: SampledParameters | None = Field(
+        default=None, exclude_if=lambda value: value is None
+    )
     split: Split = Split()
     tests: ExtraTests = ExtraTests()
 
@@ -154,6 +160,32 @@ class DatasetSpec(CommonDatasetSpec):
         for name in ("unseen_region", "paper_magnitude_n"):
             if getattr(self.tests, name) is not None:
                 raise ValueError(f"`tests.{name}` must be absent {where}")
+        return self
+
+    @model_validator(mode="after")
+    def _sampled_parameters(self) -> Self:
+        """Check that the scene can take its sampled parameters."""
+        if self.parameters is None:
+            if "unseen_parameters" in self.tests.model_fields_set:
+                raise ValueError(
+                    "`tests.unseen_parameters` must be absent without the table `parameters`"
+                )
+            return self
+        check_parameters_of(self.parameters, self.material)
+        others = {
+            "`loads.kind` is 'displacement'": isinstance(self.loads, Motion),
+            "`observed` is given": self.observed is not None,
+            "`loads.follower` is true": isinstance(self.loads, Pressure) and self.loads.follower,
+        }
+        if found := [other for other, present in others.items() if present]:
+            raise ValueError(f"`parameters` must be absent where {found[0]}")
+        fixed_shape = {
+            "the loads are pressures": isinstance(self.loads, Pressure),
+            "`springs` are given": bool(self.springs),
+        }
+        found = [other for other, present in fixed_shape.items() if present]
+        if self.parameters.scale is not None and found:
+            raise ValueError(f"`parameters.scale` must be absent where {found[0]}")
         return self
 
     @property
@@ -181,6 +213,7 @@ class DatasetSpec(CommonDatasetSpec):
                 "springs",
                 "gravity",
                 "loads",
+                "parameters",
             },
             exclude_none=True,
         )

@@ -15,6 +15,7 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.compliance import project
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.observed import LinearResponse, linear_response
+from mor_bench.mechanics.parametric import Bodies, ParametricResponse
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.coordinates import error_weights, input_axes
@@ -67,6 +68,10 @@ class CoordinateRegression(Surrogate, ABC):
     nodes, their displacements replace the force, and their linear extension replaces the linear
     response.
 
+    In a scene with sampled parameters, the linear response is that of the sample's own body. The
+    parameters follow as further coordinates, scaled to [-1, 1] over the training samples. Then a
+    subclass must ensure that g is zero where all other coordinates are.
+
     A subclass declares the parameters below as its hyperparameters, and `derivatives` if it can
     learn from them. `regress` learns g, `take` restores its arrays, and `coefficients` evaluates
     it.
@@ -101,6 +106,9 @@ class CoordinateRegression(Surrogate, ABC):
     axes_: Array
     modes_: Array
     response_: LinearResponse
+    responses_: ParametricResponse
+    ends_: Array
+    """(2, n_varied): lowest and highest training value of each parameter that g depends on."""
 
     @abstractmethod
     def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
@@ -134,17 +142,26 @@ class CoordinateRegression(Surrogate, ABC):
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         samples = _shuffled(samples)
         given, targets = samples.given.values.reshape(len(samples), -1), samples.free_displacements
+        parametric = bool(scene.parameter_names)
         if self.input == "linear-response":
-            self.response_ = linear_response(scene)
-            inputs = self.response_.respond(given)[:, scene.free_dofs]
+            self._respond_to(scene)
+            inputs = self._responses(given, samples.parameters)[:, scene.free_dofs]
             targets = targets - inputs
         else:
             inputs = given[:, scene.free_dofs]
         usual = min(self.usual_inputs[self.input], *inputs[:, inputs.any(axis=0)].shape)
         self.axes_ = axes = input_axes(inputs, self.n_input_modes or usual, self.evenness)
         self.modes_ = modes = pod(targets, self.n_output_modes).modes
+        more: dict[str, Array] = {}
+        if parametric:
+            values = samples.parameters[:, self._varied(scene)]
+            self.ends_ = np.array([values.min(axis=0), values.max(axis=0)])
+            z = self._with_parameters(inputs @ axes, samples.parameters)
+            more = {"parameter_ends": self.ends_} if self.ends_.size else {}
+        else:
+            z = project(self._to_coordinates(axes), given)
         known = CoordinateSamples(
-            project(self._to_coordinates(axes), given),
+            z,
             targets @ modes,
             error_weights(samples.free_displacements)[:, None],
         )
@@ -152,14 +169,19 @@ class CoordinateRegression(Surrogate, ABC):
             of_force = self.input == "force"
             found = sensitivities(FullOrderModel(scene), samples, axes, modes, of_force=of_force)
             known = replace(known, directions=found.inputs, slopes=found.outputs)
-        return {"axes": axes, "modes": modes, **self.regress(known)}
+        return {"axes": axes, "modes": modes, **more, **self.regress(known)}
 
     def prepare(self, scene: Scene, model: Arrays) -> None:
         n_free = len(scene.free_dofs)
         self.axes_ = take_array(model, "axes", (n_free, None))
         self.modes_ = take_array(model, "modes", (n_free, None))
-        shapes = self.shapes(model, self.axes_.shape[1], self.modes_.shape[1])
-        names = {"axes", "modes", *shapes}
+        names, self.ends_ = {"axes", "modes"}, np.zeros((2, 0))
+        if varied := self._varied(scene):
+            self.ends_ = take_array(model, "parameter_ends", (2, len(varied)))
+            names.add("parameter_ends")
+        n_inputs = self.axes_.shape[1] + len(varied)
+        shapes = self.shapes(model, n_inputs, self.modes_.shape[1])
+        names |= shapes.keys()
         if model.keys() != names:
             raise InvalidInputError(
                 f"the arrays must be {', '.join(sorted(names))}; got {', '.join(sorted(model))}."
@@ -170,9 +192,10 @@ class CoordinateRegression(Surrogate, ABC):
                 for name, shape in shapes.items()
             }
         )
-        if self.input == "linear-response" and not hasattr(self, "response_"):
-            self.response_ = linear_response(scene)
-        self.from_forces_ = self._to_coordinates(self.axes_)
+        if self.input == "linear-response" and not self._responds:
+            self._respond_to(scene)
+        if self.input == "force" or not scene.parameter_names:
+            self.from_forces_ = self._to_coordinates(self.axes_)
         self._expanding = np.ascontiguousarray(self._on_all_dofs(self.modes_).T)
 
     def answer(self, forces: Array) -> Array:
@@ -184,8 +207,48 @@ class CoordinateRegression(Surrogate, ABC):
             out += self.response_.respond(loads)
         return out.reshape(forces.shape)
 
+    def answer_parametric(self, forces: Array, parameters: Array) -> Array:
+        loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
+        if self.input == "linear-response":
+            out = self.responses_.respond(loads, parameters)
+            count(multiply_adds=len(loads) * self.axes_.size)
+            z = out[:, self.scene_.free_dofs] @ self.axes_
+        else:
+            out, z = np.zeros(loads.shape), project(self.from_forces_, loads)
+        coefficients = self.coefficients(self._with_parameters(z, parameters))
+        count(multiply_adds=len(loads) * self.modes_.size)
+        return (out + coefficients @ self._expanding).reshape(forces.shape)
+
     def answer_observed(self, observed: ObservedDisplacements) -> Array:
         return self.answer(observed.values)
+
+    def _respond_to(self, scene: Scene) -> None:
+        if scene.parameter_names:
+            self.responses_ = ParametricResponse(scene)
+        else:
+            self.response_ = linear_response(scene)
+
+    @property
+    def _responds(self) -> bool:
+        return hasattr(self, "response_") or hasattr(self, "responses_")
+
+    def _responses(self, loads: Array, parameters: Array) -> Array:
+        if self.scene_.parameter_names:
+            return self.responses_.respond(loads, parameters)
+        return self.response_.respond(loads)
+
+    def _varied(self, scene: Scene) -> list[int]:
+        """Return the numbers of the parameters that g depends on."""
+        if self.input == "linear-response" and scene.parameter_names:
+            return Bodies(scene).varied
+        return list(range(len(scene.parameter_names)))
+
+    def _with_parameters(self, z: Array, parameters: Array) -> Array:
+        """Append the scaled parameters (n, n_parameters) to coordinates (n, n_axes)."""
+        low, high = self.ends_
+        half = np.where(high > low, 0.5 * (high - low), 1.0)
+        values = parameters[:, self._varied(self.scene_)]
+        return np.hstack([z, (values - 0.5 * (low + high)) / half])
 
     def _to_coordinates(self, axes: Array) -> Array:
         """Return the matrix A (n_dofs, n_inputs) with z = fᵀA for a load f."""
