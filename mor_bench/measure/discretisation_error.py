@@ -287,6 +287,11 @@ def refine(
             f"{spec.name}: the discretisation error can be measured for forces only, not where "
             "`loads.kind` is 'displacement'."
         )
+    if scene.parameter_names:
+        raise UnsupportedSceneError(
+            f"{spec.name}: the discretisation error can be measured for one body only, not with "
+            "the table `parameters`."
+        )
     n_patches = n_samples_of(scene) if scene.pressure else len(scene.patch_nodes)
     if not 1 <= plan.n_loads <= n_patches:
         raise InvalidInputError(
