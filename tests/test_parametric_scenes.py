@@ -35,7 +35,7 @@ BOTH: dict[str, Any] = {
     "scale": {"x": [0.9, 1.2]},
 }
 
-TAKE = {
+TAKE: dict[str, dict[str, Any]] = {
     "pod": {"n_modes": 6},
     "hpod": {"n_modes": 6, "cubature_tolerance": 0.01},
     "fem": {},

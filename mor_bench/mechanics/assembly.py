@@ -149,9 +149,9 @@ def quadrature_of(body: Discretisation) -> Quadrature:
 def law_parameters(body: Discretisation) -> Array:
     """Return the law's parameters (n_points, n_parameters) at the quadrature points of a cell."""
     material, n = body.material, len(element_of(body.cells).weights)
-    if not body.selective:
-        return np.array([material.parameters] * n)
-    return np.array([material.shape_parameters] * n + [material.volume_parameters])
+    if body.selective:
+        return np.array([material.shape_parameters] * n + [material.volume_parameters])
+    return np.array([material.parameters] * n)
 
 
 def _placed(
