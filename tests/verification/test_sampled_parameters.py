@@ -106,6 +106,17 @@ def test_a_linear_response_is_that_of_a_scene_with_these_parameters(kind: str) -
         assert np.linalg.norm(response - expected) <= 1e-10 * np.linalg.norm(expected)
 
 
+def test_a_tiny_force_moves_each_body_by_its_own_linear_response() -> None:
+    scene = built(RANGES["both"])
+    forces, parameters = drawn(scene, 2)
+    found = ParametricModel(scene).solve_many(1e-13 * forces, parameters)
+    for load, row, solution in zip(forces, parameters, found, strict=True):
+        own = FullOrderModel(with_parameters(named(scene, row)), "cholesky")
+        expected = own.rest_factor.solve(1e-13 * load)
+        error = np.linalg.norm(solution.displacement - expected)  # type: ignore[union-attr]
+        assert error <= 1e-9 * np.linalg.norm(expected)
+
+
 def test_a_stiffer_body_under_a_larger_force_moves_the_same() -> None:
     scene = built(RANGES["stiffness"])
     forces, parameters = drawn(scene, 4)
