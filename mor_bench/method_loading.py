@@ -30,7 +30,10 @@ from mor_bench.specs import (
     load_recorded_spec,
 )
 from mor_bench.specs.inline_parameters import split_method
-from mor_bench.surrogate import Surrogate
+from mor_bench.surrogate import NO_PARAMETERS, Surrogate
+
+ANSWERS = ("predict", "answer", "answer_parametric", "answer_observed")
+"""Methods of a class, at least one of which must be its own."""
 
 
 def load_method(source: str | Path, **parameters: Any) -> Surrogate:
@@ -60,7 +63,7 @@ def load_method(source: str | Path, **parameters: Any) -> Surrogate:
 
 def check_predicts(surrogate: type[Any], name: str) -> None:
     """Raise `UnusableClassError` if a class has no prediction of its own."""
-    own = (getattr(surrogate, verb, None) for verb in ("predict", "answer", "answer_observed"))
+    own = (getattr(surrogate, verb, None) for verb in ANSWERS)
     if all(function in vars(Surrogate).values() for function in own):
         raise UnusableClassError(f"surrogate {name!r} has neither `answer` nor `predict`.")
 
@@ -122,7 +125,11 @@ class AdaptedMethod(Surrogate):
             self.range_ = LoadRange.of(snapshots)
         return self
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+    def predict(
+        self, forces: ArrayLike, parameters: ArrayLike | None = None
+    ) -> NDArray[np.float64]:
+        if parameters is not None:
+            raise UnsupportedSceneError(f"{class_path(self._class)}: {NO_PARAMETERS}.")
         if not hasattr(self, "method_"):
             raise NotFittedError(f"{class_path(self._class)} must be fitted before it predicts.")
         return np.asarray(self.method_.predict(forces))
@@ -173,7 +180,8 @@ def _fitted(
         method.restore(scene, model.arrays, model.sizes)
         method.timings_ms_.update(model.timings_ms)
         if model.load_range:
-            method.range_ = LoadRange.from_arrays(model.load_range, scene.mesh.n_nodes)
+            n_nodes, n_parameters = scene.mesh.n_nodes, len(scene.parameter_names)
+            method.range_ = LoadRange.from_arrays(model.load_range, n_nodes, n_parameters)
     except (
         MorBenchError,
         ArithmeticError,

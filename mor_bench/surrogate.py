@@ -29,8 +29,10 @@ from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.given import (
     Given,
     ObservedDisplacements,
+    ParametricForces,
     checked_forces,
     checked_given,
+    checked_parametric,
 )
 from mor_bench.snapshots.load_range import LoadRange
 from mor_bench.specs import CONTACT, NO_FORCES, check_parameters
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
     import onnx
 
 Array = NDArray[np.float64]
+
+NO_PARAMETERS = "it does not take sampled parameters"
 
 
 class Surrogate:
@@ -57,6 +61,9 @@ class Surrogate:
     takes_observations: ClassVar[bool] = False
     """True if the input may be displacements of a part of the surface instead of forces. A
     class that defines `answer_observed` sets it."""
+
+    takes_parameters: ClassVar[bool] = False
+    """True if the method can handle scenes with sampled parameters, by `answer_parametric`."""
 
     architecture: ClassVar[tuple[str, ...]] = ()
     """Hyperparameters that determine names, shapes or meaning of the weights. A training can start
@@ -110,6 +117,10 @@ class Surrogate:
     def answer(self, forces: Array) -> Array:
         """Return displacements, m, under checked forces (n, n_nodes, 3), N, in the same shape."""
         raise MorBenchError(f"{type(self).__name__} has neither `answer` nor `predict`.")
+
+    def answer_parametric(self, forces: Array, parameters: Array) -> Array:
+        """Return the same as `answer`, on bodies with checked parameters (n, n_parameters)."""
+        raise UnsupportedSceneError(f"{type(self).__name__} cannot be used: {NO_PARAMETERS}.")
 
     def answer_observed(self, observed: ObservedDisplacements) -> Array:
         """Return the same as `answer`, from displacements of the observed nodes, zero elsewhere."""
@@ -181,13 +192,16 @@ class Surrogate:
         self.prepare(scene, self.arrays_)
         return self
 
-    def predict(self, forces: ArrayLike) -> Array:
+    def predict(self, forces: ArrayLike, parameters: ArrayLike | None = None) -> Array:
         """Predict displacements.
 
         Parameters
         ----------
         forces : (n_nodes, 3) or (n, n_nodes, 3), or ObservedDisplacements
             Nodal forces, N; or displacements of a part of the surface, m.
+        parameters : (n_parameters,) or (n, n_parameters), optional
+            Values of ``scene.parameter_names``, for all forces or for each of them. Required in a
+            scene with sampled parameters, and refused in all others.
 
         Returns
         -------
@@ -207,6 +221,9 @@ class Surrogate:
             given = self._checked(forces)
             assert isinstance(given, ObservedDisplacements)
             found, shape = self.answer_observed(given), given.values.shape
+        elif parameters is not None or self._fitted_scene().parameter_names:
+            both = checked_parametric(self._fitted_scene(), forces, parameters)
+            found, shape = self.answer_parametric(both.values, both.parameters), both.values.shape
         else:
             values = checked_forces(self._fitted_scene(), forces)
             found, shape = self.answer(values), values.shape
@@ -223,6 +240,8 @@ class Surrogate:
 
     def supports(self, scene: Scene) -> str | None:
         """Return the reason why the method cannot handle a scene, or None if it can."""
+        if scene.parameter_names and not self.takes_parameters:
+            return NO_PARAMETERS
         if self.takes_observations or scene.observed_nodes is None:
             return None
         return CONTACT if scene.contact else NO_FORCES
@@ -234,11 +253,13 @@ class Surrogate:
             raise InvalidInputError(f"no value was chosen for `{name}`.")
         return value
 
-    def out_of_range(self, forces: ArrayLike) -> NDArray[np.bool_]:
+    def out_of_range(
+        self, forces: ArrayLike, parameters: ArrayLike | None = None
+    ) -> NDArray[np.bool_]:
         """Flag loads outside the range of the training loads, as a bool array of shape () or (n,).
 
         A flag is not a bound on the error, see `mor_bench.snapshots.load_range`. A method that
-        needs no snapshots flags nothing. The parameter and errors are those of `predict`.
+        needs no snapshots flags nothing. Parameters and errors are those of `predict`.
 
         Raises
         ------
@@ -251,11 +272,12 @@ class Surrogate:
                 f"{type(self).__name__} overrides `fit`, so the range of its training loads is "
                 "not known."
             )
-        given = self._checked(forces)
+        given = self._checked(forces, parameters)
         if not self.needs_snapshots:
             flags = np.zeros(len(given), dtype=bool)
         elif hasattr(self, "range_"):
-            flags = self.range_.excludes(given.values)
+            bodies = given.parameters if isinstance(given, ParametricForces) else None
+            flags = self.range_.excludes(given.values, bodies)
         elif self.scene_.observed_nodes is not None:
             raise UnknownRangeError(
                 f"{self.scene_.name}: the range of the training loads is not known: "
@@ -281,6 +303,10 @@ class Surrogate:
         UnsupportedSceneError
             If the scene's equations or the forces are unknown.
         """
+        if self._fitted_scene().parameter_names:
+            raise UnsupportedSceneError(
+                f"{self.scene_.name}: the error cannot be estimated with sampled parameters."
+            )
         given = self._checked(forces)
         if self.scene_.observed_nodes is not None:
             raise UnsupportedSceneError(
@@ -354,7 +380,9 @@ class Surrogate:
     def _become(self, scene: Scene, sizes: dict[str, Any]) -> None:
         self.scene_, self.sizes_, self.timings_ms_ = scene, sizes, {}
 
-    def _checked(self, forces: ArrayLike) -> Given:
+    def _checked(self, forces: ArrayLike, parameters: ArrayLike | None = None) -> Given:
+        if parameters is not None:
+            return checked_parametric(self._fitted_scene(), forces, parameters)
         return checked_given(self._fitted_scene(), forces)
 
     def _fitted_scene(self) -> Scene:

@@ -20,7 +20,7 @@ class Good(PODGalerkin):
 class Bad(PODGalerkin):
     """Moves without a force, never repeats a prediction, and accepts NaN."""
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:  # type: ignore[override]
         answer = super().predict(np.nan_to_num(np.asarray(forces)))
         return answer + 0.01 + 1e-5 * np.random.default_rng().normal(size=answer.shape)
 
@@ -28,7 +28,7 @@ class Bad(PODGalerkin):
 class Crashing(PODGalerkin):
     """Divides by zero if there is no force, as in some poor snapshots."""
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:  # type: ignore[override]
         answer = super().predict(forces)
         if answer.size and not np.any(np.asarray(forces)):
             raise ZeroDivisionError("on purpose")
@@ -38,7 +38,7 @@ class Crashing(PODGalerkin):
 class Rounding(PODGalerkin):
     """Loses a fifth of the displacement in single precision."""
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:  # type: ignore[override]
         return super().predict(forces) * (0.8 if np.asarray(forces).dtype == np.float32 else 1.0)
 
 
@@ -62,7 +62,7 @@ class Unfit(PODGalerkin):
 class Ending(PODGalerkin):
     """Ends Python if there is no force."""
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:  # type: ignore[override]
         if not np.asarray(forces).any():
             os._exit(7)
         return super().predict(forces)
@@ -71,14 +71,14 @@ class Ending(PODGalerkin):
 class Alarmed(PODGalerkin):
     """Flags every load as out of range."""
 
-    def out_of_range(self, forces: ArrayLike) -> NDArray[np.bool_]:
+    def out_of_range(self, forces: ArrayLike) -> NDArray[np.bool_]:  # type: ignore[override]
         return np.ones(np.shape(forces)[:-2], dtype=bool)
 
 
 class Careless(PODGalerkin):
     """Flags no load."""
 
-    def out_of_range(self, forces: ArrayLike) -> NDArray[np.bool_]:
+    def out_of_range(self, forces: ArrayLike) -> NDArray[np.bool_]:  # type: ignore[override]
         return np.zeros(np.shape(forces)[:-2], dtype=bool)
 
 

@@ -17,7 +17,7 @@ from mor_bench.snapshots import load_range
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.imported_dataset import NodalLoads
 from mor_bench.snapshots.load_range import LoadRange
-from mor_bench.snapshots.sampling import PatchLoads
+from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.surrogate import Surrogate
 from tests.model_files import rewrite
 

@@ -9,6 +9,7 @@ import re
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -190,6 +191,11 @@ def a_shard(path: Path) -> None:
     write_shard(path, Shard("key", 0, patches, vectors, np.zeros((3, 9)), np.ones(3), status))
 
 
+def a_parametric_shard(path: Path) -> None:
+    a_shard(path)
+    write_shard(path, replace(read_shard(path), parameters=np.ones((3, 2))))
+
+
 def forged_shard(content: bytes, generator: np.random.Generator) -> bytes:
     """Mutate the HDF5 part of a shard, with a header that fits."""
     rest = mutated_bytes(content[HEADER_BYTES:], generator)
@@ -332,6 +338,7 @@ READERS = [
     Reader("snapshots.h5", snapshots_h5, source, [mutated_bytes]),
     Reader("predictions.npy", lambda path: np.save(path, np.ones((3, 4))), read_npy, TEXT),
     Reader("shard.h5", a_shard, read_shard, [mutated_bytes, forged_shard]),
+    Reader("parameters.h5", a_parametric_shard, read_shard, [mutated_bytes, forged_shard]),
     Reader("manifest.json", a_manifest, manifest_of, [*JSON, forged_manifest]),
     Reader("fit.json", a_fit, read_fit_record, JSON),
     Reader(

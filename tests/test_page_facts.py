@@ -70,6 +70,8 @@ def test_the_sentence_of_a_scene() -> None:
     )
     text = scene_text(load_dataset_spec("artery-pressure").model_dump(mode="json"))
     assert "on springs with dead pressures of 0 to 20000 Pa on inner and outer." in text
+    text = scene_text(load_dataset_spec("beam-stiffness").model_dump(mode="json"))
+    assert text.endswith("; sampled per body: E from 300 to 800 Pa, ν from 0.35 to 0.45.")
 
 
 @pytest.mark.parametrize("content", [{}, {"geometry": 5}, {"loads": {"kind": "force"}}])

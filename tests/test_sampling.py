@@ -12,7 +12,8 @@ from scipy.stats import kstest
 
 from mor_bench.errors import SpecError
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.snapshots.sampling import PatchLoads, draw_loads, far_apart, n_samples_of, repeated
+from mor_bench.snapshots.patch_loads import PatchLoads
+from mor_bench.snapshots.sampling import draw_loads, far_apart, n_samples_of, repeated
 from mor_bench.specs import load_generated_spec
 
 PLANS = ("random", "latin-hypercube", "sobol")

@@ -23,7 +23,7 @@ from mor_bench.sandbox.handover import write_snapshots
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.imported_dataset import NodalLoads
-from mor_bench.snapshots.sampling import PatchLoads
+from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.specs import load_method_spec
 from mor_bench.surrogates.hpod import HyperReducedPOD
 from mor_bench.surrogates.pca_regression import PCARegression

@@ -15,7 +15,8 @@ from mor_bench.report.published_figures import scene_of
 from mor_bench.scene.scene import load_scene
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.generate import dataset_folder, read_shards
-from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of, repeated
+from mor_bench.snapshots.patch_loads import PatchLoads
+from mor_bench.snapshots.sampling import draw_loads, n_samples_of, repeated
 from mor_bench.snapshots.split import split_samples
 from mor_bench.snapshots.test_sets import available_sets, check_regions, spec_of_set, why_not
 from mor_bench.specs import DatasetSpec, Split, list_suite, load_generated_spec

@@ -21,6 +21,8 @@ SHIPPED = {
     "beam-coarse-3-forces": (135, 256, 64, 12360),
     "beam-coarse-3-forces-paper": (135, 256, 64, 12360),
     "beam-coarse-paper": (135, 256, 64, 6400),
+    "beam-stiffness": (135, 256, 64, 6400),
+    "beam-shape": (135, 256, 64, 6400),
     "beam-nearly-incompressible": (135, 256, 64, 3200),
     "block-compression": (216, 343, 49, 1960),
     "l-shape": (335, 540, 60, 6000),

@@ -47,7 +47,7 @@ class Slowed(FullFEM):
         super().__init__(tolerance)
         self.part = part
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:  # type: ignore[override]
         start = time.perf_counter()
         answer = super().predict(forces)
         until = time.perf_counter() + self.part * (time.perf_counter() - start)
@@ -76,7 +76,7 @@ class Recorder(mor_bench.Surrogate):
             raise SystemExit(3)
         return self
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:  # type: ignore[override]
         array = np.asarray(forces)
         out = np.zeros(array.shape)
         array *= 0.0
@@ -135,7 +135,7 @@ class Broken(Zero):
         else:
             super().save(path)
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:  # type: ignore[override]
         batch = np.asarray(forces, dtype=float).reshape(-1, *np.shape(forces)[-2:])
         if self.how == "crash":
             raise ZeroDivisionError("on purpose")
@@ -200,7 +200,7 @@ class Leaky(Zero):
         super().fit(scene, snapshots)
         return self
 
-    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:
+    def predict(self, forces: ArrayLike) -> NDArray[np.float64]:  # type: ignore[override]
         np.save(self.path, np.asarray(forces))
         return super().predict(forces)
 

@@ -17,7 +17,7 @@ from mor_bench.measure.discretisation_error import measured
 from mor_bench.method_loading import make_surrogate
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots, load_dataset
-from mor_bench.snapshots.sampling import PatchLoads
+from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.specs import DatasetSpec, MethodSpec, check_parameters, load_generated_spec
 from mor_bench.surrogate import Surrogate
 

@@ -27,7 +27,7 @@ from mor_bench.hard_cases.case import (
 from mor_bench.measure.error_metrics import sample_errors
 from mor_bench.scratch import scratch_folder
 from mor_bench.snapshots.dataset import Dataset, Snapshots
-from mor_bench.snapshots.sampling import PatchLoads
+from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.surrogate import Surrogate
 from mor_bench.surrogates.fem import FullFEM
 

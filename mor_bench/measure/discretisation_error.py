@@ -36,7 +36,8 @@ from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.other_meshes import refined
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.generate import dataset_folder
-from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of
+from mor_bench.snapshots.patch_loads import PatchLoads
+from mor_bench.snapshots.sampling import draw_loads, n_samples_of
 from mor_bench.snapshots.store import write_atomically
 from mor_bench.specs import DatasetSpec, find_suite, load_generated_spec
 from mor_bench.version import __version__
@@ -284,6 +285,11 @@ def refine(
         raise UnsupportedSceneError(
             f"{spec.name}: the discretisation error can be measured for forces only, not where "
             "`loads.kind` is 'displacement'."
+        )
+    if scene.parameter_names:
+        raise UnsupportedSceneError(
+            f"{spec.name}: the discretisation error can be measured for one body only, not with "
+            "the table `parameters`."
         )
     n_patches = n_samples_of(scene) if scene.pressure else len(scene.patch_nodes)
     if not 1 <= plan.n_loads <= n_patches:

@@ -117,12 +117,15 @@ class Queries:
         The nodes where answers count.
     scratch : Path
         A folder for answers.
+    parameters : (n, n_parameters) float64, optional
+        Sampled parameters of a parametric scene.
     """
 
     forces: NDArray[np.float64]
     references: NDArray[np.float64]
     nodes: NDArray[np.int64]
     scratch: Path
+    parameters: NDArray[np.float64] | None = None
 
 
 def measure_latencies(
@@ -252,7 +255,13 @@ class _Turns:
         """Start a process with a loaded and warm method; a failure is recorded."""
         try:
             self.process = self.method.open(server)
-            answer = self._ask("warm", forces=self.queries.forces, threads=self.threads, seed=seed)
+            answer = self._ask(
+                "warm",
+                forces=self.queries.forces,
+                parameters=self.queries.parameters,
+                threads=self.threads,
+                seed=seed,
+            )
         except MorBenchError as error:
             self.timing.failed = str(error)
             self.end()

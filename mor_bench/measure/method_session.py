@@ -38,6 +38,8 @@ from mor_bench.specs import check_parameters, load_class
 from mor_bench.surrogate import Surrogate
 from mor_bench.training_options import TrainingOptions
 
+Array = NDArray[np.float64]
+
 CURVES = ("loss_curve", "validation_curve")
 """Attributes, without the final underscore, in which a trained method keeps its losses."""
 
@@ -123,6 +125,7 @@ class MethodSession(Session):
             self.scene = scene
         self.method: Surrogate
         self.loads: TimedLoads
+        self.parameters: Array | None = None
 
     @classmethod
     def preload(cls) -> None:
@@ -182,16 +185,22 @@ class MethodSession(Session):
         self.method = load_fitted(model, load_class(surrogate), self.scene)
         return {}
 
-    def predict(self, forces: NDArray[np.float64], out: Path, threads: int) -> dict[str, Any]:
-        """Predict loads, (n, n_nodes, 3), N, and write the displacements to a file."""
+    def predict(
+        self, forces: Array, out: Path, threads: int, parameters: Array | None = None
+    ) -> dict[str, Any]:
+        """Predict loads, (n, n_nodes, 3), N, and write the displacements to a file.
+
+        In a parametric scene, `parameters` (n, n_parameters) belong to them.
+        """
         with pinned_threads(threads):
-            np.save(out, predict_all(self.method, given_of(self.scene, forces)), allow_pickle=False)
+            given = given_of(self.scene, forces, parameters)
+            np.save(out, predict_all(self.method, given), allow_pickle=False)
         return {}
 
-    def flag(self, forces: NDArray[np.float64]) -> dict[str, Any]:
+    def flag(self, forces: Array, parameters: Array | None = None) -> dict[str, Any]:
         """Return which loads are out of the training range; None if the method does not know."""
         try:
-            flagged = self.method.out_of_range(self._query(forces))
+            flagged = self.method.out_of_range(given_of(self.scene, forces, parameters).query)
         except UnknownRangeError:
             return {"flagged": None}
         if flagged.shape != (len(forces),):
@@ -201,13 +210,15 @@ class MethodSession(Session):
             )
         return {"flagged": [bool(flag) for flag in flagged]}
 
-    def cost(self, forces: NDArray[np.float64]) -> dict[str, Any]:
+    def cost(self, forces: Array, parameters: Array | None = None) -> dict[str, Any]:
         """Count the work of a query, averaged over some loads."""
-        return {"cost": cost_of(self.method, given_of(self.scene, forces))}
+        return {"cost": cost_of(self.method, given_of(self.scene, forces, parameters))}
 
-    def warm(self, forces: NDArray[np.float64], threads: int, seed: int) -> dict[str, Any]:
+    def warm(
+        self, forces: Array, threads: int, seed: int, parameters: Array | None = None
+    ) -> dict[str, Any]:
         """Store the loads of the queries, see `TimedLoads`, and answer some of them untimed."""
-        self.loads = TimedLoads(forces, seed)
+        self.loads, self.parameters = TimedLoads(forces, seed), parameters
         with pinned_threads(threads):
             start = perf_counter()
             for _ in range(WARM_UP_QUERIES):
@@ -252,12 +263,14 @@ class MethodSession(Session):
             "checked": list(turn.kept),
         }
 
-    def _query(self, values: NDArray[np.float64]) -> ArrayLike:
-        """Convert forces, N, or displacements of observed nodes, m, to the input of `predict`."""
-        return given_of(self.scene, values).query
+    def _query(self, values: Array, numbers: int | NDArray[np.int64]) -> ArrayLike:
+        """Convert loads with these numbers, changed or not, to the input of `predict`."""
+        parameters = None if self.parameters is None else self.parameters[numbers]
+        return given_of(self.scene, values, parameters).query
 
     def _answer_untimed(self) -> None:
-        self._predict_if_possible(self._query(self.loads.changed(self.loads.next())))
+        number = self.loads.next()
+        self._predict_if_possible(self._query(self.loads.changed(number), number))
 
     def _predict_if_possible(self, query: ArrayLike) -> Any:
         try:
@@ -271,7 +284,7 @@ class MethodSession(Session):
             while True:
                 number, few = loads.next(), len(turn.kept) < CHECKED_ANSWERS
                 checked = loads.unchanged(number, CHECKED_SHARE) if few else None
-                query = self._query(loads.changed(number) if checked is None else checked)
+                query = self._query(loads.changed(number) if checked is None else checked, number)
                 clock.seconds, busy = 0.0, process_time()
                 before = perf_counter()
                 answer = self._predict_if_possible(query)
@@ -303,7 +316,7 @@ class MethodSession(Session):
                 seconds, n = 0.0, 0
                 try:
                     while n == 0 or seconds < floor_s:
-                        batch = self._query(self.loads.changed(numbers[:size]))
+                        batch = self._query(self.loads.changed(numbers[:size]), numbers[:size])
                         start = perf_counter()
                         self.method.predict(batch)
                         seconds, n = seconds + perf_counter() - start, n + size

@@ -16,7 +16,7 @@ def predict_all(method: Surrogate, given: Given) -> NDArray[np.float64]:
     Parameters
     ----------
     method : Surrogate
-    given : Forces or ObservedDisplacements
+    given : Forces, ParametricForces or ObservedDisplacements
         With values (n, n_nodes, 3).
 
     Raises

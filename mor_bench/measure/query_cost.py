@@ -18,7 +18,7 @@ def cost_of(method: Surrogate, given: Given) -> dict[str, float] | None:
     ----------
     method : Surrogate
         Fitted.
-    given : Forces or ObservedDisplacements
+    given : Forces, ParametricForces or ObservedDisplacements
         With values (n, n_nodes, 3). If the method cannot answer a load, the work until its error
         counts.
 
@@ -28,8 +28,9 @@ def cost_of(method: Surrogate, given: Given) -> dict[str, float] | None:
         The fields of `mor_bench.counting.Cost`; None for a method that counts nothing.
     """
     with counted() as cost:
-        for load in given.values:
+        for number in range(len(given)):
             with suppress(SolverError):
-                method.predict(given.with_values(load.copy()).query)
+                one = given[number]
+                method.predict(one.with_values(one.values.copy()).query)
     means = {name: total / len(given) for name, total in asdict(cost).items()}
     return means if any(means.values()) else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -132,23 +133,27 @@ def quadrature_of(body: Discretisation) -> Quadrature:
     every point (B-bar: Hughes, IJNME 15, 1980). The energy is a sum of both parts, so the tangent
     stays symmetric. The pressure is constant in a cell and may oscillate between cells.
     """
-    material = body.material
     element = element_of(body.cells)
     gradients, det_j = shape_gradients(body.points, body.cells, element.derivatives)
     weights = det_j * element.weights
     if not body.selective:
-        return Quadrature(
-            gradients, weights, np.array([material.parameters] * len(element.weights))
-        )
+        return Quadrature(gradients, weights, law_parameters(body))
     # The gradient at the centre instead of the mean fails the patch test on warped cells.
     volume = weights.sum(axis=1)
     mean = np.einsum("cq,cqaj->caj", weights, gradients) / volume[:, None, None]
-    parameters = [material.shape_parameters] * len(element.weights) + [material.volume_parameters]
     return Quadrature(
         np.concatenate([gradients, mean[:, None]], axis=1),
         np.hstack([weights, volume[:, None]]),
-        np.array(parameters),
+        law_parameters(body),
     )
+
+
+def law_parameters(body: Discretisation) -> Array:
+    """Return the law's parameters (n_points, n_parameters) at the quadrature points of a cell."""
+    material, n = body.material, len(element_of(body.cells).weights)
+    if body.selective:
+        return np.array([material.shape_parameters] * n + [material.volume_parameters])
+    return np.array([material.parameters] * n)
 
 
 def _placed(
@@ -167,10 +172,6 @@ def _placed(
     keys = pattern.rows * pattern.n + pattern.indices
     slots = np.searchsorted(keys, rows[upper] * pattern.n + columns[upper])
     return matrix, slots, entries[upper]
-
-
-def _local(fields: Array, frames: Frames) -> Array:
-    return frames.to_local(fields.ravel()).reshape(-1, 3)
 
 
 class Assembler:
@@ -211,11 +212,7 @@ class Assembler:
         cell_weights: Array | None = None,
         frames: Frames | None = None,
     ) -> None:
-        quadrature, material = quadrature_of(body), body.material
-        weights = quadrature.weights
-        if cell_weights is not None:
-            weights = weights * cell_weights[:, None]
-        n_cells, n_points, n_nodes, _ = quadrature.gradients.shape
+        n_cells, n_nodes = body.cells.shape
         self.pattern, slots = build_pattern(dof_of_node, body.cells, n_dofs)
         self.n_dofs = n_dofs
         # The kernels sum over dofs along x, y and z, which nodes with frames have beside their own.
@@ -229,34 +226,68 @@ class Assembler:
             self.turned.of_patterns(self.summed_pattern, self.pattern)
         dofs = dof_of_node[body.cells].reshape(n_cells, 3 * n_nodes)
         self.n_cells = n_cells
-        self.extent_m = float(np.ptp(body.points, axis=0).max())
-        self.material = material
         self._n_values = len(self.summed_pattern.indices) + 1
+        self._dof_of_node, self._own, self._frames = dof_of_node, own, frames
+        self._dofs = _batched(dofs.astype(np.int32), self._n_summed)
+        self._slots = _batched(slots, len(self.summed_pattern.indices))
+        quadrature = quadrature_of(body)
+        n_points = quadrature.gradients.shape[1]
         self._gradients = _batched(
             quadrature.gradients.reshape(n_cells, n_points, 3 * n_nodes), 0.0
         ).reshape(-1, n_points, 3 * n_nodes * LANES)
-        self._dofs = _batched(dofs.astype(np.int32), self._n_summed)
-        self._slots = _batched(slots, len(self.summed_pattern.indices))
+        self._rule = quadrature.weights
+        if cell_weights is not None:
+            self._rule = quadrature.weights * cell_weights[:, None]
+        self._take(body)
+
+    def scaled(self, body: Discretisation, scale: Array) -> Assembler:
+        """Return an assembler of the same cells with another material, scaled along the axes.
+
+        Parameters
+        ----------
+        body : Discretisation
+            The same cells with the material, the springs, the rest state and the scaled positions.
+        scale : (3,) float64
+        """
+        found = copy(self)
+        if (scale != 1.0).any():
+            n_batches, n_points, _ = self._gradients.shape
+            by_axis = self._gradients.reshape(n_batches, n_points, -1, 3, LANES) / scale[:, None]
+            found._gradients = by_axis.reshape(self._gradients.shape)
+            found._rule = self._rule * float(np.prod(scale))
+        found._take(body)
+        return found
+
+    def _take(self, body: Discretisation) -> None:
+        """Compute what depends on the material, the springs and the rest state."""
+        material, weights, parameters = body.material, self._rule, law_parameters(body)
+        (n_cells, n_nodes), n_points = body.cells.shape, weights.shape[1]
+        self.extent_m = float(np.ptp(body.points, axis=0).max())
+        self.material = material
         self._has_own_kernel = isinstance(material, SaintVenantKirchhoff) and n_nodes == H8.n_nodes
         if self._has_own_kernel:
-            self._w_lam = _batched(weights * quadrature.parameters[:, 0], 0.0)
-            self._w_mu = _batched(weights * quadrature.parameters[:, 1], 0.0)
+            self._w_lam = _batched(weights * parameters[:, 0], 0.0)
+            self._w_mu = _batched(weights * parameters[:, 1], 0.0)
             per_point = FORCE_MULTIPLY_ADDS, FORCE_MULTIPLY_ADDS + TANGENT_MULTIPLY_ADDS
         else:
             self._kernel = general_force(material.law, n_nodes)
             self._weights = _batched(weights, 0.0)
-            self._parameters = np.repeat(quadrature.parameters, LANES, axis=1)
-            per_point = general_multiply_adds(material.law, quadrature.parameters.shape[1], n_nodes)
+            self._parameters = np.repeat(parameters, LANES, axis=1)
+            per_point = general_multiply_adds(material.law, parameters.shape[1], n_nodes)
         self._multiply_adds = n_cells * n_points * per_point[0], n_cells * n_points * per_point[1]
-        self._plain = body.springs is None and body.rest is None and frames is None
+        self._plain = body.springs is None and body.rest is None and self._frames is None
         self._springs: tuple[sp.csr_array, NDArray[np.int64], Array] | None = None
         if body.springs is not None:
-            self._springs = _placed(body.springs, dof_of_node.ravel(), self.summed_pattern)
+            own = self._dof_of_node.ravel()
+            self._springs = _placed(body.springs, own, self.summed_pattern)
         self._rest: tuple[Array, Array] | None = None
         if body.rest is not None:
-            rest = np.zeros(n_dofs + 1)
-            rest[own] = body.rest if frames is None else _local(body.rest, frames)
-            rest[n_dofs] = 0.0
+            frames = self._frames
+            rest = np.zeros(self.n_dofs + 1)
+            rest[self._own] = body.rest
+            if frames is not None:
+                rest[self._own] = frames.to_local(body.rest.ravel()).reshape(-1, 3)
+            rest[self.n_dofs] = 0.0
             self._rest = self._total(rest[:-1]), self.force(rest[:-1]).force
 
     def _total(self, u: Array) -> Array:

@@ -11,11 +11,13 @@ differ from the modes; they make the tangent unsymmetric.
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.counting import cholesky_multiply_adds, count, triangular_multiply_adds
-from mor_bench.mechanics.assembly import Discretisation, State, quadrature_of
+from mor_bench.mechanics.assembly import Discretisation, State, law_parameters, quadrature_of
 from mor_bench.mechanics.laws import SAINT_VENANT_KIRCHHOFF, point_multiply_adds, point_stresses
 from mor_bench.mechanics.newton import HOPELESS, PLAIN_ITERATIONS, Solution
 from mor_bench.mechanics.problem import ROUND_OFF
@@ -62,6 +64,13 @@ def _mode_gradients(shape_gradients: Array, cell_modes: Array, kept: NDArray[np.
     return _batched(own.reshape(-1, r, 9)[kept]).reshape(-1, r, 9 * LANES)
 
 
+def _scaled(mode_gradients: Array, scale: Array) -> Array:
+    """Return gradients of modes (n_batches, r, 9 * LANES) on a body scaled along the axes."""
+    n_batches, r, _ = mode_gradients.shape
+    by_axis = mode_gradients.reshape(n_batches, r, 3, 3, LANES) / scale[:, None]
+    return by_axis.reshape(mode_gradients.shape)
+
+
 class ReducedPoints:
     """Reduced internal force and tangent over the weighted quadrature points of some cells.
 
@@ -98,13 +107,12 @@ class ReducedPoints:
         if test_modes is not None:
             self.test = _mode_gradients(rule.gradients, test_modes[cells], kept)
         self.weights = _batched(weights[kept])
-        law, parameters = body.material.law, np.tile(rule.parameters, (len(cells), 1))[kept]
-        self._stresses = point_stresses(law)
-        self._parameters = _parameters_of_lanes(parameters)
-        self._lame = _batched(parameters) if law == SAINT_VENANT_KIRCHHOFF else None
+        self._kept = kept
+        self._lame: Array | None
+        self._take(body)
         force, tangent = SVK_MULTIPLY_ADDS
         if self._lame is None:
-            force, tangent = point_multiply_adds(law, rule.parameters.shape[1])
+            force, tangent = point_multiply_adds(body.material.law, rule.parameters.shape[1])
         force += 18 * self.n_unknowns
         tangent += force + tangent_multiply_adds(self.n_unknowns, self.symmetric)
         self._multiply_adds = self.n_points * force, self.n_points * tangent
@@ -120,6 +128,27 @@ class ReducedPoints:
             rest = _mode_gradients(rule.gradients, body.rest[cells][..., None], kept)[:, 0]
             self._rest = rest, np.zeros(self.n_unknowns)
             self._rest = rest, self.force(np.zeros(self.n_unknowns)).force
+
+    def _take(self, body: Discretisation) -> None:
+        """Take the law and its parameters at the kept points."""
+        law = body.material.law
+        parameters = np.tile(law_parameters(body), (self.n_cells, 1))[self._kept]
+        self._stresses = point_stresses(law)
+        self._parameters = _parameters_of_lanes(parameters)
+        self._lame = _batched(parameters) if law == SAINT_VENANT_KIRCHHOFF else None
+
+    def scaled(self, body: Discretisation, scale: Array) -> ReducedPoints:
+        """Return the points with another material, scaled along the axes (3,).
+
+        Neither this body nor the new one may have springs or a rest state.
+        """
+        found = copy(self)
+        found._take(body)
+        if (scale != 1.0).any():
+            found.weights = self.weights * float(np.prod(scale))
+            found.trial = _scaled(self.trial, scale)
+            found.test = found.trial if self.symmetric else _scaled(self.test, scale)
+        return found
 
     def _gradients(self, q: Array) -> Array:
         """Return du/dX (n_batches, 9 * LANES) of the total displacement."""

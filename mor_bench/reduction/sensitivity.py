@@ -13,7 +13,7 @@ from mor_bench.mechanics.linear import NotPositiveDefiniteError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.snapshots.sampling import PatchLoads
+from mor_bench.snapshots.patch_loads import PatchLoads
 
 Array = NDArray[np.float64]
 

@@ -70,3 +70,10 @@ class Subspace:
         for row, given in zip(out, batch.reshape(out.shape), strict=True):
             self.expand(solve(given[self._free]), row)
         return out.reshape(batch.shape)
+
+    def answer_each(
+        self, batch: Array, each: Array, solve: Callable[[Array, Array], Array]
+    ) -> Array:
+        """Return the same as `answer`; ``solve`` also gets the row of ``each`` (n, m) of a load."""
+        rows = iter(each)
+        return self.answer(batch, lambda load: solve(load, next(rows)))

@@ -68,7 +68,7 @@ def scene_text(content: Mapping[str, Any]) -> str:
         else "",
         "under gravity" if spec.gravity else "",
         "on springs" if spec.springs else "",
-        f"with {_loads(spec.loads)}.",
+        f"with {_loads(spec.loads)}{_parameters(spec)}.",
     ]
     text = " ".join(filter(None, parts))
     return text[0].upper() + text[1:]
@@ -98,6 +98,18 @@ def _material(spec: DatasetSpec) -> str:
         if isinstance(value, float)
     )
     return f"{LAWS.get(material.law, material.law)} ({', '.join(constants)}),"
+
+
+def _parameters(spec: DatasetSpec) -> str:
+    """State the ranges of sampled parameters; empty without any."""
+    if spec.parameters is None:
+        return ""
+    ranges = (
+        f"{SYMBOLS.get(name, name)} from {number(low)} to {number(high)}"
+        f"{' Pa' if name.endswith('_pa') else ''}"
+        for name, (low, high) in spec.parameters.ranges.items()
+    )
+    return f"; sampled per body: {', '.join(ranges)}"
 
 
 def _regions(regions: Iterable[Region]) -> str:

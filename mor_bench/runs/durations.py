@@ -24,7 +24,7 @@ from mor_bench.measure.latency import (
 from mor_bench.measure.machine_speed import MachineSpeed, recorded_machines
 from mor_bench.measure.method_session import SETTLE_QUERIES
 from mor_bench.measure.timing import BATCHES
-from mor_bench.mechanics.observed import generating_model
+from mor_bench.mechanics.parametric import generator_of
 from mor_bench.runs.cached_fit import FitRecord, read_fit_record
 from mor_bench.runs.compilation import uncompiled
 from mor_bench.runs.configurations import OWN, Configuration, may_train
@@ -93,12 +93,12 @@ class Pace:
 def sample_seconds(spec: DatasetSpec) -> float:
     """Measure the seconds of one full-order solution among several."""
     scene = load_scene(spec)
-    model = generating_model(scene)
-    forces = draw_loads(scene, 0, PROBED).nodal_forces(scene.patch_weights)
+    model, loads = generator_of(scene), draw_loads(scene, 0, PROBED)
+    forces = loads.nodal_forces(scene.patch_weights)
     free_forces = scene.at_free_dofs(forces.reshape(PROBED, -1))
-    model.solve_many(free_forces[:1])
+    model.solve_many(free_forces[:1], loads.parameters[:1])
     start = perf_counter()
-    model.solve_many(free_forces)
+    model.solve_many(free_forces, loads.parameters)
     return (perf_counter() - start) / PROBED
 
 

@@ -89,14 +89,15 @@ class _Scorer:
                 chunk = slice(start, start + SCORE_CHUNK)
                 forces = test.forces[chunk]
                 left_s = max(1.0, until - monotonic())
-                predicted = self._predictions(forces, left_s, Path(folder) / "answers.npy")
+                out = Path(folder) / "answers.npy"
+                predicted = self._predictions(test, chunk, left_s, out)
                 references = test.references[chunk]
                 errors.append(sample_errors(predicted, references, test.nodes, test.fixed_nodes))
                 if data.reaction_errors:
                     reactions.append(data.reaction_errors(predicted, references))
                 worst.look_at(start, errors[-1].mean_dof_m, predicted)
                 indicated.add(start, forces, predicted)
-                found = self.worker.ask("flag", LOAD_LIMIT_S, forces=forces)["flagged"]
+                found = self.worker.ask("flag", LOAD_LIMIT_S, **test.queries(chunk))["flagged"]
                 flags = None if found is None or flags is None else flags + found
             score: Score = {
                 name: np.concatenate([getattr(part, name) for part in errors]) for name in ERRORS
@@ -105,9 +106,8 @@ class _Scorer:
                 score["reaction_relative"] = np.concatenate(reactions)
             typical = _typical(score["mean_dof_m"])
             left_s = max(1.0, until - monotonic())
-            again = self._predictions(test.forces[[typical]], left_s, Path(folder) / "answers.npy")[
-                0
-            ]
+            one = np.array([typical])
+            again = self._predictions(test, one, left_s, Path(folder) / "answers.npy")[0]
         if flags is not None:
             score["flagged"] = np.asarray(flags, dtype=bool)
         has_forces = data.scene.observed_nodes is None
@@ -123,11 +123,11 @@ class _Scorer:
         }
 
     def _predictions(
-        self, forces: NDArray[np.float64], limit_s: float, out: Path
+        self, test: TestSet, chosen: NDArray[np.int64] | slice, limit_s: float, out: Path
     ) -> NDArray[np.float64]:
         """Let the worker predict; check what it wrote, since a third party's code ran there."""
-        threads = self.cached.environment.threads
-        self.worker.ask("predict", limit_s, forces=forces, out=out, threads=threads)
+        threads, forces = self.cached.environment.threads, test.forces[chosen]
+        self.worker.ask("predict", limit_s, **test.queries(chosen), out=out, threads=threads)
         try:
             predicted = parse_npy(read_written(out, self.cached.data.scratch), str(out))
         except (OSError, StoreError) as error:
@@ -147,7 +147,7 @@ class _Scorer:
         with suppress(OSError, StoreError, ValidationError):
             return read_cost(path)
         chosen = np.linspace(0, len(test.forces) - 1, min(N_COUNTED, len(test.forces))).astype(int)
-        answer = self.worker.ask("cost", LOAD_LIMIT_S, forces=test.forces[chosen])
+        answer = self.worker.ask("cost", LOAD_LIMIT_S, **test.queries(chosen))
         cost: dict[str, float] | None = answer["cost"]
         write_atomically(path, json.dumps(cost).encode())
         return cost

@@ -86,8 +86,9 @@ def _measured(stage: Stage, fits: Mapping[str, CachedFit]) -> dict[str, Timing]:
     }
     test = stage.training_data.sets["test"]
     chosen = timed_numbers(test.references)
+    asked, scratch = test.queries(chosen), stage.training_data.scratch
     queries = Queries(
-        test.forces[chosen], test.references[chosen], test.nodes, stage.training_data.scratch
+        test.forces[chosen], test.references[chosen], test.nodes, scratch, asked["parameters"]
     )
     timings = measure_latencies(
         methods,

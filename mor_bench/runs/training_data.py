@@ -42,6 +42,8 @@ class TestSet:
         Nodes of the supports.
     digest : str
         SHA-256 of all arrays.
+    parameters : (n, n_parameters) float64, optional
+        Sampled parameters of a parametric scene.
     """
 
     forces: NDArray[np.float64]
@@ -49,6 +51,12 @@ class TestSet:
     nodes: NDArray[np.int64]
     fixed_nodes: NDArray[np.int64]
     digest: str
+    parameters: NDArray[np.float64] | None = None
+
+    def queries(self, chosen: NDArray[np.int64] | slice) -> dict[str, NDArray[np.float64] | None]:
+        """Return the arguments of a request for some samples: their forces and parameters."""
+        parameters = None if self.parameters is None else self.parameters[chosen]
+        return {"forces": self.forces[chosen], "parameters": parameters}
 
     @classmethod
     def of(cls, snapshots: Snapshots) -> TestSet:
@@ -60,8 +68,11 @@ class TestSet:
         }
         if len(nodes) < snapshots.scene.mesh.n_nodes:
             arrays["nodes"] = nodes
-        digest = digest_of_arrays(arrays)
-        return cls(snapshots.given.values, snapshots.displacements, nodes, fixed_nodes, digest)
+        parameters = snapshots.parameters if snapshots.scene.parameter_names else None
+        if parameters is not None:
+            arrays["p"] = parameters
+        digest, loads = digest_of_arrays(arrays), snapshots.given.values
+        return cls(loads, snapshots.displacements, nodes, fixed_nodes, digest, parameters)
 
 
 class TrainingData:
@@ -145,8 +156,12 @@ class TrainingData:
 
     @cached_property
     def indicator(self) -> ErrorIndicator | None:
-        """Error indicator; None if equations, forces or some nodes' displacements are unknown."""
+        """Error indicator; None if equations, forces or some nodes' displacements are unknown.
+
+        There is none for bodies with sampled parameters.
+        """
         known = self.scene.material is not None and self.scene.observed_nodes is None
+        known = known and not self.scene.parameter_names
         if not known or len(self.scene.output_nodes) < self.scene.mesh.n_nodes:
             return None
         with warnings.catch_warnings():

@@ -12,7 +12,7 @@ from mor_bench.array_files import read_npy
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.imported_dataset import NodalLoads
-from mor_bench.snapshots.sampling import PatchLoads
+from mor_bench.snapshots.patch_loads import PatchLoads
 
 
 def arrays_of(snapshots: Snapshots) -> dict[str, NDArray[np.generic]]:
@@ -21,6 +21,8 @@ def arrays_of(snapshots: Snapshots) -> dict[str, NDArray[np.generic]]:
     forces = (
         {"forces": loads.forces} if isinstance(loads, NodalLoads) else {"vectors": loads.vectors}
     )
+    if snapshots.scene.parameter_names:
+        forces["parameters"] = snapshots.parameters
     return {
         "patches": loads.patches,
         **forces,
@@ -48,6 +50,6 @@ def read_snapshots(folder: Path, scene: Scene) -> Snapshots:
     loads = (
         NodalLoads(arrays["forces"], patches)
         if "forces" in arrays
-        else PatchLoads(patches, arrays["vectors"])
+        else PatchLoads(patches, arrays["vectors"], arrays.get("parameters"))
     )
     return Snapshots(scene, loads, arrays["free_displacements"], arrays["min_det_f"])

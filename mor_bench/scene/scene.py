@@ -75,7 +75,6 @@ class Scene:
     frames: Frames | None = field(default=None, kw_only=True, repr=False)
     embedded_surface: Facets | None = field(default=None, repr=False)
     point_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict, repr=False)
-
     springs: tuple[Springs, ...] = field(default=(), repr=False)
     memo: dict[str, NDArray[np.float64]] = field(
         init=False, default_factory=dict, repr=False, compare=False
@@ -89,6 +88,12 @@ class Scene:
     def generated(self) -> DatasetSpec:
         """The spec of a scene with known equations; `UnsupportedSceneError` for any other."""
         return generated(self.spec)
+
+    @cached_property
+    def parameter_names(self) -> tuple[str, ...]:
+        """The names of the sampled parameters; empty if samples differ in their loads only."""
+        table = self.spec.parameters if isinstance(self.spec, DatasetSpec) else None
+        return () if table is None else table.names
 
     @property
     def selective(self) -> bool:
@@ -123,11 +128,7 @@ class Scene:
 
     def columns_at_all_dofs(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return columns (n_dofs, m), along x, y and z, from (n_free, m); 0 at supports."""
-        whole = np.zeros((self.mesh.n_dofs, columns.shape[1]))
-        whole[self.free_dofs] = columns
-        if self.frames is None:
-            return whole
-        return np.ascontiguousarray(self.frames.to_global(whole.T).T)
+        return np.ascontiguousarray(self.at_all_dofs(columns.T).T)
 
     def hold(self, fields: NDArray[np.float64]) -> None:
         """Remove what supports hold from displacements (n, n_dofs), m, in place."""
@@ -269,10 +270,9 @@ class Scene:
     @cached_property
     def patch_scales(self) -> NDArray[np.float64]:
         """(n_patches,) largest load of each patch, relative to the largest of all tables."""
-        if len(self.acting) == 1:
-            return np.ones(len(self.patch_nodes))
-        ends = [acting.plan.magnitude[1] for acting in self.acting]
-        return np.repeat(np.array(ends) / max(ends), [len(acting.nodes) for acting in self.acting])
+        ends = np.array([acting.plan.magnitude[1] for acting in self.acting])
+        numbers = [1] if self.contact else [len(acting.nodes) for acting in self.acting]
+        return np.repeat(ends / ends.max(), numbers)
 
     def patch_points(self, patches: NDArray[np.int64]) -> tuple[NDArray[np.float64], sp.csr_array]:
         """Return the tractions of patches as forces at surface points, the same on every mesh.
@@ -302,7 +302,6 @@ class Scene:
         vectors, m².
         """
         if self.contact:
-            assert self.observed_nodes is not None
             touched = np.zeros((1, self.mesh.n_nodes))
             touched[:, self.observed_nodes] = 1.0
             return sp.csr_array(touched)
@@ -394,6 +393,5 @@ def _in_elements(
         )
     if n_nodes == 10 and wanted.order == 1:
         raise SpecError("`discretisation.order` must be 2, as in the mesh; got 1.")
-    return (
-        with_middles(mesh, point_sets) if (n_nodes, wanted.order) == (4, 2) else (mesh, point_sets)
-    )
+    promote = (n_nodes, wanted.order) == (4, 2)
+    return with_middles(mesh, point_sets) if promote else (mesh, point_sets)

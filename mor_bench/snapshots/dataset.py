@@ -19,7 +19,8 @@ from mor_bench.snapshots.executors import check_pool
 from mor_bench.snapshots.generate import GenerationOptions, generate, read_shards
 from mor_bench.snapshots.given import Given, given_of
 from mor_bench.snapshots.imported_dataset import NodalLoads, nodal_loads, read_samples
-from mor_bench.snapshots.sampling import PatchLoads, n_samples_of, path_of_samples, repeated
+from mor_bench.snapshots.patch_loads import PatchLoads
+from mor_bench.snapshots.sampling import n_samples_of, path_of_samples, repeated
 from mor_bench.snapshots.split import split_imported, split_samples
 from mor_bench.snapshots.test_sets import SetName, check_regions, spec_of_set
 from mor_bench.specs import AnyDatasetSpec, DatasetSpec, ImportedDatasetSpec, SplitBy
@@ -63,7 +64,11 @@ class Snapshots:
     def __getitem__(self, index: NDArray[np.int64] | slice) -> Snapshots:
         loads = self.loads[index]
         read_only(loads.patches)
-        read_only(loads.forces if isinstance(loads, NodalLoads) else loads.vectors)
+        if isinstance(loads, NodalLoads):
+            read_only(loads.forces)
+        else:
+            read_only(loads.vectors)
+            read_only(loads.parameters)
         displacements, min_det_f = self.free_displacements[index], self.min_det_f[index]
         return Snapshots(self.scene, loads, read_only(displacements), read_only(min_det_f))
 
@@ -76,15 +81,22 @@ class Snapshots:
             return read_only(ToolForces(self.scene)(self.free_displacements))
         return read_only(self.loads.nodal_forces(self.scene.patch_weights))
 
+    @property
+    def parameters(self) -> NDArray[np.float64]:
+        """(n_samples, n_parameters) values of ``scene.parameter_names``; no columns without any."""
+        if isinstance(self.loads, NodalLoads):
+            return np.zeros((len(self), len(self.scene.parameter_names)))
+        return self.loads.parameters
+
     @cached_property
     def given(self) -> Given:
-        """Input of the methods: the forces, or the displacements of the observed nodes.
+        """Input of the methods: forces, with parameters if any, or observed displacements.
 
         Displacements are zero at all other nodes. Where an instrument presses, they are its own.
         """
         nodes = self.scene.observed_nodes
         if nodes is None:
-            return given_of(self.scene, self.forces)
+            return given_of(self.scene, self.forces, self.parameters)
         if self.scene.contact and isinstance(self.loads, PatchLoads):
             moved = self.loads.nodal_forces(self.scene.patch_weights)
             return given_of(self.scene, read_only(moved))
@@ -259,11 +271,11 @@ class _Store:
             replace(shard, displacements=shard.displacements[:, :0])
             for shard in read_shards(folder, self._total)
         ]
-        patches, vectors, self.status, self._min_det_f = (
+        patches, vectors, parameters, self.status, self._min_det_f = (
             np.concatenate([getattr(shard, name) for shard in shards])
-            for name in ("patches", "vectors", "status", "min_det_f")
+            for name in ("patches", "vectors", "parameters", "status", "min_det_f")
         )
-        self.loads = PatchLoads(patches, vectors)
+        self.loads = PatchLoads(patches, vectors, parameters)
 
     @property
     def valid(self) -> NDArray[np.int64]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from mor_bench.errors import SolverError
 from mor_bench.mechanics.newton import Solution
-from mor_bench.mechanics.observed import generating_model
+from mor_bench.mechanics.parametric import generator_of
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.sampling import draw_loads, n_samples_of, path_of_samples
@@ -47,7 +47,7 @@ def fresh_test_set(spec: DatasetSpec, scene: Scene, by: SplitBy, seed: int, n: i
     held = drawn[split_samples(drawn, n_patches, split, own_seed, paths).test]
     held = held[: min(n, MAX_FRESH)]
     values = scene.at_free_dofs(held.nodal_forces(scene.patch_weights).reshape(len(held), -1))
-    found = generating_model(scene).solve_many(values)
+    found = generator_of(scene).solve_many(values, held.parameters)
     solved = [(i, answer) for i, answer in enumerate(found) if isinstance(answer, Solution)]
     if not solved:
         raise SolverError(f"{spec.name}: no fresh test load has a valid equilibrium.")

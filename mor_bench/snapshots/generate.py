@@ -19,7 +19,8 @@ from mor_bench.errors import DamagedFileWarning, NewerSchemaError, StoreError
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.executors import KEPT, check_pool, open_pool
 from mor_bench.snapshots.manifest import Manifest, keep_sources, read_manifest, update_manifest
-from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of
+from mor_bench.snapshots.patch_loads import PatchLoads
+from mor_bench.snapshots.sampling import draw_loads, n_samples_of
 from mor_bench.snapshots.solve import GENERATOR_VERSION, Solved, Task, pack, solve_task
 from mor_bench.snapshots.store import (
     SCHEMA_VERSION,
@@ -154,9 +155,11 @@ class _Plan:
         return bool(
             shard.patches.shape == loads.patches.shape
             and shard.vectors.shape == loads.vectors.shape
+            and shard.parameters.shape == loads.parameters.shape
             and len(shard.status) == len(loads)
             and (shard.patches == loads.patches).all()
             and np.abs(shard.vectors - loads.vectors).max() <= ROUND_OFF * largest
+            and np.allclose(shard.parameters, loads.parameters, rtol=ROUND_OFF, atol=0.0)
         )
 
 

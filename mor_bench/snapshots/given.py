@@ -1,4 +1,4 @@
-"""The input of a query: forces, or displacements of a part of the surface."""
+"""The input of a query: forces, alone or with parameters, or displacements of some nodes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.scene import Scene
+from mor_bench.specs import LIMITS
 
 MAX_FORCE_N = 1e30
 """Largest accepted component of a force, N, or displacement, m; its cube does not overflow."""
@@ -65,21 +66,60 @@ class ObservedDisplacements(_NodalValues):
         return self
 
 
-Given = Forces | ObservedDisplacements
+@dataclass(frozen=True, eq=False)
+class ParametricForces(_NodalValues):
+    """Nodal forces with the parameters of the body that they act on.
+
+    Attributes
+    ----------
+    values : (n, n_nodes, 3) or (n_nodes, 3) float64
+        Forces, N.
+    parameters : (n, n_parameters) or (n_parameters,) float64
+        Values of ``Scene.parameter_names``, one row for each load.
+    """
+
+    parameters: NDArray[np.float64]
+
+    def __getitem__(self, index: Any) -> Self:
+        return replace(self, values=self.values[index], parameters=self.parameters[index])
+
+    @property
+    def query(self) -> Self:
+        """Argument of `Surrogate.predict`: the object itself."""
+        return self
 
 
-def given_of(scene: Scene, values: NDArray[Any]) -> Given:
-    """Wrap plain values in the class of the scene's queries."""
+Given = Forces | ParametricForces | ObservedDisplacements
+
+
+def given_of(
+    scene: Scene, values: NDArray[Any], parameters: NDArray[np.float64] | None = None
+) -> Given:
+    """Wrap plain values, and the parameters of a parametric scene, as the scene's queries."""
+    if scene.parameter_names:
+        if parameters is None:
+            raise InvalidInputError(missing_parameters(scene))
+        return ParametricForces(values, parameters)
     if scene.observed_nodes is None:
         return Forces(values)
     return ObservedDisplacements(values, scene.observed_nodes)
+
+
+def missing_parameters(scene: Scene) -> str:
+    """Return the message for a query without the parameters that its scene needs."""
+    n, names = len(scene.parameter_names), ", ".join(scene.parameter_names)
+    return (
+        f"{scene.name}: a query must have `parameters` beside its forces, of shape ({n},) or "
+        f"(n, {n}): {names}."
+    )
 
 
 def checked_given(scene: Scene, given: ArrayLike) -> Given:
     """Check a query and return it with values of shape (n, n_nodes, 3) in float64.
 
     Displacements of nodes that are not observed become zero. For a scene with observed nodes,
-    `given` must be `ObservedDisplacements`; otherwise an array or `Forces`.
+    `given` must be `ObservedDisplacements`, for a parametric one `ParametricForces`; otherwise an
+    array or `Forces`.
 
     Raises
     ------
@@ -87,6 +127,8 @@ def checked_given(scene: Scene, given: ArrayLike) -> Given:
         If forces are given instead of displacements or vice versa; for a wrong shape or dtype, NaN,
         infinity or a value beyond `MAX_FORCE_N`.
     """
+    if isinstance(given, ParametricForces) or scene.parameter_names:
+        return checked_parametric(scene, given, None)
     if isinstance(given, ObservedDisplacements) and scene.observed_nodes is not None:
         return _checked_displacements(scene.mesh.n_nodes, scene.observed_nodes, given)
     return Forces(checked_forces(scene, given))
@@ -100,6 +142,51 @@ def checked_forces(scene: Scene, forces: ArrayLike) -> NDArray[np.float64]:
         raise InvalidInputError(f"{scene.name}: a query must be {wanted}.")
     n_nodes = scene.mesh.n_nodes
     return _in_range(_real_numbers(n_nodes, forces, "`forces`"), "`forces`", "N")
+
+
+def checked_parametric(
+    scene: Scene, forces: ArrayLike, parameters: ArrayLike | None
+) -> ParametricForces:
+    """Check forces and parameters, and return both with a row for each load.
+
+    Parameters of shape (n_parameters,) belong to all loads.
+
+    Raises
+    ------
+    InvalidInputError
+        As `checked_forces`; also if the scene has no sampled parameters, or the parameters are
+        missing, have another shape, or lie outside the values for which they are defined.
+    """
+    if isinstance(forces, ParametricForces):
+        parameters, forces = forces.parameters, forces.values
+    names = scene.parameter_names
+    if not names:
+        raise InvalidInputError(
+            f"{scene.name}: `parameters` must be absent, since the scene samples none."
+        )
+    if parameters is None:
+        raise InvalidInputError(missing_parameters(scene))
+    values = checked_forces(scene, forces)
+    try:
+        array = np.asarray(parameters)
+    except (ValueError, TypeError) as error:
+        raise InvalidInputError(f"`parameters` must be an array: {error}") from None
+    n, p = len(values), len(names)
+    if array.dtype.kind not in "fiu" or array.shape not in ((p,), (n, p)):
+        raise InvalidInputError(
+            f"`parameters` must hold real numbers of shape ({p},) or ({n}, {p}), "
+            f"{', '.join(names)}; got {array.dtype} of shape {array.shape}."
+        )
+    array = np.broadcast_to(array.astype(np.float64), (n, p))
+    for name, column in zip(names, array.T, strict=True):
+        low, high = LIMITS[name]
+        wrong = ~((column >= low) & (column <= high))  # NaN compares as false
+        if wrong.any():
+            raise InvalidInputError(
+                f"`parameters`: {name} must be in [{low:.9g}, {high:.9g}]; "
+                f"got {column[wrong.argmax()]:g}."
+            )
+    return ParametricForces(values, array)
 
 
 def _checked_displacements(

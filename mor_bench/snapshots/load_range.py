@@ -1,7 +1,8 @@
 """The range of the training loads in compact form, and a check for loads outside it.
 
 A load is out of range if it is larger than any training load or spread over more nodes. It is also
-out of range at nodes or in directions without training loads. Smaller loads are not flagged, and
+out of range at nodes or in directions without training loads, or on a body with a parameter outside
+the range of training. Smaller loads are not flagged, and
 neither are pushes if training only pulled. There is no range for observed displacements: the loads
 behind them are unknown.
 """
@@ -9,7 +10,7 @@ behind them are unknown.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Self
 
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.snapshots.sampling import PatchLoads
+from mor_bench.snapshots.patch_loads import PatchLoads
 
 LARGER = 1.01
 """Largest size of a load in range, relative to the largest training load."""
@@ -33,6 +34,10 @@ equally in all directions."""
 
 REGULARISATION = 0.01
 """ε of the novelty score: a force at a node or in a direction without training loads scores 1/ε."""
+
+MARGIN = 0.01
+"""Distance from the range of a sampled parameter at which a query is still in range, relative to
+the width of the range."""
 
 CHUNK = 256
 """Number of samples with nodal forces in memory at the same time."""
@@ -52,12 +57,15 @@ class LoadRange:
         Nodes with a force in some sample, in ascending order.
     moments : (n_loaded, 3, 3) float64
         M_i = Σ f_i f_iᵀ / Σ |f_i|² over the samples: symmetric, semi-definite, of unit trace.
+    parameters : (2, n_parameters) float64
+        Lowest and highest value of each sampled parameter.
     """
 
     size_n: float
     width: float
     nodes: NDArray[np.int64]
     moments: NDArray[np.float64]
+    parameters: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 0)))
 
     @classmethod
     def of(cls, snapshots: Snapshots) -> Self:
@@ -70,21 +78,32 @@ class LoadRange:
             size, width = max(size, float(sizes.max())), max(width, float(widths.max()))
         traces = np.trace(moments, axis1=1, axis2=2)
         loaded = np.flatnonzero(traces)
-        return cls(size, width, loaded, moments[loaded] / traces[loaded, None, None])
+        drawn = snapshots.parameters
+        ends = np.array([drawn.min(axis=0), drawn.max(axis=0)])
+        return cls(size, width, loaded, moments[loaded] / traces[loaded, None, None], ends)
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, NDArray[Any]], n_nodes: int) -> Self:
-        """Return the range from the arrays of `arrays`, for a mesh of ``n_nodes`` nodes.
+    def from_arrays(
+        cls, arrays: dict[str, NDArray[Any]], n_nodes: int, n_parameters: int = 0
+    ) -> Self:
+        """Return the range from the arrays of `arrays`, for a mesh and a number of parameters.
 
         Raises
         ------
         InvalidInputError
             If they are not such arrays.
         """
-        if set(arrays) != {"limits", "nodes", "moments"}:
+        names = ["limits", "nodes", "moments", *(["parameters"] if n_parameters else [])]
+        if set(arrays) != set(names):
             raise InvalidInputError(
-                "the range of the training loads must consist of the arrays limits, nodes "
-                f"and moments; got {', '.join(sorted(arrays))}."
+                f"the range of the training loads must consist of the arrays {', '.join(names)}; "
+                f"got {', '.join(sorted(arrays))}."
+            )
+        ends = arrays.get("parameters", np.zeros((2, 0)))
+        if ends.dtype != np.float64 or ends.shape != (2, n_parameters) or not _are_ends(ends):
+            raise InvalidInputError(
+                f"`parameters` of the range must be the lowest and the highest values of "
+                f"{n_parameters} parameters, in this order."
             )
         limits, nodes, moments = arrays["limits"], arrays["nodes"], arrays["moments"]
         positive = np.isfinite(limits) & (limits >= 0)
@@ -101,24 +120,36 @@ class LoadRange:
                 f"`moments` of the range must be {len(nodes)} symmetric 3x3 matrices of unit trace "
                 "without negative eigenvalues."
             )
-        return cls(float(limits[0]), float(limits[1]), nodes, moments)
+        return cls(float(limits[0]), float(limits[1]), nodes, moments, ends)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the range as arrays, for a file."""
-        return {
+        arrays = {
             "limits": np.array([self.size_n, self.width]),
             "nodes": self.nodes,
             "moments": self.moments,
         }
+        return arrays | ({"parameters": self.parameters} if self.parameters.size else {})
 
-    def excludes(self, forces: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which loads (n, n_nodes, 3), N, are out of range, (n,); zero loads never are."""
+    def excludes(
+        self, forces: NDArray[np.float64], parameters: NDArray[np.float64] | None = None
+    ) -> NDArray[np.bool_]:
+        """Return which loads (n, n_nodes, 3), N, are out of range, (n,); zero loads never are.
+
+        With ``parameters`` (n, n_parameters), bodies outside their range are out of range, too.
+        """
         size, width = _sizes_and_widths(forces)
-        return np.asarray(
+        outside = np.asarray(
             (size > LARGER * self.size_n)
             | (width > WIDER * self.width)
             | (self.strangeness(forces) > MOST_STRANGE)
         )
+        if parameters is not None:
+            low, high = self.parameters
+            margin = MARGIN * (high - low)
+            other = (parameters < low - margin) | (parameters > high + margin)
+            outside |= other.any(axis=1) & (size > 0)
+        return outside
 
     def strangeness(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the novelty score: the mean of d_iᵀ (M_i + ε)⁻¹ d_i over nodes, weighted by |f_i|.
@@ -170,6 +201,10 @@ def _sizes_and_widths(
     lengths = np.linalg.norm(forces, axis=2)
     size, squares = lengths.sum(axis=1), (lengths**2).sum(axis=1)
     return size, size**2 / np.where(squares > 0, squares, 1.0)
+
+
+def _are_ends(ends: NDArray[np.float64]) -> bool:
+    return bool(np.isfinite(ends).all() and (ends[0] <= ends[1]).all())
 
 
 def _are_moments(matrices: NDArray[np.float64]) -> bool:

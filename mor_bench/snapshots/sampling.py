@@ -16,24 +16,27 @@ latin-hypercube, sobol
 With several tables, sample i has the i-th loads of each. If a table asks for n steps, sample i is
 step i modulo n, plus 1, of load i / n.
 
+Sampled parameters of the body are further coordinates: of the same design, or of a generator with
+seed (seed, i) and a constant.
+
 A sample depends neither on the order of generation nor on the number of workers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from mor_bench.errors import SpecError
+from mor_bench.scene import contact_surface
 from mor_bench.scene.acting import Acting
-from mor_bench.scene.contact_surface import unit
 from mor_bench.scene.scene import Scene
+from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.specs import (
     MAX_COUNT,
     Contact,
@@ -42,6 +45,7 @@ from mor_bench.specs import (
     Motion,
     PointLoads,
     Pressure,
+    SampledParameters,
     Sampling,
 )
 
@@ -59,38 +63,6 @@ Drawn = Loads | PointLoads | LineLoads | Motion
 
 N_COORDINATES = {"force": 3, "point": 3, "line": 3, "displacement": 3, "tangential": 2, "normal": 1}
 """Coordinates of one force or displacement, by kind of load."""
-
-
-@dataclass(frozen=True)
-class PatchLoads:
-    """Loads in compact form: k force vectors on k patches per sample, or the motion of one tool.
-
-    Attributes
-    ----------
-    patches : (n_samples, k) int64
-        Patch numbers, which are also the load-region ids, in ascending order.
-    vectors : (n_samples, k, 3) float64
-        Forces, N, or displacements, m.
-    """
-
-    patches: NDArray[np.int64]
-    vectors: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.patches)
-
-    def __getitem__(self, index: NDArray[np.int64] | slice) -> PatchLoads:
-        return PatchLoads(self.patches[index], self.vectors[index])
-
-    def nodal_forces(self, weights: sp.csr_array) -> NDArray[np.float64]:
-        """Return nodal forces, N, or displacements, m, of a moved tool, from a scene's weights.
-
-        Their shape is (n_samples, n_nodes, 3).
-        """
-        total = np.zeros((len(self), weights.shape[1], 3))
-        for patches, vectors in zip(self.patches.T, np.moveaxis(self.vectors, 1, 0), strict=True):
-            total += weights[patches].toarray()[:, :, None] * vectors[:, None, :]
-        return total
 
 
 def n_samples_of(scene: Scene, limit: int | None = None) -> int:
@@ -149,8 +121,8 @@ def draw_loads(scene: Scene, start: int, stop: int) -> PatchLoads:
 
 def _drawn(scene: Scene, numbers: NDArray[np.int64]) -> PatchLoads:
     """Return some loads of a plan, each as a whole."""
-    whole = _n_loads(scene)
-    parts = [_drawn_from(acting, numbers, whole) for acting in scene.acting]
+    whole, sampled = _n_loads(scene), scene.generated.parameters
+    parts = [_drawn_from(acting, numbers, whole, sampled) for acting in scene.acting]
     if len(parts) == 1:
         return parts[0]
     n_patches = [len(acting.nodes) for acting in scene.acting]
@@ -161,11 +133,16 @@ def _drawn(scene: Scene, numbers: NDArray[np.int64]) -> PatchLoads:
     )
 
 
-def _drawn_from(acting: Acting, numbers: NDArray[np.int64], whole: int) -> PatchLoads:
-    """Return some of ``whole`` loads of one table."""
+def _drawn_from(
+    acting: Acting,
+    numbers: NDArray[np.int64],
+    whole: int,
+    sampled: SampledParameters | None,
+) -> PatchLoads:
+    """Return some of ``whole`` loads of one table, with the sampled parameters of the body."""
     loads = acting.plan
     if isinstance(loads, Pressure):
-        return _pressures(loads, numbers)
+        return _pressures(loads, numbers, sampled)
     if isinstance(loads, Contact):
         return _instrument_motions(loads, numbers)
     chosen, k = _combinations(acting), loads.simultaneous
@@ -177,32 +154,66 @@ def _drawn_from(acting: Acting, numbers: NDArray[np.int64], whole: int) -> Patch
     normals = np.zeros((*patches.shape, 3)) if free else acting.normals[patches]
     if loads.sampling == "random":
         drawn = [_random_forces(loads, int(i), n) for i, n in zip(numbers, normals, strict=True)]
-        return PatchLoads(patches, np.stack(drawn))
+        return PatchLoads(
+            patches, np.stack(drawn), _random_parameters(loads.seed, sampled, numbers)
+        )
     d = N_COORDINATES[loads.kind]
+    n = k * d + _n_parameters(sampled)
     if k == 1:
         assert chosen is not None
         size, turns = -(-whole // len(chosen)), numbers // len(chosen)
-        designs = [_design(loads.sampling, (loads.seed, int(p)), size, d) for p in patches[:, 0]]
+        designs = [_design(loads.sampling, (loads.seed, int(p)), size, n) for p in patches[:, 0]]
         unit = np.stack([design[turn] for design, turn in zip(designs, turns, strict=True)])
     else:
-        unit = _design(loads.sampling, (loads.seed,), whole, k * d)[numbers]
-    return PatchLoads(patches, _forces(loads, unit.reshape(len(numbers), k, d), normals))
+        unit = _design(loads.sampling, (loads.seed,), whole, n)[numbers]
+    forces = _forces(loads, unit[:, : k * d].reshape(len(numbers), k, d), normals)
+    return PatchLoads(patches, forces, _parameters(sampled, unit[:, k * d :]))
 
 
-def _pressures(loads: Pressure, numbers: NDArray[np.int64]) -> PatchLoads:
+def _n_parameters(sampled: SampledParameters | None) -> int:
+    return 0 if sampled is None else len(sampled.names)
+
+
+def _parameters(
+    sampled: SampledParameters | None, unit: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return sampled parameters for coordinates in [0, 1], (n, n_parameters) both."""
+    return unit if sampled is None else sampled.values(unit)
+
+
+def _random_parameters(
+    seed: int, sampled: SampledParameters | None, numbers: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the parameters (n, n_parameters) of samples with a random plan."""
+    if sampled is None:
+        return np.zeros((len(numbers), 0))
+    n = len(sampled.names)
+    drawn = [np.random.default_rng([seed, 0xB0D7, int(i)]).uniform(size=n) for i in numbers]
+    return _parameters(sampled, np.stack(drawn))
+
+
+def _pressures(
+    loads: Pressure, numbers: NDArray[np.int64], sampled: SampledParameters | None
+) -> PatchLoads:
     """Return pressures, as the forces -p e_i on three patches of each region."""
     d = len(loads.regions)
+    if loads.sampling == "random":
+        parameters = _random_parameters(loads.seed, sampled, numbers)
+        unit = _in_unit_cube(loads, numbers, d)
+    else:
+        unit = _in_unit_cube(loads, numbers, d + _n_parameters(sampled))
+        unit, parameters = unit[:, :d], _parameters(sampled, unit[:, d:])
     low, high = loads.magnitude
-    pressures = low + (high - low) * _in_unit_cube(loads, numbers, d)
+    pressures = low + (high - low) * unit
     vectors = -pressures[:, :, None, None] * np.eye(3)
     patches = np.tile(np.arange(3 * d), (len(numbers), 1))
-    return PatchLoads(patches, vectors.reshape(len(numbers), 3 * d, 3))
+    return PatchLoads(patches, vectors.reshape(len(numbers), 3 * d, 3), parameters)
 
 
 def _instrument_motions(loads: Contact, numbers: NDArray[np.int64]) -> PatchLoads:
     """Return displacements of an instrument, in directions uniform on a cap of the sphere."""
     drawn = _in_unit_cube(loads, numbers, 3)
-    axis = unit(loads.direction)
+    axis = contact_surface.unit(loads.direction)
     first, second = (found[0, 0] for found in _tangents(axis[None, None]))
     height = 1.0 - drawn[:, 0] * (1.0 - np.cos(np.deg2rad(loads.spread_deg)))
     radius, angle = np.sqrt(np.maximum(1.0 - height**2, 0.0)), 2 * np.pi * drawn[:, 1]
@@ -360,7 +371,13 @@ def _tangents(normals: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 def repeated(parts: Sequence[tuple[Scene, PatchLoads]]) -> int:
     """Return how many samples repeat others, in several sets of loads on one body."""
     rows = [
-        np.hstack([scene.patch_nodes[loads.patches], loads.vectors.reshape(len(loads), -1)])
+        np.hstack(
+            [
+                loads.parameters,
+                scene.patch_nodes[loads.patches],
+                loads.vectors.reshape(len(loads), -1),
+            ]
+        )
         for scene, loads in parts
     ]
     width = max(row.shape[1] for row in rows)

@@ -18,10 +18,10 @@ from threadpoolctl import threadpool_limits
 from mor_bench.errors import InvertedElementError, SolverError, WorkerError
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import Solution
-from mor_bench.mechanics.observed import ObservedModel, generating_model
+from mor_bench.mechanics.parametric import Generator, OneBody, generator_of
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.load_paths import solve_paths
-from mor_bench.snapshots.sampling import PatchLoads
+from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.snapshots.store import STATUSES, Shard
 
 GENERATOR_VERSION = 3
@@ -80,13 +80,13 @@ class _Kept(threading.local):
     """The last model of each thread. Models have buffers, so threads do not share them."""
 
     problem: bytes = b""
-    model: FullOrderModel | ObservedModel
+    model: Generator
     weights: sp.csr_array
 
-    def of(self, problem: bytes) -> tuple[FullOrderModel | ObservedModel, sp.csr_array]:
+    def of(self, problem: bytes) -> tuple[Generator, sp.csr_array]:
         if self.problem != problem:
             scene, self.weights = pickle.loads(problem)
-            self.model, self.problem = generating_model(scene), problem
+            self.model, self.problem = generator_of(scene), problem
         return self.model, self.weights
 
 
@@ -118,12 +118,16 @@ _single_threaded = _SingleThreaded()
 
 
 def _solutions(
-    model: FullOrderModel | ObservedModel, values: NDArray[np.float64], task: Task
+    model: Generator,
+    values: NDArray[np.float64],
+    task: Task,
+    parameters: NDArray[np.float64],
 ) -> list[Solution | SolverError]:
     if task.steps == 1:
-        return model.solve_many(values)
-    assert isinstance(model, FullOrderModel)
-    return solve_paths(model, values, task.start, task.steps)
+        return model.solve_many(values, parameters)
+    assert isinstance(model, OneBody)
+    assert isinstance(model.model, FullOrderModel)
+    return solve_paths(model.model, values, task.start, task.steps)
 
 
 def solve_task(task: Task) -> Solved:
@@ -147,7 +151,7 @@ def solve_task(task: Task) -> Solved:
     status = np.zeros(len(loads), dtype=np.uint8)
     with _single_threaded(), install_listener("numba:compile", TimingListener()) as compilation:  # type: ignore[no-untyped-call]
         begun = perf_counter()
-        for row, found in enumerate(_solutions(model, values, task)):
+        for row, found in enumerate(_solutions(model, values, task, loads.parameters)):
             if isinstance(found, Solution):
                 displacements[row], min_det_f[row] = found.displacement, found.min_det_f
             else:
@@ -156,5 +160,5 @@ def solve_task(task: Task) -> Solved:
         seconds = perf_counter() - begun
     if compilation.done:  # the compiled kernels stay, for all later samples
         seconds = max(seconds - compilation.duration, 0.0)
-    columns = loads.patches, loads.vectors, displacements, min_det_f, status
+    columns = loads.patches, loads.vectors, displacements, min_det_f, status, loads.parameters
     return Solved(Shard(task.dataset, task.start, *columns), seconds)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mor_bench.errors import InvalidInputError
 from mor_bench.scene.snapshot_file import ImportedArrays
 from mor_bench.snapshots.imported_dataset import NodalLoads, nodal_loads
-from mor_bench.snapshots.sampling import PatchLoads
+from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.specs import ImportedDatasetSpec, Split, SplitBy
 
 IMPORTED_SEED = 0

@@ -15,7 +15,7 @@ import re
 import secrets
 import time
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import h5py
@@ -54,6 +54,8 @@ class Shard:
     min_det_f : (n,) float64
     status : (n,) uint8
         Index into `STATUSES`.
+    parameters : (n, n_parameters) float64
+        Sampled parameters. Without any, there are no columns, and the file has no such array.
     """
 
     dataset: str
@@ -63,6 +65,17 @@ class Shard:
     displacements: NDArray[np.float64]
     min_det_f: NDArray[np.float64]
     status: NDArray[np.uint8]
+    parameters: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def __post_init__(self) -> None:
+        if self.parameters.size == 0:
+            vars(self)["parameters"] = np.zeros((len(self.patches), 0))
+
+    @property
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """The arrays that a file holds, by name."""
+        names = list(_FIELDS) if self.parameters.shape[1] else list(_FIELDS)[:-1]
+        return {name: getattr(self, name) for name in names}
 
     def first(self, n: int) -> Shard:
         """Return the first n samples, or all if there are fewer."""
@@ -75,8 +88,16 @@ _FIELDS = {
     "displacements": "<f8",
     "min_det_f": "<f8",
     "status": "|u1",
+    "parameters": "<f8",
 }
-_RANKS = {"patches": 2, "vectors": 3, "displacements": 2, "min_det_f": 1, "status": 1}
+_RANKS = {
+    "patches": 2,
+    "vectors": 3,
+    "displacements": 2,
+    "min_det_f": 1,
+    "status": 1,
+    "parameters": 2,
+}
 
 
 def make_own_folder(folder: Path) -> None:
@@ -159,8 +180,8 @@ def shard_bytes(shard: Shard) -> bytes:
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", userblock_size=HEADER_BYTES) as file:
         file.attrs["dataset"], file.attrs["start"] = shard.dataset, shard.start
-        for name, dtype in _FIELDS.items():
-            file.create_dataset(name, data=getattr(shard, name).astype(dtype), track_times=False)
+        for name, array in shard.arrays.items():
+            file.create_dataset(name, data=array.astype(_FIELDS[name]), track_times=False)
     body = buffer.getvalue()[HEADER_BYTES:]
     return header_line(SCHEMA_VERSION, len(body), hashlib.sha256(body).hexdigest()) + body
 
@@ -214,13 +235,15 @@ def parse_shard(content: bytes, where: str) -> Shard:
         raise StoreError(f"{where}: damaged: the checksum does not match.")
     with reading(where, "shard", StoreError), h5py.File(io.BytesIO(content), "r") as file:
         check_hdf5(file, len(content))
-        for name, dtype in _FIELDS.items():
+        names = [name for name in _FIELDS if name != "parameters" or name in file]
+        for name in names:
+            dtype = _FIELDS[name]
             if file[name].dtype != dtype or file[name].ndim != _RANKS[name]:
                 raise ValueError(f"`{name}` must be an array of {_RANKS[name]} axes of {dtype}")
         return Shard(
             str(file.attrs["dataset"]),
             int(file.attrs["start"]),
-            **{name: file[name][()] for name in _FIELDS},
+            **{name: file[name][()] for name in names},
         )
 
 

@@ -13,6 +13,8 @@ unseen-directions
     directions all over the sphere, use the split by direction instead.
 several-forces
     Three simultaneous forces, far apart, if the main set has one.
+unseen-parameters
+    The loads of the main plan, on bodies whose sampled parameters all lie outside their ranges.
 """
 
 from __future__ import annotations
@@ -32,7 +34,9 @@ from mor_bench.specs import (
     Loads,
     Motion,
     Pressure,
+    SampledParameters,
     Several,
+    check_parameters_of,
 )
 
 SetName = Literal[
@@ -43,6 +47,7 @@ SetName = Literal[
     "unseen-regions",
     "unseen-directions",
     "several-forces",
+    "unseen-parameters",
 ]
 
 SET_NAMES: tuple[SetName, ...] = get_args(SetName)
@@ -60,6 +65,8 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
     """Return the reason why a dataset has no such test set, or None if it has one."""
     if name not in SET_NAMES:
         return f"there is no such set; known: {', '.join(SET_NAMES)}"
+    if name == "unseen-parameters":
+        return _no_parameters_outside(spec)
     if name == "unseen-regions" and spec.tests.unseen_region is None:
         return "its file names no `tests.unseen_region`"
     if name == "unseen-regions" and isinstance(spec.load_plan, LineLoads):
@@ -89,6 +96,21 @@ def why_not(spec: DatasetSpec, name: SetName) -> str | None:
     return None
 
 
+def _no_parameters_outside(spec: DatasetSpec) -> str | None:
+    """Return why parameters cannot be drawn outside their ranges; None if they can."""
+    if spec.parameters is None:
+        return "it has no table `parameters`"
+    try:
+        check_parameters_of(_outside(spec, spec.parameters), spec.material)
+    except ValueError as error:
+        return f"`tests.unseen_parameters` is too large: {error}"
+    return None
+
+
+def _outside(spec: DatasetSpec, parameters: SampledParameters) -> SampledParameters:
+    return parameters.model_copy(update={"outside": spec.tests.unseen_parameters})
+
+
 def available_sets(spec: DatasetSpec) -> list[SetName]:
     """Return the names of the test sets that a dataset has."""
     return [name for name in SET_NAMES if why_not(spec, name) is None]
@@ -111,6 +133,8 @@ def spec_of_set(spec: DatasetSpec, name: SetName) -> DatasetSpec:
     else:
         loads = _changed(spec, plan, name)
     content = {**spec.model_dump(), "name": f"{spec.name}--{name}"}
+    if name == "unseen-parameters" and spec.parameters is not None:
+        content["parameters"] = _outside(spec, spec.parameters).model_dump()
     return DatasetSpec.model_validate({**content, "loads": loads})
 
 

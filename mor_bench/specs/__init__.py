@@ -62,6 +62,12 @@ from mor_bench.specs.region_spec import (
     Region,
     SphereRegion,
 )
+from mor_bench.specs.sampled_parameters import (
+    LIMITS,
+    SampledParameters,
+    check_parameters_of,
+    material_with,
+)
 from mor_bench.specs.source_file import RECORDED, SourceFile
 from mor_bench.specs.spec_files import (
     is_method_file,
@@ -77,6 +83,7 @@ from mor_bench.specs.support_spec import AXES, Support
 __all__ = [
     "AXES",
     "CONTACT",
+    "LIMITS",
     "MAX_COUNT",
     "NO_EQUATIONS",
     "NO_FORCES",
@@ -111,6 +118,7 @@ __all__ = [
     "Pressure",
     "Race",
     "Region",
+    "SampledParameters",
     "Sampling",
     "Several",
     "SolverName",
@@ -128,6 +136,7 @@ __all__ = [
     "all_configurations",
     "check_method",
     "check_parameters",
+    "check_parameters_of",
     "find_suite",
     "generated",
     "is_method_file",
@@ -137,6 +146,7 @@ __all__ = [
     "load_generated_spec",
     "load_method_spec",
     "load_recorded_spec",
+    "material_with",
     "tables_of",
     "with_seed",
 ]

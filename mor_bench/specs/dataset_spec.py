@@ -15,13 +15,16 @@ from mor_bench.specs.geometry_spec import Geometry
 from mor_bench.specs.loads_spec import (
     AnyLoads,
     Contact,
+    LineLoads,
     LoadPlan,
     Motion,
+    PointLoads,
     Pressure,
     Several,
 )
 from mor_bench.specs.material_spec import Discretisation, MaterialSpec, SolverName
 from mor_bench.specs.region_spec import Outputs, Region
+from mor_bench.specs.sampled_parameters import SampledParameters, check_parameters_of
 from mor_bench.specs.source_file import File, without_paths
 from mor_bench.specs.split_spec import ExtraTests, ImportedSplit, Split
 from mor_bench.specs.support_spec import Gravity, Spring, Support
@@ -117,8 +120,10 @@ class DatasetSpec(CommonDatasetSpec):
         A constant pre-load: displacements are measured from the rest state under it.
     loads : Loads, PointLoads, LineLoads, Motion, Pressure, Contact or Several, optional
         Sampled forces, displacements of a tool, pressures, motions of an instrument, or several of
-        them together. Without it
-        the scene can be solved for given forces, but no samples can be drawn.
+        them together. Without it the scene can be solved for given forces, but no samples can be
+        drawn.
+    parameters : SampledParameters, optional
+        Properties of the body that vary between samples, beside the loads.
     """
 
     geometry: Geometry
@@ -131,6 +136,9 @@ class DatasetSpec(CommonDatasetSpec):
     ] = ()
     gravity: Gravity | None = None
     loads: LoadPlan | None = None
+    parameters: SampledParameters | None = Field(
+        default=None, exclude_if=lambda value: value is None
+    )
     split: Split = Split()
     tests: ExtraTests = ExtraTests()
 
@@ -163,6 +171,39 @@ class DatasetSpec(CommonDatasetSpec):
                 raise ValueError(f"`tests.{name}` must be absent {where}")
         return self
 
+    @model_validator(mode="after")
+    def _sampled_parameters(self) -> Self:
+        """Check that the scene can take its sampled parameters."""
+        if self.parameters is None:
+            if "unseen_parameters" in self.tests.model_fields_set:
+                raise ValueError(
+                    "`tests.unseen_parameters` must be absent without the table `parameters`"
+                )
+            return self
+        check_parameters_of(self.parameters, self.material)
+        others = {
+            "`loads.kind` is 'displacement'": isinstance(self.loads, Motion),
+            "`loads.kind` is 'contact'": isinstance(self.loads, Contact),
+            "several tables `[[loads]]` are given": isinstance(self.loads, Several),
+            "`loads.steps` is above 1": self.loads is not None and self.loads.steps > 1,
+            "`supports.direction` is given": any(
+                support.direction is not None for support in self.supports
+            ),
+            "`observed` is given": self.observed is not None,
+            "`loads.follower` is true": isinstance(self.loads, Pressure) and self.loads.follower,
+        }
+        if found := [other for other, present in others.items() if present]:
+            raise ValueError(f"`parameters` must be absent where {found[0]}")
+        fixed_shape = {
+            "the loads are pressures": isinstance(self.loads, Pressure),
+            "the loads act on points or lines": isinstance(self.loads, PointLoads | LineLoads),
+            "`springs` are given": bool(self.springs),
+        }
+        found = [other for other, present in fixed_shape.items() if present]
+        if self.parameters.scale is not None and found:
+            raise ValueError(f"`parameters.scale` must be absent where {found[0]}")
+        return self
+
     @property
     def motion(self) -> Motion | None:
         """The table `[loads]` if it prescribes displacements."""
@@ -188,6 +229,7 @@ class DatasetSpec(CommonDatasetSpec):
                 "springs",
                 "gravity",
                 "loads",
+                "parameters",
             },
             exclude_none=True,
         )

@@ -12,6 +12,8 @@ from mor_bench.specs.region_spec import Region
 
 SplitBy = Literal["region", "sample", "direction"]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
+OUTSIDE, MAX_OUTSIDE = 1.5, 10.0
+"""Usual and largest multiple of a range's half-width for parameters outside their ranges."""
 
 
 class Split(StrictModel):
@@ -49,8 +51,14 @@ class ExtraTests(StrictModel):
         A part of the surface where no load of the main set acts.
     paper_magnitude_n : two floats, optional
         Range of each force at which the set's largest deformation is that of the paper, N.
+    unseen_parameters : float
+        The set `unseen-parameters` draws each parameter outside its range, up to this multiple of
+        the range's half-width, measured from the middle. Default: 1.5.
     """
 
     samples: Count = 200
     unseen_region: Region | None = None
     paper_magnitude_n: Magnitude | None = None
+    unseen_parameters: Annotated[
+        float, Field(gt=1, le=MAX_OUTSIDE, exclude_if=lambda value: value == OUTSIDE)
+    ] = OUTSIDE

@@ -16,6 +16,7 @@ from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.compliance import project
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.observed import LinearResponse, linear_response
+from mor_bench.mechanics.parametric import Bodies, ParametricResponse
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.coordinates import error_weights, input_axes
@@ -23,7 +24,7 @@ from mor_bench.reduction.sensitivity import sensitivities
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.given import ObservedDisplacements
-from mor_bench.snapshots.sampling import PatchLoads
+from mor_bench.snapshots.patch_loads import PatchLoads
 from mor_bench.surrogate import Surrogate
 
 Array = NDArray[np.float64]
@@ -69,6 +70,10 @@ class CoordinateRegression(Surrogate, ABC):
     response. Where an instrument presses, its displacement replaces the force, and linear
     elasticity with the same contact replaces the linear response.
 
+    In a scene with sampled parameters, the linear response is that of the sample's own body. The
+    parameters follow as further coordinates, scaled to [-1, 1] over the training samples. Then a
+    subclass must ensure that g is zero where all other coordinates are.
+
     A subclass declares the parameters below as its hyperparameters, and `derivatives` if it can
     learn from them. `regress` learns g, `take` restores its arrays, and `coefficients` evaluates
     it.
@@ -103,6 +108,9 @@ class CoordinateRegression(Surrogate, ABC):
     axes_: Array
     modes_: Array
     response_: LinearResponse
+    responses_: ParametricResponse
+    ends_: Array
+    """(2, n_varied): lowest and highest training value of each parameter that g depends on."""
 
     @abstractmethod
     def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
@@ -136,9 +144,10 @@ class CoordinateRegression(Surrogate, ABC):
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
         samples = _shuffled(samples)
         given, targets = samples.given.values.reshape(len(samples), -1), samples.free_displacements
+        parametric = bool(scene.parameter_names)
         if self.input == "linear-response":
-            self.response_ = linear_response(scene)
-            response = self.response_.respond(given)
+            self._respond_to(scene)
+            response = self._responses(given, samples.parameters)
             inputs = scene.at_free_dofs(response)
             targets = targets - inputs
         else:
@@ -146,8 +155,16 @@ class CoordinateRegression(Surrogate, ABC):
         usual = min(self.usual_inputs[self.input], *inputs[:, inputs.any(axis=0)].shape)
         self.axes_ = axes = input_axes(inputs, self.n_input_modes or usual, self.evenness)
         self.modes_ = modes = pod(targets, self.n_output_modes).modes
+        more: dict[str, Array] = {}
+        if parametric:
+            values = samples.parameters[:, self._varied(scene)]
+            self.ends_ = np.array([values.min(axis=0), values.max(axis=0)])
+            z = self._with_parameters(inputs @ axes, samples.parameters)
+            more = {"parameter_ends": self.ends_} if self.ends_.size else {}
+        else:
+            z = project(self._to_coordinates(axes), response if self._kinked else given)
         known = CoordinateSamples(
-            project(self._to_coordinates(axes), response if self._kinked else given),
+            z,
             targets @ modes,
             error_weights(samples.free_displacements)[:, None],
         )
@@ -155,14 +172,19 @@ class CoordinateRegression(Surrogate, ABC):
             of_force = self.input == "force"
             found = sensitivities(FullOrderModel(scene), samples, axes, modes, of_force=of_force)
             known = replace(known, directions=found.inputs, slopes=found.outputs)
-        return {"axes": axes, "modes": modes, **self.regress(known)}
+        return {"axes": axes, "modes": modes, **more, **self.regress(known)}
 
     def prepare(self, scene: Scene, model: Arrays) -> None:
         n_free = len(scene.free_dofs)
         self.axes_ = take_array(model, "axes", (n_free, None))
         self.modes_ = take_array(model, "modes", (n_free, None))
-        shapes = self.shapes(model, self.axes_.shape[1], self.modes_.shape[1])
-        names = {"axes", "modes", *shapes}
+        names, self.ends_ = {"axes", "modes"}, np.zeros((2, 0))
+        if varied := self._varied(scene):
+            self.ends_ = take_array(model, "parameter_ends", (2, len(varied)))
+            names.add("parameter_ends")
+        n_inputs = self.axes_.shape[1] + len(varied)
+        shapes = self.shapes(model, n_inputs, self.modes_.shape[1])
+        names |= shapes.keys()
         if model.keys() != names:
             raise InvalidInputError(
                 f"the arrays must be {', '.join(sorted(names))}; got {', '.join(sorted(model))}."
@@ -173,9 +195,10 @@ class CoordinateRegression(Surrogate, ABC):
                 for name, shape in shapes.items()
             }
         )
-        if self.input == "linear-response" and not hasattr(self, "response_"):
-            self.response_ = linear_response(scene)
-        self.from_forces_ = self._to_coordinates(self.axes_)
+        if self.input == "linear-response" and not self._responds:
+            self._respond_to(scene)
+        if self.input == "force" or not scene.parameter_names:
+            self.from_forces_ = self._to_coordinates(self.axes_)
         self._expanding = np.ascontiguousarray(scene.columns_at_all_dofs(self.modes_).T)
 
     def answer(self, forces: Array) -> Array:
@@ -189,6 +212,18 @@ class CoordinateRegression(Surrogate, ABC):
             out += loads if self._kinked else self.response_.respond(loads)
         return out.reshape(forces.shape)
 
+    def answer_parametric(self, forces: Array, parameters: Array) -> Array:
+        loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
+        if self.input == "linear-response":
+            out = self.responses_.respond(loads, parameters)
+            count(multiply_adds=len(loads) * self.axes_.size)
+            z = self.scene_.at_free_dofs(out) @ self.axes_
+        else:
+            out, z = np.zeros(loads.shape), project(self.from_forces_, loads)
+        coefficients = self.coefficients(self._with_parameters(z, parameters))
+        count(multiply_adds=len(loads) * self.modes_.size)
+        return (out + coefficients @ self._expanding).reshape(forces.shape)
+
     def answer_observed(self, observed: ObservedDisplacements) -> Array:
         return self.answer(observed.values)
 
@@ -196,6 +231,34 @@ class CoordinateRegression(Surrogate, ABC):
     def _kinked(self) -> bool:
         """True if the response to the input is not linear, so that z is taken of the response."""
         return self.input == "linear-response" and self.scene_.contact is not None
+
+    def _respond_to(self, scene: Scene) -> None:
+        if scene.parameter_names:
+            self.responses_ = ParametricResponse(scene)
+        else:
+            self.response_ = linear_response(scene)
+
+    @property
+    def _responds(self) -> bool:
+        return hasattr(self, "response_") or hasattr(self, "responses_")
+
+    def _responses(self, loads: Array, parameters: Array) -> Array:
+        if self.scene_.parameter_names:
+            return self.responses_.respond(loads, parameters)
+        return self.response_.respond(loads)
+
+    def _varied(self, scene: Scene) -> list[int]:
+        """Return the numbers of the parameters that g depends on."""
+        if self.input == "linear-response" and scene.parameter_names:
+            return Bodies(scene).varied
+        return list(range(len(scene.parameter_names)))
+
+    def _with_parameters(self, z: Array, parameters: Array) -> Array:
+        """Append the scaled parameters (n, n_parameters) to coordinates (n, n_axes)."""
+        low, high = self.ends_
+        half = np.where(high > low, 0.5 * (high - low), 1.0)
+        values = parameters[:, self._varied(self.scene_)]
+        return np.hstack([z, (values - 0.5 * (low + high)) / half])
 
     def _to_coordinates(self, axes: Array) -> Array:
         """Return the matrix A (n_dofs, n_inputs) with z = fᵀA for a load f."""

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.cubature import ecsw_system
 from mor_bench.reduction.empirical_cubature import empirical_cubature
-from mor_bench.surrogates.hyper_reduced import CubatureSurrogate
+from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, States
 
 Array = NDArray[np.float64]
 
@@ -26,8 +25,9 @@ class EmpiricalCubaturePOD(CubatureSurrogate):
     """
 
     def choose_cells(
-        self, model: FullOrderModel, modes: Array, q: Array, tolerance: float
+        self, states: States, modes: Array, tolerance: float
     ) -> tuple[NDArray[np.int64], Array]:
+        ((model, q),) = states()
         weights = empirical_cubature(
             ecsw_system(model.assembler, model.cell_dofs, modes, q), tolerance
         ).weights

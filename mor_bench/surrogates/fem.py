@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
@@ -12,8 +12,9 @@ from pydantic import Field
 
 from mor_bench.errors import SolverError
 from mor_bench.mechanics.model import missing_library, unknown_equations
-from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.mechanics.newton import NewtonOptions, Solution
 from mor_bench.mechanics.observed import forward_model
+from mor_bench.mechanics.parametric import ParametricModel
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.specs import SolverName
@@ -39,6 +40,7 @@ class FullFEM(Surrogate):
     solver: SolverName | None = None
 
     needs_snapshots: ClassVar = False
+    takes_parameters: ClassVar = True
 
     def supports(self, scene: Scene) -> str | None:
         return unknown_equations(scene, observed=True) or missing_library(
@@ -46,13 +48,34 @@ class FullFEM(Surrogate):
         )
 
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
-        self.model_ = forward_model(scene, self.solver)
+        if scene.parameter_names:
+            self.bodies_ = ParametricModel(scene, self.solver)
+            self.bodies_.prepare()
+        else:
+            self.model_ = forward_model(scene, self.solver)
 
     def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self._displacements(
+            forces, lambda loads: self.model_.solve_many(loads, NewtonOptions(self.tolerance))
+        )
+
+    def answer_parametric(
+        self, forces: NDArray[np.float64], parameters: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        options = NewtonOptions(self.tolerance)
+        return self._displacements(
+            forces, lambda loads: self.bodies_.solve_many(loads, parameters, options)
+        )
+
+    def _displacements(
+        self,
+        forces: NDArray[np.float64],
+        solve: Callable[[NDArray[np.float64]], list[Solution | SolverError]],
+    ) -> NDArray[np.float64]:
         scene = self.scene_
         loads = scene.at_free_dofs(forces.reshape(len(forces), scene.mesh.n_dofs))
-        solutions, out = self.model_.solve_many(loads, NewtonOptions(self.tolerance)), loads.copy()
-        for row, found in zip(out, solutions, strict=True):
+        out = loads.copy()
+        for row, found in zip(out, solve(loads), strict=True):
             if isinstance(found, SolverError):
                 raise found
             row[:] = found.displacement

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.reduction.cubature import ecsw_system, sparse_nnls, triangle
-from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, nodal, reduced_points
+from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, States, nodal, reduced_points
 
 Array = NDArray[np.float64]
 
@@ -35,24 +34,34 @@ class HyperReducedPOD(CubatureSurrogate):
 
     sampling: Literal["cells", "points"] = "points"
 
+    takes_parameters: ClassVar = True
+
     def choose_cells(
-        self, model: FullOrderModel, modes: Array, q: Array, tolerance: float
+        self, states: States, modes: Array, tolerance: float
     ) -> tuple[NDArray[np.int64], Array]:
-        system = ecsw_system(model.assembler, model.cell_dofs, modes, q)
+        systems = [ecsw_system(m.assembler, m.cell_dofs, modes, q) for m, q in states()]
+        system = systems[0] if len(systems) == 1 else _short(np.concatenate(systems))
         weights = sparse_nnls(system, system.sum(axis=1), tolerance).weights
         cells = np.flatnonzero(weights)
         if self.sampling == "cells":
             return cells, weights[cells]
-        points = reduced_points(model.scene, cells, np.ones(len(cells)), nodal(model.scene, modes))
-        own = np.concatenate([points.point_forces(coordinates).T for coordinates in q])
-        target = np.concatenate(
-            [modes.T @ model.force(modes @ coordinates).force for coordinates in q]
-        )
-        if model.springs is not None:  # they are no part of the cubature
-            target -= (q @ (modes.T @ (model.springs @ modes))).ravel()
-        both = triangle(np.column_stack([own, target]))
+        own, target = [], []
+        for model, q in states():
+            on_nodes = nodal(model.scene, modes)
+            points = reduced_points(model.scene, cells, np.ones(len(cells)), on_nodes)
+            forces = np.array([modes.T @ model.force(modes @ row).force for row in q])
+            if model.springs is not None:  # they are no part of the cubature
+                forces -= q @ (modes.T @ (model.springs @ modes))
+            own += [points.point_forces(row).T for row in q]
+            target.append(forces.ravel())
+        both = triangle(np.column_stack([np.concatenate(own), np.concatenate(target)]))
         factors = sparse_nnls(
             np.ascontiguousarray(both[:, :-1]), both[:, -1], tolerance
         ).weights.reshape(len(cells), -1)
         used = factors.any(axis=1)
         return cells[used], factors[used]
+
+
+def _short(system: Array) -> Array:
+    """Return a matrix with the same least-squares problem; QR pays above 4 rows per column."""
+    return triangle(system) if len(system) > 4 * system.shape[1] else system

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
@@ -14,6 +14,7 @@ from pydantic import Field
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel, body_of, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
+from mor_bench.mechanics.parametric import Bodies, ParametricModel
 from mor_bench.model_arrays import take_array, take_indices
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.galerkin import CubatureProblem
@@ -21,6 +22,7 @@ from mor_bench.reduction.points import ReducedPoints
 from mor_bench.reduction.sizing import MODES, TOLERANCES, Auto
 from mor_bench.reduction.subspace import Subspace, extent_of
 from mor_bench.scene.scene import Scene
+from mor_bench.scene.scene_at import scale_of
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.surrogate import Surrogate
@@ -28,14 +30,20 @@ from mor_bench.surrogate import Surrogate
 Array = NDArray[np.float64]
 
 
-def training_coordinates(displacements: Array, modes: Array, n_snapshots: int) -> Array:
-    """Return coordinates (n, r) of at most ``n_snapshots`` snapshots.
+States = Callable[[], Iterator[tuple[FullOrderModel, Array]]]
+"""Yields the bodies of training states, and the coordinates (n, r) of the states of each."""
 
-    They are spread evenly over the nonzero snapshots. The modes are orthonormal.
-    """
+
+def training_rows(displacements: Array, n_snapshots: int) -> NDArray[np.int64]:
+    """Return at most ``n_snapshots`` rows, spread evenly over the nonzero snapshots."""
     moved = np.flatnonzero(displacements.any(axis=1))
     chosen = np.unique(np.linspace(0, len(moved) - 1, n_snapshots).astype(int))
-    return np.asarray(displacements[moved[chosen]] @ modes)
+    return np.asarray(moved[chosen])
+
+
+def training_coordinates(displacements: Array, modes: Array, n_snapshots: int) -> Array:
+    """Return coordinates (n, r) of the `training_rows`. The modes are orthonormal."""
+    return np.asarray(displacements[training_rows(displacements, n_snapshots)] @ modes)
 
 
 def nodal(scene: Scene, rows: Array) -> Array:
@@ -93,11 +101,11 @@ class CubatureSurrogate(Surrogate):
 
     @abstractmethod
     def choose_cells(
-        self, model: FullOrderModel, modes: Array, q: Array, tolerance: float
+        self, states: States, modes: Array, tolerance: float
     ) -> tuple[NDArray[np.int64], Array]:
         """Return the kept cells, and their weights (n,) or those of their points (n, n_points).
 
-        `q` (n_snapshots, r) float64 are coordinates of snapshots in the basis.
+        There is one body, unless the class takes sampled parameters and the scene has some.
         """
 
     def learn(self, scene: Scene, samples: Snapshots) -> dict[str, NDArray[Any]]:
@@ -106,8 +114,8 @@ class CubatureSurrogate(Surrogate):
         if tolerance == 0:
             cells, weights = np.arange(scene.mesh.n_cells), np.ones(scene.mesh.n_cells)
         else:
-            q = training_coordinates(displacements, modes, self.n_cubature_snapshots)
-            cells, weights = self.choose_cells(FullOrderModel(scene), modes, q, tolerance)
+            states = _states(scene, samples, modes, self.n_cubature_snapshots)
+            cells, weights = self.choose_cells(states, modes, tolerance)
         return {"modes": modes, "cells": cells, "weights": weights}
 
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
@@ -121,13 +129,28 @@ class CubatureSurrogate(Surrogate):
                 "`weights` must be positive for a cell, or for some of its points."
             )
         self.subspace_ = Subspace(scene, self.modes_)
-        points = reduced_points(scene, self.cells_, self.weights_, nodal(scene, self.modes_))
-        self.problem_ = CubatureProblem(points, extent_of(scene))
+        self._on_nodes = nodal(scene, self.modes_)
+        self.problem_ = self._problem(scene)
         self.problem_.prepare()
         if scene.contact:
             from mor_bench.reduction.pressed_modes import PressedModes  # only such scenes need it
 
             self.pressed_ = PressedModes(scene, self.problem_, self.modes_)
+        if scene.parameter_names:
+            self.bodies_ = Bodies(scene)
+
+    def _problem(self, scene: Scene) -> CubatureProblem:
+        points = reduced_points(scene, self.cells_, self.weights_, self._on_nodes)
+        return CubatureProblem(points, extent_of(scene))
+
+    def _problem_of(self, parameters: Array) -> CubatureProblem:
+        """Return the problem of a body, (n_parameters,)."""
+        scene = self.bodies_.at(parameters)
+        if self.scene_.springs or scene.generated.gravity is not None:
+            return self._problem(scene)
+        body = body_of(scene, self.cells_)
+        points = self.problem_.points.scaled(body, scale_of(self.scene_, parameters))
+        return CubatureProblem(points, extent_of(scene))
 
     def answer(self, forces: Array) -> Array:
         options = NewtonOptions(self.value("tolerance"))
@@ -140,3 +163,32 @@ class CubatureSurrogate(Surrogate):
         return self.subspace_.answer_given(
             observed.values, lambda given: self.pressed_.solve(given, options)
         )
+
+    def answer_parametric(self, forces: Array, parameters: Array) -> Array:
+        options = NewtonOptions(self.value("tolerance"))
+
+        def solve(load: Array, values: Array) -> Array:
+            body, factor = self.bodies_.shared(values)
+            reference = self.bodies_.is_reference(body)
+            problem = self.problem_ if reference else self._problem_of(body)
+            return problem.solve(factor * load, options).displacement
+
+        return self.subspace_.answer_each(forces, parameters, solve)
+
+
+def _states(scene: Scene, samples: Snapshots, modes: Array, n_snapshots: int) -> States:
+    """Return training states; those of a parametric scene have a body each."""
+    displacements = samples.free_displacements
+    rows = training_rows(displacements, n_snapshots)
+    q = displacements[rows] @ modes
+    if not scene.parameter_names:
+        model = FullOrderModel(scene)
+        return lambda: iter([(model, q)])
+    models = ParametricModel(scene)
+
+    def states() -> Iterator[tuple[FullOrderModel, Array]]:
+        for number, row in zip(rows, q, strict=True):
+            body, _ = models.bodies.shared(samples.parameters[number])
+            yield models.model_of(body), row[None]
+
+    return states

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mor_bench.mechanics.model import unknown_equations
 from mor_bench.mechanics.observed import linear_response
+from mor_bench.mechanics.parametric import ParametricResponse
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.surrogate import Surrogate
@@ -25,16 +26,26 @@ class LinearFEM(Surrogate):
     """
 
     needs_snapshots: ClassVar = False
+    takes_parameters: ClassVar = True
 
     def supports(self, scene: Scene) -> str | None:
         return unknown_equations(scene, observed=True)
 
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
-        self.compliance_ = linear_response(scene)
+        if scene.parameter_names:
+            self.responses_ = ParametricResponse(scene)
+        else:
+            self.compliance_ = linear_response(scene)
 
     def answer(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
         return self.compliance_.respond(loads).reshape(forces.shape)
+
+    def answer_parametric(
+        self, forces: NDArray[np.float64], parameters: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        loads = forces.reshape(-1, self.scene_.mesh.n_dofs)
+        return self.responses_.respond(loads, parameters).reshape(forces.shape)
 
     def answer_observed(self, observed: ObservedDisplacements) -> NDArray[np.float64]:
         return self.answer(observed.values)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,8 @@ class PCARegression(CoordinateRegression):
     degree: Annotated[int, Field(ge=1, le=4)] = 3
     ridge: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1e-6
 
+    takes_parameters: ClassVar = True
+
     def regress(self, samples: CoordinateSamples) -> dict[str, NDArray[Any]]:
         from sklearn.linear_model import Ridge
 
@@ -59,10 +61,21 @@ class PCARegression(CoordinateRegression):
                 f"{8e-09 * n * n_samples:.1f} GB; lower `degree` or `n_input_modes`."
             )
         features = Monomials(n_variables, monomial_indices(n_variables, self.degree))(samples.z)
+        used = self._vanishing(n_variables)
+        features = features if used.all() else features[:, used]
         feature_scale = np.sqrt((features**2).mean(axis=0))
         regression = Ridge(alpha=self.ridge * len(features), fit_intercept=False, solver="cholesky")
         regression.fit(features / feature_scale, samples.values)
-        return {"weights": np.atleast_2d(regression.coef_) / feature_scale}
+        weights = np.zeros((samples.values.shape[1], n))
+        weights[:, used] = np.atleast_2d(regression.coef_) / feature_scale
+        return {"weights": weights}
+
+    def _vanishing(self, n_variables: int) -> NDArray[np.bool_]:
+        """Return which monomials vanish without load: all but those of parameters alone."""
+        at_rest = np.ones((1, n_variables))
+        at_rest[:, : self.axes_.shape[1]] = 0.0
+        values = Monomials(n_variables, monomial_indices(n_variables, self.degree))(at_rest)[0]
+        return np.asarray(values == 0.0)
 
     def shapes(
         self, model: Arrays, n_inputs: int, n_outputs: int
@@ -70,7 +83,8 @@ class PCARegression(CoordinateRegression):
         return {"weights": (n_outputs, n_monomials(n_inputs, self.degree))}
 
     def take(self, model: dict[str, NDArray[Any]]) -> None:
-        self.weights_, n_variables = model["weights"], self.axes_.shape[1]
+        self.weights_ = model["weights"]
+        n_variables = self.axes_.shape[1] + self.ends_.shape[1]
         self._monomials = Monomials(n_variables, monomial_indices(n_variables, self.degree))
 
     def coefficients(self, z: Array) -> Array:

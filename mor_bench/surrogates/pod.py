@@ -14,6 +14,7 @@ from pydantic import Field
 from mor_bench.errors import InvalidInputError
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
+from mor_bench.mechanics.parametric import ParametricModel
 from mor_bench.model_arrays import take_array
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.galerkin import GalerkinProblem
@@ -56,6 +57,7 @@ class PODGalerkin(Surrogate):
     inner_product: Literal["euclidean", "stiffness"] = "euclidean"
 
     sized: ClassVar = {"n_modes": MODES, "tolerance": TOLERANCES}
+    takes_parameters: ClassVar = True
 
     def supports(self, scene: Scene) -> str | None:
         return unknown_equations(scene, contact=True)
@@ -82,6 +84,9 @@ class PODGalerkin(Surrogate):
         self.modes_ = take_array(model, "modes", (len(scene.free_dofs), None))
         self.options_ = NewtonOptions(self.value("tolerance"))
         self.subspace_ = Subspace(scene, self.modes_)
+        if scene.parameter_names:
+            self.bodies_ = ParametricModel(scene)
+            return
         self.problem_ = GalerkinProblem(FullOrderModel(scene).assembler, self.modes_)
         self.problem_.prepare()
         if scene.contact:
@@ -99,3 +104,15 @@ class PODGalerkin(Surrogate):
         return self.subspace_.answer_given(
             observed.values, lambda given: self.pressed_.solve(given, self.options_)
         )
+
+    def answer_parametric(
+        self, forces: NDArray[np.float64], parameters: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        return self.subspace_.answer_each(forces, parameters, self._solve_on)
+
+    def _solve_on(
+        self, load: NDArray[np.float64], parameters: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        body, factor = self.bodies_.bodies.shared(parameters)
+        problem = GalerkinProblem(self.bodies_.assembler_of(body), self.modes_)
+        return solve_equilibrium(problem, factor * load, options=self.options_).displacement

@@ -29,7 +29,8 @@ from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import Solution
 from mor_bench.report.published_figures import SAME_AMPLITUDE, SCENES, scene_of
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.snapshots.sampling import PatchLoads, draw_loads, n_samples_of
+from mor_bench.snapshots.patch_loads import PatchLoads
+from mor_bench.snapshots.sampling import draw_loads, n_samples_of
 from mor_bench.snapshots.split import split_samples
 from mor_bench.snapshots.test_sets import spec_of_set
 from mor_bench.specs import DatasetSpec, Split, list_suite, load_generated_spec

@@ -31,7 +31,7 @@ def test_a_leak_and_a_drift_are_found(how: str, tiny: Dataset) -> None:
     class Spoiled(LinearFEM):
         kept: list[Any]
 
-        def predict(self, forces: Any) -> Any:
+        def predict(self, forces: Any) -> Any:  # type: ignore[override]
             # Mapped pages, since freed heap of earlier tests would take small arrays unseen.
             self.kept.append(mmap(-1, 16_384) if how == "leaks" else 0)
             if how == "leaks":

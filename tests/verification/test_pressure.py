@@ -16,7 +16,8 @@ from mor_bench.measure.discretisation_error import RefinementPlan, refine
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.scene.scene import Scene, load_scene
-from mor_bench.snapshots.sampling import PatchLoads, draw_loads
+from mor_bench.snapshots.patch_loads import PatchLoads
+from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.snapshots.test_sets import available_sets, spec_of_set
 from mor_bench.specs import load_generated_spec
 

@@ -16,7 +16,8 @@ from mor_bench.report.scene_text import scene_text
 from mor_bench.runs.file_check import check_file
 from mor_bench.scene.scene import Scene, load_scene
 from mor_bench.snapshots.dataset import load_dataset
-from mor_bench.snapshots.sampling import PatchLoads, draw_loads
+from mor_bench.snapshots.patch_loads import PatchLoads
+from mor_bench.snapshots.sampling import draw_loads
 from mor_bench.snapshots.test_sets import available_sets, spec_of_set
 from mor_bench.specs import tables_of
 
