@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from mor_bench.report.number_format import DASH, number
 from tests.published.run_tables import markdown
 from tests.published.stored import content_of
@@ -63,3 +65,15 @@ def generation(source: str) -> str:
             for row in content_of(source)["sizes"]
         ],
     )
+
+
+def large_deformation(source: str) -> str:
+    """Show the time of a solve and the ratio of another code's, by the displacement of the end."""
+    found = content_of(source)["datasets"]["beam-fine"]
+    own, peer = (np.median(np.array(row["times_ms"]), axis=1) for row in found["contenders"])
+    steps = found["contenders"][0]["steps"]
+    body = [
+        [f"{amplitude:g}", f"{n}", number(float(ms)), number(float(other / ms))]
+        for amplitude, n, ms, other in zip(found["amplitudes_m"], steps, own, peer, strict=True)
+    ]
+    return markdown(["end moves, m", "back-solves", "`auto`, ms", "felupe, Pardiso: ratio"], body)
