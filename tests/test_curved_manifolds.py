@@ -88,7 +88,7 @@ def test_the_answer_is_a_minimum_of_the_potential_on_the_manifold(name: str, tin
     method = mor_bench.load_method(name, **parameters).fit(tiny.scene, tiny.train)
     assert isinstance(method, CurvedPOD)
     force = tiny.test.free_forces[3]
-    projected = method.modes_.T @ force
+    projected = method.space_.T @ force
     load = CurvedLoad(projected, method.curved_.slope.T @ projected, np.zeros(len(method.rows_)))
     q, problem = method.solve(load), CurvedProblem(method.curved_, load)
 

@@ -212,7 +212,8 @@ class Assembler:
         cell_weights: Array | None = None,
         frames: Frames | None = None,
     ) -> None:
-        n_cells, n_nodes = body.cells.shape
+        quadrature = quadrature_of(body)  # checks the cells
+        n_cells, n_points, n_nodes, _ = quadrature.gradients.shape
         self.pattern, slots = build_pattern(dof_of_node, body.cells, n_dofs)
         self.n_dofs = n_dofs
         # The kernels sum over dofs along x, y and z, which nodes with frames have beside their own.
@@ -230,8 +231,6 @@ class Assembler:
         self._dof_of_node, self._own, self._frames = dof_of_node, own, frames
         self._dofs = _batched(dofs.astype(np.int32), self._n_summed)
         self._slots = _batched(slots, len(self.summed_pattern.indices))
-        quadrature = quadrature_of(body)
-        n_points = quadrature.gradients.shape[1]
         self._gradients = _batched(
             quadrature.gradients.reshape(n_cells, n_points, 3 * n_nodes), 0.0
         ).reshape(-1, n_points, 3 * n_nodes * LANES)

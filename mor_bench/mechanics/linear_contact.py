@@ -20,6 +20,9 @@ TOLERANCE = 1e-10
 
 MAX_ITERATIONS = 100
 MAX_HALVINGS = 20
+
+LEAST_STEP = 1e-3
+"""Smallest step of the instrument, as a fraction of its motion, before the solve gives up."""
 CHUNK = 256
 """Columns of the compliance that are computed together."""
 
@@ -78,14 +81,22 @@ class LinearContact:
 
     def _solved(self, motion: Array) -> Array:
         """Return the contact's forces (n_touched_dofs,), N."""
-        n_steps = int(np.ceil(1.0 / self._contact.points.first_step(motion)))
-        forces = np.zeros(len(self._dofs))
-        for step in range(1, n_steps + 1):
-            forces = self._settled(step / n_steps * motion, forces)
+        step = 1.0 / np.ceil(1.0 / self._contact.points.first_step(motion))
+        reached, forces = 0.0, np.zeros(len(self._dofs))
+        while reached < 1.0:
+            place = 1.0 if reached + 1.001 * step > 1.0 else reached + step
+            found = self._settled(place * motion, forces)
+            if found is not None:
+                reached, forces = place, found
+            elif (step := 0.5 * step) < LEAST_STEP:
+                raise NoEquilibriumError(
+                    f"{self.scene.name}: linear elasticity with contact did not converge in "
+                    f"{MAX_ITERATIONS} iterations, at {reached:.0%} of the motion."
+                )
         return forces
 
-    def _settled(self, motion: Array, forces: Array) -> Array:
-        """Iterate from the forces (n,), N, at another place of the instrument."""
+    def _settled(self, motion: Array, forces: Array) -> Array | None:
+        """Iterate from the forces (n,), N, at another place; None if that does not converge."""
         u = self._flexibility @ forces
         touch = self._contact.touch(u, motion)
         for _ in range(MAX_ITERATIONS):
@@ -108,10 +119,7 @@ class LinearContact:
                 if 0.5 * float(other @ moved) + touch.energy_j <= before or abs(left) <= slope:
                     break
             forces, u = other, moved
-        raise NoEquilibriumError(
-            f"{self.scene.name}: linear elasticity with contact did not converge in "
-            f"{MAX_ITERATIONS} iterations."
-        )
+        return None
 
     def _newton(self, touch: Touch, wanted: Array, excess: Array, curved: bool) -> Array:
         """Return the forces of the equilibrium with the contact linearised."""

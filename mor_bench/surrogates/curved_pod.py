@@ -103,8 +103,10 @@ class CurvedPOD(Surrogate):
             offsets = model.rest_factor.solve(samples.free_forces.T).T
             offsets = offsets - samples.free_forces @ _primary_response(model, primary) @ primary.T
         targets = displacements - offsets
-        q = targets @ primary
-        modes = np.hstack([primary, pod(targets - q @ primary.T, self.n_secondary).modes])
+        rest = pod(targets - targets @ primary @ primary.T, self.n_secondary).modes
+        # The remainder may be small against the primary part, so round-off is projected out.
+        secondary = np.linalg.qr(rest - primary @ (primary.T @ rest))[0]
+        modes = np.hstack([primary, secondary])
         arrays, latent = self.fit_map(scene, samples, targets @ modes, primary.shape[1])
         weights = np.ones(scene.mesh.n_cells)
         if self.cubature_tolerance > 0:
@@ -123,20 +125,20 @@ class CurvedPOD(Surrogate):
     def prepare(self, scene: Scene, model: Arrays) -> None:
         n_free = len(scene.free_dofs)
         primary = take_array(model, "primary", (n_free, None))
-        self.primary_ = primary
-        self.modes_ = np.hstack([primary, take_array(model, "secondary", (n_free, None))])
+        self.modes_ = primary
+        self.space_ = np.hstack([primary, take_array(model, "secondary", (n_free, None))])
         self.cells_ = take_array(model, "cells", (None,), np.int64)
         weights = take_array(model, "weights", (len(self.cells_),))
-        self.curve_ = self.take_map(model, primary.shape[1], self.modes_.shape[1])
+        self.curve_ = self.take_map(model, primary.shape[1], self.space_.shape[1])
         assembler, self.rows_ = weighted_cells(scene, self.cells_, weights)
-        sampled = GalerkinProblem(assembler, self.modes_[self.rows_])
+        sampled = GalerkinProblem(assembler, self.space_[self.rows_])
         self.curved_ = CurvedModel(sampled, self.curve_)
         self.curved_.linear.prepare()
         self.model_ = FullOrderModel(scene)
-        self._to_load = self.modes_
+        self._to_load = self.space_
         if self.static_correction:
             self.compliance_ = Compliance(self.model_)
-            forces = np.zeros_like(self.modes_)
+            forces = np.zeros_like(self.space_)
             forces[self.rows_] = self.curved_.rest_forces
             self._to_load = self.model_.rest_factor.solve(forces)
             self._to_primary = _primary_response(self.model_, primary)
@@ -149,15 +151,15 @@ class CurvedPOD(Surrogate):
         projected = project(self._to_load, force[None])[0]
         if self.static_correction:
             lacked = project(self._to_primary, force[None])[0]
-            offset = self.compliance_.solve(force) - self.primary_ @ lacked
+            offset = self.compliance_.solve(force) - self.modes_ @ lacked
             at_rest = self.curved_.linear.rest_tangent @ lacked
-            count(multiply_adds=self.primary_.size + lacked.size**2)
+            count(multiply_adds=self.modes_.size + lacked.size**2)
         else:
             at_rest = self.curved_.slope.T @ projected
             count(multiply_adds=self.curved_.slope.size)
         load = CurvedLoad(projected, at_rest, offset[self.rows_])
-        u = np.asarray(offset + self.modes_ @ self.curve_.at(self.solve(load))[0])
-        count(multiply_adds=self.modes_.size)
+        u = np.asarray(offset + self.space_ @ self.curve_.at(self.solve(load))[0])
+        count(multiply_adds=self.space_.size)
         if len(self.cells_) < self.scene_.mesh.n_cells:
             refuse_inverted(self.model_, u)
         return u
