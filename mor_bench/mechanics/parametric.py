@@ -4,7 +4,8 @@ The laws of Young's modulus and Poisson's ratio are linear in Young's modulus Y.
 and gravity, the displacement under a load f with Y is that under f Y₀ / Y with Y₀, exactly. Bodies
 that differ in nothing else share one model. Every other body has a model of its own, with the
 sparsity pattern of the reference. The reference's factor preconditions its iterations. This takes
-less counted work than a factor for each body, except on small meshes at tight tolerances.
+less counted work than a factor for each body, except on small meshes at tight tolerances, and where
+Poisson's ratio and the shape vary together on a body near incompressibility.
 """
 
 from __future__ import annotations
