@@ -17,6 +17,13 @@ from threadpoolctl import threadpool_limits
 MEMBERSHIP, GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 
 
+SIGNAL_CHECK_S = 0.2
+"""Longest wait of the main thread, s.
+
+Linux may deliver a signal to any thread. Python acts on it only when the main thread runs again.
+"""
+
+
 @contextmanager
 def pinned_threads(threads: int) -> Iterator[None]:
     """Limit the threads of BLAS, OpenMP and, if it is loaded, torch."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import threading
@@ -172,7 +171,8 @@ def test_an_interrupt_while_workers_open_ends_them(
     def interrupt() -> None:
         while not opening:
             time.sleep(0.05)
-        os.kill(os.getpid(), signal.SIGINT)
+        # Linux may deliver a signal of the terminal to any thread.
+        signal.pthread_kill(threading.get_ident(), signal.SIGINT)
 
     began = time.monotonic()
     threading.Thread(target=interrupt, daemon=True).start()

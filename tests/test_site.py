@@ -51,6 +51,7 @@ def test_every_cited_work_is_in_the_bibliography_and_every_work_is_cited() -> No
     ],
 )
 def test_links_lead_to_pages_of_the_site(source: str, elsewhere: bool, expected: str) -> None:
+    pytest.importorskip("sphinx", reason="needs the extra `docs`")
     from repository_links import rewritten  # type: ignore[import-not-found]
 
     assert rewritten(source, elsewhere=elsewhere) == expected

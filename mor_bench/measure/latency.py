@@ -223,7 +223,7 @@ def _open_all(
     for turn in wanted.values():
         stack.callback(turn.end)
     with stoppable_threads(cpu_count() or 1) as pool:
-        list(pool.map(lambda turn: turn.open(server, seed), wanted.values()))
+        list(pool.in_order(lambda turn: turn.open(server, seed), wanted.values()))
     return {label: turn for label, turn in wanted.items() if not turn.timing.failed}
 
 

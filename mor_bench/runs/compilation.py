@@ -98,7 +98,7 @@ def compile_kernels(
     with tempfile.TemporaryDirectory(dir=scratch) as folder:
         compile_group(waiting[0])
         with stoppable_threads(os.cpu_count() or 1) as threads:
-            list(threads.map(compile_group, waiting[1:]))
+            list(threads.in_order(compile_group, waiting[1:]))
         context.listener.compiling(waiting[-1].method.name, len(waiting), len(waiting))
 
 

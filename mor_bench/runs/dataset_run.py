@@ -188,11 +188,11 @@ class DatasetRun:
             executor = stack.enter_context(stoppable_threads(n_threads))
             for _, group in groupby(self.configurations, key=lambda item: item.method.name):
                 mine = list(group)
-                attempts = list(executor.map(partial(self._fit, pool), range(len(mine)), mine))
+                attempts = list(executor.in_order(partial(self._fit, pool), range(len(mine)), mine))
                 for attempt in attempts:
                     if attempt.cached is not None:
                         stack.callback(attempt.cached.release)
-                scored = executor.map(self._score, attempts)
+                scored = executor.in_order(self._score, attempts)
                 for attempt, (row, samples) in zip(attempts, scored, strict=True):
                     self.comparison.put(row, samples)
                     self.context.listener.fitted(row)

@@ -9,13 +9,13 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from queue import Empty, SimpleQueue
 from threading import Event, Thread, get_ident
 from time import monotonic
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO, Self, TypeVar
 
 import psutil
 from pydantic import ValidationError
@@ -23,7 +23,7 @@ from pydantic import ValidationError
 from mor_bench import errors
 from mor_bench.checked_files import parse_json
 from mor_bench.errors import MorBenchError, StoreError
-from mor_bench.machine import memory_limit_bytes
+from mor_bench.machine import SIGNAL_CHECK_S, memory_limit_bytes
 from mor_bench.sandbox.fork_server import CHILD_MODULE, ForkServer, environment
 from mor_bench.sandbox.seal import Restrictions
 from mor_bench.sandbox.session import Answer, Session
@@ -49,18 +49,40 @@ def default_memory_limit_bytes() -> float:
     return MEMORY_SHARE * memory_limit_bytes()
 
 
+_R = TypeVar("_R")
+
 _ALIVE: set[SandboxedProcess] = set()
 
 
+class StoppableThreads(ThreadPoolExecutor):
+    """A pool of threads that a signal can interrupt at any time."""
+
+    def in_order(self, function: Callable[..., _R], /, *arguments: Iterable[Any]) -> Iterator[_R]:
+        """Return an iterator over the results in the order of the arguments."""
+        futures = [self.submit(function, *items) for items in zip(*arguments, strict=False)]
+
+        def results() -> Iterator[_R]:
+            try:
+                for future in futures:
+                    while not wait([future], timeout=SIGNAL_CHECK_S).done:
+                        pass
+                    yield future.result()
+            finally:
+                for future in futures:
+                    future.cancel()
+
+        return results()
+
+
 @contextmanager
-def stoppable_threads(n: int) -> Iterator[ThreadPoolExecutor]:
+def stoppable_threads(n: int) -> Iterator[StoppableThreads]:
     """Open a pool of threads that wait for processes which they start.
 
     After an error in the body, such as an interrupt, these processes are ended, because a fit may
     last an hour and the pool waits for its threads.
     """
     own: set[int] = set()
-    executor = ThreadPoolExecutor(n, initializer=lambda: own.add(get_ident()))
+    executor = StoppableThreads(n, initializer=lambda: own.add(get_ident()))
     stop, left = Event(), Event()
 
     def end_processes() -> None:

@@ -24,6 +24,7 @@ from time import sleep
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from mor_bench.errors import InvalidInputError, MissingDependencyError, WorkerError, check_count
+from mor_bench.machine import SIGNAL_CHECK_S
 from mor_bench.parent_death import end_with_parent
 
 if TYPE_CHECKING:
@@ -65,7 +66,9 @@ class Pool:
 
     @staticmethod
     def _finished(waiting: set[Future[_R]]) -> Iterator[_R]:
-        done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+        done: set[Future[_R]] = set()
+        while not done:
+            done, _ = wait(waiting, timeout=SIGNAL_CHECK_S, return_when=FIRST_COMPLETED)
         waiting -= done
         while done:
             yield done.pop().result()
