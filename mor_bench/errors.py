@@ -161,5 +161,9 @@ class LockingWarning(UserWarning):
     """The elements lock: displacements of a nearly incompressible material are too small."""
 
 
+class RenamedWarning(UserWarning):
+    """A method has another name now."""
+
+
 class FallbackWarning(UserWarning):
     """A faster implementation is not available, so a slower one is used."""

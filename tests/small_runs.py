@@ -24,7 +24,7 @@ LIMIT = 60
 
 COMMAND = [sys.executable, "-m", "mor_bench"]
 
-PLAIN: list[str | Path] = ["linear-fem", "pca-regression-force"]
+PLAIN: list[str | Path] = ["linear-fem", "pca-regression"]
 """Methods of the suite that are quick to fit: one learns from samples."""
 
 

@@ -191,7 +191,7 @@ def test_pairs_are_antisymmetric_and_name_the_faster_method(analysis: Record) ->
         for end, other in (("ratio", "ratio"), ("low", "high"), ("high", "low")):
             if record[end] is not None:
                 assert record[end] * back[other] == pytest.approx(1)
-    assert pair(analysis, "pca-regression", "fem", 0.03)["verdict"] == "faster"
+    assert pair(analysis, "pca-regression-linear", "fem", 0.03)["verdict"] == "faster"
     assert pair(analysis, "umesh", "hpod", 0.01)["by"] == ["umesh", "hpod"]
 
 

@@ -23,7 +23,7 @@ def filled(tiny: Dataset, cache: Path, tmp_path: Path) -> Path:
     """A cache with beam-tiny, two fits of one method and one of another."""
     folder = dataset_folder(tiny.scene.generated, cache)
     shutil.copytree(folder, tmp_path / "datasets" / folder.name)
-    for name in ("pca-regression-force-0a1b", "pca-regression-force-2c3d", "pod-4e5f"):
+    for name in ("pca-regression-0a1b", "pca-regression-2c3d", "pod-4e5f"):
         (tmp_path / "fits" / name).mkdir(parents=True)
         (tmp_path / "fits" / name / "model.safetensors").write_bytes(bytes(1000))
     return tmp_path
@@ -33,11 +33,11 @@ def test_the_cache_is_listed_with_sizes(filled: Path) -> None:
     found = json.loads(cache_command("--cache", filled, "--json").stdout)
     sizes = {(item["kind"], item["name"]): item["size_bytes"] for item in found["entries"]}
     data = sum(path.stat().st_size for path in (filled / "datasets").rglob("*.*") if path.is_file())
-    assert sizes[("fit", "pca-regression-force")] == 2000
+    assert sizes[("fit", "pca-regression")] == 2000
     assert sizes[("fit", "pod")] == 1000
     assert sizes[("dataset", "beam-tiny")] == data > 0
     assert found["size_bytes"] == sum(sizes.values())
-    assert "pca-regression-force" in cache_command("--cache", filled).stdout
+    assert "pca-regression" in cache_command("--cache", filled).stdout
     assert cache_command("--cache", filled / "nothing").exit_code == 0
 
 
@@ -46,7 +46,7 @@ def test_only_named_entries_are_deleted_and_can_be_made_again(filled: Path) -> N
     assert (filled / "fits" / "pod-4e5f").exists()
     assert cache_command("pod", "beam-tiny", "--clean", "--cache", filled).exit_code == 0
     left = sorted(path.name for path in filled.glob("*/*"))
-    assert left == ["pca-regression-force-0a1b", "pca-regression-force-2c3d"]
+    assert left == ["pca-regression-0a1b", "pca-regression-2c3d"]
     assert len(load_dataset("beam-tiny", 30, cache=filled, workers=1).train) > 0
     refused = cache_command("pdo", "--clean", "--cache", filled)
     assert (refused.exit_code, refused.stdout) == (2, "")

@@ -110,7 +110,7 @@ def test_doubts_about_the_choice_are_named_and_other_notes_counted(shown: Any) -
     text = shown(80)
     flat = " ".join(text.split())
     assert re.search(r"^  linear-fem +[\d.]+ % +[\d.]+ % +~[\d.]+ µs", text, re.MULTILINE)
-    assert "pca-regression · k5: the median error is" in flat
+    assert "pca-regression-linear · k5: the median error is" in flat
     assert "- 1 of 18 timings was not stable" in flat
     again = next(line for line in text.splitlines() if line.startswith("  mor-bench run "))
     assert again.endswith("--retime")

@@ -235,7 +235,7 @@ QUICK = sorted(
 REFUSED = {"gappy-pod": "the motion of an instrument", "pod-tensor": "this law is neo-hookean"}
 """Reasons other than `CONTACT`."""
 
-TAKEN = {"fem", "linear-fem", "pod", "hpod", "ecm", "pca-regression"}
+TAKEN = {"fem", "linear-fem", "pod", "hpod", "ecm", "pca-regression-linear"}
 """Methods that must not refuse."""
 
 

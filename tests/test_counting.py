@@ -292,7 +292,7 @@ def test_deim_evaluates_the_points_of_the_cells_around_its_dofs(
 
 def test_pca_regression_by_its_products(tiny: Dataset, loads: np.ndarray) -> None:
     method = mor_bench.load_method(
-        "pca-regression", n_input_modes=4, n_output_modes=5, degree=3
+        "pca-regression-linear", n_input_modes=4, n_output_modes=5, degree=3
     ).fit(tiny.scene, tiny.train)
     n = len(tiny.scene.free_dofs)
     features = 4 + 10 + 20
@@ -327,7 +327,7 @@ def test_u_mesh_by_its_layers_and_by_torch(tiny: Dataset, loads: np.ndarray) -> 
     assert flops.get_total_flops() == 2 * convolutions
 
 
-QUICK = {"fem", "linear-fem", "pod", "hpod", "pca-regression"}
+QUICK = {"fem", "linear-fem", "pod", "hpod", "pca-regression-linear"}
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,9 @@ def test_cuda_is_refused_where_there_is_none(
 def test_a_fit_takes_the_first_swept_value_and_scores_on_the_test_part(
     cache: Path, tmp_path: Path
 ) -> None:
-    fitted = fit_tiny("pca-regression", {"n_output_modes": 4}, tmp_path / "a.safetensors", cache)
+    fitted = fit_tiny(
+        "pca-regression-linear", {"n_output_modes": 4}, tmp_path / "a.safetensors", cache
+    )
     again = mor_bench.load_surrogate(fitted.out)
     assert again.parameters["n_input_modes"] == 5
     test = load_dataset("beam-tiny", LIMIT, cache=cache).test

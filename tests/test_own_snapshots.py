@@ -112,7 +112,7 @@ def test_a_plan_counts_the_training_samples_of_the_file(
     arrays: Arrays, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Pace, "measured", lambda *_: Pace(1.0, 1.0, 1.0))
-    path, method = written(tmp_path, arrays), SPECS["pca-regression-force"]
+    path, method = written(tmp_path, arrays), SPECS["pca-regression"]
     data = mor_bench.load_dataset(path)
     size = data.scene.mesh.n_dofs, len(data.train)
     keep_fit_record(tmp_path, method.name, method.configurations("quick")[0], size, 7.0)
@@ -132,7 +132,7 @@ def test_imported_samples_are_split_as_the_file_specifies(arrays: Arrays, tmp_pa
         mor_bench.load_dataset(written(tmp_path, arrays, BY_FILE))
 
 
-QUICK = {"fem", "pod", "gappy-pod", "pca-regression", "pca-regression-force"}
+QUICK = {"fem", "pod", "gappy-pod", "pca-regression-linear", "pca-regression"}
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_a_linear_law_is_learned(tmp_path: Path, arrays: Arrays) -> None:
     mine = {**arrays, "forces": forces, "displacements": displacements}
     path = written(tmp_path, without("fixed_nodes", "regions")(mine))
     data = mor_bench.load_dataset(path, split="sample")
-    method = mor_bench.load_method("pca-regression-force", degree=1).fit(data.scene, data.train)
+    method = mor_bench.load_method("pca-regression", degree=1).fit(data.scene, data.train)
     found, expected = method.predict(data.test.forces), data.test.displacements
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(displacements).max())
 
@@ -228,7 +228,7 @@ def test_a_run_ends_with_tables_and_a_report(
 ) -> None:
     written(tmp_path, arrays)
     monkeypatch.chdir(tmp_path)
-    methods = ["-m", "fem-jacobi-pcg", "-m", "linear-fem", "-m", "pca-regression-force"]
+    methods = ["-m", "fem-jacobi-pcg", "-m", "linear-fem", "-m", "pca-regression"]
     with short_timing():
         done = command("run", "mine.toml", *methods, "--out", "out", "--cache", "cache")
     assert done.exit_code == 0, done.output

@@ -40,8 +40,8 @@ TAKE: dict[str, dict[str, Any]] = {
     "hpod": {"n_modes": 6, "cubature_tolerance": 0.01},
     "fem": {},
     "linear-fem": {},
-    "pca-regression": {"n_input_modes": 4, "n_output_modes": 6},
-    "pca-regression-force": {"n_input_modes": 6, "n_output_modes": 6},
+    "pca-regression-linear": {"n_input_modes": 4, "n_output_modes": 6},
+    "pca-regression": {"n_input_modes": 6, "n_output_modes": 6},
 }
 """Methods that take all parameters."""
 

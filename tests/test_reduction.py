@@ -118,7 +118,7 @@ def test_monomials_include_every_product_up_to_their_degree() -> None:
 
 
 def test_pca_regression_predicts_forces_outside_the_load_region(tiny: Dataset) -> None:
-    method = mor_bench.load_method("pca-regression").fit(tiny.scene, tiny.train)
+    method = mor_bench.load_method("pca-regression-linear").fit(tiny.scene, tiny.train)
     forces = np.zeros((tiny.scene.mesh.n_nodes, 3))
     forces[tiny.scene.mesh.points[:, 2] == 0.0] = [0.0, 0.0, 1e-4]
     linear = mor_bench.load_method("linear-fem").fit(tiny.scene, None).predict(forces)

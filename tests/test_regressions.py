@@ -253,7 +253,7 @@ def test_kernels_take_samples_from_all_load_regions(tiny: Dataset, name: str, or
 @pytest.mark.parametrize(
     ("name", "knob", "value", "message"),
     [
-        ("pca-regression", "ridge", np.inf, "a finite number; got inf"),
+        ("pca-regression-linear", "ridge", np.inf, "a finite number; got inf"),
         ("pca-kernel-ridge", "ridge", np.inf, "a finite number; got inf"),
         ("pca-kernel-ridge", "length_scale", 1e-300, "greater than or equal to 0.01; got 1e-300"),
         ("pca-kernel-ridge", "length_scale", np.inf, "less than or equal to 1000; got inf"),
@@ -271,9 +271,13 @@ def test_more_monomials_than_fit_into_memory_are_refused(
 ) -> None:
     train = tiny.train[:40]
     monkeypatch.setattr(pca_regression, "MAX_FEATURE_BYTES", 8 * 65 * 40)
-    mor_bench.load_method("pca-regression", n_input_modes=10, degree=2).fit(tiny.scene, train)
+    mor_bench.load_method("pca-regression-linear", n_input_modes=10, degree=2).fit(
+        tiny.scene, train
+    )
     message = (
         r"`degree` 2 of 11 input modes gives 77 monomials, .* lower `degree` or `n_input_modes`"
     )
     with pytest.raises(InvalidInputError, match=message):
-        mor_bench.load_method("pca-regression", n_input_modes=11, degree=2).fit(tiny.scene, train)
+        mor_bench.load_method("pca-regression-linear", n_input_modes=11, degree=2).fit(
+            tiny.scene, train
+        )

@@ -339,7 +339,7 @@ def test_the_matrix_of_pairs_shows_factors_and_intervals(
     rich: Comparison, analysis: Analysis
 ) -> None:
     pairs = pairs_at(rich, "beam-coarse", 0.01, analysis)
-    assert pairs.methods == ["fem", "pod", "pca-regression"]
+    assert pairs.methods == ["fem", "pod", "pca-regression-linear"]
     assert pairs.absent == ["hpod", "linear-fem", "umesh"]
     record = next(
         r

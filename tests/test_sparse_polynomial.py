@@ -71,7 +71,7 @@ def test_sparse_terms_beat_the_full_cubic_and_derivatives_help_with_few_samples(
     errors = [
         median_error(mor_bench.load_method(name, **knobs).fit(tiny.scene, few), tiny.test)
         for name, knobs in (
-            ("pca-regression", {"n_input_modes": 20}),
+            ("pca-regression-linear", {"n_input_modes": 20}),
             ("sparse-polynomial", {}),
             ("sparse-polynomial-derivative", {"max_terms": 100}),
         )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import mor_bench
-from mor_bench.errors import MissingDependencyError, MorBenchError, SpecError
+from mor_bench.errors import MissingDependencyError, MorBenchError, RenamedWarning, SpecError
 from mor_bench.report.published_figures import SAME_AMPLITUDE, scene_of
 from mor_bench.runs.file_check import check_file
 from mor_bench.specs import list_suite, load_generated_spec, load_method_spec
@@ -364,3 +364,9 @@ def test_the_digest_depends_on_physics_only() -> None:
     assert spec.digest() == spec.model_copy(update={"title": "other", "split": split}).digest()
     stiffer = spec.material.model_copy(update={"young_pa": 501.0})
     assert spec.digest() != spec.model_copy(update={"material": stiffer}).digest()
+
+
+def test_a_former_name_of_a_method_is_read_with_a_warning() -> None:
+    with pytest.warns(RenamedWarning, match="`pca-regression-force` is now `pca-regression`"):
+        spec = load_method_spec("pca-regression-force")
+    assert (spec.name, spec.told) == ("pca-regression", "input")

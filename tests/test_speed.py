@@ -32,7 +32,7 @@ CASES: dict[str, tuple[str, dict[str, Any], float]] = {
     "full-order solve": ("fem", {}, 1e-7),
     "POD r=10": ("pod", {"n_modes": 10}, 0.08),
     "ECSW r=10": ("hpod", {"n_modes": 10, "cubature_tolerance": 1e-2}, 0.08),
-    "PCA regression": ("pca-regression", {"n_input_modes": 5}, 0.07),
+    "PCA regression": ("pca-regression-linear", {"n_input_modes": 5}, 0.07),
     "U-Mesh": (
         "umesh",
         {"channels": 8, "steps": 1, "iterations": 200, "batch_size": 16, "learning_rate": 3e-3},

@@ -66,7 +66,7 @@ def test_wide_tables_show_every_column_in_whole_lines(run: Comparison) -> None:
 
 def test_pick_uses_short_names_and_explains_them(run: Comparison) -> None:
     shown = mor_bench("pick", "beam-coarse", "--run", str(run.out)).stdout
-    assert "pca-regression · k20 wins" in shown
+    assert "pca-regression-linear · k20 wins" in shown
     assert "[n_input_modes=" not in shown
     assert shown.splitlines()[-1].endswith("k = n_input_modes (number of input modes)")
 

@@ -22,7 +22,7 @@ from mor_bench.runs.pick import RUNS
 from mor_bench.specs import is_method_file, list_suite, load_dataset_spec, load_method_spec
 from mor_bench.specs.inline_parameters import split_method
 from mor_bench.specs.one_line_errors import nearest_name
-from mor_bench.specs.suite_folder import Kind
+from mor_bench.specs.suite_folder import FORMER_NAMES, Kind
 
 app = typer.Typer(rich_markup_mode=None)
 
@@ -81,7 +81,7 @@ def card_of(name: str, suite: Path | None = None) -> Card:
             return method_card(load_method_spec(path))
         return dataset_card(load_dataset_spec(path), path)
     methods, datasets = _known("methods", suite), _known("datasets", suite)
-    if split_method(name)[0] in methods:
+    if split_method(name)[0] in {*methods, *FORMER_NAMES}:
         return method_card(load_method_spec(name, suite))
     if name in datasets:
         return dataset_card(load_dataset_spec(name, suite), datasets[name])

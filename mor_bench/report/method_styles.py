@@ -58,7 +58,7 @@ _MARKERS = (
 )
 """Markers of the suite's methods in matplotlib and plotly."""
 
-_OTHER_SHADE = {"pca-regression-force": 1}
+_OTHER_SHADE = {"pca-regression": 1}
 """Shades of methods that a default run compares with another one of the same shade."""
 
 _OTHER_MARKERS = (("*", "star"), ("h", "hexagon2"), ("8", "octagon"), ("d", "diamond-tall"))
@@ -99,13 +99,13 @@ _FAMILIES: dict[str, tuple[_Shades, tuple[str, ...]]] = {
     "regression on modes": (
         (("#009E73", "#2FCB9F"), ("#006548", "#8CE5CB"), ("#2E8C6C", "#17A67C")),
         (
-            "pca-regression",
+            "pca-regression-linear",
             "pca-ridge",
             "pca-gaussian-process",
             "pca-kernel-ridge",
             "pca-random-forest",
             "pca-extra-trees",
-            "pca-regression-force",
+            "pca-regression",
             "pca-polynomial-force",
             "gappy-pod",
         ),

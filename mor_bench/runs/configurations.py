@@ -43,17 +43,17 @@ CORE_METHODS = (
     "pod",
     "pod-tensor",
     "hpod",
+    "pca-regression-linear",
     "pca-regression",
-    "pca-regression-force",
     "umesh",
     "umesh-linear",
 )
 """Default methods."""
 
-DATA_METHODS = ("pca-regression-force", "umesh")
+DATA_METHODS = ("pca-regression", "umesh")
 """Default methods on imported snapshots, whose equations are unknown."""
 
-OBSERVATION_METHODS = ("fem", "linear-fem", "gappy-pod", "pca-regression", "umesh")
+OBSERVATION_METHODS = ("fem", "linear-fem", "gappy-pod", "pca-regression-linear", "umesh")
 """Default methods if displacements of a part of the surface are given instead of forces."""
 
 OWN = "mor_bench."

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any, Literal
 
 from mor_bench import checked_files
-from mor_bench.errors import SpecError
+from mor_bench.errors import RenamedWarning, SpecError
 from mor_bench.specs.one_line_errors import nearest_name
 
 Kind = Literal["datasets", "methods"]
+
+FORMER_NAMES = {
+    "pca-regression-force": (
+        "pca-regression",
+        "PCA regression on the linear response is `pca-regression-linear`.",
+    )
+}
+"""New names of methods by their former names, each with a note."""
 
 
 def find_suite(suite: Path | None = None) -> Path:
@@ -48,12 +57,21 @@ def find_file(kind: Kind, source: str | Path, suite: Path | None) -> Path:
     ------
     SpecError
         If the name is unknown; the message gives the nearest name.
+
+    Warns
+    -----
+    RenamedWarning
+        If the name is a former one.
     """
     if isinstance(source, Path) or source.endswith(".toml"):
         return Path(source)
     known = list_suite(kind, suite)
     if source not in known and suite is not None:
         known = {**list_suite(kind), **known}
+    if source not in known and source in FORMER_NAMES:
+        name, note = FORMER_NAMES[source]
+        warnings.warn(f"`{source}` is now `{name}`. {note}", RenamedWarning, stacklevel=3)
+        source = name
     if source not in known:
         raise SpecError(
             f"unknown {kind[:-1]} {source!r}{nearest_name(source, known)} "

@@ -27,7 +27,7 @@ from mor_bench.runs.time_left import tasks_of
 
 RUNS: dict[str, dict[str, Any]] = {
     "the default": {},
-    "two methods": {"methods": ["pod", "pca-regression"]},
+    "two methods": {"methods": ["pod", "pca-regression-linear"]},
     "with training": {"methods": ["fem", "umesh"], "train": True, "fit_seconds": 40.0},
     "with a dataset to generate": {
         "datasets": ["beam-fine"],

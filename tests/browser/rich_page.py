@@ -27,7 +27,7 @@ def browser() -> Iterator[Browser]:
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of a run with everything that a run can measure."""
     made = synthetic_comparison(tmp_path_factory.mktemp("rich"), per_region=8)
-    told = {"umesh": "input", "pca-regression": "linear-response"}
+    told = {"umesh": "input", "pca-regression-linear": "linear-response"}
     for row in list(made.rows):
         known = {"told": told.get(row.method, "equations")}
         made.put(row.with_parts(reference=row.method == "fem", **known))

@@ -68,12 +68,14 @@ def test_the_pages_of_datasets_and_methods_are_linked(browser: Browser, tmp_path
         page = found.page
         page.get_by_role("link", name="A page per dataset and method").click()
         assert not serious_findings(found)
-        page.get_by_role("link", name="pca-regression", exact=True).click()
+        page.get_by_role("link", name="pca-regression-linear", exact=True).click()
         found.all_charts()
-        assert page.locator("h1").inner_text() == "Method pca-regression"
+        assert page.locator("h1").inner_text() == "Method pca-regression-linear"
         methods = {row["method"] for section in found.data() for row in section["rows"]}
-        assert methods == {"fem", "pca-regression"}  # the front
-        assert page.locator(".card .verdict").first.inner_text() == "pca-regression · k20 wins"
+        assert methods == {"fem", "pca-regression-linear"}  # the front
+        assert (
+            page.locator(".card .verdict").first.inner_text() == "pca-regression-linear · k20 wins"
+        )
         assert not serious_findings(found)
         page.get_by_role("link", name="beam-tiny", exact=True).click()
         found.all_charts()

@@ -177,10 +177,10 @@ def test_methods_learn_following_pressures(tmp_path: Path) -> None:
         supports=CLAMPED,
         loads=loads,
     )
-    methods = ["fem", "linear-fem", "pod[n_modes=2]", "pca-regression"]
+    methods = ["fem", "linear-fem", "pod[n_modes=2]", "pca-regression-linear"]
     comparison = mor_bench.run([table], methods, out=tmp_path / "out", cache=tmp_path)
     rows = {row.method: row for row in comparison.rows}
     assert "follow the surface" in str(rows["pod"].reason)
     medians = {name: row.error.rel_l2_median for name, row in rows.items() if row.error}
     assert medians["fem"] < 1e-2
-    assert medians["pca-regression"] < medians["linear-fem"]
+    assert medians["pca-regression-linear"] < medians["linear-fem"]

@@ -217,7 +217,7 @@ by = "sample"
 """,
         encoding="utf-8",
     )
-    methods = ["fem", "linear-fem", "pca-regression", "pod"]
+    methods = ["fem", "linear-fem", "pca-regression-linear", "pod"]
     made = mor_bench.run([path], methods, out=tmp_path / "out", cache=cache, profile="quick")
     rows = {row.method: row for row in made.rows}
     assert rows["pod"].status == "skipped"

@@ -194,7 +194,7 @@ def test_a_cubature_reproduces_the_forces_of_bodies_with_other_shapes() -> None:
 
 def test_a_regression_gives_no_displacement_without_force_on_any_body() -> None:
     training = samples("both")
-    method = mor_bench.load_method("pca-regression", n_input_modes=4, n_output_modes=6)
+    method = mor_bench.load_method("pca-regression-linear", n_input_modes=4, n_output_modes=6)
     method.fit(training.scene, training)
     still = method.predict(0.0 * training.forces, training.parameters)
     assert not still.any()

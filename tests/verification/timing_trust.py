@@ -57,7 +57,7 @@ RERUN_FITTED: dict[str, tuple[str, dict[str, Any]]] = {
     "pod": ("mor_bench.surrogates.pod:PODGalerkin", {"n_modes": 20}),
     "pod-tensor": ("mor_bench.surrogates.pod_tensor:TensorPOD", {"n_modes": 20}),
     "hpod": ("mor_bench.surrogates.hpod:HyperReducedPOD", {"n_modes": 20}),
-    "pca-regression": ("mor_bench.surrogates.pca_regression:PCARegression", {}),
+    "pca-regression-linear": ("mor_bench.surrogates.pca_regression:PCARegression", {}),
 }
 """Methods that learn from the first `SAMPLES` samples."""
 
