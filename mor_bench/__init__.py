@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from mor_bench.measure.error_bounds import ErrorBound as ErrorBound
     from mor_bench.measure.error_bounds import error_bound as error_bound
     from mor_bench.mechanics.reactions import reaction_forces as reaction_forces
+    from mor_bench.mechanics.stresses import Stresses as Stresses
+    from mor_bench.mechanics.stresses import stresses as stresses
     from mor_bench.method_loading import load_method as load_method
     from mor_bench.method_loading import load_surrogate as load_surrogate
     from mor_bench.report.notebook import Comparison as Comparison
@@ -49,6 +51,7 @@ _HOMES = {
     "MorBenchError": "mor_bench.errors",
     "Scene": "mor_bench.scene.scene",
     "Snapshots": "mor_bench.snapshots.dataset",
+    "Stresses": "mor_bench.mechanics.stresses",
     "Surrogate": "mor_bench.surrogate",
     "Verdict": "mor_bench.runs.pick",
     "error_bound": "mor_bench.measure.error_bounds",
@@ -60,6 +63,7 @@ _HOMES = {
     "pick": "mor_bench.runs.pick",
     "reaction_forces": "mor_bench.mechanics.reactions",
     "run": "mor_bench.report.notebook",
+    "stresses": "mor_bench.mechanics.stresses",
 }
 
 

@@ -15,8 +15,8 @@ from mor_bench.analysis.draws import VALIDATION, error_bound
 from mor_bench.analysis.frontier import compare, selecting_error
 from mor_bench.analysis.performance_profile import profile, share_within
 from mor_bench.results.comparison import Comparison
-from mor_bench.results.parts import TrainingRecord
-from mor_bench.results.row import ErrorSummary, Row, SetErrors
+from mor_bench.results.parts import ErrorSummary, TrainingRecord
+from mor_bench.results.row import Row, SetErrors
 from tests.synthetic import a_row
 
 Record = dict[str, Any]

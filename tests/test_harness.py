@@ -16,7 +16,8 @@ import mor_bench
 from mor_bench.errors import InvalidInputError, SpecError, StoreError
 from mor_bench.options import FitOptions, Options, RunOptions
 from mor_bench.results.comparison import Comparison
-from mor_bench.results.row import ErrorSummary, Latency, Row
+from mor_bench.results.parts import ErrorSummary
+from mor_bench.results.row import Latency, Row
 from mor_bench.runs.listener import Listener
 from mor_bench.snapshots.generate import generation_seconds
 from mor_bench.specs import list_suite, load_generated_spec

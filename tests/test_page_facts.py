@@ -16,7 +16,8 @@ from mor_bench.report.page_samples import Sampled
 from mor_bench.report.page_strains import strain_facts
 from mor_bench.report.page_tables import run_again
 from mor_bench.report.scene_text import scene_text
-from mor_bench.results.row import ErrorSummary, SetErrors
+from mor_bench.results.parts import ErrorSummary
+from mor_bench.results.row import SetErrors
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.specs import list_suite, load_dataset_spec
 from tests.report_runs import add_row, tiny

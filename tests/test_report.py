@@ -22,7 +22,7 @@ from mor_bench.report.short_names import renamed, short_names
 from mor_bench.report.speed_tables import NOT_REACHED, pairs_at, target_table
 from mor_bench.report.summary import discretisation_error, warnings_of
 from mor_bench.results.comparison import Comparison
-from mor_bench.results.row import ErrorSummary
+from mor_bench.results.parts import ErrorSummary
 from tests.report_runs import N_TEST, add_row, data_of, markup_of, text_of, tiny
 from tests.synthetic import (
     a_row,

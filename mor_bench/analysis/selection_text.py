@@ -12,7 +12,8 @@ from mor_bench.analysis.frontier import median_error, median_latency_ms
 from mor_bench.analysis.told import class_text, told_text
 from mor_bench.analysis.verdict import RULE, Requirements, Verdict
 from mor_bench.options import RunOptions, command_line
-from mor_bench.results.row import ErrorSummary, Row, SetErrors
+from mor_bench.results.parts import ErrorSummary
+from mor_bench.results.row import Row, SetErrors
 
 FIGURE_NAMES = {
     "error": "error",

@@ -59,15 +59,22 @@ _UNSEEN = {
 """What is new in the test loads of each split."""
 
 
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join([*([", ".join(names[:-1])] if names[:-1] else []), names[-1]])
+
+
 def _compared(comparison: Comparison, entries: Sequence[Entry]) -> str:
     """Name the quantities that are compared, and their references."""
     names = {entry.row.dataset for entry in entries}
     imported = any(comparison.datasets.get(name, {}).get("snapshots") for name in names)
     reference = "the data" if imported else "full-order solutions on this mesh"
-    with_reactions = any(entry.figure("error", "reaction_rel_median") for entry in entries)
-    what = "displacements and reactions" if with_reactions else "displacements"
-    others = "stresses and motion in time"
-    others = others if with_reactions else f"reactions, {others}"
+    figures = {"reactions": "reaction_rel_median", "stresses": "stress_rel_median"}
+    given = {
+        name: any(entry.figure("error", figure) for entry in entries)
+        for name, figure in figures.items()
+    }
+    what = _listed(["displacements", *(name for name in figures if given[name])])
+    others = _listed([*(name for name in figures if not given[name]), "motion in time"])
     return f"Errors are those of static {what} against {reference}; {others} are not compared."
 
 

@@ -65,6 +65,14 @@ GROUPS: dict[str, dict[str, Cell]] = {
         "p95": figure_cell("error", "reaction_rel_p95", percent),
         "max": figure_cell("error", "reaction_rel_max", percent),
     },
+    "Stress at the cells' centroids (%)": {
+        "median": figure_cell("error", "stress_rel_median", percent),
+        "p95": figure_cell("error", "stress_rel_p95", percent),
+        "max": figure_cell("error", "stress_rel_max", percent),
+        "largest von Mises, median": figure_cell("error", "peak_stress_rel_median", percent),
+        "largest von Mises, p95": figure_cell("error", "peak_stress_rel_p95", percent),
+        "largest von Mises, max": figure_cell("error", "peak_stress_rel_max", percent),
+    },
     "Size and samples": {
         "model": lambda e: bytes_text(e.row.model_bytes),
         "threads": lambda e: str(e.row.threads),

@@ -1,7 +1,8 @@
-"""The base of all typed parts of results.json, and the parts about trainings."""
+"""The base of all typed parts of results.json, and the parts about trainings and errors."""
 
 from __future__ import annotations
 
+from math import nan
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
@@ -141,3 +142,64 @@ class Memory(Part):
 
     fit: int | float
     predict: int | float | None = None
+
+
+class ErrorSummary(Part):
+    """Errors of a test set, from `mor_bench.measure.error_metrics.summary`.
+
+    Attributes
+    ----------
+    mean_dof_m, std_dof_m, max_dof_m : float
+        Mean, standard deviation and maximum of the mean absolute error per degree of freedom, m.
+        The degrees of freedom of the supports count.
+    mean_free_dof_m : float
+        The mean over the free degrees of freedom alone, m.
+    rel_l2_median, rel_l2_p95, rel_l2_max : float
+        Relative L2 error, as a fraction: median, 95th percentile and maximum.
+    max_nodal_m : float
+        Largest nodal error, m.
+    slope : float
+        Slope of the error over the largest displacement, through the origin.
+    amplitude_m : float
+        Largest displacement of a node in the test set's reference, m.
+    tip_max_m : float
+        Largest error at the tip, the node that moves most in a sample, m.
+    tip_rel_median, tip_rel_p95, tip_rel_max : float
+        Error at the tip over its displacement, as a fraction: median, 95th percentile and maximum.
+    tip_rel_at_max_e, tip_rel_at_largest : float
+        The same of the sample with the largest e, and of the sample with the largest displacement.
+    reaction_rel_median, reaction_rel_p95, reaction_rel_max : float
+        Error of the force that a moved tool feels over that force, as a fraction; NaN without a
+        tool.
+    stress_rel_median, stress_rel_p95, stress_rel_max : float
+        Relative L2 error of the Cauchy stress over the cells' centroids, as a fraction; NaN unless
+        the dataset asks for stresses.
+    peak_stress_rel_median, peak_stress_rel_p95, peak_stress_rel_max : float
+        Error of the largest von Mises stress over that stress, as a fraction; NaN likewise.
+    """
+
+    mean_dof_m: Real = nan
+    std_dof_m: Real = nan
+    max_dof_m: Real = nan
+    mean_free_dof_m: Real = nan
+    rel_l2_median: Real = nan
+    rel_l2_p95: Real = nan
+    rel_l2_max: Real = nan
+    max_nodal_m: Real = nan
+    slope: Real = nan
+    amplitude_m: Real = nan
+    tip_max_m: Real = nan
+    tip_rel_median: Real = nan
+    tip_rel_p95: Real = nan
+    tip_rel_max: Real = nan
+    tip_rel_at_max_e: Real = nan
+    tip_rel_at_largest: Real = nan
+    reaction_rel_median: Real = nan
+    reaction_rel_p95: Real = nan
+    reaction_rel_max: Real = nan
+    stress_rel_median: Real = nan
+    stress_rel_p95: Real = nan
+    stress_rel_max: Real = nan
+    peak_stress_rel_median: Real = nan
+    peak_stress_rel_p95: Real = nan
+    peak_stress_rel_max: Real = nan

@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, FailFast, Field, model_validator
 
 from mor_bench.errors import printable
 from mor_bench.results.parts import (
+    ErrorSummary,
     IndicatorQuality,
     Memory,
     Part,
@@ -37,56 +38,6 @@ def _few(value: Any) -> Any:
     if isinstance(value, dict) and len(value) > MOST_SETS:
         raise ValueError(f"there must be at most {MOST_SETS} of them; got {len(value):,}")
     return value
-
-
-class ErrorSummary(Part):
-    """Errors of a test set, from `mor_bench.measure.error_metrics.summary`.
-
-    Attributes
-    ----------
-    mean_dof_m, std_dof_m, max_dof_m : float
-        Mean, standard deviation and maximum of the mean absolute error per degree of freedom, m.
-        The degrees of freedom of the supports count.
-    mean_free_dof_m : float
-        The mean over the free degrees of freedom alone, m.
-    rel_l2_median, rel_l2_p95, rel_l2_max : float
-        Relative L2 error, as a fraction: median, 95th percentile and maximum.
-    max_nodal_m : float
-        Largest nodal error, m.
-    slope : float
-        Slope of the error over the largest displacement, through the origin.
-    amplitude_m : float
-        Largest displacement of a node in the test set's reference, m.
-    tip_max_m : float
-        Largest error at the tip, the node that moves most in a sample, m.
-    tip_rel_median, tip_rel_p95, tip_rel_max : float
-        Error at the tip over its displacement, as a fraction: median, 95th percentile and maximum.
-    tip_rel_at_max_e, tip_rel_at_largest : float
-        The same of the sample with the largest e, and of the sample with the largest displacement.
-    reaction_rel_median, reaction_rel_p95, reaction_rel_max : float
-        Error of the force that a moved tool feels over that force, as a fraction; NaN without a
-        tool.
-    """
-
-    mean_dof_m: Real = nan
-    std_dof_m: Real = nan
-    max_dof_m: Real = nan
-    mean_free_dof_m: Real = nan
-    rel_l2_median: Real = nan
-    rel_l2_p95: Real = nan
-    rel_l2_max: Real = nan
-    max_nodal_m: Real = nan
-    slope: Real = nan
-    amplitude_m: Real = nan
-    tip_max_m: Real = nan
-    tip_rel_median: Real = nan
-    tip_rel_p95: Real = nan
-    tip_rel_max: Real = nan
-    tip_rel_at_max_e: Real = nan
-    tip_rel_at_largest: Real = nan
-    reaction_rel_median: Real = nan
-    reaction_rel_p95: Real = nan
-    reaction_rel_max: Real = nan
 
 
 class SetErrors(Part):

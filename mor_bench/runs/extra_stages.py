@@ -12,8 +12,8 @@ from mor_bench.analysis.draws import draws_of
 from mor_bench.analysis.seeds import seed_interval
 from mor_bench.errors import MorBenchError
 from mor_bench.results.comparison import Comparison
-from mor_bench.results.parts import SeedSpread, SeedTraining, Spread
-from mor_bench.results.row import ErrorSummary, LearningPoint, Row
+from mor_bench.results.parts import ErrorSummary, SeedSpread, SeedTraining, Spread
+from mor_bench.results.row import LearningPoint, Row
 from mor_bench.runs.cached_fit import CachedFit, RunEnvironment
 from mor_bench.runs.row_figures import error_summary, failed_set, failure, set_errors
 from mor_bench.runs.run_context import RunContext

@@ -12,8 +12,8 @@ from mor_bench.errors import MissingDependencyError, MorBenchError, UnsupportedS
 from mor_bench.measure.error_metrics import ERRORS, SampleErrors, percentiles, summary
 from mor_bench.measure.method_session import CURVES
 from mor_bench.measure.range_flags import Flags
-from mor_bench.results.parts import TrainingRecord
-from mor_bench.results.row import ErrorSummary, Row, SetErrors, Status
+from mor_bench.results.parts import ErrorSummary, TrainingRecord
+from mor_bench.results.row import Row, SetErrors, Status
 from mor_bench.runs.cached_fit import FitRecord
 from mor_bench.sandbox.process import MethodFailedError
 from mor_bench.training_options import TrainingOptions
@@ -44,8 +44,9 @@ def n_failed(score: Score) -> int:
 def error_summary(score: Score) -> ErrorSummary:
     """Summarise the errors on a test set."""
     figures = summary(SampleErrors(**{name: score[name] for name in ERRORS}))
-    if "reaction_relative" in score:
-        figures |= percentiles(score["reaction_relative"], "reaction_rel")
+    for name in ("reaction", "stress", "peak_stress"):
+        if f"{name}_relative" in score:
+            figures |= percentiles(score[f"{name}_relative"], f"{name}_rel")
     return ErrorSummary(**figures)
 
 

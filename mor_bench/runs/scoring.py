@@ -70,6 +70,8 @@ class _Scorer:
     def score(self, test: TestSet) -> Score:
         """Return the scores on a test set, from the cache if it has them."""
         name = f"score-{measuring_digest()}-{test.digest[:20]}"
+        if self.cached.data.stress_errors:
+            name += "-stress"
         found = self.cached.arrays(name)
         if found is None:
             found = self._measured(test)
@@ -78,7 +80,7 @@ class _Scorer:
 
     def _measured(self, test: TestSet) -> Score:
         errors: list[SampleErrors] = []
-        reactions: list[NDArray[np.float64]] = []
+        derived: list[dict[str, NDArray[np.float64]]] = []
         flags: list[bool] | None = []
         data, worst = self.cached.data, _Worst(test)
         is_main = test is data.sets.get("test")
@@ -93,8 +95,7 @@ class _Scorer:
                 predicted = self._predictions(test, chunk, left_s, out)
                 references = test.references[chunk]
                 errors.append(sample_errors(predicted, references, test.nodes, test.fixed_nodes))
-                if data.reaction_errors:
-                    reactions.append(data.reaction_errors(predicted, references))
+                derived.append(data.derived_errors(predicted, references))
                 worst.look_at(start, errors[-1].mean_dof_m, predicted)
                 indicated.add(start, forces, predicted)
                 found = self.worker.ask("flag", LOAD_LIMIT_S, **test.queries(chunk))["flagged"]
@@ -102,8 +103,7 @@ class _Scorer:
             score: Score = {
                 name: np.concatenate([getattr(part, name) for part in errors]) for name in ERRORS
             }
-            if reactions:
-                score["reaction_relative"] = np.concatenate(reactions)
+            score |= {name: np.concatenate([part[name] for part in derived]) for name in derived[0]}
             typical = _typical(score["mean_dof_m"])
             left_s = max(1.0, until - monotonic())
             one = np.array([typical])

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mor_bench.digests import digest_of_arrays, digest_of_file
 from mor_bench.errors import StoreError
 from mor_bench.measure.reaction_errors import ReactionErrors
+from mor_bench.measure.stress_errors import StressErrors
 from mor_bench.mechanics.indicator import ErrorIndicator
 from mor_bench.sandbox.handover import arrays_of, write_snapshots
 from mor_bench.sandbox.process import MethodFailedError
@@ -174,6 +175,23 @@ class TrainingData:
         whole = len(self.scene.output_nodes) == self.scene.mesh.n_nodes
         tool = self.scene.motion or self.scene.contact
         return ReactionErrors(self.scene) if tool and whole else None
+
+    @cached_property
+    def stress_errors(self) -> StressErrors | None:
+        """Errors of the stresses; None if the dataset does not ask for them."""
+        return StressErrors(self.scene) if self.scene.spec.needs.stress else None
+
+    def derived_errors(
+        self, predicted: NDArray[np.float64], references: NDArray[np.float64]
+    ) -> dict[str, NDArray[np.float64]]:
+        """Return relative errors (n,) of what follows from displacements (n, n_nodes, 3)."""
+        found = {}
+        if self.reaction_errors:
+            found["reaction_relative"] = self.reaction_errors(predicted, references)
+        if self.stress_errors:
+            names = "stress_relative", "peak_stress_relative"
+            found |= zip(names, self.stress_errors(predicted, references), strict=True)
+        return found
 
     def first(self, n: int) -> TrainingData:
         """Return the same data with only the first training samples and the main test set."""

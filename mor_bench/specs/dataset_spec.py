@@ -60,11 +60,23 @@ class Needs(StrictModel):
         Relative l2 error over the wanted nodes, median over the test set. Default: 1 %.
     latency_ms : float
         Median latency of one query, ms. Default: 16, a frame of a display with 60 Hz.
+    stress : bool
+        Whether stresses are wanted too: their errors are then compared. Default: no.
     """
 
     outputs: Outputs = "all"
     error: Positive = 0.01
     latency_ms: Positive = 16.0
+    stress: bool = False
+
+    @model_validator(mode="after")
+    def _stress_of_all(self) -> Self:
+        if self.stress and self.outputs != "all":
+            raise ValueError(
+                "`outputs` must be 'all' where `stress` is true: the stress of a cell needs all "
+                "its nodes"
+            )
+        return self
 
 
 class Observed(StrictModel):
@@ -190,6 +202,7 @@ class DatasetSpec(CommonDatasetSpec):
                 support.direction is not None for support in self.supports
             ),
             "`observed` is given": self.observed is not None,
+            "`needs.stress` is true": self.needs.stress,
             "`loads.follower` is true": isinstance(self.loads, Pressure) and self.loads.follower,
         }
         if found := [other for other, present in others.items() if present]:
@@ -249,6 +262,12 @@ class ImportedDatasetSpec(CommonDatasetSpec):
 
     snapshots: SnapshotsFile
     split: ImportedSplit = ImportedSplit()
+
+    @model_validator(mode="after")
+    def _no_stress(self) -> Self:
+        if self.needs.stress:
+            raise ValueError("`needs.stress` must be absent: stresses need the equations")
+        return self
 
     def physics(self) -> dict[str, Any]:
         physics: dict[str, Any] = without_paths(self.model_dump(mode="json", include={"snapshots"}))

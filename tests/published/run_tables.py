@@ -14,7 +14,8 @@ from mor_bench.report.entries import entries_of
 from mor_bench.report.number_format import DASH, number, percent, short_swept
 from mor_bench.report.paper_tables import against_the_paper
 from mor_bench.results.comparison import Comparison
-from mor_bench.results.row import ErrorSummary, Row
+from mor_bench.results.parts import ErrorSummary
+from mor_bench.results.row import Row
 from tests.published.stored import EvidenceError, run_of
 
 LEVELS = (0.03, 0.01, 0.003, 0.001)

@@ -1,0 +1,142 @@
+"""Cauchy stresses at the centroids of the cells, from displacements at the nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mor_bench.errors import InvalidInputError, UnsupportedSceneError
+from mor_bench.mechanics.assembly import discretisation_of
+from mor_bench.mechanics.elements import element_of, shape_gradients
+from mor_bench.mechanics.kernels import LANES
+from mor_bench.mechanics.laws import point_stresses
+from mor_bench.mechanics.model import rest_displacement
+from mor_bench.scene.scene import Scene
+from mor_bench.specs import NO_EQUATIONS
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Stresses:
+    """Stresses at the centroids of the cells.
+
+    Attributes
+    ----------
+    cauchy : (..., n_cells, 3, 3) float64
+        Cauchy stress, Pa.
+    """
+
+    cauchy: Array
+
+    @property
+    def von_mises(self) -> Array:
+        """Equivalent stress √(3/2 s : s) of the deviator s, Pa, (..., n_cells)."""
+        mean = np.trace(self.cauchy, axis1=-2, axis2=-1) / 3.0
+        deviator = self.cauchy - mean[..., None, None] * np.eye(3)
+        return np.asarray(np.sqrt(1.5 * np.einsum("...ij,...ij->...", deviator, deviator)))
+
+    @property
+    def principal(self) -> Array:
+        """Principal stresses in ascending order, Pa, (..., n_cells, 3)."""
+        return np.asarray(np.linalg.eigvalsh(self.cauchy))
+
+
+class CellStresses:
+    """Computes σ = P Fᵀ / det F at the centroid of every cell (Holzapfel 2000, eq. 3.9).
+
+    Stresses of H8 converge fastest at the centroids (Barlow 1976). Those of a body with gravity
+    contain the stress of the rest state. Where a displacement inverts a cell, the stress has no
+    meaning, and may be infinite or NaN.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Attributes
+    ----------
+    volumes : (n_cells,) float64
+        Volumes of the undeformed cells, m³.
+
+    Raises
+    ------
+    UnsupportedSceneError
+        If the scene's equations are unknown, or its material or shape varies between samples.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        if scene.material is None:
+            raise UnsupportedSceneError(f"{scene.name}: {NO_EQUATIONS}.")
+        if scene.parameter_names:
+            raise UnsupportedSceneError(
+                f"{scene.name}: stresses need one body, and `parameters` gives each sample its own."
+            )
+        body, rest = discretisation_of(scene), rest_displacement(scene)
+        element = element_of(body.cells)
+        centre = shape_gradients(body.points, body.cells, element.centre[None])[0]
+        det_j = shape_gradients(body.points, body.cells, element.derivatives)[1]
+        self.volumes = det_j @ element.weights
+        self._gradients, self._cells = centre[:, 0], body.cells
+        self._rest = np.zeros_like(body.points) if rest is None else rest
+        self._stresses = point_stresses(body.material.law)
+        self._parameters = np.array(body.material.parameters)
+
+    def __call__(self, displacements: Array) -> Stresses:
+        """Return the stresses at displacements (n, n_nodes, 3), m.
+
+        Raises
+        ------
+        InvalidInputError
+            If the shape is wrong.
+        """
+        if displacements.ndim != 3 or displacements.shape[1:] != self._rest.shape:
+            raise InvalidInputError(
+                f"displacements must have shape (n, {len(self._rest)}, 3); "
+                f"got {displacements.shape}."
+            )
+        shape = (len(displacements), len(self._cells), 3, 3)
+        found = np.empty(shape)
+        for u, cauchy in zip(displacements, found, strict=True):
+            nodal = (self._rest + u)[self._cells]
+            cauchy[:] = self._cauchy(np.einsum("cai,caj->cij", nodal, self._gradients))
+        return Stresses(found)
+
+    def _cauchy(self, gradients: Array) -> Array:
+        """Return the stress (n, 3, 3) at displacement gradients (n, 3, 3)."""
+        n = len(gradients)
+        n_batches = -(-n // LANES)
+        padded = np.zeros((n_batches * LANES, 9))
+        padded[:n] = gradients.reshape(n, 9)
+        H = np.ascontiguousarray(padded.reshape(n_batches, LANES, 9).swapaxes(1, 2))
+        P = np.empty((n_batches, 9 * LANES))
+        parameters = np.tile(np.repeat(self._parameters, LANES), (n_batches, 1))
+        self._stresses(H.reshape(n_batches, -1), np.ones((n_batches, LANES)), parameters, P, None)
+        stress = P.reshape(n_batches, 9, LANES).swapaxes(1, 2).reshape(-1, 3, 3)[:n]
+        F = np.eye(3) + gradients
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            cauchy = stress @ F.swapaxes(1, 2) / np.linalg.det(F)[:, None, None]
+        return np.asarray(0.5 * (cauchy + cauchy.swapaxes(1, 2)))
+
+
+def stresses(scene: Scene, displacements: ArrayLike) -> Stresses:
+    """Return the stresses at the centroids of the cells.
+
+    Parameters
+    ----------
+    scene : Scene
+    displacements : (n_nodes, 3) or (n, n_nodes, 3)
+        As predicted, m: without the rest state under gravity.
+
+    Raises
+    ------
+    InvalidInputError
+        If the shape is wrong.
+    UnsupportedSceneError
+        As `CellStresses`, which is faster for many calls.
+    """
+    u = np.asarray(displacements, dtype=np.float64)
+    if u.ndim == 2:
+        return Stresses(CellStresses(scene)(u[None]).cauchy[0])
+    return CellStresses(scene)(u)
