@@ -68,6 +68,7 @@ sphinx_gallery_conf = {
     "show_memory": False,
     "abort_on_example_error": True,
     "min_reported_time": 1e9,
+    "write_computation_times": False,  # the page of times would load scripts from elsewhere
     "image_scrapers": ("matplotlib",),
     "remove_config_comments": True,
 }

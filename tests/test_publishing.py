@@ -132,7 +132,7 @@ def test_a_interval_that_the_samples_do_not_give_is_found(stored: Path, tmp_path
     assert "(linear-fem)/rel_l2_median/high is" in found
 
 
-@pytest.mark.parametrize("table", ["selected", "verdict", "fastest", "facts"])
+@pytest.mark.parametrize("table", ["selected", "verdict", "headline", "fastest", "facts"])
 def test_a_table_that_was_edited_is_generated_again(stored: Path, table: str) -> None:
     page = with_blocks(f"Text\n\n<!-- from: {stored} {table} -->\nstale\n<!-- end -->\n\nMore\n")
     assert "stale" not in page

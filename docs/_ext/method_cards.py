@@ -111,7 +111,9 @@ def card_page(name: str, folder: Path) -> str:
     lines += [*table(name), ""]
     target = spec.surrogate.replace(":", ".")
     module, _, cls = target.rpartition(".")
-    lines += ["## Class", "", "```{eval-rst}", f".. currentmodule:: {module}", ""]
+    # The pages of the source code link to this anchor.
+    lines += ["## Class", "", f'<span id="{target}"></span>', "", "```{eval-rst}"]
+    lines += [f".. currentmodule:: {module}", ""]
     lines += [f".. autoclass:: {cls}", "   :no-members:", "   :no-index:", "```", ""]
     lines += ["## Commands", "", "```bash", *card.commands, "```", ""]
     return "\n".join(lines)

@@ -14,9 +14,11 @@ from sphinx.application import Sphinx
 PAGES = {
     "../CONTRIBUTING.md": "contributing.md",
     "../reports/README.md": "evidence.md",
+    "../reports/notes/experiments.md": "experiments.md",
     "../tests/verification/PLANTED_BUGS.md": "planted-bugs.md",
     "CONTRIBUTING.md": "contributing.md",
     "reports/README.md": "evidence.md",
+    "notes/experiments.md": "experiments.md",
     "../docs": "index.md",
 }
 

@@ -209,6 +209,11 @@ def verdict(source: str, dataset: str = "") -> str:
     return "\n".join([found["headline"], *(f"- {line}" for line in beside)])
 
 
+def headline(source: str, dataset: str = "") -> str:
+    """State only the first sentences of the verdict: the needs, the winner and its errors."""
+    return verdict(source, dataset).partition("\n")[0]
+
+
 def indicated(source: str, methods: str = "") -> str:
     """Show how well errors are estimated without the reference; SOURCE is FOLDER,FOLDER,…."""
     runs = [run_of(folder) for folder in source.split(",")]
@@ -289,6 +294,7 @@ RUN_TABLES: dict[str, Callable[..., str]] = {
     "selected": selected,
     "fastest": fastest,
     "verdict": verdict,
+    "headline": headline,
     "indicated": indicated,
     "paper": paper,
     "facts": facts,
