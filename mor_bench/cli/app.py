@@ -65,6 +65,7 @@ COMMANDS = {
     "generate": ("data_commands", "Generate the snapshots of a dataset.", "Data"),
     "refine": ("data_commands", "Measure the discretisation error of a dataset's mesh.", "Data"),
     "export": ("export_commands", "Write samples and results for other programs.", "Data"),
+    "archive": ("archive_command", "Write a dataset for a data repository.", "Data"),
     "cache": (
         "cache_command",
         "List generated datasets and finished fits, or delete them.",

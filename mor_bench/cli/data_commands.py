@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import partial
+from pathlib import Path
 from typing import Annotated, ClassVar
 
 import typer
@@ -12,13 +13,21 @@ from threadpoolctl import threadpool_limits
 
 from mor_bench.cli.console import make_console
 from mor_bench.cli.help_texts import command
-from mor_bench.cli.option_groups import DatasetName, Json, QuietOutput, with_options
+from mor_bench.cli.option_groups import (
+    DatasetName,
+    Json,
+    OptionalDatasetName,
+    QuietOutput,
+    with_options,
+)
 from mor_bench.cli.progress_bars import show_progress
-from mor_bench.errors import UnsupportedSceneError
+from mor_bench.cli.slow_notice import notice_if_slow
+from mor_bench.errors import InvalidInputError, UnsupportedSceneError
 from mor_bench.measure.discretisation_error import RefinementPlan
 from mor_bench.measure.discretisation_error import refine as refine_dataset
 from mor_bench.options import Cluster, CommandLine, DataOptions, FolderOptions
 from mor_bench.report.console_tables import print_discretisation
+from mor_bench.snapshots.archive_import import import_archive
 from mor_bench.snapshots.generate import generate as generate_shards
 from mor_bench.snapshots.test_sets import with_test_sets
 from mor_bench.specs import Contact, load_generated_spec
@@ -56,16 +65,23 @@ class RefineOptions(FolderOptions):
     app,
     {
         "generate beam-coarse": "Generate all samples, on all cores.",
-        "generate beam-fine --tests --workers 2": "Generate the named test sets too, in two "
-        "processes.",
+        "generate --from-archive beam-fine.zip": "Check the samples of an archive, and use them.",
     },
 )
 @with_options
 def generate(
-    dataset: DatasetName,
+    dataset: OptionalDatasetName = None,
     tests: Annotated[
         bool, typer.Option("--tests", help="Also generate the named test sets of the dataset.")
     ] = False,
+    from_archive: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH",
+            help="Folder or ZIP file of `mor-bench archive`: check it, and take its samples "
+            "instead of generating them. DATASET may be absent.",
+        ),
+    ] = None,
     *,
     options: GenerateOptions,
     output: QuietOutput,
@@ -74,6 +90,11 @@ def generate(
 
     Generation can be stopped at any moment; the same command resumes it.
     """
+    if from_archive is not None:
+        _take(from_archive, dataset, tests, options)
+        return
+    if dataset is None:
+        raise InvalidInputError("DATASET or `--from-archive` must be given.")
     spec = load_generated_spec(dataset, options.suite)
     items = with_test_sets(spec) if tests else [spec]
     with show_progress(make_console(stderr=True), quiet=output.quiet) as listener:
@@ -83,6 +104,24 @@ def generate(
                 item, options.limit, options.workers, options.cache, progress, options.cluster
             )
             print(folder)
+
+
+def _take(archive: Path, dataset: str | None, tests: bool, options: GenerateOptions) -> None:
+    """Put the samples of an archive into the cache, and print their folders."""
+    given = {"--tests": tests, "--limit": options.limit} | {
+        "--workers": options.workers,
+        "--cluster": options.cluster,
+    }
+    if useless := [flag for flag, value in given.items() if value]:
+        raise InvalidInputError(
+            f"`{useless[0]}` and `--from-archive` cannot be used together: an archive is taken "
+            "whole."
+        )
+    wanted = load_generated_spec(dataset, options.suite) if dataset else None
+    with notice_if_slow("Checking the archive and copying its samples."):
+        folders = import_archive(archive, options.cache, wanted)
+    for folder in folders:
+        print(folder)
 
 
 @command(

@@ -46,6 +46,15 @@ DatasetName = Annotated[
     str,
     typer.Argument(help="Name or TOML file of a dataset.", autocompletion=complete_datasets),
 ]
+OptionalDatasetName = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="[DATASET]",
+        help="Name or TOML file of a dataset.",
+        autocompletion=complete_datasets,
+        show_default=False,
+    ),
+]
 Json = Annotated[
     bool,
     typer.Option(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError
 from mor_bench.export.output_path import new_file
+from mor_bench.export.toml_text import quoted
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.imported_dataset import NodalLoads
@@ -68,20 +68,15 @@ def snapshot_arrays(data: Dataset) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _quoted(text: str) -> str:
-    """Quote a text as TOML: as JSON, with the delete character escaped and no surrogates."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
 def _toml(scene: Scene, file: str) -> str:
     spec = scene.spec
     grid = spec.grid_nodes or scene.mesh.grid_shape
-    return f"""title = {_quoted(spec.title)}
-source = {_quoted(spec.source)}
+    return f"""title = {quoted(spec.title)}
+source = {quoted(spec.source)}
 {f"grid_nodes = {list(grid)}" if grid else ""}
 
 [snapshots]
-file = {_quoted(file)}
+file = {quoted(file)}
 
 [split]
 by = "file"

@@ -76,6 +76,10 @@ def shard_path(folder: Path, number: int) -> Path:
     return folder / f"shard-{number:05d}.h5"
 
 
+def seconds_path(folder: Path, number: int) -> Path:
+    return folder / f"seconds-{number:05d}.txt"
+
+
 def n_samples_to_generate(spec: DatasetSpec, limit: int | None = None) -> int:
     """Return the number of samples of a dataset, or the limit if that is less."""
     return n_samples_of(load_scene(spec), limit)
@@ -88,8 +92,16 @@ def read_shards(folder: Path, n_samples: int) -> Iterator[Shard]:
 
 
 @dataclass(frozen=True)
-class _Plan:
-    """The shards that a folder should hold, by number."""
+class ShardPlan:
+    """The shards that a folder should hold, by number.
+
+    Attributes
+    ----------
+    folder : Path
+    scene : Scene
+    n_wanted : int
+        Number of samples that the shards should hold.
+    """
 
     folder: Path
     scene: Scene
@@ -123,7 +135,7 @@ class _Plan:
         """Return whether the right shard exists; warn if an existing one is damaged or wrong."""
         path = shard_path(self.folder, number)
         try:
-            shard = read_shard(path)
+            self.check(read_shard(path), number, str(path))
         except NewerSchemaError:
             raise
         except StoreError as error:
@@ -131,15 +143,13 @@ class _Plan:
             return False
         except FileNotFoundError:
             return False
+        return True
+
+    def check(self, shard: Shard, number: int, where: str) -> None:
+        """Raise `StoreError`, beginning with ``where``, unless a shard holds the right samples."""
         named = shard.dataset == self.key and shard.start == number * SHARD_SIZE
-        if named and self._is_filled(shard) and self._is_loaded(shard, self.loads(number)):
-            return True
-        warnings.warn(
-            f"{path}: holds the wrong samples. It is generated again.",
-            DamagedFileWarning,
-            stacklevel=3,
-        )
-        return False
+        if not (named and self._is_filled(shard) and self._is_loaded(shard, self.loads(number))):
+            raise StoreError(f"{where}: holds the wrong samples.")
 
     def _is_filled(self, shard: Shard) -> bool:
         n, n_free = len(shard.status), len(self.scene.free_dofs)
@@ -164,7 +174,7 @@ class _Plan:
 
 
 @contextmanager
-def _writing(folder: Path) -> Iterator[None]:
+def writing(folder: Path) -> Iterator[None]:
     """Turn errors of the operating system into one that names the folder."""
     try:
         yield
@@ -216,7 +226,7 @@ def generate(
     """
     check_pool(workers, cluster)
     scene, folder = load_scene(spec), dataset_folder(spec, cache)
-    plan = _Plan(folder, scene, n_samples_of(scene, limit))
+    plan = ShardPlan(folder, scene, n_samples_of(scene, limit))
     missing = _prepare_folder(plan, spec)
     count = _Count(plan, missing, progress)
     if missing and cluster is None:
@@ -228,19 +238,23 @@ def generate(
     return folder
 
 
-def _prepare_folder(plan: _Plan, spec: DatasetSpec) -> list[int]:
+def _prepare_folder(plan: ShardPlan, spec: DatasetSpec) -> list[int]:
     """Create the folder with its manifest, and return the numbers of missing shards."""
     folder = plan.folder
-    with _writing(folder):
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         remove_leftovers(folder)
     missing = [number for number in plan.numbers if not plan.has(number)]
-    whole = n_samples_of(plan.scene)
-    manifest = Manifest(_owner(folder, spec), GENERATOR_VERSION, whole, SHARD_SIZE)
-    with _writing(folder):
+    with writing(folder):
         keep_sources(folder, spec)
-        update_manifest(folder, manifest, solves=bool(missing))
+        update_manifest(folder, manifest_of(plan, spec), solves=bool(missing))
     return missing
+
+
+def manifest_of(plan: ShardPlan, spec: DatasetSpec) -> Manifest:
+    """Return the manifest of a plan's folder, without environments."""
+    whole = n_samples_of(plan.scene)
+    return Manifest(_owner(plan.folder, spec), GENERATOR_VERSION, whole, SHARD_SIZE)
 
 
 def _owner(folder: Path, spec: DatasetSpec) -> DatasetSpec:
@@ -257,7 +271,7 @@ def _owner(folder: Path, spec: DatasetSpec) -> DatasetSpec:
 
 
 class _Count:
-    def __init__(self, plan: _Plan, missing: list[int], progress: Progress | None) -> None:
+    def __init__(self, plan: ShardPlan, missing: list[int], progress: Progress | None) -> None:
         self._plan, self._progress = plan, progress
         self._done = plan.n_wanted - sum(map(plan.n_wanted_of, missing))
         self._report()
@@ -272,7 +286,11 @@ class _Count:
 
 
 def _fill(
-    plan: _Plan, missing: list[int], count: _Count, workers: int | None, cluster: str | None = None
+    plan: ShardPlan,
+    missing: list[int],
+    count: _Count,
+    workers: int | None,
+    cluster: str | None = None,
 ) -> None:
     def tasks() -> Iterator[Task]:
         for number in missing:
@@ -289,15 +307,22 @@ def _fill(
 
 
 def _commit(folder: Path, number: int, solved: Solved) -> None:
-    with _writing(folder):  # a kill in between must not lose the time of a shard that exists
-        write_atomically(folder / f"seconds-{number:05d}.txt", f"{solved.seconds:.6f}\n".encode())
+    with writing(folder):  # a kill in between must not lose the time of a shard that exists
+        write_atomically(seconds_path(folder, number), f"{solved.seconds:.6f}\n".encode())
         write_shard(shard_path(folder, number), solved.shard)
 
 
 def shard_seconds(path: Path) -> float | None:
     """Return the seconds that a timing of a shard states; None if it is missing or damaged."""
-    with suppress(ValueError, OSError, StoreError):
-        seconds = float(read_bytes(path, MOST_TIME_BYTES))
+    with suppress(OSError, StoreError):
+        return parse_seconds(read_bytes(path, MOST_TIME_BYTES))
+    return None
+
+
+def parse_seconds(content: bytes) -> float | None:
+    """Return the seconds in the content of a timing; None if it is damaged."""
+    with suppress(ValueError):
+        seconds = float(content)
         if 0.0 <= seconds < inf:
             return seconds
     return None

@@ -120,8 +120,26 @@ def keep_sources(folder: Path, spec: DatasetSpec) -> None:
             write_atomically(kept, read_bytes(SourceFile(**file).checked()))
 
 
+def with_kept_files(spec: DatasetSpec, folder: Path) -> DatasetSpec:
+    """Return a specification that names the copies of its files that `keep_sources` makes."""
+    content = spec.model_dump(mode="json")
+    for file in _sources(content):
+        file["path"] = str(_kept(folder, file))
+    return DatasetSpec.model_validate_json(json.dumps(content), context=RECORDED)
+
+
+def files_of(spec: DatasetSpec) -> list[SourceFile]:
+    """Return the mesh and surface files that a specification names."""
+    return [SourceFile(**file) for file in _sources(spec.model_dump(mode="json"))]
+
+
+def kept_name(file: SourceFile) -> str:
+    """Return the name of a file's copy beside the samples."""
+    return f"source-{file.sha256[:12]}{Path(file.path).suffix}"
+
+
 def _kept(folder: Path, file: dict[str, str]) -> Path:
-    return folder / f"source-{file['sha256'][:12]}{Path(file['path']).suffix}"
+    return folder / kept_name(SourceFile(**file))
 
 
 def _sources(value: Any) -> Iterator[dict[str, str]]:
@@ -150,7 +168,7 @@ def update_manifest(folder: Path, manifest: Manifest, *, solves: bool) -> None:
     ----------
     folder : Path
     manifest : Manifest
-        The wanted content, without environments.
+        The wanted content; its environments are added to those of the folder.
     solves : bool
         Whether shards will be generated now, so that this environment is added.
     """
@@ -160,8 +178,10 @@ def update_manifest(folder: Path, manifest: Manifest, *, solves: bool) -> None:
         raise
     except (StoreError, FileNotFoundError):
         environments = ()
-    if solves and this_environment() not in environments:
-        environments = (*environments, this_environment())
+    more = (*manifest.environments, *([this_environment()] if solves else []))
+    for environment in more:
+        if environment not in environments:
+            environments = (*environments, environment)
     content = replace(manifest, environments=environments).to_json()
     path = folder / NAME
     if not path.is_file() or read_bytes(path) != content:
