@@ -83,6 +83,7 @@ html_copy_source = False
 html_show_search_summary = False  # summaries are fetched, which browsers refuse in local files
 html_theme_options = {
     "navbar_align": "left",
+    "header_links_before_dropdown": 6,
     "navbar_end": ["theme-switcher"],
     "show_toc_level": 2,
     "secondary_sidebar_items": ["page-toc"],
