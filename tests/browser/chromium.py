@@ -90,6 +90,17 @@ def pixels_of(element: Locator) -> Any:
     return np.asarray(Image.open(io.BytesIO(element.screenshot())).convert("RGB"))
 
 
+def serious_findings(found: Visit) -> list[tuple[str, str, str]]:
+    """Return what axe finds that hinders readers."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    return [
+        (item["id"], node["html"][:200], node.get("failureSummary", "")[:300])
+        for item in axe.Axe().run(found.page, options={"preload": False}).response["violations"]
+        if item["impact"] in ("serious", "critical")
+        for node in item["nodes"]
+    ]
+
+
 def _note(requests: list[str], url: str, path: Path) -> None:
     if url != path.as_uri() and not url.startswith(("data:", "blob:")):
         requests.append(url)

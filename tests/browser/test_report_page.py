@@ -14,7 +14,7 @@ from mor_bench.analysis.analyse import analyse
 from mor_bench.report.method_styles import DARK, WHITE, contrast
 from mor_bench.report.number_format import number, percent
 from mor_bench.report.page import render
-from tests.browser.chromium import Visit, pixels_of, visit
+from tests.browser.chromium import Visit, pixels_of, serious_findings, visit
 from tests.hostile_runs import hostile_run
 from tests.synthetic import synthetic_comparison
 
@@ -42,17 +42,6 @@ def test_the_page_works_offline_and_is_accessible(
         assert not serious_findings(found)
         assert not found.requests
         assert not found.errors
-
-
-def serious_findings(found: Visit) -> list[tuple[str, str, str]]:
-    """Return what axe finds that hinders readers."""
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
-    return [
-        (item["id"], node["html"][:200], node.get("failureSummary", "")[:300])
-        for item in axe.Axe().run(found.page, options={"preload": False}).response["violations"]
-        if item["impact"] in ("serious", "critical")
-        for node in item["nodes"]
-    ]
 
 
 def test_the_pages_of_datasets_and_methods_are_linked(browser: Browser, tmp_path: Path) -> None:

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.browser.chromium import Visit, chromium
-from tests.browser.test_report_page import serious_findings
+from tests.browser.chromium import Visit, chromium, serious_findings
 from tests.published.stored import ROOT
 
 if TYPE_CHECKING:
