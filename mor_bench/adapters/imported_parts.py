@@ -48,7 +48,8 @@ class Body:
 def write_parts(out: str | Path, body: Body, parts: Mapping[str, Samples]) -> list[Path]:
     """Write parts to an NPZ file and a TOML that reads them again; return both.
 
-    With a part ``test``, the split is that of the parts. Otherwise samples are drawn at random.
+    With a part ``test``, the split is that of the parts. Otherwise test samples are drawn at
+    random, and so are validation samples without a part ``validation``.
 
     Raises
     ------
@@ -74,7 +75,8 @@ def write_parts(out: str | Path, body: Body, parts: Mapping[str, Samples]) -> li
         lengths = [len(part.forces) for part in held]
         part_of = np.repeat([name for name in PARTS if name in parts], lengths)
         arrays["test"] = part_of == "test"
-        arrays["validation"] = part_of == "validation"
+        if "validation" in parts:
+            arrays["validation"] = part_of == "validation"
     toml = (
         f"title = {quoted(body.title)}\nsource = {quoted(body.source)}\n\n"
         f'[snapshots]\nfile = {quoted(out.name)}\n\n[split]\nby = "{by}"\n'
