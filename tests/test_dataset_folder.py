@@ -122,8 +122,8 @@ def in_file(name: str, array: str, values: Any) -> Callable[[Path], None]:
     return change
 
 
-def cut(name: str) -> Callable[[Path], None]:
-    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:3000]) and None
+def cut(name: str) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:3000])
 
 
 DAMAGES: list[tuple[Callable[[Path], object], str]] = [

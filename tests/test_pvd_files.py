@@ -15,6 +15,7 @@ from mor_bench.export.pvd_files import export_load_path_pvd, export_pvd, volume_
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.scene.loads import Facets
 from mor_bench.snapshots.dataset import Dataset
+from mor_bench.snapshots.patch_loads import PatchLoads
 from tests.commands import invoke as command
 
 
@@ -112,14 +113,11 @@ def test_impossible_collections_are_refused_and_nothing_is_written(
         UnsupportedSceneError, match="has no load path: its snapshots were imported"
     ):
         export_load_path_pvd(unknown, 0, out)
-    torn = replace(tiny.test.loads, vectors=1e6 * tiny.test.loads.vectors)  # type: ignore[type-var]
+    loads = tiny.test.loads
+    assert isinstance(loads, PatchLoads)
+    torn = replace(tiny.test, loads=replace(loads, vectors=1e6 * loads.vectors))
     with pytest.raises(SolverError, match=r"elements invert|equilibrium"):
-        export_load_path_pvd(
-            replace(tiny, test=replace(tiny.test, loads=torn)),
-            0,
-            out,
-            n_steps=1,  # type: ignore[arg-type]
-        )
+        export_load_path_pvd(replace(tiny, test=torn), 0, out, n_steps=1)
     assert not list(tmp_path.iterdir())
     (tmp_path / "out").mkdir()
     with pytest.raises(InvalidInputError, match="out exists and is not overwritten"):

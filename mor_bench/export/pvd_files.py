@@ -97,7 +97,7 @@ def export_load_path_pvd(
     if reason := reason or unknown_equations(scene):
         raise UnsupportedSceneError(f"{scene.name} has no load path: {reason}.")
     _check_new(out)
-    fractions = np.linspace(0.0, 1.0, n_steps + 1)
+    fractions = np.arange(n_steps + 1) / n_steps
     loads = fractions[1:, None] * data.test.free_forces[sample]
     steps = np.zeros((n_steps + 1, len(scene.free_dofs)))
     for row, found in zip(
