@@ -72,6 +72,20 @@ def test_the_card_is_yaml_that_names_the_files(exported: Path) -> None:
     assert block["pretty_name"] == "Cantilever beam, 24 H8, for tests and first steps"
 
 
+def test_the_library_datasets_reads_the_splits(
+    exported: Path, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setenv("HF_HOME", str(tmp_path))
+    library = pytest.importorskip("datasets", reason="needs the library datasets")
+    splits = library.load_dataset(str(exported), cache_dir=str(tmp_path))
+    assert set(splits) == {"train", "validation", "test"}
+    for name, rows in splits.items():
+        columns = rows.with_format("numpy", dtype=np.float64)[:]
+        for column, found in columns.items():
+            np.testing.assert_array_equal(found, getattr(getattr(tiny, name), column))
+
+
 CARDS = {
     "a list of paths": "configs:\n- config_name: default\n  data_files:\n  - split: train\n"
     '    path:\n    - "data/a.h5"\n    - data/b.h5\n  - split: test\n    path: data/test-*\n',

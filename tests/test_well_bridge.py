@@ -88,6 +88,24 @@ def test_fields_lie_where_their_nodes_are(exported: Path, tiny: Dataset) -> None
         np.testing.assert_array_equal(force[:, i, j, k], tiny.test.forces[:, node].astype("f4"))
 
 
+def test_the_wells_own_loader_reads_the_files(exported: Path, tiny: Dataset) -> None:
+    well = pytest.importorskip("the_well.data", reason="needs the package the_well")
+    for folder, part in {"train": tiny.train, "valid": tiny.validation, "test": tiny.test}.items():
+        read = well.WellDataset(
+            path=str(exported), well_split_name=folder, n_steps_input=1, n_steps_output=1
+        )
+        assert len(read) == len(part)
+        sample = read[3]
+        for name, expected in (
+            ("input_fields", np.zeros((63, 3))),
+            ("output_fields", part.displacements[3].astype("f4")),
+            ("constant_fields", part.forces[3].astype("f4")),
+        ):
+            np.testing.assert_array_equal(sample[name].numpy().reshape(-1, 3), expected)
+        # One row per axis, for its two ends: 0 is a wall, 1 is open.
+        assert sample["boundary_conditions"].tolist() == [[0, 1], [1, 1], [1, 1]]
+
+
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_samples_come_back_exactly(dtype: Any, tiny: Dataset, tmp_path: Path) -> None:
     export_well(tiny, tmp_path / "well", dtype=dtype)
@@ -206,7 +224,7 @@ DISPLACEMENT = "t1_fields/displacement"
 DAMAGES: list[tuple[Callable[[h5py.File], None], str]] = [
     (attribute("/", "grid_type", "spherical"), "`grid_type` must be 'cartesian'; got 'spherical'"),
     (attribute("/", "grid_type", 3), "the attribute `grid_type` must be a text"),
-    (attribute("/", "n_spatial_dims", 2), "`n_spatial_dims` must be 3; got"),
+    (attribute("/", "n_spatial_dims", 2), "`n_spatial_dims` must be 3; got 2"),
     (attribute("/", "n_trajectories", 41), r"`.*force` must have shape \(41, 7, 3, 3, 3\); got"),
     (attribute("/", "n_trajectories", -1), "`n_trajectories` must be at least 1"),
     (attribute("dimensions", "spatial_dims", ["x", "y"]), "`spatial_dims` must be three names"),

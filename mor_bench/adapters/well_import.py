@@ -274,4 +274,5 @@ class _WellFile:
 
 
 def _shown(value: Any) -> str:
-    return printable(repr(value), 100, "")
+    """Return a value as short text; NumPy's numbers as Python's."""
+    return printable(repr(value.item() if isinstance(value, np.generic) else value), 100, "")
