@@ -20,7 +20,8 @@ from mor_bench.export.asv_results import export_asv
 from mor_bench.export.load_path import export_load_path
 from mor_bench.export.npz_file import export_numpy
 from mor_bench.export.onnx_file import export_onnx
-from mor_bench.export.vtu_files import PARTS, export_vtu
+from mor_bench.export.pvd_files import export_load_path_pvd, export_pvd
+from mor_bench.export.vtu_files import PARTS, Part, export_vtu
 from mor_bench.options import DataOptions
 from mor_bench.snapshots.dataset import Dataset, load_dataset
 from mor_bench.snapshots.test_sets import SET_NAMES, SetName
@@ -61,12 +62,50 @@ def vtu(
     options: DataOptions,
 ) -> None:
     """Write a sample and its predictions as VTU for ParaView."""
-    known = {name: name for name in PARTS}
-    if part not in known:
-        raise InvalidInputError(f"`--part` must be {', '.join(known)}; got {part!r}.")
+    chosen = _part(part)
     data = _load(dataset, options, [name for name in SET_NAMES if name == part])
     with notice_if_slow(WRITING):
-        paths = export_vtu(data, sample, out, part=known[part], models=model or [])
+        paths = export_vtu(data, sample, out, part=chosen, models=model or [])
+    for path in paths:
+        print(path)
+
+
+@command(
+    export,
+    {
+        "export pvd beam-tiny --sample 3 --sample 5 --out two.pvd": "Write two test samples.",
+        "export pvd beam-tiny --sample 3 --steps 20 --out path.pvd": "Write the load path of one.",
+    },
+)
+@with_options
+def pvd(
+    dataset: DatasetName,
+    sample: Annotated[
+        list[int],
+        typer.Option(min=0, help="Number of a sample in its part, from 0; repeat for more."),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(metavar="FILE", help="PVD file to write. VTU files are written beside it."),
+    ],
+    part: Annotated[str, typer.Option(help="train, test, or the name of a test set.")] = "test",
+    steps: Annotated[
+        int | None,
+        typer.Option(min=1, help="Steps of the load path of one test sample, from rest."),
+    ] = None,
+    *,
+    options: DataOptions,
+) -> None:
+    """Write samples, or the load path of one, as a time series for ParaView."""
+    chosen = _part(part)
+    if steps is not None and (len(sample) > 1 or part != "test"):
+        raise InvalidInputError("`--steps` needs one test sample: give `--sample` once.")
+    data = _load(dataset, options, [name for name in SET_NAMES if name == part])
+    with notice_if_slow(WRITING):
+        if steps is None:
+            paths = export_pvd(data, sample, out, part=chosen)
+        else:
+            paths = export_load_path_pvd(data, sample[0], out, n_steps=steps)
     for path in paths:
         print(path)
 
@@ -194,6 +233,14 @@ def asv(
         paths = export_asv(comparison, out, commit=commit, machine=machine)
     for path in paths:
         print(path)
+
+
+def _part(name: str) -> Part:
+    """Return the part of this name; `InvalidInputError` if there is none."""
+    known = {part: part for part in PARTS}
+    if name not in known:
+        raise InvalidInputError(f"`--part` must be {', '.join(known)}; got {name!r}.")
+    return known[name]
 
 
 def _load(dataset: str, options: DataOptions, tests: Sequence[SetName] = ()) -> Dataset:

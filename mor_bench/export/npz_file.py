@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +32,28 @@ def export_numpy(data: Dataset, out: str | Path) -> list[Path]:
         If the file's name does not end in .npz, or cannot be the name of a dataset, or one of the
         two files exists.
     """
+    out = new_dataset_file(out)
+    return write_snapshots(out, snapshot_arrays(data), _toml(data.scene, out.name))
+
+
+def new_dataset_file(out: str | Path) -> Path:
+    """Check the NPZ file of a new dataset; errors as in `export_numpy`."""
     out = new_file(out, ".npz", ".toml")
     if not re.fullmatch(NAME_PATTERN, out.stem):
         raise InvalidInputError(
             "`out` must have a name of lower-case letters, digits and hyphens, because the dataset "
             f"gets it; got {out.name!r}."
         )
+    return out
+
+
+def write_snapshots(out: Path, arrays: Mapping[str, NDArray[Any]], toml: str) -> list[Path]:
+    """Write arrays in the schema of `mor_bench.scene.snapshot_file`, and their TOML beside them."""
     out.parent.mkdir(parents=True, exist_ok=True)
     buffer = io.BytesIO()
-    np.savez(buffer, **snapshot_arrays(data))  # type: ignore[arg-type]
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
     write_atomically(out, buffer.getvalue())
-    write_atomically(out.with_suffix(".toml"), _toml(data.scene, out.name).encode())
+    write_atomically(out.with_suffix(".toml"), toml.encode())
     return [out, out.with_suffix(".toml")]
 
 

@@ -61,7 +61,7 @@ def export_vtu(
     SolverError
         If a model finds no answer.
     """
-    samples, out = _samples_of(data, part), Path(out)
+    samples, out = samples_of(data, part), Path(out)
     if not 0 <= sample < len(samples):
         raise InvalidInputError(
             f"`sample` must be an integer in [0, {len(samples) - 1}], "
@@ -83,11 +83,12 @@ def export_vtu(
     return [
         path
         for stem, found in zip(stems, fields, strict=True)
-        for path in _write(data.scene, found, out, stem)
+        for path in write_fields(data.scene, found, out, stem)
     ]
 
 
-def _samples_of(data: Dataset, part: Part) -> Snapshots:
+def samples_of(data: Dataset, part: Part) -> Snapshots:
+    """Return a part of a dataset by name; `InvalidInputError` if it has no such part."""
     parts: dict[str, Snapshots] = {
         "train": data.train,
         "validation": data.validation,
@@ -114,16 +115,34 @@ def _observed(scene: Scene) -> list[int] | None:
     return None if scene.observed_nodes is None else scene.observed_nodes.tolist()
 
 
-def _write(
-    scene: Scene, fields: Mapping[str, NDArray[np.float64]], out: Path, stem: str
+def write_fields(
+    scene: Scene,
+    fields: Mapping[str, NDArray[np.float64]],
+    out: Path,
+    stem: str,
+    *,
+    cell_fields: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> list[Path]:
+    """Write fields on the mesh at rest, and on the embedded surface if there is one.
+
+    Parameters
+    ----------
+    scene : Scene
+    fields : mapping of str to (n_nodes, 3) float64
+        Point data; `force` stays at the nodes, because a sum over nodes cannot be interpolated.
+    out : Path
+        Existing folder of the files ``STEM.vtu`` and ``STEM-surface.vtu``.
+    stem : str
+    cell_fields : mapping of str to (n_cells,) float64, optional
+        Cell data.
+    """
     kind = {4: "tetra", 8: "hexahedron", 10: "tetra10"}[scene.mesh.cells.shape[1]]
     path, surface = out / f"{stem}.vtu", scene.embedded_surface
-    body = meshio.Mesh(scene.mesh.points, [(kind, scene.mesh.cells)], point_data=dict(fields))
-    _write_mesh(body, path)
+    in_cells = {name: [values] for name, values in (cell_fields or {}).items()}
+    cells = [(kind, scene.mesh.cells)]
+    _write_mesh(meshio.Mesh(scene.mesh.points, cells, dict(fields), in_cells), path)
     if surface is None:
         return [path]
-    # The force remains at the nodes: a sum over nodes cannot be interpolated.
     carried = {
         name: scene.to_surface @ values for name, values in fields.items() if name != "force"
     }

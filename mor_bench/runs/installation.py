@@ -20,6 +20,7 @@ EXTRAS = {
     "cluster": (("distributed",), "data generation and fits on a Dask cluster"),
     "onnx": (("onnx", "onnxruntime"), "`mor-bench export onnx` and its check"),
     "viz": (("pyvista",), "rendered meshes; without it, matplotlib draws them"),
+    "pymor": (("pymor",), "scenes as models of pyMOR, and its reduced models as methods"),
 }
 """The modules of each extra, and its use."""
 

@@ -97,7 +97,7 @@ class MethodSpec(StrictModel):
     source: Text
     told: Told | None = None
     snapshots: bool = True
-    extra: Literal["learn", "mkl"] | None = None
+    extra: Literal["learn", "mkl", "pymor"] | None = None
     reference: bool = False
     limits: Text = ""
     regime: Regime | None = None

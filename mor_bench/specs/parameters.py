@@ -18,6 +18,9 @@ from pydantic import ConfigDict, create_model
 from mor_bench.errors import MissingDependencyError, SpecError, UnusableClassError, text_of
 from mor_bench.specs.one_line_errors import nearest_name, validated
 
+EXTRA_OF = {"torch": "learn", "pymor": "pymor"}
+"""The extra that brings a library, of those that a method's module imports."""
+
 
 def load_class(target: str, folder: Path | None = None) -> type[Any]:
     """Import ``package.module:Class``, also from a folder that is not on the import path.
@@ -37,9 +40,10 @@ def load_class(target: str, folder: Path | None = None) -> type[Any]:
     try:
         loaded = import_module(module)
     except ModuleNotFoundError as error:
-        if error.name == "torch":
+        library = (error.name or "").partition(".")[0]
+        if library in EXTRA_OF:
             raise MissingDependencyError(
-                f"{target} needs torch: pip install 'mor-bench[learn]'"
+                f"{target} needs {library}: pip install 'mor-bench[{EXTRA_OF[library]}]'"
             ) from error
         raise SpecError(f"surrogate {target!r} cannot be imported: {error}") from error
     except (Exception, SystemExit) as error:  # foreign code runs here
