@@ -52,6 +52,7 @@ FLOORS = (
     ("hard_cases",),
     ("report",),
     ("export",),
+    ("adapters",),
     ("",),  # mor_bench/__init__.py
     ("cli",),
     ("__main__",),
