@@ -22,6 +22,7 @@ from mor_bench.runs.file_check import check_file
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import check_parameters
 from mor_bench.surrogates.estimator_regression import PCAEstimator
+from tests.missing_packages import hide_package
 from tests.model_files import rewrite
 from tests.small_runs import method_file
 
@@ -242,22 +243,9 @@ def test_an_estimator_that_cannot_be_fitted_is_named(tiny: Dataset) -> None:
 
 
 def test_without_scikit_learn_the_error_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [name for name in sys.modules if name.partition(".")[0] == "sklearn"]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setattr("sys.meta_path", [_Without("sklearn"), *sys.meta_path])
+    hide_package("sklearn", monkeypatch)
     with pytest.raises(MissingDependencyError, match="needs scikit-learn: pip install"):
         check_parameters(PCAEstimator, {"estimator": "sklearn.svm:SVR"})
-
-
-class _Without:
-    """A finder that finds no module of a package."""
-
-    def __init__(self, package: str) -> None:
-        self.package = package
-
-    def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
-        if name.partition(".")[0] == self.package:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=self.package)
 
 
 def test_a_method_file_is_checked_with_its_estimator(tmp_path: Path) -> None:
