@@ -13,7 +13,7 @@ The packages, from the ground up; each imports only from those before it:
 `specs` and `options` define the input of users. `scene`, `mechanics`, `snapshots` and `reduction`
 compute. `surrogate.py` is the interface of a method; `learning` and `surrogates` hold the methods.
 `sandbox`, `measure`, `results`, `analysis` and `runs` make a comparison. `hard_cases` holds the
-stress tests. `report`, `export` and `cli` show the results. `adapters` are doors to other
+stress tests. `report`, `export` and `cli` show the results. `adapters` serves other
 libraries. Start reading with `surrogate.py`, then `surrogates/pod.py`, then `runs/compare.py`.
 """
 

@@ -105,6 +105,7 @@ def test_no_load_gives_no_displacement_and_a_huge_one_a_finite(trees: Any, tiny:
     assert not answers[1].any()
     assert answers[[0, 2]].any(axis=(1, 2)).all()
     assert np.isfinite(trees.predict(1e29 * tiny.test.forces[:2])).all()
+    assert np.isfinite(trees.coefficients(np.full((1, 6), 1e39))).all()  # beyond float32
     assert trees.predict(forces[:0]).shape == (0, *forces.shape[1:])
 
 
@@ -157,6 +158,26 @@ def test_a_model_whose_repeated_fit_is_another_one_is_refused(
     load_fitted(path, PCAEstimator, tiny.scene)
     rewrite(path, lambda arrays: arrays.update({array: forge(arrays[array])}))
     with pytest.raises(StoreError, match=r"model\.safetensors: .*`(answers|values|inputs)`"):
+        load_fitted(path, PCAEstimator, tiny.scene)
+
+
+@pytest.mark.filterwarnings("ignore:One or more samples have no neighbors")
+def test_answers_that_are_no_numbers_are_refused_in_a_fit_and_a_file(
+    tiny: Dataset, tmp_path: Path
+) -> None:
+    """Without any neighbour within its radius, this regressor answers NaN."""
+    near = {"estimator": "sklearn.neighbors:RadiusNeighborsRegressor"}
+    with pytest.raises(InvalidInputError, match="`answers` of a PCAEstimator holds NaN"):
+        make("all outputs at once", **near, estimator_parameters={"radius": 1e-9}).fit(
+            tiny.scene, tiny.train
+        )
+    wide = make("all outputs at once", **near, estimator_parameters={"radius": 100.0})
+    path = tmp_path / "model.safetensors"
+    wide.fit(tiny.scene, tiny.train).save(path)
+    load_fitted(path, PCAEstimator, tiny.scene)
+    parameters = {**wide.parameters, "estimator_parameters": {"radius": 1e-9}}
+    rewrite(path, lambda arrays: None, parameters=json.dumps(parameters))
+    with pytest.raises(StoreError, match="`answers` do not come out again"):
         load_fitted(path, PCAEstimator, tiny.scene)
 
 

@@ -1,4 +1,4 @@
-"""Doors to other libraries: methods as their estimators, and samples as their data sets.
+"""Methods and samples as classes of other libraries: their estimators and their data sets.
 
 Here: classes that derive from a class of another library, so that its tools take them. Not here:
 methods of the suite (`surrogates`) and file formats (`export`, `scene/files.py`). Nothing in the

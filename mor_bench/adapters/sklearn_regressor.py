@@ -135,21 +135,15 @@ class SurrogateRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         forces = rows.reshape(len(rows), self.scene_.mesh.n_nodes, 3)
         return self.method_.predict(forces).reshape(len(rows), -1)
 
-    def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
+    def score(self, X: ArrayLike, y: ArrayLike) -> float:
         """Return R² over the nodes whose displacements the scene wants.
 
         Columns are weighted by their variance. The plain mean over the columns would count each
         component of a support as perfect.
         """
         predicted, dofs = self.predict(X), dofs_of_nodes(self.scene_.output_nodes)
-        return float(
-            r2_score(
-                np.asarray(y)[:, dofs],
-                predicted[:, dofs],
-                sample_weight=sample_weight,
-                multioutput="variance_weighted",
-            )
-        )
+        known = np.asarray(y)[:, dofs]
+        return float(r2_score(known, predicted[:, dofs], multioutput="variance_weighted"))
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
