@@ -13,7 +13,7 @@ import pytest
 
 from mor_bench.analysis.analyse import analyse
 from mor_bench.report.entries import entries_of, verdict_of
-from mor_bench.report.number_format import percent
+from mor_bench.report.number_format import joined_units, percent
 from mor_bench.report.page import render
 from mor_bench.report.page_index import standings
 from mor_bench.report.page_sections import View
@@ -45,7 +45,7 @@ def test_the_data_of_the_charts_are_those_of_the_rows(comparison: Comparison, pa
     for shown, row in zip(data["rows"], comparison.rows, strict=True):
         if row.error and np.isfinite(row.error.rel_l2_median):
             assert shown["error"]["median"] == 100 * row.error.rel_l2_median
-            assert f"error {percent(row.error.rel_l2_median)} %" in shown["hover"][1]
+            assert joined_units(f"error {percent(row.error.rel_l2_median)} %") in shown["hover"][1]
         if row.latency_ms:
             assert shown["latency"]["median"] == row.latency_ms.median
             slowest = comparison.samples(row)["latency_ms"].max()

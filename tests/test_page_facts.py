@@ -10,18 +10,29 @@ import pytest
 
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.verdict import Requirements
+from mor_bench.machine import describe_machine
 from mor_bench.report.entries import Entry, entries_of
-from mor_bench.report.page_facts import answer_of, facts_of, limits_of, method_facts, reason_of
+from mor_bench.report.number_format import joined_units
+from mor_bench.report.page_facts import (
+    answer_of,
+    facts_of,
+    limits_of,
+    machine_facts,
+    method_facts,
+    reason_of,
+)
 from mor_bench.report.page_samples import Sampled
 from mor_bench.report.page_strains import strain_facts
 from mor_bench.report.page_tables import run_again
 from mor_bench.report.scene_text import scene_text
+from mor_bench.report.summary import interval_basis, paper_size
 from mor_bench.results.parts import ErrorSummary
 from mor_bench.results.row import SetErrors
+from mor_bench.runs.run_folder import record_commit
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.specs import list_suite, load_dataset_spec
 from tests.report_runs import add_row, tiny
-from tests.synthetic import a_row
+from tests.synthetic import a_row, synthetic_comparison
 
 NEEDS = Requirements(error=0.01, latency_ms=3.0)
 
@@ -127,3 +138,41 @@ def test_a_configuration_tells_the_command_that_repeats_it() -> None:
     trained = a_row("umesh", {"channels": 8}, training={"device": "cpu"})
     trained = trained.with_parts(parameters={"channels": 8, "iterations": 200})
     assert run_again(Entry(trained)).endswith("-m 'umesh[channels=8,iterations=200]' --train")
+
+
+def test_the_page_gives_the_commit_date_and_processor_model_or_says_not_recorded() -> None:
+    old = dict(machine_facts({"processor": "AMD EPYC", "memory_bytes": 25e9, "cores": 2}))
+    assert old["commit of mor-bench"] == old["date"] == old["processor model"] == "not recorded"
+    new = dict(machine_facts({**describe_machine(), "commit": "a" * 40, "date": "2026-11-24"}))
+    assert new["commit of mor-bench"] == "a" * 40
+    assert new["processor model"] not in ("", "not recorded")
+    assert "GB" in new["memory"]
+
+
+def test_a_run_records_its_commit_and_the_one_at_which_it_continues(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    machine: dict[str, object] = {}
+    for commit in ("a1", "a1", "b2", "b2", None):
+        monkeypatch.setattr("mor_bench.runs.run_folder.source_commit", lambda c=commit: c)
+        record_commit(machine)
+    assert machine["commit"] == (
+        "a1, continued at b2, continued at none: the package is not in a git checkout"
+    )
+
+
+def test_the_size_of_a_network_stands_beside_that_of_the_paper(tmp_path: Path) -> None:
+    made = synthetic_comparison(tmp_path, per_region=4)
+    row = made.rows[0].with_parts(parameters={"channels": 16, "steps": 2})
+    assert paper_size(row) == (
+        "16 channels and 2 steps (the paper's network: 128 channels and 3 steps); "
+    )
+    assert paper_size(made.rows[0]) == ""
+    text = interval_basis("beam-coarse", analyse(made, n_resamples=77))
+    assert "(bootstrap of 77 resamples)" in text
+
+
+def test_numbers_stay_beside_their_units() -> None:
+    space = "\N{NO-BREAK SPACE}"
+    assert joined_units("1.47 mm, 5 % of 3 modes") == f"1.47{space}mm, 5{space}% of 3 modes"
+    assert joined_units("2 s. 3 steps, 7 N") == f"2{space}s. 3 steps, 7{space}N"

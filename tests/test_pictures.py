@@ -32,6 +32,7 @@ from mor_bench.report.canvas import (
     uncut,
 )
 from mor_bench.report.entries import entries_of
+from mor_bench.report.error_against_deformation import error_against_deformation
 from mor_bench.report.error_against_time import error_against_time, fastest
 from mor_bench.report.figures import explain_names, pictures_of
 from mor_bench.report.labels import Note, annotate
@@ -332,3 +333,19 @@ def test_pyvista_renders_what_matplotlib_draws() -> None:
         assert dark[2] > dark[0]  # viridis begins with violet at x = 0 and ends with yellow
         assert light[2] < light[0]
     np.testing.assert_array_equal(images[0], images[1])
+
+
+def test_pictures_of_errors_say_what_each_method_is_told(tmp_path: Path) -> None:
+    made = synthetic_comparison(tmp_path, per_region=4)
+    told = {"umesh": "input", "pca-regression-linear": "linear-response"}
+    for row in list(made.rows):
+        known = {"told": told.get(row.method, "equations")}
+        made.put(row.with_parts(reference=row.method == "fem", **known))
+    analysis = analyse(made, n_resamples=50)
+    for draw in (error_against_time, error_against_deformation):
+        picture = draw(made, "beam-coarse", analysis)
+        assert picture is not None
+        explain_names(picture, made, "beam-coarse")
+        note = " ".join(" ".join(text.get_text().split()) for text in picture.figure.texts)
+        assert "Told: force only (umesh); force and linear response (pca-regression-linear)" in note
+        assert ("; equations (fem, " in note) == (draw is error_against_time)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ from mor_bench.cli.app import COMMANDS, app
 from mor_bench.cli.console import DEFAULT_WIDTH
 from mor_bench.cli.help_texts import EXIT_CODES
 from mor_bench.options import RunOptions, command_line
+from mor_bench.report.line_wrapping import command_lines
 from mor_bench.report.suite_overview import overview
 from mor_bench.results.comparison import Comparison
 from mor_bench.specs import list_suite, load_method_spec
@@ -68,7 +70,44 @@ def test_pick_uses_short_names_and_explains_them(run: Comparison) -> None:
     shown = mor_bench("pick", "beam-coarse", "--run", str(run.out)).stdout
     assert "pca-regression-linear · k20 wins" in shown
     assert "[n_input_modes=" not in shown
-    assert shown.splitlines()[-1].endswith("k = n_input_modes (number of input modes)")
+    assert "k = n_input_modes (number of input modes)" in " ".join(shown.split())
+
+
+@pytest.mark.parametrize("columns", ["60", "80", "120"])
+def test_pick_wraps_between_words_and_keeps_names_and_units_whole(
+    run: Comparison, columns: str
+) -> None:
+    shown = mor_bench("pick", "beam-coarse", "--run", str(run.out), columns=columns).stdout
+    lines = [line for line in shown.splitlines() if str(run.out) not in line]
+    assert int(columns) - 20 < max(map(len, lines)) <= int(columns)
+    assert not re.search(r"(·|[\d.]+)\n +(%|ms|s|core-s|[kMG]B|[a-z]+\d)\b", shown)
+    assert re.search(r"\n {4}latency  [\d.]+ ms median", shown)
+
+
+def test_a_command_that_is_too_long_for_a_line_can_be_copied() -> None:
+    command = "mor-bench run beam-coarse -m fem -m 'pod[n_modes=10, 20]' --out out --retime"
+    assert command_lines(command, 90) == [f"  {command}"]
+    lines = command_lines(command, 40)
+    assert max(map(len, lines)) <= 40
+    assert len(lines) > 2
+    assert shlex.split("\n".join(lines).replace("\\\n", "")) == shlex.split(command)
+
+
+def test_a_warning_of_mor_bench_is_one_line_without_its_place_in_the_code() -> None:
+    shown = mor_bench("show", "pca-regression-force")
+    assert shown.exit_code == 0, shown.output
+    warned = [line for line in shown.stderr.splitlines() if "is now" in line]
+    assert len(warned) == 1
+    assert warned[0].startswith("warning: `pca-regression-force` is now `pca-regression`.")
+    assert "RenamedWarning" not in shown.stderr
+    assert ".py" not in shown.stderr
+
+
+def test_checked_files_are_shown_from_the_current_folder_and_wrapped() -> None:
+    shown = mor_bench("check", "datasets/beam-tiny.toml", "methods/pod.toml", columns="60").stdout
+    assert max(map(len, shown.splitlines())) <= 60
+    assert shown.startswith("datasets/beam-tiny.toml: dataset, 24 cells, 63 nodes, ")
+    assert "\nmethods/pod.toml: method, 7 quick and 7 full" in shown
 
 
 def test_a_quiet_report_prints_the_verdict_alone(
@@ -76,8 +115,11 @@ def test_a_quiet_report_prints_the_verdict_alone(
 ) -> None:
     monkeypatch.setattr("mor_bench.cli.slow_notice.SILENT_S", 0.0)
     monkeypatch.setattr("mor_bench.cli.result_commands.render", lambda *_, **__: [Path("page")])
-    shown = mor_bench("report", str(run.out), "--quiet")
-    assert len(shown.stdout.splitlines()) == 2
+    shown = mor_bench("report", str(run.out), "--quiet", columns="80")
+    *verdict, page = shown.stdout.splitlines()
+    assert page == "page"
+    assert 40 < max(map(len, verdict)) <= 80
+    assert " ".join(verdict).count(". ") == 2
     assert shown.stderr == ""
 
 
@@ -185,8 +227,8 @@ def test_a_quiet_run_prints_the_verdict_and_the_report_alone(tmp_path: Path, cac
     options = ["-m", "linear-fem", "-m", "pod[n_modes=3,9]", "--cache", str(cache), "--quiet"]
     done = mor_bench_command("run", "beam-tiny", "--out", "out", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    headline, path = done.stdout.splitlines()
-    assert headline.startswith("beam-tiny needs ")
+    *headline, path = done.stdout.splitlines()
+    assert headline[0].startswith("beam-tiny needs ")
     assert path.endswith("report.html")
     assert done.stderr == ""
     rows = Comparison.read(tmp_path / "out").rows

@@ -17,6 +17,7 @@ from mor_bench.cli.clear_errors import (
     exit_by_signal,
     open_streams,
 )
+from mor_bench.cli.clear_warnings import clear_warnings
 from mor_bench.cli.windows_job import end_children_with_this_process
 
 COMMANDS = {
@@ -118,7 +119,7 @@ class LazyCommands(TyperGroup):
         torch_files = Path(platformdirs.user_cache_dir("mor-bench")) / "torch"
         os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(torch_files))
         try:
-            with clear_errors():
+            with clear_errors(), clear_warnings():
                 return super().main(*args, **extra)
         except StoppedBySignal as stop:  # it came while the context ended
             exit_by_signal(stop)

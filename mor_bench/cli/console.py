@@ -8,6 +8,8 @@ from contextlib import suppress
 
 from rich.console import Console
 
+from mor_bench.report.line_wrapping import wrapped
+
 DEFAULT_WIDTH, LEAST_WIDTH = 80, 40
 """Width without a terminal, and the least width that tables are fitted to, in characters."""
 
@@ -30,3 +32,8 @@ def console_width() -> int:
             if columns := os.get_terminal_size(stream.fileno()).columns:
                 return max(columns, LEAST_WIDTH)
     return DEFAULT_WIDTH
+
+
+def print_wrapped(text: str, indent: str = "  ") -> None:
+    """Print a text in lines of this width that end between words; later lines are indented."""
+    print(*wrapped(text, console_width(), indent), sep="\n")

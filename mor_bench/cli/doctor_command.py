@@ -9,10 +9,12 @@ from typing import Annotated
 
 import typer
 
+from mor_bench.cli.console import console_width
 from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import Json
 from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.measure.machine_speed import MachineSpeed
+from mor_bench.report.line_wrapping import wrapped
 from mor_bench.report.number_format import bytes_text, seconds_text
 from mor_bench.runs.installation import Installation
 from mor_bench.runs.plan import plan
@@ -60,8 +62,14 @@ def doctor(
     if as_json:
         print(json.dumps({**found.as_dict(), "default_run_s": seconds}, indent=1))
         return
+    width = console_width()
     for line in _lines(found, seconds):
-        print(line)
+        indent = " " * (len(line) - len(line.lstrip()))
+        if len(line) > width:
+            lines = wrapped(line.lstrip(), width, f"{indent}  ", first=indent)
+            print(*lines, sep="\n")
+        else:
+            print(line)
 
 
 def _self_test(as_json: bool) -> None:
@@ -73,7 +81,9 @@ def _self_test(as_json: bool) -> None:
             if not as_json:
                 spoken()
                 word = {True: "passed", False: "FAILED", None: "not here"}[check.passed]
-                print(f"{check.name:<16}{word:<10}{check.detail}", flush=True)
+                first = f"{check.name:<16}{word:<10}"
+                lines = wrapped(check.detail, console_width(), " " * len(first), first=first)
+                print(*lines, sep="\n", flush=True)
     if as_json:
         print(json.dumps([asdict(check) for check in done], indent=1))
     require(done)
@@ -94,18 +104,23 @@ def _lines(found: Installation, seconds: float) -> Iterator[str]:
         yield f"  The extra `{extra}` is missing: {use}."
     yield ""
     yield "Speed, on one thread (less is better, except bandwidth):"
-    columns = ["here", *(item.name for item in found.recorded)]
-    speeds = [found.speed, *(item.speed for item in found.recorded)]
-    for name, title in SPEEDS.items():
-        values = (
-            f"{column} {_shown(speed, name)}" for column, speed in zip(columns, speeds, strict=True)
-        )
-        yield f"  {title}: {'; '.join(values)}"
-    for item in found.recorded:
-        if item.run_min is not None:
-            yield f"  `mor-bench run` took {item.run_min:g} min on {item.name}."
+    yield from _speeds(found)
     yield ""
     yield f"`mor-bench run` is expected to take about {seconds_text(seconds)} here."
+
+
+def _speeds(found: Installation) -> Iterator[str]:
+    """Yield a table of this machine beside the recorded ones, and what their numbers mean."""
+    headings = ["here", *(f"({i})" for i, _ in enumerate(found.recorded, start=1))]
+    speeds = [found.speed, *(item.speed for item in found.recorded)]
+    first = max(map(len, SPEEDS.values()))
+    yield f"  {'':<{first}}" + "".join(f"{heading:>8}" for heading in headings)
+    for name, title in SPEEDS.items():
+        cells = "".join(f"{_shown(speed, name):>8}" for speed in speeds)
+        yield f"  {title:<{first}}{cells}"
+    for heading, item in zip(headings[1:], found.recorded, strict=True):
+        took = "" if item.run_min is None else f"; `mor-bench run` took {item.run_min:g} min there"
+        yield f"  {heading} {item.name}{took}"
 
 
 def _shown(speed: MachineSpeed, name: str) -> str:

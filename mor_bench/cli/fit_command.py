@@ -10,7 +10,7 @@ import typer
 from pydantic import Field
 
 import mor_bench
-from mor_bench.cli.console import make_console
+from mor_bench.cli.console import make_console, print_wrapped
 from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import (
     OUTPUT,
@@ -95,7 +95,7 @@ def fit(
     error = fitted.error
     iterations = "" if fitted.iterations is None else f", {fitted.iterations:,} iterations"
     for name, values in fitted.first_of.items():
-        print(
+        print_wrapped(
             f"{name} = {values[0]!r}, the first of {len(values)} values in the method's file; "
             f"choose another one with --set {name}=VALUE"
         )
@@ -104,7 +104,7 @@ def fit(
     relative = ", ".join(
         f"{name} {error[f'rel_l2_{name}']:.3%}" for name in ("median", "p95", "max")
     )
-    print(
+    print_wrapped(
         f"test error: ē {error['mean_dof_m']:.2e} m, relative l2 {relative} "
         f"({fitted.n_test:,} samples)"
     )

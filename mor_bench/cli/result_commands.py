@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterator
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -13,7 +16,8 @@ from pydantic import Field
 import mor_bench
 from mor_bench.analysis.analyse import analyse
 from mor_bench.analysis.told import told_at_most
-from mor_bench.cli.console import make_console
+from mor_bench.analysis.verdict import Verdict
+from mor_bench.cli.console import console_width, make_console
 from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import (
     DatasetName,
@@ -25,7 +29,8 @@ from mor_bench.cli.option_groups import (
 from mor_bench.cli.run_progress import show_run
 from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.options import CommandLine, FolderOptions
-from mor_bench.report.console_tables import print_tables
+from mor_bench.report.console_tables import print_tables, verdict_lines
+from mor_bench.report.line_wrapping import wrapped
 from mor_bench.report.number_format import explain_short_names
 from mor_bench.report.page import render
 from mor_bench.report.short_names import renamed, short_names
@@ -138,9 +143,27 @@ def pick(
     if as_json:
         print(json.dumps(chosen.as_json(), indent=1, ensure_ascii=False, allow_nan=False))
     else:
-        text = chosen.headline if output.quiet else chosen.text()
-        print(renamed(text, short_names(chosen.rows)))
-        if not output.quiet:
-            print(explain_short_names(row.swept for row in chosen.rows))
+        print(*_lines(chosen, console_width(), quiet=output.quiet), sep="\n")
     if chosen.choice is None:
         raise typer.Exit(1)
+
+
+def _lines(chosen: Verdict, width: int, *, quiet: bool) -> Iterator[str]:
+    """Yield the verdict in lines of this width: the headline, its figures, all else."""
+    names = short_names(chosen.rows)
+    if quiet:
+        yield from wrapped(renamed(chosen.headline, names), width, names=names.values())
+        return
+    whole = list(verdict_lines(chosen.headline, chosen.beside, names, width))
+    finding = list(takewhile(lambda line: not line.startswith("- "), whole))
+    yield from finding
+    for line in chosen.evidence:
+        name = re.match(r" +\w+ +", line)  # such as "    latency  "
+        first = (
+            name[0] if name and line.startswith("    ") else " " * (len(line) - len(line.lstrip()))
+        )
+        text = renamed(line, names)[len(first) :]
+        yield from wrapped(text, width, " " * len(first), first=first, names=names.values())
+    yield from whole[len(finding) :]
+    swept = explain_short_names(row.swept for row in chosen.rows)
+    yield from wrapped(swept, width)

@@ -17,6 +17,7 @@ from mor_bench.cli.option_groups import Json, complete_datasets, complete_method
 from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.errors import InvalidInputError
 from mor_bench.report.cards import Card, dataset_card, method_card, run_card
+from mor_bench.report.line_wrapping import command_lines, wrapped
 from mor_bench.results.comparison import Comparison
 from mor_bench.runs.pick import RUNS
 from mor_bench.specs import is_method_file, list_suite, load_dataset_spec, load_method_spec
@@ -115,12 +116,14 @@ def print_card(card: Card) -> None:
     console.print(Text(card.title, style="bold"))
     for name, text in card.facts.items():
         console.print(Text(name, style="dim"))
-        for line in wrap(text, console.width - 2):
-            console.print(Text(f"  {line}", no_wrap=True), soft_wrap=True)
+        for line in wrapped(text, console.width, "  ", first="  "):
+            console.print(Text(line, no_wrap=True), soft_wrap=True)
     if card.hyperparameters:
         console.print(Text("hyperparameters in `mor-bench run`", style="dim"))
     for line in _columns(card.hyperparameters, console.width):
         console.print(Text(line), soft_wrap=True)
     console.print()
-    for line in card.commands:
+    for line in (
+        part for given in card.commands for part in command_lines(given, console.width, "")
+    ):
         console.print(Text(line, no_wrap=True), soft_wrap=True, highlight=False)

@@ -7,6 +7,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from threading import Timer
 
+from mor_bench.cli.console import console_width
+from mor_bench.report.line_wrapping import wrapped
+
 SILENT_S = 1.5
 """Time after which a command says that it works, s."""
 
@@ -31,7 +34,7 @@ def notice_if_slow(
             if say is not None:
                 say(text)
             else:
-                print(text, file=sys.stderr, flush=True)
+                print(*wrapped(text, console_width()), sep="\n", file=sys.stderr, flush=True)
 
     timer = Timer(SILENT_S, print_text)
     timer.daemon = True

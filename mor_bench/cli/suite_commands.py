@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from mor_bench.cli.console import console_width
+from mor_bench.cli.console import console_width, print_wrapped
 from mor_bench.cli.help_texts import command
 from mor_bench.cli.option_groups import Json
 from mor_bench.cli.slow_notice import notice_if_slow
@@ -20,7 +20,7 @@ from mor_bench.specs import list_suite
 
 app = typer.Typer(rich_markup_mode=None)
 
-BUSY = "still checking; large files, and imports of a method's module, may take two minutes."
+BUSY = "Still checking. Large files, and imports of a method's module, may take two minutes:"
 
 LEAST_TITLE = 20
 """Least width of the column of titles, in characters."""
@@ -100,11 +100,11 @@ def check(
     problems = 0
     for path in files or shipped:
         try:
-            with notice_if_slow(printable(f"{path}: {BUSY}")):
+            with notice_if_slow(printable(f"{BUSY} {path}")):
                 found = check_file(path)
-            print(printable(f"{path}: {found}", keep=""))
+            _print_checked(path, found)
         except MissingDependencyError as error:
-            print(printable(f"{path}: not checked in full: {error}"))
+            _print_checked(path, f"not checked in full: {error}")
         except MorBenchError as error:
             problems += 1
             message = str(error)
@@ -112,3 +112,10 @@ def check(
             typer.secho(printable(line, keep=""), fg="red", err=True)
     if problems:
         raise typer.Exit(2)
+
+
+def _print_checked(path: Path, found: str) -> None:
+    """Print a path, from the current folder if it is below it, and what a check found."""
+    here = Path.cwd()
+    shown = path.relative_to(here) if path.is_relative_to(here) else path
+    print_wrapped(printable(f"{shown}: {found}", keep=""), "    ")

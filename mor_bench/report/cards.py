@@ -75,6 +75,7 @@ def run_card(comparison: Comparison) -> Card:
         "methods": ", ".join(dict.fromkeys(row.method for row in comparison.rows)),
         "settings": _pairs({k: v for k, v in settings.items() if not isinstance(v, dict)}),
         "machine": _machine(machine),
+        "commit": str(machine.get("commit", "not recorded")),
         "files": _files(comparison.out),
     }
     commands = [f"mor-bench report {comparison.out}", f"mor-bench report {comparison.out} --wide"]

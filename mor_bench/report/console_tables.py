@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot
-from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
@@ -26,6 +25,7 @@ from mor_bench.report.entries import (
     entries_of,
     verdict_of,
 )
+from mor_bench.report.line_wrapping import command_lines, wrapped
 from mor_bench.report.number_format import (
     explain_short_names,
     metres,
@@ -129,35 +129,47 @@ def _out_of_range_parts(entries: Sequence[Entry]) -> list[RenderableType]:
     return _titled(title, table, Text(found.note, style="dim"))
 
 
-def _verdict_lines(
+def verdict_lines(
+    headline: str, sentences: Sequence[str], names: Mapping[str, ShortName], width: int
+) -> Iterator[str]:
+    """Yield a verdict with short names: the finding, then its needs and all other sentences."""
+    needs, _, finding = renamed(headline, names).partition(". ")
+    yield from wrapped(finding, width, names=names.values())
+    for sentence in (f"{needs}.", *sentences):
+        text, again, command = renamed(sentence, names).partition(AGAIN)
+        text += again.rstrip()
+        yield from wrapped(f"- {text}", width, "  ", names=names.values())
+        if again:
+            yield from command_lines(command, width)
+
+
+def _verdict_parts(
     verdict: Mapping[str, Any], names: Mapping[str, ShortName], width: int
 ) -> Iterator[Text]:
-    """Yield the verdict, with short names; the command that repeats timings keeps its line."""
-    needs, _, finding = renamed(verdict["headline"], names).partition(". ")
-    yield from _wrapped(finding, width, "bold")
-    for sentence in (f"{needs}.", *verdict["beside"]):
-        text, again, command = renamed(sentence, names).partition(AGAIN)
-        yield from _wrapped(f"- {text}{' Time again:' if again else ''}", width, "", "  ")
-        if again:
-            yield Text(f"  {command}", no_wrap=True)
+    """Yield the verdict; the finding is bold."""
+    finding = renamed(verdict["headline"], names).partition(". ")[2]
+    n_bold = len(wrapped(finding, width, names=names.values()))
+    for i, line in enumerate(verdict_lines(verdict["headline"], verdict["beside"], names, width)):
+        yield Text(line, style="bold" if i < n_bold else "", no_wrap=True)
 
 
-def _wrapped(text: str, width: int, style: str = "", indent: str = "") -> Iterator[Text]:
-    """Yield a text in lines that end between words; a longer word is not broken."""
-    for line in wrap(
-        text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
-    ):
+def _wrapped(
+    text: str, width: int, style: str = "", names: Mapping[str, ShortName] | None = None
+) -> Iterator[Text]:
+    for line in wrapped(text, width, names=(names or {}).values()):
         yield Text(line, style=style, no_wrap=True)
 
 
-def _failures(entries: Sequence[Entry], names: Mapping[str, ShortName]) -> Iterator[Text]:
+def _failures(
+    entries: Sequence[Entry], names: Mapping[str, ShortName], width: int
+) -> Iterator[Text]:
     """Yield a line per reason for which configurations have no result or lack predictions."""
     reasons: dict[str, list[str]] = {}
     for entry in entries:
         if entry.trouble:
             reasons.setdefault(entry.trouble, []).append(str(names[entry.label]))
     for reason, labels in reasons.items():
-        yield Text(f"{', '.join(labels)}: {reason}", style="red")
+        yield from _wrapped(f"{', '.join(labels)}: {reason}", width, "red", names)
 
 
 def _notes(
@@ -201,7 +213,7 @@ def _dataset_parts(
     if not verdict:
         yield Text("No configuration.\n")
         return
-    yield from _verdict_lines(verdict, names, console.width)
+    yield from _verdict_parts(verdict, names, console.width)
     yield Text("")
     yield from configuration_lines(entries, names, None if detail.wide else console.width)
     swept = (entry.swept for entry in entries)
@@ -209,9 +221,10 @@ def _dataset_parts(
     for text in (NOTE, explain_short_names(swept), f"Same in all rows: {fixed}." if fixed else ""):
         if text:
             yield from _wrapped(text, console.width, "dim")
-    yield from _failures(entries, names)
+    yield from _failures(entries, names, console.width)
     notes = _notes if detail.verbose else _short_notes
-    yield from notes(comparison, dataset, entries, analysis)
+    for note in notes(comparison, dataset, entries, analysis):
+        yield from _wrapped(note.plain, console.width, str(note.style), names)
     if detail.wide:
         yield from _wide_parts(comparison, dataset, entries, analysis)
     yield Text("")
@@ -247,7 +260,8 @@ def print_tables(
             if detail.quiet:
                 names = short_names(row for row in comparison.rows if row.dataset == name)
                 headline = verdict_of(analysis, name).get("headline", f"{name}: no configuration.")
-                console.print(Text(renamed(headline, names)), soft_wrap=True)
+                for line in _wrapped(renamed(headline, names), console.width, names=names):
+                    _print(line, console)
                 continue
             for part in _dataset_parts(comparison, name, analysis, console, detail):
                 _print(part, console)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 
 from matplotlib.text import Text
 
+from mor_bench.analysis.told import classes_of, is_observed, told_text
 from mor_bench.report.canvas import Drawn, Picture, add_note, save
 from mor_bench.report.distribution_figure import error_distribution
 from mor_bench.report.entries import Analysis, dataset_names
@@ -19,6 +21,10 @@ from mor_bench.report.training_curves import learning_curves, loss_curves
 from mor_bench.report.whole_cost import whole_cost
 from mor_bench.report.worst_samples import worst_samples
 from mor_bench.results.comparison import Comparison
+from mor_bench.results.row import Row
+
+ERRORS_OF_METHODS = ("error-against-time", "error-against-deformation")
+"""Pictures that compare all methods, so that they must say what each is told."""
 
 ALL = "all datasets"
 """Replaces the dataset's name in figures about all datasets."""
@@ -43,11 +49,25 @@ def pictures_of(comparison: Comparison, dataset: str, analysis: Analysis) -> Ite
 
 
 def explain_names(picture: Picture, comparison: Comparison, dataset: str) -> None:
-    """Explain in a picture the short names of parameters that it uses."""
+    """Explain in a picture its short names of parameters, and what its methods are told."""
     drawn = [t.get_text() for t in picture.figure.findobj(Text) if isinstance(t, Text)]
     rows = [row for row in comparison.rows if row.dataset == dataset]
-    if note := explained_values(rows, " ".join(drawn)):
+    shown = " ".join(drawn)
+    if note := explained_values(rows, shown):
         add_note(picture.figure, note)
+    if picture.kind in ERRORS_OF_METHODS and (note := _told(rows, shown, comparison, dataset)):
+        add_note(picture.figure, note)
+
+
+def _told(rows: Sequence[Row], shown: str, comparison: Comparison, dataset: str) -> str:
+    """Name the methods of a picture by what they are told at query time."""
+    observed, parts = is_observed(comparison, dataset), []
+    for told in classes_of(rows):
+        methods = dict.fromkeys(row.method for row in rows if row.told == told)
+        named = [m for m in methods if re.search(rf"(?<![\w-]){re.escape(m)}(?![\w-])", shown)]
+        if told and named:
+            parts.append(f"{told_text(told, observed)} ({', '.join(named)})")
+    return f"Told: {'; '.join(parts)}" if parts else ""
 
 
 def write_figures(comparison: Comparison, analysis: Analysis) -> list[Drawn]:

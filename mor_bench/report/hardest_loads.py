@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.report.number_format import number, percent
+from mor_bench.report.number_format import DASH, number, percent
 from mor_bench.report.page_samples import Sampled
 from mor_bench.report.text_table import TextTable
 
@@ -92,13 +92,15 @@ def _known(value: float, shown: Callable[[float | None], str]) -> str:
     return shown(value) if np.isfinite(value) else "no prediction"
 
 
-_LOAD = ("largest u (mm)", "load at (m)")
+_LOAD = ("largest u (mm)", "force (N)", "load at (m)")
 
 
 def _load(item: Sampled, arrays: Mapping[str, NDArray[Any]], load: int) -> list[str]:
-    """Return the largest displacement of the reference, and the centres of the loaded patches."""
-    where = "–"
+    """Return the reference's largest displacement, the total force, and the patches' centres."""
+    where, force = DASH, DASH
+    if "test_force_n" in arrays:
+        force = number(float(arrays["test_force_n"][load]))
     if {"test_regions", "patch_centres"} <= set(arrays):
         centres = arrays["patch_centres"][arrays["test_regions"][load]]
         where = "; ".join(", ".join(f"{x:.3g}" for x in centre) for centre in centres)
-    return [number(1e3 * item.arrays["amplitude_m"][load]), where]
+    return [number(1e3 * item.arrays["amplitude_m"][load]), force, where]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from math import isfinite
 from typing import Any
@@ -35,6 +36,17 @@ MEANINGS = {
     "cubature_tolerance": "accepted error of the cubature",
 }
 """Meanings of some parameters with short names."""
+
+BEFORE_UNIT = re.compile(
+    r"(?<=\d) (?=(?:%|[nµm]?s|min|h|[kmµ]?m|[kM]?N|[kMG]?B|[kMG]?Pa|core-(?:s|min|h)|core-seconds"
+    r"|times)(?![\w/-]))"
+)
+"""The space between a number and its unit."""
+
+
+def joined_units(text: str) -> str:
+    """Return a text in which no line breaks between a number and its unit."""
+    return BEFORE_UNIT.sub("\N{NO-BREAK SPACE}", text)
 
 
 def number(value: float | None) -> str:

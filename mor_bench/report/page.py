@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
@@ -19,8 +20,8 @@ from mor_bench.report.entries import Analysis, dataset_names
 from mor_bench.report.figures import write_figures
 from mor_bench.report.hard_case_table import stress_table
 from mor_bench.report.method_view import method_view
-from mor_bench.report.number_format import bytes_text
-from mor_bench.report.page_facts import flat, method_facts
+from mor_bench.report.number_format import joined_units, whole
+from mor_bench.report.page_facts import machine_facts, method_facts
 from mor_bench.report.page_index import standings
 from mor_bench.report.page_scripts import Assets, beside, embedded_json, inlined
 from mor_bench.report.page_sections import View, section_of
@@ -175,7 +176,8 @@ def _write(path: Path, view: View, frame: Frame) -> Path:
             sections=sections,
             hard=with_content([hard] if hard else []),
             overall=[] if view.method else with_content(overall(view.analysis)),
-            machine=[_readable(*pair) for pair in flat(comparison.machine)],
+            machine=machine_facts(comparison.machine),
+            n_resamples=whole(view.analysis["settings"]["n_resamples"]),
             told={told or "": told_text(told, observed) for told in classes_of(comparison.rows)},
             legend=LEGEND,
             data=embedded_json([section.data for section in sections]),
@@ -193,6 +195,7 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        finalize=_joined,
     )
     environment.filters |= {"data_uri": _data_uri, "code": _code, "slug": _slug}
     return environment
@@ -202,17 +205,21 @@ def _data_uri(path: Path) -> str:
     return f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
+def _joined(value: Any) -> Any:
+    """Keep numbers beside their units in every text of a template."""
+    return joined_units(value) if type(value) is str else value
+
+
 def _code(text: str) -> Markup:
-    """Show what stands between backticks as code."""
-    return Markup(re.sub("`([^`]*)`", r"<code>\1</code>", str(escape(text))))
+    """Show what stands between backticks as code; no line breaks at a hyphen in it."""
+
+    def shown(found: re.Match[str]) -> str:
+        words = re.sub(r"(\S*-\S*)", r'<span class="whole">\1</span>', found[1])
+        return f"<code>{words}</code>"
+
+    return Markup(re.sub("`([^`]*)`", shown, str(escape(joined_units(text)))))
 
 
 def _slug(text: str) -> str:
     """Return the part of an address for a title."""
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
-
-
-def _readable(key: str, text: str) -> tuple[str, str]:
-    """Format a size in bytes."""
-    name = key.removesuffix("_bytes")
-    return (name, bytes_text(float(text))) if name != key and text.isdecimal() else (key, text)

@@ -8,7 +8,6 @@ from math import isfinite
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mor_bench.analysis.verdict import Requirements, needs_of
 from mor_bench.report.entries import Analysis, Entry, by_group
@@ -17,6 +16,7 @@ from mor_bench.report.number_format import number, percent, span
 from mor_bench.report.page_bodies import bodies
 from mor_bench.report.page_facts import answer_of, method_facts, reason_of
 from mor_bench.report.page_samples import (
+    dataset_arrays,
     deformations,
     distributions,
     losses,
@@ -93,14 +93,6 @@ def _style(method: str) -> dict[str, Any]:
 def reading_order(entry: Entry) -> tuple[bool, bool, float]:
     """Put qualified configurations first and failed ones last, each group by latency."""
     return not entry.qualified, bool(entry.trouble), entry.latency_ms
-
-
-def dataset_arrays(comparison: Comparison, dataset: str) -> Mapping[str, NDArray[Any]]:
-    """Read a dataset's arrays; empty if there are none."""
-    try:
-        return comparison.dataset_arrays(dataset)
-    except (OSError, KeyError):
-        return {}
 
 
 def _row(

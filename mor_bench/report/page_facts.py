@@ -15,7 +15,8 @@ from mor_bench.measure.discretisation_error import measured
 from mor_bench.report.cards import pair_text
 from mor_bench.report.entries import Analysis, Entry
 from mor_bench.report.method_styles import style_of
-from mor_bench.report.number_format import number
+from mor_bench.report.number_format import bytes_text, number
+from mor_bench.report.page_samples import dataset_arrays
 from mor_bench.report.scene_text import recorded_scene
 from mor_bench.report.summary import discretisation_error
 from mor_bench.results.comparison import Comparison
@@ -115,6 +116,26 @@ def limits_of(comparison: Comparison, analysis: Analysis, entries: Sequence[Entr
     return " ".join(said)
 
 
+_FIRST = ("commit", "date", "processor", "processor_model")
+
+
+def machine_facts(machine: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """List the commit and date of a run and its machine; older runs lack some of them."""
+    first = {
+        "commit of mor-bench": machine.get("commit"),
+        "date": machine.get("date"),
+        "processor": machine.get("processor"),
+        "processor model": machine.get("processor_model"),
+    }
+    facts = [(name, str(text or "not recorded")) for name, text in first.items()]
+    rest = {k: v for k, v in machine.items() if k not in _FIRST}
+    for key, text in flat(rest):
+        name = key.removesuffix("_bytes")
+        size = name != key and text.isdecimal()
+        facts.append((name, bytes_text(float(text)) if size else text))
+    return facts
+
+
 def method_facts(comparison: Comparison, method: str) -> list[tuple[str, str]]:
     """List what a method's file says of it."""
     spec = comparison.methods.get(method, {})
@@ -141,6 +162,7 @@ def facts_of(
     split += f"test samples: {_values(row.n_test for row in rows)}"
     split += f"; in no part: {unused}" if any(row.n_unused for row in rows) else ""
     split += _patches(spec, entries)
+    refused = dataset_arrays(comparison, dataset).get("n_refused")
     counts = (
         f"{sum(r.status == status for r in rows)} {status}" for status in ("failed", "skipped")
     )
@@ -158,6 +180,10 @@ def facts_of(
         *([("command that runs it all again", command)] if command else []),
         *facts,
         ("split", split),
+        (
+            "samples refused by the full-order model (no stable equilibrium found)",
+            "not recorded" if refused is None else f"{int(refused):,}, in no part of the split",
+        ),
         ("needs", needs_text(needs_of(comparison, dataset))),
         ("degrees of freedom", _values(f"{row.n_dofs:,}" for row in rows if row.n_dofs)),
         ("discretisation error of the dataset's mesh", discretisation_error(entries)),

@@ -37,6 +37,14 @@ class Sampled:
     arrays: Mapping[str, NDArray[Any]]
 
 
+def dataset_arrays(comparison: Comparison, dataset: str) -> Mapping[str, NDArray[Any]]:
+    """Read a dataset's arrays; empty if there are none."""
+    try:
+        return comparison.dataset_arrays(dataset)
+    except (OSError, KeyError):
+        return {}
+
+
 def sampled(
     comparison: Comparison, entries: Sequence[Entry], preferred: Sequence[Entry]
 ) -> list[Sampled]:

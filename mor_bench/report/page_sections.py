@@ -14,7 +14,7 @@ from mor_bench.report.details import dataset_details, hard_cases
 from mor_bench.report.entries import Analysis, Entry, entries_of, verdict_of
 from mor_bench.report.hardest_loads import hardest_loads
 from mor_bench.report.number_format import explain_short_names, percent
-from mor_bench.report.page_data import Shown, cells_of, dataset_arrays, payload, reading_order
+from mor_bench.report.page_data import Shown, cells_of, payload, reading_order
 from mor_bench.report.page_facts import (
     answer_of,
     deformation,
@@ -24,7 +24,7 @@ from mor_bench.report.page_facts import (
     protocol_of,
 )
 from mor_bench.report.page_findings import Chart, charts, frontier
-from mor_bench.report.page_samples import sampled
+from mor_bench.report.page_samples import dataset_arrays, sampled
 from mor_bench.report.page_strains import strain_facts
 from mor_bench.report.page_tables import figure_tables, with_content
 from mor_bench.report.page_verdict import Card, FullOrder, card, method_card

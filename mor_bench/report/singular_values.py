@@ -147,10 +147,9 @@ def draw_singular_values(axes: Axes, spectrum: Spectrum, entries: Sequence[Entry
     ]
     notes += _method_names(used, 100 * bottom)
     if last < len(sigma):
-        text = f"falls to {percent(float(tail.min()))} % at {len(tail):,} →"
-        end = (axes.get_xlim()[1], 100 * bottom)
-        above_strip = (-6, STEP_PT * (len(used) + 0.5))
-        notes.insert(0, Note(text, [end], offsets=(above_strip,), must=True))
+        text = f"left out by {len(tail):,} modes: {percent(float(tail.min()))} %"
+        corner = (axes.get_xlim()[1], axes.get_ylim()[1])  # free, since both curves fall
+        notes.insert(0, Note(text, [corner], offsets=((-6, -9),), must=True, leader=False))
     for text, curve, colour in (("left out by r modes", tail, INK), ("σᵢ / σ₁", sigma, GREY)):
         places = [(float(i), 100 * float(curve[i - 1])) for i in range(2, min(len(curve), last))]
         notes.append(Note(text, places[:: max(1, len(places) // 30)], colour, "bold"))
@@ -182,7 +181,7 @@ def _draw_ranks(
         style = style_of(method)
         y = 100 * tail[np.subtract(ranks, 1)]
         axes.plot(ranks, y, "o", color=INK, ms=5, zorder=4)
-        up = ScaledTranslation(0, STEP_PT * (place + 0.7) / 72, figure.dpi_scale_trans)
+        up = ScaledTranslation(0, STEP_PT * (place + 0.95) / 72, figure.dpi_scale_trans)
         low = np.full(len(ranks), axes.get_ylim()[0])
         (marks,) = axes.plot(ranks, low, style.marker, zorder=5, label=method)
         marks.set(ms=8, mec="white", mew=0.5, mfc=style.colour)
@@ -203,7 +202,7 @@ def _method_names(used: dict[str, list[int]], bottom: float) -> list[Note]:
     notes = []
     for place, (method, ranks) in enumerate(used.items()):
         places = [(float(rank), bottom) for rank in ranks[::-1]]
-        low = STEP_PT * (place + 0.7) - 5.5
+        low = STEP_PT * (place + 0.95) - 5.5
         colour, name = readable(style_of(method).colour), shortened(method, 30)
         beside = ((9.0, low), (-9.0, low))
         notes.append(Note(name, places, colour, "bold", beside, leader=False))

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 from mor_bench.report.entries import Analysis, Entry, entries_of
 from mor_bench.report.number_format import metres, number, percent
+from mor_bench.report.published_figures import SCENES, scene_of
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.parts import TrainedElsewhere
+from mor_bench.results.row import Row
 
 MESH_NOTE = "an error below it is not evidence about the real body"
 
@@ -60,24 +62,38 @@ def hidden_doubts(dataset: str, analysis: Analysis) -> list[tuple[str, str]]:
 def origins(comparison: Comparison, dataset: str) -> list[tuple[str, str]]:
     """Describe each training that was done elsewhere, after the label of its configuration."""
     return [
-        (row.label, _origin(row.trained_elsewhere, comparison, row.method))
+        (row.label, _origin(row, row.trained_elsewhere, comparison))
         for row in comparison.rows
         if row.dataset == dataset and row.trained_elsewhere
     ]
 
 
-def _origin(training: TrainedElsewhere, comparison: Comparison, method: str) -> str:
-    """State the iterations beside those of the method's file and of a training here."""
-    spec = comparison.methods.get(method, {})
+def _origin(row: Row, training: TrainedElsewhere, comparison: Comparison) -> str:
+    """State the size and iterations beside those of the paper, the method's file and `--train`."""
+    spec = comparison.methods.get(row.method, {})
     published = spec.get("parameters", {}).get("iterations", 0)
     profile = spec.get("profiles", {}).get(comparison.settings.get("profile")) or {}
     here = profile.get("parameters", {}).get("iterations", published)
     fewer = f", not the {published:,} of its method file" if published > training.iterations else ""
     return (
+        f"{paper_size(row)}"
         f"trained elsewhere for {training.iterations:,} iterations{fewer}; seed {training.seed}, "
         f"{number(training.core_s)} core-seconds on {training.machine} cores, {training.date}, "
         f"commit {training.commit[:7]}; `--train` trains here"
         + (f" for {here:,} iterations, those of this profile" if here else "")
+    )
+
+
+def paper_size(row: Row) -> str:
+    """State the size of a network of the paper's kind beside the one that the paper selected."""
+    channels, steps = (row.parameters.get(name) for name in ("channels", "steps"))
+    scene = SCENES.get(scene_of(row.dataset))
+    if not isinstance(channels, int) or not isinstance(steps, int) or scene is None:
+        return ""
+    paper = scene.network
+    return (
+        f"{channels} channels and {steps} steps (the paper's network: {paper.channels} channels "
+        f"and {paper.steps} steps); "
     )
 
 
@@ -87,15 +103,18 @@ def _first_of(labels: Sequence[str]) -> str:
 
 def interval_basis(dataset: str, analysis: Analysis) -> str:
     """Describe in a sentence the basis of a dataset's intervals; empty if there are none."""
+    n = analysis["settings"]["n_resamples"]
     parts = [
-        f"95 % intervals: errors over {c['n']} {c['of']}"
+        f"95 % intervals: errors over {c['n']} {c['of']} (bootstrap of {n:,} resamples)"
         for c in analysis["clusters"]
         if c["dataset"] == dataset
     ]
     for found in analysis["timing"]:
         if found["dataset"] != dataset:
             continue
-        n, specific, common = (found[key] for key in ("n_processes", "specific", "common"))
+        n_processes, specific, common = (
+            found[key] for key in ("n_processes", "specific", "common")
+        )
         spread = (
             "and a typical spread between processes"
             if specific is None
@@ -104,8 +123,8 @@ def interval_basis(dataset: str, analysis: Analysis) -> str:
         drift = f"; the machine's speed drifts by {percent(common)} %" if common else ""
         parts.append(
             f"latencies from one process {spread}"
-            if n == 1
-            else f"latencies over {n} processes {spread}{drift}"
+            if n_processes == 1
+            else f"latencies over {n_processes} processes {spread}{drift}"
         )
     return f"{', '.join(parts)}." if parts else ""
 

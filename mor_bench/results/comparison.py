@@ -149,7 +149,8 @@ class Comparison:
         `singular_values` of the training displacements, perhaps the leading ones only, and
         `snapshots_norm`, the Frobenius norm of these displacements; `points` (n_nodes, 3), `cells`
         (n_cells, 8), `test_regions` (n_test, k), `validation_regions` (n_validation, k);
-        `patch_centres` (n_patches, 3), m, of generated samples.
+        `patch_centres` (n_patches, 3), m, of generated samples; `n_refused`, the number of samples
+        without equilibrium; `test_force_n` (n_test,), the size of each test load's total force, N.
 
         Raises
         ------

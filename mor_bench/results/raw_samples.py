@@ -79,6 +79,8 @@ OF_DATASETS = {
     "patch_centres": Allowed("real", ("patches", 3), -FARTHEST, FARTHEST, finite=True),
     "test_regions": Allowed("whole", ("test", "regions"), 0.0),
     "validation_regions": Allowed("whole", ("validation", "validation regions"), 0.0),
+    "n_refused": Allowed("whole", (), 0.0),
+    "test_force_n": Allowed("real", ("test",), 0.0, finite=True),
 }
 """The arrays of a dataset."""
 

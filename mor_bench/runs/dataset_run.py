@@ -372,7 +372,10 @@ def record_dataset(comparison: Comparison, spec: AnyDatasetSpec, data: Dataset) 
         "cells": data.scene.mesh.cells,
         "test_regions": data.test.loads.patches,
         "validation_regions": data.validation.loads.patches,
+        "n_refused": np.asarray(data.n_refused),
     }
+    if data.scene.observed_nodes is None:
+        arrays["test_force_n"] = np.linalg.norm(data.test.forces.sum(axis=1), axis=-1)
     if isinstance(spec, DatasetSpec):
         arrays["patch_centres"] = data.scene.patch_centres
     comparison.add_dataset(spec.name, spec.model_dump(mode="json"), arrays)

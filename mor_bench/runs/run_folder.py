@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mor_bench.checked_files import read_bytes
+from mor_bench.checkout import source_commit
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.machine import describe_machine, gpu_name
 from mor_bench.results.comparison import Comparison
@@ -57,9 +58,9 @@ def open_run(
     else:
         _check_no_foreign(folder)
         gpu = {"gpu": gpu_name()} if context.training.device == "cuda" else {}
-        comparison = Comparison(
-            folder, {**describe_machine(), **isolation(), **gpu}, settings=settings
-        )
+        about = {"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", **describe_machine()}
+        comparison = Comparison(folder, {**about, **isolation(), **gpu}, settings=settings)
+    record_commit(comparison.machine)
     comparison.methods |= {
         method.name: method.model_dump(mode="json", exclude={"folder"}) for method in methods
     }
@@ -68,6 +69,14 @@ def open_run(
     except OSError as error:
         raise InvalidInputError(f"`out`: {folder} cannot be written: {error.strerror}.") from None
     return comparison
+
+
+def record_commit(machine: dict[str, Any]) -> None:
+    """Record the commit of the code; a run that continues at another one keeps both."""
+    commit = source_commit() or "none: the package is not in a git checkout"
+    known = machine.get("commit", "")
+    if commit not in known:
+        machine["commit"] = f"{known}, continued at {commit}" if known else commit
 
 
 def _differences(kept: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
