@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import sys
+import builtins
 from typing import Any
 
 import pytest
 
 
-class _Without:
-    """A finder that finds no module of a package."""
-
-    def __init__(self, package: str) -> None:
-        self.package = package
-
-    def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
-        if name.partition(".")[0] == self.package:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=self.package)
-
-
 def hide_package(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every import of a package fail as if it were not installed, until the test ends."""
-    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setattr("sys.meta_path", [_Without(package), *sys.meta_path])
+    """Let import statements of a package fail as if it were not installed, until the test ends.
+
+    Its modules stay loaded, because a second copy of a compiled module may crash.
+    """
+    real = builtins.__import__
+
+    def without(name: str, *others: Any, **options: Any) -> Any:
+        if name.partition(".")[0] == package:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=package)
+        return real(name, *others, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)

@@ -60,15 +60,15 @@ def regressor_class(target: str) -> type[Any]:
     if not PUBLIC.fullmatch(target) or NOT_IMPORTED & set(module.split(".")):
         raise ValueError(form)
     try:
-        loaded = import_module(module)
+        from sklearn.base import BaseEstimator, RegressorMixin
     except ModuleNotFoundError as error:
-        if error.name == "sklearn":
-            raise MissingDependencyError(
-                f"{target} needs scikit-learn: pip install scikit-learn"
-            ) from error
+        raise MissingDependencyError(
+            f"{target} needs scikit-learn: pip install scikit-learn"
+        ) from error
+    try:
+        loaded = import_module(module)
+    except ModuleNotFoundError:
         raise ValueError(f"{form}; there is no module {module!r}") from None
-    from sklearn.base import BaseEstimator, RegressorMixin
-
     found = getattr(loaded, name, None)
     if found is None:
         near = nearest_name(name, dir(loaded)).rstrip(".")
