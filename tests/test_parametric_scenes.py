@@ -17,6 +17,7 @@ from mor_bench.errors import (
     StoreError,
     UnsupportedSceneError,
 )
+from mor_bench.export.npz_file import export_numpy
 from mor_bench.measure.discretisation_error import refine
 from mor_bench.measure.query_cost import cost_of
 from mor_bench.model_file import read_model, write_model
@@ -283,3 +284,9 @@ def test_a_fresh_test_set_has_parameters_of_its_own(data: Dataset) -> None:
 def test_the_discretisation_error_is_refused() -> None:
     with pytest.raises(UnsupportedSceneError, match="for one body only"):
         refine(DatasetSpec.model_validate(content()))
+
+
+def test_samples_with_parameters_have_no_numpy_file(data: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(UnsupportedSceneError, match="cannot hold the sampled parameters"):
+        export_numpy(data, tmp_path / "mine.npz")
+    assert not list(tmp_path.iterdir())

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import InvalidInputError
+from mor_bench.errors import InvalidInputError, UnsupportedSceneError
 from mor_bench.export.output_path import new_file
 from mor_bench.export.toml_text import quoted
 from mor_bench.scene.scene import Scene
@@ -31,8 +31,14 @@ def export_numpy(data: Dataset, out: str | Path) -> list[Path]:
     InvalidInputError
         If the file's name does not end in .npz, or cannot be the name of a dataset, or one of the
         two files exists.
+    UnsupportedSceneError
+        If the scene samples parameters, which the file has no room for.
     """
     out = new_dataset_file(out)
+    if names := data.scene.parameter_names:
+        raise UnsupportedSceneError(
+            f"{data.scene.name}: an NPZ file cannot hold the sampled parameters {', '.join(names)}."
+        )
     return write_snapshots(out, snapshot_arrays(data), _toml(data.scene, out.name))
 
 
