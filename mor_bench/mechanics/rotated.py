@@ -267,19 +267,25 @@ class RotatedRest:
         return z if self._pattern.completion is None else self._pattern.cut(z.T).T.copy()
 
     @cached_property
-    def _soft(self) -> NDArray[np.float32]:
+    def _soft(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         force = np.random.default_rng(0).normal(size=(1, 3 * len(self._place)))
         response = force.astype(np.float32)
         with uncounted():
             self._factor.solve_in_place(response)
-        return np.asarray(response[0] / np.abs(response).max())
+        size = np.abs(response).max()
+        return response[0] / size, np.asarray(force[0] / size, dtype=np.float32)
 
-    def soft(self, rotations: Array) -> Array:
-        """Return the rotated response at rest to a random force, scaled to size one."""
-        count(multiply_adds=4 * len(self._soft))
-        z = np.empty(len(self._soft))
-        _turn(self._place, rotations, 1.0, self._soft, z)
-        return self._pattern.cut(z)
+    def soft(self, rotations: Array) -> tuple[Array, Array]:
+        """Return the rotated response at rest to a random force, scaled to size one, and the force.
+
+        The force is rotated and scaled like the response.
+        """
+        response, force = self._soft
+        count(multiply_adds=8 * len(response))
+        z, f = np.empty(len(response)), np.empty(len(response))
+        _turn(self._place, rotations, 1.0, response, z)
+        _turn(self._place, rotations, 1.0, force, f)
+        return self._pattern.cut(z), self._pattern.cut(f)
 
     def at(self, q: Array | None) -> Turned:
         """Return the preconditioner of a tangent at displacements q (n,), m."""
