@@ -180,5 +180,7 @@ def test_wrong_steps_are_refused(loads: dict[str, Any], message: str) -> None:
     with pytest.raises(SpecError, match=message):
         n_samples_of(path_scene(**loads))
     tool = {"kind": "displacement", "region": "x-max", "magnitude_m": [0.0, 0.1], "samples": 20}
-    with pytest.raises(SpecError, match=r"unknown key `loads.steps`"):
+    with pytest.raises(SpecError, match=r"`loads.steps`: it must be 1 or left out.*got 2"):
         load_scene(bar(loads={**tool, "steps": 2}))
+    once = load_scene(bar(loads={**tool, "steps": 1})).spec.model_dump(mode="json")
+    assert "steps" not in once["loads"]
