@@ -107,7 +107,7 @@ class ContactPoints:
 
     def touch(self, moved: Array, motion: Array) -> Touch:
         """Return the contact of points that moved by (n, 3), m, and an instrument by (3,), m."""
-        gaps, normals, curvatures = self._instrument.gaps(self._points + (moved - motion))
+        gaps, normals, curvatures = self._instrument.gaps(self._relative(moved, motion))
         count(multiply_adds=GAP_MULTIPLY_ADDS * len(gaps))
         points = np.flatnonzero(gaps < 0)
         depth, normals, stiffness = -gaps[points], normals[points], self.surface.stiffness[points]
@@ -118,7 +118,11 @@ class ContactPoints:
     def normals(self, moved: Array, motion: Array) -> Array:
         """Return the instrument's normals (n, 3) at points that moved by (n, 3), m."""
         count(multiply_adds=GAP_MULTIPLY_ADDS * len(moved))
-        return self._instrument.gaps(self._points + (moved - motion))[1]
+        return self._instrument.gaps(self._relative(moved, motion))[1]
+
+    def _relative(self, moved: Array, motion: Array) -> Array:
+        """Return the points (n, 3), m, as seen by the instrument."""
+        return self._points + (moved - motion)
 
 
 def motion_of(scene: Scene, given: Array) -> Array:

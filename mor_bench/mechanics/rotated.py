@@ -97,9 +97,7 @@ def _to_rotation(Q):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def nodal_rotations(u, cell_nodes, centre_gradients, volumes, rotations):
-    """Compute each free node's rotation from the mean deformation gradient of its cells.
-
-    The mean is weighted by volume.
+    """Compute each free node's rotation from the mean over volume of its deformation gradient.
 
     Parameters
     ----------
@@ -267,25 +265,20 @@ class RotatedRest:
         return z if self._pattern.completion is None else self._pattern.cut(z.T).T.copy()
 
     @cached_property
-    def _soft(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        force = np.random.default_rng(0).normal(size=(1, 3 * len(self._place)))
-        response = force.astype(np.float32)
+    def _soft(self) -> NDArray[np.float32]:
+        force = np.random.default_rng(0).normal(size=(1, 3 * len(self._place))).astype(np.float32)
+        response = force.copy()
         with uncounted():
             self._factor.solve_in_place(response)
-        size = np.abs(response).max()
-        return response[0] / size, np.asarray(force[0] / size, dtype=np.float32)
+        return np.asarray(np.concatenate([response, force]) / np.abs(response).max())
 
     def soft(self, rotations: Array) -> tuple[Array, Array]:
-        """Return the rotated response at rest to a random force, scaled to size one, and the force.
-
-        The force is rotated and scaled like the response.
-        """
-        response, force = self._soft
-        count(multiply_adds=8 * len(response))
-        z, f = np.empty(len(response)), np.empty(len(response))
-        _turn(self._place, rotations, 1.0, response, z)
-        _turn(self._place, rotations, 1.0, force, f)
-        return self._pattern.cut(z), self._pattern.cut(f)
+        """Return the rotated response at rest to a random force, of size one, and this force."""
+        count(multiply_adds=4 * self._soft.size)
+        z = np.empty(self._soft.shape)
+        for vector, out in zip(self._soft, z, strict=True):
+            _turn(self._place, rotations, 1.0, vector, out)
+        return self._pattern.cut(z[0]), self._pattern.cut(z[1])
 
     def at(self, q: Array | None) -> Turned:
         """Return the preconditioner of a tangent at displacements q (n,), m."""
