@@ -183,7 +183,7 @@ class ContactMap:
 
     def _moved(self, q: Array) -> Array:
         count(multiply_adds=3 * self._values.size)
-        return np.einsum("pa,pai->pi", self._values, np.append(q, 0.0)[self.dofs])
+        return np.asarray(np.einsum("pa,pai->pi", self._values, np.append(q, 0.0)[self.dofs]))
 
     def force(self, touch: Touch) -> Array:
         """Return the forces (n,), N, on the body."""
