@@ -253,11 +253,13 @@ def cantilever_spec(
 ) -> dict[str, Any]:
     """Return a dataset of a beam along x, clamped at its start and loaded at its end.
 
-    Young's modulus is 12 kPa, so EI is 1000 N m² if the beam is 1 m wide and high.
+    Young's modulus is 12 kPa, so EI is 1000 N m² if the beam is 1 m wide and high. The integration
+    is that of H8, or "T10" for tetrahedra with ten nodes.
     """
+    quadratic = {"element": "tetrahedron", "order": 2}
     return {
         "geometry": {"shape": "box", "size_m": size, "cells": cells},
-        "discretisation": {"integration": integration},
+        "discretisation": quadratic if integration == "T10" else {"integration": integration},
         "material": material_table(law, 12e3, poisson),
         "supports": [{"region": "x-min"}],
         "loads": {

@@ -28,7 +28,13 @@ TURNING = 1e-2
 PROBE_FROM = 0.1
 """Residual, relative to the load, at which probing begins; the tangent hardly changes later."""
 PROBES = 3
-"""Number of directions, soft ones first, that are probed for negative curvature."""
+"""Most directions, soft ones first, that are probed for negative curvature."""
+STIFF = 0.5
+"""Lowest curvature of two probes, relative to P, from which no third is needed.
+
+It misses no buckling that three probes notice, also of a strut beside a softer body. One probe with
+little spread of its curvatures missed some.
+"""
 PROBE_LENGTH = 1e-6
 """Length of the finite difference along a probe, relative to the body."""
 TOGETHER = 16
@@ -39,40 +45,51 @@ Correcting = Generator[Asked, list[Array], Attempt]
 """A pass as a generator, which yields residuals with rotations and receives the corrections."""
 
 
-class _Probes:
+class Probes:
     """A search for negative curvature along the iteration, with one more residual per step.
 
     The first probe is the rotated response to a random force, which soft modes dominate. Each next
     probe is P⁻¹K of the previous one, as in Lanczos' method. Products with K are differences of
-    the internal force.
+    the internal force. Two probes are enough if their curvatures relative to P are far from zero.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         self._probes: list[Array] = []
         self._products: list[Array] = []
+        self._pulls: list[Array] = []
+        self.complete = False
 
     @property
     def begun(self) -> bool:
         return bool(self._probes)
 
     @property
-    def complete(self) -> bool:
-        return len(self._probes) >= PROBES
-
-    @property
     def wanted(self) -> Array:
         """The residual whose correction is the next probe."""
         return self._products[-1]
 
-    def add(self, answer: Array, q: Array, force: Array) -> None:
-        """Add a probe from its correction, the state q and the internal force at q."""
-        for probe in self._probes:
-            answer = answer - float(probe @ answer) / float(probe @ probe) * probe
+    def add(self, answer: Array, pull: Array, q: Array, force: Array) -> None:
+        """Add a probe from its correction, P times it, the state q and the internal force at q."""
+        for probe, of_probe in zip(self._probes, self._pulls, strict=True):
+            part = float(probe @ answer) / float(probe @ probe)
+            answer, pull = answer - part * probe, pull - part * of_probe
         length = PROBE_LENGTH * self._problem.extent / (float(np.abs(answer).max()) or 1.0)
         probe = length * answer
         self._probes.append(probe)
+        self._pulls.append(length * pull)
         self._products.append(self._problem.force(q + probe).force - force)
+        n = len(self._probes)
+        self.complete = n >= PROBES or (n == 2 and self._stiff)
+
+    @property
+    def _stiff(self) -> bool:
+        """True if the lowest curvature of the probes, relative to P, is far from zero."""
+        probes, products = np.array(self._probes), np.array(self._products)
+        size, matrix = probes @ np.array(self._pulls).T, probes @ products.T
+        if not (np.isfinite(matrix).all() and float(np.linalg.det(size)) > 0):
+            return False
+        return float(np.linalg.eigvals(np.linalg.solve(size, matrix)).real.min()) >= STIFF
 
     @property
     def convex(self) -> bool:
@@ -110,7 +127,7 @@ def accelerated(
 ) -> Correcting:
     """Iterate with Anderson acceleration; reject a solution if negative curvature was seen."""
     load_norm = float(np.linalg.norm(load))
-    memory, probes = Anderson(problem.n_unknowns), _Probes(problem)
+    memory, probes = Anderson(problem.n_unknowns), Probes(problem)
     rotations = inverse.turned(start)
     q = (yield [(load, rotations)])[0] if start is None else start.copy()
     if start is None and is_linear(problem, q):
@@ -133,11 +150,11 @@ def accelerated(
         asked = [(residual, rotations)]
         if size <= PROBE_FROM * load_norm and not probes.complete:
             if not probes.begun:
-                probes.add(inverse.soft(rotations), q, state.force)
+                probes.add(*inverse.soft(rotations), q, state.force)
             asked.append((probes.wanted, rotations))
         correction, *answers = yield asked
         for answer in answers:
-            probes.add(answer, q, state.force)
+            probes.add(answer, probes.wanted, q, state.force)
         if size > 0.5 * before and is_round_off(correction, q, problem.extent):
             break
         before = size
@@ -148,9 +165,10 @@ def accelerated(
     if not (min_det > 0 and memory.convex):
         return Attempt(q, min_det, iteration, converged=False)
     if not probes.begun:
-        probes.add(inverse.soft(rotations), q, state.force)
+        probes.add(*inverse.soft(rotations), q, state.force)
     while not probes.complete:
-        probes.add((yield [(probes.wanted, rotations)])[0], q, state.force)
+        (answer,) = yield [(probes.wanted, rotations)]
+        probes.add(answer, probes.wanted, q, state.force)
     return Attempt(q, min_det, iteration, converged=probes.convex)
 
 

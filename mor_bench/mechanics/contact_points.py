@@ -107,13 +107,22 @@ class ContactPoints:
 
     def touch(self, moved: Array, motion: Array) -> Touch:
         """Return the contact of points that moved by (n, 3), m, and an instrument by (3,), m."""
-        gaps, normals, curvatures = self._instrument.gaps(self._points + (moved - motion))
+        gaps, normals, curvatures = self._instrument.gaps(self._relative(moved, motion))
         count(multiply_adds=GAP_MULTIPLY_ADDS * len(gaps))
         points = np.flatnonzero(gaps < 0)
         depth, normals, stiffness = -gaps[points], normals[points], self.surface.stiffness[points]
         forces = (stiffness * depth)[:, None] * normals
         energy = 0.5 * float(stiffness @ depth**2)
         return Touch(points, forces, energy, depth, normals, curvatures[points], stiffness)
+
+    def normals(self, moved: Array, motion: Array) -> Array:
+        """Return the instrument's normals (n, 3) at points that moved by (n, 3), m."""
+        count(multiply_adds=GAP_MULTIPLY_ADDS * len(moved))
+        return self._instrument.gaps(self._relative(moved, motion))[1]
+
+    def _relative(self, moved: Array, motion: Array) -> Array:
+        """Return the points (n, 3), m, as seen by the instrument."""
+        return self._points + (moved - motion)
 
 
 def motion_of(scene: Scene, given: Array) -> Array:
@@ -166,9 +175,15 @@ class ContactMap:
 
     def touch(self, q: Array, motion: Array) -> Touch:
         """Return the contact at displacements q (n,), m, of the body and (3,), m, of its motion."""
-        moved = np.einsum("pa,pai->pi", self._values, np.append(q, 0.0)[self.dofs])
+        return self.points.touch(self._moved(q), motion)
+
+    def normals(self, q: Array, motion: Array) -> Array:
+        """Return the instrument's normals (n_points, 3); arguments as in `touch`."""
+        return self.points.normals(self._moved(q), motion)
+
+    def _moved(self, q: Array) -> Array:
         count(multiply_adds=3 * self._values.size)
-        return self.points.touch(moved, motion)
+        return np.asarray(np.einsum("pa,pai->pi", self._values, np.append(q, 0.0)[self.dofs]))
 
     def force(self, touch: Touch) -> Array:
         """Return the forces (n,), N, on the body."""

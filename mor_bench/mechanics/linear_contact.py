@@ -85,13 +85,14 @@ class LinearContact:
         reached, forces = 0.0, np.zeros(len(self._dofs))
         while reached < 1.0:
             place = 1.0 if reached + 1.001 * step > 1.0 else reached + step
+            before = self._contact.normals(self._flexibility @ forces, reached * motion)
             found = self._settled(place * motion, forces)
-            if found is not None:
+            if found is not None and not self._passed(found, place * motion, before):
                 reached, forces = place, found
             elif (step := 0.5 * step) < LEAST_STEP:
                 raise NoEquilibriumError(
-                    f"{self.scene.name}: linear elasticity with contact did not converge in "
-                    f"{MAX_ITERATIONS} iterations, at {reached:.0%} of the motion."
+                    f"{self.scene.name}: linear elasticity with contact has no solution on this "
+                    f"side of the instrument, beyond {reached:.0%} of the motion."
                 )
         return forces
 
@@ -120,6 +121,16 @@ class LinearContact:
                     break
             forces, u = other, moved
         return None
+
+    def _passed(self, forces: Array, motion: Array, before: Array) -> bool:
+        """Return whether the surface got past the instrument's centre since these normals (n, 3).
+
+        The potential has a second minimum there, with the surface on the other side.
+        """
+        u = self._flexibility @ forces
+        count(multiply_adds=self._flexibility.size)
+        touch = self._contact.touch(u, motion)
+        return bool(((touch.normals * before[touch.points]).sum(axis=1) < 0).any())
 
     def _newton(self, touch: Touch, wanted: Array, excess: Array, curved: bool) -> Array:
         """Return the forces of the equilibrium with the contact linearised."""

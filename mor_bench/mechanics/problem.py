@@ -32,8 +32,11 @@ class Turning(Protocol):
         """Return the nodal rotations of the body at q; the identity for None."""
         ...
 
-    def soft(self, rotations: Array) -> Array:
-        """Return the rotated response at rest to a random force; soft modes dominate it."""
+    def soft(self, rotations: Array) -> tuple[Array, Array]:
+        """Return the rotated response at rest to a random force, and this force.
+
+        Soft modes dominate the response.
+        """
         ...
 
     def bent(self, q: Array) -> Array | None:

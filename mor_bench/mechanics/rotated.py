@@ -97,9 +97,7 @@ def _to_rotation(Q):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def nodal_rotations(u, cell_nodes, centre_gradients, volumes, rotations):
-    """Compute each free node's rotation from the mean deformation gradient of its cells.
-
-    The mean is weighted by volume.
+    """Compute each free node's rotation from the mean over volume of its deformation gradient.
 
     Parameters
     ----------
@@ -268,18 +266,19 @@ class RotatedRest:
 
     @cached_property
     def _soft(self) -> NDArray[np.float32]:
-        force = np.random.default_rng(0).normal(size=(1, 3 * len(self._place)))
-        response = force.astype(np.float32)
+        force = np.random.default_rng(0).normal(size=(1, 3 * len(self._place))).astype(np.float32)
+        response = force.copy()
         with uncounted():
             self._factor.solve_in_place(response)
-        return np.asarray(response[0] / np.abs(response).max())
+        return np.asarray(np.concatenate([response, force]) / np.abs(response).max())
 
-    def soft(self, rotations: Array) -> Array:
-        """Return the rotated response at rest to a random force, scaled to size one."""
-        count(multiply_adds=4 * len(self._soft))
-        z = np.empty(len(self._soft))
-        _turn(self._place, rotations, 1.0, self._soft, z)
-        return self._pattern.cut(z)
+    def soft(self, rotations: Array) -> tuple[Array, Array]:
+        """Return the rotated response at rest to a random force, of size one, and this force."""
+        count(multiply_adds=4 * self._soft.size)
+        z = np.empty(self._soft.shape)
+        for vector, out in zip(self._soft, z, strict=True):
+            _turn(self._place, rotations, 1.0, vector, out)
+        return self._pattern.cut(z[0]), self._pattern.cut(z[1])
 
     def at(self, q: Array | None) -> Turned:
         """Return the preconditioner of a tangent at displacements q (n,), m."""

@@ -31,3 +31,13 @@ Magnitude = Annotated[
 
 Steps = Annotated[int, Field(ge=1, le=1000, exclude_if=lambda value: value == 1)]
 """Number of equal steps in which each load is applied; every step is a sample."""
+
+
+def _at_once(value: int) -> int:
+    if value != 1:
+        raise ValueError("it must be 1 or left out, as only forces and pressures act in steps")
+    return value
+
+
+AtOnce = Annotated[int, AfterValidator(_at_once), Field(exclude_if=lambda value: value == 1)]
+"""The steps of a tool or an instrument, whose displacement is one sample."""

@@ -16,7 +16,7 @@ from mor_bench.specs.base import (
     in_range,
 )
 from mor_bench.specs.instrument_spec import Direction, Instrument
-from mor_bench.specs.load_ranges import SEED_STEP, LoadKind, Magnitude, Sampling, Steps
+from mor_bench.specs.load_ranges import SEED_STEP, AtOnce, LoadKind, Magnitude, Sampling, Steps
 from mor_bench.specs.region_spec import Region
 
 
@@ -169,13 +169,13 @@ class Motion(StrictModel):
     simultaneous: ClassVar[int] = 1
     samples_per_patch: ClassVar[int | None] = None
     min_distance_m: ClassVar[float | None] = None
-    steps: ClassVar[int] = 1
     unit: ClassVar[str] = "m"
 
     region: Region
     kind: Literal["displacement"]
     samples: Count
     magnitude_m: Magnitude
+    steps: AtOnce = 1
     sampling: Sampling = "random"
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
 
@@ -261,7 +261,6 @@ class Contact(StrictModel):
 
     simultaneous: ClassVar[int] = 1
     samples_per_patch: ClassVar[int | None] = None
-    steps: ClassVar[int] = 1
     min_distance_m: ClassVar[float | None] = None
     unit: ClassVar[str] = "m"
 
@@ -272,6 +271,7 @@ class Contact(StrictModel):
     spread_deg: Annotated[float, Field(ge=0, le=180)] = 0.0
     magnitude_m: Magnitude
     samples: Count
+    steps: AtOnce = 1
     penalty_n_m3: Annotated[Positive, in_range(1e-12, 1e24, "N/m³")] | None = None
     sampling: Sampling = "random"
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0

@@ -28,6 +28,23 @@ def law_speed(source: str) -> str:
     return markdown(["", *(f"{element}: {kind}" for element, kind in pairs)], body)
 
 
+def probe_cost(source: str) -> str:
+    """Show the share of the stability probes in the counted work of a solve, in %."""
+    units = {"residuals": "element_evaluations", "back-solves": "back_solves"}
+    units["multiply-adds"] = "multiply_adds"
+    return markdown(
+        ["end moves, m", "iterations", *units],
+        [
+            [
+                f"{row['amplitude_m']:g}",
+                f"{row['iterations']}",
+                *(f"{100 * row['shares'][unit]:.1f} %" for unit in units.values()),
+            ]
+            for row in content_of(source)["loads"]
+        ],
+    )
+
+
 def scaling(source: str) -> str:
     """Show the cost of a solve against the number of unknowns."""
     headings = ["unknowns", "rest state", "set-up, s", "solve, ms", "iterations", "peak MB"]

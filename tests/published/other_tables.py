@@ -12,7 +12,13 @@ from mor_bench.analysis.told import class_of_method
 from mor_bench.report.number_format import DASH, number
 from mor_bench.scene.scene import load_scene
 from mor_bench.specs import load_method_spec
-from tests.published.cost_tables import generation, large_deformation, law_speed, scaling
+from tests.published.cost_tables import (
+    generation,
+    large_deformation,
+    law_speed,
+    probe_cost,
+    scaling,
+)
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
 from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of, look_up
@@ -339,6 +345,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "reduced-peers": reduced_peers,
     "large-deformation": large_deformation,
     "law-speed": law_speed,
+    "probe-cost": probe_cost,
     "scaling": scaling,
     "generation": generation,
     "random-loads": random_loads,

@@ -4,6 +4,8 @@ Run ``python -m tests.verification.planted_bugs``, with ``--workers 2`` for two 
 `planted_bugs.toml`, writes `planted_bugs.json` and `PLANTED_BUGS.md` beside this file, and fails if
 a bug goes unnoticed. Only the quick tests of this folder run, unless a bug says ``slow = true``.
 ``--again`` takes a fraction of the time: it runs the recorded tests until one notices the bug.
+``--missing`` plants only bugs without a record. The record is written after every bug, so that the
+same command continues after an interruption.
 """
 
 from __future__ import annotations
@@ -17,18 +19,20 @@ import subprocess
 import sys
 import tempfile
 import tomllib
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from queue import SimpleQueue
+from threading import Lock
 
 ROOT = Path(__file__).parents[2]
 HERE = Path(__file__).parent
 FOLDER = HERE.relative_to(ROOT)
 RECORD, TABLE = HERE / "planted_bugs.json", HERE / "PLANTED_BUGS.md"
 COPIED = ("mor_bench", "tests", "datasets", "methods")
-LIMIT_S = 120
-"""Time limit for one bug's tests. A bug may make them hang; failures until then count."""
+LIMIT_S = 120.0
+"""Default time limit for one bug's tests. A bug may make them hang; failures until then count."""
 
 LONG = (
     "manufactured or elastica or cures or slender or felupe or arch or huge or nearly or conjugate "
@@ -103,7 +107,7 @@ BUGS = _read_bugs()
 
 
 def run(
-    tree: Path, tests: str | list[str], slow: bool = False, limit_s: float = LIMIT_S
+    tree: Path, tests: str | list[str], limit_s: float, slow: bool = False
 ) -> tuple[list[str], bool]:
     """Return the failing test functions of a copy, in order, and whether any test ran.
 
@@ -132,17 +136,21 @@ def run(
     return list(dict.fromkeys(failed)), " PASSED" in output or bool(failed)
 
 
-def prepare(tree: Path) -> list[str]:
-    """Copy the package and compile its kernels; return the tests that fail without a bug."""
+def prepare(tree: Path, bugs: list[Bug], limit_s: float) -> list[str]:
+    """Copy the package and compile its kernels; return the tests that fail without a bug.
+
+    The quick tests of all bugs run.
+    """
     for name in COPIED:
         shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", tree)
-    failed, ran = run(tree, SELECTIONS["ALL"], limit_s=10 * LIMIT_S)
+    wanted = " or ".join(sorted({f"({bug.selection})" for bug in bugs}))
+    failed, ran = run(tree, wanted, 10 * limit_s)
     shutil.copytree(tree / ".numba", tree / ".numba-clean")
     return failed if ran else ["no test ran"]
 
 
-def plant(bug: Bug, tree: Path, tests: list[str]) -> list[str]:
+def plant(bug: Bug, tree: Path, tests: list[str], limit_s: float) -> list[str]:
     """Return the tests that notice a bug in a copy, and restore the copy.
 
     Where tests are given, they run until one notices it, instead of the bug's own selection.
@@ -151,7 +159,7 @@ def plant(bug: Bug, tree: Path, tests: list[str]) -> list[str]:
     """
     before, planted = bug.sources(tree)
     (tree / bug.file).write_text(planted, encoding="utf-8")
-    failed, _ = run(tree, tests or bug.selection, bug.slow)
+    failed, _ = run(tree, tests or bug.selection, limit_s, bug.slow)
     (tree / bug.file).write_text(before, encoding="utf-8")
     shutil.rmtree(tree / ".numba")
     shutil.copytree(tree / ".numba-clean", tree / ".numba")
@@ -160,39 +168,48 @@ def plant(bug: Bug, tree: Path, tests: list[str]) -> list[str]:
 
 
 def plant_all(
-    bugs: list[Bug], workers: int, known: dict[str, Record]
-) -> dict[str, list[str]] | None:
-    """Return the tests that notice each bug in a copy; None if tests fail without a bug.
+    bugs: list[Bug],
+    workers: int,
+    limit_s: float,
+    known: dict[str, Record],
+    record: Callable[[str, list[str]], None],
+) -> bool:
+    """Record the tests that notice each bug in a copy; return False if tests fail without a bug.
 
     The known tests of a bug run until one notices it; a bug without any has its own selection.
     """
+    recording = Lock()
     with (
         tempfile.TemporaryDirectory(prefix="planted-") as folder,
         ThreadPoolExecutor(workers) as pool,
     ):
         trees = [Path(folder) / str(number) for number in range(workers)]
-        failed = {test for tests in pool.map(prepare, trees) for test in tests}
+        prepared = pool.map(lambda tree: prepare(tree, bugs, limit_s), trees)
+        failed = {test for tests in prepared for test in tests}
         if failed:
             print(f"fail without a bug: {sorted(failed)}")
-            return None
+            return False
         free: SimpleQueue[Path] = SimpleQueue()
         for tree in trees:
             free.put(tree)
 
-        def plant_somewhere(bug: Bug) -> list[str]:
+        def plant_somewhere(bug: Bug) -> None:
             tree = free.get()
             try:
-                return plant(bug, tree, known[bug.name].tests if bug.name in known else [])
+                before = known[bug.name].tests if bug.name in known else []
+                tests = plant(bug, tree, before, limit_s)
             finally:
                 free.put(tree)
+            with recording:
+                record(bug.name, tests)
 
-        noticed = pool.map(plant_somewhere, bugs)
-        return dict(zip([bug.name for bug in bugs], noticed, strict=True))
+        list(pool.map(plant_somewhere, bugs))
+        return True
 
 
 def write(records: dict[str, Record]) -> None:
-    """Write the record and the table for readers."""
-    content = {name: asdict(record) for name, record in records.items()}
+    """Write the record and the table for readers, in the order of the list of bugs."""
+    content = {bug.name: asdict(records[bug.name]) for bug in BUGS if bug.name in records}
     RECORD.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     lines = [
         "# Planted bugs",
@@ -209,7 +226,9 @@ def write(records: dict[str, Record]) -> None:
         "|---|---|---|---|---|",
     ]
     for bug in BUGS:
-        record = records[bug.name]
+        record = records.get(bug.name)
+        if record is None:
+            continue
         law = _law(record.tests[0]) if record.tests else "**unnoticed**"
         again = _law(record.again) if record.again else "not run"
         again += ", slow" * (bug.slow and bool(record.again))
@@ -226,6 +245,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--workers", type=int, default=1, help="number of copies used at once")
     parser.add_argument(
+        "--limit-s",
+        type=float,
+        default=LIMIT_S,
+        help="time limit for the tests of one bug, in seconds; more on a busy machine",
+    )
+    parser.add_argument(
         "--only",
         nargs="+",
         default=[],
@@ -236,23 +261,32 @@ def main() -> int:
         action="store_true",
         help="run only the tests on record, until one notices the bug; keep the record of others",
     )
+    parser.add_argument(
+        "--missing",
+        action="store_true",
+        help="plant only bugs that no test on record notices; keep the record of others",
+    )
     arguments = parser.parse_args()
+    records = Record.read()
     wanted = arguments.only or [""]
     bugs = [bug for bug in BUGS if any(text in bug.name for text in wanted)]
+    if arguments.missing:
+        bugs = [bug for bug in bugs if bug.name not in records or not records[bug.name].tests]
     for bug in bugs:
         bug.sources()
-    known = Record.read()
-    found = plant_all(bugs, arguments.workers, known if arguments.again else {})
-    if found is None:
-        return 1
-    records = {bug.name: known.get(bug.name, Record([])) for bug in BUGS}
-    for name, tests in found.items():
+
+    def record(name: str, tests: list[str]) -> None:
         if arguments.again and tests:
-            records[name] = Record(records[name].tests or tests, tests[0])
+            known = records.get(name, Record([])).tests
+            records[name] = Record(known or tests, tests[0])
         else:
             records[name] = Record(tests)
-    write(records)
-    unnoticed = [name for name, record in records.items() if not record.tests]
+        write(records)
+
+    known = dict(records) if arguments.again else {}
+    if not plant_all(bugs, arguments.workers, arguments.limit_s, known, record):
+        return 1
+    unnoticed = [bug.name for bug in BUGS if not records.get(bug.name, Record([])).tests]
     for name in unnoticed:
         print(f"unnoticed: {name}")
     return int(bool(unnoticed))

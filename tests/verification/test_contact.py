@@ -266,6 +266,15 @@ def test_linear_elasticity_balances_the_contact_at_large_motions(
         assert placed.reaction(u)[2] > 1.0
 
 
+def test_linear_elasticity_keeps_the_surface_on_its_side_of_a_ball() -> None:
+    """Beyond the ball's centre, the potential has another minimum: the ball pushes from below."""
+    scene = block({"sphere": {"radius_m": 0.3, "centre_m": [0.5, 0.5, 0.8]}})
+    model, response = ContactModel(scene), LinearContact(scene)
+    for motion in np.array([[0.1, 0.03, -0.2], [0.2, 0.06, -0.4], [0.1, 0.03, -0.45]]):
+        u = response.respond(given(scene, motion).reshape(1, -1))[0, scene.free_dofs]
+        assert model.under(motion).reaction(u) @ motion < 0
+
+
 def test_an_instrument_that_barely_touches_needs_no_smaller_steps() -> None:
     """The energy of tiny strains is round-off, which must not stop the descent."""
     scene = block({"sphere": {"radius_m": 5.0, "centre_m": [0.45, 0.55, 5.5]}})

@@ -22,7 +22,7 @@ from mor_bench.snapshots.generate import generate, shard_path
 from mor_bench.snapshots.load_paths import solve_paths
 from mor_bench.snapshots.sampling import draw_loads, n_samples_of
 from mor_bench.snapshots.split import split_samples
-from mor_bench.specs import load_generated_spec
+from mor_bench.specs import Motion, load_generated_spec
 
 from .test_pressure import content as bar
 from .test_several_loads import FORCE, PRESSURE, together
@@ -180,5 +180,6 @@ def test_wrong_steps_are_refused(loads: dict[str, Any], message: str) -> None:
     with pytest.raises(SpecError, match=message):
         n_samples_of(path_scene(**loads))
     tool = {"kind": "displacement", "region": "x-max", "magnitude_m": [0.0, 0.1], "samples": 20}
-    with pytest.raises(SpecError, match=r"unknown key `loads.steps`"):
+    with pytest.raises(SpecError, match=r"`loads.steps`: it must be 1 or left out.*got 2"):
         load_scene(bar(loads={**tool, "steps": 2}))
+    assert "steps" not in Motion.model_validate({**tool, "steps": 1}).model_dump()

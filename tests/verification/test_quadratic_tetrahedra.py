@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from mor_bench.errors import SpecError
 from mor_bench.hard_cases.setups import cantilever, cantilever_spec, of_order, tip
+from mor_bench.mechanics import model as model_module
 from mor_bench.mechanics.elements import T10, shape_gradients
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.multigrid import MultigridFactor
 from mor_bench.scene.interpolation import interpolation_matrix, quadratic
 from mor_bench.scene.loads import Facets, cut_patches
 from mor_bench.scene.mesh import Mesh, box_mesh, corners_of
@@ -22,6 +24,7 @@ from mor_bench.scene.triangle_rules import (
     DEGREE_4_WEIGHTS,
     quadratic_triangle,
 )
+from mor_bench.specs import SolverName
 
 from .laws_and_elements import LAWS
 
@@ -60,6 +63,21 @@ def test_quadratic_tetrahedra_do_not_lock(poisson: float, law: str) -> None:
     expected = tip(cantilever([4.0, 1.0, 1.0], [12, 3, 3], poisson, "selective", law), -50.0)[2]
     assert found[0] / expected == pytest.approx(1.0, abs=0.06)
     assert found[1] / expected < 0.3
+
+
+@pytest.mark.parametrize("solver", ["auto", "rotated-pcg"])
+def test_multigrid_solves_for_quadratic_tetrahedra(
+    solver: SolverName, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body = scene()
+    expected = tip(FullOrderModel(body), -50.0)
+    monkeypatch.setattr(model_module, "MAX_BAND_ENTRIES", 0)
+    model = FullOrderModel(body, solver)
+    factor, rhs = model.rest_factor, np.random.default_rng(0).normal(size=model.n_unknowns)
+    assert isinstance(factor, MultigridFactor)
+    product = model.assembler.pattern.symmetric(model.rest_tangent) @ factor.solve(rhs)
+    np.testing.assert_allclose(product, rhs, rtol=0, atol=1e-7 * np.abs(rhs).max())
+    np.testing.assert_allclose(tip(model, -50.0), expected, rtol=1e-5)
 
 
 def test_shape_functions_are_one_at_their_node_and_zero_at_the_others() -> None:

@@ -9,14 +9,18 @@ from numpy.typing import NDArray
 import mor_bench
 from mor_bench.errors import LimitPointError, SolverError
 from mor_bench.hard_cases.setups import LAW, LIMIT_PA, Arch, confined_column, dense, make_arch
+from mor_bench.mechanics import accelerated
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import solve_equilibrium
+from mor_bench.mechanics.problem import Attempt
 from mor_bench.mechanics.stability import (
     LimitPoint,
     limit_load,
     lowest_tangent_eigenvalue,
     solve_on_path,
 )
+from mor_bench.scene.materials import NeoHookean
+from mor_bench.scene.mesh import Mesh, box_mesh
 from mor_bench.scene.scene import Scene
 
 from .scenes import relative_residual
@@ -128,3 +132,53 @@ def test_an_unstable_equilibrium_is_never_returned_by_the_accelerated_pass() -> 
         solution = model.solve(load, start)
         assert lowest_tangent_eigenvalue(model, solution.displacement) > 0
         assert relative_residual(model, load, solution.displacement) <= 1e-8
+
+
+class NoProbes:
+    """Stability probes that accept every state."""
+
+    begun = complete = convex = True
+
+    def __init__(self, problem: object) -> None: ...
+
+
+def beams(thickness: float, beside: float) -> tuple[FullOrderModel, Array]:
+    """Return a beam of 2 m with another beside it, and a load that compresses the first by 1 N.
+
+    The second is longer by a factor, and therefore softer. It carries no load.
+    """
+    first = box_mesh((2.0, 0.5, thickness), (12, 2, 2))
+    second = box_mesh((2.0 * beside, 0.5, thickness), (12, 2, 2))
+    points = np.concatenate([first.points, second.points + np.array([0.0, 2.0, 0.0])])
+    mesh = Mesh(points, np.concatenate([first.cells, second.cells + first.n_nodes]))
+    spec = mor_bench.load_scene("beam-tiny").spec
+    scene = Scene(spec, mesh, NeoHookean(500.0, 0.3), np.flatnonzero(points[:, 0] == 0))
+    end = (points[:, 0] == 2.0) & (points[:, 1] < 1.0)
+    corners = end[mesh.cells] & (end[mesh.cells].sum(axis=1) == 4)[:, None]
+    load = np.zeros_like(points)
+    load[:, 0] = -np.bincount(mesh.cells[corners], minlength=len(points)) / corners.sum()
+    return FullOrderModel(scene), load.ravel()[scene.free_dofs]
+
+
+@pytest.mark.parametrize(("thickness", "beside"), [(0.35, 1.0), (0.3, 2.5), (0.3, 6.0)])
+def test_buckling_is_noticed_under_a_symmetric_load_also_beside_a_softer_body(
+    thickness: float, beside: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing pushes a straight column to the side: only the probes see that it is unstable."""
+    model, push = beams(thickness, beside)
+    euler = np.pi**2 * 500.0 * 0.5 * thickness**3 / 12 / 4 / 2.0**2
+
+    def straight(factor: float, start: Array | None) -> Attempt:
+        load = factor * euler * push
+        one = accelerated.accelerated(model, model.turned_rest, load, start, 1e-8)
+        ((_, found),) = accelerated.run_in_step(model.turned_rest, iter([one]))
+        return found
+
+    q = None
+    for factor in (0.5, 0.9, 1.1, 1.3):
+        with monkeypatch.context() as patch:
+            patch.setattr(accelerated, "Probes", NoProbes)
+            q = straight(factor, q).q
+        stable = lowest_tangent_eigenvalue(model, q) > 0
+        assert stable == (factor < 1.2)
+        assert straight(factor, q).converged == stable
