@@ -1,4 +1,4 @@
-"""Training states of a cubature: projected snapshots, or equilibria in the span of the modes."""
+"""Training states of hyper-reduction: projected snapshots, or equilibria in the modes' span."""
 
 from __future__ import annotations
 
@@ -37,11 +37,6 @@ def training_rows(displacements: Array, n_snapshots: int) -> NDArray[np.int64]:
     moved = np.flatnonzero(displacements.any(axis=1))
     chosen = np.unique(np.linspace(0, len(moved) - 1, n_snapshots).astype(int))
     return np.asarray(moved[chosen])
-
-
-def training_coordinates(displacements: Array, modes: Array, n_snapshots: int) -> Array:
-    """Return coordinates (n, r) of the `training_rows`. The modes are orthonormal."""
-    return np.asarray(displacements[training_rows(displacements, n_snapshots)] @ modes)
 
 
 def projected_states(scene: Scene, samples: Snapshots, modes: Array, n_snapshots: int) -> States:

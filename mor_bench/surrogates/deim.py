@@ -24,13 +24,20 @@ from mor_bench.scene.dofs import dofs_of_nodes
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.surrogate import Surrogate
-from mor_bench.surrogates.cubature_states import training_coordinates
+from mor_bench.surrogates.cubature_states import (
+    are_far,
+    equilibria,
+    projected_states,
+    training_rows,
+)
 from mor_bench.surrogates.hyper_reduced import nodal, reduced_points
 
 Array = NDArray[np.float64]
 
 FORCE_MODES = (10, 20, 40, 80, 160)
 """Candidates for "auto"."""
+STEP = 1e-5
+"""Step of the central difference, relative to the size of the body."""
 
 
 @dataclass(eq=False)
@@ -63,6 +70,10 @@ class InterpolatedPOD(Surrogate):
         forces of single cells (unassembled DEIM). "cells": all entries of the cells that
         "cell-dofs" chooses; least squares fits the basis to them (gappy POD, Everson & Sirovich
         1995). It costs the same, and is the most accurate and stable of the three.
+    states : {"projected", "equilibria", "as-needed"}
+        States whose forces span U: projected snapshots, or the equilibria in the span of the modes
+        under the same loads. "as-needed": equilibria if the projected snapshots are far from them,
+        as in a nearly incompressible body.
     n_force_snapshots : int
         Training snapshots whose forces span U, spread evenly over the training set.
     tolerance : float or "auto"
@@ -75,6 +86,7 @@ class InterpolatedPOD(Surrogate):
     n_force_snapshots: Annotated[int, Field(ge=1)] = 300
     tolerance: Annotated[float, Field(gt=0, le=1)] | Auto = 1e-8
     sampling: Literal["dofs", "cell-dofs", "cells"] = "dofs"
+    states: Literal["projected", "equilibria", "as-needed"] = "as-needed"
 
     sized: ClassVar = {"n_modes": MODES, "n_force_modes": FORCE_MODES, "tolerance": TOLERANCES}
 
@@ -86,7 +98,7 @@ class InterpolatedPOD(Surrogate):
         modes = pod(displacements, self.value("n_modes")).modes
         model = FullOrderModel(scene)
         stiff = stiffness_times(model.assembler.pattern, model.rest_tangent, modes)
-        q = training_coordinates(displacements, modes, self.n_force_snapshots)
+        q = self._coordinates(scene, samples, modes)
         rest = modes.T @ stiff
         if self.sampling != "dofs":
             return {"modes": modes, "rest": rest, **self._unassembled(model, modes, q)}
@@ -99,6 +111,17 @@ class InterpolatedPOD(Surrogate):
             "interpolation": np.linalg.solve(basis[dofs].T, basis.T @ modes),
             "rest": rest,
         }
+
+    def _coordinates(self, scene: Scene, samples: Snapshots, modes: Array) -> Array:
+        """Return coordinates (n, r) of the training states."""
+        states = projected_states(scene, samples, modes, self.n_force_snapshots)
+        rows = training_rows(samples.free_displacements, self.n_force_snapshots)
+        loads = samples.free_forces[rows]
+        wanted = self.states == "equilibria"
+        if wanted or (self.states == "as-needed" and are_far(states, loads, modes)):
+            states = equilibria(states, loads, modes)
+        ((_, q),) = states()
+        return q
 
     def _unassembled(self, model: FullOrderModel, modes: Array, q: Array) -> dict[str, Any]:
         """Return entries of the forces of cells, and their part in the reduced force."""
@@ -149,22 +172,15 @@ class InterpolatedPOD(Surrogate):
         return self.subspace_.answer(forces, lambda load: self.problem_.solve(load, options))
 
 
-STEP = 1e-5
-"""Step of the central difference, relative to the size of the body."""
-
-
 def _remainders(model: FullOrderModel, modes: Array, q: Array) -> Array:
     """Return the forces of cells without their linear part, (n, n_cells n_cell_dofs), N.
 
     The linear part is a central difference. Its error, about 1e-9 of the force, is a part of the
     remainder, and the sampled force keeps its exact tangent at rest. Held dofs get zeros.
     """
-    step = STEP * model.extent
-    both = [
-        [model.assembler.cell_forces(sign * step * mode) for sign in (1, -1)] for mode in modes.T
-    ]
-    linear = np.array([(up - down).ravel() for up, down in both]) / (2 * step)
-    forces = np.array([model.assembler.cell_forces(modes @ own).ravel() for own in q])
+    step, force_of = STEP * model.extent, model.assembler.cell_forces
+    linear = np.array([(force_of(u) - force_of(-u)).ravel() for u in step * modes.T]) / (2 * step)
+    forces = np.array([force_of(modes @ own).ravel() for own in q])
     return np.asarray((forces - q @ linear) * (model.cell_dofs.ravel() < len(modes)))
 
 

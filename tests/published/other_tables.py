@@ -216,7 +216,21 @@ def refinement(source: str) -> str:
     return markdown([*headings, "commit", "date"], body)
 
 
-LAWS = {"saint-venant-kirchhoff": "SVK", "neo-hookean": "neo-Hookean"}
+LAWS = {
+    "saint-venant-kirchhoff": "SVK",
+    "neo-hookean": "neo-Hookean",
+    "mooney-rivlin": "Mooney–Rivlin",
+}
+
+
+def _law(law: Mapping[str, Any]) -> str:
+    """Name a law and its constants."""
+    if "young_pa" in law:
+        return f"{LAWS[law['law']]}, {law['young_pa']:,g} Pa, ν = {law['poisson']:g}"
+    moduli = (
+        f"{key.removesuffix('_pa')} = {value:g}" for key, value in law.items() if key != "law"
+    )
+    return f"{LAWS[law['law']]}, {', '.join(moduli)} Pa"
 
 
 def scenes(source: str) -> str:
@@ -241,7 +255,7 @@ def scenes(source: str) -> str:
                 f"`{path.stem}`",
                 f"{size} m, " * bool(size)
                 + f"{scene.mesh.n_cells:,} {element}, {scene.mesh.n_nodes:,} nodes",
-                f"{LAWS[law['law']]}, {law['young_pa']:,g} Pa, ν = {law['poisson']:g}",
+                _law(law),
                 f"{n_loads} × {loads['kind']}, {low:g}–{high:g} {plan.unit}",
                 where,
                 f"{samples:,}",
