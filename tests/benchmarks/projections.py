@@ -119,12 +119,7 @@ def reconstruction(method: mor_bench.Surrogate, samples: Snapshots) -> Array | N
     """
     u = samples.free_displacements
     if isinstance(method, CurvedPOD):
-        offsets = np.zeros_like(u)
-        if method.static_correction:
-            loads = samples.free_forces
-            offsets = np.array([method.compliance_.solve(load) for load in loads])
-            offsets -= loads @ method._to_primary @ method.modes_.T
-        rests = [_distance(method, own) for own in u - offsets]
+        rests = [_distance(method, own) for own in u - method.offsets(samples.free_forces)]
         return np.array(rests) / np.linalg.norm(u, axis=1)
     modes = getattr(method, "modes_", None)
     if not isinstance(modes, np.ndarray) or modes.ndim != 2:

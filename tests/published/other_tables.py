@@ -13,6 +13,7 @@ from mor_bench.report.number_format import DASH, number
 from mor_bench.scene.scene import load_scene
 from mor_bench.specs import load_method_spec
 from tests.published.cost_tables import generation, large_deformation, law_speed, scaling
+from tests.published.projection_tables import projections, reconstructions
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
 from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of, look_up
@@ -367,4 +368,6 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "hard-loads": hard_loads,
     "evidence": evidence,
     "timed-work": timed_work,
+    "projections": projections,
+    "reconstructions": reconstructions,
 }
