@@ -29,6 +29,7 @@ from mor_bench.scene.other_meshes import with_cells
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.sampling import draw_loads
+from mor_bench.surrogates.cubature_states import are_far, equilibria, in_energy, projected_states
 from mor_bench.surrogates.deim import InterpolatedPOD
 from mor_bench.surrogates.ecm import EmpiricalCubaturePOD
 from mor_bench.surrogates.hpod import HyperReducedPOD
@@ -151,10 +152,11 @@ def test_the_compiled_steps_end_where_the_shared_solve_ends(tiny: Dataset, scale
     assert (failed > 0) == (scale == 100.0)
 
 
+@pytest.mark.parametrize("sampling", ["dofs", "cell-dofs", "cells"])
 def test_the_interpolated_tangent_is_the_derivative_of_the_force_and_exact_at_rest(
-    tiny: Dataset,
+    tiny: Dataset, sampling: Any
 ) -> None:
-    method = InterpolatedPOD(6, 12).fit(tiny.scene, tiny.train)
+    method = InterpolatedPOD(6, 12, sampling=sampling).fit(tiny.scene, tiny.train)
     model, modes = FullOrderModel(tiny.scene), method.modes_
     rng = np.random.default_rng(0)
     rest = method.problem_.linearise(np.zeros(6))[1]
@@ -167,6 +169,76 @@ def test_the_interpolated_tangent_is_the_derivative_of_the_force_and_exact_at_re
     assert np.abs(tangent - tangent.T).max() > 1e-6 * np.abs(tangent).max()
     stiff = np.array([modes.T @ model.force(modes @ q).force])
     assert np.linalg.norm(force - stiff) <= 0.02 * np.linalg.norm(stiff)
+
+
+def test_unassembled_interpolation_is_exact_on_its_basis_and_integrates_fewer_cells(
+    tiny: Dataset,
+) -> None:
+    """With as many force modes as snapshots, every training force is in their span."""
+    train = tiny.train[:20]
+    model = FullOrderModel(tiny.scene)
+    for sampling in ("dofs", "cell-dofs", "cells"):
+        method = InterpolatedPOD(4, 20, sampling=sampling).fit(tiny.scene, train)
+        for q in train.free_displacements @ method.modes_:
+            whole = method.modes_.T @ model.force(method.modes_ @ q).force
+            own = method.problem_.linearise(q)[0]
+            np.testing.assert_allclose(own, whole, atol=1e-7 * np.abs(whole).max())
+    cells = {
+        sampling: len(InterpolatedPOD(4, 5, sampling=sampling).fit(tiny.scene, train).cells_)
+        for sampling in ("dofs", "cell-dofs", "cells")
+    }
+    assert cells["cell-dofs"] == cells["cells"] <= 5 < cells["dofs"]
+
+
+@pytest.fixture(scope="module")
+def stiff() -> tuple[Scene, Snapshots]:
+    """A nearly incompressible body and some samples."""
+    scene = scene_of("neo-hookean", ("hexahedron", True), 0.499)
+    return scene, solved(scene, 40)
+
+
+@pytest.mark.parametrize("method", [HyperReducedPOD, EmpiricalCubaturePOD])
+def test_a_nearly_incompressible_body_needs_training_at_equilibria(
+    stiff: tuple[Scene, Snapshots], method: Any
+) -> None:
+    """Projected snapshots change the volume of cells, and their forces are no guide."""
+    scene, train = stiff
+    plain = PODGalerkin(5).fit(scene, train).predict(train.forces)
+    errors = {}
+    for matching in ("force", "energy", "as-needed"):
+        found = method(5, 1e-2, matching=matching).fit(scene, train).predict(train.forces)
+        errors[matching] = float(np.linalg.norm(found - plain) / np.linalg.norm(plain))
+    assert errors["energy"] == errors["as-needed"] < 0.05
+    assert errors["force"] > 3 * errors["energy"]
+
+
+def test_states_in_energy_coordinates_are_the_same_displacements(
+    stiff: tuple[Scene, Snapshots],
+) -> None:
+    scene, train = stiff
+    modes = PODGalerkin(5).fit(scene, train).modes_
+    projected = projected_states(scene, train, modes, 40)
+    loads = train.free_forces
+    assert are_far(projected, loads, modes)
+    ((model, q),) = equilibria(projected, loads, modes)()
+    for own, load in zip(q, loads @ modes, strict=True):
+        residual = modes.T @ model.force(modes @ own).force - load
+        assert np.linalg.norm(residual) <= 1e-4 * np.linalg.norm(load)
+    states, scaled = in_energy(lambda: iter([(model, q)]), modes)
+    ((_, again),) = states()
+    np.testing.assert_allclose(again @ scaled.T, q @ modes.T, atol=1e-12)
+    stiffness = GalerkinProblem(model.assembler, scaled).rest_tangent
+    np.testing.assert_allclose(stiffness, np.eye(5), atol=1e-9)
+
+
+def test_projected_snapshots_of_a_compressible_body_are_not_far(tiny: Dataset) -> None:
+    """So `as-needed` trains as published there, with the same cells and weights."""
+    found, published = (
+        HyperReducedPOD(5, 1e-2, matching=matching).fit(tiny.scene, tiny.train)
+        for matching in ("as-needed", "force")
+    )
+    np.testing.assert_array_equal(found.cells_, published.cells_)
+    np.testing.assert_array_equal(found.weights_, published.weights_)
 
 
 def test_deim_without_an_equilibrium_raises_a_typed_error(tiny: Dataset) -> None:
@@ -192,13 +264,19 @@ def test_points_preserve_the_reduced_force_of_the_training_samples(kind: tuple[s
 
 
 @pytest.mark.parametrize(
-    "method", [HyperReducedPOD(4, 1e-2), EmpiricalCubaturePOD(4, 1e-2), InterpolatedPOD(4, 6)]
+    "method",
+    [
+        HyperReducedPOD(4, 1e-2),
+        EmpiricalCubaturePOD(4, 1e-2),
+        InterpolatedPOD(4, 6),
+        InterpolatedPOD(4, 6, sampling="cells"),
+    ],
 )
 @pytest.mark.parametrize("forged", [-1, 10**6, "twice", 0.5])
 def test_invalid_indices_in_a_file_are_refused(tiny: Dataset, method: Any, forged: Any) -> None:
     """Kernels check no bounds."""
     state = method.fit(tiny.scene, tiny.train).arrays_
-    name = "cells" if "cells" in state else "dofs"
+    (name,) = {"cells", "dofs", "entries"} & state.keys()
     indices = state[name].copy()
     indices[0] = indices[1] if forged == "twice" else forged
     with pytest.raises(InvalidInputError, match=f"`{name}` must be different integers"):

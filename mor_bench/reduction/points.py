@@ -82,8 +82,9 @@ class ReducedPoints:
     modes : (n_nodes, 3, r) float64
         Displacement of each mode at every node, zero at supports. Only rows of the cells' nodes are
         read.
-    test_modes : (n_nodes, 3, r) float64, optional
-        Test functions that the force is projected on; the modes by default.
+    test_modes : (n_nodes, 3, r) or (n_cells, n_cell_nodes, 3, r) float64, optional
+        Test functions that the force is projected on, continuous or for each cell by itself; the
+        modes by default. Springs add nothing to those of cells.
 
     Attributes
     ----------
@@ -105,7 +106,8 @@ class ReducedPoints:
         self.symmetric = test_modes is None
         self.test = self.trial
         if test_modes is not None:
-            self.test = _mode_gradients(rule.gradients, test_modes[cells], kept)
+            by_cell = test_modes if test_modes.ndim == 4 else test_modes[cells]
+            self.test = _mode_gradients(rule.gradients, by_cell, kept)
         self.weights = _batched(weights[kept])
         self._kept = kept
         self._lame: Array | None
@@ -117,7 +119,7 @@ class ReducedPoints:
         tangent += force + tangent_multiply_adds(self.n_unknowns, self.symmetric)
         self._multiply_adds = self.n_points * force, self.n_points * tangent
         self._springs: Array | None = None
-        if body.springs is not None:
+        if body.springs is not None and (test_modes is None or test_modes.ndim == 3):
             self._lame = None  # its kernels have no springs
             tested = modes if test_modes is None else test_modes
             moved = body.springs @ modes.reshape(-1, self.n_unknowns)

@@ -164,6 +164,13 @@ class CurvedPOD(Surrogate):
             refuse_inverted(self.model_, u)
         return u
 
+    def offsets(self, forces: Array) -> Array:
+        """Return what static correction adds under loads (n, n_free), N, in m; zero without it."""
+        if not self.static_correction:
+            return np.zeros_like(forces)
+        responses = np.array([self.compliance_.solve(force) for force in forces])
+        return np.asarray(responses - forces @ self._to_primary @ self.modes_.T)
+
     def solve(self, load: CurvedLoad) -> Array:
         """Return the latent coordinates of the equilibrium under a load."""
         problem = CurvedProblem(self.curved_, load)

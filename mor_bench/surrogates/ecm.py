@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from mor_bench.reduction.cubature import ecsw_system
 from mor_bench.reduction.empirical_cubature import empirical_cubature
-from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, States
+from mor_bench.surrogates.cubature_states import States
+from mor_bench.surrogates.hyper_reduced import CubatureSurrogate
 
 Array = NDArray[np.float64]
 

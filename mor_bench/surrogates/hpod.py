@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.reduction.cubature import ecsw_system, sparse_nnls, triangle
-from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, States, nodal, reduced_points
+from mor_bench.surrogates.cubature_states import States
+from mor_bench.surrogates.hyper_reduced import CubatureSurrogate, nodal, reduced_points
 
 Array = NDArray[np.float64]
 
@@ -24,7 +25,7 @@ class HyperReducedPOD(CubatureSurrogate):
 
     Parameters
     ----------
-    n_modes, cubature_tolerance, n_cubature_snapshots, tolerance
+    n_modes, cubature_tolerance, n_cubature_snapshots, tolerance, matching
         See `CubatureSurrogate`.
     sampling : {"cells", "points"}
         "cells": integrate every point of a chosen cell, as published. "points": a second cubature

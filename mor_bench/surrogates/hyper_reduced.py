@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mor_bench.errors import InvalidInputError
-from mor_bench.mechanics.model import FullOrderModel, body_of, unknown_equations
+from mor_bench.mechanics.model import body_of, unknown_equations
 from mor_bench.mechanics.newton import NewtonOptions
-from mor_bench.mechanics.parametric import Bodies, ParametricModel
+from mor_bench.mechanics.parametric import Bodies
 from mor_bench.model_arrays import take_array, take_indices
 from mor_bench.reduction.basis import pod
 from mor_bench.reduction.galerkin import CubatureProblem
@@ -26,24 +26,17 @@ from mor_bench.scene.scene_at import scale_of
 from mor_bench.snapshots.dataset import Snapshots
 from mor_bench.snapshots.given import ObservedDisplacements
 from mor_bench.surrogate import Surrogate
+from mor_bench.surrogates.cubature_states import (
+    Matching,
+    States,
+    are_far,
+    equilibria,
+    in_energy,
+    projected_states,
+    training_rows,
+)
 
 Array = NDArray[np.float64]
-
-
-States = Callable[[], Iterator[tuple[FullOrderModel, Array]]]
-"""Yields the bodies of training states, and the coordinates (n, r) of the states of each."""
-
-
-def training_rows(displacements: Array, n_snapshots: int) -> NDArray[np.int64]:
-    """Return at most ``n_snapshots`` rows, spread evenly over the nonzero snapshots."""
-    moved = np.flatnonzero(displacements.any(axis=1))
-    chosen = np.unique(np.linspace(0, len(moved) - 1, n_snapshots).astype(int))
-    return np.asarray(moved[chosen])
-
-
-def training_coordinates(displacements: Array, modes: Array, n_snapshots: int) -> Array:
-    """Return coordinates (n, r) of the `training_rows`. The modes are orthonormal."""
-    return np.asarray(displacements[training_rows(displacements, n_snapshots)] @ modes)
 
 
 def nodal(scene: Scene, rows: Array) -> Array:
@@ -83,12 +76,19 @@ class CubatureSurrogate(Surrogate):
         Training snapshots whose reduced forces are matched, spread evenly over the training set.
     tolerance : float or "auto"
         Norm of the reduced residual relative to that of the reduced load, in (0, 1].
+    matching : {"force", "energy", "as-needed"}
+        What the cubature matches to its tolerance. "force": the forces of projected snapshots, in
+        the Euclidean norm, as published. "energy": the forces of equilibria in the span of the
+        modes, in the norm of the inverse stiffness at rest. It needs fewer cells at an equal error,
+        and a solve of plain POD for each training state. "as-needed": "energy" if the projected
+        snapshots are far from equilibrium, as in a nearly incompressible body, else "force".
     """
 
     n_modes: Annotated[int, Field(ge=1)] | Auto = 20
     cubature_tolerance: Annotated[float, Field(ge=0, lt=1)] | Auto = 1e-3
     n_cubature_snapshots: Annotated[int, Field(ge=1)] = 300
     tolerance: Annotated[float, Field(gt=0, le=1)] | Auto = 1e-8
+    matching: Matching = "as-needed"
 
     sized: ClassVar = {
         "n_modes": MODES,
@@ -114,9 +114,20 @@ class CubatureSurrogate(Surrogate):
         if tolerance == 0:
             cells, weights = np.arange(scene.mesh.n_cells), np.ones(scene.mesh.n_cells)
         else:
-            states = _states(scene, samples, modes, self.n_cubature_snapshots)
-            cells, weights = self.choose_cells(states, modes, tolerance)
+            cells, weights = self.choose_cells(*self._matched(scene, samples, modes), tolerance)
         return {"modes": modes, "cells": cells, "weights": weights}
+
+    def _matched(self, scene: Scene, samples: Snapshots, modes: Array) -> tuple[States, Array]:
+        """Return training states, and the modes on which their forces are matched."""
+        states = projected_states(scene, samples, modes, self.n_cubature_snapshots)
+        if self.matching == "force":
+            return states, modes
+        loads = samples.free_forces[
+            training_rows(samples.free_displacements, self.n_cubature_snapshots)
+        ]
+        if self.matching == "as-needed" and not are_far(states, loads, modes):
+            return states, modes
+        return in_energy(equilibria(states, loads, modes), modes)
 
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
         self.modes_ = take_array(model, "modes", (len(scene.free_dofs), None))
@@ -174,21 +185,3 @@ class CubatureSurrogate(Surrogate):
             return problem.solve(factor * load, options).displacement
 
         return self.subspace_.answer_each(forces, parameters, solve)
-
-
-def _states(scene: Scene, samples: Snapshots, modes: Array, n_snapshots: int) -> States:
-    """Return training states; those of a parametric scene have a body each."""
-    displacements = samples.free_displacements
-    rows = training_rows(displacements, n_snapshots)
-    q = displacements[rows] @ modes
-    if not scene.parameter_names:
-        model = FullOrderModel(scene)
-        return lambda: iter([(model, q)])
-    models = ParametricModel(scene)
-
-    def states() -> Iterator[tuple[FullOrderModel, Array]]:
-        for number, row in zip(rows, q, strict=True):
-            body, _ = models.bodies.shared(samples.parameters[number])
-            yield models.model_of(body), row[None]
-
-    return states

@@ -19,6 +19,7 @@ from tests.published.cost_tables import (
     probe_cost,
     scaling,
 )
+from tests.published.projection_tables import projections, reconstructions
 from tests.published.record import SOURCES, experiments, record_of
 from tests.published.run_tables import markdown
 from tests.published.stored import REPORTS, ROOT, EvidenceError, content_of, look_up
@@ -222,7 +223,21 @@ def refinement(source: str) -> str:
     return markdown([*headings, "commit", "date"], body)
 
 
-LAWS = {"saint-venant-kirchhoff": "SVK", "neo-hookean": "neo-Hookean"}
+LAWS = {
+    "saint-venant-kirchhoff": "SVK",
+    "neo-hookean": "neo-Hookean",
+    "mooney-rivlin": "Mooney–Rivlin",
+}
+
+
+def _law(law: Mapping[str, Any]) -> str:
+    """Name a law and its constants."""
+    if "young_pa" in law:
+        return f"{LAWS[law['law']]}, {law['young_pa']:,g} Pa, ν = {law['poisson']:g}"
+    moduli = (
+        f"{key.removesuffix('_pa')} = {value:g}" for key, value in law.items() if key != "law"
+    )
+    return f"{LAWS[law['law']]}, {', '.join(moduli)} Pa"
 
 
 def scenes(source: str) -> str:
@@ -247,7 +262,7 @@ def scenes(source: str) -> str:
                 f"`{path.stem}`",
                 f"{size} m, " * bool(size)
                 + f"{scene.mesh.n_cells:,} {element}, {scene.mesh.n_nodes:,} nodes",
-                f"{LAWS[law['law']]}, {law['young_pa']:,g} Pa, ν = {law['poisson']:g}",
+                _law(law),
                 f"{n_loads} × {loads['kind']}, {low:g}–{high:g} {plan.unit}",
                 where,
                 f"{samples:,}",
@@ -360,4 +375,6 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "hard-loads": hard_loads,
     "evidence": evidence,
     "timed-work": timed_work,
+    "projections": projections,
+    "reconstructions": reconstructions,
 }

@@ -1,0 +1,54 @@
+"""Tables in Markdown about projection methods at equal sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from mor_bench.report.number_format import DASH, number
+from tests.published.run_tables import markdown
+from tests.published.stored import content_of
+
+
+def projections(source: str, dataset: str) -> str:
+    """Show errors, cells, points and counted work of hyper-reduced models on one scene."""
+    headings = ["r", "method", "median %", "p95 %", "max %", "without answer"]
+    body = []
+    for row in content_of(source)[dataset]["rows"]:
+        head = [str(row["size"]), row["name"]]
+        if "reason" in row:
+            body.append([*head, *[DASH] * 7])
+            continue
+        points = row["n_points"]
+        counts = [
+            str(row["n_failed"]),
+            str(row["n_cells"]),
+            DASH if points is None else str(points),
+        ]
+        body.append([*head, *_percents(row["error"]), *counts, _millions(row)])
+    return markdown([*headings, "cells", "points", "10⁶ multiply-adds per query"], body)
+
+
+def reconstructions(source: str, dataset: str) -> str:
+    """Show errors beside reconstruction errors of POD and curved manifolds on one scene."""
+    headings = ["r", "method", "median %", "p95 %", "max %", "without answer"]
+    headings += ["reconstruction: median %", "p95 %", "cells", "10⁶ multiply-adds per query"]
+    body = []
+    for row in content_of(source)[dataset]["rows"]:
+        head = [str(row["size"]), row["name"]]
+        if "reason" in row:
+            body.append([*head, *[DASH] * 8])
+            continue
+        apart = _percents(row["reconstruction"])[:2] if "reconstruction" in row else [DASH] * 2
+        counts = [str(row["n_failed"]), *apart, str(row["n_cells"]), _millions(row)]
+        body.append([*head, *_percents(row["error"]), *counts])
+    return markdown(headings, body)
+
+
+def _percents(spread: Mapping[str, float | None]) -> list[str]:
+    found = (spread[name] for name in ("median", "p95", "max"))
+    return ["∞" if value is None else number(100 * value) for value in found]
+
+
+def _millions(row: Mapping[str, Any]) -> str:
+    return number(row["multiply_adds"] / 1e6)
