@@ -234,6 +234,9 @@ def write(records: dict[str, Record]) -> None:
         again += ", slow" * (bug.slow and bool(record.again))
         file = bug.file.removeprefix("mor_bench/")
         lines.append(f"| {bug.name} | `{file}` | {law} | {len(record.tests)} | {again} |")
+    waiting = [bug.name for bug in BUGS if bug.name not in records]
+    if waiting:
+        lines += ["", "Not planted yet (`--missing`):", "", *(f"- {name}" for name in waiting)]
     TABLE.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
