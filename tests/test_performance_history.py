@@ -16,8 +16,8 @@ from tests.benchmarks import asv_history
 from tests.benchmarks.asv_history import (
     RESULTS,
     ROOT,
+    farthest_first,
     import_digests,
-    in_passes,
     spread,
     without_paths,
 )
@@ -122,15 +122,16 @@ def test_a_single_commit_is_not_shown(tmp_path: Path) -> None:
     assert page().picture(tmp_path) is not None
 
 
-def test_commits_are_spread_evenly_and_passes_cover_the_whole_history() -> None:
+def test_commits_are_spread_evenly_and_a_part_of_a_run_covers_the_whole_history() -> None:
     commits = [str(i) for i in range(101)]
     chosen = spread(commits, 11)
     assert chosen == [str(10 * i) for i in range(11)]
     assert spread(commits, 1) == ["100"]
     assert spread(commits, 500) == commits
-    ordered = in_passes(chosen)
-    assert sorted(ordered) == sorted(chosen)
-    assert ordered[:3] == ["100", "60", "20"]
+    assert list(farthest_first(chosen, set()))[:4] == ["100", "0", "50", "80"]
+    rest = list(farthest_first(chosen, {"0", "50", "60"}))
+    assert rest[:2] == ["100", "80"]
+    assert sorted(rest) == sorted(set(chosen) - {"0", "50", "60"})
 
 
 def test_a_module_is_compiled_again_if_one_that_it_imports_has_changed(tmp_path: Path) -> None:

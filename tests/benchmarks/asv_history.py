@@ -25,7 +25,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from pathlib import Path
 from typing import Any
 
@@ -59,10 +59,18 @@ def spread(commits: list[str], n: int) -> list[str]:
     return [commits[round(i * (len(commits) - 1) / (n - 1))] for i in range(n)]
 
 
-def in_passes(commits: list[str]) -> list[str]:
-    """Order commits so that a run which stops early covers the whole history."""
-    back = commits[::-1]
-    return [*back[::4], *back[2::4], *back[1::2]]
+def farthest_first(commits: list[str], done: Set[str]) -> Iterator[str]:
+    """Yield the commits that are not done, each the farthest from those before it.
+
+    So a run that stops early has covered the whole history evenly. Of equals, the newest is first.
+    """
+    places = {i for i, commit in enumerate(commits) if commit in done}
+    missing = sorted(set(range(len(commits))) - places, reverse=True)
+    while missing:
+        next_one = max(missing, key=lambda i: min((abs(i - j) for j in places), default=0))
+        missing.remove(next_one)
+        places.add(next_one)
+        yield commits[next_one]
 
 
 def result_file(commit: str) -> Path:
@@ -178,9 +186,9 @@ def wanted(arguments: argparse.Namespace) -> Iterator[str]:
     if arguments.commit:
         yield from (git("rev-parse", f"{name}^{{commit}}") for name in arguments.commit)
         return
-    for commit in in_passes(spread(candidates(), arguments.commits)):
-        if not result_file(commit).exists():
-            yield commit
+    commits = spread(candidates(), arguments.commits)
+    done = {commit for commit in commits if result_file(commit).exists()}
+    yield from farthest_first(commits, done)
 
 
 def main() -> None:
