@@ -87,21 +87,43 @@ def median_load(scene: Any) -> Any:
     return nodal[int(sizes.argsort()[N_DRAWN // 2])].ravel()[scene.free_dofs]
 
 
-def full_order(dataset: str) -> dict[str, float]:
-    """Measure the full-order model at the median load; bytes are the peak of the process so far."""
-    import resource
-
+def solved(dataset: str) -> tuple[Any, Any, Any]:
+    """Return the full-order model, its median load, (n_free,) N, and the solution."""
     import mor_bench
     from mor_bench.mechanics.model import FullOrderModel
 
     scene = mor_bench.load_scene(dataset)
     load = median_load(scene)
     model = FullOrderModel(scene)
-    solution = model.solve(load)
+    return model, load, model.solve(load)
+
+
+def in_new_process(*arguments: str) -> str:
+    """Run Python with the commit's code; return what it prints."""
+    variables = {**os.environ, **({} if TREE is None else {"PYTHONPATH": TREE})}
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True, env=variables).stdout
+
+
+def print_peak(dataset: str) -> None:
+    """Solve once and print the peak memory of this process, bytes on Linux."""
+    import resource
+
+    solved(dataset)
+    print(1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+
+
+def full_order(dataset: str) -> dict[str, float]:
+    """Measure the full-order model at the median load.
+
+    The peak memory is that of a new process, which loads kernels that this one has compiled:
+    compiling takes more memory than solving.
+    """
+    model, load, solution = solved(dataset)
     state = solution.displacement
     found = {
         "iterations": solution.iterations,
-        "peak_memory": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        "peak_memory": int(in_new_process(__file__, dataset)),
         "solve": cpu_seconds(lambda: model.solve(load)),
         "residual": cpu_seconds(lambda: model.force(state)),
         "residual_and_tangent": cpu_seconds(lambda: model.linearise(state)),
@@ -151,14 +173,7 @@ def query(method: str, data: Any) -> dict[str, float]:
 
 def first_use() -> dict[str, float]:
     """Import the package in new processes; return the least CPU time and the new modules."""
-    command = [sys.executable, "-c", IMPORT]
-    variables = {**os.environ, **({} if TREE is None else {"PYTHONPATH": TREE})}
-    found = [
-        subprocess.run(
-            command, check=True, capture_output=True, text=True, env=variables
-        ).stdout.split()
-        for _ in range(3)
-    ]
+    found = [in_new_process("-c", IMPORT).split() for _ in range(3)]
     return {
         "cpu_time": min(float(seconds) for seconds, _ in found),
         "modules": int(found[0][1]),
@@ -287,3 +302,7 @@ class Import(Measured):
 
     track_cpu_time.unit = "seconds"  # type: ignore[attr-defined]
     track_modules.unit = "modules"  # type: ignore[attr-defined]
+
+
+if __name__ == "__main__":
+    print_peak(sys.argv[1])
