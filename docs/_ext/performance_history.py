@@ -127,7 +127,7 @@ def picture(folder: Path = RESULTS) -> Figure | None:
     for i, (panel, mine) in enumerate(panels):
         axes = figure.add_subplot(rows, 2, i + 1)
         _plot(axes, panel, mine, place)
-        axes.set_xticks(list(days), list(days.values()))
+        axes.set_xticks(list(days), list(days.values()), fontsize=7)
     return figure
 
 
@@ -137,7 +137,7 @@ def first_of_days(results: list[dict[str, Any]]) -> dict[int, str]:
     for i, content in enumerate(results):
         at = datetime.fromtimestamp(content["date"] / 1000, tz=UTC)
         found.setdefault(f"{at.day} {at:%b} {at.year}", i)
-    apart = max(1, len(results) // 8)  # places between two texts that do not touch
+    apart = -(-len(results) // 6)  # places between two texts that do not touch
     chosen: dict[int, str] = {}
     for day, i in found.items():
         if not chosen or i - max(chosen) >= apart:
