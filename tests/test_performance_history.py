@@ -97,7 +97,7 @@ def test_the_results_name_commits_of_the_main_line() -> None:
         content = json.loads(path.read_text())
         assert content["commit_hash"] in commits, path.name
         assert path.name.startswith(content["commit_hash"][:8])
-        date = int(git("show", "-s", "--format=%ct", content["commit_hash"]))
+        date = int(git("show", "-s", "--format=%at", content["commit_hash"]))
         assert content["date"] // 1000 == date, path.name
 
 
