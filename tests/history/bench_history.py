@@ -81,7 +81,8 @@ def median_load(scene: Any) -> Any:
     try:
         drawn = draw_loads(scene, 0, N_DRAWN)
     except TypeError:  # the interface of the first commits
-        drawn = draw_loads(scene.spec.loads, len(scene.patch_nodes), 0, N_DRAWN)
+        of_old: Any = draw_loads
+        drawn = of_old(scene.spec.loads, len(scene.patch_nodes), 0, N_DRAWN)
     sizes = np.linalg.norm(drawn.vectors.reshape(N_DRAWN, -1), axis=1)
     nodal = drawn.nodal_forces(scene.patch_weights)
     return nodal[int(sizes.argsort()[N_DRAWN // 2])].ravel()[scene.free_dofs]
