@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.benchmarks import asv_history
@@ -22,6 +23,7 @@ from tests.benchmarks.asv_history import (
     without_paths,
 )
 from tests.benchmarks.publish import publish_history
+from tests.history.bench_history import in_new_process, peak_bytes
 from tests.verification.trust_record import git
 
 sys.path.append(str(ROOT / "docs" / "_ext"))
@@ -76,7 +78,9 @@ def test_every_line_of_the_picture_has_the_stored_values() -> None:
     figure = page().picture()
     assert figure is not None
     drawn = 0
-    for axes, panel in zip(figure.axes, page().PANELS, strict=True):
+    panels = {panel.title: panel for panel in page().PANELS}
+    for axes in figure.axes:
+        panel = panels[axes.get_title(loc="left")]
         for line in axes.get_lines():
             label = str(line.get_label())
             name = (panel.benchmark, (label,) if not label.startswith("_") and label else ())
@@ -166,6 +170,14 @@ def test_an_environment_is_named_by_its_python() -> None:
     text = json.dumps(without_paths(content))
     assert "home" not in text
     assert f"existing-py{sys.version_info[0]}.{sys.version_info[1]}" in text
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux")
+def test_the_peak_memory_is_that_of_the_new_process() -> None:
+    large = np.ones(50_000_000)
+    code = "from tests.history.bench_history import peak_bytes; print(peak_bytes())"
+    assert 1e6 < float(in_new_process("-c", code)) < 0.75 * large.nbytes
+    assert peak_bytes() > large.nbytes
 
 
 @pytest.mark.slow

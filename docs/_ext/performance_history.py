@@ -122,7 +122,7 @@ def picture(folder: Path = RESULTS) -> Figure | None:
     rows = -(-len(panels) // 2)
     figure = new_figure(
         2.25 * rows,
-        "Speed, memory and counted work over the commits",
+        "Speed and counted work over the commits",
         f"{len(place)} commits of the main line, oldest at the left; gaps: not in the commit",
     )
     days = first_of_days(results)
@@ -195,7 +195,7 @@ class PerformanceHistory(SphinxDirective):
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(as_png(figure, {"Software": None}))
         found: list[nodes.Node] = [
-            nodes.image(uri=PICTURE, alt="Speed, memory and counted work over the commits"),
+            nodes.image(uri=PICTURE, alt="Speed and counted work over the commits"),
             nodes.paragraph(text=noise_sentence()),
         ]
         if dashboard_possible():
