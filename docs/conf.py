@@ -34,6 +34,7 @@ extensions = [
     "repository_links",
     "method_cards",
     "order_plots",
+    "performance_history",
 ]
 exclude_patterns = [
     "_build",

@@ -16,6 +16,10 @@ from pathlib import Path
 
 from mor_bench.errors import MorBenchError
 
+ROOT = Path(__file__).parents[2]
+HISTORY = ROOT / "tests" / "history" / "asv.conf.json"
+"""Configuration of the benchmarks whose results are stored in `reports/asv`."""
+
 COPIES = Path(__file__).parent / "dashboard"
 
 _CDNJS = "https://cdnjs.cloudflare.com/ajax/libs"
@@ -75,6 +79,19 @@ def publish(configuration: Path) -> Path:
     Publish.run(config)
     make_offline(Path(config.html_dir))
     return Path(config.html_dir)
+
+
+def publish_history(html: Path) -> None:
+    """Publish the stored history in a folder, which is replaced; for this, asv needs git."""
+    from asv.commands.publish import Publish
+    from asv.config import Config
+
+    config = Config.load(str(HISTORY))
+    config.repo = str(ROOT)
+    config.results_dir = str(ROOT / "reports" / "asv")
+    config.html_dir = str(html)
+    Publish.run(config, pull=False)
+    make_offline(html)
 
 
 if __name__ == "__main__":
