@@ -120,7 +120,7 @@ def reconstruction(method: mor_bench.Surrogate, samples: Snapshots) -> Array | N
     u = samples.free_displacements
     if isinstance(method, CurvedPOD):
         rests = [_distance(method, own) for own in u - method.offsets(samples.free_forces)]
-        return np.array(rests) / np.linalg.norm(u, axis=1)
+        return np.asarray(np.array(rests) / np.linalg.norm(u, axis=1))
     modes = getattr(method, "modes_", None)
     if not isinstance(modes, np.ndarray) or modes.ndim != 2:
         return None
@@ -132,11 +132,14 @@ def _distance(method: CurvedPOD, u: Array) -> float:
     coordinates, n = method.space_.T @ u, method.modes_.shape[1]
     rest = float(np.linalg.norm(u - method.space_ @ coordinates))
     size = float(np.linalg.norm(u))
-    found = least_squares(
-        lambda q: (method.curve_.at(q * size)[0] - coordinates) / size,
-        coordinates[:n] / size,
-        jac=lambda q: method.curve_.at(q * size)[1],
-    )
+
+    def apart(q: Array) -> Array:
+        return np.asarray((method.curve_.at(q * size)[0] - coordinates) / size)
+
+    def slopes(q: Array) -> Array:
+        return method.curve_.at(q * size)[1]
+
+    found = least_squares(apart, coordinates[:n] / size, jac=slopes)
     return float(np.hypot(size * np.linalg.norm(found.fun), rest))
 
 
