@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Literal
@@ -26,7 +26,7 @@ from mor_bench.report.canvas import (
     uncut,
 )
 from mor_bench.report.entries import Analysis, best_per_method, entries_of
-from mor_bench.report.labels import Note, Point, annotate
+from mor_bench.report.labels import Note, annotate
 from mor_bench.report.method_styles import readable, style_of
 from mor_bench.report.number_format import number
 from mor_bench.report.short_names import short_names
@@ -148,30 +148,40 @@ def _draw(axes: Axes, found: Sequence[Staircase], need: float | None, unit: str)
             linestyle=dashes[stairs.method],
         )
         lines.append(np.column_stack([x, y]))
-        text = shortened(stairs.name, 30)
-        offsets: Sequence[Point] = _BESIDE
-        places = [(float(np.quantile(x, q)), 100 * q) for q in np.linspace(0.6, 0.05, 12)]
-        if x[-1] > end:
-            text = f"{text}: up to {number(float(x[-1]))} {unit} →"
-            places, offsets = [(end, float(np.interp(end, x, y)))], _ABOVE_ONE_ANOTHER
-        elif x[-1] < start:
-            text, places = f"← {text}: up to {number(float(x[-1]))} {unit}", [(start, 50.0)]
-        must = not start <= x[-1] <= end
-        notes.append(Note(text, places, readable(style.colour), "bold", offsets, must=must))
-    missing = {note.text for note in annotate(axes, notes, [], lines)}
+        if start <= x[-1] <= end:
+            continue
+        text = f"{shortened(stairs.name, 30)}: up to {number(float(x[-1]))} {unit}"
+        text = f"{text} →" if x[-1] > end else f"← {text}"
+        place = (end, float(np.interp(end, x, y))) if x[-1] > end else (start, 50.0)
+        colour = readable(style.colour)
+        notes.append(Note(text, [place], colour, "bold", _ABOVE_ONE_ANOTHER, must=True))
+    annotate(axes, notes, [], lines)
+    _legend(axes, found, dashes)
+
+
+def _legend(axes: Axes, found: Sequence[Staircase], dashes: Mapping[str, Dash]) -> None:
+    """Name the lines beside the axes, in the order in which they reach half of the height."""
+    ordered = sorted(found, key=lambda stairs: float(np.median(stairs.values)))
     handles = [
         Line2D(
             [],
             [],
             color=style_of(stairs.method).colour,
             linestyle=dashes[stairs.method],
-            label=plain(text),
+            linewidth=1.8,
+            label=plain(shortened(stairs.name, 30)),
         )
-        for stairs in found
-        if (text := shortened(stairs.name, 30)) in missing
+        for stairs in ordered
     ]
-    if handles:
-        axes.legend(handles=handles, loc="lower right", fontsize=NOTE, frameon=False)
+    axes.legend(
+        handles=handles,
+        title="from left to right",
+        title_fontsize=NOTE,
+        loc="center left",
+        bbox_to_anchor=(1.01, 0.5),
+        fontsize=NOTE,
+        frameon=False,
+    )
 
 
 def dashes_of(methods: Sequence[str]) -> dict[str, Dash]:
@@ -185,5 +195,4 @@ def dashes_of(methods: Sequence[str]) -> dict[str, Dash]:
     return found
 
 
-_BESIDE = ((8, -4), (-8, 4), (10, -9), (-10, 9))
 _ABOVE_ONE_ANOTHER = ((-6, -8), (-6, -21), (-6, -34), (-6, -47), (-6, -60))
