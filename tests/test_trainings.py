@@ -18,6 +18,7 @@ from rich.console import Console
 
 import mor_bench
 from mor_bench.report.console_tables import Detail, print_tables
+from mor_bench.report.number_format import joined_units
 from mor_bench.report.page import render
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
@@ -117,7 +118,7 @@ def test_a_training_out_of_time_reports_its_expected_duration(
     reason = OUT_OF_TIME.format("1.67")
     assert str(row.reason).startswith(reason)
     assert f"descent · channels 100: failed: {reason}" in shown[0]
-    assert reason in shown[1]
+    assert joined_units(reason) in shown[1]
 
 
 def test_loss_curves_are_kept_with_the_samples(comparison: Comparison) -> None:
