@@ -22,7 +22,7 @@ from mor_bench.report.short_names import ShortName
 from mor_bench.report.text_table import Cell, figure_cell
 
 NOTE = (
-    "*: on the Pareto front of the medians. ~: timing not stable. "
+    "*: on the Pareto front of the medians, references aside. ~: timing not stable. "
     "offline: core-seconds of data and fit; °: trained elsewhere."
 )
 """Explanation of the marks and of the one column that needs it."""

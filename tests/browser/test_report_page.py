@@ -12,7 +12,7 @@ import pytest
 
 from mor_bench.analysis.analyse import analyse
 from mor_bench.report.method_styles import DARK, WHITE, contrast
-from mor_bench.report.number_format import number, percent
+from mor_bench.report.number_format import joined_units, number, percent
 from mor_bench.report.page import render
 from tests.browser.chromium import Visit, pixels_of, serious_findings, visit
 from tests.hostile_runs import hostile_run
@@ -119,8 +119,9 @@ def test_hover_texts_equal_the_results(open_page: Visit, path: Path) -> None:
     shown.first.wait_for(timeout=60_000)
     lines = shown.all_text_contents()
     assert lines[0].startswith(row["method"])
-    assert lines[1].startswith(f"error {percent(row['error']['rel_l2_median'])} % [")
-    assert lines[2].startswith(f"latency {number(row['latency_ms']['median'])} ms [")
+    error, latency = row["error"]["rel_l2_median"], row["latency_ms"]["median"]
+    assert lines[1].startswith(joined_units(f"error {percent(error)} % ["))
+    assert lines[2].startswith(joined_units(f"latency {number(latency)} ms ["))
     for key, value in row["parameters"].items():
         assert f"{key} = {value}" in lines
 
