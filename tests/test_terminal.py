@@ -209,9 +209,7 @@ def test_show_prints_a_method_a_dataset_or_a_run(run: Comparison, tmp_path: Path
     assert max(map(len, method.splitlines())) <= 80
     for text in ("hyper-reduction", "equations, snapshots", "ECSW", "n_cubature_snapshots"):
         assert text in method
-    assert re.search(
-        r"^  n_modes +5, 10, 20, 40 +an integer of at least 1", method, re.MULTILINE
-    )
+    assert re.search(r"^  n_modes +5, 10, 20, 40 +an integer of at least 1", method, re.MULTILINE)
     dataset = mor_bench("show", "beam-tiny", columns="80").stdout
     for text in ("24 cells, 63 nodes", "saint-venant-kirchhoff", "≤ 1 %, ≤ 3 ms", "mor-bench pick"):
         assert text in dataset

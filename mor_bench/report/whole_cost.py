@@ -66,13 +66,17 @@ class Costs:
 
     @property
     def finding(self) -> str:
-        """Name the method that pays off first."""
+        """Name the first that pays off; digits of the break-even are few, as fit costs vary."""
         paid = [line for line in self.lines if line.break_even is not None]
         target = f"at {number(self.target)} %"
         if not paid:
             return f"No method is cheaper in the long run than the full-order model {target}"
         best = min(paid, key=lambda line: line.break_even or 0)
-        return f"{best.name} pays off first {target}, after {whole(best.break_even)} queries"
+        queries = whole(float(f"{best.break_even:.2g}"))
+        return (
+            f"Of each method's fastest {target}, {best.name} pays off first, "
+            f"after about {queries} queries"
+        )
 
     @property
     def queries(self) -> int:
