@@ -16,7 +16,7 @@ import yaml
 
 import mor_bench
 from mor_bench.adapters.dataset_folder import export_dataset_folder, import_dataset_folder
-from mor_bench.errors import InvalidInputError, StoreError, UnsupportedSceneError
+from mor_bench.errors import InvalidInputError, SpecError, StoreError, UnsupportedSceneError
 from mor_bench.snapshots.dataset import Dataset
 
 TRAIN, TEST = (f"data/{name}-00000-of-00001.h5" for name in ("train", "test"))
@@ -58,6 +58,25 @@ def test_a_dataset_comes_back_exactly_and_without_a_connection(
     for path in again:
         first = exported / path.relative_to(tmp_path / "again")
         assert path.read_bytes() == first.read_bytes(), path.name
+
+
+def test_a_folder_is_no_toml_and_the_message_names_the_way(
+    exported: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(exported.parent)
+    for source in (exported, exported.name, f"{exported.name}/"):
+        with pytest.raises(SpecError, match=r"tiny: a folder; .*\.import_dataset_folder turns"):
+            mor_bench.load_dataset(source)
+    with pytest.raises(SpecError, match="unknown dataset 'tinny'"):
+        mor_bench.load_dataset("tinny")
+    (exported.parent / "beam-tiny").mkdir()
+    assert mor_bench.load_scene("beam-tiny").name == "beam-tiny"
+
+
+def test_the_class_of_a_dataset_has_a_public_name(tiny: Dataset) -> None:
+    assert mor_bench.Dataset is Dataset
+    assert isinstance(tiny, mor_bench.Dataset)
+    assert "Dataset" in mor_bench.__all__
 
 
 def test_the_card_is_yaml_that_names_the_files(exported: Path) -> None:
