@@ -199,6 +199,7 @@ REFUSED: list[tuple[Callable[[Scene], object], str]] = [
     (lambda s: doors.pymor_model(s, np.full((1, 63, 3), np.nan)), "`loads` must be finite"),
     (lambda s: doors.pymor_model(s, tolerance=2.0), r"`tolerance` must be in \(0, 1\]; got 2.0"),
     (lambda s: doors.to_vector_array(s, np.zeros((1, 63))), "`fields` must be real numbers"),
+    (lambda s: doors.from_vector_array(s, ZERO), "must be a vector array of pyMOR; got ndarray"),
     (
         lambda s: doors.from_vector_array(
             replace(s, fixed_nodes=s.fixed_nodes[:1]), doors.to_vector_array(s, ZERO)
