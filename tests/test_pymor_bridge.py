@@ -128,7 +128,7 @@ COERCIVE = "pymor.reductors.coercive:CoerciveRBReductor"
 
 
 def test_a_reductor_is_named_by_its_import_path(tiny: Dataset) -> None:
-    method = make_surrogate(PymorPOD, {"n_modes": 3, "reductor": COERCIVE})
+    method: Any = make_surrogate(PymorPOD, {"n_modes": 3, "reductor": COERCIVE})
     method.fit(tiny.scene, tiny.train)
     assert type(method.reductor_) is CoerciveRBReductor
     usual = PymorPOD(n_modes=3).fit(tiny.scene, tiny.train)

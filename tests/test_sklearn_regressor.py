@@ -13,6 +13,7 @@ from sklearn.exceptions import NotFittedError
 from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
+from sklearn.utils import estimator_html_repr
 from sklearn.utils.estimator_checks import check_estimator
 from sklearn.utils.validation import check_is_fitted
 
@@ -142,6 +143,7 @@ def test_parameters_and_dict_stay_as_they_were(pod: Any, X: Array, y: Array) -> 
 
 def test_samples_of_other_types_are_converted(pod: Any, X: Array, y: Array) -> None:
     expected = pod.fit(X, y).predict(X[:3])
+    convert: Any
     for convert in (lambda a: a.astype(object), lambda a: a.tolist()):
         np.testing.assert_array_equal(pod.fit(convert(X), convert(y)).predict(X[:3]), expected)
     found = pod.fit(X.astype(np.float32), y.astype(np.float32)).predict(X[:3].astype(np.float32))
@@ -156,7 +158,7 @@ def test_a_model_with_a_scene_has_a_short_repr(pod: Any, tiny: Dataset) -> None:
     pod.scene = tiny.scene
     found = "scene=<Scene beam-tiny: 63 nodes, 24 cells>"
     assert " ".join(repr(pod).split()) == f"SurrogateRegressor(n_modes=5, {found})"
-    assert "array(" not in pod._repr_html_()
+    assert "array(" not in estimator_html_repr(pod)
 
 
 def test_a_second_fit_forgets_the_first(pod: Any, X: Array, y: Array) -> None:
