@@ -67,7 +67,8 @@ def never_solve(*_: object) -> None:
 def test_the_samples_come_back_bit_by_bit_and_are_used(
     name: str, cache: Path, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_archive(SPEC, tmp_path / name, ["A. Author"], BY, cache=cache, workers=1)
+    written = write_archive(SPEC, tmp_path / name, ["A. Author"], BY, cache=cache, workers=1)
+    assert written.path == (tmp_path / name / SUMS if name == "tiny" else tmp_path / name)
     assert (tmp_path / name).is_dir() == (name == "tiny")
     other = tmp_path / "cache"
     (folder,) = import_archive(tmp_path / name, other)
