@@ -41,12 +41,14 @@ if TYPE_CHECKING:
     from mor_bench.runs.single_fit import fit as fit
     from mor_bench.scene.scene import Scene as Scene
     from mor_bench.scene.scene import load_scene as load_scene
+    from mor_bench.snapshots.dataset import Dataset as Dataset
     from mor_bench.snapshots.dataset import Snapshots as Snapshots
     from mor_bench.snapshots.dataset import load_dataset as load_dataset
     from mor_bench.surrogate import Surrogate as Surrogate
 
 _HOMES = {
     "Comparison": "mor_bench.report.notebook",
+    "Dataset": "mor_bench.snapshots.dataset",
     "ErrorBound": "mor_bench.measure.error_bounds",
     "Fit": "mor_bench.runs.single_fit",
     "MorBenchError": "mor_bench.errors",

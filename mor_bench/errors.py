@@ -7,6 +7,7 @@ wrong value, the allowed values and the given value.
 from __future__ import annotations
 
 from numbers import Integral
+from typing import TypeGuard
 
 
 class MorBenchError(Exception):
@@ -45,11 +46,14 @@ class InvalidInputError(MorBenchError, ValueError):
     """An argument is out of range, or an array has a wrong shape or dtype or is not finite."""
 
 
+def is_integer(value: object) -> TypeGuard[int]:
+    """Return True for an integer, also of NumPy, but not for a boolean."""
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
 def check_count(name: str, value: object) -> None:
     """Raise `InvalidInputError` unless an argument is None or an integer >= 1, also of NumPy."""
-    if value is not None and (
-        isinstance(value, bool) or not isinstance(value, Integral) or value < 1
-    ):
+    if value is not None and not (is_integer(value) and value >= 1):
         raise InvalidInputError(f"`{name}` must be an integer >= 1; got {value!r}.")
 
 

@@ -63,11 +63,13 @@ def never_solve(*_: object) -> None:
 # Round trips
 
 
-@pytest.mark.parametrize("name", ["tiny", "tiny.zip"])
+@pytest.mark.parametrize("name", ["tiny", "tiny.zip", "tiny.ZIP"])
 def test_the_samples_come_back_bit_by_bit_and_are_used(
     name: str, cache: Path, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_archive(SPEC, tmp_path / name, ["A. Author"], BY, cache=cache, workers=1)
+    written = write_archive(SPEC, tmp_path / name, ["A. Author"], BY, cache=cache, workers=1)
+    assert written.path == (tmp_path / name / SUMS if name == "tiny" else tmp_path / name)
+    assert (tmp_path / name).is_dir() == (name == "tiny")
     other = tmp_path / "cache"
     (folder,) = import_archive(tmp_path / name, other)
     assert folder == tiny_folder(other)
@@ -198,6 +200,7 @@ def test_nothing_is_left_when_an_archive_cannot_be_written(
         (["archive", "beam-tiny", "--out", "."], "exists and is not overwritten"),
         (["archive", "beam-tiny", "--out", "x", "--limit", "5"], "holds the whole dataset"),
         (["archive", "beam-tiny", "--out", "x", "--licence", "GPL"], "`licence` must be CC-BY-4.0"),
+        (["archive", "beam-tiny", "--out", "x", "--licence", "e.txt"], "e.txt: a licence must be"),
         (["archive", "beam-tiny", "--out", "x", "--author", "a\nb"], "`author` must be a name"),
         (["archive", "own.toml", "--out", "x"], "`--author` must name the authors"),
         (["generate"], "DATASET or `--from-archive` must be given"),
@@ -211,6 +214,7 @@ def test_wrong_calls_get_one_line(
 ) -> None:
     shutil.move(own_dataset(tmp_path / "own").parent, tmp_path / "here")
     monkeypatch.chdir(tmp_path / "here")
+    Path("e.txt").write_text(" \n\n", encoding="utf-8")
     before = sorted(Path().iterdir())
     found = invoke(*arguments, *([] if arguments == ["generate"] else ["--cache", "cache"]))
     assert found.exit_code == 2
@@ -219,14 +223,22 @@ def test_wrong_calls_get_one_line(
 
 
 def test_the_commands_write_and_read(cache: Path, tiny: Dataset, tmp_path: Path) -> None:
-    (tmp_path / "terms.txt").write_text("Terms", encoding="utf-8")
+    terms = "\n  # Open *Data* Commons\n\nTerms"
+    (tmp_path / "terms.txt").write_text(terms, encoding="utf-8")
     out, other = tmp_path / "out", tmp_path / "cache"
     licence = ["--licence", str(tmp_path / "terms.txt")]
     options = ["--cache", str(cache), "--workers", "1", "--quiet", *licence]
     found = invoke("archive", "beam-tiny", "--out", str(out), *options)
     assert found.exit_code == 0, found.output
     assert found.stdout.strip() == str(out / SUMS)
-    assert (out / "LICENSE.txt").read_text(encoding="utf-8") == "Terms"
+    assert (out / "LICENSE.txt").read_text(encoding="utf-8") == terms
+    card = (out / "README.md").read_text(encoding="utf-8")
+    assert "Open Data Commons, see `LICENSE.txt`." in card
+    assert "Dataset beam-tiny, made with mor-bench" in card
+    assert "CITATION.cff" not in card
+    metadata = json.loads((out / "metadata.json").read_text(encoding="utf-8"))
+    known = {"@type": "CreativeWork", "name": "Open Data Commons", "url": "LICENSE.txt"}
+    assert metadata["license"] == known
     found = invoke("generate", "beam-tiny", "--from-archive", str(out), "--cache", str(other))
     assert found.exit_code == 0, found.output
     assert found.stdout.strip() == str(tiny_folder(other))

@@ -242,6 +242,21 @@ def test_an_archive_that_was_packed_again_is_read(sound: Path, tmp_path: Path) -
     assert import_archive(again, tmp_path / "cache") == [tiny_folder(tmp_path / "cache")]
 
 
+def test_the_finders_files_are_ignored_and_never_opened(
+    sound: Path, copy: Path, tmp_path: Path
+) -> None:
+    for place in ("", "samples/"):
+        put(f"{place}.DS_Store", b"x" * 9000)(copy)
+    cache = tmp_path / "cache"
+    (folder,) = import_archive(copy, cache)
+    assert ".DS_Store" not in {path.name for path in folder.iterdir()}
+    assert import_archive(packed(copy, tmp_path / "a.zip"), cache) == [folder]
+    (copy / ".DS_Store").unlink()
+    (copy / ".DS_Store").symlink_to(sound / SUMS)
+    with pytest.raises(StoreError, match=r"\.DS_Store: a link"):
+        import_archive(copy, cache)
+
+
 @pytest.mark.parametrize("n", [40, pytest.param(400, marks=pytest.mark.slow)])
 def test_mutated_archives_are_read_or_refused(n: int, sound: Path, tmp_path: Path) -> None:
     folder, cache = tmp_path / "archive", tmp_path / "cache"

@@ -12,10 +12,11 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import yaml
 
 import mor_bench
 from mor_bench.adapters.dataset_folder import export_dataset_folder, import_dataset_folder
-from mor_bench.errors import InvalidInputError, StoreError, UnsupportedSceneError
+from mor_bench.errors import InvalidInputError, SpecError, StoreError, UnsupportedSceneError
 from mor_bench.snapshots.dataset import Dataset
 
 TRAIN, TEST = (f"data/{name}-00000-of-00001.h5" for name in ("train", "test"))
@@ -59,8 +60,26 @@ def test_a_dataset_comes_back_exactly_and_without_a_connection(
         assert path.read_bytes() == first.read_bytes(), path.name
 
 
+def test_a_folder_is_no_toml_and_the_message_names_the_way(
+    exported: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(exported.parent)
+    for source in (exported, exported.name, f"{exported.name}/"):
+        with pytest.raises(SpecError, match=r"tiny: a folder; .*\.import_dataset_folder turns"):
+            mor_bench.load_dataset(source)
+    with pytest.raises(SpecError, match="unknown dataset 'tinny'"):
+        mor_bench.load_dataset("tinny")
+    (exported.parent / "beam-tiny").mkdir()
+    assert mor_bench.load_scene("beam-tiny").name == "beam-tiny"
+
+
+def test_the_class_of_a_dataset_has_a_public_name(tiny: Dataset) -> None:
+    assert mor_bench.Dataset is Dataset
+    assert isinstance(tiny, mor_bench.Dataset)
+    assert "Dataset" in mor_bench.__all__
+
+
 def test_the_card_is_yaml_that_names_the_files(exported: Path) -> None:
-    yaml = pytest.importorskip("yaml")
     text = (exported / "README.md").read_text(encoding="utf-8")
     block = yaml.safe_load(text.split("---\n")[1])
     (config,) = block["configs"]
@@ -93,6 +112,15 @@ CARDS = {
     "no paths": "license: mit\n",
     "single quotes": "pretty_name: 'it''s'\nconfigs:\n- config_name: d\n  data_files:\n"
     "  - split: train\n    path: 'data/[ab].h5'\n  - split: test\n    path: 'data/test-*.h5'\n",
+    "flow form": "configs: [{data_files: [{split: train, path: [data/a.h5, data/b.h5]}, "
+    "{split: test, path: data/test-*.h5}]}]\n",
+    "a mapping": "configs:\n- data_files:\n    train: data/[ab].h5\n    test: data/test-*.h5\n",
+    "keys in order, other lists": "configs:\n- config_name: default\n  data_files:\n"
+    "  - path: data/[ab].h5\n    split: train\n  - path: data/test-*.h5\n    split: test\n"
+    "split: test\ntags:\n- data/validation-*.h5\n",
+    "comments": "# about\nconfigs: # splits\n- data_files: # three\n  - split: train # 140\n"
+    "    path: data/[ab].h5 # two\n  - split: test\n    # path: data/a.h5\n"
+    "    path: data/test-*.h5\n",
 }
 
 
@@ -141,6 +169,11 @@ def cut(name: str) -> Callable[[Path], object]:
     return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:3000])
 
 
+def rename_validation(folder: Path) -> None:
+    (folder / "README.md").write_text("---\nlicense: mit\n---\n")
+    (folder / TEST.replace("test", "validation")).rename(folder / "data" / "valid.h5")
+
+
 DAMAGES: list[tuple[Callable[[Path], object], str]] = [
     (lambda f: (f / "README.md").unlink(), "README.md: no such file; the folder needs it"),
     (lambda f: (f / "mesh.h5").unlink(), "mesh.h5: no such file; the folder needs it"),
@@ -153,11 +186,26 @@ DAMAGES: list[tuple[Callable[[Path], object], str]] = [
     (in_card("data/test-*.h5", "/etc/*.h5"), "`path` must lie in the folder; got '/etc"),
     (in_card("data/test-*.h5", "https://x.org/a.h5"), "`path` must lie in the folder; got 'https"),
     (in_card("data/test-*.h5", "**x/a.h5"), "is no pattern of files|no file of the split"),
-    (in_card('pretty_name: "', 'pretty_name: "\\x'), "is no text"),
+    (in_card('pretty_name: "', 'pretty_name: "\\q'), "README.md, line 2: not valid YAML: .*escape"),
     (
         in_card("configs:", "configs:\n  - config_name: other"),
         "it has 2 configurations; one is allowed",
     ),
+    (in_card("configs:", "a: &a [b]\nb: *a\nconfigs:"), r"aliases \(`\*a`\) are not read"),
+    (in_card("configs:", f"a: {'[' * 25}{']' * 25}\nconfigs:"), "more than 20 nested levels"),
+    (in_card("configs:", "<<: {a: b}\nconfigs:"), "line 6: keys must be texts, each once and not"),
+    (in_card("configs:", "configs: []\nconfigs:"), "each once and not `<<`; got 'configs'"),
+    (in_card("configs:", "configs: x\nother:"), "`configs` must be a list of configurations"),
+    (
+        in_card("data_files:", "data_dir: x\n    data_files:"),
+        "key `data_dir`, which is not read; al",
+    ),
+    (in_card("path:", "paths:"), "needs the keys split and path, and no others; got split, paths"),
+    (in_card('path: "data/test-*.h5"', "path: []"), "paths of a split must be a text or a list"),
+    (in_card("data/test-*.h5", "data/t*-*.h5"), "is in the splits 'train' and 'test'"),
+    (in_card("data/test-*.h5", "README.*"), "README.md: not read, though the card names it; only"),
+    (lambda f: (f / "README.md").write_text("---\n- a\n---\n"), "must be a mapping of keys"),
+    (rename_validation, "valid.h5: in no split. Name the files in the card"),
     (cut("mesh.h5"), "mesh.h5: not a readable HDF5 file"),
     (cut(TEST), "test-00000-of-00001.h5: not a readable HDF5 file"),
     (in_file("mesh.h5", "cells", None), "mesh.h5: the array `cells` is missing"),

@@ -66,18 +66,26 @@ def flat(array: Array) -> Array:
 
 
 @pytest.mark.filterwarnings("ignore:Stochastic Optimizer")
-@pytest.mark.parametrize("source", ["linear-response", "force"])
+@pytest.mark.parametrize(
+    ("source", "output"),
+    [
+        ("linear-response", None),
+        ("force", None),
+        ("linear-response", "displacement"),
+        ("linear-response", "remainder"),
+    ],
+)
 @pytest.mark.parametrize("kind", KINDS)
 def test_answers_are_those_of_the_estimator_between_the_coordinates(
-    kind: str, source: str, tiny: Dataset
+    kind: str, source: str, output: str | None, tiny: Dataset
 ) -> None:
-    method = make(kind, input=source).fit(tiny.scene, tiny.train)
+    method = make(kind, input=source, output=output).fit(tiny.scene, tiny.train)
     z, queries = (
         project(method.from_forces_, flat(part.forces)) for part in (tiny.train, tiny.test)
     )
     # Rounded as in `fit`, because trees see each bit.
     rest, answers = tiny.train.free_displacements, np.zeros((1, tiny.scene.mesh.n_dofs))
-    if source == "linear-response":
+    if source == "linear-response" and output != "displacement":
         rest = rest - method.response_.respond(flat(tiny.train.forces))[:, tiny.scene.free_dofs]
         linear = mor_bench.load_method("linear-fem").fit(tiny.scene)
         answers = flat(linear.predict(tiny.test.forces))
@@ -96,6 +104,14 @@ def test_answers_are_those_of_the_estimator_between_the_coordinates(
     found = found @ method.modes_
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(values).max())
     assert np.abs(expected).max() > 0.1 * np.abs(values).max()
+
+
+def test_a_remainder_needs_the_linear_response() -> None:
+    assert make("all outputs at once", input="force", output="displacement").output
+    with pytest.raises(SpecError, match=r'`output`.* with `input = "force"` it must be "displacem'):
+        make("all outputs at once", input="force", output="remainder")
+    with pytest.raises(SpecError, match=r"`output`.*'remainder' or 'displacement'"):
+        make("all outputs at once", output="stress")
 
 
 def test_no_load_gives_no_displacement_and_a_huge_one_a_finite(trees: Any, tiny: Dataset) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import meshio
@@ -103,9 +104,10 @@ def test_impossible_collections_are_refused_and_nothing_is_written(
     tiny: Dataset, tmp_path: Path
 ) -> None:
     out = tmp_path / "out.pvd"
-    for samples in ([], [40], [-1, 2], [3, 3], [5, 2]):
+    wrong: Any
+    for wrong in ([], [40], [-1, 2], [3, 3], [5, 2], [1.7, 2.2], [False, True], ["1"]):
         with pytest.raises(InvalidInputError, match=r"growing integers in \[0, 39\], the samples"):
-            export_pvd(tiny, samples, out)
+            export_pvd(tiny, wrong, out)
     with pytest.raises(InvalidInputError, match=r"`out` must end in .pvd; got 'x.vtu'"):
         export_pvd(tiny, [0], "x.vtu")
     with pytest.raises(InvalidInputError, match="`part` must be train, validation, test; got '2x'"):
@@ -114,6 +116,9 @@ def test_impossible_collections_are_refused_and_nothing_is_written(
         export_load_path_pvd(tiny, 0, out, n_steps=0)
     with pytest.raises(InvalidInputError, match=r"`sample` must be an integer in \[0, 39\]"):
         export_load_path_pvd(tiny, 40, out)
+    for wrong in (1.5, True, "1", None):
+        with pytest.raises(InvalidInputError, match=rf"integer in \[0, 39\]; got {wrong!r}\."):
+            export_load_path_pvd(tiny, wrong, out)
     unknown = replace(tiny, scene=replace(tiny.scene, material=None))
     with pytest.raises(
         UnsupportedSceneError, match="has no load path: its snapshots were imported"

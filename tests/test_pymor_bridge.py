@@ -18,8 +18,10 @@ from mor_bench.errors import (
     InvalidInputError,
     MissingDependencyError,
     SolverError,
+    SpecError,
     UnsupportedSceneError,
 )
+from mor_bench.method_loading import make_surrogate
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.patch_loads import PatchLoads
@@ -31,6 +33,7 @@ pytest.importorskip("pymor", reason="needs the extra `pymor`")
 from pymor.algorithms.pod import pod
 from pymor.core.exceptions import InversionError
 from pymor.reductors.basic import StationaryRBReductor
+from pymor.reductors.coercive import CoerciveRBReductor
 from pymor.solvers.newton import NewtonSolver
 
 from mor_bench.adapters.pymor_pod import PymorPOD, quiet
@@ -121,6 +124,42 @@ def test_the_method_errs_as_much_as_pod_with_equal_modes(n_modes: int, tiny: Dat
     assert errors[0].min() > 0
 
 
+COERCIVE = "pymor.reductors.coercive:CoerciveRBReductor"
+
+
+def test_a_reductor_is_named_by_its_import_path(tiny: Dataset) -> None:
+    method: Any = make_surrogate(PymorPOD, {"n_modes": 3, "reductor": COERCIVE})
+    method.fit(tiny.scene, tiny.train)
+    assert type(method.reductor_) is CoerciveRBReductor
+    usual = PymorPOD(n_modes=3).fit(tiny.scene, tiny.train)
+    assert type(usual.reductor_) is StationaryRBReductor
+    force = tiny.test.forces[0]
+    assert relative(method.predict(force), usual.predict(force)) < 1e-6
+
+
+def test_a_reductor_that_cannot_reduce_the_model_gives_one_error(tiny: Dataset) -> None:
+    other = COERCIVE.replace("Coercive", "SimpleCoercive")
+    method = PymorPOD(n_modes=3, reductor=other)
+    with pytest.raises(InvalidInputError, match=r"SimpleCoer.* cannot reduce beam-tiny: Assertion"):
+        method.fit(tiny.scene, tiny.train)
+
+
+@pytest.mark.parametrize(
+    ("target", "reason"),
+    [
+        ("os:System", "it must name a reductor as"),
+        ("pymor.reductors.basic:StationaryRBReductor()", "it must name a reductor as"),
+        ("pymor.reductors.basics:StationaryRBReductor", "there is no module 'pymor.reductors.basi"),
+        ("pymor.reductors.basic:StationaryRBReducto", "did you mean 'StationaryRBReductor'"),
+        ("pymor.reductors.basic:InstationaryRBReductor", "is no StationaryRBReductor or subclass"),
+        ("pymor.reductors.basic:StationaryModel", "is no StationaryRBReductor or subclass"),
+    ],
+)
+def test_other_reductors_are_refused(target: str, reason: str) -> None:
+    with pytest.raises(SpecError, match=f"`reductor`.*{reason}"):
+        make_surrogate(PymorPOD, {"reductor": target})
+
+
 def test_a_fitted_method_survives_its_file(tiny: Dataset, tmp_path: Path) -> None:
     from mor_bench.method_loading import load_fitted
 
@@ -160,6 +199,7 @@ REFUSED: list[tuple[Callable[[Scene], object], str]] = [
     (lambda s: doors.pymor_model(s, np.full((1, 63, 3), np.nan)), "`loads` must be finite"),
     (lambda s: doors.pymor_model(s, tolerance=2.0), r"`tolerance` must be in \(0, 1\]; got 2.0"),
     (lambda s: doors.to_vector_array(s, np.zeros((1, 63))), "`fields` must be real numbers"),
+    (lambda s: doors.from_vector_array(s, ZERO), "must be a vector array of pyMOR; got ndarray"),
     (
         lambda s: doors.from_vector_array(
             replace(s, fixed_nodes=s.fixed_nodes[:1]), doors.to_vector_array(s, ZERO)

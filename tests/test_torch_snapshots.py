@@ -49,6 +49,19 @@ def test_samples_are_float32_tensors_of_forces_and_displacements(part: Snapshots
     assert len(list(rows)) == 20
 
 
+def test_only_integers_number_samples(part: Snapshots) -> None:
+    data: Any = TorchSnapshots(part)
+    for number in (np.int32(7), torch.tensor(7)):
+        np.testing.assert_array_equal(data[number][0], data[7][0])
+        np.testing.assert_array_equal(data.__getitems__([number, 1])[0][0], data[7][0])
+    for index in (1.5, slice(0, 3), "1", [1]):
+        with pytest.raises(InvalidInputError, match="must be an integer; got"):
+            data[index]
+    with pytest.raises(InvalidInputError, match=r"must be integers; got \[0, 1.5\]"):
+        data.__getitems__([0, 1.5])
+    assert data.__getitems__([]) == []
+
+
 @pytest.mark.parametrize("workers", [0, 2])
 def test_a_loader_gives_all_samples_in_batches(part: Snapshots, workers: int) -> None:
     loader = DataLoader(TorchSnapshots(part), batch_size=6, num_workers=workers)

@@ -161,6 +161,10 @@ def test_steps_of_a_growing_force_become_samples(exported: Path, tmp_path: Path)
         assert "regions" not in arrays
         expected = np.arange(1.0, 4.0, dtype="f4")[:, None, None] * force.reshape(1, -1, 3)
         np.testing.assert_array_equal(arrays["forces"], expected)
+    with h5py.File(path, "a") as file:
+        file["t1_fields/displacement"][0, 0, 4, 1, 1, 0] = 0.2
+    with pytest.raises(StoreError, match=r"must be zero wherever no force acts, .*; got up to 0.2"):
+        import_well(path, tmp_path / "other.npz")
 
 
 def test_scenes_that_are_no_whole_grid_are_refused(tiny: Dataset, tmp_path: Path) -> None:
@@ -220,6 +224,13 @@ def one_entry(name: str, value: float) -> Callable[[h5py.File], None]:
     return change
 
 
+def first_step(value: float) -> Callable[[h5py.File], None]:
+    def change(file: h5py.File) -> None:
+        file[DISPLACEMENT][3, 0, 5, 1, 1, 2] = value
+
+    return change
+
+
 DISPLACEMENT = "t1_fields/displacement"
 DAMAGES: list[tuple[Callable[[h5py.File], None], str]] = [
     (attribute("/", "grid_type", "spherical"), "`grid_type` must be 'cartesian'; got 'spherical'"),
@@ -241,7 +252,9 @@ DAMAGES: list[tuple[Callable[[h5py.File], None], str]] = [
     (removed(DISPLACEMENT), "the array `/t1_fields/displacement` is missing"),
     (removed("dimensions/y"), "the array `/dimensions/y` is missing"),
     (removed("boundary_conditions/x_wall/mask"), "the array `/boundary_conditions/x_wall/mask`"),
-    (replaced("dimensions/z", [0.0, 1.0, 0.5]), "`/dimensions/z` must be at least two growing"),
+    (replaced("dimensions/z", [0.0, 1.0, 0.5]), "two growing coordinates; got 0.5 after 1"),
+    (replaced("dimensions/z", [1.0, 0.5, 0.0]), "`/dimensions/z` .* growing .*; got 0.5 after 1"),
+    (replaced("dimensions/z", [[1.0, 0.5]]), r"coordinates; got an array of shape \(1, 2\)"),
     (replaced("dimensions/x", np.zeros(7)), "`/dimensions/x` must be at least two growing"),
     (
         replaced(DISPLACEMENT, np.zeros((3, 2))),
@@ -250,6 +263,7 @@ DAMAGES: list[tuple[Callable[[h5py.File], None], str]] = [
     (replaced(DISPLACEMENT, ["a"]), "`/t1_fields/displacement` must hold numbers; got object"),
     (replaced("boundary_conditions/x_wall/mask", np.ones(6, bool)), "an entry per point of its"),
     (replaced("scalars/load_region", [1, 2]), r"must have shape \(40,\); got \(2,\)"),
+    (first_step(0.3), r"'displacement' must be zero in the first time step, .*; got up to 0.3 m"),
     (one_entry(DISPLACEMENT, np.nan), "its samples are refused: .*`displacements` must be finite"),
     (one_entry("t1_fields/force", np.inf), "its samples are refused: .*`forces` must be finite"),
     (

@@ -17,25 +17,23 @@ from __future__ import annotations
 
 import io
 import json
-import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.adapters.imported_parts import PARTS, Body, Samples, write_parts
+from mor_bench.adapters.dataset_card import CARD, Card
+from mor_bench.adapters.imported_parts import Body, Samples, write_parts
 from mor_bench.array_files import read_hdf5
-from mor_bench.checked_files import KIB, read_bytes
 from mor_bench.errors import InvalidInputError, StoreError, UnsupportedSceneError, printable
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
 from mor_bench.snapshots.store import write_atomically
 
-CARD, MESH = "README.md", "mesh.h5"
-MOST_CARD_BYTES = 256 * KIB
+MESH = "mesh.h5"
 COLUMNS = {"forces": True, "displacements": True, "regions": False}
 """Columns of the files of a split, and whether each is required."""
 
@@ -130,8 +128,8 @@ Static equilibria of a hyperelastic solid with {scene.mesh.n_nodes} nodes, writt
 def import_dataset_folder(folder: str | Path, out: str | Path) -> list[Path]:
     """Turn a folder with a data set card into snapshots; return an NPZ and a TOML file.
 
-    Of the card, the YAML keys `pretty_name`, `split` and `path` are read. Without these paths, the
-    files of a split are ``data/SPLIT-*.h5``.
+    Of the card's YAML, `pretty_name` and the `data_files` of one configuration are read, in each
+    form that the Hub allows. Without them, the files of a split are ``data/SPLIT-*.h5``.
 
     Parameters
     ----------
@@ -143,13 +141,14 @@ def import_dataset_folder(folder: str | Path, out: str | Path) -> list[Path]:
     Raises
     ------
     StoreError
-        If a file is missing or damaged; the message names it.
+        If a file is missing or damaged, is in two splits, or is no HDF5 file; the message names it.
+        Also if the card is no valid YAML, or names its files in another way.
     InvalidInputError
         If `out` exists or has a wrong name.
     """
     folder = Path(folder)
     try:
-        card = _Card(folder)
+        card = Card(folder)
         mesh = read_hdf5(folder / MESH)
         for name in ("points", "cells"):
             if name not in mesh:
@@ -199,87 +198,3 @@ def _read_rows(path: Path, n_nodes: int) -> dict[str, NDArray[Any]]:
             )
         table["regions"] = regions.reshape(shape[0], -1)
     return table
-
-
-class _Card:
-    """The keys of a card's YAML block that matter here; all others may be anything."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.path = folder, folder / CARD
-        try:
-            text = read_bytes(self.path, MOST_CARD_BYTES).decode("utf-8-sig")
-        except UnicodeDecodeError:
-            raise StoreError(f"{self.path}: not a text in UTF-8.") from None
-        block = re.match(r"---[ \t]*\r?\n(.*?\n)---[ \t]*(\r?\n|$)", text, re.DOTALL)
-        if block is None:
-            raise StoreError(
-                f"{self.path}: a data set card begins with a YAML block between two lines `---`."
-            )
-        self._lines = [line for line in block[1].splitlines() if line.strip()]
-        names = [line for line in self._lines if re.match(r"\s*(- )?\s*config_name:", line)]
-        if len(names) > 1:
-            raise StoreError(f"{self.path}: it has {len(names)} configurations; one is allowed.")
-        titles = [line.partition(":")[2] for line in self._lines if line.startswith("pretty_name:")]
-        title = self._scalar(titles[0]) if titles else folder.resolve().name
-        self.title = printable(title, 500, "") or "data set"
-
-    def _scalar(self, text: str) -> str:
-        """Return a YAML scalar on one line: plain or quoted."""
-        text = text.strip()
-        if text.startswith('"'):
-            try:
-                return str(json.loads(text))
-            except ValueError:
-                raise StoreError(f"{self.path}: {printable(text, 100, '')} is no text.") from None
-        return text[1:-1].replace("''", "'") if text[:1] == text[-1:] == "'" != text else text
-
-    def files(self) -> dict[str, list[Path]]:
-        """Return the files of each split."""
-        patterns = self._patterns() or {name: [f"data/{name}-*.h5"] for name in PARTS}
-        declared = bool(self._patterns())
-        found = {}
-        for split, texts in patterns.items():
-            files = sorted({path for text in texts for path in self._matching(text)})
-            if not files and (declared or split == "train"):
-                raise StoreError(f"{self.path}: no file of the split {split!r} exists: {texts}.")
-            if files:
-                found[split] = files
-        return found
-
-    def _patterns(self) -> dict[str, list[str]]:
-        """Return the path patterns of each split, in the card's order."""
-        found: dict[str, list[str]] = {}
-        split = None
-        for line in self._lines:
-            key = re.match(r"\s*(?:- )?\s*(split|path):(.*)", line)
-            item = re.match(r"\s*-\s+([^:]+)$", line)
-            if key and key[1] == "split":
-                split = self._scalar(key[2])
-                if split not in PARTS or split in found:
-                    raise StoreError(
-                        f"{self.path}: each split must be one of {', '.join(PARTS)}, once; "
-                        f"got {printable(split, 100, '')!r}."
-                    )
-                found[split] = []
-            elif key and split is not None and key[2].strip():
-                found[split].append(self._scalar(key[2]))
-            elif item and split is not None:
-                found[split].append(self._scalar(item[1]))
-        if found and "train" not in found:
-            raise StoreError(f"{self.path}: the split 'train' is missing.")
-        return found
-
-    def _matching(self, pattern: str) -> list[Path]:
-        path = PurePosixPath(pattern)
-        if path.is_absolute() or ".." in path.parts or ":" in pattern or "\\" in pattern:
-            raise StoreError(
-                f"{self.path}: `path` must lie in the folder; got {printable(pattern, 200, '')!r}."
-            )
-        try:
-            return [
-                found for found in self.folder.glob(pattern) if found.suffix in (".h5", ".hdf5")
-            ]
-        except (ValueError, NotImplementedError):
-            raise StoreError(
-                f"{self.path}: {printable(pattern, 200, '')!r} is no pattern of files."
-            ) from None

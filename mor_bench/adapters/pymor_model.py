@@ -98,8 +98,12 @@ def from_vector_array(scene: Scene, vectors: Any) -> NDArray[np.float64]:
     Raises
     ------
     InvalidInputError
-        If the vectors have another number of components.
+        If `vectors` is no vector array, or has another number of components.
     """
+    if not hasattr(vectors, "to_numpy"):
+        raise InvalidInputError(
+            f"`vectors` must be a vector array of pyMOR; got {type(vectors).__name__}."
+        )
     values = np.ascontiguousarray(vectors.to_numpy().T)
     if values.shape[1] != len(scene.free_dofs):
         raise InvalidInputError(

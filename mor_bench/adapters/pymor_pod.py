@@ -1,4 +1,4 @@
-"""POD-Galerkin made by pyMOR, as a method that competes with the others.
+"""POD and a reductor of pyMOR, as a method that competes with the others.
 
 Use it with the method file
 
@@ -10,14 +10,16 @@ Use it with the method file
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from pymor.algorithms.pod import pod
 from pymor.core.exceptions import InversionError
 from pymor.core.logger import log_levels
@@ -30,11 +32,52 @@ from mor_bench.adapters.pymor_model import (
     to_vector_array,
     unsupported,
 )
-from mor_bench.errors import SolverError
+from mor_bench.errors import InvalidInputError, SolverError, text_of
 from mor_bench.model_arrays import take_array
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
+from mor_bench.specs.one_line_errors import nearest_name
 from mor_bench.surrogate import Surrogate
+
+USUAL = "pymor.reductors.basic:StationaryRBReductor"
+
+PUBLIC = re.compile(r"pymor\.reductors(\.[a-z][a-z0-9_]*)+:[A-Z][A-Za-z0-9]*")
+"""Import paths of public reductors of pyMOR. Others are never imported."""
+
+
+def reductor_class(target: str) -> type[Any]:
+    """Import a reductor of pyMOR by ``pymor.reductors.module:Class``.
+
+    No other package is imported, because the text may come from a model file.
+
+    Raises
+    ------
+    ValueError
+        If the text has another form, or names no ``StationaryRBReductor`` or subclass of it.
+    """
+    form = "it must name a reductor as `pymor.reductors.module:Class`"
+    module, _, name = target.partition(":")
+    if not PUBLIC.fullmatch(target):
+        raise ValueError(form)
+    try:
+        loaded = import_module(module)
+    except ModuleNotFoundError:
+        raise ValueError(f"{form}; there is no module {module!r}") from None
+    found = getattr(loaded, name, None)
+    if found is None:
+        near = nearest_name(name, dir(loaded)).rstrip(".")
+        raise ValueError(f"{form}; {module} has no {name!r}{near}")
+    if not (isinstance(found, type) and issubclass(found, StationaryRBReductor)):
+        raise ValueError(
+            f"{form}; {name!r} is no StationaryRBReductor or subclass of it, so it does not "
+            "project a static nonlinear model onto one basis"
+        )
+    return found
+
+
+def _checked_reductor(target: str) -> str:
+    reductor_class(target)
+    return target
 
 
 def quiet() -> AbstractContextManager[None]:
@@ -47,7 +90,7 @@ def quiet() -> AbstractContextManager[None]:
 
 @dataclass(eq=False)
 class PymorPOD(Surrogate):
-    """Galerkin projection by pyMOR's ``StationaryRBReductor`` onto the modes of its ``pod``.
+    """Projection by a reductor of pyMOR onto the modes of its ``pod``.
 
     Without hyper-reduction, each Newton step sums over all cells of the mesh. Answers are not
     checked for stability or inverted cells.
@@ -58,10 +101,14 @@ class PymorPOD(Surrogate):
         Size of the basis. pyMOR drops modes below 1e-7 of the largest singular value.
     tolerance : float
         Norm of the reduced residual relative to that of the reduced load, in (0, 1).
+    reductor : str
+        Import path ``pymor.reductors.module:Class`` of ``StationaryRBReductor`` or of a subclass
+        whose other parameters have defaults.
     """
 
     n_modes: Annotated[int, Field(ge=1)] = 20
     tolerance: Annotated[float, Field(gt=0, lt=1)] = 1e-8
+    reductor: Annotated[str, AfterValidator(_checked_reductor)] = USUAL
 
     def supports(self, scene: Scene) -> str | None:
         return unsupported(scene)
@@ -74,11 +121,20 @@ class PymorPOD(Surrogate):
     def prepare(self, scene: Scene, model: Mapping[str, NDArray[Any]]) -> None:
         modes = take_array(model, "modes", (len(scene.free_dofs), None))
         full = pymor_model(scene, tolerance=self.tolerance)
-        self.reductor_ = StationaryRBReductor(full, full.solution_space.from_numpy(modes))
         solver = NewtonSolver(rtol=self.tolerance, error_measure="residual")
         solver.disable_logging()
+        made, basis = reductor_class(self.reductor), full.solution_space.from_numpy(modes)
         with quiet():
-            reduced = self.reductor_.reduce()
+            try:
+                self.reductor_ = made(full, basis)
+                reduced = self.reductor_.reduce()
+            except MemoryError:
+                raise
+            except Exception as error:  # a reductor may need another model, by an assertion
+                reason = f"{type(error).__name__}: {text_of(error)}".rstrip(": ")
+                raise InvalidInputError(
+                    f"{self.reductor} cannot reduce {scene.name}: {reason}"
+                ) from error
         self.reduced_ = reduced.with_(operator=reduced.operator.with_(solver=solver))
         self.reduced_.disable_logging()
 

@@ -135,15 +135,22 @@ class SurrogateRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         forces = rows.reshape(len(rows), self.scene_.mesh.n_nodes, 3)
         return self.method_.predict(forces).reshape(len(rows), -1)
 
-    def score(self, X: ArrayLike, y: ArrayLike) -> float:
+    def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Return R² over the nodes whose displacements the scene wants.
 
         Columns are weighted by their variance. The plain mean over the columns would count each
-        component of a support as perfect.
+        component of a support as perfect. `sample_weight` has one number per row.
         """
         predicted, dofs = self.predict(X), dofs_of_nodes(self.scene_.output_nodes)
         known = np.asarray(y)[:, dofs]
-        return float(r2_score(known, predicted[:, dofs], multioutput="variance_weighted"))
+        return float(
+            r2_score(
+                known,
+                predicted[:, dofs],
+                sample_weight=sample_weight,
+                multioutput="variance_weighted",
+            )
+        )
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 
 import numpy as np
@@ -48,16 +49,34 @@ class TorchSnapshots(Dataset[Sample]):
         ------
         IndexError
             If there is no such sample.
+        InvalidInputError
+            If the index is no integer. For several samples, slice the snapshots.
         """
         n = len(self.snapshots)
+        try:
+            index = operator.index(index)  # also of NumPy and PyTorch
+        except TypeError:
+            raise InvalidInputError(
+                f"the number of a sample must be an integer; got {index!r}. "
+                "TorchSnapshots(snapshots[0:3]) holds several."
+            ) from None
         if not -n <= index < n:
             raise IndexError(f"sample {index} of {n}")
-        return self.__getitems__([int(index) % n])[0]
+        return self.__getitems__([index % n])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[Sample]:
-        """Return several samples; `DataLoader` asks for each batch in this way."""
+        """Return several samples; `DataLoader` asks for each batch in this way.
+
+        Raises
+        ------
+        InvalidInputError
+            If the numbers are no integers.
+        """
+        numbers = np.asarray(indices)
+        if len(numbers) and numbers.dtype.kind not in "iu":
+            raise InvalidInputError(f"the numbers of samples must be integers; got {indices!r}.")
         # A part of the samples computes its own forces, and is dropped with them.
-        part = self.snapshots[np.asarray(indices, dtype=np.int64)]
+        part = self.snapshots[numbers.astype(np.int64)]
         columns = [part.given.values, part.displacements]
         if part.scene.parameter_names:
             columns.insert(1, part.parameters)

@@ -103,7 +103,7 @@ def write_archive(
         text = json.dumps(metadata, indent=1, ensure_ascii=False)
         writer.add(METADATA, f"{text}\n".encode())
         digest = writer.list_sums()
-    return Written(out if out.suffix == ".zip" else out / SUMS, digest)
+    return Written(out if out.suffix.lower() == ".zip" else out / SUMS, digest)
 
 
 def _add_samples(

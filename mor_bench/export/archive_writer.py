@@ -68,7 +68,7 @@ def new_archive(target: Path) -> Iterator[ArchiveWriter]:
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_beside(target)
     try:
-        if target.suffix == ".zip":
+        if target.suffix.lower() == ".zip":
             with zipfile.ZipFile(temporary, "x", zipfile.ZIP_STORED) as packed:
                 yield ArchiveWriter(temporary, packed, target.stem)
         else:

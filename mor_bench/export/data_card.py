@@ -12,7 +12,7 @@ import numpy as np
 
 from mor_bench.checked_files import MIB, read_bytes
 from mor_bench.checkout import source_commit
-from mor_bench.errors import InvalidInputError
+from mor_bench.errors import InvalidInputError, printable
 from mor_bench.mechanics.newton import NewtonOptions
 from mor_bench.report.scene_text import scene_text
 from mor_bench.snapshots.archive_files import SUMS
@@ -48,6 +48,7 @@ class Licence:
     Attributes
     ----------
     name : str
+        For a text, its first line.
     url : str
         Address of its text; empty if the archive holds the text.
     own_text : str
@@ -65,7 +66,7 @@ class Licence:
         Raises
         ------
         InvalidInputError
-            If it is neither, or the file is no text.
+            If it is neither, or the file is no text, or holds nothing.
         """
         if choice in CREATIVE_COMMONS:
             name, url = CREATIVE_COMMONS[choice]
@@ -79,7 +80,10 @@ class Licence:
             ) from None
         except UnicodeDecodeError:
             raise InvalidInputError(f"{choice}: a licence must be a text in UTF-8.") from None
-        return cls("the licence in LICENSE.txt", own_text=text)
+        lines = [" ".join(_plain(line).split()) for line in text.splitlines()]
+        if not any(lines):
+            raise InvalidInputError(f"{choice}: a licence must be a text; the file holds none.")
+        return cls(printable(next(filter(None, lines)), 200, "").rstrip("."), own_text=text)
 
     def text(self, authors: Sequence[str]) -> str:
         """Return the content of LICENSE.txt."""
@@ -124,7 +128,7 @@ class Facts:
     @property
     def citation(self) -> str:
         return (
-            f"{_listed(self.authors)}: {self.spec.title}. Dataset `{self.spec.name}`, made with "
+            f"{_listed(self.authors)}: {self.spec.title}. Dataset {self.spec.name}, made with "
             f"mor-bench {__version__}."
         )
 
@@ -152,8 +156,8 @@ def card_text(facts: Facts) -> str:
         "Arrays": _arrays(facts),
         "Read it": _reading(spec.name),
         "Cite it": f"{_plain(facts.citation)}\n\n"
-        "Add the identifier of the repository that you have it from. Cite mor-bench too; its file "
-        "`CITATION.cff` shows how.",
+        "Add the identifier of the repository that you have it from. Cite the program too:\n\n"
+        f"The mor-bench authors: {facts.software}.",
         "Licence": f"{facts.licence.name}, see `LICENSE.txt`. {facts.licence.url}".rstrip(),
     }
     title = (
@@ -252,7 +256,8 @@ def metadata_of(facts: Facts, sums: Mapping[str, str], sizes: Mapping[str, int])
         "alternateName": facts.spec.name,
         "description": f"{facts.scene} {facts.n_samples:,} static equilibria.",
         "creator": [{"name": author} for author in facts.authors],
-        "license": facts.licence.url or "LICENSE.txt",
+        "license": facts.licence.url
+        or {"@type": "CreativeWork", "name": facts.licence.name, "url": "LICENSE.txt"},
         "creditText": facts.citation,
         "version": f"v{SCHEMA_VERSION}.{GENERATOR_VERSION}",
         "keywords": ["hyperelasticity", "model order reduction", "finite elements", "surrogate"],

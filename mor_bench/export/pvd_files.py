@@ -10,7 +10,13 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import InvalidInputError, SolverError, UnsupportedSceneError, check_count
+from mor_bench.errors import (
+    InvalidInputError,
+    SolverError,
+    UnsupportedSceneError,
+    check_count,
+    is_integer,
+)
 from mor_bench.export.output_path import new_file
 from mor_bench.export.vtu_files import Part, samples_of, write_fields
 from mor_bench.mechanics.elements import element_of, shape_gradients
@@ -48,7 +54,7 @@ def export_pvd(
         If the part or a sample does not exist, no sample is given, or a file or folder exists.
     """
     found, numbers = samples_of(data, part), list(samples)
-    growing = all(a < b for a, b in pairwise(numbers))
+    growing = all(map(is_integer, numbers)) and all(a < b for a, b in pairwise(numbers))
     if not numbers or not growing or numbers[0] < 0 or numbers[-1] >= len(found):
         raise InvalidInputError(
             f"`samples` must be growing integers in [0, {len(found) - 1}], "
@@ -89,9 +95,9 @@ def export_load_path_pvd(
     """
     scene = data.scene
     check_count("n_steps", n_steps)
-    if not 0 <= sample < len(data.test):
+    if not (is_integer(sample) and 0 <= sample < len(data.test)):
         raise InvalidInputError(
-            f"`sample` must be an integer in [0, {len(data.test) - 1}]; got {sample}."
+            f"`sample` must be an integer in [0, {len(data.test) - 1}]; got {sample!r}."
         )
     reason = "its body varies between samples" if scene.parameter_names else None
     if reason := reason or unknown_equations(scene):

@@ -72,13 +72,14 @@ class Scene:
     material: Material | None
     fixed_nodes: NDArray[np.int64]
     held_dofs: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    frames: Frames | None = field(default=None, kw_only=True, repr=False)
-    embedded_surface: Facets | None = field(default=None, repr=False)
-    point_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict, repr=False)
-    springs: tuple[Springs, ...] = field(default=(), repr=False)
-    memo: dict[str, NDArray[np.float64]] = field(
-        init=False, default_factory=dict, repr=False, compare=False
-    )
+    frames: Frames | None = field(default=None, kw_only=True)
+    embedded_surface: Facets | None = None
+    point_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    springs: tuple[Springs, ...] = ()
+    memo: dict[str, NDArray[np.float64]] = field(init=False, default_factory=dict, compare=False)
+
+    def __repr__(self) -> str:
+        return f"<Scene {self.name}: {self.mesh.n_nodes} nodes, {self.mesh.n_cells} cells>"
 
     @property
     def name(self) -> str:

@@ -51,6 +51,9 @@ _KINDS = {
 }
 """Patterns of the names that an archive may hold, with the size limits of such files, bytes."""
 
+_IGNORED = ".DS_Store"
+"""A file that the Finder of macOS adds to each folder that it shows; it is never opened."""
+
 _FOLDERS = re.compile(rf"{MAIN}|{TESTS}|{TESTS}/[a-z0-9-]{{1,40}}")
 _LINE = re.compile(r"([0-9a-f]{64}) [ *](.+)")
 
@@ -182,6 +185,8 @@ def _sizes_in_folder(root: Path) -> dict[str, int]:
             if stat.S_ISLNK(status.st_mode):
                 raise StoreError(f"{path}: a link; an archive of a dataset holds none.")
             allowed = _FOLDERS.fullmatch(inside) if name in inner else most_bytes(inside)
+            if name == _IGNORED and stat.S_ISREG(status.st_mode):
+                continue
             if not allowed or not (stat.S_ISDIR if name in inner else stat.S_ISREG)(status.st_mode):
                 shown = printable(str(path), 300, "")
                 raise StoreError(f"{shown}: no file of an archive of a dataset; remove it.")
@@ -195,7 +200,11 @@ def _members(path: Path, packed: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
     Files are stored as they are, so none is larger than the ZIP file.
     """
-    infos = [info for info in packed.infolist() if not info.is_dir()]
+    infos = [
+        info
+        for info in packed.infolist()
+        if not info.is_dir() and info.filename.rpartition("/")[2] != _IGNORED
+    ]
     tops = {info.filename.partition("/")[0] for info in infos}
     top = f"{tops.pop()}/" if len(tops) == 1 and all("/" in i.filename for i in infos) else ""
     members: dict[str, zipfile.ZipInfo] = {}

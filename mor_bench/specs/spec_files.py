@@ -44,9 +44,25 @@ def load_dataset_spec(
         raise SpecError(
             f"a dataset must be a name, the path of a TOML or a dict; got {type(source).__name__}."
         )
-    path = find_file("datasets", source, suite)
+    path = _dataset_file(source, suite)
     content = {"title": path.stem, **read_toml(path), "name": path.stem}
     return _validated_dataset(content, str(path), path.parent)
+
+
+def _dataset_file(source: str | Path, suite: Path | None) -> Path:
+    try:
+        path = find_file("datasets", source, suite)
+    except SpecError:
+        path = Path(source)
+        if not path.is_dir():
+            raise
+    if path.is_dir():
+        raise SpecError(
+            f"{path}: a folder; a dataset must be a name or the path of a TOML. "
+            "mor_bench.adapters.dataset_folder.import_dataset_folder turns a folder with a data "
+            "set card into a TOML."
+        )
+    return path
 
 
 def load_recorded_spec(content: Any, where: str) -> AnyDatasetSpec:

@@ -30,6 +30,7 @@ from mor_bench.surrogate import Surrogate
 Array = NDArray[np.float64]
 Arrays = Mapping[str, NDArray[Any]]
 Input = Literal["linear-response", "force"]
+Output = Literal["remainder", "displacement"]
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,9 @@ class CoordinateSamples:
 class CoordinateRegression(Surrogate, ABC):
     """u = K₀⁻¹f + Φ g(z) with z coordinates of K₀⁻¹f, or u = Φ g(z) with z coordinates of f.
 
+    A subclass may also declare `output`; "displacement" is u = Φ g(z) with z coordinates of K₀⁻¹f,
+    without sampled parameters.
+
     No mean is subtracted, and g(0) = 0: no force gives no displacement. With the linear response as
     input, g learns only the nonlinear remainder. With the force as input, g needs no equations, but
     it has no information about load regions without training samples. In a scene with observed
@@ -95,6 +99,7 @@ class CoordinateRegression(Surrogate, ABC):
     n_input_modes: int | None
     n_output_modes: int
     derivatives: bool = False
+    output: Output | None = None
 
     usual_inputs: ClassVar[Mapping[str, int]] = {"linear-response": 20, "force": 60}
     """Length of z for each input, if `n_input_modes` is None."""
@@ -149,7 +154,7 @@ class CoordinateRegression(Surrogate, ABC):
             self._respond_to(scene)
             response = self._responses(given, samples.parameters)
             inputs = scene.at_free_dofs(response)
-            targets = targets - inputs
+            targets = targets - inputs if self._adds_response else targets
         else:
             inputs = scene.at_free_dofs(given)
         usual = min(self.usual_inputs[self.input], *inputs[:, inputs.any(axis=0)].shape)
@@ -208,7 +213,7 @@ class CoordinateRegression(Surrogate, ABC):
         coefficients = self.coefficients(project(self.from_forces_, loads))
         count(multiply_adds=len(loads) * self.modes_.size)
         out = coefficients @ self._expanding
-        if self.input == "linear-response":
+        if self._adds_response:
             out += loads if self._kinked else self.response_.respond(loads)
         return out.reshape(forces.shape)
 
@@ -231,6 +236,10 @@ class CoordinateRegression(Surrogate, ABC):
     def _kinked(self) -> bool:
         """True if the response to the input is not linear, so that z is taken of the response."""
         return self.input == "linear-response" and self.scene_.contact is not None
+
+    @property
+    def _adds_response(self) -> bool:
+        return self.input == "linear-response" and self.output != "displacement"
 
     def _respond_to(self, scene: Scene) -> None:
         if scene.parameter_names:

@@ -22,6 +22,7 @@ from mor_bench.surrogates.coordinate_regression import (
     CoordinateRegression,
     CoordinateSamples,
     Input,
+    Output,
 )
 
 PUBLIC = re.compile(r"sklearn(\.[a-z][a-z0-9_]*)+:[A-Z][A-Za-z0-9]*")
@@ -106,6 +107,15 @@ def _checked_parameters(parameters: dict[str, Any], info: ValidationInfo) -> dic
     return parameters
 
 
+def _checked_output(output: Output | None, info: ValidationInfo) -> Output | None:
+    if output == "remainder" and info.data.get("input") == "force":
+        raise ValueError(
+            'with `input = "force"` it must be "displacement": a remainder is what linear '
+            "elasticity leaves"
+        )
+    return output
+
+
 def _is_plain(value: object) -> bool:
     if isinstance(value, list):
         return all(map(_is_plain, value))
@@ -128,6 +138,8 @@ class PCAEstimator(CoordinateRegression):
 
     The work of the regressor is not counted, because it is unknown.
 
+    The coordinates of the output are those of POD modes Φ of its training samples.
+
     `input`, `n_input_modes` and `n_output_modes` are those of `CoordinateRegression`.
 
     Parameters
@@ -136,6 +148,10 @@ class PCAEstimator(CoordinateRegression):
         Import path of the regressor, such as "sklearn.neighbors:KNeighborsRegressor".
     estimator_parameters : dict
         Its parameters: numbers, texts, booleans or lists. `n_jobs` cannot be set.
+    output : {"remainder", "displacement"}, optional
+        Source of the modes Φ and of the targets: the displacement without its linear response, or
+        the whole displacement. By default, the remainder with the linear response as input, and
+        the displacement with the force as input.
     seed : int
         Its `random_state`, if it has one.
     """
@@ -145,6 +161,7 @@ class PCAEstimator(CoordinateRegression):
         default_factory=dict
     )
     input: Input = "linear-response"
+    output: Annotated[Output | None, AfterValidator(_checked_output)] = None
     n_input_modes: Annotated[int, Field(ge=1)] | None = None
     n_output_modes: Annotated[int, Field(ge=1)] = 20
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
