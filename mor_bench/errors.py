@@ -11,7 +11,17 @@ from typing import TypeGuard
 
 
 class MorBenchError(Exception):
-    """Base class of the errors of mor-bench."""
+    """Base class of the errors of mor-bench.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> try:
+    ...     mor_bench.load_scene("no-such-scene")
+    ... except MorBenchError as error:
+    ...     type(error).__name__
+    'SpecError'
+    """
 
 
 def printable(text: str, most: int = 2000, keep: str = "\n\t") -> str:

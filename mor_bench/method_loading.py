@@ -53,6 +53,11 @@ def load_method(source: str | Path, **parameters: Any) -> Surrogate:
         If the method or a hyperparameter is unknown, or a value is of the wrong type or range.
     MissingDependencyError
         If the method needs an extra that is not installed.
+
+    Examples
+    --------
+    >>> load_method("pod[n_modes=5]").n_modes
+    5
     """
     spec = load_method_spec(source)
     if isinstance(source, str) and any(len(v) > 1 for v in split_method(source)[1].values()):
@@ -151,6 +156,16 @@ def load_surrogate(path: str | Path) -> Surrogate:
     StoreError
         If the file is missing, damaged, of another format or a newer schema, or names a class that
         belongs to no method.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import mor_bench
+    >>> fitted = load_method("linear-fem").fit(mor_bench.load_scene("beam-tiny"))
+    >>> with TemporaryDirectory() as folder:
+    ...     fitted.save(f"{folder}/model.safetensors")
+    ...     type(load_surrogate(f"{folder}/model.safetensors")).__name__
+    'LinearFEM'
     """
     model = read_model(path)
     known = {load_method_spec(file).surrogate for file in list_suite("methods").values()}

@@ -53,6 +53,13 @@ class Surrogate:
     `learn` returns the model as arrays, `prepare` computes from them everything else that a query
     needs, and `answer` predicts. Pydantic's `Field` in the annotations gives the range of a
     hyperparameter. This base class checks all input, saves, loads, and discards earlier fits.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> scene = mor_bench.load_scene("beam-tiny")
+    >>> mor_bench.load_method("linear-fem").fit(scene).predict(scene.mesh.points * 0.0).shape
+    (63, 3)
     """
 
     needs_snapshots: ClassVar[bool] = True

@@ -55,6 +55,15 @@ def export_dataset_folder(data: Dataset, out: str | Path) -> list[Path]:
         If the body varies between samples.
     InvalidInputError
         If one of the files exists.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import mor_bench
+    >>> with TemporaryDirectory() as folder:
+    ...     files = export_dataset_folder(mor_bench.load_dataset("beam-tiny"), folder)
+    >>> sorted(file.name.partition("-")[0] for file in files)
+    ['README.md', 'mesh.h5', 'test', 'train', 'validation']
     """
     scene, out = data.scene, Path(out)
     if scene.parameter_names:
@@ -145,6 +154,16 @@ def import_dataset_folder(folder: str | Path, out: str | Path) -> list[Path]:
         Also if the card is no valid YAML, or names its files in another way.
     InvalidInputError
         If `out` exists or has a wrong name.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import mor_bench
+    >>> with TemporaryDirectory() as folder:
+    ...     files = export_dataset_folder(mor_bench.load_dataset("beam-tiny"), f"{folder}/hub")
+    ...     arrays, toml = import_dataset_folder(f"{folder}/hub", f"{folder}/again.npz")
+    ...     len(mor_bench.load_dataset(toml).test)
+    40
     """
     folder = Path(folder)
     try:

@@ -40,6 +40,14 @@ def pymor_model(scene: Scene, loads: ArrayLike | None = None, *, tolerance: floa
         If the scene has no known equations, sampled parameters, or no given forces.
     InvalidInputError
         If the loads have another shape or are not finite, or the tolerance is out of range.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> scene = mor_bench.load_scene("beam-tiny")
+    >>> model = pymor_model(scene, patch_loads(scene))
+    >>> model.solve({"load": [0.0] * len(patch_loads(scene))}).norm()
+    array([0.])
     """
     if reason := unsupported(scene):
         raise UnsupportedSceneError(f"{scene.name} cannot be a model of pyMOR: {reason}.")
@@ -72,6 +80,13 @@ def patch_loads(scene: Scene) -> NDArray[np.float64]:
     """Return 1 N along x, y and z on each load patch, (3 n_patches, n_nodes, 3), for `pymor_model`.
 
     The factors of patch p are the components 3p, 3p + 1 and 3p + 2 of the parameter.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> scene = mor_bench.load_scene("beam-tiny")
+    >>> len(patch_loads(scene)) == 3 * len(scene.patch_nodes)
+    True
     """
     weights = scene.patch_weights.toarray()
     fields = weights[:, None, :, None] * np.eye(3)[None, :, None, :]
@@ -87,6 +102,14 @@ def to_vector_array(scene: Scene, fields: ArrayLike) -> Any:
         If pyMOR is not installed.
     InvalidInputError
         If the fields have another shape or are not finite.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> data = mor_bench.load_dataset("beam-tiny")
+    >>> vectors = to_vector_array(data.scene, data.test.displacements)
+    >>> len(vectors), vectors.dim
+    (40, 162)
     """
     values = np.ascontiguousarray(scene.at_free_dofs(_nodal(scene, fields, "fields")))
     return _operators().NumpyVectorSpace(values.shape[1]).from_numpy(values.T)
@@ -99,6 +122,14 @@ def from_vector_array(scene: Scene, vectors: Any) -> NDArray[np.float64]:
     ------
     InvalidInputError
         If `vectors` is no vector array, or has another number of components.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> data = mor_bench.load_dataset("beam-tiny")
+    >>> vectors = to_vector_array(data.scene, data.test.displacements)
+    >>> from_vector_array(data.scene, vectors).shape
+    (40, 63, 3)
     """
     if not hasattr(vectors, "to_numpy"):
         raise InvalidInputError(

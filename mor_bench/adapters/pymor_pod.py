@@ -104,6 +104,14 @@ class PymorPOD(Surrogate):
     reductor : str
         Import path ``pymor.reductors.module:Class`` of ``StationaryRBReductor`` or of a subclass
         whose other parameters have defaults.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> data = mor_bench.load_dataset("beam-tiny")
+    >>> method = PymorPOD(n_modes=5).fit(data.scene, data.train)
+    >>> method.predict(data.test.forces[0]).shape
+    (63, 3)
     """
 
     n_modes: Annotated[int, Field(ge=1)] = 20

@@ -54,6 +54,15 @@ class SurrogateRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     scene_ : Scene
     n_features_in_ : int
         Three times the number of nodes.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> data = mor_bench.load_dataset("beam-tiny")
+    >>> X = data.train.forces.reshape(len(data.train), -1)
+    >>> y = data.train.displacements.reshape(len(data.train), -1)
+    >>> SurrogateRegressor("pod", data.scene, n_modes=5).fit(X, y).predict(X[:2]).shape
+    (2, 189)
     """
 
     def __init__(

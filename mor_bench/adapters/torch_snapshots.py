@@ -29,6 +29,13 @@ class TorchSnapshots(Dataset[Sample]):
     ----------
     snapshots : Snapshots
         For example `Dataset.train`.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> forces, displacements = TorchSnapshots(mor_bench.load_dataset("beam-tiny").train)[0]
+    >>> tuple(forces.shape), displacements.dtype
+    ((63, 3), torch.float32)
     """
 
     def __init__(self, snapshots: Snapshots) -> None:

@@ -55,6 +55,15 @@ def export_well(data: Dataset, out: str | Path, *, dtype: Precision = "float32")
         varies between samples.
     InvalidInputError
         If the type is another one, or one of the files exists.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import mor_bench
+    >>> with TemporaryDirectory() as folder:
+    ...     files = export_well(mor_bench.load_dataset("beam-tiny"), folder)
+    >>> [file.parent.name for file in files]
+    ['train', 'valid', 'test']
     """
     if dtype not in get_args(Precision):
         raise InvalidInputError(f"`dtype` must be float32 or float64; got {dtype!r}.")

@@ -55,6 +55,17 @@ def import_well(
         If `out` exists or has a wrong name.
     FileNotFoundError
         If the source does not exist.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import mor_bench
+    >>> from mor_bench.adapters.well_export import export_well
+    >>> with TemporaryDirectory() as folder:
+    ...     files = export_well(mor_bench.load_dataset("beam-tiny"), f"{folder}/well")
+    ...     arrays, toml = import_well(f"{folder}/well", f"{folder}/again.npz")
+    ...     len(mor_bench.load_dataset(toml).test)
+    40
     """
     source = Path(source)
     found = {

@@ -129,6 +129,16 @@ class Verdict:
         Sentences about everything else.
     evidence : list of str
         Lines with the figures of the winner, or of the nearest configuration.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import mor_bench
+    >>> with TemporaryDirectory() as folder:  # doctest: +SKIP
+    ...     comparison = mor_bench.run(["beam-tiny"], ["linear-fem"], out=f"{folder}/run")
+    ...     verdict = mor_bench.pick("beam-tiny", comparison=comparison, error=1e-6)
+    ...     verdict.qualified, verdict.nearest.label
+    ([], 'linear-fem')
     """
 
     dataset: str

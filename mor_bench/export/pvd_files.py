@@ -52,6 +52,15 @@ def export_pvd(
     ------
     InvalidInputError
         If the part or a sample does not exist, no sample is given, or a file or folder exists.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import mor_bench
+    >>> with TemporaryDirectory() as folder:
+    ...     files = export_pvd(mor_bench.load_dataset("beam-tiny"), [0, 3], f"{folder}/samples.pvd")
+    >>> [file.name for file in files]
+    ['samples.pvd', '00000.vtu', '00001.vtu']
     """
     found, numbers = samples_of(data, part), list(samples)
     growing = all(map(is_integer, numbers)) and all(a < b for a, b in pairwise(numbers))
@@ -92,6 +101,15 @@ def export_load_path_pvd(
         If the full-order model cannot solve the scene for given forces.
     SolverError
         If a step has no solution.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import mor_bench
+    >>> data = mor_bench.load_dataset("beam-tiny")
+    >>> with TemporaryDirectory() as folder:
+    ...     len(export_load_path_pvd(data, 3, f"{folder}/path.pvd", n_steps=2))
+    4
     """
     scene = data.scene
     check_count("n_steps", n_steps)

@@ -91,6 +91,18 @@ def reaction_forces(scene: Scene, displacements: ArrayLike, forces: ArrayLike) -
     scene : Scene
     displacements, forces : (n_nodes, 3) or (n, n_nodes, 3)
         As for `Reactions`, which is faster for many calls.
+
+    Examples
+    --------
+    The reactions balance the load, here one of 0.5 N:
+
+    >>> import mor_bench, numpy as np
+    >>> scene = mor_bench.load_scene("beam-tiny")
+    >>> forces = np.zeros((63, 3))
+    >>> forces[scene.patch_nodes[-1]] = [0.0, 0.0, -0.5]
+    >>> u = mor_bench.load_method("fem").fit(scene).predict(forces)
+    >>> bool(np.isclose(reaction_forces(scene, u, forces)[:, 2].sum(), 0.5))
+    True
     """
     u, f = np.asarray(displacements, dtype=np.float64), np.asarray(forces, dtype=np.float64)
     if u.ndim not in (2, 3) or u.shape != f.shape:

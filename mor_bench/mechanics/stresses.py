@@ -27,6 +27,15 @@ class Stresses:
     ----------
     cauchy : (..., n_cells, 3, 3) float64
         Cauchy stress, Pa.
+
+    Examples
+    --------
+    A body at rest has no stress:
+
+    >>> import mor_bench
+    >>> scene = mor_bench.load_scene("beam-tiny")
+    >>> float(abs(stresses(scene, scene.mesh.points * 0.0).cauchy).max())
+    0.0
     """
 
     cauchy: Array
@@ -135,6 +144,13 @@ def stresses(scene: Scene, displacements: ArrayLike) -> Stresses:
         If the shape is wrong.
     UnsupportedSceneError
         As `CellStresses`, which is faster for many calls.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> data = mor_bench.load_dataset("beam-tiny")
+    >>> stresses(data.scene, data.test.displacements).cauchy.shape
+    (40, 24, 3, 3)
     """
     u = np.asarray(displacements, dtype=np.float64)
     if u.ndim == 2:

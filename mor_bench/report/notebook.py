@@ -39,6 +39,15 @@ class Comparison(results.Comparison):
 
     `table` is a `pandas.DataFrame`. The functions `plot_…` draw on the given axes, or on new ones,
     and return them. See `mor_bench.results.comparison.Comparison` for the attributes.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:  # doctest: +SKIP
+    ...     _ = run(["beam-tiny"], ["linear-fem"], out=f"{folder}/run")
+    ...     Comparison.read(f"{folder}/run").table[["dataset", "method", "n_test"]]
+         dataset      method  n_test
+    0  beam-tiny  linear-fem      40
     """
 
     @classmethod

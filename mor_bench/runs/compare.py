@@ -68,6 +68,15 @@ def run(
         If an option is unknown or out of range, or ``out`` cannot be written or holds another run.
     StoreError
         If the record of a discretisation error is damaged.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:  # doctest: +SKIP
+    ...     comparison = mor_bench.run(["beam-tiny"], ["linear-fem"], out=f"{folder}/run")
+    ...     [row.label for row in comparison.rows]
+    ['linear-fem']
     """
     context = RunContext.of(RunOptions(profile=profile, **options), listener)
     specs, methods_found, _ = checked_specs(datasets, methods, context.options)

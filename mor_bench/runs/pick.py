@@ -57,6 +57,16 @@ def pick(
         If a limit is not positive, or the comparison does not hold this dataset.
     SpecError, StoreError
         If the dataset is not valid, or the run's folder cannot be read or lacks raw samples.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import mor_bench
+    >>> with TemporaryDirectory() as folder:  # doctest: +SKIP
+    ...     comparison = mor_bench.run(["beam-tiny"], ["linear-fem"], out=f"{folder}/run")
+    ...     verdict = pick("beam-tiny", comparison=comparison, error=0.2, latency_ms=100.0)
+    ...     [row.label for row in verdict.qualified]
+    ['linear-fem']
     """
     spec = load_dataset_spec(dataset, suite)
     given = {name: limit for name, limit in limits.items() if limit is not None}

@@ -54,6 +54,16 @@ class Fit:
         Numbers of samples. A training uses the validation samples to stop early.
     first_of : dict of str to list
         Swept parameters that were not given, and the values in the file; the first one was used.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import mor_bench
+    >>> with TemporaryDirectory() as folder:
+    ...     result = fit("beam-tiny", "linear-fem", out=f"{folder}/model.safetensors")
+    ...     again = mor_bench.load_surrogate(result.out)
+    >>> type(again) is type(result.method), result.n_train
+    (True, 140)
     """
 
     method: Surrogate
@@ -110,6 +120,14 @@ def fit(
         If ``start_from`` or the checkpoint is damaged.
     MorBenchError
         Any error of the method's `fit`; `MethodFailedError` if a third party's method crashes.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     result = fit("beam-tiny", "linear-fem", out=f"{folder}/model.safetensors")
+    >>> result.n_test, f"{result.error['rel_l2_median']:.1%}"
+    (40, '2.6%')
     """
     chosen = FitOptions(**options)
     out = Path(out)

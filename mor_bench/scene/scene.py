@@ -23,7 +23,7 @@ from mor_bench.scene.materials import Material, make_material
 from mor_bench.scene.mesh import Mesh
 from mor_bench.scene.observed_regions import moved_nodes, observed_nodes
 from mor_bench.scene.regions import Cloud, region_points
-from mor_bench.scene.second_order import with_middles
+from mor_bench.scene.second_order import in_elements
 from mor_bench.scene.snapshot_file import ImportedArrays, read_arrays
 from mor_bench.scene.springs import Springs, foundations
 from mor_bench.scene.supports import Frames, held_by
@@ -65,6 +65,12 @@ class Scene:
         Foundations.
     memo : dict of str to float64
         Arrays that are computed once for a scene, such as its rest state under gravity.
+
+    Examples
+    --------
+    >>> scene = load_scene("beam-tiny")
+    >>> scene.spec.material.law, len(scene.fixed_nodes), len(scene.patch_nodes)
+    ('saint-venant-kirchhoff', 9, 21)
     """
 
     spec: AnyDatasetSpec
@@ -347,6 +353,12 @@ def load_scene(source: str | Path | Mapping[str, Any] | AnyDatasetSpec) -> Scene
     ------
     SpecError
         If the dataset is unknown or not valid, or one of its regions is empty.
+
+    Examples
+    --------
+    >>> scene = load_scene("beam-tiny")
+    >>> scene.name, scene.mesh.n_nodes
+    ('beam-tiny', 63)
     """
     spec = as_spec(source)
     try:
@@ -365,7 +377,7 @@ def imported_scene(spec: ImportedDatasetSpec, arrays: ImportedArrays) -> Scene:
 def scene_without_patches(spec: DatasetSpec) -> Scene:
     """Build a scene without searching its load region."""
     mesh, surface, point_sets = build_body(spec)
-    mesh, point_sets = _in_elements(spec, mesh, point_sets)
+    mesh, point_sets = in_elements(spec, mesh, point_sets)
     cloud = Cloud(mesh.points, np.unique(mesh.boundary_facets), point_sets)
     material, held = make_material(spec.material), held_by(spec.supports, cloud)
     springs = foundations(spec, surface or Facets(mesh.points, mesh.boundary_facets), point_sets)
@@ -380,19 +392,3 @@ def scene_without_patches(spec: DatasetSpec) -> Scene:
         springs,
         frames=held.frames,
     )
-
-
-def _in_elements(
-    spec: DatasetSpec, mesh: Mesh, point_sets: Mapping[str, NDArray[np.int64]]
-) -> tuple[Mesh, Mapping[str, NDArray[np.int64]]]:
-    """Return the mesh in the elements of a dataset file; `SpecError` if it has others."""
-    wanted, n_nodes = spec.discretisation, mesh.cells.shape[1]
-    element = "hexahedron" if n_nodes == 8 else "tetrahedron"
-    if element != wanted.element:
-        raise SpecError(
-            f"`discretisation.element` must be {element!r}, as in the mesh; got {wanted.element!r}."
-        )
-    if n_nodes == 10 and wanted.order == 1:
-        raise SpecError("`discretisation.order` must be 2, as in the mesh; got 1.")
-    promote = (n_nodes, wanted.order) == (4, 2)
-    return with_middles(mesh, point_sets) if promote else (mesh, point_sets)

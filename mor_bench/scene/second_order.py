@@ -7,7 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.errors import SpecError
 from mor_bench.scene.mesh import TET_EDGES, Mesh, along_longest_axis, inverse_of
+from mor_bench.specs import DatasetSpec
 
 
 def with_middles(
@@ -37,3 +39,19 @@ def with_middles(
         sets[name] = np.sort(place[np.append(nodes, mesh.n_nodes + between)])
     kept = None if index is None else index[order]
     return Mesh(points[order], place[cells], shape, kept), sets
+
+
+def in_elements(
+    spec: DatasetSpec, mesh: Mesh, point_sets: Mapping[str, NDArray[np.int64]]
+) -> tuple[Mesh, Mapping[str, NDArray[np.int64]]]:
+    """Return the mesh in the elements of a dataset file; `SpecError` if it has others."""
+    wanted, n_nodes = spec.discretisation, mesh.cells.shape[1]
+    element = "hexahedron" if n_nodes == 8 else "tetrahedron"
+    if element != wanted.element:
+        raise SpecError(
+            f"`discretisation.element` must be {element!r}, as in the mesh; got {wanted.element!r}."
+        )
+    if n_nodes == 10 and wanted.order == 1:
+        raise SpecError("`discretisation.order` must be 2, as in the mesh; got 1.")
+    promote = (n_nodes, wanted.order) == (4, 2)
+    return with_middles(mesh, point_sets) if promote else (mesh, point_sets)

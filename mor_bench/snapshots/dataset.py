@@ -45,6 +45,12 @@ class Snapshots:
         Displacements of the free dofs, m. Supports do not move.
     min_det_f : (n_samples,) float64
         Smallest det F of each sample; NaN for imported samples.
+
+    Examples
+    --------
+    >>> samples = load_dataset("beam-tiny").test
+    >>> samples.forces.shape, samples.displacements.shape
+    ((40, 63, 3), (40, 63, 3))
     """
 
     scene: Scene = field(repr=False)
@@ -205,6 +211,12 @@ def load_dataset(
         ``cluster`` is not an address or is given together with ``workers``.
     StoreError, WorkerError, MissingDependencyError
         If generation fails, see `mor_bench.snapshots.generate.generate`.
+
+    Examples
+    --------
+    >>> data = load_dataset("beam-tiny")
+    >>> len(data.train), len(data.validation), len(data.test)
+    (140, 30, 40)
     """
     if unknown := sorted(generation.keys() - GenerationOptions.__annotations__.keys()):
         raise TypeError(f"load_dataset() got an unexpected keyword argument {unknown[0]!r}")
