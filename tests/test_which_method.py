@@ -1,0 +1,58 @@
+"""The page that leads to a method names the winners and networks of the stored runs."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+import pytest
+
+from mor_bench.report.suite_overview import overview
+from mor_bench.results.comparison import Comparison
+from mor_bench.results.row import Row
+from tests.published.stored import REPORTS, ROOT
+
+PAGE = (ROOT / "docs" / "which-method.md").read_text(encoding="utf-8")
+ROW = re.compile(r"^\| `([\w-]+)` \| \[?`([\w/-]+)`.* \| (`.*`) \|$", re.MULTILINE)
+
+
+def stored_verdicts() -> dict[tuple[str, str], list[str]]:
+    """Return the winner and the methods not distinguished from it, by dataset and run."""
+    found = {}
+    for file in sorted(REPORTS.rglob("comparison.json")):
+        run = file.parent.relative_to(REPORTS).as_posix()
+        if run.startswith("runs/"):  # a run of the reader's own
+            continue
+        for verdict in json.loads(file.read_text(encoding="utf-8"))["verdicts"]:
+            found[verdict["dataset"], run] = methods_of(verdict)
+    return found
+
+
+def methods_of(verdict: dict[str, Any]) -> list[str]:
+    labels = [verdict["choice"], *verdict["undecided"]]
+    return list(dict.fromkeys(label.partition(" ")[0] for label in labels))
+
+
+def test_the_page_names_the_winner_of_every_stored_run() -> None:
+    named = {
+        (scene, run): re.findall(r"`([\w-]+)`", cell) for scene, run, cell in ROW.findall(PAGE)
+    }
+    assert named == stored_verdicts()
+
+
+@pytest.mark.parametrize("beam", [True, False])
+def test_the_page_names_the_most_accurate_network(beam: bool) -> None:
+    networks = {m.name for m in overview()["methods"] if m.family == "neural networks"}
+    best: dict[str, Row] = {}
+    for run in sorted({run for _, run in stored_verdicts()}):
+        for row in Comparison.read(REPORTS / run).rows:
+            if row.method in networks and row.error:
+                other = best.get(row.dataset, row)
+                assert other.error
+                if row.error.rel_l2_median <= other.error.rel_l2_median:
+                    best[row.dataset] = row
+    named = re.findall(r"\[`([\w-]+)`\]\([^)]*\) is the most accurate (?:network|one)", PAGE)
+    assert {row.method for name, row in best.items() if (name == "beam-coarse") == beam} == {
+        named[0 if beam else 1]
+    }
