@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import re
 import sys
+from pathlib import Path
+from statistics import median
 
 import pytest
 
+from mor_bench.report.cards import method_card
+from mor_bench.specs import load_method_spec
 from mor_bench.specs.suite_folder import list_suite
 from tests.published.stored import ROOT
 
@@ -19,10 +23,49 @@ def test_every_method_has_a_card_and_every_card_a_method() -> None:
     assert {path.stem for path in CARDS.glob("*.md")} == set(list_suite("methods"))
 
 
-def test_cards_have_an_equation_an_algorithm_and_a_cost() -> None:
+def test_cards_have_an_equation_an_algorithm_a_cost_and_a_source() -> None:
     for path in CARDS.glob("*.md"):
         headings = re.findall(r"^## (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
-        assert headings[:3] == ["Equation", "Algorithm", "Cost"], path.name
+        assert headings == ["Equation", "Algorithm", "Cost", "Source"], path.name
+
+
+def test_every_method_page_says_where_the_method_fails(tmp_path: Path) -> None:
+    pytest.importorskip("sphinx", reason="needs the extra `docs`")
+    import method_cards  # type: ignore[import-not-found]
+
+    for name in list_suite("methods"):
+        page = method_cards.card_page(name, tmp_path, draw=False)
+        _, _, after = page.partition("\n## Where it fails\n")
+        said = after.partition("\n## ")[0].strip()
+        assert said.endswith("."), name
+        assert said == " ".join(load_method_spec(name).limits.split())
+
+
+def test_stated_costs_of_fits_are_near_the_stored_ones() -> None:
+    pytest.importorskip("sphinx", reason="needs the extra `docs`")
+    import method_cards
+
+    wrong = {}
+    for name in list_suite("methods"):
+        rows = [row for _, row in method_cards.measured(name) if row.dataset == "beam-coarse"]
+        stored = [row.offline_s.fit_core_s for row in rows if row.offline_s]
+        stated = load_method_spec(name).fit_seconds("quick")
+        if stored and stated and not 1 / 3 <= stated / median(stored) <= 3:
+            wrong[name] = (stated, median(stored))
+    assert not wrong, "fit_s of the method file, and the median of the stored core-seconds"
+
+
+def test_a_page_states_which_of_two_trainings_was_measured() -> None:
+    pytest.importorskip("sphinx", reason="needs the extra `docs`")
+    import method_cards
+
+    (cost,) = [
+        line
+        for line in method_cards._facts("umesh", method_card(load_method_spec("umesh")))
+        if line.startswith("cost of a fit")
+    ]
+    assert "core-seconds on beam-coarse, measured in `quick-start` with the profile quick" in cost
+    assert cost.strip().endswith("with the profile full and its 100,000 iterations")
 
 
 def test_every_cited_work_is_in_the_bibliography_and_every_work_is_cited() -> None:

@@ -95,17 +95,18 @@ def table(method: str) -> list[str]:
     return lines
 
 
-def card_page(name: str, folder: Path) -> str:
-    """Return the source of a method's page."""
+def card_page(name: str, folder: Path, *, draw: bool = True) -> str:
+    """Return the source of a method's page; its picture is drawn into the folder."""
     spec = load_method_spec(name)
     card = method_card(spec)
     lines = [f"# {name}", "", f"**{spec.title}**", ""]
     text = ROOT / "docs" / "cards" / f"{name}.md"
     if text.exists():
         lines += [f"```{{include}} ../cards/{name}.md", "```", ""]
-    lines += ["## In short", "", *_facts(card), "", *_hyperparameters(card)]
+    lines += ["## Where it fails", "", " ".join(card.facts["limits"].split()), ""]
+    lines += ["## In short", "", *_facts(name, card), "", *_hyperparameters(card)]
     lines += ["## Measured", "", "Errors are those of the test samples of each stored run.", ""]
-    if shown := picture(name, folder):
+    if draw and (shown := picture(name, folder)):
         caption = f"Error over latency of {name}, with the other methods of the run in grey."
         lines += [f"![{caption}]({shown})", ""]
     lines += [*table(name), ""]
@@ -119,8 +120,27 @@ def card_page(name: str, folder: Path) -> str:
     return "\n".join(lines)
 
 
-def _facts(card: Card) -> Iterator[str]:
-    for fact, value in card.facts.items():
+def measured_fit(method: str, dataset: str = "beam-coarse") -> str | None:
+    """Return the cost of the method's fits in stored runs; None if no run measured it."""
+    found = [
+        (row.offline_s.fit_core_s, run)
+        for run, row in measured(method)
+        if row.dataset == dataset and row.offline_s and row.offline_s.fit_core_s
+    ]
+    if not found:
+        return None
+    ends = [f"{number(end(found)[0])}" for end in (min, max)]
+    runs = ", ".join(f"`{run}`" for run in dict.fromkeys(run for _, run in found))
+    return f"{' to '.join(dict.fromkeys(ends))} core-seconds on {dataset}, measured in {runs}"
+
+
+def _facts(method: str, card: Card) -> Iterator[str]:
+    facts = {name: text for name, text in card.facts.items() if name != "limits"}
+    if fit := measured_fit(method):
+        # Two trainings: the stored runs measured that of the profile quick only.
+        _, both, rest = facts.get("cost of a fit", "").partition(" with the profile quick;")
+        facts["cost of a fit"] = fit + both + rest
+    for fact, value in facts.items():
         yield f"{fact}\n: {' '.join(value.split())}\n"
 
 

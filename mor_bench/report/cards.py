@@ -107,9 +107,7 @@ def method_card(spec: MethodSpec) -> Card:
         "limits": spec.limits.strip(),
         "origin": spec.source,
         "class": spec.surrogate,
-        "duration of a fit": f"about {seconds_text(spec.fit_s)} on beam-coarse with two cores"
-        if spec.fit_s
-        else "",
+        "cost of a fit": _cost_of_fit(spec),
     }
     table: list[list[str]] = []
     if spec.folder is None:  # the class of a third party is not imported here
@@ -120,6 +118,19 @@ def method_card(spec: MethodSpec) -> Card:
     name = spec.asked or spec.name
     commands = [f"mor-bench run beam-tiny -m fem -m {name}", f"mor-bench stress -m {name}"]
     return Card(f"{spec.name} – {spec.title}", _given(facts), table, commands)
+
+
+def _cost_of_fit(spec: MethodSpec) -> str:
+    """Return the time of one core on beam-coarse; with both trainings if they differ."""
+    quick, own = spec.fit_seconds("quick"), spec.fit_s
+    if not quick:
+        return ""
+    text = f"about {seconds_text(quick)} of one core on beam-coarse"
+    if own == quick:
+        return text
+    return f"{text} with the profile quick; about {seconds_text(own)} with the profile full" + (
+        f" and its {n:,} iterations" if (n := spec.parameters_of("full").get("iterations")) else ""
+    )
 
 
 def _hyperparameters(spec: MethodSpec) -> list[list[str]]:

@@ -84,7 +84,7 @@ class MethodSpec(StrictModel):
     asked : str
         Name or path by which the method was asked for, with the parameters in brackets.
     fit_s : float, optional
-        Approximate time of a fit on beam-coarse with two cores, s.
+        Approximate cost of a fit on beam-coarse, in core-seconds.
     compile_s : float, optional
         Approximate time to compile the method's kernels, beside those of the full-order model, s.
     battery : Battery
@@ -143,7 +143,7 @@ class MethodSpec(StrictModel):
         return _TOLD_BY_INPUT.get(str(parameters.get("input")), self.told)
 
     def fit_seconds(self, profile: str) -> float | None:
-        """Return the approximate time of a fit on beam-coarse, s, if the file has it."""
+        """Return the approximate cost of a fit on beam-coarse, core-s, if the file has it."""
         return self._profile(profile).fit_s or self.fit_s
 
     def swept_keys(self, profile: str) -> list[str]:
