@@ -84,6 +84,7 @@ _NOT_PROSE = (
     re.compile(r"^:{3,}.*$", re.MULTILINE),  # directives of the site
     re.compile(r"`[^`\n]+`"),
     re.compile(r"\]\([^)]*\)"),
+    re.compile(r'<img src="[^"]*" width="\d+"'),
     re.compile(r"https?://\S+|arXiv \d+\.\d+"),
 )
 

@@ -31,11 +31,14 @@ from mor_bench.snapshots.store import write_atomically
 from tests.published.compact import ERRORS, StoredRun
 from tests.published.stored import ROOT, EvidenceError, run_of
 
+OPENING = r"(?:!\[[^\]]*\]\(|<img src=\")"
+"""A picture in Markdown, or in HTML, which can also state a width."""
+
 DRAWN = re.compile(
     r"<!-- drawn from: (?P<source>\S+) (?P<kind>\S+) (?P<dataset>\S+) -->\n+"
-    r"!\[[^\]]*\]\((?P<path>[^)]+)\)"
+    rf"{OPENING}(?P<path>[^)\"]+)[)\"]"
 )
-PICTURE = re.compile(r"!\[[^\]]*\]\((?P<path>[^)]+\.png)\)")
+PICTURE = re.compile(rf"{OPENING}(?P<path>[^)\"]+\.png)[)\"]")
 
 
 DRAWINGS: dict[str, Callable[[Comparison, str, Analysis], Picture | None]] = {
