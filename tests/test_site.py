@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -98,3 +99,19 @@ def test_links_lead_to_pages_of_the_site(source: str, elsewhere: bool, expected:
     from repository_links import rewritten  # type: ignore[import-not-found]
 
     assert rewritten(source, elsewhere=elsewhere) == expected
+
+
+def test_a_downloaded_notebook_has_no_markup_of_the_site() -> None:
+    pytest.importorskip("sphinx", reason="needs the extra `docs`")
+    from repository_links import for_download
+
+    text = (ROOT / "docs" / "start.md").read_text(encoding="utf-8")
+    assert "{nb-download}" in text
+    code = {"cell_type": "code", "source": ["a = {'b': [c](d.md)}"]}
+    cells = [{"cell_type": "markdown", "source": text.splitlines(keepends=True)}, code]
+    cleaned = json.loads(for_download(json.dumps({"cells": cells, "nbformat": 4})))
+    prose = "".join(cleaned["cells"][0]["source"])
+    assert "download this page as a notebook: `start.ipynb`" in prose
+    assert "needs an installed mor-bench" in prose
+    assert not re.search(r"\{[\w-]+\}`|\]\([\w./-]+\.md", prose)
+    assert cleaned["cells"][1] == code

@@ -33,6 +33,8 @@ PICTURE = "methods/performance-history.png"
 DASHBOARD = "_static/performance-dashboard"
 """Where the checks of the site's own pages do not look: asv's page has a layout of its own."""
 
+SERVE = "python -m http.server --directory docs/_build/html"
+
 LEAST_COMMITS = 2
 """Commits that a series needs to be shown: one value is no history."""
 
@@ -202,7 +204,10 @@ class PerformanceHistory(SphinxDirective):
             paragraph = nodes.paragraph()
             target = f"{DASHBOARD}/index.html"
             paragraph += nodes.reference(text="Open the dashboard of asv", refuri=target)
-            paragraph += nodes.Text(": every quantity, commit by commit.")
+            paragraph += nodes.Text(": every quantity, commit by commit. It reads files by ")
+            paragraph += nodes.Text("script, which browsers refuse from disk. So serve the site: ")
+            paragraph += nodes.literal(text=SERVE)
+            paragraph += nodes.Text(f", then http://localhost:8000/{target}.")
             found.append(paragraph)
         return found
 
