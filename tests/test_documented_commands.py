@@ -53,13 +53,12 @@ def parsed(text: str) -> dict[str, Any]:
         assert words[0] in {option for p in command.params for option in p.opts}
         return {}
     context = command.make_context("mor-bench", list(words))
-    while hasattr(command, "resolve_command"):
-        words = [*context._protected_args, *context.args]
-        name, command, rest = command.resolve_command(context, words)
-        mentioned = not rest  # `mor-bench pick` in a sentence has no arguments
-        context = command.make_context(name, rest, parent=context, resilient_parsing=mentioned)
-        if mentioned:
-            break
+    while words and hasattr(command, "resolve_command"):
+        name, command, words = command.resolve_command(context, words)
+        # `mor-bench pick` in a sentence has no arguments
+        context = command.make_context(
+            name, list(words), parent=context, resilient_parsing=not words
+        )
     parameters: dict[str, Any] = context.params
     return parameters
 

@@ -62,7 +62,7 @@ def test_a_page_states_which_of_two_trainings_was_measured() -> None:
 
     (cost,) = [
         line
-        for line in method_cards._facts("umesh", method_card(load_method_spec("umesh")))
+        for line in method_cards.facts_of("umesh", method_card(load_method_spec("umesh")))
         if line.startswith("cost of a fit")
     ]
     assert "core-seconds on beam-coarse, measured in `quick-start` with the profile quick" in cost

@@ -104,7 +104,7 @@ def card_page(name: str, folder: Path, *, draw: bool = True) -> str:
     if text.exists():
         lines += [f"```{{include}} ../cards/{name}.md", "```", ""]
     lines += ["## Where it fails", "", " ".join(card.facts["limits"].split()), ""]
-    lines += ["## In short", "", *_facts(name, card), "", *_hyperparameters(card)]
+    lines += ["## In short", "", *facts_of(name, card), "", *_hyperparameters(card)]
     lines += ["## Measured", "", "Errors are those of the test samples of each stored run.", ""]
     if draw and (shown := picture(name, folder)):
         caption = f"Error over latency of {name}, with the other methods of the run in grey."
@@ -134,7 +134,7 @@ def measured_fit(method: str, dataset: str = "beam-coarse") -> str | None:
     return f"{' to '.join(dict.fromkeys(ends))} core-seconds on {dataset}, measured in {runs}"
 
 
-def _facts(method: str, card: Card) -> Iterator[str]:
+def facts_of(method: str, card: Card) -> Iterator[str]:
     facts = {name: text for name, text in card.facts.items() if name != "limits"}
     if fit := measured_fit(method):
         # Two trainings: the stored runs measured that of the profile quick only.
