@@ -144,6 +144,12 @@ class Dataset:
         Valid samples in no part, because only some of their forces are held out for the test.
     tests : dict of str to Snapshots
         The requested named test sets, see `mor_bench.snapshots.test_sets`.
+
+    Examples
+    --------
+    >>> data = load_dataset("beam-tiny")
+    >>> {part: len(getattr(data, part)) for part in ("train", "validation", "test")}
+    {'train': 140, 'validation': 30, 'test': 40}
     """
 
     scene: Scene = field(repr=False)
