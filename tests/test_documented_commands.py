@@ -25,6 +25,9 @@ UsageError = typer.BadParameter.__mro__[1]
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 COMMAND = re.compile(r"^\s*(mor-bench .+)$|`(mor-bench [^`]+)`", re.MULTILINE)
+PROSE = re.compile(r" (?:a|are|as|its|the) ")
+"""Words of a sentence that begins with `mor-bench` at the start of a line."""
+
 PLACEHOLDER = re.compile(r"[A-Z]{2}|…|^my\b|^mean\b|^nearest\b|^pymor-pod\b|[/.]")
 """Of names that the reader replaces, and of files: those that do not belong to the suite."""
 
@@ -32,8 +35,9 @@ PLACEHOLDER = re.compile(r"[A-Z]{2}|…|^my\b|^mean\b|^nearest\b|^pymor-pod\b|[/
 def commands_of(page: Path) -> Iterator[str]:
     """Yield the calls of `mor-bench` in a page, without prose, comments, pipes and redirections."""
     for line, inline in COMMAND.findall(page.read_text(encoding="utf-8")):
-        if not line or not re.search(r"^mor-bench \w+[^`]* (?:a|are|in|is|its|of|the) ", line):
-            yield re.split(r" \\?\||>", line or inline)[0].strip()
+        call = re.split(r" #| \\?\||>", line or inline)[0].strip()
+        if not (line and PROSE.search(call)):
+            yield call
 
 
 COMMANDS = sorted({(page.name, text) for page in PAGES for text in commands_of(page)})
