@@ -95,3 +95,13 @@ html_theme_options = {
 html_context = {"default_mode": "auto"}
 WITH_MEMBERS = {"api", "methods", "gallery"}
 html_sidebars = {page.stem: [] for page in HERE.glob("*.md") if page.stem not in WITH_MEMBERS}
+
+
+def _is_of_scikit_learn(app, what, name, member, skip, options):
+    """Leave out methods that scikit-learn adds, whose texts refer to its own site."""
+    return True if name == "get_metadata_routing" or name.endswith("_request") else None
+
+
+def setup(app):
+    """Register the events."""
+    app.connect("autodoc-skip-member", _is_of_scikit_learn)

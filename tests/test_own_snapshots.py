@@ -239,7 +239,7 @@ def test_a_run_ends_with_tables_and_a_report(
     assert rows[2].offline_s.data is None
     assert rows[2].discretisation_error_m is None
     assert "mine.npz" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    checked = command("check", "mine.toml").stdout
+    checked = " ".join(command("check", "mine.toml").stdout.split())
     counts = (
         "24 cells, 63 nodes, 9 of them fixed, 140 samples to train, 30 to validate and 40 to test"
     )
