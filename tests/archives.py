@@ -14,11 +14,17 @@ from typing import Any
 import meshio
 import numpy as np
 
+from mor_bench.export.data_card import Licence
 from mor_bench.scene.mesh import box_mesh
 from mor_bench.snapshots.archive_files import SUMS
 from mor_bench.snapshots.generate import dataset_folder
 from mor_bench.snapshots.store import read_shard, write_shard
 from mor_bench.specs import load_generated_spec
+
+SPEC = load_generated_spec("beam-tiny")
+BY = Licence.named("CC-BY-4.0")
+ZEROS = "0" * 64
+S0, S1, S2 = (f"samples/shard-0000{number}.h5" for number in range(3))
 
 Damage = Callable[[Path], object]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache as kept
@@ -11,11 +12,13 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import mor_bench
+from mor_bench.export.archive import write_archive
 from mor_bench.results.comparison import Comparison
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import load_generated_spec
 from mor_bench.surrogate import Surrogate
+from tests.archives import BY, SPEC
 from tests.small_runs import PLAIN, Heard, method_file, run_small
 
 
@@ -113,3 +116,17 @@ def threads(request: pytest.FixtureRequest) -> Iterator[None]:
     torch.set_num_threads(request.param)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def sound_archive(cache: Path, tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An archive of beam-tiny; tests must not change it."""
+    out = tmp_path_factory.mktemp("archive") / "tiny"
+    write_archive(SPEC, out, ["A. Author"], BY, cache=cache, workers=1)
+    return out
+
+
+@pytest.fixture
+def archive_copy(sound_archive: Path, tmp_path: Path) -> Path:
+    """A copy of that archive."""
+    return Path(shutil.copytree(sound_archive, tmp_path / "archive"))

@@ -16,7 +16,6 @@ import mor_bench
 from mor_bench.errors import InvalidInputError, StoreError
 from mor_bench.export.archive import write_archive
 from mor_bench.export.archive_writer import ArchiveWriter
-from mor_bench.export.data_card import Licence
 from mor_bench.export.toml_text import toml_text
 from mor_bench.snapshots import generate as generate_module
 from mor_bench.snapshots.archive_files import SUMS
@@ -26,30 +25,15 @@ from mor_bench.snapshots.generate import dataset_folder
 from mor_bench.snapshots.manifest import read_manifest
 from mor_bench.specs import list_suite, load_dataset_spec, load_generated_spec
 from tests.archives import (
+    BY,
+    S0,
+    S2,
+    SPEC,
     flip,
     own_dataset,
     tiny_folder,
 )
 from tests.commands import invoke
-
-SPEC = load_generated_spec("beam-tiny")
-BY = Licence.named("CC-BY-4.0")
-ZEROS = "0" * 64
-S0, S1, S2 = (f"samples/shard-0000{number}.h5" for number in range(3))
-
-
-@pytest.fixture(scope="module")
-def sound(cache: Path, tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An archive of beam-tiny; tests must not change it."""
-    out = tmp_path_factory.mktemp("archive") / "tiny"
-    write_archive(SPEC, out, ["A. Author"], BY, cache=cache, workers=1)
-    return out
-
-
-@pytest.fixture
-def copy(sound: Path, tmp_path: Path) -> Path:
-    """A copy of the archive."""
-    return Path(shutil.copytree(sound, tmp_path / "archive"))
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -91,12 +75,17 @@ def test_equal_datasets_give_equal_archives(cache: Path, tiny: Dataset, tmp_path
 
 
 @pytest.mark.skipif(shutil.which("sha256sum") is None, reason="needs sha256sum")
-def test_sha256sum_accepts_the_list_and_notices_damage(copy: Path) -> None:
+def test_sha256sum_accepts_the_list_and_notices_damage(archive_copy: Path) -> None:
     command = ["sha256sum", "--strict", "-c", SUMS]
-    done = subprocess.run(command, cwd=copy, capture_output=True, text=True, check=True)
-    assert len(done.stdout.splitlines()) == len([p for p in copy.rglob("*") if p.is_file()]) - 1
-    flip(S0)(copy)
-    assert subprocess.run(command, cwd=copy, capture_output=True, check=False).returncode == 1
+    done = subprocess.run(command, cwd=archive_copy, capture_output=True, text=True, check=True)
+    assert (
+        len(done.stdout.splitlines())
+        == len([p for p in archive_copy.rglob("*") if p.is_file()]) - 1
+    )
+    flip(S0)(archive_copy)
+    assert (
+        subprocess.run(command, cwd=archive_copy, capture_output=True, check=False).returncode == 1
+    )
 
 
 def test_an_own_mesh_travels_with_the_samples_and_no_path_does(tmp_path: Path) -> None:
@@ -151,26 +140,28 @@ def test_odd_values_keep_their_form_in_toml() -> None:
         toml_text({"a": None})
 
 
-def test_the_card_and_the_metadata_state_the_facts(sound: Path) -> None:
-    card = (sound / "README.md").read_text(encoding="utf-8")
+def test_the_card_and_the_metadata_state_the_facts(sound_archive: Path) -> None:
+    card = (sound_archive / "README.md").read_text(encoding="utf-8")
     for fact in ("| training | 140 |", "held out by region | 40 |", "1e-08", "ν 0.4", "A. Author"):
         assert fact in card
-    metadata = json.loads((sound / "metadata.json").read_text(encoding="utf-8"))
-    lines = [line.split("  ") for line in (sound / SUMS).read_text(encoding="utf-8").splitlines()]
+    metadata = json.loads((sound_archive / "metadata.json").read_text(encoding="utf-8"))
+    lines = [
+        line.split("  ") for line in (sound_archive / SUMS).read_text(encoding="utf-8").splitlines()
+    ]
     sums = {name: digest for digest, name in lines}
     for item in metadata["distribution"]:
         assert item["sha256"] == sums[item["name"]]
-        assert item["contentSize"] == f"{(sound / item['name']).stat().st_size} B"
+        assert item["contentSize"] == f"{(sound_archive / item['name']).stat().st_size} B"
     assert {*sums} - {item["name"] for item in metadata["distribution"]} == {"metadata.json"}
 
 
 def test_damaged_shards_in_the_cache_are_replaced(
-    sound: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sound_archive: Path, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = Path(shutil.copytree(tiny_folder(cache), tiny_folder(tmp_path)))
     (folder / "shard-00001.h5").write_bytes(b"damaged")
     (folder / "shard-00002.h5").unlink()
-    import_archive(sound, tmp_path)
+    import_archive(sound_archive, tmp_path)
     assert files(folder) == files(tiny_folder(cache))
 
 

@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 
 from mor_bench.errors import MorBenchError, StoreError
-from mor_bench.export.archive import write_archive
-from mor_bench.export.data_card import Licence
 from mor_bench.snapshots.archive_files import SUMS
 from mor_bench.snapshots.archive_import import import_archive
-from mor_bench.snapshots.dataset import Dataset
 from mor_bench.specs import load_generated_spec
 from tests.archives import (
+    S0,
+    S1,
+    S2,
+    ZEROS,
     Damage,
     append_sum,
     change_manifest,
@@ -38,26 +39,6 @@ from tests.archives import (
     tiny_folder,
 )
 from tests.mutations import mutated_bytes
-
-SPEC = load_generated_spec("beam-tiny")
-BY = Licence.named("CC-BY-4.0")
-ZEROS = "0" * 64
-S0, S1, S2 = (f"samples/shard-0000{number}.h5" for number in range(3))
-
-
-@pytest.fixture(scope="module")
-def sound(cache: Path, tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An archive of beam-tiny; tests must not change it."""
-    out = tmp_path_factory.mktemp("archive") / "tiny"
-    write_archive(SPEC, out, ["A. Author"], BY, cache=cache, workers=1)
-    return out
-
-
-@pytest.fixture
-def copy(sound: Path, tmp_path: Path) -> Path:
-    """A copy of the archive."""
-    return Path(shutil.copytree(sound, tmp_path / "archive"))
-
 
 # Bad archives
 
@@ -147,33 +128,37 @@ def refused(archive: Path, cache: Path, message: str) -> None:
 
 
 @pytest.mark.parametrize("how", BAD)
-def test_a_bad_archive_is_refused_and_leaves_nothing(how: str, copy: Path, tmp_path: Path) -> None:
+def test_a_bad_archive_is_refused_and_leaves_nothing(
+    how: str, archive_copy: Path, tmp_path: Path
+) -> None:
     damage, message = BAD[how]
-    damage(copy)
-    refused(copy, tmp_path / "cache", message)
+    damage(archive_copy)
+    refused(archive_copy, tmp_path / "cache", message)
 
 
-def test_a_file_outside_that_the_dataset_names_is_refused(copy: Path, tmp_path: Path) -> None:
+def test_a_file_outside_that_the_dataset_names_is_refused(
+    archive_copy: Path, tmp_path: Path
+) -> None:
     own_dataset(tmp_path / "outside")
-    shutil.copy(tmp_path / "outside" / "own.toml", copy / "beam-tiny.toml")
+    shutil.copy(tmp_path / "outside" / "own.toml", archive_copy / "beam-tiny.toml")
     outside = json.dumps(str(tmp_path / "outside" / "body.vtu"))
-    replace_text("beam-tiny.toml", '"body.vtu"', outside)(copy)
-    listed_again(copy)
-    refused(copy, tmp_path / "cache", "names other files than")
+    replace_text("beam-tiny.toml", '"body.vtu"', outside)(archive_copy)
+    listed_again(archive_copy)
+    refused(archive_copy, tmp_path / "cache", "names other files than")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
 @pytest.mark.parametrize(("name", "is_folder"), [(S1, False), ("samples", True), (SUMS, False)])
-def test_links_are_refused(name: str, is_folder: bool, copy: Path, tmp_path: Path) -> None:
-    link(name, tmp_path / "target", is_folder)(copy)
-    refused(copy, tmp_path / "cache", "a link; an archive of a dataset holds none")
+def test_links_are_refused(name: str, is_folder: bool, archive_copy: Path, tmp_path: Path) -> None:
+    link(name, tmp_path / "target", is_folder)(archive_copy)
+    refused(archive_copy, tmp_path / "cache", "a link; an archive of a dataset holds none")
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-def test_a_pipe_is_refused_without_waiting(copy: Path, tmp_path: Path) -> None:
-    (copy / S1).unlink()
-    os.mkfifo(copy / S1)
-    refused(copy, tmp_path / "cache", "no file of an archive")
+def test_a_pipe_is_refused_without_waiting(archive_copy: Path, tmp_path: Path) -> None:
+    (archive_copy / S1).unlink()
+    os.mkfifo(archive_copy / S1)
+    refused(archive_copy, tmp_path / "cache", "no file of an archive")
 
 
 def test_things_that_are_no_archive_are_refused(tmp_path: Path) -> None:
@@ -185,21 +170,21 @@ def test_things_that_are_no_archive_are_refused(tmp_path: Path) -> None:
         import_archive(tmp_path / "nothing", tmp_path / "cache")
 
 
-def test_the_archive_of_another_dataset_is_refused(sound: Path, tmp_path: Path) -> None:
+def test_the_archive_of_another_dataset_is_refused(sound_archive: Path, tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="other physics than `beam-coarse`"):
-        import_archive(sound, tmp_path / "cache", load_generated_spec("beam-coarse"))
+        import_archive(sound_archive, tmp_path / "cache", load_generated_spec("beam-coarse"))
     assert not (tmp_path / "cache").exists()
 
 
 # Bad ZIP files
 
 
-def zipped(sound: Path, **changes: Any) -> bytes:
+def zipped(sound_archive: Path, **changes: Any) -> bytes:
     """Return the archive as a ZIP file in which the member of the second shard is changed."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        for path in sorted(p for p in sound.rglob("*") if p.is_file()):
-            info = zipfile.ZipInfo(f"top/{path.relative_to(sound).as_posix()}")
+        for path in sorted(p for p in sound_archive.rglob("*") if p.is_file()):
+            info = zipfile.ZipInfo(f"top/{path.relative_to(sound_archive).as_posix()}")
             if info.filename.endswith(S1):
                 for name, value in changes.items():
                     setattr(info, name, value)
@@ -220,14 +205,14 @@ def zipped(sound: Path, **changes: Any) -> bytes:
 )
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_bad_members_of_a_zip_file_are_refused(
-    changes: dict[str, Any], message: str, sound: Path, tmp_path: Path
+    changes: dict[str, Any], message: str, sound_archive: Path, tmp_path: Path
 ) -> None:
-    (tmp_path / "a.zip").write_bytes(zipped(sound, **changes))
+    (tmp_path / "a.zip").write_bytes(zipped(sound_archive, **changes))
     refused(tmp_path / "a.zip", tmp_path / "cache", message)
 
 
-def test_a_bomb_is_not_unpacked(sound: Path, tmp_path: Path) -> None:
-    content = bytearray(zipped(sound))
+def test_a_bomb_is_not_unpacked(sound_archive: Path, tmp_path: Path) -> None:
+    content = bytearray(zipped(sound_archive))
     entry = content.rindex(
         b"PK\x01\x02", 0, content.index(b"top/samples/shard-00002.h5", len(content) - 3000)
     )
@@ -237,36 +222,38 @@ def test_a_bomb_is_not_unpacked(sound: Path, tmp_path: Path) -> None:
     refused(tmp_path / "a.zip", tmp_path / "cache", "so they overlap")
 
 
-def test_an_archive_that_was_packed_again_is_read(sound: Path, tmp_path: Path) -> None:
-    again = packed(sound, tmp_path / "again.zip")
+def test_an_archive_that_was_packed_again_is_read(sound_archive: Path, tmp_path: Path) -> None:
+    again = packed(sound_archive, tmp_path / "again.zip")
     assert import_archive(again, tmp_path / "cache") == [tiny_folder(tmp_path / "cache")]
 
 
 def test_the_finders_files_are_ignored_and_never_opened(
-    sound: Path, copy: Path, tmp_path: Path
+    sound_archive: Path, archive_copy: Path, tmp_path: Path
 ) -> None:
     for place in ("", "samples/"):
-        put(f"{place}.DS_Store", b"x" * 9000)(copy)
+        put(f"{place}.DS_Store", b"x" * 9000)(archive_copy)
     cache = tmp_path / "cache"
-    (folder,) = import_archive(copy, cache)
+    (folder,) = import_archive(archive_copy, cache)
     assert ".DS_Store" not in {path.name for path in folder.iterdir()}
-    assert import_archive(packed(copy, tmp_path / "a.zip"), cache) == [folder]
-    (copy / ".DS_Store").unlink()
-    (copy / ".DS_Store").symlink_to(sound / SUMS)
+    assert import_archive(packed(archive_copy, tmp_path / "a.zip"), cache) == [folder]
+    (archive_copy / ".DS_Store").unlink()
+    (archive_copy / ".DS_Store").symlink_to(sound_archive / SUMS)
     with pytest.raises(StoreError, match=r"\.DS_Store: a link"):
-        import_archive(copy, cache)
+        import_archive(archive_copy, cache)
 
 
 @pytest.mark.parametrize("n", [40, pytest.param(400, marks=pytest.mark.slow)])
-def test_mutated_archives_are_read_or_refused(n: int, sound: Path, tmp_path: Path) -> None:
+def test_mutated_archives_are_read_or_refused(n: int, sound_archive: Path, tmp_path: Path) -> None:
     folder, cache = tmp_path / "archive", tmp_path / "cache"
-    shutil.copytree(sound, folder)
-    names = sorted(p.relative_to(sound).as_posix() for p in sound.rglob("*") if p.is_file())
+    shutil.copytree(sound_archive, folder)
+    names = sorted(
+        p.relative_to(sound_archive).as_posix() for p in sound_archive.rglob("*") if p.is_file()
+    )
     n_refused = 0
     for seed in range(n):
         generator = np.random.default_rng(seed)
         name = names[generator.integers(len(names))]
-        original = (sound / name).read_bytes()
+        original = (sound_archive / name).read_bytes()
         content = mutated_bytes(original, generator)
         (folder / name).write_bytes(content)
         is_listed = bool(name != SUMS and seed % 2)
@@ -284,5 +271,5 @@ def test_mutated_archives_are_read_or_refused(n: int, sound: Path, tmp_path: Pat
         assert said or is_listed or name == SUMS or content == original, (seed, name)
         n_refused += bool(said)
         for changed in (name, SUMS):
-            shutil.copyfile(sound / changed, folder / changed)
+            shutil.copyfile(sound_archive / changed, folder / changed)
     assert n_refused > n / 2

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from mor_bench.errors import InvalidInputError, SolverError, UnsupportedSceneError
-from mor_bench.export.pvd_files import export_load_path_pvd, export_pvd, volume_ratios
+from mor_bench.export.pvd_files import export_load_path_pvd, export_pvd
 from mor_bench.mechanics.model import FullOrderModel
+from mor_bench.mechanics.stresses import CellDeformations
 from mor_bench.scene.loads import Facets
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.patch_loads import PatchLoads
@@ -48,20 +49,21 @@ def test_samples_can_be_opened_again(part: str, tiny: Dataset, tmp_path: Path) -
         np.testing.assert_array_equal(mesh.cells_dict["hexahedron"], tiny.scene.mesh.cells)
         np.testing.assert_array_equal(mesh.point_data["displacement"], samples.displacements[row])
         np.testing.assert_array_equal(mesh.point_data["force"], samples.forces[row])
-        expected = volume_ratios(tiny.scene, samples.displacements[row])
+        expected = np.linalg.det(CellDeformations(tiny.scene)(samples.displacements[row]))
         np.testing.assert_array_equal(mesh.cell_data["volume_ratio"][0], expected)
 
 
-def test_the_volume_ratio_is_that_of_known_maps(tiny: Dataset) -> None:
+def test_deformations_are_those_of_known_maps(tiny: Dataset) -> None:
+    deformations = CellDeformations(tiny.scene)
     matrix = np.array([[0.1, 0.2, 0.0], [0.0, -0.3, 0.1], [0.0, 0.0, 0.5]])
     moved = tiny.scene.mesh.points @ matrix.T
-    found = volume_ratios(tiny.scene, moved)
-    np.testing.assert_allclose(found, np.linalg.det(np.eye(3) + matrix), rtol=1e-13)
+    found = deformations(moved)
+    np.testing.assert_allclose(found, np.broadcast_to(np.eye(3) + matrix, found.shape), atol=1e-13)
     # Of u = 0.1 x² along x, the difference quotient over a cell is exact: det F = 1 + 0.2 x.
     mesh, moved = tiny.scene.mesh, np.zeros_like(moved)
     moved[:, 0] = 0.1 * mesh.points[:, 0] ** 2
     centres = mesh.points[mesh.cells].mean(axis=1)
-    found = volume_ratios(tiny.scene, moved)
+    found = np.linalg.det(deformations(moved))
     np.testing.assert_allclose(found, 1.0 + 0.2 * centres[:, 0], rtol=1e-13)
 
 

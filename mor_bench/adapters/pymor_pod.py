@@ -10,11 +10,9 @@ Use it with the method file
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Annotated, Any
 
 import numpy as np
@@ -36,13 +34,10 @@ from mor_bench.errors import InvalidInputError, SolverError, text_of
 from mor_bench.model_arrays import take_array
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Snapshots
-from mor_bench.specs.one_line_errors import nearest_name
+from mor_bench.specs.public_class import public_class
 from mor_bench.surrogate import Surrogate
 
 USUAL = "pymor.reductors.basic:StationaryRBReductor"
-
-PUBLIC = re.compile(r"pymor\.reductors(\.[a-z][a-z0-9_]*)+:[A-Z][A-Za-z0-9]*")
-"""Import paths of public reductors of pyMOR. Others are never imported."""
 
 
 def reductor_class(target: str) -> type[Any]:
@@ -56,21 +51,11 @@ def reductor_class(target: str) -> type[Any]:
         If the text has another form, or names no ``StationaryRBReductor`` or subclass of it.
     """
     form = "it must name a reductor as `pymor.reductors.module:Class`"
-    module, _, name = target.partition(":")
-    if not PUBLIC.fullmatch(target):
-        raise ValueError(form)
-    try:
-        loaded = import_module(module)
-    except ModuleNotFoundError:
-        raise ValueError(f"{form}; there is no module {module!r}") from None
-    found = getattr(loaded, name, None)
-    if found is None:
-        near = nearest_name(name, dir(loaded)).rstrip(".")
-        raise ValueError(f"{form}; {module} has no {name!r}{near}")
-    if not (isinstance(found, type) and issubclass(found, StationaryRBReductor)):
+    found = public_class(target, "pymor.reductors", form)
+    if not issubclass(found, StationaryRBReductor):
         raise ValueError(
-            f"{form}; {name!r} is no StationaryRBReductor or subclass of it, so it does not "
-            "project a static nonlinear model onto one basis"
+            f"{form}; {found.__name__!r} is no StationaryRBReductor or subclass of it, so it does "
+            "not project a static nonlinear model onto one basis"
         )
     return found
 

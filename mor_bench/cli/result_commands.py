@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Iterator
 from functools import partial
-from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -29,7 +28,7 @@ from mor_bench.cli.option_groups import (
 from mor_bench.cli.run_progress import show_run
 from mor_bench.cli.slow_notice import notice_if_slow
 from mor_bench.options import CommandLine, FolderOptions
-from mor_bench.report.console_tables import print_tables, verdict_lines
+from mor_bench.report.console_tables import finding_lines, print_tables, sentence_lines
 from mor_bench.report.line_wrapping import wrapped
 from mor_bench.report.number_format import explain_short_names
 from mor_bench.report.page import render
@@ -154,9 +153,7 @@ def _lines(chosen: Verdict, width: int, *, quiet: bool) -> Iterator[str]:
     if quiet:
         yield from wrapped(renamed(chosen.headline, names), width, names=names.values())
         return
-    whole = list(verdict_lines(chosen.headline, chosen.beside, names, width))
-    finding = list(takewhile(lambda line: not line.startswith("- "), whole))
-    yield from finding
+    yield from finding_lines(chosen.headline, names, width)
     for line in chosen.evidence:
         name = re.match(r" +\w+ +", line)  # such as "    latency  "
         first = (
@@ -164,6 +161,6 @@ def _lines(chosen: Verdict, width: int, *, quiet: bool) -> Iterator[str]:
         )
         text = renamed(line, names)[len(first) :]
         yield from wrapped(text, width, " " * len(first), first=first, names=names.values())
-    yield from whole[len(finding) :]
+    yield from sentence_lines(chosen.headline, chosen.beside, names, width)
     swept = explain_short_names(row.swept for row in chosen.rows)
     yield from wrapped(swept, width)

@@ -82,7 +82,7 @@ def card_of(name: str, suite: Path | None = None) -> Card:
             return method_card(load_method_spec(path))
         return dataset_card(load_dataset_spec(path), path)
     methods, datasets = _known("methods", suite), _known("datasets", suite)
-    if split_method(name)[0] in {*methods, *FORMER_NAMES}:
+    if split_method(name)[0] in {*methods, *FORMER_NAMES["methods"]}:
         return method_card(load_method_spec(name, suite))
     if name in datasets:
         return dataset_card(load_dataset_spec(name, suite), datasets[name])

@@ -19,8 +19,8 @@ from mor_bench.errors import (
 )
 from mor_bench.export.output_path import new_file
 from mor_bench.export.vtu_files import Part, samples_of, write_fields
-from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.model import FullOrderModel, unknown_equations
+from mor_bench.mechanics.stresses import CellDeformations
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.load_paths import solve_paths
@@ -135,14 +135,6 @@ def export_load_path_pvd(
     return _write_collection(scene, fractions, moved, forces, out)
 
 
-def volume_ratios(scene: Scene, displacement: Array) -> Array:
-    """Return det F at the centres of the cells, (n_cells,), of a displacement (n_nodes, 3), m."""
-    mesh = scene.mesh
-    gradients, _ = shape_gradients(mesh.points, mesh.cells, element_of(mesh.cells).centre[None])
-    moved = np.einsum("cai,caj->cij", displacement[mesh.cells], gradients[:, 0])
-    return np.asarray(np.linalg.det(np.eye(3) + moved))
-
-
 def _check_new(out: str | Path) -> tuple[Path, Path]:
     """Return the collection and the folder of its files, neither of which may exist."""
     path = new_file(out, ".pvd", "")
@@ -155,10 +147,11 @@ def _write_collection(
     """Write the VTU files first, so that a collection never names a missing file."""
     path, folder = _check_new(out)
     folder.mkdir(parents=True)
+    deformations = CellDeformations(scene)
     entries, written = [], []
     for number, (time, u, force) in enumerate(zip(times, displacements, forces, strict=True)):
         fields = {"displacement": u, "force": force}
-        ratios = {"volume_ratio": volume_ratios(scene, u)}
+        ratios = {"volume_ratio": np.linalg.det(deformations(u))}
         files = write_fields(scene, fields, folder, f"{number:05d}", cell_fields=ratios)
         written += files
         entries += [

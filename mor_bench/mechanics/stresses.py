@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mor_bench.errors import InvalidInputError, UnsupportedSceneError
-from mor_bench.mechanics.assembly import discretisation_of
 from mor_bench.mechanics.elements import element_of, shape_gradients
 from mor_bench.mechanics.kernels import LANES
 from mor_bench.mechanics.laws import point_stresses
@@ -53,8 +52,32 @@ class Stresses:
         return np.asarray(np.linalg.eigvalsh(self.cauchy))
 
 
+class CellDeformations:
+    """Computes the deformation gradient at the centroid of every cell.
+
+    That of a body with gravity contains the deformation of the rest state.
+
+    Parameters
+    ----------
+    scene : Scene
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        mesh = scene.mesh
+        centre = element_of(mesh.cells).centre[None]
+        self._gradients = shape_gradients(mesh.points, mesh.cells, centre)[0][:, 0]
+        rest = None if scene.material is None else rest_displacement(scene)
+        self._rest = np.zeros_like(mesh.points) if rest is None else rest
+        self._cells = mesh.cells
+
+    def __call__(self, displacement: Array) -> Array:
+        """Return F (n_cells, 3, 3) at a displacement (n_nodes, 3), m."""
+        nodal = (self._rest + displacement)[self._cells]
+        return np.asarray(np.eye(3) + np.einsum("cai,caj->cij", nodal, self._gradients))
+
+
 class CellStresses:
-    """Computes σ = P Fᵀ / det F at the centroid of every cell (Holzapfel 2000, eq. 3.9).
+    """Computes σ = P Fᵀ / det F at the centroid of every cell (Holzapfel 2000, section 3.1).
 
     Stresses of H8 converge fastest at the centroids (Barlow 1976). Those of a body with gravity
     contain the stress of the rest state. Where a displacement inverts a cell, the stress has no
@@ -82,15 +105,14 @@ class CellStresses:
             raise UnsupportedSceneError(
                 f"{scene.name}: stresses need one body, and `parameters` gives each sample its own."
             )
-        body, rest = discretisation_of(scene), rest_displacement(scene)
-        element = element_of(body.cells)
-        centre = shape_gradients(body.points, body.cells, element.centre[None])[0]
-        det_j = shape_gradients(body.points, body.cells, element.derivatives)[1]
+        mesh = scene.mesh
+        element = element_of(mesh.cells)
+        det_j = shape_gradients(mesh.points, mesh.cells, element.derivatives)[1]
         self.volumes = det_j @ element.weights
-        self._gradients, self._cells = centre[:, 0], body.cells
-        self._rest = np.zeros_like(body.points) if rest is None else rest
-        self._stresses = point_stresses(body.material.law)
-        self._parameters = np.array(body.material.parameters)
+        self._shape = mesh.points.shape
+        self._deformations = CellDeformations(scene)
+        self._stresses = point_stresses(scene.material.law)
+        self._parameters = np.array(scene.material.parameters)
 
     def __call__(self, displacements: Array) -> Stresses:
         """Return the stresses at displacements (n, n_nodes, 3), m.
@@ -100,30 +122,27 @@ class CellStresses:
         InvalidInputError
             If the shape is wrong.
         """
-        if displacements.ndim != 3 or displacements.shape[1:] != self._rest.shape:
+        if displacements.ndim != 3 or displacements.shape[1:] != self._shape:
             raise InvalidInputError(
-                f"displacements must have shape (n, {len(self._rest)}, 3); "
+                f"displacements must have shape (n, {self._shape[0]}, 3); "
                 f"got {displacements.shape}."
             )
-        shape = (len(displacements), len(self._cells), 3, 3)
-        found = np.empty(shape)
+        found = np.empty((len(displacements), len(self.volumes), 3, 3))
         for u, cauchy in zip(displacements, found, strict=True):
-            nodal = (self._rest + u)[self._cells]
-            cauchy[:] = self._cauchy(np.einsum("cai,caj->cij", nodal, self._gradients))
+            cauchy[:] = self._cauchy(self._deformations(u))
         return Stresses(found)
 
-    def _cauchy(self, gradients: Array) -> Array:
-        """Return the stress (n, 3, 3) at displacement gradients (n, 3, 3)."""
-        n = len(gradients)
+    def _cauchy(self, F: Array) -> Array:
+        """Return the stress (n, 3, 3) at deformation gradients (n, 3, 3)."""
+        n = len(F)
         n_batches = -(-n // LANES)
         padded = np.zeros((n_batches * LANES, 9))
-        padded[:n] = gradients.reshape(n, 9)
+        padded[:n] = (F - np.eye(3)).reshape(n, 9)
         H = np.ascontiguousarray(padded.reshape(n_batches, LANES, 9).swapaxes(1, 2))
         P = np.empty((n_batches, 9 * LANES))
         parameters = np.tile(np.repeat(self._parameters, LANES), (n_batches, 1))
         self._stresses(H.reshape(n_batches, -1), np.ones((n_batches, LANES)), parameters, P, None)
         stress = P.reshape(n_batches, 9, LANES).swapaxes(1, 2).reshape(-1, 3, 3)[:n]
-        F = np.eye(3) + gradients
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             cauchy = stress @ F.swapaxes(1, 2) / np.linalg.det(F)[:, None, None]
         return np.asarray(0.5 * (cauchy + cauchy.swapaxes(1, 2)))

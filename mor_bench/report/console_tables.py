@@ -129,13 +129,17 @@ def _out_of_range_parts(entries: Sequence[Entry]) -> list[RenderableType]:
     return _titled(title, table, Text(found.note, style="dim"))
 
 
-def verdict_lines(
+def finding_lines(headline: str, names: Mapping[str, ShortName], width: int) -> list[str]:
+    """Return the finding of a verdict's headline, with short names."""
+    finding = renamed(headline, names).partition(". ")[2]
+    return wrapped(finding, width, names=names.values())
+
+
+def sentence_lines(
     headline: str, sentences: Sequence[str], names: Mapping[str, ShortName], width: int
 ) -> Iterator[str]:
-    """Yield a verdict with short names: the finding, then its needs and all other sentences."""
-    needs, _, finding = renamed(headline, names).partition(". ")
-    yield from wrapped(finding, width, names=names.values())
-    for sentence in (f"{needs}.", *sentences):
+    """Yield the needs of a verdict's headline and all other sentences, with short names."""
+    for sentence in (f"{headline.partition('. ')[0]}.", *sentences):
         text, again, command = renamed(sentence, names).partition(AGAIN)
         text += again.rstrip()
         yield from wrapped(f"- {text}", width, "  ", names=names.values())
@@ -147,10 +151,10 @@ def _verdict_parts(
     verdict: Mapping[str, Any], names: Mapping[str, ShortName], width: int
 ) -> Iterator[Text]:
     """Yield the verdict; the finding is bold."""
-    finding = renamed(verdict["headline"], names).partition(". ")[2]
-    n_bold = len(wrapped(finding, width, names=names.values()))
-    for i, line in enumerate(verdict_lines(verdict["headline"], verdict["beside"], names, width)):
-        yield Text(line, style="bold" if i < n_bold else "", no_wrap=True)
+    for line in finding_lines(verdict["headline"], names, width):
+        yield Text(line, style="bold", no_wrap=True)
+    for line in sentence_lines(verdict["headline"], verdict["beside"], names, width):
+        yield Text(line, no_wrap=True)
 
 
 def _wrapped(

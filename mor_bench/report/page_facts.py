@@ -116,20 +116,19 @@ def limits_of(comparison: Comparison, analysis: Analysis, entries: Sequence[Entr
     return " ".join(said)
 
 
-_FIRST = ("commit", "date", "processor", "processor_model")
+_FIRST = {
+    "commit": "commit of mor-bench",
+    "date": "date",
+    "processor": "processor",
+    "processor_model": "processor model",
+}
+"""Facts of a run that come first, and their names."""
 
 
 def machine_facts(machine: Mapping[str, Any]) -> list[tuple[str, str]]:
     """List the commit and date of a run and its machine; older runs lack some of them."""
-    first = {
-        "commit of mor-bench": machine.get("commit"),
-        "date": machine.get("date"),
-        "processor": machine.get("processor"),
-        "processor model": machine.get("processor_model"),
-    }
-    facts = [(name, str(text or "not recorded")) for name, text in first.items()]
-    rest = {k: v for k, v in machine.items() if k not in _FIRST}
-    for key, text in flat(rest):
+    facts = [(name, str(machine.get(key) or "not recorded")) for key, name in _FIRST.items()]
+    for key, text in flat({key: value for key, value in machine.items() if key not in _FIRST}):
         name = key.removesuffix("_bytes")
         size = name != key and text.isdecimal()
         facts.append((name, bytes_text(float(text)) if size else text))

@@ -12,13 +12,16 @@ from mor_bench.specs.one_line_errors import nearest_name
 
 Kind = Literal["datasets", "methods"]
 
-FORMER_NAMES = {
-    "pca-regression-force": (
-        "pca-regression",
-        "PCA regression on the linear response is `pca-regression-linear`.",
-    )
+FORMER_NAMES: dict[Kind, dict[str, tuple[str, str]]] = {
+    "datasets": {},
+    "methods": {
+        "pca-regression-force": (
+            "pca-regression",
+            "PCA regression on the linear response is `pca-regression-linear`.",
+        )
+    },
 }
-"""New names of methods by their former names, each with a note."""
+"""New names by former names, each with a note."""
 
 
 def find_suite(suite: Path | None = None) -> Path:
@@ -68,8 +71,8 @@ def find_file(kind: Kind, source: str | Path, suite: Path | None) -> Path:
     known = list_suite(kind, suite)
     if source not in known and suite is not None:
         known = {**list_suite(kind), **known}
-    if source not in known and source in FORMER_NAMES:
-        name, note = FORMER_NAMES[source]
+    if source not in known and source in FORMER_NAMES[kind]:
+        name, note = FORMER_NAMES[kind][source]
         warnings.warn(f"`{source}` is now `{name}`. {note}", RenamedWarning, stacklevel=3)
         source = name
     if source not in known:

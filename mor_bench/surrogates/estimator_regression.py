@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from typing import Annotated, Any
 
 import numpy as np
@@ -16,6 +14,7 @@ from pydantic import AfterValidator, Field, ValidationInfo
 
 from mor_bench.errors import InvalidInputError, MissingDependencyError, text_of
 from mor_bench.specs.one_line_errors import nearest_name
+from mor_bench.specs.public_class import public_class
 from mor_bench.surrogates.coordinate_regression import (
     Array,
     Arrays,
@@ -24,9 +23,6 @@ from mor_bench.surrogates.coordinate_regression import (
     Input,
     Output,
 )
-
-PUBLIC = re.compile(r"sklearn(\.[a-z][a-z0-9_]*)+:[A-Z][A-Za-z0-9]*")
-"""Import paths of public classes of scikit-learn. Others are never imported."""
 
 NOT_IMPORTED = {"conftest", "experimental", "externals", "tests"}
 """Modules of scikit-learn without regressors of their own."""
@@ -57,8 +53,7 @@ def regressor_class(target: str) -> type[Any]:
         If the text has another form, or names no regressor of scikit-learn.
     """
     form = "it must name a regressor as `sklearn.module:Class`"
-    module, _, name = target.partition(":")
-    if not PUBLIC.fullmatch(target) or NOT_IMPORTED & set(module.split(".")):
+    if NOT_IMPORTED & set(target.partition(":")[0].split(".")):
         raise ValueError(form)
     try:
         from sklearn.base import BaseEstimator, RegressorMixin
@@ -66,18 +61,11 @@ def regressor_class(target: str) -> type[Any]:
         raise MissingDependencyError(
             f"{target} needs scikit-learn: pip install scikit-learn"
         ) from error
-    try:
-        loaded = import_module(module)
-    except ModuleNotFoundError:
-        raise ValueError(f"{form}; there is no module {module!r}") from None
-    found = getattr(loaded, name, None)
-    if found is None:
-        near = nearest_name(name, dir(loaded)).rstrip(".")
-        raise ValueError(f"{form}; {module} has no {name!r}{near}")
-    if not (isinstance(found, type) and issubclass(found, RegressorMixin)):
-        raise ValueError(f"{form}; {name!r} is no regressor")
+    found = public_class(target, "sklearn", form)
+    if not issubclass(found, RegressorMixin):
+        raise ValueError(f"{form}; {found.__name__!r} is no regressor")
     if not issubclass(found, BaseEstimator) or not found.__module__.startswith("sklearn."):
-        raise ValueError(f"{form}; {name!r} is no estimator of scikit-learn")
+        raise ValueError(f"{form}; {found.__name__!r} is no estimator of scikit-learn")
     return found
 
 
