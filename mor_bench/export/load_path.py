@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from mor_bench.errors import InvalidInputError, UnsupportedSceneError
+from mor_bench.export.load_steps import load_steps
 from mor_bench.export.output_path import new_file
 from mor_bench.report.canvas import INK, LABEL, length_unit, log_ticks, plain
 from mor_bench.report.number_format import number
@@ -23,7 +23,6 @@ from mor_bench.report.rendering import Look, Shot, show_shots
 from mor_bench.scene.mesh import Mesh
 from mor_bench.snapshots.dataset import Dataset
 from mor_bench.snapshots.store import write_atomically
-from mor_bench.surrogates.fem import FullFEM
 
 VIEW = View(azimuth=-68.0, elevation=20.0)
 COLOUR_MAP = "viridis_r"
@@ -39,7 +38,7 @@ COLOURS = 256
 def export_load_path(data: Dataset, sample: int, out: str | Path, *, n_steps: int = 20) -> Path:
     """Write the deformation under a growing load of the test set as GIF; return the file.
 
-    The full-order model solves each step. PyVista renders the meshes if it is installed.
+    `load_steps` solves each step. PyVista renders the meshes if it is installed.
 
     Parameters
     ----------
@@ -54,22 +53,14 @@ def export_load_path(data: Dataset, sample: int, out: str | Path, *, n_steps: in
     Raises
     ------
     InvalidInputError
-        If the sample does not exist, or the file does.
+        If the sample does not exist, `n_steps` is less than 1, or the file exists.
     UnsupportedSceneError
         If the full-order model cannot solve the scene.
     SolverError
         If a step has no solution.
     """
-    if not 0 <= sample < len(data.test):
-        raise InvalidInputError(
-            f"`sample` must be an integer in [0, {len(data.test) - 1}]; got {sample}."
-        )
-    if data.scene.observed_nodes is not None:
-        raise UnsupportedSceneError(f"{data.scene.name}: its samples are not given by forces.")
     path, mesh = new_file(out, ".gif"), data.scene.mesh
-    parts = np.linspace(0.0, 1.0, n_steps + 1)
-    model = FullFEM().fit(data.scene, None)
-    steps = model.predict(parts[:, None, None] * data.test.forces[sample])
+    parts, steps = load_steps(data, sample, n_steps)
     frames = _frames(mesh, parts, steps, data.scene.name)
     buffer = io.BytesIO()
     durations = [FRAME_MS] * n_steps + [LAST_MS]

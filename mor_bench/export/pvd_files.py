@@ -10,20 +10,13 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
-from mor_bench.errors import (
-    InvalidInputError,
-    SolverError,
-    UnsupportedSceneError,
-    check_count,
-    is_integer,
-)
+from mor_bench.errors import InvalidInputError, is_integer
+from mor_bench.export.load_steps import load_steps
 from mor_bench.export.output_path import new_file
 from mor_bench.export.vtu_files import Part, samples_of, write_fields
-from mor_bench.mechanics.model import FullOrderModel, unknown_equations
 from mor_bench.mechanics.stresses import CellDeformations
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset
-from mor_bench.snapshots.load_paths import solve_paths
 from mor_bench.snapshots.store import write_atomically
 
 Array = NDArray[np.float64]
@@ -111,28 +104,10 @@ def export_load_path_pvd(
     ...     len(export_load_path_pvd(data, 3, f"{folder}/path.pvd", n_steps=2))
     4
     """
-    scene = data.scene
-    check_count("n_steps", n_steps)
-    if not (is_integer(sample) and 0 <= sample < len(data.test)):
-        raise InvalidInputError(
-            f"`sample` must be an integer in [0, {len(data.test) - 1}]; got {sample!r}."
-        )
-    reason = "its body varies between samples" if scene.parameter_names else None
-    if reason := reason or unknown_equations(scene):
-        raise UnsupportedSceneError(f"{scene.name} has no load path: {reason}.")
     _check_new(out)
-    fractions = np.arange(n_steps + 1) / n_steps
-    loads = fractions[1:, None] * data.test.free_forces[sample]
-    steps = np.zeros((n_steps + 1, len(scene.free_dofs)))
-    for row, found in zip(
-        steps[1:], solve_paths(FullOrderModel(scene), loads, 0, n_steps), strict=True
-    ):
-        if isinstance(found, SolverError):
-            raise found
-        row[:] = found.displacement
-    moved = scene.at_all_dofs(steps).reshape(n_steps + 1, -1, 3)
+    fractions, moved = load_steps(data, sample, n_steps)
     forces = fractions[:, None, None] * data.test.forces[sample]
-    return _write_collection(scene, fractions, moved, forces, out)
+    return _write_collection(data.scene, fractions, moved, forces, out)
 
 
 def _check_new(out: str | Path) -> tuple[Path, Path]:
