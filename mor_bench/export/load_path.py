@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from mor_bench.export.load_steps import load_steps
+from mor_bench.export.growing_load import load_steps
 from mor_bench.export.output_path import new_file
 from mor_bench.report.canvas import INK, LABEL, length_unit, log_ticks, plain
 from mor_bench.report.number_format import number

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.errors import InvalidInputError, is_integer
-from mor_bench.export.load_steps import load_steps
+from mor_bench.export.growing_load import load_steps
 from mor_bench.export.output_path import new_file
 from mor_bench.export.vtu_files import Part, samples_of, write_fields
 from mor_bench.mechanics.stresses import CellDeformations
