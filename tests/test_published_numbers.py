@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from mor_bench.specs import list_suite
+from mor_bench.results.comparison import Comparison
+from mor_bench.specs import list_suite, load_method_spec
 from tests.published.blocks import pages, with_blocks
 from tests.published.claims import (
     EVERY_PAGE,
@@ -98,9 +99,38 @@ def test_the_verdict_of_a_run_is_that_of_its_rows(run: str) -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_every_record_names_a_commit_of_the_history() -> None:
+def _command(run: str) -> dict[str, str]:
+    return tomllib.loads((REPORTS / run / "run.toml").read_text(encoding="utf-8"))["run"]
+
+
+def _needs_history() -> None:
     if not (ROOT / ".git").exists() or int(git("rev-list", "--count", "HEAD")) < LEAST_COMMITS:
         pytest.skip("the history is not here")
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_the_methods_of_a_command_were_in_its_commit(run: str) -> None:
+    """Otherwise nobody could repeat the run."""
+    _needs_history()
+    record = _command(run)
+    listed = git("ls-tree", "--name-only", record["commit"], "methods/").split()
+    named = re.findall(r"-m '?([\w-]+)", record["command"])
+    assert {f"methods/{name}.toml" for name in named} <= set(listed)
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_a_run_has_the_sweeps_of_the_methods_files(run: str) -> None:
+    """A changed sweep asks for a new run."""
+    comparison = Comparison.read(REPORTS / run)
+    profile, command = comparison.settings["profile"], _command(run)["command"]
+    for row in comparison.rows:
+        if f"{row.method}[" not in command:
+            sweep = load_method_spec(row.method).sweep_of(profile)
+            assert all(value in sweep.get(key, ()) for key, value in row.swept.items()), row.label
+
+
+def test_every_record_names_a_commit_of_the_history() -> None:
+    _needs_history()
     files = [path for folder in ("reports", "datasets", "trained") for path in _records(folder)]
     found = {commit for path in files for commit in COMMIT.findall(path.read_text("utf-8"))}
     assert len(found) > 3

@@ -4,8 +4,9 @@ Console, report and `pick` use this rule. The validation part selects, so the te
 winner is unbiased. Limits on memory and offline cost, if given, qualify in the same way.
 
 If a fresh test set was drawn, its median error must meet the limit, too. It guards against methods
-that were tuned to the shipped samples. The test set itself selects nothing, unless a row has no
-validation errors; the verdict then says so.
+that were tuned to the shipped samples. Of the test set itself, only this counts: a row
+must answer all of its loads. Without validation errors the test errors select; the verdict then
+says so.
 """
 
 from __future__ import annotations

@@ -116,10 +116,7 @@ def _checked(beside: Sequence[str]) -> list[str]:
 
 
 def wrong_verdicts(folder: Path) -> Iterator[str]:
-    """Reach the verdicts again from the stored rows and intervals; yield each difference.
-
-    Resampled latencies are not stored, so what cannot be told apart is not compared.
-    """
+    """Reach the verdicts again from the stored rows and intervals; yield each difference."""
     comparison = Comparison.read(folder)
     analysis = content_of("comparison.json", folder)
     for stored in analysis["verdicts"]:

@@ -1,12 +1,12 @@
 """Check that timings can be trusted; run it on an otherwise idle machine.
 
-    python -m tests.verification.timing_trust [--only reruns|pairs|busy] [--out FILE]
+    python -m tests.verification.timing_trust [--only PART] [--out FILE]
 
 `reruns` repeats the measurement of some methods and counts the medians inside the interval of the
-measurement before. `pairs` times identical code under two names, and code slowed by 10 %. `busy`
-times a method beside a busy process. The first two do so for the quick and the full protocol. It
-prints every count out of its total and exits with 1 if one misses its goal. Together they take
-about half an hour on two cores. With `--out`, each part is stored as soon as it ends, and a later
+measurement before; `reruns-coarse` does so on the coarse beam, with a network. `pairs` times identical code under two names, and code slowed by 10 %. `busy`
+times a method beside a busy process. All but `busy` do so for the quick and the full protocol.
+It prints every count out of its total and exits with 1 if one misses its goal. Together they take
+about 40 minutes on two cores. With `--out`, each part is stored as soon as it ends, and a later
 call with the same file skips the parts that were stored at the same commit.
 """
 
@@ -37,12 +37,15 @@ from tests.synthetic import a_row
 from tests.timed_methods import fitted_method, timed_method
 from tests.verification.trust_record import trust_record
 
-DATASET = "beam-tiny"
+DATASET, COARSE = "beam-tiny", "beam-coarse"
 AT_ONCE = 20
 """Comparisons, of three processes each, that are measured side by side."""
 
 RERUN_PAIRS = 10
 """Pairs of successive measurements; with the methods below, 110 repeated medians."""
+
+COARSE_PAIRS = 6
+"""Pairs of `reruns-coarse`: 30 repeated medians."""
 
 RERUN_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "fem": ("mor_bench.surrogates.fem:FullFEM", {"tolerance": 1e-4}),
@@ -60,6 +63,16 @@ RERUN_FITTED: dict[str, tuple[str, dict[str, Any]]] = {
     "pca-regression-linear": ("mor_bench.surrogates.pca_regression:PCARegression", {}),
 }
 """Methods that learn from the first `SAMPLES` samples."""
+
+COARSE_METHODS = {name: RERUN_METHODS[name] for name in ("fem", "linear-fem")}
+COARSE_FITTED: dict[str, tuple[str, dict[str, Any]]] = {
+    **{name: RERUN_FITTED[name] for name in ("pod-tensor", "pca-regression-linear")},
+    "umesh-linear": (
+        "mor_bench.surrogates.umesh.method:UMesh",
+        {"channels": 16, "input": "linear-response", "iterations": 20},
+    ),
+}
+"""Methods of `reruns-coarse`. A network's latency does not depend on its weights."""
 
 SAMPLES = 300
 
@@ -150,19 +163,38 @@ def _count_pairs(scene: Scene, folder: Path, n: int, protocol: str) -> dict[str,
 
 
 def reruns(scene: Scene, folder: Path, n: int) -> Part:
-    """Count repeated medians in the interval of the previous measurement, in n pairs of runs.
-
-    Like a repeated run, every measurement has the same seed.
-    """
-    counts: dict[str, dict[str, Any]] = {}
+    """Count repeated medians in the interval of the previous measurement, in n pairs of runs."""
     methods = {name: timed_method(scene, folder, *found) for name, found in RERUN_METHODS.items()}
-    samples = load_dataset(DATASET, SAMPLES, cache=folder / "cache").train
-    for name, found in RERUN_FITTED.items():
-        model = folder / f"{name}.safetensors"
-        methods[name] = fitted_method(scene, model, *found, samples)
+    return _reruns(DATASET, {**methods, **_fitted(DATASET, RERUN_FITTED, folder)}, folder, n)
+
+
+def reruns_coarse(_: Scene, folder: Path, n: int) -> Part:
+    """Do the same on the coarse beam, with a network."""
+    scene = load_scene(COARSE)
+    methods = {name: timed_method(scene, folder, *found) for name, found in COARSE_METHODS.items()}
+    return _reruns(COARSE, {**methods, **_fitted(COARSE, COARSE_FITTED, folder)}, folder, n)
+
+
+def _fitted(
+    dataset: str, learning: dict[str, tuple[str, dict[str, Any]]], folder: Path
+) -> dict[str, TimedMethod]:
+    samples = load_dataset(dataset, SAMPLES, cache=folder / "cache").train
+    return {
+        name: fitted_method(
+            load_scene(dataset), folder / f"{dataset}-{name}.safetensors", *found, samples
+        )
+        for name, found in learning.items()
+    }
+
+
+def _reruns(dataset: str, methods: dict[str, TimedMethod], folder: Path, n: int) -> Part:
+    """Measure methods n + 1 times. Like a repeated run, every measurement has the same seed."""
+    counts: dict[str, dict[str, Any]] = {}
+    scene = load_scene(dataset)
     for protocol in PROTOCOLS:
         before: dict[str, Any] = {}
         inside: list[bool] = []
+        widths: list[float] = []
         misses: list[str] = []
         for number in range(n + 1):
             timings = _measured(scene, folder, methods, 0, protocol)
@@ -170,6 +202,7 @@ def reruns(scene: Scene, folder: Path, n: int) -> Part:
             for name, (low, high) in latency_intervals(before).items():
                 median = float(np.median(after[name]["latency_ms"]))
                 inside.append(low <= median <= high)
+                widths.append((high - low) / float(np.median(before[name]["latency_ms"])))
                 if not inside[-1]:
                     misses.append(f"{number} {name}: {median:.4g} not in {low:.4g}–{high:.4g} ms")
             before = after
@@ -179,7 +212,12 @@ def reruns(scene: Scene, folder: Path, n: int) -> Part:
                 flush=True,
             )
         print("\n".join(misses), flush=True)
-        counts[protocol] = {"inside": sum(inside), "of": len(inside), "misses": misses}
+        counts[protocol] = {
+            "inside": sum(inside),
+            "of": len(inside),
+            "median_width": round(float(np.median(widths)), 4),
+            "misses": misses,
+        }
     trusted = all(found["inside"] >= 0.9 * found["of"] for found in counts.values())
     return {**counts, "trusted": trusted}
 
@@ -200,6 +238,7 @@ def busy(scene: Scene, folder: Path, _: int) -> Part:
 PARTS: dict[str, tuple[Callable[[Scene, Path, int], Part], int]] = {
     "busy": (busy, 1),
     "reruns": (reruns, RERUN_PAIRS),
+    "reruns-coarse": (reruns_coarse, COARSE_PAIRS),
     "pairs": (pairs, 100),
 }
 """Function and default size of each part."""
