@@ -83,7 +83,18 @@ def count(
 
 @contextmanager
 def counted() -> Iterator[Cost]:
-    """Count the work of this process inside the block, also for an enclosing counter."""
+    """Count the work of this process inside the block, also for an enclosing counter.
+
+    Examples
+    --------
+    >>> import mor_bench
+    >>> scene = mor_bench.load_scene("beam-tiny")
+    >>> method = mor_bench.load_method("linear-fem").fit(scene, None)
+    >>> with counted() as cost:
+    ...     displacement = method.predict(0.0 * scene.mesh.points + 0.001)
+    >>> cost.multiply_adds > 0
+    True
+    """
     global _running
     enclosing, _running = _running, Cost()
     cost = _running

@@ -21,10 +21,10 @@ from mor_bench.errors import (
 from mor_bench.measure.discretisation_error import (
     RefinementPlan,
     chosen_samples,
-    limit_of,
     measured,
     refine,
 )
+from mor_bench.measure.mesh_limit import limit_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.report.page import render
 from mor_bench.scene.interpolation import interpolation_matrix
@@ -194,23 +194,6 @@ def test_a_start_at_the_solution_needs_no_step(tiny: Dataset, start: str, needed
         method.predict(tiny.train.forces[5])
     assert iterations[1] == 1
     assert (iterations[0] == 1) == needed
-
-
-def test_extrapolation_finds_the_limit_of_a_series_of_known_order() -> None:
-    exact, error = np.random.default_rng(2).normal(size=(2, 5, 3))
-    for order in (1.0, 1.6, 2.0):
-        found, seen, kind = limit_of(
-            [exact + error * 2.0 ** (-order * level) for level in range(3)]
-        )
-        np.testing.assert_allclose(found, exact, rtol=0, atol=1e-12)
-        assert seen == pytest.approx(order)
-        assert kind == "extrapolated"
-    for insane in (0.1, 5.0, -1.0):
-        series = [exact + error * 2.0 ** (-insane * level) for level in range(3)]
-        assert limit_of(series)[2] == "finest"
-        np.testing.assert_array_equal(limit_of(series)[0], series[-1])
-    assert limit_of([exact, exact + error])[1:] == (None, "finest")
-    assert limit_of([exact, exact, exact])[1:] == (None, "finest")
 
 
 def tip_deflection(scene: Scene, cells: tuple[int, int, int]) -> np.ndarray[Any, Any]:

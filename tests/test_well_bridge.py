@@ -139,12 +139,12 @@ def test_fixed_nodes_that_fill_no_plane_come_back(tiny: Dataset, tmp_path: Path)
 
 
 def test_steps_of_a_growing_force_become_samples(exported: Path, tmp_path: Path) -> None:
-    """A file of another simulation: one trajectory in which force and displacement vary."""
+    """A file of another simulation: trajectories in which force and displacement vary."""
     path = tmp_path / "steps.hdf5"
     shutil.copy(exported / "data/test/beam-tiny.hdf5", path)
     with h5py.File(path, "a") as file:
         group = file["t1_fields"]
-        moved, force = group["displacement"][:1], group["force"][:1]
+        moved, force = group["displacement"][:5], group["force"][:5]
         for name, field in {"displacement": moved[:, 1], "force": force}.items():
             attributes = dict(group[name].attrs)
             del group[name]
@@ -155,12 +155,18 @@ def test_steps_of_a_growing_force_become_samples(exported: Path, tmp_path: Path)
         file["dimensions/time"] = np.arange(4.0)
         del file["scalars/load_region"]
         file["scalars"].attrs["field_names"] = []
-        file.attrs["n_trajectories"] = 1
-    with np.load(import_well(path, tmp_path / "back.npz")[0]) as arrays:
+        file.attrs["n_trajectories"] = 5
+    written, toml = import_well(path, tmp_path / "back.npz")
+    with np.load(written) as arrays:
         assert "test" not in arrays
-        assert "regions" not in arrays
-        expected = np.arange(1.0, 4.0, dtype="f4")[:, None, None] * force.reshape(1, -1, 3)
+        assert arrays["regions"].ravel().tolist() == np.repeat(range(5), 3).tolist()
+        steps = np.arange(1.0, 4.0, dtype="f4")[:, None, None]
+        expected = np.concatenate([steps * each.reshape(1, -1, 3) for each in force])
         np.testing.assert_array_equal(arrays["forces"], expected)
+    data = mor_bench.load_dataset(toml)
+    parts = [set(part.loads.patches.ravel()) for part in (data.train, data.test, data.validation)]
+    assert all(parts[0].isdisjoint(part) for part in parts[1:])
+    assert parts[1].isdisjoint(parts[2])
     with h5py.File(path, "a") as file:
         file["t1_fields/displacement"][0, 0, 4, 1, 1, 0] = 0.2
     with pytest.raises(StoreError, match=r"must be zero wherever no force acts, .*; got up to 0.2"):

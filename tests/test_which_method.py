@@ -11,6 +11,7 @@ import pytest
 from mor_bench.report.suite_overview import overview
 from mor_bench.results.comparison import Comparison
 from mor_bench.results.row import Row
+from tests.published.run_tables import best_of_class
 from tests.published.stored import REPORTS, ROOT
 
 PAGE = (ROOT / "docs" / "which-method.md").read_text(encoding="utf-8")
@@ -56,3 +57,24 @@ def test_the_page_names_the_most_accurate_network(beam: bool) -> None:
     assert {row.method for name, row in best.items() if (name == "beam-coarse") == beam} == {
         named[0 if beam else 1]
     }
+
+
+def test_the_page_names_the_best_of_those_told_the_equations() -> None:
+    verdicts = json.loads((REPORTS / "reduced-order/beam-coarse/comparison.json").read_text())
+    (best,) = (
+        re.fullmatch(r"Best when told equations: ([\w-]+) .*", line)
+        for line in verdicts["verdicts"][0]["beside"]
+        if line.startswith("Best when told equations: ")
+    )
+    assert best
+    named = re.search(r"\[`([\w-]+)`\]\([^)]*\) is the best that is told the equations", PAGE)
+    assert named
+    assert named[1] == best[1]
+
+
+def test_the_page_names_the_fastest_without_snapshots() -> None:
+    table = best_of_class("reports/reduced-order/beam-coarse")
+    (row,) = (line for line in table.splitlines() if line.startswith("| equations, no snapshots |"))
+    named = re.search(r"- \*\*No\*\*: \[`([\w-]+)`\]", PAGE)
+    assert named
+    assert f"| `{named[1]}` |" in row

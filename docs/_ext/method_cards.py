@@ -6,6 +6,7 @@ class, and every stored measurement of the method with its curve.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -103,6 +104,7 @@ def card_page(name: str, folder: Path, *, draw: bool = True) -> str:
     text = ROOT / "docs" / "cards" / f"{name}.md"
     if text.exists():
         lines += [f"```{{include}} ../cards/{name}.md", "```", ""]
+        lines += [*_references(text.read_text(encoding="utf-8")), ""]
     lines += ["## Where it fails", "", " ".join(card.facts["limits"].split()), ""]
     lines += ["## In short", "", *facts_of(name, card), "", *_hyperparameters(card)]
     lines += ["## Measured", "", "Errors are those of the test samples of each stored run.", ""]
@@ -118,6 +120,26 @@ def card_page(name: str, folder: Path, *, draw: bool = True) -> str:
     lines += [f".. autoclass:: {cls}", "   :no-members:", "   :no-index:", "```", ""]
     lines += ["## Commands", "", "```bash", *card.commands, "```", ""]
     return "\n".join(lines)
+
+
+ENTRY = re.compile(r"@\w+\{(?P<key>\w+),(?P<fields>.*)\}$", re.M)
+FIELD = re.compile(r"\b(author|title|year|doi|url)=\{((?:[^{}]|\{[^{}]*\})*)\}")
+
+
+@cache
+def bibliography() -> dict[str, dict[str, str]]:
+    """Return author, title, year, and doi or url of every cited work, by its key."""
+    text = (ROOT / "docs" / "references.bib").read_text(encoding="utf-8")
+    return {entry["key"]: dict(FIELD.findall(entry["fields"])) for entry in ENTRY.finditer(text)}
+
+
+def _references(card: str) -> Iterator[str]:
+    """List the works that a card cites, each with a link."""
+    for key in dict.fromkeys(re.findall(r"\{cite\}`(\w+)`", card)):
+        work = bibliography()[key]
+        address = f"https://doi.org/{work['doi']}" if "doi" in work else work.get("url")
+        if address:
+            yield f"- [{key}]: <{address}>"
 
 
 def measured_fit(method: str, dataset: str = "beam-coarse") -> str | None:

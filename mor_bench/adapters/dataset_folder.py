@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.adapters.dataset_card import CARD, Card
+from mor_bench.adapters.exported_scene import why_not_written
 from mor_bench.adapters.imported_parts import Body, Samples, write_parts
 from mor_bench.array_files import read_hdf5
 from mor_bench.errors import InvalidInputError, StoreError, UnsupportedSceneError, printable
@@ -52,7 +53,7 @@ def export_dataset_folder(data: Dataset, out: str | Path) -> list[Path]:
     Raises
     ------
     UnsupportedSceneError
-        If the body varies between samples.
+        If the body varies between samples, or methods are given displacements instead of forces.
     InvalidInputError
         If one of the files exists.
 
@@ -66,11 +67,8 @@ def export_dataset_folder(data: Dataset, out: str | Path) -> list[Path]:
     ['README.md', 'mesh.h5', 'test', 'train', 'validation']
     """
     scene, out = data.scene, Path(out)
-    if scene.parameter_names:
-        raise UnsupportedSceneError(
-            f"{scene.name} cannot be written as a folder: its body varies between samples, and the "
-            "folder holds one mesh."
-        )
+    if reason := why_not_written(scene):
+        raise UnsupportedSceneError(f"{scene.name} cannot be written as a folder: {reason}.")
     mesh = {
         "points": scene.mesh.points,
         "cells": scene.mesh.cells,

@@ -49,8 +49,9 @@ class Body:
 def write_parts(out: str | Path, body: Body, parts: Mapping[str, Samples]) -> list[Path]:
     """Write parts to an NPZ file and a TOML that reads them again; return both.
 
-    With a part ``test``, the split is that of the parts. Otherwise test samples are drawn at
-    random, and so are validation samples without a part ``validation``.
+    With a part ``test``, the split is that of the parts. Otherwise test samples are drawn by load
+    region if regions are known, else at random. Validation samples without a part ``validation``
+    are drawn alike.
 
     Raises
     ------
@@ -71,7 +72,7 @@ def write_parts(out: str | Path, body: Body, parts: Mapping[str, Samples]) -> li
     regions = [part.regions for part in held if part.regions is not None]
     if len(regions) == len(held) and len({ids.shape[1] for ids in regions}) == 1:
         arrays["regions"] = np.concatenate(regions)
-    by = "file" if "test" in parts else "sample"
+    by = "file" if "test" in parts else "region" if "regions" in arrays else "sample"
     if by == "file":
         lengths = [len(part.forces) for part in held]
         part_of = np.repeat([name for name in PARTS if name in parts], lengths)

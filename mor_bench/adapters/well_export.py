@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from mor_bench.adapters.exported_scene import why_not_written
 from mor_bench.errors import InvalidInputError, UnsupportedSceneError
 from mor_bench.scene.scene import Scene
 from mor_bench.snapshots.dataset import Dataset, Snapshots
@@ -51,8 +52,8 @@ def export_well(data: Dataset, out: str | Path, *, dtype: Precision = "float32")
     Raises
     ------
     UnsupportedSceneError
-        If the nodes and cells are not those of a whole regular grid of hexahedra, or the body
-        varies between samples.
+        If the nodes and cells are not those of a whole regular grid of hexahedra, the body varies
+        between samples, or methods are given displacements instead of forces.
     InvalidInputError
         If the type is another one, or one of the files exists.
 
@@ -182,8 +183,8 @@ class GridFields:
 def _why_no_grid(scene: Scene) -> str | None:
     """Return why a scene's mesh is not a whole grid; None if it is one."""
     mesh = scene.mesh
-    if scene.parameter_names:
-        return "its body varies between samples"
+    if reason := why_not_written(scene):
+        return reason
     if mesh.cells.shape[1] != 8:
         return "its cells are not hexahedra, and the layout holds the points of a grid alone"
     if mesh.grid_shape is None:

@@ -32,7 +32,8 @@ def import_well(
     """Turn files in The Well's layout into snapshots; return an NPZ and a TOML file.
 
     The grid becomes hexahedra. If the force is constant in time, the last time step of each
-    trajectory is a sample; otherwise each step with a force is one. Walls are fixed nodes.
+    trajectory is a sample; otherwise each step with a force is one. Walls are fixed nodes. Steps of
+    one trajectory stay in one part: without load regions in the files, a trajectory is a region.
 
     Samples must be static equilibria, and this layout is also used for motion. So the body must be
     at rest in the first of several time steps under a constant force, and wherever no force acts.
@@ -68,10 +69,13 @@ def import_well(
     40
     """
     source = Path(source)
-    found = {
-        part: [_WellFile(path, displacement, force).read() for path in files]
-        for part, files in _files_of(source).items()
-    }
+    found: dict[str, list[_Content]] = {}
+    n_trajectories = 0
+    for part, files in _files_of(source).items():
+        for path in files:
+            content = _WellFile(path, displacement, force, n_trajectories).read()
+            n_trajectories += content.n_trajectories
+            found.setdefault(part, []).append(content)
     first = next(iter(found.values()))[0]
     for file in (file for files in found.values() for file in files):
         first.check_same_body(file)
@@ -114,6 +118,7 @@ class _Content:
     name: str
     coordinates: tuple[NDArray[np.float64], ...]
     fixed: NDArray[np.bool_]
+    n_trajectories: int
     samples: Samples
 
     def check_same_body(self, other: _Content) -> None:
@@ -136,8 +141,9 @@ class _Content:
 class _WellFile:
     """Reader of one file; every refusal names the file and the entry."""
 
-    def __init__(self, path: Path, displacement: str, force: str) -> None:
+    def __init__(self, path: Path, displacement: str, force: str, first: int) -> None:
         self.path, self.displacement, self.force = path, displacement, force
+        self.first = first  # number of the file's first trajectory
 
     def refuse(self, text: str) -> StoreError:
         return StoreError(f"{self.path}: {text}")
@@ -150,7 +156,8 @@ class _WellFile:
             n = int(file.attrs["n_trajectories"])
             samples = self._samples(file, n, shape)
             fixed = self._fixed(file, shape)
-            return _Content(self.path, str(file.attrs["dataset_name"]), coordinates, fixed, samples)
+            name = str(file.attrs["dataset_name"])
+            return _Content(self.path, name, coordinates, fixed, n, samples)
 
     def _check_root(self, file: h5py.File) -> None:
         for name, kind in {"dataset_name": str, "grid_type": str}.items():
@@ -251,6 +258,8 @@ class _WellFile:
             raise self.refuse(f"{self.force!r} is zero everywhere.")
         flat = len(force), int(np.prod(shape)), 3
         regions = self._regions(file["scalars"], n)
+        if regions is None and pushes:
+            regions = np.arange(self.first, self.first + n)[:, None]
         return Samples(
             force.reshape(flat).astype(np.float64),
             moved.reshape(flat).astype(np.float64),

@@ -179,13 +179,14 @@ def _misses(verdict: Verdict) -> str:
 
 
 def _mesh(verdict: Verdict) -> list[str]:
-    found = (row.discretisation_rel_l2 for row in verdict.rows)
-    mesh = next((value for value in found if value is not None), None)
+    found = ((row.discretisation_rel_l2, row.discretisation_at_least) for row in verdict.rows)
+    mesh, at_least = next((pair for pair in found if pair[0] is not None), (None, False))
     if mesh is None:
-        return ["The discretisation error of the mesh was not measured."]
+        return ["The discretisation error of the mesh is not known."]
+    least = "at least " if at_least else ""
     return [
-        f"The discretisation error of the mesh is {100 * mesh:.3g} % (median). Differences below "
-        "it say nothing about the real body."
+        f"The discretisation error of the mesh is {least}{100 * mesh:.3g} % (median). Differences "
+        "below it say nothing about the real body."
     ]
 
 

@@ -38,7 +38,7 @@ from mor_bench.hard_cases.setups import (
     tip,
     tip_load,
 )
-from mor_bench.measure.discretisation_error import limit_of
+from mor_bench.measure.mesh_limit import limit_of
 from mor_bench.mechanics.model import FullOrderModel
 from mor_bench.mechanics.newton import NewtonOptions, solve_equilibrium
 from mor_bench.mechanics.rotated import condition_number

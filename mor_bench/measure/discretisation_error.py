@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from math import inf, log2
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from mor_bench.errors import (
 )
 from mor_bench.machine import describe_machine
 from mor_bench.measure.error_metrics import sample_errors
+from mor_bench.measure.mesh_limit import limit_of
 from mor_bench.mechanics.pressed import full_order_model
 from mor_bench.scene.interpolation import interpolation_matrix
 from mor_bench.scene.other_meshes import refined
@@ -44,12 +45,6 @@ from mor_bench.version import __version__
 
 FORMAT = "mor-bench discretisation error"
 SCHEMA_VERSION = 1
-PLAUSIBLE_ORDERS = (0.5, 3.0)
-"""Range of orders of convergence that allows extrapolation of a limit.
-
-Linear elements have at most 2, and less at a clamped edge.
-"""
-
 Progress = Callable[[int, int], None]
 """Called with the numbers of finished solves and of all solves."""
 
@@ -88,38 +83,6 @@ def chosen_samples(scene: Scene, n_loads: int) -> NDArray[np.int64]:
     patches = generator.integers(bounds[:-1], bounds[1:])
     chosen = generator.integers(loads.samples_per_patch, size=n_loads) * n_patches + patches
     return np.asarray(chosen * loads.steps + last)
-
-
-def limit_of(
-    displacements: list[NDArray[np.float64]],
-) -> tuple[NDArray[np.float64], float | None, str]:
-    """Estimate the limit of displacements on meshes whose cell size is halved repeatedly.
-
-    Parameters
-    ----------
-    displacements : list of (n_nodes, 3) float64
-        Displacements at the same nodes, m, coarsest mesh first; at least two.
-
-    Returns
-    -------
-    limit : (n_nodes, 3) float64
-        Richardson's extrapolation. With fewer than three meshes, or an order outside
-        `PLAUSIBLE_ORDERS`, it is the last of the list.
-    order : float or None
-        Order of convergence of the last three.
-    kind : {"extrapolated", "finest"}
-    """
-    finest = displacements[-1]
-    if len(displacements) < 3:
-        return finest, None, "finest"
-    before, last = (
-        float(np.linalg.norm(b - a))
-        for a, b in zip(displacements[-3:-1], displacements[-2:], strict=True)
-    )
-    order = log2(before / last) if before > 0 and last > 0 else inf
-    if not PLAUSIBLE_ORDERS[0] <= order <= PLAUSIBLE_ORDERS[1]:
-        return finest, order if np.isfinite(order) else None, "finest"
-    return finest + (finest - displacements[-2]) / (2**order - 1), order, "extrapolated"
 
 
 def _meshes(scene: Scene, plan: RefinementPlan) -> tuple[list[Scene], list[dict[str, int]]]:

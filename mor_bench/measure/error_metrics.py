@@ -66,6 +66,13 @@ def sample_errors(
         The nodes that count; by default all.
     fixed_nodes : (n_fixed,) int64, optional
         The nodes of the supports; by default none.
+
+    Examples
+    --------
+    >>> reference = np.ones((1, 2, 3))
+    >>> errors = sample_errors(1.1 * reference, reference)
+    >>> errors.relative_l2.round(3).tolist(), errors.mean_dof_m.round(3).tolist()
+    ([0.1], [0.1])
     """
     free = np.ones(reference.shape[1], dtype=bool)
     free[[] if fixed_nodes is None else fixed_nodes] = False

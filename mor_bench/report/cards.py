@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 from mor_bench.analysis.analyse import analyse
 from mor_bench.errors import MissingDependencyError
 from mor_bench.measure.discretisation_error import measured
+from mor_bench.measure.mesh_limit import known_error
 from mor_bench.options import allowed_values
 from mor_bench.report.entries import dataset_names, verdict_of
 from mor_bench.report.number_format import bytes_text, metres, percent, seconds_text
@@ -178,8 +179,12 @@ def _discretisation(spec: DatasetSpec, cache: Path | None) -> str:
     record = measured(spec, cache)
     if record is None or record.get("error_m") is None:
         return f"not measured; mor-bench refine {spec.name} measures it"
-    relative = percent(record.get("relative_l2_median"))
-    return f"{metres(record['error_m'])} m per degree of freedom, relative L2 {relative} % (median)"
+    error_m, relative, at_least = known_error(record)
+    if error_m is None:
+        return "not known; displacements change more with every refinement"
+    least = "at least " if at_least else ""
+    size = f"{least}{metres(error_m)} m per degree of freedom"
+    return f"{size}, relative L2 {percent(relative)} % (median)"
 
 
 def _given(facts: Mapping[str, str]) -> dict[str, str]:

@@ -146,7 +146,8 @@ def _draw_mesh_error(axes: Axes, plane: Plane) -> list[Note]:
         return []
     top = min(max(plane.mesh_percent, y0), y1)
     axes.axhspan(y0, top, facecolor=MESH_FACE, edgecolor="none", zorder=0.3)
-    text = f"discretisation error of the mesh: {number(plane.mesh_percent)} %"
+    least = "at least " if plane.mesh_at_least else ""
+    text = f"discretisation error of the mesh: {least}{number(plane.mesh_percent)} %"
     if not y0 < plane.mesh_percent < y1:
         where = "below" if plane.mesh_percent <= y0 else "above"
         return [Note(f"{text}, {where} this axis", [(x0, y0 if where == "below" else y1)], GREY)]

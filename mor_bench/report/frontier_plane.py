@@ -51,6 +51,7 @@ class Plane:
     y: tuple[float, float]
     needs: Requirements
     mesh_percent: float | None
+    mesh_at_least: bool = False
 
     def place(self, entry: Entry) -> tuple[float, float]:
         """Latency in ms and error in percent; a point beyond the axes lies at their end."""
@@ -94,8 +95,8 @@ def plane_of(shown: Sequence[Entry], needs: Requirements) -> Plane:
     Errors far below the needs are left out, such as those of references. The discretisation error
     is held if it is near.
     """
-    known = (e.row.discretisation_rel_l2 or 0.0 for e in shown)
-    mesh = next((error for error in known if error > 0), None)
+    known = ((e.row.discretisation_rel_l2 or 0.0, e.row.discretisation_at_least) for e in shown)
+    mesh, at_least = next((pair for pair in known if pair[0] > 0), (None, False))
     errors = [100 * e.error for e in shown]
     needed = 100 * (needs.error or inf)
     floor = BELOW_NEEDS * needed if isfinite(needed) else 0.0
@@ -116,7 +117,11 @@ def plane_of(shown: Sequence[Entry], needs: Requirements) -> Plane:
         y0, y1 = min(y0, needed), max(y1, needed)
     x_room, y_room = max(1.25, (x1 / x0) ** 0.07), max(1.3, (y1 / y0) ** 0.08)
     return Plane(
-        (x0 / x_room, x1 * x_room), (y0 / y_room, y1 * y_room), needs, 100 * mesh if mesh else None
+        (x0 / x_room, x1 * x_room),
+        (y0 / y_room, y1 * y_room),
+        needs,
+        100 * mesh if mesh else None,
+        at_least,
     )
 
 

@@ -60,6 +60,7 @@ def payload(shown: Shown, body_bytes: int) -> dict[str, Any]:
             "latency": needs.latency_ms,
         },
         "mesh_error": next((100 * value for value in mesh_error if value is not None), None),
+        "mesh_at_least": any(entry.row.discretisation_at_least for entry in entries),
         "winner": shown.card.rankings[0].picks[0].entry.label if shown.card.rankings else None,
         "styles": {entry.method: _style(entry.method) for entry in entries},
         "groups": list(by_group(entries)),

@@ -134,7 +134,8 @@ def discretisation_error(entries: Sequence[Entry]) -> str:
     measured = (e.row for e in entries if e.row.discretisation_error_m is not None)
     row = next(measured, None)
     if row is None:
-        return "not measured"
+        return "not known"
+    least = "at least " if row.discretisation_at_least else ""
     relative = row.discretisation_rel_l2
     beside = "" if relative is None else f", relative L2 (median) {percent(relative)} %"
-    return f"{metres(row.discretisation_error_m)} m{beside}; {MESH_NOTE}"
+    return f"{least}{metres(row.discretisation_error_m)} m{beside}; {MESH_NOTE}"

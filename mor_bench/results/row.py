@@ -236,6 +236,8 @@ class Row(Part):
     seeds : SeedSpread or None
     discretisation_error_m, discretisation_rel_l2 : float or None
         Error of the dataset's mesh against the limit of fine meshes: mean, m; relative median.
+    discretisation_at_least : bool
+        Whether these are lower bounds, since no limit of fine meshes is known.
     warnings : list of str
     tuning_s : float or None
         Tuning budget that the configuration used, s.
@@ -279,6 +281,7 @@ class Row(Part):
     seeds: SeedSpread | None = None
     discretisation_error_m: Real | None = None
     discretisation_rel_l2: Real | None = None
+    discretisation_at_least: bool = False
     warnings: Annotated[list[str], FailFast()] = Field(default=[])
     tuning_s: Real | None = None
 

@@ -20,6 +20,7 @@ from mor_bench.errors import MorBenchError, SolverError
 from mor_bench.measure.discretisation_error import measured
 from mor_bench.measure.error_bounds import calibrated, covered
 from mor_bench.measure.indicator_quality import indicator_summary
+from mor_bench.measure.mesh_limit import known_error
 from mor_bench.measure.range_flags import flags_of
 from mor_bench.reduction.basis import pod
 from mor_bench.results.comparison import Comparison
@@ -355,9 +356,11 @@ def _discretisation(spec: AnyDatasetSpec, context: RunContext) -> dict[str, floa
     record = None
     if isinstance(spec, DatasetSpec):
         record = measured(spec, context.cache, context.options.suite)
+    error_m, relative, at_least = known_error(record)
     return {
-        "discretisation_error_m": (record or {}).get("error_m"),
-        "discretisation_rel_l2": (record or {}).get("relative_l2_median"),
+        "discretisation_error_m": error_m,
+        "discretisation_rel_l2": relative,
+        "discretisation_at_least": at_least,
     }
 
 

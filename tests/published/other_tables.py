@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mor_bench.analysis.told import class_of_method
+from mor_bench.measure.mesh_limit import known_error
 from mor_bench.report.number_format import DASH, number
 from mor_bench.scene.scene import load_scene
 from mor_bench.specs import load_method_spec
+from tests.published.choice_tables import choices, choices_decided
 from tests.published.cost_tables import (
     generation,
     large_deformation,
@@ -111,35 +113,6 @@ def random_loads(source: str) -> str:
     return markdown(headings, body)
 
 
-def choices(source: str, group: str = "open") -> str:
-    """Show errors of variants of methods: medians of the trainings, and the range of e."""
-    body = []
-    for row in content_of(source)["rows"]:
-        if row["group"] != group:
-            continue
-        cells = [f"{row['choice']} {row['value']}".strip()]
-        for part in ("validation", "test"):
-            errors = [training[part] for training in row["trainings"]]
-            sizes = [error["mean_dof_m"] for error in errors]
-            e = f"{float(np.median(sizes)):.2e}"
-            if len(sizes) > 1:
-                e += f" ({min(sizes):.2e} to {max(sizes):.2e})"
-            median, p95 = (
-                100 * float(np.median([error[name] for error in errors]))
-                for name in ("rel_l2_median", "rel_l2_p95")
-            )
-            cells.append(f"{e}; {number(median)}; {number(p95)}".replace("e-0", "e-"))
-        core_s = float(np.median([training["core_s"] for training in row["trainings"]]))
-        body.append([*cells, number(core_s)])
-    headings = [
-        "",
-        "validation: e, m; median %; p95 %",
-        "test: e, m; median %; p95 %",
-        "core-s of a fit",
-    ]
-    return markdown(headings, body)
-
-
 def records(source: str, key: str, columns: str = "") -> str:
     """Show a list of flat records; `columns` names the shown fields, by default all."""
     found = look_up(content_of(source), key)
@@ -206,21 +179,25 @@ def refinement(source: str) -> str:
     body = []
     for path in sorted((ROOT / source).glob("*.refine.json")):
         found = content_of(path.relative_to(ROOT).as_posix())
-        meshes = found["meshes"]
+        meshes, (error_m, relative, at_least) = found["meshes"], known_error(found)
+        orders = [load["order"] for load in found["loads"] if load["order"] is not None]
+        least = "≥ " if at_least else ""
         body.append(
             [
                 f"`{found['dataset']}`",
                 f"{meshes[0]['n_cells']:,}",
                 f"{meshes[-1]['n_cells']:,}",
+                f"{len(meshes) - 1}",
                 f"{len(found['loads'])}",
-                f"{found['error_m']:.1e}",
-                f"{100 * found['relative_l2_median']:.2g}",
+                f"{min(orders):.2f} to {max(orders):.2f}" if orders else DASH,
+                "not known" if error_m is None else f"{least}{error_m:.1e}",
+                "not known" if relative is None else f"{least}{100 * relative:.2g}",
                 (found.get("commit") or DASH)[:7],
                 found.get("date", DASH).partition(" ")[0],
             ]
         )
-    headings = ["mesh", "cells", "cells of the finest mesh", "loads", "e, m", "median %"]
-    return markdown([*headings, "commit", "date"], body)
+    headings = ["mesh", "cells", "cells of the finest mesh", "refinements", "loads"]
+    return markdown([*headings, "orders", "e, m", "median %", "commit", "date"], body)
 
 
 LAWS = {
@@ -365,6 +342,7 @@ OTHER_TABLES: dict[str, Callable[..., str]] = {
     "generation": generation,
     "random-loads": random_loads,
     "choices": choices,
+    "choices-decided": choices_decided,
     "paper-amplitude": paper_amplitude,
     "records": records,
     "optimism": optimism,

@@ -177,6 +177,26 @@ def selected(source: str, dataset: str = "", methods: str = "", by: str = "need"
     )
 
 
+def best_of_class(source: str, dataset: str = "") -> str:
+    """Show the fastest configuration that meets the need, by what is given; the verdict's rule."""
+    run = run_of(source)
+    name = dataset or next(iter(run.datasets))
+    need = float((run.datasets[name].get("needs") or {}).get("error", 0.01))
+    bounds, by_class = error_bounds(run, name), dict[str, list[Row]]()
+    for row in _rows(run, name, ""):
+        by_class.setdefault(class_text(row, is_observed(run, name)), []).append(row)
+    body = []
+    for told, rows in by_class.items():
+        row = sufficient(rows, bounds, need)
+        cells = (
+            [f"`{row.method}`", _configuration(row), _error(run, row), _latency(run, row)]
+            if row
+            else ["none meets the need", *[DASH] * 3]
+        )
+        body.append([told, *cells])
+    return markdown(["is given", "method", "configuration", "median %", "ms"], body)
+
+
 def fastest(source: str, dataset: str = "", methods: str = "") -> str:
     """Show the latency of the fastest configuration below each error, method by method.
 
@@ -313,6 +333,7 @@ def facts(source: str, dataset: str = "") -> str:
 
 RUN_TABLES: dict[str, Callable[..., str]] = {
     "selected": selected,
+    "best-of-class": best_of_class,
     "fastest": fastest,
     "verdict": verdict,
     "headline": headline,

@@ -3,11 +3,12 @@
     python -m tests.verification.timing_trust [--only PART] [--out FILE]
 
 `reruns` repeats the measurement of some methods and counts the medians inside the interval of the
-measurement before; `reruns-coarse` does so on the coarse beam, with a network. `pairs` times identical code under two names, and code slowed by 10 %. `busy`
-times a method beside a busy process. All but `busy` do so for the quick and the full protocol.
-It prints every count out of its total and exits with 1 if one misses its goal. Together they take
-about 40 minutes on two cores. With `--out`, each part is stored as soon as it ends, and a later
-call with the same file skips the parts that were stored at the same commit.
+measurement before; `reruns-coarse` does so on the coarse beam, with a network. `pairs` times
+identical code under two names, and code slowed by 10 %. `busy` times a method beside a busy
+process. All but `busy` do so for the quick and the full protocol. It prints every count out of its
+total and exits with 1 if one misses its goal. Together they take about 40 minutes on two cores.
+With `--out`, each part is stored as soon as it ends, and a later call with the same file skips the
+parts that were stored at the same commit.
 """
 
 from __future__ import annotations

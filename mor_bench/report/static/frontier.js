@@ -128,7 +128,7 @@ Report.kinds.frontier = (figure, data) => {
       const top = Math.min(data.mesh_error, 10 ** range.y[1]);
       shapes.push({ type: "rect", xref: "paper", x0: 0, x1: 1, y0: low[1], y1: top,
         fillcolor: mesh, line: { width: 0 }, layer: "below" });
-      write(`grey: below the mesh’s own error (${R.short(data.mesh_error)} %)`, [0, 1],
+      write(`grey: below the mesh’s own error (${data.mesh_at_least ? "at least " : ""}${R.short(data.mesh_error)} %)`, [0, 1],
         { xref: "paper", yref: "paper", xanchor: "left", yanchor: "bottom" });
     }
     if (error.value === "median" && time.value === "median" && data.needs.error && data.needs.latency) {
