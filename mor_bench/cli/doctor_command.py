@@ -119,8 +119,7 @@ def _speeds(found: Installation) -> Iterator[str]:
         cells = "".join(f"{_shown(speed, name):>8}" for speed in speeds)
         yield f"  {title:<{first}}{cells}"
     for heading, item in zip(headings[1:], found.recorded, strict=True):
-        took = "" if item.run_min is None else f"; `mor-bench run` took {item.run_min:g} min there"
-        yield f"  {heading} {item.name}{took}"
+        yield f"  {heading} {item.name}"
 
 
 def _shown(speed: MachineSpeed, name: str) -> str:

@@ -89,8 +89,6 @@ class RecordedMachine(BaseModel):
     name : str
         Processor, instructions and number of cores.
     cores : int
-    run_min : float or None
-        Minutes of `mor-bench run` after installation and compilation; None if not recorded.
     speed : MachineSpeed
     """
 
@@ -98,7 +96,6 @@ class RecordedMachine(BaseModel):
 
     name: str
     cores: int
-    run_min: float | None = None
     speed: MachineSpeed
 
 
