@@ -67,7 +67,7 @@ Report.table = (grid, data) => {
       { title: "configuration", field: "name", formatter: nameCell, sorter: byMethod, minWidth: 150, widthGrow: 3 },
       { title: "error (%)", field: "error_value", formatter: figureCell("error"), minWidth: 98, ...numbers },
       { title: "latency (ms)", field: "latency_value", formatter: figureCell("latency"), minWidth: 104, ...numbers },
-      { title: "offline", field: "offline", formatter: figureCell("offline"), minWidth: 84, ...numbers },
+      { title: "offline (core-s)", field: "offline", formatter: figureCell("offline"), minWidth: 84, ...numbers },
       { title: "told", field: "group", formatter: textCell, minWidth: 150, widthGrow: 2 },
       { title: "qualifies", field: "answer", formatter: textCell, sorter: natural, minWidth: 96 },
     ],
