@@ -162,13 +162,18 @@ class TimeLeft:
         return factor, max(0.0, (yb - ab * factor) / bb)
 
     def _common(self, known: Known, prior: float = 1.0) -> float:
-        """Return measured over planned seconds of all stages without fits."""
-        return self._ratio([task for task in known if task.stage not in FITTED], known, prior)
+        """Return measured over planned seconds of all stages but fits and timing."""
+        apart = (*FITTED, *MEASURED)
+        return self._ratio([task for task in known if task.stage not in apart], known, prior)
 
     def _pace(self, stage: StageName, known: Known) -> float:
-        """Return measured over planned seconds of a stage, or of all before it, fits included."""
+        """Return measured over planned seconds of a stage, or of all before it, fits included.
+
+        A slow machine does not lengthen turns of timing: they end after a fixed time.
+        """
         common = self._common(known, self._law("fit", known, 1.0)[0])
-        pace = self._ratio([task for task in known if task.stage == stage], known, common)
+        prior = 1.0 if stage in MEASURED else common
+        pace = self._ratio([task for task in known if task.stage == stage], known, prior)
         return min(max(pace, 1 / MOST_CORRECTION), MOST_CORRECTION)
 
     def _ratio(self, done: Sequence[Task], known: Known, prior: float) -> float:

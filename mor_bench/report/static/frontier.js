@@ -78,7 +78,7 @@ Report.kinds.frontier = (figure, data) => {
     const markers = rows.map((row) => boxAt(pixels(row, range), 12, 12));
     return front.flatMap((row, i) => {
       if (y(row) !== inside(y(row))) return [];
-      const [px, py] = pixels(row, range), text = String(i + 1), width = R.widthOf(text, 12) + 8;
+      const [px, py] = pixels(row, range), text = String(i + 1), width = R.widthOf(text, 13) + 8;
       const places = AROUND.map(([dx, dy]) => {
         const box = boxAt([px + dx, py + dy], width, 18);
         return { dx, dy, box, covered: markers.filter((marker) => overlap(box, marker)).length };
@@ -90,7 +90,8 @@ Report.kinds.frontier = (figure, data) => {
       return [{
         x: Math.log10(x(row)), y: Math.log10(y(row)), ax: best.dx, ay: -best.dy, text,
         arrowhead: 0, arrowwidth: 1, standoff: 6, arrowcolor: R.theme().quiet,
-        font: { size: 12, color: R.textColourOf(R.styleOf(data, row)) },
+        bgcolor: R.theme().paper, borderpad: 0,
+        font: { size: 13, color: R.textColourOf(R.styleOf(data, row)) },
       }];
     });
   }
