@@ -83,8 +83,8 @@ def pick(
         spec = load_dataset_spec(dataset, suite)
         name, needs = spec.name, {"error": spec.needs.error, "latency_ms": spec.needs.latency_ms}
         requirements = Requirements(**{**needs, **given})
-        evidence = _given(comparison, spec) or newest_run(spec)
-        evidence = evidence or run([dataset], cache=cache, suite=suite, listener=listener)
+        there = _given(comparison, spec) or newest_run(spec)
+        evidence = there or run([dataset], cache=cache, suite=suite, listener=listener)
     evidence.check_samples(name)
     return verdict_on(told_at_most(evidence, told), name, requirements)
 
